@@ -1,0 +1,164 @@
+"""Directions as an array sees them: the angular grid of a spectrum, unit vectors, distances, the array's pose.
+
+Axes and units are those of docs/conventions.md: azimuth counter-clockwise from the array's x axis, elevation from its
+plane (0) to its normal (90 degrees); radians inside, degrees at the borders.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from swiftwrf.errors import InputError
+
+TURN = 2 * math.pi
+
+
+@dataclass(frozen=True)
+class AngularGrid:
+    """The directions of a spectrum's pixels: evenly spaced elevations, azimuths evenly spaced over the whole circle.
+
+    Rows are elevations, lowest first; columns are azimuths and periodic. All four numbers are in radians.
+    """
+
+    elevation_start: float
+    elevation_step: float
+    n_elevation: int
+    azimuth_start: float
+    n_azimuth: int
+
+    @classmethod
+    def degrees(cls, elevation: Iterable[float], azimuth: Iterable[float]) -> AngularGrid:
+        """The grid of the given angles in degrees, e.g. `degrees(elevation=range(1, 91), azimuth=range(360))`.
+
+        Raises:
+            InputError: uneven spacing, descending order, or azimuths that do not go once round the circle.
+        """
+        rows, columns = [float(e) for e in elevation], [float(a) for a in azimuth]
+        row_step = _even_step(rows, "elevation")
+        column_step = _even_step(columns, "azimuth")
+        if abs(column_step * len(columns) - 360) > 1e-6 * 360:
+            raise InputError(
+                f"azimuths must go once round the circle, but {len(columns)} columns of {column_step:g} degrees make "
+                f"{column_step * len(columns):g} degrees; give evenly spaced azimuths over 360 degrees"
+            )
+        return cls(math.radians(rows[0]), math.radians(row_step), len(rows), math.radians(columns[0]), len(columns))
+
+    @classmethod
+    def hemisphere(cls, n_elevation: int, n_azimuth: int) -> AngularGrid:
+        """A grid of the given size whose rows end at elevation 90 degrees, the layout of the NeRF2 spectra."""
+        step = 90 / n_elevation
+        return cls.degrees(
+            elevation=[step * (row + 1) for row in range(n_elevation)],
+            azimuth=[360 / n_azimuth * column for column in range(n_azimuth)],
+        )
+
+    @property
+    def azimuth_step(self) -> float:
+        return TURN / self.n_azimuth
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(n_elevation, n_azimuth)."""
+        return self.n_elevation, self.n_azimuth
+
+    @cached_property
+    def elevation(self) -> Tensor:
+        """Elevation of each row, float64 (n_elevation,) [rad]."""
+        return self.elevation_start + self.elevation_step * torch.arange(self.n_elevation, dtype=torch.float64)
+
+    @cached_property
+    def azimuth(self) -> Tensor:
+        """Azimuth of each column, float64 (n_azimuth,) [rad]."""
+        return self.azimuth_start + self.azimuth_step * torch.arange(self.n_azimuth, dtype=torch.float64)
+
+    @cached_property
+    def direction(self) -> Tensor:
+        """Unit vector of each pixel in array coordinates, float64 (n_elevation, n_azimuth, 3)."""
+        return to_direction(self.azimuth[None, :], self.elevation[:, None])
+
+
+def _even_step(values: list[float], name: str) -> float:
+    if len(values) < 2:
+        raise InputError(f"a grid needs at least 2 {name}s, got {len(values)}")
+    step = (values[-1] - values[0]) / (len(values) - 1)
+    if step <= 0 or any(abs(b - a - step) > 1e-6 * step for a, b in zip(values, values[1:], strict=False)):
+        raise InputError(f"{name}s must ascend in even steps, got {values[:3]} ... {values[-1]} [degrees]")
+    return step
+
+
+def to_direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
+    """Unit vectors (..., 3) of azimuth and elevation (...) [rad], which broadcast."""
+    azimuth, elevation = torch.broadcast_tensors(azimuth, elevation)
+    flat = torch.cos(elevation)
+    return torch.stack([flat * torch.cos(azimuth), flat * torch.sin(azimuth), torch.sin(elevation)], dim=-1)
+
+
+def to_angles(direction: Tensor) -> tuple[Tensor, Tensor]:
+    """Azimuth in [0, 2 pi) and elevation in [0, pi/2] (...) [rad] of vectors (..., 3) in array coordinates.
+
+    A planar array cannot tell +z from -z, so directions behind it are folded up.
+    """
+    x, y, z = direction.unbind(-1)
+    azimuth = torch.remainder(torch.atan2(y, x), TURN)
+    azimuth = torch.where(azimuth >= TURN, torch.zeros_like(azimuth), azimuth)  # remainder(-tiny, TURN) rounds up to TURN
+    return azimuth, torch.atan2(z.abs(), torch.hypot(x, y))
+
+
+def wrap(angle: Tensor) -> Tensor:
+    """The angle [rad] brought to [-pi, pi] by whole turns."""
+    return angle - TURN * torch.round(angle / TURN)
+
+
+def great_circle(a: Tensor, b: Tensor) -> Tensor:
+    """Angle between vectors a and b (..., 3), in [0, pi] (...) [rad]; exact for small angles, where acos is not."""
+    return torch.atan2(torch.linalg.cross(a, b, dim=-1).norm(dim=-1), (a * b).sum(dim=-1))
+
+
+@dataclass(frozen=True)
+class ArrayPose:
+    """Where an array stands and how it is turned.
+
+    Args:
+        position: of the array's reference point, 3 numbers [m].
+        orientation: unit quaternion in the order x, y, z, w that turns array into world coordinates.
+
+    Raises:
+        InputError: the quaternion is not of unit length (1e-3), or something is not finite.
+    """
+
+    position: tuple[float, float, float]
+    orientation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(x) for x in (*self.position, *self.orientation)):
+            raise InputError(f"the array's position {self.position} and orientation {self.orientation} must be finite")
+        length = math.hypot(*self.orientation)
+        if abs(length - 1) > 1e-3:
+            raise InputError(
+                f"the array's orientation must be a unit quaternion (x, y, z, w), got {list(self.orientation)} of "
+                f"length {length:.4g}; divide it by its length"
+            )
+
+    @cached_property
+    def rotation(self) -> Tensor:
+        """Matrix R that turns array into world coordinates, float64 (3, 3)."""
+        x, y, z, w = (q / math.hypot(*self.orientation) for q in self.orientation)
+        return torch.tensor(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ],
+            dtype=torch.float64,
+        )
+
+    def line_of_sight(self, transmitter: Tensor, receiver: Tensor) -> Tensor:
+        """Azimuth and elevation (n, 2) [rad] at which an array turned like this one, standing at `receiver`, sees
+        `transmitter` (both (n, 3) or (3,) [m]): d = R^T (transmitter - receiver) / |.|, folded above the plane."""
+        return torch.stack(to_angles((transmitter - receiver) @ self.rotation), dim=-1)

@@ -1,0 +1,128 @@
+"""Position to offsets: how the primitives move, answer and fade as one end of the link moves (paper, section 4.2).
+
+Positions here are normalised: the training positions' bounding box, scaled alike on all axes, is centred in [-1, 1]^3.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+MEAN_BANDS, POSITION_BANDS = 10, 6  # frequency bands of the paper's encodings
+WIDTH, DEPTH = 156, 8  # of the paper's network
+COMPONENTS = {"mean": 2, "response": 2, "attenuation": 1, "cholesky": 3}  # what can deform, and its numbers a primitive
+
+
+class Offsets(NamedTuple):
+    """What is added to each primitive at each position; None where a component does not deform."""
+
+    mean: Tensor | None = None  # (B, N, 2) [rad]
+    response: Tensor | None = None  # (B, N, 2)
+    attenuation: Tensor | None = None  # (B, N)
+    cholesky: Tensor | None = None  # (B, N, 3) on the raw factor
+
+
+def _offsets(flat: Tensor, components: tuple[str, ...]) -> Offsets:
+    """Splits (B, N, sum of sizes) into the named components."""
+    parts = dict(zip(components, flat.split([COMPONENTS[c] for c in components], dim=-1), strict=True))
+    if "attenuation" in parts:
+        parts["attenuation"] = parts["attenuation"].squeeze(-1)
+    return Offsets(**parts)
+
+
+def encode(x: Tensor, bands: int) -> Tensor:
+    """[x, sin(2^k pi x), cos(2^k pi x)], k = 0 .. bands - 1 (paper, positional encoding): (..., d) to (..., d (2 bands + 1))."""
+    angle = x[..., None, :] * (math.pi * 2.0 ** torch.arange(bands, dtype=x.dtype, device=x.device))[:, None]
+    return torch.cat([x, torch.sin(angle).flatten(-2), torch.cos(angle).flatten(-2)], dim=-1)
+
+
+class PerPrimitiveMLP(nn.Module):
+    """The paper's network: one evaluation a primitive and position, from the encodings of the mean and the position.
+
+    Eight layers of width 156 with the input fed in again every two layers, and one linear output whose initial zeros
+    make the first deformed spectrum the canonical one. 0.3 million multiplications a primitive and position: at 10,000
+    primitives it, not the rasterizer, bounds the spectra per second.
+    """
+
+    def __init__(self, components: tuple[str, ...]) -> None:
+        super().__init__()
+        self.components = components
+        inputs = 2 * (2 * MEAN_BANDS + 1) + 3 * (2 * POSITION_BANDS + 1)
+        self.layers = nn.ModuleList(
+            nn.Linear(inputs if i == 0 else WIDTH + (inputs if i % 2 == 0 else 0), WIDTH) for i in range(DEPTH)
+        )
+        self.output = nn.Linear(WIDTH, sum(COMPONENTS[c] for c in components))
+        nn.init.zeros_(self.output.weight)
+        nn.init.zeros_(self.output.bias)
+
+    def forward(self, position: Tensor, mean: Tensor) -> Offsets:
+        """Offsets at positions (B, 3) of primitives with canonical means (N, 2) [rad]."""
+        unit = mean / mean.new_tensor([math.pi, math.pi / 4]) - 1  # the range the encoding was made for
+        n_position, n = position.shape[0], mean.shape[0]
+        x = torch.cat(
+            [
+                encode(unit, MEAN_BANDS).expand(n_position, n, -1),
+                encode(position, POSITION_BANDS)[:, None].expand(n_position, n, -1),
+            ],
+            dim=-1,
+        )
+        h = x
+        for i, layer in enumerate(self.layers):
+            h = torch.relu(layer(torch.cat([h, x], dim=-1) if i and i % 2 == 0 else h))
+        return _offsets(self.output(h), self.components)
+
+
+class MotionBasis(nn.Module):
+    """Low-rank motion: all primitives move by one basis, whose K coefficients are a smooth random function of position.
+
+    The coefficients have a Gaussian-process prior with kernel exp(-|s - s'| / length): c(s) = k(s, Z) R^-T z with anchors
+    Z, k(Z, Z) = R R^T and z standard normal under the prior, so a small |z|^2 is a smooth motion. Near measured
+    positions the model follows them; far from all of them it falls back to the canonical primitives, that is to the
+    mean spectrum, instead of extrapolating. One small matrix product a position, whatever the number of primitives.
+
+    Args:
+        anchor: Z, normalised positions (M, 3).
+        length: correlation length of the kernel, in units of normalised positions.
+        rank: K.
+        n: number of primitives.
+    """
+
+    def __init__(
+        self, anchor: Tensor, length: float, rank: int, n: int, components: tuple[str, ...], *, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.components = components
+        size = sum(COMPONENTS[c] for c in components)
+        self.register_buffer("anchor", anchor.to(torch.float32))
+        self.register_buffer("length", torch.tensor(length, dtype=torch.float32))
+        self.register_buffer("whiten", torch.empty(len(anchor), len(anchor)))
+        self.reset_kernel()
+        self.coefficient = nn.Parameter(torch.zeros(len(anchor), rank))
+        self.basis = nn.Parameter(torch.randn(rank, n, size, generator=generator) / math.sqrt(rank))
+
+    anchor: Tensor
+    length: Tensor
+    whiten: Tensor
+
+    def reset_kernel(self) -> None:
+        """Computes R^-T from the anchors and the length, in float64: nearby anchors make k(Z, Z) nearly singular."""
+        kernel = torch.exp(-torch.cdist(self.anchor.double(), self.anchor.double()) / self.length.double())
+        factor = torch.linalg.cholesky(kernel + 1e-6 * torch.eye(len(kernel), dtype=kernel.dtype))
+        eye = torch.eye(len(kernel), dtype=kernel.dtype)
+        self.whiten = torch.linalg.solve_triangular(factor, eye, upper=False).T.to(self.anchor)
+
+    def coefficients(self, position: Tensor) -> Tensor:
+        """c(s) at positions (B, 3), (B, K)."""
+        kernel = torch.exp(-torch.cdist(position, self.anchor) / self.length)
+        return kernel @ self.whiten @ self.coefficient
+
+    def forward(self, position: Tensor, mean: Tensor) -> Offsets:
+        """Offsets at positions (B, 3); the canonical means are not looked at."""
+        return _offsets(torch.einsum("bk,kns->bns", self.coefficients(position), self.basis), self.components)
+
+    def prior(self) -> Tensor:
+        """|z|^2, the negative log prior of the motion up to a factor 1/2."""
+        return self.coefficient.square().sum()
