@@ -58,6 +58,17 @@ class AngularGrid:
             azimuth=[360 / n_azimuth * column for column in range(n_azimuth)],
         )
 
+    def coarsen(self, factor: int) -> AngularGrid:
+        """The grid of the centres of factor x factor pixels; the sizes must be multiples of the factor."""
+        middle = (factor - 1) / 2
+        return AngularGrid(
+            self.elevation_start + middle * self.elevation_step,
+            self.elevation_step * factor,
+            self.n_elevation // factor,
+            self.azimuth_start + middle * self.azimuth_step,
+            self.n_azimuth // factor,
+        )
+
     @property
     def azimuth_step(self) -> float:
         return TURN / self.n_azimuth

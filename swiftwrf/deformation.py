@@ -6,6 +6,7 @@ Positions here are normalised: the training positions' bounding box, scaled alik
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -47,7 +48,7 @@ class PerPrimitiveMLP(nn.Module):
     primitives it, not the rasterizer, bounds the spectra per second.
     """
 
-    def __init__(self, components: tuple[str, ...]) -> None:
+    def __init__(self, components: tuple[str, ...], *, generator: torch.Generator) -> None:
         super().__init__()
         self.components = components
         inputs = 2 * (2 * MEAN_BANDS + 1) + 3 * (2 * POSITION_BANDS + 1)
@@ -55,6 +56,10 @@ class PerPrimitiveMLP(nn.Module):
             nn.Linear(inputs if i == 0 else WIDTH + (inputs if i % 2 == 0 else 0), WIDTH) for i in range(DEPTH)
         )
         self.output = nn.Linear(WIDTH, sum(COMPONENTS[c] for c in components))
+        for layer in self.layers:
+            bound = 1 / math.sqrt(layer.weight.shape[1])  # torch's default, drawn from our own generator
+            for parameter in layer.parameters():
+                nn.init.uniform_(parameter, -bound, bound, generator=generator)
         nn.init.zeros_(self.output.weight)
         nn.init.zeros_(self.output.bias)
 
@@ -75,49 +80,72 @@ class PerPrimitiveMLP(nn.Module):
         return _offsets(self.output(h), self.components)
 
 
+@dataclass(frozen=True)
+class Kernel:
+    """How alike the motion is at two positions, by their distance r: a rough long-range and a smooth short-range part.
+
+        k(r) = share exp(-r / long) + (1 - share) (1 + sqrt(3) r / short) exp(-sqrt(3) r / short)
+
+    The long part (Matern 1/2) carries the rough field between rooms' positions, the short one (Matern 3/2) follows a path
+    sampled densely.
+
+    Args:
+        long, short: correlation lengths, in the unit of the positions.
+        share: of the long part, in [0, 1].
+        noise: variance of what is not a function of position, relative to k(0) = 1.
+    """
+
+    long: float = 0.5
+    short: float = 0.1
+    share: float = 0.6
+    noise: float = 1e-2
+
+    def scaled(self, factor: float) -> Kernel:
+        """The same kernel on positions multiplied by `factor`."""
+        return replace(self, long=self.long * factor, short=self.short * factor)
+
+    def __call__(self, a: Tensor, b: Tensor) -> Tensor:
+        """k between positions (n, 3) and (m, 3), (n, m)."""
+        r = torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")  # the fast mode loses close pairs to rounding
+        near = math.sqrt(3) * r / self.short
+        return self.share * torch.exp(-r / self.long) + (1 - self.share) * (1 + near) * torch.exp(-near)
+
+
 class MotionBasis(nn.Module):
     """Low-rank motion: all primitives move by one basis, whose K coefficients are a smooth random function of position.
 
-    The coefficients have a Gaussian-process prior with kernel exp(-|s - s'| / length): c(s) = k(s, Z) R^-T z with anchors
-    Z, k(Z, Z) = R R^T and z standard normal under the prior, so a small |z|^2 is a smooth motion. Near measured
-    positions the model follows them; far from all of them it falls back to the canonical primitives, that is to the
-    mean spectrum, instead of extrapolating. One small matrix product a position, whatever the number of primitives.
+    The coefficients have a Gaussian-process prior: c(s) = k(s, Z) R^-T z with the training positions as anchors Z,
+    k(Z, Z) + noise = R R^T and z standard normal under the prior, so that a small |z|^2 is a smooth motion. Near measured
+    positions the model follows them; far from all of them it falls back to the canonical primitives, instead of
+    extrapolating. One small matrix product a position, whatever the number of primitives.
 
     Args:
         anchor: Z, normalised positions (M, 3).
-        length: correlation length of the kernel, in units of normalised positions.
+        kernel: k, on normalised positions.
         rank: K.
         n: number of primitives.
     """
 
     def __init__(
-        self, anchor: Tensor, length: float, rank: int, n: int, components: tuple[str, ...], *, generator: torch.Generator
+        self, anchor: Tensor, kernel: Kernel, rank: int, n: int, components: tuple[str, ...], *, generator: torch.Generator
     ) -> None:
         super().__init__()
         self.components = components
+        self.kernel = kernel
         size = sum(COMPONENTS[c] for c in components)
-        self.register_buffer("anchor", anchor.to(torch.float32))
-        self.register_buffer("length", torch.tensor(length, dtype=torch.float32))
-        self.register_buffer("whiten", torch.empty(len(anchor), len(anchor)))
-        self.reset_kernel()
+        self.register_buffer("anchor", anchor)
+        gram = kernel(anchor.double(), anchor.double()) + kernel.noise * torch.eye(len(anchor), dtype=torch.float64)
+        inverse = torch.linalg.inv(torch.linalg.cholesky(gram))  # of R; in float64, for nearby anchors are nearly alike
+        self.register_buffer("whiten", inverse.T.to(anchor))
         self.coefficient = nn.Parameter(torch.zeros(len(anchor), rank))
-        self.basis = nn.Parameter(torch.randn(rank, n, size, generator=generator) / math.sqrt(rank))
+        self.basis = nn.Parameter(0.1 / math.sqrt(rank) * torch.randn(rank, n, size, generator=generator))
 
     anchor: Tensor
-    length: Tensor
     whiten: Tensor
-
-    def reset_kernel(self) -> None:
-        """Computes R^-T from the anchors and the length, in float64: nearby anchors make k(Z, Z) nearly singular."""
-        kernel = torch.exp(-torch.cdist(self.anchor.double(), self.anchor.double()) / self.length.double())
-        factor = torch.linalg.cholesky(kernel + 1e-6 * torch.eye(len(kernel), dtype=kernel.dtype))
-        eye = torch.eye(len(kernel), dtype=kernel.dtype)
-        self.whiten = torch.linalg.solve_triangular(factor, eye, upper=False).T.to(self.anchor)
 
     def coefficients(self, position: Tensor) -> Tensor:
         """c(s) at positions (B, 3), (B, K)."""
-        kernel = torch.exp(-torch.cdist(position, self.anchor) / self.length)
-        return kernel @ self.whiten @ self.coefficient
+        return self.kernel(position, self.anchor) @ self.whiten @ self.coefficient
 
     def forward(self, position: Tensor, mean: Tensor) -> Offsets:
         """Offsets at positions (B, 3); the canonical means are not looked at."""

@@ -1,0 +1,67 @@
+"""What a planar antenna array reports of the paths that reach it (paper, section 3)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from swiftwrf.angles import AngularGrid
+
+LIGHT_SPEED = 299_792_458.0  # [m / s]
+
+
+@dataclass(frozen=True)
+class PlanarArray:
+    """Elements in the plane z = 0 of the array's coordinates.
+
+    Args:
+        element: positions (K, 2) [m], float64.
+        wavelength: of the carrier [m].
+    """
+
+    element: Tensor
+    wavelength: float
+
+    @classmethod
+    def square(cls, side: int, frequency_hz: float) -> PlanarArray:
+        """side x side elements half a wavelength apart, the first at the origin."""
+        wavelength = LIGHT_SPEED / frequency_hz
+        steps = torch.arange(side, dtype=torch.float64) * wavelength / 2
+        return cls(torch.cartesian_prod(steps, steps), wavelength)
+
+    def phase(self, direction: Tensor) -> Tensor:
+        """By how much each element leads the origin for a wave from unit vectors (..., 3), (..., K) [rad] (paper, the
+        phase difference Delta alpha)."""
+        return 2 * math.pi / self.wavelength * (direction[..., :2].to(self.element) @ self.element.T)
+
+    def spectrum(self, channel: Tensor, grid: AngularGrid) -> Tensor:
+        """The magnitude |sum_m w_m exp(j angle(h_m))| / K at each direction, in [0, 1] (paper, equation of the spectrum).
+
+        Only the phases of the channel count: what the array reports is where the wave comes from, not its power.
+
+        Args:
+            channel: complex channel of each element, (n, K).
+            grid: the directions to scan.
+
+        Returns:
+            float32 (n, n_elevation, n_azimuth).
+        """
+        steering = torch.polar(torch.ones((), dtype=torch.float64), -self.phase(grid.direction)).flatten(0, 1)
+        heard = torch.polar(torch.ones((), dtype=torch.float64), channel.angle().double())
+        beam = heard.to(torch.complex64) @ steering.to(torch.complex64).T
+        return (beam.abs() / len(self.element)).reshape(-1, *grid.shape).float()
+
+    def channel(self, direction: Tensor, gain: Tensor, owner: Tensor, n: int) -> Tensor:
+        """Sum of paths at each element: gain exp(j phase), complex128 (n, K).
+
+        Args:
+            direction: unit vectors towards where the paths come from, in array coordinates, (paths, 3).
+            gain: complex amplitude of each path at the origin, (paths,).
+            owner: which of the n channels a path belongs to, (paths,).
+        """
+        phase = self.phase(direction.double())
+        wave = gain.to(torch.complex128)[:, None] * torch.polar(torch.ones_like(phase), phase)
+        return torch.zeros(n, len(self.element), dtype=torch.complex128).index_add(0, owner, wave)

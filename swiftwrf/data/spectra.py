@@ -1,0 +1,82 @@
+"""Spatial spectra measured at known positions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from torch import Tensor
+from torch.nn import functional
+
+from swiftwrf.angles import AngularGrid
+from swiftwrf.arrays import PlanarArray
+from swiftwrf.data.splits import choose_split
+from swiftwrf.errors import InputError
+
+Moving = Literal["transmitter", "receiver"]
+
+
+@dataclass(frozen=True)
+class Spectra:
+    """Spectra and where the moving end of the link stood when each was taken.
+
+    Args:
+        name: of the data set.
+        position: of the moving end, float64 (n, 3) [m].
+        spectrum: magnitudes in [0, 1], float32 (n, n_elevation, n_azimuth).
+        grid: the directions of a spectrum's pixels.
+        label: azimuth and elevation of the line of sight in array coordinates, float64 (n, 2) [rad].
+        line_of_sight: whether the direct path is free, bool (n,); where it is unknown it is taken to be.
+        moving: which end moves.
+        index: number of each spectrum in the data set it comes from, counted from 0, int64 (n,).
+        named_splits: training and test rows of the splits that came with the data.
+        array: the antenna array, where it is known.
+        source: sha256 of each file that says what the data are, by file name.
+    """
+
+    name: str
+    position: Tensor
+    spectrum: Tensor
+    grid: AngularGrid
+    label: Tensor
+    line_of_sight: Tensor
+    moving: Moving
+    index: Tensor
+    named_splits: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
+    array: PlanarArray | None = None
+    source: dict[str, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def subset(self, rows: Tensor) -> Spectra:
+        """The given rows, in the given order; splits named for the whole set are dropped."""
+        return replace(
+            self,
+            position=self.position[rows],
+            spectrum=self.spectrum[rows],
+            label=self.label[rows],
+            line_of_sight=self.line_of_sight[rows],
+            index=self.index[rows],
+            named_splits={},
+        )
+
+    def split(self, name: str = "random", seed: int = 0) -> tuple[Spectra, Spectra]:
+        """Training and test part: a split that came with the data, or a seeded `random` or `block` one.
+
+        Raises:
+            InputError: an unknown name; fewer than 10 training spectra.
+        """
+        train, test = choose_split(name, seed, self.position, self.named_splits, self.name)
+        return self.subset(train), self.subset(test)
+
+    def coarsen(self, factor: int) -> Spectra:
+        """The same spectra averaged over squares of factor x factor pixels.
+
+        Raises:
+            InputError: the numbers of rows and columns are not multiples of the factor.
+        """
+        if any(size % factor for size in self.grid.shape):
+            raise InputError(f"spectra of {self.grid.shape} pixels cannot be averaged over {factor} x {factor} of them")
+        small = functional.avg_pool2d(self.spectrum[:, None], factor)[:, 0]
+        return replace(self, spectrum=small, grid=self.grid.coarsen(factor))

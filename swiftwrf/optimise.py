@@ -1,0 +1,287 @@
+"""One optimisation of a model: schedule, loss, guards, state on disk."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import Tensor, nn
+
+from swiftwrf import checkpoint as files
+from swiftwrf.data.spectra import Spectra
+from swiftwrf.deformation import Kernel, MotionBasis
+from swiftwrf.errors import FitError, InputError
+from swiftwrf.metrics import ssim
+from swiftwrf.model import ModelConfig, SwiftWRF
+
+Record = dict[str, Any]
+Stage = Literal["search", "final"]
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How a model is fitted. The defaults are what measured best; `FitConfig.paper()` is the paper."""
+
+    model: ModelConfig = field(default_factory=ModelConfig)
+    steps: int = 2000
+    """optimisation steps, coarse ones included"""
+    coarse_steps: int = 300
+    """of them on shared primitives, without deformation"""
+    batch: int = 16
+    """spectra a step"""
+    rate: float = 3e-2
+    """learning rate of primitives and coefficients (half of it for the motion basis)"""
+    deformation_rate: float | None = None
+    """learning rate of the paper's network"""
+    warm_up: int = 50
+    """steps over which the rates rise"""
+    final_rate: float = 0.02
+    """share of the rates left after cosine decay"""
+    ssim_weight: float = 0.3
+    """weight of 1 - SSIM in the loss; L1 has the rest"""
+    prior_weight: float = 1e-4
+    """weight of the motion's negative log prior per training spectrum"""
+    smoothing: float = 0.0
+    """the paper's gamma: scale of the noise on positions, annealed to 0"""
+    smoothing_steps: int = 10_000
+    """the paper's tau: fine steps until that noise is gone"""
+    stop_mean: bool = False
+    """keep the canonical means where the coarse stage left them"""
+    max_azimuths: int = 180
+    """spectra with more columns are averaged down to at most this many for fitting; 0 fits all pixels"""
+    validation: Literal["random", "block"] = "random"
+    """what is held out inside the training part: single spectra, or a region where the model must extrapolate"""
+    check_every: int = 100
+    """steps between two looks at the validation spectra"""
+    patience: int = 6
+    """looks without a better one until the search ends"""
+    seed: int = 0
+
+    @classmethod
+    def paper(cls, **changes: Any) -> FitConfig:
+        """The paper's settings: 10,000 bounded primitives, its network, means kept, annealed noise, all pixels."""
+        model = ModelConfig(
+            n_primitives=10_000,
+            deformation="per_primitive_mlp",
+            components=("mean", "response", "attenuation"),
+            bounded=True,
+        )
+        paper = cls(
+            model=model,
+            steps=110_000,
+            coarse_steps=10_000,
+            batch=1,
+            rate=1e-2,
+            deformation_rate=8e-3,
+            smoothing=1.0,
+            stop_mean=True,
+            max_azimuths=0,
+            check_every=1000,
+        )
+        return replace(paper, **changes)
+
+
+@dataclass(frozen=True)
+class State:
+    """Where an interrupted fit stood."""
+
+    stage: Stage
+    steps: int
+    """steps of that stage"""
+    header: dict[str, Any]
+    tensors: dict[str, Tensor]
+
+
+def fingerprint(config: FitConfig, train: Spectra) -> str:
+    """Says whether a saved state belongs to this configuration and these spectra."""
+    digest = hashlib.sha256(json.dumps(asdict(config)).encode())
+    for tensor in (train.position, train.spectrum):
+        digest.update(tensor.numpy().tobytes())
+    return digest.hexdigest()
+
+
+def read_state(path: Path | None, expected: str) -> State | None:
+    """The state at `path`, or None where there is none yet.
+
+    Raises:
+        InputError: the state of another fit.
+    """
+    if path is None or not path.exists():
+        return None
+    tensors, header = files.read(path, "fit state")
+    if header["fingerprint"] != expected:
+        raise InputError(f"{path} is the state of another fit (other spectra or settings); remove it or give another path")
+    return State(header["stage"], header["steps"], header, tensors)
+
+
+def progress_bar(shown: bool) -> Progress:
+    """Rate and time left of a fit, on a terminal; nothing elsewhere."""
+    return Progress(
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f} steps"),
+        TextColumn("{task.fields[rate]}"), TimeRemainingColumn(), transient=True, disable=not shown,
+    )  # fmt: skip
+
+
+class Optimisation:
+    """Adam on the primitives and their motion, from a seeded start.
+
+    Args:
+        stage: `search` looks at held-out spectra and stops when they are no longer predicted better; `final` runs through.
+        steps: when to stop at the latest.
+        train: spectra to fit.
+        kernel: of the motion's prior, lengths in [m].
+        held_out: spectra to look at.
+    """
+
+    def __init__(
+        self,
+        stage: Stage,
+        steps: int,
+        train: Spectra,
+        kernel: Kernel,
+        config: FitConfig,
+        device: torch.device | str,
+        held_out: Spectra | None = None,
+    ) -> None:
+        self.stage: Stage = stage
+        self.steps, self.config = steps, config
+        self.generator = torch.Generator().manual_seed(config.seed)
+        model = SwiftWRF(config.model, train.grid, train.position, kernel, generator=self.generator)
+        self.model = model.to(device)
+        self.position, self.spectrum = self._tensors(train)
+        self.held_out = None if held_out is None else self._tensors(held_out)
+        self.optimiser = self._optimiser()
+        self.schedule = torch.optim.lr_scheduler.LambdaLR(self.optimiser, self._rate)
+        self.step, self.best_step, self.best_loss = 0, steps, math.inf
+        self.seconds = 0.0
+
+    def _tensors(self, spectra: Spectra) -> tuple[Tensor, Tensor]:
+        device = self.model.centre.device
+        return self.model.normalise(spectra.position.to(device)), spectra.spectrum.to(device)
+
+    def _optimiser(self) -> torch.optim.Adam:
+        rate, deformation = self.config.rate, self.model.deformation
+        groups: list[dict[str, Any]] = [{"params": list(self.model.primitives.parameters()), "lr": rate}]
+        if isinstance(deformation, MotionBasis):
+            groups += [{"params": [deformation.coefficient], "lr": rate}, {"params": [deformation.basis], "lr": rate / 2}]
+        elif deformation is not None:
+            groups += [{"params": list(deformation.parameters()), "lr": self.config.deformation_rate or rate}]
+        return torch.optim.Adam(groups, betas=(0.9, 0.99))
+
+    def _rate(self, step: int) -> float:
+        """Warm-up, then cosine decay over the configured steps, whatever the stage stops at."""
+        cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, step / self.config.steps)))
+        return min(1.0, (step + 1) / self.config.warm_up) * (self.config.final_rate + (1 - self.config.final_rate) * cosine)
+
+    def loss(self, drawn: Tensor, measured: Tensor) -> Tensor:
+        """Paper, equation of the loss: 0.7 L1 + 0.3 (1 - SSIM) at the default weight."""
+        weight = self.config.ssim_weight
+        return (1 - weight) * (drawn - measured).abs().mean() + weight * (1 - ssim(drawn, measured).mean())
+
+    def smoothing(self) -> float:
+        """Standard deviation of the noise on normalised positions: gamma 2 / cbrt(N_s) (1 - i / tau) (paper, annealed
+        smoothing); 2 is the side of the box [-1, 1]^3, so that this is the distance between N_s even positions."""
+        fine = self.step - self.config.coarse_steps
+        left = max(0.0, 1 - fine / self.config.smoothing_steps)
+        return self.config.smoothing * 2 / len(self.position) ** (1 / 3) * left
+
+    def advance(self) -> float:
+        """One step; its loss.
+
+        Raises:
+            FitError: a loss or gradient that is not finite; the parameters are those before the step.
+        """
+        config, model = self.config, self.model
+        rows = torch.randint(len(self.position), (min(config.batch, len(self.position)),), generator=self.generator)
+        position = self.position[rows]
+        deform = self.step >= config.coarse_steps
+        if deform and (scale := self.smoothing()):
+            noise = torch.randn(position.shape, generator=self.generator).to(position)
+            position = position + scale * noise
+        loss = self.loss(model(position, deform=deform, stop_mean=config.stop_mean and deform), self.spectrum[rows])
+        if isinstance(model.deformation, MotionBasis):
+            loss = loss + config.prior_weight / len(self.position) * model.deformation.prior()
+        self.optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        norm = nn.utils.clip_grad_norm_(model.parameters(), max_norm=1.0)
+        if not (math.isfinite(loss.item()) and math.isfinite(norm.item())):
+            raise FitError(
+                f"the fit broke at step {self.step}: loss {loss.item():.3g}, gradient {norm.item():.3g}; "
+                f"try a learning rate below {config.rate:g}"
+            )
+        self.optimiser.step()
+        self.schedule.step()
+        self.step += 1
+        return loss.item()
+
+    @torch.no_grad()
+    def look(self) -> float | None:
+        """Loss on the held-out spectra."""
+        if self.held_out is None:
+            return None
+        position, measured = self.held_out
+        parts = zip(position.split(64), measured.split(64), strict=True)
+        deform = self.step > self.config.coarse_steps
+        losses = [float(self.loss(self.model(p, deform=deform), m)) * len(p) for p, m in parts]
+        return sum(losses) / len(position)
+
+    def run(
+        self, saved: State | None, path: Path | None, owner: str, bar: Progress, on_record: Callable[[Record], None] | None
+    ) -> None:
+        """Goes on from `saved` where it is of this stage; keeps its state at `path` at each look."""
+        if saved is not None and saved.stage == self.stage:
+            self._restore(saved)
+        task = bar.add_task(self.stage, total=self.steps, completed=self.step, rate="")
+        every, patience = self.config.check_every, self.config.patience
+        start, began = self.step, time.perf_counter() - self.seconds
+        while self.step < self.steps and not (self.held_out and self.step - self.best_step >= patience * every > 0):
+            loss = self.advance()
+            if self.step % every and self.step != self.steps:
+                continue
+            held_out = self.look()
+            if held_out is not None and held_out < self.best_loss:
+                self.best_loss, self.best_step = held_out, self.step
+            self.seconds = time.perf_counter() - began
+            rate = (self.step - start) * self.config.batch / max(time.perf_counter() - began, 1e-9)
+            bar.update(task, completed=self.step, rate=f"{rate:.0f} spectra/s")
+            if path is not None:
+                self._save(path, owner)
+            if on_record is not None:
+                on_record(
+                    {"stage": self.stage, "step": self.step, "loss": loss, "validation": held_out, "seconds": self.seconds}
+                )
+        bar.remove_task(task)
+
+    def _save(self, path: Path, owner: str) -> None:
+        tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
+        for number, moments in self.optimiser.state_dict()["state"].items():
+            tensors |= {f"optimiser.{number}.{name}": torch.as_tensor(value) for name, value in moments.items()}
+        tensors["generator"] = self.generator.get_state()
+        header = {name: getattr(self, name) for name in ("stage", "steps", "step", "best_step", "seconds")}
+        header |= {"best_loss": None if math.isinf(self.best_loss) else self.best_loss, "fingerprint": owner}
+        files.write(path, "fit state", tensors, header)
+
+    def _restore(self, saved: State) -> None:
+        header, tensors = saved.header, saved.tensors
+        self.step, self.best_step, self.seconds = header["step"], header["best_step"], header["seconds"]
+        self.best_loss = math.inf if header["best_loss"] is None else header["best_loss"]
+        prefix = "model."
+        self.model.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
+        state = copy.deepcopy(self.optimiser.state_dict())
+        for name, value in tensors.items():
+            if name.startswith("optimiser."):
+                _, number, moment = name.split(".")
+                state["state"].setdefault(int(number), {})[moment] = value
+        self.optimiser.load_state_dict(state)
+        self.generator.set_state(tensors["generator"])
+        for _ in range(self.step):
+            self.schedule.step()
