@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -11,9 +13,11 @@ from torch import Tensor
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import MIN_TRAINING, slabs
 from swiftwrf.errors import InputError
+from swiftwrf.metrics import WINDOW
 from swiftwrf.model import SwiftWRF
-from swiftwrf.optimise import FitConfig, Optimisation, Record, fingerprint, progress_bar, read_state
+from swiftwrf.optimise import FitConfig, Optimisation, Record, fingerprint, read_state
 from swiftwrf.prior import choose_kernel
+from swiftwrf.progress import progress_bar
 
 FOLDS = 5  # validation holds out one; the kernel is chosen over all
 
@@ -51,7 +55,7 @@ def fit(
         bad = (~tensor.isfinite()).flatten(1).any(dim=1).nonzero()
         if len(bad):
             raise InputError(f"{name} of training spectrum {int(bad[0])} is not finite; mend or leave it out")
-    fold = _folds(train.position, config)
+    fold = folds(train.position, config.validation, config.seed)
     work = _working(train, config.max_azimuths)
     kernel = choose_kernel(work.position, work.spectrum, fold)
     saved = read_state(checkpoint, fingerprint(config, work))
@@ -72,19 +76,16 @@ def fit(
     return model.eval()
 
 
-def _folds(position: Tensor, config: FitConfig) -> Tensor:
+def folds(position: Tensor, validation: Literal["random", "block"], seed: int) -> Tensor:
     """Number of the fold, 0 to 4, of each training position."""
-    if config.validation == "block":
+    if validation == "block":
         return slabs(position, FOLDS)
-    order = torch.randperm(len(position), generator=torch.Generator().manual_seed(config.seed))
+    order = torch.randperm(len(position), generator=torch.Generator().manual_seed(seed))
     return order % FOLDS
 
 
 def _working(train: Spectra, max_azimuths: int) -> Spectra:
     """The spectra at the resolution of the fit: an array's beams are far wider than a pixel, so little is lost."""
-    factor = 1
-    while max_azimuths and train.grid.n_azimuth // factor > max_azimuths:
-        factor += 1
-        while any(size % factor for size in train.grid.shape) and factor < min(train.grid.shape):
-            factor += 1
-    return train.coarsen(factor) if all(size % factor == 0 for size in train.grid.shape) else train
+    least = math.ceil(train.grid.n_azimuth / max_azimuths) if max_azimuths else 1
+    factors = range(least, min(train.grid.shape) // WINDOW + 1)
+    return train.coarsen(next((f for f in factors if all(size % f == 0 for size in train.grid.shape)), 1))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
+from swiftwrf import checkpoint
 from swiftwrf.angles import AngularGrid
 from swiftwrf.deformation import Kernel, MotionBasis, Offsets, PerPrimitiveMLP
 from swiftwrf.errors import InputError
@@ -136,6 +138,30 @@ class SwiftWRF(nn.Module):
             spectrum[start : start + batch] = self.draw(self.gaussians(x), len(x), grid).clamp(0, 1)
         return spectrum
 
-    @property
-    def n_parameters(self) -> int:
-        return sum(p.numel() for p in self.parameters())
+    def save(self, path: str | Path, provenance: dict[str, str] | None = None) -> None:
+        """Writes the model to one safetensors file, its configuration and `provenance` in the header."""
+        motion = self.deformation.kernel if isinstance(self.deformation, MotionBasis) else Kernel()
+        header = {
+            "config": asdict(self.config),
+            "grid": asdict(self.grid),
+            "kernel": asdict(motion),
+            "provenance": provenance or {},
+        }
+        checkpoint.write(path, "swiftwrf model", self.state_dict(), header)
+
+
+def load(path: str | Path) -> SwiftWRF:
+    """The model that `SwiftWRF.save` wrote.
+
+    Raises:
+        InputError: not such a file.
+    """
+    tensors, header = checkpoint.read(path, "swiftwrf model")
+    config = ModelConfig(**{**header["config"], "components": tuple(header["config"]["components"])})
+    anchor = torch.zeros_like(tensors.get("deformation.anchor", torch.empty(1, 3)))  # of the right shape, for now
+    grid = AngularGrid(**header["grid"])
+    model = SwiftWRF(config, grid, anchor, Kernel(), generator=torch.Generator())
+    model.load_state_dict(tensors)
+    if isinstance(model.deformation, MotionBasis):
+        model.deformation.kernel = Kernel(**header["kernel"])
+    return model.eval()

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import Progress
 from torch import Tensor, nn
 
 from swiftwrf import checkpoint as files
@@ -121,14 +121,6 @@ def read_state(path: Path | None, expected: str) -> State | None:
     if header["fingerprint"] != expected:
         raise InputError(f"{path} is the state of another fit (other spectra or settings); remove it or give another path")
     return State(header["stage"], header["steps"], header, tensors)
-
-
-def progress_bar(shown: bool) -> Progress:
-    """Rate and time left of a fit, on a terminal; nothing elsewhere."""
-    return Progress(
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f} steps"),
-        TextColumn("{task.fields[rate]}"), TimeRemainingColumn(), transient=True, disable=not shown,
-    )  # fmt: skip
 
 
 class Optimisation:
@@ -240,19 +232,18 @@ class Optimisation:
         """Goes on from `saved` where it is of this stage; keeps its state at `path` at each look."""
         if saved is not None and saved.stage == self.stage:
             self._restore(saved)
-        task = bar.add_task(self.stage, total=self.steps, completed=self.step, rate="")
+        task = bar.add_task(self.stage, total=self.steps, completed=self.step)
         every, patience = self.config.check_every, self.config.patience
-        start, began = self.step, time.perf_counter() - self.seconds
+        began = time.perf_counter() - self.seconds
         while self.step < self.steps and not (self.held_out and self.step - self.best_step >= patience * every > 0):
             loss = self.advance()
+            bar.update(task, completed=self.step)
             if self.step % every and self.step != self.steps:
                 continue
             held_out = self.look()
             if held_out is not None and held_out < self.best_loss:
                 self.best_loss, self.best_step = held_out, self.step
             self.seconds = time.perf_counter() - began
-            rate = (self.step - start) * self.config.batch / max(time.perf_counter() - began, 1e-9)
-            bar.update(task, completed=self.step, rate=f"{rate:.0f} spectra/s")
             if path is not None:
                 self._save(path, owner)
             if on_record is not None:

@@ -1,0 +1,80 @@
+"""Measured and synthetic spectra at a given share, each labelled by its origin, with nothing withheld leaking in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from swiftwrf import InputError, Spectra
+from swiftwrf.data.splits import MIN_TRAINING
+
+
+class Places(NamedTuple):
+    """Where spectra are withheld: what one knows of a place without measuring there. It has no spectrum to leak."""
+
+    position: Tensor  # (n, 3) [m]
+    label: Tensor  # (n, 2) direction of the transmitter [rad], from the positions of both ends
+    index: Tensor  # (n,) numbers in the data set
+
+
+@dataclass(frozen=True)
+class Mixed:
+    """A training set for an estimator of the angle of arrival.
+
+    Args:
+        spectrum: (n, H, W).
+        label: azimuth and elevation [rad], (n, 2).
+        index: number of each sample's place in the data set, (n,).
+        synthetic: origin of each spectrum: False measured, True synthesized, (n,).
+    """
+
+    spectrum: Tensor
+    label: Tensor
+    index: Tensor
+    synthetic: Tensor
+
+    def __len__(self) -> int:
+        return len(self.spectrum)
+
+    @classmethod
+    def measured(cls, spectra: Spectra) -> Mixed:
+        """Measured spectra alone."""
+        synthetic = torch.zeros(len(spectra), dtype=torch.bool)
+        return cls(spectra.spectrum, spectra.label, spectra.index, synthetic)
+
+
+def withhold(train: Spectra, share: float, seed: int) -> tuple[Spectra, Places]:
+    """A random `share` of the training spectra as measured, and the places of the others.
+
+    Raises:
+        InputError: a share outside (0, 1]; fewer than 10 measured spectra left.
+    """
+    if not 0 < share <= 1:
+        raise InputError(f"the measured share must lie in (0, 1], got {share:g}")
+    n = round(share * len(train))
+    if n < MIN_TRAINING:
+        raise InputError(
+            f"a measured share of {share:g} leaves {n} of {len(train)} training spectra; at least {MIN_TRAINING} are needed, "
+            f"a share of {MIN_TRAINING / len(train):.2g}"
+        )
+    order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
+    measured, others = train.subset(order[:n].sort().values), train.subset(order[n:].sort().values)
+    return measured, Places(others.position, others.label, others.index)
+
+
+def mix(measured: Spectra, withheld: Places, synthetic: Tensor) -> Mixed:
+    """Measured spectra, and synthetic ones (n, H, W) at the withheld places, in this order.
+
+    The synthesizer that drew them was fitted on `measured` alone, which is all that `withhold` hands out.
+    """
+    if len(synthetic) != len(withheld.index):
+        raise InputError(f"expected one synthetic spectrum for each of {len(withheld.index)} places, got {len(synthetic)}")
+    return Mixed(
+        torch.cat([measured.spectrum, synthetic]),
+        torch.cat([measured.label, withheld.label]),
+        torch.cat([measured.index, withheld.index]),
+        torch.cat([torch.zeros(len(measured), dtype=torch.bool), torch.ones(len(synthetic), dtype=torch.bool)]),
+    )

@@ -1,0 +1,31 @@
+"""SwiftWRF: a measured wireless radiance field, known everywhere.
+
+    data = swiftwrf.load_spectra(folder)
+    train, test = data.split("block")
+    model = swiftwrf.fit(train)
+    spectrum = model.synthesize(test.position)
+"""
+
+from swiftwrf.angles import AngularGrid, ArrayPose
+from swiftwrf.data import Spectra, load_spectra
+from swiftwrf.data.room import simulated_room
+from swiftwrf.errors import FitError, InputError
+from swiftwrf.fit import FitConfig, fit
+from swiftwrf.model import ModelConfig, SwiftWRF, load
+from swiftwrf.rasterize import rasterize
+
+__all__ = [
+    "AngularGrid",
+    "ArrayPose",
+    "FitConfig",
+    "FitError",
+    "InputError",
+    "ModelConfig",
+    "Spectra",
+    "SwiftWRF",
+    "fit",
+    "load",
+    "load_spectra",
+    "rasterize",
+    "simulated_room",
+]

@@ -1,0 +1,168 @@
+"""The built-in simulated room: image sources of a rectangular room with a few boxes in it, and an antenna array.
+
+Walls mirror the transmitter; mirrored up to twice that makes 25 sources, each seen along a straight line through the
+unfolded rooms (J. B. Allen and D. A. Berkley, "Image method for efficiently simulating small-room acoustics", J. Acoust.
+Soc. Am. 65, 1979). Folding that line back into the room gives the path's corners, and with them what stands in its way.
+It is a toy with exact geometry: no diffraction, no scattering, no materials that depend on the angle.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from swiftwrf.angles import AngularGrid, ArrayPose
+from swiftwrf.arrays import LIGHT_SPEED, PlanarArray
+from swiftwrf.data.spectra import Moving, Spectra
+from swiftwrf.errors import InputError
+
+MAX_ORDER = 2
+GRID = AngularGrid.hemisphere(45, 180)
+FACING_X = ArrayPose((0.1, 2.4, 1.2), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)))  # on the wall x = 0, its normal is +x
+LEVEL = ArrayPose((3.0, 2.5, 2.7))  # lies level; the position is that of the fixed transmitter on the ceiling
+REGION = ((2.2, 1.6, 0.9), (4.2, 3.4, 1.5))  # where the moving end goes: opposite corners [m]
+
+
+class Paths(NamedTuple):
+    """Paths from n transmitters to n receivers, one for each of the 25 sources; the first is the direct one."""
+
+    direction: Tensor  # (n, 25, 3) unit vectors from the receiver to where the path comes from
+    length: Tensor  # (n, 25) [m]
+    gain: Tensor  # (n, 25) complex amplitude: free space, reflections, blockage
+    clear: Tensor  # (n, 25) whether no box stands in the way
+
+
+@dataclass(frozen=True)
+class Room:
+    """A rectangular room with one corner at the origin.
+
+    Args:
+        size: along x, y and z [m].
+        boxes: things that stand in the way, as pairs of opposite corners [m].
+        reflection: amplitude that a wall reflects, with its sign.
+        blockage: amplitude that gets past a box.
+        frequency_hz: of the carrier.
+    """
+
+    size: tuple[float, float, float] = (6.0, 5.0, 3.0)
+    boxes: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...] = (
+        ((1.0, 0.6, 0.0), (1.6, 1.9, 1.3)),
+        ((4.6, 3.6, 0.0), (5.4, 4.6, 1.8)),
+        ((1.2, 3.0, 0.0), (1.5, 3.2, 2.2)),
+    )
+    reflection: float = -0.6
+    blockage: float = 0.1
+    frequency_hz: float = 915e6
+
+    def paths(self, transmitter: Tensor, receiver: Tensor) -> Paths:
+        """All paths with at most two reflections between positions (n, 3) [m], which broadcast.
+
+        Raises:
+            InputError: a position outside the room, or both ends at one place.
+        """
+        transmitter, receiver = torch.broadcast_tensors(transmitter.double(), receiver.double())
+        size = torch.tensor(self.size, dtype=torch.float64)
+        for name, position in (("transmitter", transmitter), ("receiver", receiver)):
+            if not bool(((position > 0) & (position < size)).all()):
+                raise InputError(f"a {name} stands outside the room of {self.size} m")
+        rooms = torch.tensor(_mirrored_rooms(), dtype=torch.float64)  # (25, 3)
+        inside = torch.where(rooms % 2 == 0, transmitter[:, None], size - transmitter[:, None])
+        ray = rooms * size + inside - receiver[:, None]  # (n, 25, 3)
+        length = ray.norm(dim=-1)
+        if bool((length == 0).any()):
+            raise InputError("transmitter and receiver stand at one place, so there is no direction between them")
+        clear = ~self._blocked(receiver, ray, rooms)
+        wavelength = LIGHT_SPEED / self.frequency_hz
+        amplitude = wavelength / (4 * math.pi * length) * self.reflection ** rooms.abs().sum(-1)
+        amplitude = torch.where(clear, amplitude, self.blockage * amplitude)
+        gain = amplitude * torch.polar(torch.ones_like(length), -2 * math.pi / wavelength * length)
+        return Paths(ray / length[..., None], length, gain, clear)
+
+    def _blocked(self, receiver: Tensor, ray: Tensor, rooms: Tensor) -> Tensor:
+        """Whether a box stands in the way of each path, (n, 25)."""
+        size = torch.tensor(self.size, dtype=torch.float64)
+        crossing = [torch.zeros(ray.shape[:2], dtype=torch.float64), torch.ones(ray.shape[:2], dtype=torch.float64)]
+        for axis, k in itertools.product(range(3), range(MAX_ORDER)):  # the k-th wall crossed along an axis
+            count = rooms[:, axis]
+            wall = torch.where(count > 0, k + 1.0, -float(k)) * size[axis]
+            at = (wall - receiver[:, None, axis]) / ray[..., axis]
+            crossing.append(torch.where(count.abs() > k, at, torch.ones_like(at)))
+        parameter = torch.stack(crossing, dim=-1).sort(dim=-1).values  # corners along the line, 0 to 1
+        corner = _fold(receiver[:, None, None] + parameter[..., None] * ray[:, :, None], size)
+        blocked = torch.zeros(ray.shape[:2], dtype=torch.bool)
+        for box in torch.tensor(self.boxes, dtype=torch.float64).reshape(-1, 2, 3):
+            blocked |= _hits(corner[:, :, :-1], corner[:, :, 1:], *box).any(dim=-1)
+        return blocked
+
+
+def _mirrored_rooms() -> list[tuple[int, int, int]]:
+    """Mirrored rooms reached by at most two reflections, the room itself first."""
+    steps = range(-MAX_ORDER, MAX_ORDER + 1)
+    return sorted((r for r in itertools.product(steps, repeat=3) if sum(map(abs, r)) <= MAX_ORDER), key=lambda r: sum(map(abs, r)))
+
+
+def _fold(point: Tensor, size: Tensor) -> Tensor:
+    """Points of the unfolded rooms brought back into the room."""
+    within = torch.remainder(point, 2 * size)
+    return torch.minimum(within, 2 * size - within)
+
+
+def _hits(start: Tensor, end: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Whether segments (..., 3) pass through the box between the corners low and high, (...)."""
+    step = end - start
+    step = torch.where(step == 0, torch.full_like(step, 1e-300), step)
+    a, b = (low - start) / step, (high - start) / step
+    enter = torch.minimum(a, b).amax(dim=-1).clamp_min(0)
+    leave = torch.maximum(a, b).amin(dim=-1).clamp_max(1)
+    return enter < leave
+
+
+def simulated_room(
+    n: int = 300,
+    moving: Moving = "transmitter",
+    seed: int = 0,
+    room: Room | None = None,
+    grid: AngularGrid = GRID,
+    phase_noise: float = 0.1,
+) -> Spectra:
+    """Spectra of a 4 x 4 array in the simulated room, the moving end at random places of a region of 2 x 1.8 x 0.6 m.
+
+    With 300 positions neighbours are a third of a wavelength apart, so the field between them can be known.
+
+    Args:
+        n: number of positions.
+        moving: `transmitter`: the array hangs on a wall and faces the room; `receiver`: the array lies level and moves
+            under a transmitter on the ceiling.
+        seed: of positions and noise.
+        room: another room than the usual one; the region must lie inside.
+        grid: directions of the spectra.
+        phase_noise: standard deviation at each element [rad].
+    """
+    generator = torch.Generator().manual_seed(seed)
+    room = room or Room()
+    low, high = torch.tensor(REGION, dtype=torch.float64)
+    position = low + (high - low) * torch.rand(n, 3, dtype=torch.float64, generator=generator)
+    pose = FACING_X if moving == "transmitter" else LEVEL
+    fixed = torch.tensor(pose.position, dtype=torch.float64)
+    ends = (position, fixed) if moving == "transmitter" else (fixed, position)
+    paths = room.paths(*ends)
+    array = PlanarArray.square(4, room.frequency_hz)
+    owner = torch.arange(n).repeat_interleave(paths.gain.shape[1])
+    channel = array.channel((paths.direction @ pose.rotation).flatten(0, 1), paths.gain.flatten(), owner, n)
+    noise = phase_noise * torch.randn(channel.shape, dtype=torch.float64, generator=generator)
+    return Spectra(
+        name="simulated-room",
+        position=position,
+        spectrum=array.spectrum(channel * torch.polar(torch.ones_like(noise), noise), grid),
+        grid=grid,
+        label=pose.line_of_sight(*ends),
+        line_of_sight=paths.clear[:, 0],
+        moving=moving,
+        index=torch.arange(n),
+        array=array,
+    )

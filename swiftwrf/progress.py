@@ -1,0 +1,17 @@
+"""The progress of long work, on a terminal; nothing elsewhere."""
+
+from __future__ import annotations
+
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+
+class _Rate(ProgressColumn):
+    def render(self, task: Task) -> Text:
+        return Text(f"{task.speed:.1f} steps/s" if task.speed else "")
+
+
+def progress_bar(shown: bool = True) -> Progress:
+    """A bar with steps, rate and time left; it disappears when it is done."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"))
+    return Progress(*columns, _Rate(), TimeRemainingColumn(), transient=True, disable=not shown)

@@ -1,0 +1,1 @@
+"""Downstream tasks: angle of arrival and RSSI."""

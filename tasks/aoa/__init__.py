@@ -1,0 +1,1 @@
+"""Angle of arrival of the line of sight, from spatial spectra."""

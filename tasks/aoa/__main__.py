@@ -1,0 +1,9 @@
+"""python -m tasks.aoa --mix 0.3"""
+
+import sys
+
+from tasks.aoa.experiment import AoaConfig, run
+from tasks.run import command_line
+
+if __name__ == "__main__":
+    sys.exit(command_line("tasks.aoa", AoaConfig, run, sys.argv[1:]))

@@ -1,0 +1,111 @@
+"""The figures of the reports. Same records, same bytes."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+
+STYLE: dict[str, Any] = {
+    "svg.hashsalt": "swiftwrf-tasks",
+    "svg.fonttype": "path",
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e4e8ef",
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "figure.constrained_layout.use": True,
+}
+# colour-blind safe (P. Tol, "bright"); bounds and baselines are grey, so that what the product adds stands out
+COLOURS = {
+    "measured_only": "#ee6677",
+    "measured_all": "#228833",
+    "turbo_swiftwrf": "#4477aa",
+    "turbo_nearest": "#ccbb44",
+    "turbo_idw": "#66ccee",
+    "turbo_gp": "#aa3377",
+    "swiftwrf": "#4477aa",
+    "peak": "#bbbbbb",
+    "constant": "#999999",
+    "nearest_spectrum": "#666666",
+}
+
+
+def colour(name: str) -> str:
+    """The colour of a method, the same in all figures."""
+    others = ("#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")
+    return COLOURS.get(name) or others[sum(name.encode()) % len(others)]
+
+
+def new_figure(rows: int, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure of width x height inches in the house style, and its axes row by row."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        axes = figure.subplots(rows, columns, squeeze=False)
+    return figure, list(axes.flat)
+
+
+def as_svg(figure: Figure) -> str:
+    """The figure as SVG without date or random names."""
+    stream = io.StringIO()
+    with matplotlib.rc_context(STYLE):
+        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
+    return stream.getvalue()
+
+
+def cdf(axes: Axes, errors: Mapping[str, ArrayLike], label: str, limit: float | None = None) -> None:
+    """Empirical distribution of each method's errors, with the median marked by the line at 0.5."""
+    for name, values in errors.items():
+        dashed = name in ("peak", "constant", "nearest_spectrum")
+        axes.ecdf(np.asarray(values), label=name, color=colour(name), linestyle="--" if dashed else "-", linewidth=1.4)
+    axes.axhline(0.5, color="#aeb7c6", linewidth=0.8)
+    axes.set(xlabel=label, ylabel="share of test spectra", ylim=(0, 1), xlim=(0, limit))
+
+
+def bars(
+    axes: Axes, groups: Sequence[str], heights: Mapping[str, Sequence[tuple[float, float, float]]], label: str
+) -> None:
+    """Bars with whiskers: for each method one (value, low, high) a group."""
+    width = 0.8 / max(len(heights), 1)
+    for i, (name, values) in enumerate(heights.items()):
+        value, low, high = np.array(values, dtype=float).reshape(-1, 3).T
+        at = np.arange(len(groups)) + (i - (len(heights) - 1) / 2) * width
+        error = np.clip([value - low, high - value], 0, None)
+        axes.bar(at, value, width * 0.92, yerr=error, label=name, color=colour(name), error_kw={"elinewidth": 0.8})
+    axes.set(xticks=range(len(groups)), xticklabels=groups, ylabel=label)
+    axes.grid(axis="x", visible=False)
+
+
+def spectra(measured: NDArray[Any], synthetic: NDArray[Any], captions: Sequence[str]) -> Figure:
+    """Measured, synthesized and their difference, one row a spectrum; azimuth to the right, elevation upwards [deg]."""
+    figure, axes = new_figure(len(measured), 3, 9, 0.95 * len(measured) + 0.6)
+    for row, caption in enumerate(captions):
+        pair = (measured[row], synthetic[row], synthetic[row] - measured[row])
+        for column, image in enumerate(pair):
+            ax = axes[3 * row + column]
+            style = {"cmap": "RdBu_r", "vmin": -1, "vmax": 1} if column == 2 else {"cmap": "viridis", "vmin": 0, "vmax": 1}
+            drawn = ax.imshow(image, origin="lower", extent=(0, 360, 0, 90), aspect="auto", interpolation="nearest", **style)
+            ax.set(yticks=(0, 90), xticks=(0, 180, 360) if row == len(captions) - 1 else ())
+            ax.grid(visible=False)
+            if row == 0:
+                ax.set_title(("measured", "synthesized", "synthesized - measured")[column], fontsize=9)
+            if row == 0 and column:
+                figure.colorbar(drawn, ax=axes[column::3], fraction=0.04, pad=0.02)
+        axes[3 * row].set_ylabel(caption, rotation=0, ha="right", va="center")
+    axes[-2].set_xlabel("azimuth [deg]")
+    return figure
+
+
+def curves(axes: Axes, lines: Mapping[str, tuple[ArrayLike, ArrayLike]], x: str, y: str) -> None:
+    """One line a name, y logarithmic."""
+    for name, (xs, ys) in lines.items():
+        axes.plot(np.asarray(xs), np.asarray(ys), label=name, color=colour(name), linewidth=1.2)
+    axes.set(xlabel=x, ylabel=y, yscale="log")

@@ -1,0 +1,29 @@
+"""What every report says of where its numbers come from."""
+
+from __future__ import annotations
+
+from tasks.report.page import Section, Table
+from tasks.report.records import Records
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """The value with so many digits, or a dash where there is none."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def provenance(runs: list[Records]) -> Section:
+    """Command, code, versions, machine, input and time of each run."""
+    tables = []
+    for run in runs:
+        environment = run.environment
+        packages = ", ".join(f"{name} {version}" for name, version in environment["packages"].items())
+        rows = [
+            ["command", run.config["command"]],
+            ["code", f"version {environment['version']}, commit {environment['commit'] or 'unknown'}"],
+            ["packages", f"Python {environment['python']}, {packages}"],
+            ["machine", f"{environment['device']}, {environment['threads']} threads"],
+            ["time", f"{environment['start']} to {environment.get('end', '-')}"],
+            *([f"sha256 of {name}", digest] for name, digest in environment["input_sha256"].items()),
+        ]
+        tables.append(Table(["", ""], rows))
+    return Section("Provenance", tables=tables)
