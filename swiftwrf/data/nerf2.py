@@ -92,6 +92,8 @@ def _read_image(file: Path) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
         raise InputError(f"{file} is missing; images are numbered from 00001.png without gaps")
     try:
         with Image.open(file) as image:
+            image.verify()  # the checksums; loading alone forgives a missing end
+        with Image.open(file) as image:
             image.load()
             if image.mode != "L":
                 raise InputError(f"{file} has mode {image.mode}; a spectrum is an 8-bit grey image")

@@ -58,17 +58,18 @@ def rasterize(
     if chosen == "reference":
         return reference.rasterize(mean, cholesky, weight, grid, cutoff)
     batch, n = mean.shape[:-2], mean.shape[-2]
+    flat_mean, flat_weight = (x.reshape(batch.numel(), n, 2) for x in (mean, weight))
     if cholesky.dim() > 2:
-        cholesky = cholesky.expand(*batch, n, 3).reshape(-1, n, 3)
+        cholesky = cholesky.reshape(batch.numel(), n, 3)
     if chosen == "cpu":
         from swiftwrf.rasterize import cpu  # numba is imported by those who use it
 
-        flat = cpu.rasterize(mean.reshape(-1, n, 2), cholesky, weight.reshape(-1, n, 2), grid, cutoff)
+        drawn = cpu.rasterize(flat_mean, cholesky, flat_weight, grid, cutoff)
     else:
         from swiftwrf.rasterize import cuda
 
-        flat = cuda.rasterize(mean.reshape(-1, n, 2), cholesky, weight.reshape(-1, n, 2), grid, cutoff)
-    return flat.reshape(*batch, 2, *grid.shape)
+        drawn = cuda.rasterize(flat_mean, cholesky, flat_weight, grid, cutoff)
+    return drawn.reshape(*batch, 2, *grid.shape)
 
 
 def _choose(maker: Maker, mean: Tensor) -> str:

@@ -33,8 +33,8 @@ _inline = njit(inline="always", fastmath=_FAST)
 def _rows(y, l2, l3, reach2, top, bottom):
     """First row and one past the last of [top, bottom) that a kernel centred on row `y` reaches."""
     extent = math.sqrt(reach2 * (l2 * l2 + l3 * l3))
-    first = max(np.float32(top), math.ceil(y - extent))
-    last = min(np.float32(bottom - 1), math.floor(y + extent))
+    first = max(top, math.ceil(max(y - extent, -1.0)))
+    last = min(bottom - 1, math.floor(min(y + extent, float(bottom))))
     return (int(first), int(last) + 1) if last >= first else (0, 0)
 
 
@@ -52,7 +52,7 @@ def _columns(x, dy, l2, l3, inv1, inv3, reach2, n_azimuth):
         return 0, 0
     half = math.sqrt(remain / curvature)
     middle = x + shear * inv3 / curvature * dy
-    half_turn = np.float32(0.5) * n_azimuth
+    half_turn = 0.5 * n_azimuth
     first = math.ceil(max(middle - half, x - half_turn))
     last = math.floor(min(middle + half, x + half_turn))
     return int(first), min(int(last) + 1, int(first) + n_azimuth)
@@ -83,11 +83,11 @@ def _draw(mean, cholesky, weight, reach2, anchor, n_bands, out):
             s = math.exp(-curvature)
             first_row, end_row = _rows(y, l2, l3, reach2, top, bottom)
             for row in range(first_row, end_row):
-                dy = np.float32(row) - y
+                dy = np.float32(row - y)
                 first, end = _columns(x, dy, l2, l3, inv1, inv3, reach2, n_azimuth)
                 column = first % n_azimuth
                 for start in range(first, end, anchor):
-                    u = (np.float32(start) - x) * inv1
+                    u = np.float32(start - x) * inv1
                     v = (dy - l2 * u) * inv3
                     g = math.exp(-half * (u * u + v * v))
                     r = math.exp(v * shear - u * inv1 - half * curvature)
@@ -126,11 +126,11 @@ def _draw_backward(grad, mean, cholesky, weight, reach2, anchor, block, d_mean, 
             z_u, z_v, z_uu, z_uv, z_vv = zero, zero, zero, zero, zero
             first_row, end_row = _rows(y, l2, l3, reach2, 0, n_elevation)
             for row in range(first_row, end_row):
-                dy = np.float32(row) - y
+                dy = np.float32(row - y)
                 first, end = _columns(x, dy, l2, l3, inv1, inv3, reach2, n_azimuth)
                 column = first % n_azimuth
                 for start in range(first, end, anchor):
-                    u = (np.float32(start) - x) * inv1
+                    u = np.float32(start - x) * inv1
                     v = (dy - l2 * u) * inv3
                     g = math.exp(-half * (u * u + v * v))
                     r = math.exp(v * shear - u * inv1 - half * curvature)
@@ -173,7 +173,7 @@ def _arguments(mean: Tensor, cholesky: Tensor, weight: Tensor, cutoff: float | N
 def _rasterize(
     mean: Tensor, cholesky: Tensor, weight: Tensor, n_elevation: int, n_azimuth: int, cutoff: float | None
 ) -> Tensor:
-    out = mean.new_empty(mean.shape[0], 2, n_elevation, n_azimuth)
+    out = weight.new_empty(mean.shape[0], 2, n_elevation, n_azimuth)
     threads = numba.get_num_threads()
     n_bands = 1 if mean.shape[0] >= threads else min(threads, n_elevation)
     _draw(*_arguments(mean, cholesky, weight, cutoff), n_bands, out.numpy())
@@ -185,7 +185,7 @@ def _rasterize_backward(
     grad: Tensor, mean: Tensor, cholesky: Tensor, weight: Tensor, cutoff: float | None
 ) -> tuple[Tensor, Tensor, Tensor]:
     d_mean, d_weight = torch.empty_like(mean), torch.empty_like(weight)
-    d_cholesky = mean.new_empty(*mean.shape[:2], 3)
+    d_cholesky = cholesky.new_empty(*mean.shape[:2], 3)
     threads = numba.get_num_threads()
     block = max(1, mean.shape[1] if mean.shape[0] >= threads else -(-mean.shape[1] // threads))
     arguments = _arguments(mean, cholesky, weight, cutoff)
@@ -197,7 +197,7 @@ def _rasterize_backward(
 
 @_rasterize.register_fake
 def _(mean: Tensor, cholesky: Tensor, weight: Tensor, n_elevation: int, n_azimuth: int, cutoff: float | None) -> Tensor:
-    return mean.new_empty(mean.shape[0], 2, n_elevation, n_azimuth)
+    return weight.new_empty(mean.shape[0], 2, n_elevation, n_azimuth)
 
 
 @_rasterize_backward.register_fake
@@ -220,11 +220,12 @@ _rasterize.register_autograd(_backward, setup_context=_setup_context)
 def rasterize(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None) -> Tensor:
     """See `swiftwrf.rasterize`: mean (B, N, 2), cholesky (N, 3) or (B, N, 3), weight (B, N, 2), all float32 on the CPU,
     to (B, 2, n_elevation, n_azimuth). Angles are brought to pixels here, so the kernels know nothing of grids."""
-    step = mean.new_tensor([grid.azimuth_step, grid.elevation_step])
-    start = mean.new_tensor([grid.azimuth_start, grid.elevation_start])
-    pixel = (mean - start) / step
-    turns = torch.floor(pixel[..., 0] / grid.n_azimuth) * grid.n_azimuth  # keeps float32 resolution far from 0
-    pixel = torch.stack([pixel[..., 0] - turns.detach(), pixel[..., 1]], dim=-1)
-    l1, l2, l3 = cholesky.unbind(-1)
-    factor = torch.stack([l1 / step[0], l2 / step[1], l3 / step[1]], dim=-1)
+    step = torch.tensor([grid.azimuth_step, grid.elevation_step], dtype=torch.float64)
+    start = torch.tensor([grid.azimuth_start, grid.elevation_start], dtype=torch.float64)
+    # in float64: far columns and means many turns away would lose the fraction of a pixel in float32
+    pixel = (mean.double() - start) / step
+    turns = torch.floor(pixel.detach()[..., :1] / grid.n_azimuth) * grid.n_azimuth
+    pixel = pixel - torch.cat([turns, torch.zeros_like(turns)], dim=-1)
+    columns, rows = (float(x) for x in step)
+    factor = cholesky / cholesky.new_tensor([columns, rows, rows])
     return _rasterize(pixel, factor, weight, *grid.shape, cutoff)

@@ -1,0 +1,88 @@
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swiftwrf import AngularGrid, ArrayPose, InputError
+from swiftwrf.angles import great_circle, to_angles, to_direction, wrap
+
+ANGLE = st.floats(-50, 50, allow_nan=False)
+
+
+def test_degrees_makes_the_grid_of_the_data():
+    grid = AngularGrid.degrees(elevation=range(1, 91), azimuth=range(360))
+    assert grid.shape == (90, 360)
+    assert grid.elevation[0].item() == pytest.approx(math.radians(1))
+    assert grid.elevation[-1].item() == pytest.approx(math.pi / 2)
+    assert grid.azimuth[90].item() == pytest.approx(math.pi / 2)
+    assert grid == AngularGrid.hemisphere(90, 360)
+
+
+@pytest.mark.parametrize(
+    ("elevation", "azimuth", "says"),
+    [
+        ([1, 2, 4], range(360), "even steps"),
+        ([3, 2, 1], range(360), "ascend"),
+        ([1], range(360), "at least 2"),
+        (range(1, 91), range(180), "once round the circle"),
+    ],
+)
+def test_degrees_refuses(elevation, azimuth, says):
+    with pytest.raises(InputError, match=says):
+        AngularGrid.degrees(elevation, azimuth)
+
+
+def test_coarsen_keeps_the_middle_of_pixels():
+    coarse = AngularGrid.hemisphere(90, 360).coarsen(2)
+    assert coarse.shape == (45, 180)
+    assert coarse.elevation[0].rad2deg().item() == pytest.approx(1.5)
+    assert coarse.azimuth[1].rad2deg().item() == pytest.approx(2.5)
+
+
+def test_direction_of_known_angles():
+    direction = to_direction(torch.tensor([0.0, math.pi / 2, 0.0]), torch.tensor([0.0, 0.0, math.pi / 2]))
+    torch.testing.assert_close(direction, torch.eye(3), atol=1e-7, rtol=0)
+
+
+def test_what_comes_from_behind_is_folded_up():
+    azimuth, elevation = to_angles(torch.tensor([[1.0, 1.0, -math.sqrt(2)]]))
+    assert azimuth.rad2deg().item() == pytest.approx(45)
+    assert elevation.rad2deg().item() == pytest.approx(45)
+
+
+@given(ANGLE, st.floats(0.01, math.pi / 2 - 0.01))
+def test_angles_and_direction_are_inverse(azimuth, elevation):
+    a, e = to_angles(to_direction(torch.tensor(azimuth, dtype=torch.float64), torch.tensor(elevation, dtype=torch.float64)))
+    assert 0 <= a < 2 * math.pi
+    assert abs(wrap(a - azimuth)) < 1e-9
+    assert abs(e - elevation) < 1e-9
+
+
+@given(ANGLE, st.integers(-5, 5))
+def test_wrap_ignores_turns(angle, turns):
+    wrapped = wrap(torch.tensor(angle + 2 * math.pi * turns, dtype=torch.float64))
+    assert abs(wrapped) <= math.pi + 1e-9
+    assert math.cos(wrapped) == pytest.approx(math.cos(angle), abs=1e-9)
+
+
+def test_great_circle_of_tiny_angles_does_not_round_to_zero():
+    a = torch.tensor([1.0, 0.0, 0.0])
+    b = torch.tensor([1.0, 1e-6, 0.0])
+    assert great_circle(a, b).item() == pytest.approx(1e-6, rel=1e-4)  # acos in float32 gives 0
+    assert great_circle(a, -a).item() == pytest.approx(math.pi)
+
+
+def test_pose_refuses_what_is_no_rotation():
+    with pytest.raises(InputError, match="unit quaternion"):
+        ArrayPose((0, 0, 0), (0, 0, 0, 2))
+    with pytest.raises(InputError, match="finite"):
+        ArrayPose((0, float("nan"), 0))
+
+
+def test_pose_turned_a_quarter_sees_north_in_front():
+    pose = ArrayPose((0.0, 0.0, 0.0), (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)))  # x axis of the array points north
+    angles = pose.line_of_sight(torch.tensor([[0.0, 5.0, 0.0]], dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    torch.testing.assert_close(angles, torch.zeros(1, 2, dtype=torch.float64), atol=1e-12, rtol=0)
+    torch.testing.assert_close(pose.rotation @ pose.rotation.T, torch.eye(3, dtype=torch.float64))

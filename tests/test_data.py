@@ -1,0 +1,213 @@
+"""Readers of spectra: what they read, and everything they refuse."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from swiftwrf import InputError, load_spectra
+from swiftwrf.data.splits import block_split, random_split, slabs
+
+N = 12
+
+
+@pytest.fixture
+def nerf2(tmp_path):
+    """A well-formed folder in the NeRF2 layout."""
+    folder = tmp_path / "scene"
+    (folder / "spectrum").mkdir(parents=True)
+    (folder / "gateway_info.yml").write_text(
+        "dataset_name: scene\ngateway1:\n  position: [0, 0, 0]\n  orientation: [0, 0, 0.70710678, 0.70710678]\n"
+    )
+    (folder / "tx_pos.csv").write_text("x,y,z\n" + "".join(f"{i},{10 + i},1.5\n" for i in range(N)))
+    for i in range(1, N + 1):
+        image = np.full((10, 40), i, dtype=np.uint8)
+        Image.fromarray(image).save(folder / "spectrum" / f"{i:05d}.png")
+    (folder / "train_index.txt").write_text("\n".join(f"{i:05d}" for i in range(1, 11)))
+    (folder / "test_index.txt").write_text("00011\n00012\n")
+    return folder
+
+
+def test_reads_the_nerf2_layout(nerf2):
+    data = load_spectra(nerf2)
+    assert (len(data), data.name, data.moving, data.grid.shape) == (N, "scene", "transmitter", (10, 40))
+    assert data.spectrum[4, 0, 0].item() == pytest.approx(5 / 255)
+    # the array's x axis points to world y; the transmitter is due north of the first position
+    assert data.label[0, 0].item() == pytest.approx(0, abs=1e-6)
+    assert data.label[0, 1].item() == pytest.approx(math.atan2(1.5, 10), abs=1e-6)
+    train, test = data.split("random")
+    assert train.index.tolist() == list(range(10))
+    assert test.index.tolist() == [10, 11]
+
+
+def _write(name, text):
+    return lambda folder: (folder / name).write_text(text)
+
+
+def _image(name, array):
+    return lambda folder: Image.fromarray(array).save(folder / "spectrum" / name)
+
+
+def _positions(row):
+    return _write("tx_pos.csv", "x,y,z\n" + "".join(f"{i},1,1\n" for i in range(1, N)) + row + "\n")
+
+
+WRONG = {
+    "no pose": (lambda f: (f / "gateway_info.yml").unlink(), "gateway_info.yml is missing"),
+    "pose is no yaml": (_write("gateway_info.yml", "a: [1"), "not valid YAML"),
+    "pose runs code": (_write("gateway_info.yml", "a: !!python/object/apply:os.getcwd []"), "not valid YAML"),
+    "quaternion": (
+        _write("gateway_info.yml", "g:\n  position: [0, 0, 0]\n  orientation: [0, 0, 1, 1]\n"),
+        "unit quaternion",
+    ),
+    "no gateway": (_write("gateway_info.yml", "name: x\n"), "one gateway"),
+    "short position": (_write("gateway_info.yml", "g:\n  position: [0, 0]\n  orientation: [0, 0, 0, 1]\n"), "3 numbers"),
+    "no positions": (lambda f: (f / "tx_pos.csv").unlink(), "one of tx_pos.csv"),
+    "both ends move": (_write("rx_pos.csv", "x,y,z\n1,1,1\n"), "one of tx_pos.csv"),
+    "header": (_write("tx_pos.csv", "a,b,c\n1,2,3\n"), "header x,y,z"),
+    "empty table": (_write("tx_pos.csv", ""), "is empty"),
+    "no rows": (_write("tx_pos.csv", "x,y,z\n"), "no rows"),
+    "nan": (_positions("nan,1,1"), "row 12 is"),
+    "infinite": (_positions("inf,1,1"), "row 12 is"),
+    "text": (_positions("here,1,1"), "row 12 holds text"),
+    "short row": (_positions("1,1"), "row 12 has 2 values"),
+    "at the gateway": (_positions("0,0,0"), "equal to the gateway's"),
+    "more positions than images": (_write("tx_pos.csv", "x,y,z\n" + "1,1,1\n" * 13), "12 images, but there are 13"),
+    "no images": (lambda f: [p.unlink() for p in (f / "spectrum").iterdir()], "0 images"),
+    "a gap in the numbers": (lambda f: (f / "spectrum/00003.png").rename(f / "spectrum/00099.png"), "00003.png is missing"),
+    "shape": (_image("00003.png", np.zeros((10, 30), np.uint8)), "10 x 30 pixels"),
+    "another shape": (_image("00003.png", np.zeros((20, 80), np.uint8)), "must have one shape"),
+    "colour": (_image("00003.png", np.zeros((10, 40, 3), np.uint8)), "mode RGB"),
+    "empty image": (lambda f: (f / "spectrum/00003.png").write_bytes(b""), "not a complete PNG"),
+    "truncated image": (
+        lambda f: (f / "spectrum/00003.png").write_bytes((f / "spectrum/00003.png").read_bytes()[:60]),
+        "not a complete PNG",
+    ),
+    "index out of range": (_write("test_index.txt", "00013\n"), "expected 1 to 12"),
+    "index below range": (_write("test_index.txt", "0\n"), "expected 1 to 12"),
+    "index twice": (_write("test_index.txt", "11\n11\n"), "twice"),
+    "index is text": (_write("test_index.txt", "eleven\n"), "whole number"),
+    "overlap": (_write("test_index.txt", "10\n"), "both its training and its test"),
+    "one part only": (lambda f: (f / "test_index.txt").unlink(), "test_index.txt is missing"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_refuses(nerf2, name):
+    spoil, says = WRONG[name]
+    spoil(nerf2)
+    with pytest.raises(InputError, match=says):
+        load_spectra(nerf2)
+
+
+def test_refuses_few_training_spectra_and_unknown_splits(nerf2):
+    (nerf2 / "train_index_few.txt").write_text("1\n2\n")
+    (nerf2 / "test_index_few.txt").write_text("3\n")
+    data = load_spectra(nerf2)
+    with pytest.raises(InputError, match="has 2 training"):
+        data.split("few")
+    with pytest.raises(InputError, match="choose one of block, few, random"):
+        data.split("radnom")
+
+
+def test_refuses_what_is_no_folder(tmp_path):
+    with pytest.raises(InputError, match="is not a folder"):
+        load_spectra(tmp_path / "nothing")
+
+
+def paths_file(folder, **changes):
+    """Paths of five receivers, one of them with two paths, with some arrays replaced or (None) left out."""
+    arrays = {
+        "transmitter_position": np.tile([0.0, 0.0, 2.0], (5, 1)),
+        "receiver_position": np.stack([np.arange(1.0, 6.0), np.zeros(5), np.ones(5)], axis=1),
+        "path_count": np.array([1, 1, 2, 1, 1], dtype=np.int32),
+        "last_point": np.tile([0.0, 0.0, 2.0], (6, 1)),
+        "gain": np.ones(6, dtype=np.complex64),
+        "line_of_sight": np.ones(5, dtype=bool),
+        "frequency_hz": np.float64(2.4e9),
+    }
+    arrays = {name: value for name, value in {**arrays, **changes}.items() if value is not None}
+    folder.mkdir(exist_ok=True)
+    np.savez(folder / "paths.npz", **arrays)
+    return folder
+
+
+def test_spectrum_of_one_path_peaks_where_it_comes_from(tmp_path):
+    data = load_spectra(paths_file(tmp_path / "paths"))
+    assert data.moving == "receiver"
+    row, column = divmod(int(data.spectrum[0].argmax()), 360)
+    assert (column, row + 1) == (180, 45)  # from -x, as far up as away
+    assert data.spectrum[0].max().item() == pytest.approx(1, abs=1e-4)
+    assert data.label[0].rad2deg().tolist() == pytest.approx([180, 45], abs=1e-4)
+
+
+def test_the_end_with_more_positions_moves(tmp_path):
+    still = np.tile([3.0, 0.0, 1.0], (5, 1))
+    moves = np.stack([np.arange(5.0), np.ones(5), np.ones(5)], axis=1)
+    data = load_spectra(paths_file(tmp_path / "p", receiver_position=still, transmitter_position=moves))
+    assert data.moving == "transmitter"
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"gain": None}, "lacks gain"),
+        ({"gain": np.ones(5, np.complex64)}, "gain has shape"),
+        ({"gain": np.full(6, np.nan, np.complex64)}, "not finite"),
+        ({"path_count": np.array([0, 2, 2, 1, 1], np.int32)}, "at least one path"),
+        ({"frequency_hz": np.float64(-1)}, "frequency_hz"),
+        ({"last_point": np.array([object()] * 6)}, "plain numbers"),
+    ],
+)
+def test_refuses_paths(tmp_path, changes, says):
+    with pytest.raises(InputError, match=says):
+        load_spectra(paths_file(tmp_path / "paths", **changes))
+
+
+def test_refuses_a_broken_archive(tmp_path):
+    paths_file(tmp_path / "paths")
+    file = tmp_path / "paths" / "paths.npz"
+    file.write_bytes(file.read_bytes()[:100])
+    with pytest.raises(InputError, match="not an npz archive"):
+        load_spectra(tmp_path / "paths")
+
+
+def test_seeded_splits_are_partitions(generator):
+    position = torch.rand(57, 3, generator=generator)
+    for split in (lambda seed: random_split(57, seed), lambda seed: block_split(position, seed)):
+        train, test = split(3)
+        assert sorted([*train.tolist(), *test.tolist()]) == list(range(57))
+        assert len(test) in (11, 12)
+        assert split(3)[1].tolist() == test.tolist()
+        assert split(4)[1].tolist() != test.tolist()
+
+
+def test_slabs_are_equal_and_do_not_interleave(generator):
+    position = torch.rand(50, 3, generator=generator) * torch.tensor([1.0, 20.0, 1.0])
+    slab = slabs(position, 5)
+    assert slab.bincount().tolist() == [10] * 5
+    means = [position[slab == i, 1].mean() for i in range(5)]
+    assert means == sorted(means) or means == sorted(means, reverse=True)
+
+
+def test_coarsen_averages(nerf2):
+    data = load_spectra(nerf2)
+    coarse = data.coarsen(2)
+    assert coarse.spectrum.shape == (N, 5, 20)
+    torch.testing.assert_close(coarse.spectrum.mean(), data.spectrum.mean())
+    with pytest.raises(InputError, match="cannot be averaged"):
+        data.coarsen(3)
+
+
+@pytest.mark.data
+def test_measured_spectra_have_the_published_labels(measured_data):
+    data = load_spectra(measured_data / "s23-200")
+    assert data.label[0].rad2deg().tolist() == pytest.approx([61.08, 77.75], abs=0.01)
+    assert {name: (len(a), len(b)) for name, (a, b) in data.named_splits.items()} == {
+        "random": (160, 40),
+        "block": (160, 40),
+    }

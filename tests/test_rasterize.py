@@ -1,0 +1,149 @@
+"""The fast maker against the definition, in value and gradient; and what both refuse."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from conftest import GRADIENT_TOLERANCE, VALUE_TOLERANCE
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from swiftwrf import AngularGrid, InputError, rasterize
+from swiftwrf.primitives import FLOOR
+from swiftwrf.rasterize.magnitude import magnitude
+
+GRID = AngularGrid.hemisphere(30, 120)
+
+
+def scene(n=40, batch=3, seed=0, per_position=False, dtype=torch.float32, grid=GRID):
+    """Random primitives from the width's floor to a radian, sheared, means beyond both edges and turns away."""
+    generator = torch.Generator().manual_seed(seed)
+    mean = torch.rand(batch, n, 2, generator=generator) * torch.tensor([6 * math.pi, 2.2]) - torch.tensor([2 * math.pi, 0.3])
+    shape = (batch, n, 3) if per_position else (n, 3)
+    floor = FLOOR * torch.tensor([grid.azimuth_step, 0.0, grid.elevation_step])
+    cholesky = torch.exp(torch.rand(shape, generator=generator) * 4 - 4) + floor
+    cholesky[..., 1] *= torch.randn(shape[:-1], generator=generator)
+    weight = torch.randn(batch, n, 2, generator=generator)
+    return [x.to(dtype).requires_grad_() for x in (mean, cholesky, weight)]
+
+
+def against_definition(inputs, grid, cutoff):
+    """Largest value error as a share of sum |weight|, and relative L2 error of each gradient."""
+    doubles = [x.detach().double().requires_grad_() for x in inputs]
+    exact = rasterize(*doubles, grid, maker="reference", cutoff=cutoff)
+    fast = rasterize(*inputs, grid, maker="cpu", cutoff=cutoff)
+    cotangent = torch.randn(fast.shape, generator=torch.Generator().manual_seed(1))
+    wanted = torch.autograd.grad(exact, doubles, cotangent.double())
+    got = torch.autograd.grad(fast, inputs, cotangent)
+    scale = inputs[2].detach().norm(dim=-1).sum(dim=-1).max().clamp_min(1e-12)
+    value = float((fast - exact).detach().abs().max() / scale)
+    return value, [float((g - w).norm() / w.norm().clamp_min(1e-12)) for g, w in zip(got, wanted, strict=True)]
+
+
+@pytest.mark.parametrize("cutoff", [None, 1e-4])
+@pytest.mark.parametrize("per_position", [False, True])
+@pytest.mark.parametrize("batch", [1, 3])
+def test_cpu_agrees_with_the_definition(cutoff, per_position, batch):
+    value, gradients = against_definition(scene(batch=batch, per_position=per_position), GRID, cutoff)
+    assert value < VALUE_TOLERANCE[cutoff]
+    assert max(gradients) < GRADIENT_TOLERANCE[cutoff]
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from([(7, 12), (30, 120), (16, 16)]), st.integers(0, 60))
+def test_cpu_agrees_on_any_scene_and_grid(seed, shape, n):
+    grid = AngularGrid.hemisphere(*shape)
+    value, gradients = against_definition(scene(n=n, seed=seed, grid=grid), grid, None)
+    assert value < VALUE_TOLERANCE[None]
+    assert max(gradients) < GRADIENT_TOLERANCE[None]
+
+
+def test_definition_passes_gradcheck():
+    inputs = scene(n=3, batch=2, dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda *x: rasterize(*x, AngularGrid.hemisphere(7, 12), "reference", None), inputs)
+
+
+def test_one_primitive_is_the_gaussian_of_the_formula():
+    mean = torch.tensor([[[math.radians(90), math.radians(45)]]])
+    cholesky = torch.tensor([[0.3, 0.1, 0.2]])
+    drawn = rasterize(mean, cholesky, torch.tensor([[[2.0, -1.0]]]), GRID, cutoff=None)
+    factor = torch.tensor([[0.3, 0.0], [0.1, 0.2]], dtype=torch.float64)
+    offset = torch.stack(
+        torch.broadcast_tensors(
+            GRID.azimuth[None, :] - math.radians(90), GRID.elevation[:, None] - math.radians(45)
+        ),
+        dim=-1,
+    )
+    kernel = torch.exp(-0.5 * torch.einsum("hwi,ij,hwj->hw", offset, torch.linalg.inv(factor @ factor.T), offset))
+    torch.testing.assert_close(drawn[0, 0].double(), 2 * kernel, atol=1e-6, rtol=0)
+    torch.testing.assert_close(drawn[0, 1].double(), -kernel, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("maker", ["reference", "cpu"])
+def test_azimuth_is_periodic(maker):
+    mean, cholesky, weight = (x.detach() for x in scene())
+    turned = mean + torch.tensor([GRID.azimuth_step * 7, 0.0])
+    a = rasterize(mean, cholesky, weight, GRID, maker, cutoff=None)
+    b = rasterize(turned, cholesky, weight, GRID, maker, cutoff=None)
+    torch.testing.assert_close(a.roll(7, dims=-1), b, atol=2e-4, rtol=0)
+
+
+def test_same_bits_twice_and_whatever_the_batch():
+    mean, cholesky, weight = (x.detach() for x in scene(batch=5))
+    whole = rasterize(mean, cholesky, weight, GRID, "cpu")
+    assert torch.equal(whole, rasterize(mean, cholesky, weight, GRID, "cpu"))
+    for i in range(5):
+        assert torch.equal(whole[i], rasterize(mean[i], cholesky, weight[i], GRID, "cpu"))
+
+
+@pytest.mark.parametrize("maker", ["reference", "cpu"])
+@pytest.mark.parametrize(("batch", "n"), [(2, 0), (0, 4)])
+def test_nothing_to_draw(maker, batch, n):
+    mean, cholesky, weight = torch.zeros(batch, n, 2), torch.ones(n, 3), torch.zeros(batch, n, 2)
+    drawn = rasterize(mean, cholesky, weight, GRID, maker)
+    assert drawn.shape == (batch, 2, *GRID.shape)
+    assert not drawn.any()
+
+
+def test_custom_operator_is_registered_properly():
+    from swiftwrf.rasterize.cpu import _rasterize
+
+    mean, cholesky, weight = scene(n=4, batch=2)
+    torch.library.opcheck(_rasterize, (mean, cholesky, weight, 10, 20, 1e-4))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda m, c, w: (m[..., :1], c, w), "mean must have shape"),
+        (lambda m, c, w: (m, c[:-1], w), "cholesky must have shape"),
+        (lambda m, c, w: (m, c, w[:, :-1]), "weight must have"),
+        (lambda m, c, w: (m, c.double(), w), "one dtype"),
+        (lambda m, c, w: (m * float("nan"), c, w), "not finite"),
+        (lambda m, c, w: (m, c * torch.tensor([0.0, 1, 1]), w), "zero on its diagonal"),
+        (lambda m, c, w: (m.int(), c.int(), w.int()), "floating point"),
+    ],
+)
+def test_refuses_what_does_not_fit(change, says):
+    with pytest.raises(InputError, match=says):
+        rasterize(*change(*(x.detach() for x in scene())), GRID)
+
+
+def test_refuses_makers_and_cutoffs_that_do_not_exist():
+    inputs = [x.detach() for x in scene()]
+    with pytest.raises(InputError, match="unknown maker"):
+        rasterize(*inputs, GRID, maker="opengl")
+    with pytest.raises(InputError, match="cutoff"):
+        rasterize(*inputs, GRID, cutoff=1.0)
+    with pytest.raises(InputError, match="float32 tensors on cuda"):
+        rasterize(*inputs, GRID, maker="cuda")
+
+
+def test_magnitude_has_no_gradient_at_zero():
+    field = torch.zeros(2, 3, 4, dtype=torch.float64, requires_grad=True)
+    magnitude(field).sum().backward()
+    assert torch.equal(field.grad, torch.zeros_like(field))
+    field = torch.randn(2, 3, 4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(magnitude, (field,))
