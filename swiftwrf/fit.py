@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +17,7 @@ from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
 from swiftwrf.model import SwiftWRF
 from swiftwrf.optimise import FitConfig, Optimisation, Record, fingerprint, read_state
-from swiftwrf.prior import choose_kernel
+from swiftwrf.prior import choose_kernel, choose_rank
 from swiftwrf.progress import progress_bar
 
 FOLDS = 5  # validation holds out one; the kernel is chosen over all
@@ -58,6 +59,9 @@ def fit(
     fold = folds(train.position, config.validation, config.seed)
     work = _working(train, config.max_azimuths)
     kernel = choose_kernel(work.position, work.spectrum, fold)
+    if config.model.rank is None:
+        rank = choose_rank(work.position, work.spectrum, fold, kernel)
+        config = replace(config, model=replace(config.model, rank=rank))
     saved = read_state(checkpoint, fingerprint(config, work))
     with progress_bar(progress) as bar:
 
@@ -71,7 +75,7 @@ def fit(
             steps = run("search", (fold != 0).nonzero()[:, 0], config.steps, held_out).best_step
         else:
             steps = saved.steps
-        model = run("final", torch.arange(len(work)), steps).model
+        model = run("final", torch.arange(len(work)), steps).result
     model.grid = train.grid
     return model.eval()
 

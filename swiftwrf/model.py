@@ -17,6 +17,7 @@ from swiftwrf.primitives import Gaussians, Primitives
 from swiftwrf.rasterize import rasterize
 from swiftwrf.rasterize.magnitude import magnitude
 
+DEFAULT_RANK = 32  # where nobody chose one
 Deformation = Literal["motion_basis", "per_primitive_mlp", "none"]
 
 
@@ -30,8 +31,8 @@ class ModelConfig:
     """how they move: low-rank motion (fast), the paper's network per primitive, or not at all"""
     components: tuple[Literal["mean", "response", "attenuation", "cholesky"], ...] = ("mean", "response")
     """which of their parameters move"""
-    rank: int = 48
-    """number K of motions that the motion basis mixes"""
+    rank: int | None = None
+    """number K of motions that the motion basis mixes; None lets the fit choose it from the spectra"""
     bounded: bool = False
     """keep canonical means inside the grid by the paper's tanh map"""
     cutoff: float = 1e-4
@@ -63,7 +64,7 @@ class SwiftWRF(nn.Module):
         self.deformation: MotionBasis | PerPrimitiveMLP | None
         if config.deformation == "motion_basis":
             self.deformation = MotionBasis(
-                self.normalise(anchor), kernel.scaled(1 / scale), config.rank, config.n_primitives, config.components,
+                self.normalise(anchor), kernel.scaled(1 / scale), config.rank or DEFAULT_RANK, config.n_primitives, config.components,
                 generator=generator,
             )  # fmt: skip
         elif config.deformation == "per_primitive_mlp":

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import torch
 from rich.progress import Progress
 from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from swiftwrf import checkpoint as files
 from swiftwrf.data.spectra import Spectra
@@ -23,6 +24,7 @@ from swiftwrf.errors import FitError, InputError
 from swiftwrf.metrics import ssim
 from swiftwrf.model import ModelConfig, SwiftWRF
 
+AVERAGING = 0.98  # a step's weight decays by this much a step: averaged parameters predict better than the last ones
 Record = dict[str, Any]
 Stage = Literal["search", "final"]
 
@@ -124,7 +126,7 @@ def read_state(path: Path | None, expected: str) -> State | None:
 
 
 class Optimisation:
-    """Adam on the primitives and their motion, from a seeded start.
+    """Adam on the primitives and their motion, from a seeded start; the result is the running average of the parameters.
 
     Args:
         stage: `search` looks at held-out spectra and stops when they are no longer predicted better; `final` runs through.
@@ -152,7 +154,7 @@ class Optimisation:
         self.position, self.spectrum = self._tensors(train)
         self.held_out = None if held_out is None else self._tensors(held_out)
         self.optimiser = self._optimiser()
-        self.schedule = torch.optim.lr_scheduler.LambdaLR(self.optimiser, self._rate)
+        self.average = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(AVERAGING))
         self.step, self.best_step, self.best_loss = 0, steps, math.inf
         self.seconds = 0.0
 
@@ -162,15 +164,15 @@ class Optimisation:
 
     def _optimiser(self) -> torch.optim.Adam:
         rate, deformation = self.config.rate, self.model.deformation
-        groups: list[dict[str, Any]] = [{"params": list(self.model.primitives.parameters()), "lr": rate}]
+        groups: list[dict[str, Any]] = [{"params": list(self.model.primitives.parameters()), "peak": rate}]
         if isinstance(deformation, MotionBasis):
-            groups += [{"params": [deformation.coefficient], "lr": rate}, {"params": [deformation.basis], "lr": rate / 2}]
+            groups += [{"params": [deformation.coefficient], "peak": rate}, {"params": [deformation.basis], "peak": rate / 2}]
         elif deformation is not None:
-            groups += [{"params": list(deformation.parameters()), "lr": self.config.deformation_rate or rate}]
+            groups += [{"params": list(deformation.parameters()), "peak": self.config.deformation_rate or rate}]
         return torch.optim.Adam(groups, betas=(0.9, 0.99))
 
     def _rate(self, step: int) -> float:
-        """Warm-up, then cosine decay over the configured steps, whatever the stage stops at."""
+        """Share of the peak learning rate: warm-up, then cosine decay over the configured steps, whatever the stage stops at."""
         cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, step / self.config.steps)))
         return min(1.0, (step + 1) / self.config.warm_up) * (self.config.final_rate + (1 - self.config.final_rate) * cosine)
 
@@ -199,7 +201,11 @@ class Optimisation:
         if deform and (scale := self.smoothing()):
             noise = torch.randn(position.shape, generator=self.generator).to(position)
             position = position + scale * noise
-        loss = self.loss(model(position, deform=deform, stop_mean=config.stop_mean and deform), self.spectrum[rows])
+        try:
+            drawn = model(position, deform=deform, stop_mean=config.stop_mean and deform)
+        except InputError as error:  # parameters ran away, so that a primitive is no longer one
+            raise FitError(f"the fit broke at step {self.step}: {error}; {self._advice()}") from None
+        loss = self.loss(drawn, self.spectrum[rows])
         if isinstance(model.deformation, MotionBasis):
             loss = loss + config.prior_weight / len(self.position) * model.deformation.prior()
         self.optimiser.zero_grad()
@@ -208,12 +214,23 @@ class Optimisation:
         if not (math.isfinite(loss.item()) and math.isfinite(norm.item())):
             raise FitError(
                 f"the fit broke at step {self.step}: loss {loss.item():.3g}, gradient {norm.item():.3g}; "
-                f"try a learning rate below {config.rate:g}"
+                f"{self._advice()}"
             )
+        for group in self.optimiser.param_groups:
+            group["lr"] = group["peak"] * self._rate(self.step)
         self.optimiser.step()
-        self.schedule.step()
+        self.average.update_parameters(self.model)
         self.step += 1
         return loss.item()
+
+    def _advice(self) -> str:
+        return f"try a learning rate below {self.config.rate:g}"
+
+    @property
+    def result(self) -> SwiftWRF:
+        """The model with averaged parameters."""
+        result: SwiftWRF = self.average.module
+        return result
 
     @torch.no_grad()
     def look(self) -> float | None:
@@ -223,7 +240,7 @@ class Optimisation:
         position, measured = self.held_out
         parts = zip(position.split(64), measured.split(64), strict=True)
         deform = self.step > self.config.coarse_steps
-        losses = [float(self.loss(self.model(p, deform=deform), m)) * len(p) for p, m in parts]
+        losses = [float(self.loss(self.result(p, deform=deform), m)) * len(p) for p, m in parts]
         return sum(losses) / len(position)
 
     def run(
@@ -235,7 +252,7 @@ class Optimisation:
         task = bar.add_task(self.stage, total=self.steps, completed=self.step)
         every, patience = self.config.check_every, self.config.patience
         began = time.perf_counter() - self.seconds
-        while self.step < self.steps and not (self.held_out and self.step - self.best_step >= patience * every > 0):
+        while self.step < self.steps and not (self.held_out and self.step - self.best_step >= patience * every):
             loss = self.advance()
             bar.update(task, completed=self.step)
             if self.step % every and self.step != self.steps:
@@ -254,6 +271,7 @@ class Optimisation:
 
     def _save(self, path: Path, owner: str) -> None:
         tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
+        tensors |= {f"average.{name}": value for name, value in self.average.state_dict().items()}
         for number, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{number}.{name}": torch.as_tensor(value) for name, value in moments.items()}
         tensors["generator"] = self.generator.get_state()
@@ -265,8 +283,8 @@ class Optimisation:
         header, tensors = saved.header, saved.tensors
         self.step, self.best_step, self.seconds = header["step"], header["best_step"], header["seconds"]
         self.best_loss = math.inf if header["best_loss"] is None else header["best_loss"]
-        prefix = "model."
-        self.model.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
+        for prefix, module in (("model.", self.model), ("average.", self.average)):
+            module.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
         state = copy.deepcopy(self.optimiser.state_dict())
         for name, value in tensors.items():
             if name.startswith("optimiser."):
@@ -274,5 +292,3 @@ class Optimisation:
                 state["state"].setdefault(int(number), {})[moment] = value
         self.optimiser.load_state_dict(state)
         self.generator.set_state(tensors["generator"])
-        for _ in range(self.step):
-            self.schedule.step()

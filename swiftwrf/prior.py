@@ -1,4 +1,4 @@
-"""The kernel of the motion's prior, chosen from the training spectra alone.
+"""The motion's prior - its kernel and its rank - chosen from the training spectra alone.
 
 Positions whose spectra resemble each other should move alike. So the kernel is the one under which a Gaussian process on
 the spectra's pixels best predicts training spectra that are held out: at random, or a whole region at a time where the
@@ -15,6 +15,8 @@ from torch import Tensor
 
 from swiftwrf.deformation import Kernel
 
+MIN_RANK, MAX_RANK = 24, 64
+EXPLAINED = 0.05  # least share of a component's variance that counts as predicted: half of pure noise exceeds 0 by chance
 MAX_ROWS = 400  # more do not change the choice, and a candidate costs their number cubed
 
 
@@ -26,14 +28,51 @@ def choose_kernel(position: Tensor, spectrum: Tensor, fold: Tensor) -> Kernel:
         spectrum: the training spectra, (n, H, W).
         fold: number of the part that each is held out with, (n,).
     """
-    if len(position) > MAX_ROWS:
-        rows = torch.linspace(0, len(position) - 1, MAX_ROWS).long()
-        position, spectrum, fold = position[rows], spectrum[rows], fold[rows]
+    position, spectrum, fold = _thinned(position, spectrum, fold)
+    gram = _gram(spectrum)
+    extent = float((position.max(0).values - position.min(0).values).max()) or 1.0
+
+    def score(kernel: Kernel) -> float:
+        total = 0.0
+        for out, kept, gain in _predictions(kernel, position, fold):
+            own = gram.diagonal()[out]
+            error = own - 2 * (gain * gram[out][:, kept]).sum(1) + ((gain @ gram[kept][:, kept]) * gain).sum(1)
+            total -= float(error.clamp_min(1e-12).log().sum())
+        return total
+
+    return max(_candidates(extent), key=score)
+
+
+def choose_rank(position: Tensor, spectrum: Tensor, fold: Tensor, kernel: Kernel) -> int:
+    """How many principal components of the spectra are predicted better than by their mean where they are held out.
+
+    What varies from spectrum to spectrum in other components cannot be known at a position without measuring there, so
+    a motion that could draw it would only learn noise.
+
+    Args:
+        position, spectrum, fold: as for `choose_kernel`.
+        kernel: what it chose.
+    """
+    position, spectrum, fold = _thinned(position, spectrum, fold)
+    eigenvalue, eigenvector = torch.linalg.eigh(_gram(spectrum))
+    component = eigenvector * eigenvalue.clamp_min(0).sqrt()  # (n, n), one column a component
+    missed = torch.zeros_like(component)
+    for out, kept, gain in _predictions(kernel, position, fold):
+        missed[out] = component[out] - gain @ component[kept]
+    predicted = missed.square().sum(dim=0) < (1 - EXPLAINED) * component.square().sum(dim=0)
+    return int(predicted.sum().clamp(MIN_RANK, MAX_RANK))
+
+
+def _thinned(*tensors: Tensor) -> list[Tensor]:
+    n = len(tensors[0])
+    return [t[torch.linspace(0, n - 1, MAX_ROWS).long()] if n > MAX_ROWS else t for t in tensors]
+
+
+def _gram(spectrum: Tensor) -> Tensor:
+    """Inner products of the spectra's differences from their mean, a pixel, float64 (n, n)."""
     flat = spectrum.flatten(1).double()
     flat = flat - flat.mean(dim=0)
-    gram = flat @ flat.T / flat.shape[1]
-    extent = float((position.max(0).values - position.min(0).values).max()) or 1.0
-    return max(_candidates(extent), key=lambda kernel: _score(kernel, position.double(), gram, fold))
+    return flat @ flat.T / flat.shape[1]
 
 
 def _candidates(extent: float) -> Iterator[Kernel]:
@@ -44,14 +83,10 @@ def _candidates(extent: float) -> Iterator[Kernel]:
             yield from (Kernel(long=long, short=extent / 3 / 2**j, share=0.6, noise=noise) for j in range(1, 6))
 
 
-def _score(kernel: Kernel, position: Tensor, gram: Tensor, fold: Tensor) -> float:
-    covariance = kernel(position, position)
+def _predictions(kernel: Kernel, position: Tensor, fold: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """For each fold: which rows are out and which are kept, and the weights (out, kept) that predict the former."""
+    covariance = kernel(position.double(), position.double())
     noisy = covariance + kernel.noise * torch.eye(len(position), dtype=covariance.dtype)
-    score = 0.0
     for number in fold.unique():
-        out = fold == number
-        kept = ~out
-        gain = torch.linalg.solve(noisy[kept][:, kept], covariance[kept][:, out]).T  # prediction = gain @ kept spectra
-        error = gram.diagonal()[out] - 2 * (gain * gram[out][:, kept]).sum(1) + ((gain @ gram[kept][:, kept]) * gain).sum(1)
-        score -= float(error.clamp_min(1e-12).log().sum())
-    return score
+        out, kept = fold == number, fold != number
+        yield out, kept, torch.linalg.solve(noisy[kept][:, kept], covariance[kept][:, out]).T

@@ -17,6 +17,7 @@ import torch
 import torchvision
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.optim.swa_utils import update_bn
 
 from augment import Mixed
 from swiftwrf.angles import to_angles, to_direction
@@ -128,6 +129,11 @@ class AANN:
                 if self._on_record is not None and (step % 10 == 0 or step == config.steps):
                     self._on_record({"step": step, "loss": loss.item(), "seconds": time.perf_counter() - began})
 
+        # a short training leaves the batch norms' running statistics behind the weights, so they are taken anew
+        with self._autocast:
+            update_bn(spectrum.split(64), network)
+        network.eval()
+
     def _point(self, prepared: Tensor) -> Tensor:
         """Unit vectors (n, 3) of prepared spectra."""
         with self._autocast:
@@ -136,7 +142,6 @@ class AANN:
 
     @torch.no_grad()
     def estimate(self, spectrum: Tensor) -> Tensor:
-        self._network.eval()
         parts = [self._point(part) for part in self._prepare(spectrum).split(64)]
         return torch.stack(to_angles(torch.cat(parts).double().cpu()), dim=-1)
 

@@ -1,0 +1,198 @@
+"""The angle-of-arrival task: estimators, one whole run, its refusals, its resumption."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from augment import Mixed
+from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, load, simulated_room
+from swiftwrf.metrics import angle_errors
+from tasks.aoa import experiment
+from tasks.aoa.aann import AANN, AANNConfig
+from tasks.aoa.estimators import Constant, NearestSpectrum, Peak
+from tasks.report import merge
+from tasks.run import command_line
+
+TINY_FIT = FitConfig(model=ModelConfig(n_primitives=8), steps=20, coarse_steps=10, check_every=10)
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """The task on a toy: few spectra, few steps."""
+    room = simulated_room(n=50, grid=AngularGrid.hemisphere(10, 40))
+    monkeypatch.setattr(experiment, "simulated_room", lambda seed: room)
+    monkeypatch.setattr(experiment, "FitConfig", lambda: TINY_FIT)
+    monkeypatch.setattr(experiment, "AANNConfig", lambda: AANNConfig(steps=2, batch=4))
+    return room
+
+
+def run(*arguments):
+    return command_line("tasks.aoa", experiment.AoaConfig, experiment.run, [str(a) for a in arguments])
+
+
+def test_peak_of_a_known_spectrum():
+    grid = AngularGrid.hemisphere(10, 40)
+    spectrum = torch.zeros(1, 10, 40)
+    spectrum[0, 3, 10] = 1
+    assert Peak(grid).estimate(spectrum).rad2deg()[0].tolist() == pytest.approx([90, 36])
+
+
+def test_constant_is_the_mean_direction_over_the_seam():
+    train = Mixed(torch.zeros(2, 1, 1), torch.tensor([[350.0, 10], [10, 10]]).deg2rad(), torch.arange(2), torch.zeros(2).bool())
+    constant = Constant()
+    constant.fit(train)
+    azimuth = constant.estimate(torch.zeros(3, 1, 1))[:, 0]
+    assert (1 - torch.cos(azimuth)).max() < 1e-9
+
+
+def test_nearest_spectrum_returns_the_label_of_a_copy(room):
+    nearest = NearestSpectrum()
+    nearest.fit(Mixed.measured(room))
+    torch.testing.assert_close(nearest.estimate(room.spectrum[5:8]), room.label[5:8])
+
+
+@pytest.mark.parametrize("circular", [False, True])
+def test_aann_learns_a_toy(circular):
+    """Four directions, four patterns: a network that cannot tell them apart stays at the constant's error."""
+    label = torch.tensor([[0.0, 30], [90, 30], [180, 30], [270, 60]]).deg2rad().repeat(4, 1).double()
+    spectrum = torch.zeros(16, 16, 64)
+    for i in range(16):
+        spectrum[i, 4:10, 16 * (i % 4) : 16 * (i % 4) + 8] = 1
+    train = Mixed(spectrum, label, torch.arange(16), torch.zeros(16).bool())
+    aann = AANN(AANNConfig(steps=30, batch=8, circular=circular), 0, torch.device("cpu"))
+    aann.fit(train)
+    constant = Constant()
+    constant.fit(train)
+    errors = [angle_errors(e.estimate(spectrum), label)["great_circle"].mean() for e in (aann, constant)]
+    assert errors[0] < 0.5 * errors[1]
+
+
+def test_circular_padding_makes_rolled_spectra_alike():
+    from tasks.aoa.aann import _CircularConv
+
+    convolution = _CircularConv(torch.nn.Conv2d(1, 3, 5, padding=2))
+    x = torch.rand(1, 1, 9, 12)
+    torch.testing.assert_close(convolution(x).roll(4, dims=-1), convolution(x.roll(4, dims=-1)))
+
+
+def test_aann_is_seeded_and_leaves_the_global_generator_alone(room):
+    state = torch.get_rng_state()
+    estimates = []
+    for _ in range(2):
+        aann = AANN(AANNConfig(steps=2, batch=4), 7, torch.device("cpu"))
+        aann.fit(Mixed.measured(room))
+        estimates.append(aann.estimate(room.spectrum))
+    assert torch.equal(*estimates)
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_whole_run(small, tmp_path):
+    out = tmp_path / "run"
+    assert run("--mix", 0.5, 1.0, "--synthesizer", "swiftwrf", "idw", "--repeats", 2, "--out", out) == 0
+    metrics = json.loads((out / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(name))
+    assert (metrics["task"], metrics["data"], metrics["split"], metrics["seed"]) == ("aoa", "simulated-room", "random", 0)
+    methods = metrics["mixes"]["0.5"]["methods"]
+    expected = {"measured_only", "turbo_swiftwrf", "turbo_idw", "measured_all", "constant", "nearest_spectrum", "peak"}
+    assert set(methods) == expected
+    assert set(metrics["mixes"]["0.5"]["synthesis"]) == {"swiftwrf", "nearest", "idw"}
+    assert set(metrics["mixes"]["1"]["seconds"]) == {"fit", "synthesize", "train"}
+
+    errors = pd.read_csv(out / "errors.csv")
+    assert len(errors) == 2 * 2 * 7 * 10  # shares, repeats, methods, test spectra
+    own = errors[(errors.mix == 0.5) & (errors.method == "turbo_swiftwrf")]
+    median = own.groupby("index").great_circle_deg.mean().median()
+    assert methods["turbo_swiftwrf"]["great_circle_deg"]["median"] == pytest.approx(median)
+    assert methods["turbo_swiftwrf"]["great_circle_deg"]["low"] <= median
+    truth = np.degrees(small.label[own["index"].to_numpy()].numpy())
+    np.testing.assert_allclose(own[["truth_azimuth_deg", "truth_elevation_deg"]], truth, rtol=1e-9)
+
+    html = (out / "report.html").read_text()
+    assert "What this does not show" in html
+    assert "<svg" in html
+    assert not [line for line in html.splitlines() if 'src="http' in line or 'href="http' in line]
+    assert load(out / "model-mix0.5.safetensors").synthesize(small.position[:2]).shape == (2, 10, 40)
+    assert not list(tmp_path.glob("*.partial"))
+
+    merge([out, out], tmp_path / "both")
+    assert (tmp_path / "both" / "report.html").stat().st_size > 10_000
+
+
+def test_interrupted_run_goes_on_to_the_same_numbers(small, tmp_path, monkeypatch):
+    arguments = ("--mix", 0.5, "--out")
+    assert run(*arguments, tmp_path / "whole") == 0
+
+    honest, calls = AANN.fit, []
+
+    def interrupt(self, train):
+        calls.append(len(train))
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        honest(self, train)
+
+    monkeypatch.setattr(AANN, "fit", interrupt)
+    assert run(*arguments, tmp_path / "cut") == 130
+    assert not (tmp_path / "cut").exists()
+    monkeypatch.setattr(AANN, "fit", honest)
+    assert run("--resume", tmp_path / "cut.partial") == 0
+    whole, cut = (json.loads((tmp_path / name / "metrics.json").read_text())["mixes"]["0.5"] for name in ("whole", "cut"))
+    assert whole["methods"] == cut["methods"]
+    assert whole["synthesis"] == cut["synthesis"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--mix", 0), "in (0, 1]"),
+        (("--mix", 1.5), "in (0, 1]"),
+        (("--mix", 0.3, 0.3), "twice"),
+        (("--mix", 0.1), "leaves 4 of 40"),
+        (("--mix", 0.5, "--split", "nowhere"), "choose one of block, random"),
+        (("--mix", 0.5, "--synthesizer", "vae"), "unknown synthesizer"),
+        (("--mix", 0.5, "--repeats", 0), "--repeats"),
+        (("--mix", 0.5, "--data", "/nowhere"), "is not a folder"),
+        (("--resume", "nowhere"), "no interrupted run"),
+    ],
+)
+def test_wrong_input_is_one_sentence_and_code_2(small, tmp_path, capsys, arguments, says):
+    extra = () if arguments[0] == "--resume" else ("--out", tmp_path / "run")
+    assert run(*arguments, *extra) == 2
+    error = capsys.readouterr().err.strip()
+    assert says in error
+    assert error.count("\n") == 0
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_cuda_without_a_gpu(small, tmp_path, capsys):
+    assert run("--mix", 0.5, "--device", "cuda", "--out", tmp_path / "run") == 2
+    assert "NVIDIA GPU" in capsys.readouterr().err
+
+
+def test_existing_directory_is_not_overwritten(small, tmp_path, capsys):
+    (tmp_path / "run").mkdir()
+    assert run("--mix", 0.5, "--out", tmp_path / "run") == 2
+    assert "exists already" in capsys.readouterr().err
+    assert not list((tmp_path / "run").iterdir())
+
+
+def test_report_refuses_unfinished_runs(tmp_path):
+    with pytest.raises(InputError, match="no finished run"):
+        merge([tmp_path], tmp_path / "out")
+
+
+def test_metrics_are_strict_json(tmp_path):
+    from tasks.run import _strict
+
+    assert _strict({"a": math.nan, "b": [math.inf, 1.0], "c": (1, 2)}) == {"a": None, "b": [None, 1.0], "c": [1, 2]}
+
+
+def test_paper_preset_keeps_all_pixels():
+    assert AANNConfig.paper().max_azimuths == 0
+    assert replace(AANNConfig(), steps=1).batch == 16

@@ -1,0 +1,94 @@
+"""Synthesizers, and the promise that nothing withheld leaks into a training set."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from augment import SYNTHESIZERS, make_synthesizer, mix, withhold
+from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, simulated_room
+from swiftwrf.metrics import psnr
+
+ROOM = simulated_room(n=60, seed=3, grid=AngularGrid.hemisphere(15, 60))
+TRAIN, TEST = ROOM.split("random", 0)
+QUICK = FitConfig(model=ModelConfig(n_primitives=16), steps=100, coarse_steps=50, check_every=50)
+
+
+class Recorder:
+    """A synthesizer that remembers what it was shown."""
+
+    def fit(self, train):
+        self.shown = train
+
+    def synthesize(self, position):
+        return torch.full((len(position), *self.shown.grid.shape), -1.0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(0.22, 1.0), st.integers(0, 2**31))
+def test_nothing_withheld_and_no_test_spectrum_leaks(share, seed):
+    measured, withheld = withhold(TRAIN, share, seed)
+    recorder = Recorder()
+    recorder.fit(measured)
+    mixed = mix(measured, withheld, recorder.synthesize(withheld.position))
+
+    assert len(measured) == round(share * len(TRAIN))
+    shown, hidden, test = (set(x.tolist()) for x in (recorder.shown.index, withheld.index, TEST.index))
+    assert shown | hidden == set(TRAIN.index.tolist())
+    assert not shown & hidden
+    assert not (shown | hidden) & test
+    # each sample is what its origin says: the measured spectrum of its index, or the synthesizer's
+    for spectrum, index, synthetic in zip(mixed.spectrum, mixed.index.tolist(), mixed.synthetic.tolist(), strict=True):
+        assert synthetic == (index in hidden)
+        assert torch.equal(spectrum, torch.full_like(spectrum, -1.0) if synthetic else ROOM.spectrum[index])
+    torch.testing.assert_close(mixed.label, ROOM.label[mixed.index])
+
+
+def test_places_have_no_spectrum_to_leak():
+    _, withheld = withhold(TRAIN, 0.5, 0)
+    assert withheld._fields == ("position", "label", "index")
+
+
+@pytest.mark.parametrize(("share", "says"), [(0.0, "in \\(0, 1\\]"), (1.1, "in \\(0, 1\\]"), (0.1, "leaves 5 of 48")])
+def test_withhold_refuses(share, says):
+    with pytest.raises(InputError, match=says):
+        withhold(TRAIN, share, 0)
+
+
+def test_mix_refuses_a_wrong_number_of_spectra():
+    measured, withheld = withhold(TRAIN, 0.5, 0)
+    with pytest.raises(InputError, match="one synthetic spectrum for each of 24"):
+        mix(measured, withheld, TRAIN.spectrum[:3])
+
+
+@pytest.mark.parametrize("name", SYNTHESIZERS)
+def test_synthesizers_draw_spectra_better_than_noise(name):
+    synthesizer = make_synthesizer(name, config=QUICK)
+    synthesizer.fit(TRAIN)
+    drawn = synthesizer.synthesize(TEST.position)
+    assert drawn.shape == TEST.spectrum.shape
+    assert drawn.dtype == torch.float32
+    assert 0 <= drawn.min()
+    assert drawn.max() <= 1
+    assert psnr(drawn, TEST.spectrum).median() > 12
+
+
+@pytest.mark.parametrize("name", ["nearest", "idw"])
+def test_look_ups_return_measured_spectra_at_measured_positions(name):
+    synthesizer = make_synthesizer(name)
+    synthesizer.fit(TRAIN)
+    torch.testing.assert_close(synthesizer.synthesize(TRAIN.position), TRAIN.spectrum, atol=1e-5, rtol=0)
+
+
+def test_idw_of_two_neighbours_is_their_weighted_mean():
+    from augment.synthesize import _inverse_distance
+
+    weight = _inverse_distance(torch.tensor([[1.0, 0, 0]]), torch.tensor([[0.0, 0, 0], [3, 0, 0], [9, 0, 0]]).double(), 2)
+    assert weight[0].tolist() == pytest.approx([2 / 3, 1 / 3, 0])
+
+
+def test_unknown_synthesizer():
+    with pytest.raises(InputError, match="choose from swiftwrf, nearest"):
+        make_synthesizer("vae")

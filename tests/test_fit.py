@@ -1,0 +1,143 @@
+"""Fitting: what it reaches, what it refuses, how it goes on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from swiftwrf import FitConfig, FitError, InputError, ModelConfig, fit
+from swiftwrf.fit import _working, folds
+from swiftwrf.metrics import psnr
+from swiftwrf.optimise import Optimisation
+from swiftwrf.prior import MIN_RANK, choose_kernel, choose_rank
+
+QUICK = FitConfig(model=ModelConfig(n_primitives=24), steps=200, coarse_steps=50, check_every=50)
+
+
+def test_fit_beats_the_mean_spectrum(room):
+    wrf = fit(room, replace(QUICK, steps=300), progress=False)
+    fitted = psnr(wrf.synthesize(room.position), room.spectrum).median()
+    mean = psnr(room.spectrum.mean(dim=0), room.spectrum).median()
+    assert fitted > mean + 3
+
+
+def test_same_seed_same_model(room):
+    a, b = (fit(room, QUICK, progress=False).synthesize(room.position) for _ in range(2))
+    assert torch.equal(a, b)
+    other = fit(room, replace(QUICK, seed=1), progress=False).synthesize(room.position)
+    assert not torch.equal(a, other)
+
+
+def test_paper_preset_is_the_paper():
+    paper = FitConfig.paper()
+    assert paper.model.n_primitives == 10_000
+    assert paper.model.deformation == "per_primitive_mlp"
+    assert paper.model.components == ("mean", "response", "attenuation")
+    assert (paper.rate, paper.deformation_rate, paper.ssim_weight, paper.smoothing) == (1e-2, 8e-3, 0.3, 1.0)
+    assert paper.stop_mean
+
+
+def test_paper_model_fits_a_toy(room):
+    paper = FitConfig.paper(steps=40, coarse_steps=20, check_every=20)
+    config = replace(paper, model=replace(paper.model, n_primitives=20))
+    records = []
+    fit(room, config, progress=False, on_record=records.append)
+    assert [r["stage"] for r in records if r["step"] == 20] == ["search", "final"]
+
+
+def test_smoothing_is_annealed(room):
+    config = replace(QUICK, smoothing=1.0, smoothing_steps=100)
+    kernel = choose_kernel(room.position, room.spectrum, folds(room.position, "random", 0))
+    optimisation = Optimisation("final", 200, room, kernel, config, "cpu")
+    optimisation.step = config.coarse_steps
+    assert optimisation.smoothing() == pytest.approx(2 / len(room) ** (1 / 3))
+    optimisation.step = config.coarse_steps + 50
+    assert optimisation.smoothing() == pytest.approx(1 / len(room) ** (1 / 3))
+    optimisation.step = config.coarse_steps + 101
+    assert optimisation.smoothing() == 0
+
+
+def test_interrupted_fit_goes_on_to_the_same_bits(room, tmp_path):
+    whole = fit(room, QUICK, progress=False).synthesize(room.position)
+
+    class Stop(Exception):
+        pass
+
+    for stop_at in (("search", 100), ("final", 50)):
+
+        def stop(record, stop_at=stop_at):
+            if (record["stage"], record["step"]) == stop_at:
+                raise Stop
+
+        state = tmp_path / f"state-{stop_at[0]}"
+        with pytest.raises(Stop):
+            fit(room, QUICK, progress=False, checkpoint=state, on_record=stop)
+        records = []
+        again = fit(room, QUICK, progress=False, checkpoint=state, on_record=records.append)
+        assert (records[0]["stage"], records[0]["step"]) == (stop_at[0], stop_at[1] + 50)
+        assert torch.equal(again.synthesize(room.position), whole)
+
+
+def test_refuses_the_state_of_another_fit(room, tmp_path):
+    fit(room, replace(QUICK, steps=50), progress=False, checkpoint=tmp_path / "state")
+    with pytest.raises(InputError, match="another fit"):
+        fit(room, QUICK, progress=False, checkpoint=tmp_path / "state")
+
+
+def test_loss_that_is_not_finite_stops_and_keeps_the_last_good_state(room, tmp_path, monkeypatch):
+    state = tmp_path / "state"
+    honest = Optimisation.loss
+
+    def breaks(self, drawn, measured):
+        return honest(self, drawn, measured) * (float("nan") if self.step == 120 else 1)
+
+    monkeypatch.setattr(Optimisation, "loss", breaks)
+    with pytest.raises(FitError, match="step 120"):
+        fit(room, QUICK, progress=False, checkpoint=state)
+    monkeypatch.undo()
+    records = []
+    fit(room, QUICK, progress=False, checkpoint=state, on_record=records.append)
+    assert records[0]["step"] == 150  # went on from the state at 100
+
+
+def test_refuses_too_few_spectra_and_what_is_not_finite(room):
+    with pytest.raises(InputError, match="at least 10"):
+        fit(room.subset(torch.arange(9)), QUICK, progress=False)
+    broken = room.spectrum.clone()
+    broken[7, 3, 3] = float("nan")
+    with pytest.raises(InputError, match="training spectrum 7"):
+        fit(replace(room, spectrum=broken), QUICK, progress=False)
+
+
+def test_working_resolution(room):
+    assert _working(room, 0) is room
+    assert _working(room, 30).grid.shape == room.grid.shape  # 7 rows at least for SSIM, so it stays
+    assert _working(room, 60).grid.shape == (15, 60)
+
+
+def test_folds_partition_and_repeat(room):
+    for kind in ("random", "block"):
+        fold = folds(room.position, kind, 3)
+        assert fold.bincount().tolist() == [8] * 5
+        assert torch.equal(fold, folds(room.position, kind, 3))
+
+
+def test_kernel_choice_finds_smooth_and_rough_fields(generator):
+    position = torch.rand(80, 3, generator=generator, dtype=torch.float64)
+    fold = torch.arange(80) % 5
+    smooth = torch.sin(position @ torch.rand(3, 64, generator=generator, dtype=torch.float64)).reshape(80, 8, 8)
+    noise = torch.rand(80, 8, 8, generator=generator)
+    assert choose_kernel(position, smooth, fold).noise < choose_kernel(position, noise, fold).noise
+
+
+def test_rank_counts_what_can_be_predicted(generator):
+    """Thirty smooth fields over three directions: their rank is found; noise has none."""
+    position = torch.rand(200, 3, generator=generator, dtype=torch.float64)
+    fold = torch.arange(200) % 5
+    fields = torch.sin(position @ torch.randn(3, 40, generator=generator, dtype=torch.float64) * 4)
+    smooth = (fields @ torch.randn(40, 64, generator=generator, dtype=torch.float64)).reshape(200, 8, 8)
+    noise = torch.rand(200, 8, 8, generator=generator)
+    assert 28 <= choose_rank(position, smooth, fold, choose_kernel(position, smooth, fold)) <= 40
+    assert choose_rank(position, noise, fold, choose_kernel(position, noise, fold)) == MIN_RANK
