@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from swiftwrf.data.spectra import Spectra
+from swiftwrf.data.spectra import Spectra, coarsening
 from swiftwrf.data.splits import MIN_TRAINING, slabs
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
@@ -57,7 +56,8 @@ def fit(
         if len(bad):
             raise InputError(f"{name} of training spectrum {int(bad[0])} is not finite; mend or leave it out")
     fold = folds(train.position, config.validation, config.seed)
-    work = _working(train, config.max_azimuths)
+    # an array's beams are far wider than a pixel, so little is lost at the coarser resolution of the fit
+    work = train.coarsen(coarsening(train.grid.shape, config.max_azimuths, least_rows=WINDOW))
     kernel = choose_kernel(work.position, work.spectrum, fold)
     if config.model.rank is None:
         rank = choose_rank(work.position, work.spectrum, fold, kernel)
@@ -86,10 +86,3 @@ def folds(position: Tensor, validation: Literal["random", "block"], seed: int) -
         return slabs(position, FOLDS)
     order = torch.randperm(len(position), generator=torch.Generator().manual_seed(seed))
     return order % FOLDS
-
-
-def _working(train: Spectra, max_azimuths: int) -> Spectra:
-    """The spectra at the resolution of the fit: an array's beams are far wider than a pixel, so little is lost."""
-    least = math.ceil(train.grid.n_azimuth / max_azimuths) if max_azimuths else 1
-    factors = range(least, min(train.grid.shape) // WINDOW + 1)
-    return train.coarsen(next((f for f in factors if all(size % f == 0 for size in train.grid.shape)), 1))

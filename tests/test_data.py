@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 
 from swiftwrf import InputError, load_spectra
+from swiftwrf.data.spectra import coarsening
 from swiftwrf.data.splits import block_split, random_split, slabs
 
 N = 12
@@ -201,6 +202,14 @@ def test_coarsen_averages(nerf2):
     torch.testing.assert_close(coarse.spectrum.mean(), data.spectrum.mean())
     with pytest.raises(InputError, match="cannot be averaged"):
         data.coarsen(3)
+
+
+@pytest.mark.parametrize(
+    ("shape", "most", "rows", "factor"),
+    [((90, 360), 0, 1, 1), ((90, 360), 180, 7, 2), ((90, 360), 100, 7, 5), ((45, 180), 120, 1, 3), ((15, 60), 30, 7, 1)],
+)
+def test_coarsening_divides_both_sizes(shape, most, rows, factor):
+    assert coarsening(shape, most, rows) == factor
 
 
 @pytest.mark.data

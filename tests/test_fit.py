@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from swiftwrf import FitConfig, FitError, InputError, ModelConfig, fit
-from swiftwrf.fit import _working, folds
+from swiftwrf.fit import folds
 from swiftwrf.metrics import psnr
 from swiftwrf.optimise import Optimisation
 from swiftwrf.prior import MIN_RANK, choose_kernel, choose_rank
@@ -109,12 +109,6 @@ def test_refuses_too_few_spectra_and_what_is_not_finite(room):
     broken[7, 3, 3] = float("nan")
     with pytest.raises(InputError, match="training spectrum 7"):
         fit(replace(room, spectrum=broken), QUICK, progress=False)
-
-
-def test_working_resolution(room):
-    assert _working(room, 0) is room
-    assert _working(room, 30).grid.shape == room.grid.shape  # 7 rows at least for SSIM, so it stays
-    assert _working(room, 60).grid.shape == (15, 60)
 
 
 def test_folds_partition_and_repeat(room):

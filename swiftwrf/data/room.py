@@ -22,7 +22,7 @@ from swiftwrf.data.spectra import Moving, Spectra
 from swiftwrf.errors import InputError
 
 MAX_ORDER = 2
-GRID = AngularGrid.hemisphere(45, 180)
+GRID = AngularGrid.hemisphere(30, 120)
 FACING_X = ArrayPose((0.1, 2.4, 1.2), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)))  # on the wall x = 0, its normal is +x
 LEVEL = ArrayPose((3.0, 2.5, 2.7))  # lies level; the position is that of the fixed transmitter on the ceiling
 REGION = ((2.2, 1.6, 0.9), (4.2, 3.4, 1.5))  # where the moving end goes: opposite corners [m]

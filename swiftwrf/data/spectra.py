@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -82,3 +84,11 @@ class Spectra:
             raise InputError(f"spectra of {self.grid.shape} pixels cannot be averaged over {factor} x {factor} of them")
         small = functional.avg_pool2d(self.spectrum[:, None], factor)[:, 0]
         return replace(self, spectrum=small, grid=self.grid.coarsen(factor))
+
+
+def coarsening(shape: Sequence[int], max_azimuths: int, least_rows: int = 1) -> int:
+    """The smallest factor that brings spectra of `shape` (rows, columns) to at most `max_azimuths` columns and divides
+    both sizes; 1 where there is none that leaves `least_rows`, and for `max_azimuths` 0, which stands for all pixels."""
+    least = math.ceil(shape[1] / max_azimuths) if max_azimuths else 1
+    factors = range(least, shape[0] // least_rows + 1)
+    return next((factor for factor in factors if all(size % factor == 0 for size in shape)), 1)

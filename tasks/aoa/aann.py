@@ -7,7 +7,6 @@ labels' spread, so that training starts from the constant estimator.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from torch.optim.swa_utils import update_bn
 
 from augment import Mixed
 from swiftwrf.angles import to_angles, to_direction
+from swiftwrf.data.spectra import coarsening
 from swiftwrf.progress import progress_bar
 
 
@@ -28,13 +28,13 @@ from swiftwrf.progress import progress_bar
 class AANNConfig:
     """How the network is trained."""
 
-    steps: int = 250
+    steps: int = 400
     """optimisation steps, the same for every training set"""
     batch: int = 16
     """spectra a step"""
     rate: float = 1e-3
     """peak learning rate of AdamW, one cycle"""
-    max_azimuths: int = 180
+    max_azimuths: int = 120
     """larger spectra are averaged down for the network; 0 keeps all pixels"""
     circular: bool = False
     """pad the azimuth circularly, as the physics has it, instead of with zeros"""
@@ -99,8 +99,7 @@ class AANN:
         self._autocast = torch.autocast(device.type, torch.bfloat16, enabled=_gains_from_bfloat16(device))
 
     def _prepare(self, spectrum: Tensor) -> Tensor:
-        size = self._config.max_azimuths
-        factor = math.ceil(spectrum.shape[-1] / size) if size else 1
+        factor = coarsening(spectrum.shape[1:], self._config.max_azimuths)
         small = functional.avg_pool2d(spectrum[:, None], factor)
         return (2 * small - 1).to(self._device, memory_format=torch.channels_last)
 
@@ -110,7 +109,7 @@ class AANN:
         direction = to_direction(*train.label.unbind(-1)).float().to(self._device)
         self._mean = functional.normalize(direction.mean(dim=0), dim=0)
         self._spread = (direction - self._mean).square().sum(dim=1).mean().sqrt().clamp_min(1e-4)
-        optimiser = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=1e-2)
+        optimiser = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=1e-2, fused=True)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, config.rate, total_steps=config.steps)
         network.train()
         began, order = time.perf_counter(), torch.empty(0, dtype=torch.int64)
