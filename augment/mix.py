@@ -17,7 +17,7 @@ class Places(NamedTuple):
 
     position: Tensor  # (n, 3) [m]
     label: Tensor  # (n, 2) direction of the transmitter [rad], from the positions of both ends
-    index: Tensor  # (n,) numbers in the data set
+    number: Tensor  # (n,) in the data set
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ def withhold(train: Spectra, share: float, seed: int) -> tuple[Spectra, Places]:
     n = round(share * len(train))
     if n < MIN_TRAINING:
         raise InputError(
-            f"a measured share of {share:g} leaves {n} of {len(train)} training spectra; at least {MIN_TRAINING} are needed, "
-            f"a share of {MIN_TRAINING / len(train):.2g}"
+            f"a measured share of {share:g} leaves {n} of {len(train)} training spectra; "
+            f"at least {MIN_TRAINING} are needed, a share of {MIN_TRAINING / len(train):.2g}"
         )
     order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
     measured, others = train.subset(order[:n].sort().values), train.subset(order[n:].sort().values)
@@ -70,11 +70,13 @@ def mix(measured: Spectra, withheld: Places, synthetic: Tensor) -> Mixed:
 
     The synthesizer that drew them was fitted on `measured` alone, which is all that `withhold` hands out.
     """
-    if len(synthetic) != len(withheld.index):
-        raise InputError(f"expected one synthetic spectrum for each of {len(withheld.index)} places, got {len(synthetic)}")
+    if len(synthetic) != len(withheld.number):
+        raise InputError(
+            f"expected one synthetic spectrum for each of {len(withheld.number)} places, got {len(synthetic)}"
+        )
     return Mixed(
         torch.cat([measured.spectrum, synthetic]),
         torch.cat([measured.label, withheld.label]),
-        torch.cat([measured.index, withheld.index]),
+        torch.cat([measured.index, withheld.number]),
         torch.cat([torch.zeros(len(measured), dtype=torch.bool), torch.ones(len(synthetic), dtype=torch.bool)]),
     )

@@ -94,7 +94,8 @@ class GaussianProcess:
     def synthesize(self, position: Tensor) -> Tensor:
         weight = (self._kernel(position.double(), self._train.position) @ self._inverse).float()
         change = weight @ (self._train.spectrum - self._mean).flatten(1)
-        return (self._mean + change.reshape(-1, *self._train.grid.shape)).clamp(0, 1)
+        drawn: Tensor = self._mean + change.reshape(-1, *self._train.grid.shape)
+        return drawn.clamp(0, 1)
 
 
 class SwiftWRFSynthesizer:

@@ -1,9 +1,9 @@
 """SwiftWRF: a measured wireless radiance field, known everywhere.
 
-    data = swiftwrf.load_spectra(folder)
-    train, test = data.split("block")
-    model = swiftwrf.fit(train)
-    spectrum = model.synthesize(test.position)
+data = swiftwrf.load_spectra(folder)
+train, test = data.split("block")
+model = swiftwrf.fit(train)
+spectrum = model.synthesize(test.position)
 """
 
 from swiftwrf.angles import AngularGrid, ArrayPose

@@ -6,6 +6,7 @@ plane (0) to its normal (90 degrees); radians inside, degrees at the borders.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -98,7 +99,7 @@ def _even_step(values: list[float], name: str) -> float:
     if len(values) < 2:
         raise InputError(f"a grid needs at least 2 {name}s, got {len(values)}")
     step = (values[-1] - values[0]) / (len(values) - 1)
-    if step <= 0 or any(abs(b - a - step) > 1e-6 * step for a, b in zip(values, values[1:], strict=False)):
+    if step <= 0 or any(abs(b - a - step) > 1e-6 * step for a, b in itertools.pairwise(values)):
         raise InputError(f"{name}s must ascend in even steps, got {values[:3]} ... {values[-1]} [degrees]")
     return step
 
@@ -117,7 +118,9 @@ def to_angles(direction: Tensor) -> tuple[Tensor, Tensor]:
     """
     x, y, z = direction.unbind(-1)
     azimuth = torch.remainder(torch.atan2(y, x), TURN)
-    azimuth = torch.where(azimuth >= TURN, torch.zeros_like(azimuth), azimuth)  # remainder(-tiny, TURN) rounds up to TURN
+    azimuth = torch.where(
+        azimuth >= TURN, torch.zeros_like(azimuth), azimuth
+    )  # remainder(-tiny, TURN) rounds up to TURN
     return azimuth, torch.atan2(z.abs(), torch.hypot(x, y))
 
 

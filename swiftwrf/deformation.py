@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -35,7 +35,7 @@ def _offsets(flat: Tensor, components: tuple[str, ...]) -> Offsets:
 
 
 def encode(x: Tensor, bands: int) -> Tensor:
-    """[x, sin(2^k pi x), cos(2^k pi x)], k = 0 .. bands - 1 (paper, positional encoding): (..., d) to (..., d (2 bands + 1))."""
+    """[x, sin(2^k pi x), cos(2^k pi x)], k = 0 .. bands - 1 (paper): (..., d) to (..., d (2 bands + 1))."""
     angle = x[..., None, :] * (math.pi * 2.0 ** torch.arange(bands, dtype=x.dtype, device=x.device))[:, None]
     return torch.cat([x, torch.sin(angle).flatten(-2), torch.cos(angle).flatten(-2)], dim=-1)
 
@@ -57,7 +57,7 @@ class PerPrimitiveMLP(nn.Module):
         )
         self.output = nn.Linear(WIDTH, sum(COMPONENTS[c] for c in components))
         for layer in self.layers:
-            bound = 1 / math.sqrt(layer.weight.shape[1])  # torch's default, drawn from our own generator
+            bound = 1 / math.sqrt(cast(nn.Linear, layer).in_features)  # torch's default, drawn from our own generator
             for parameter in layer.parameters():
                 nn.init.uniform_(parameter, -bound, bound, generator=generator)
         nn.init.zeros_(self.output.weight)
@@ -106,7 +106,9 @@ class Kernel:
 
     def __call__(self, a: Tensor, b: Tensor) -> Tensor:
         """k between positions (n, 3) and (m, 3), (n, m)."""
-        r = torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")  # the fast mode loses close pairs to rounding
+        r = torch.cdist(
+            a, b, compute_mode="donot_use_mm_for_euclid_dist"
+        )  # the fast mode loses close pairs to rounding
         near = math.sqrt(3) * r / self.short
         return self.share * torch.exp(-r / self.long) + (1 - self.share) * (1 + near) * torch.exp(-near)
 
@@ -127,7 +129,14 @@ class MotionBasis(nn.Module):
     """
 
     def __init__(
-        self, anchor: Tensor, kernel: Kernel, rank: int, n: int, components: tuple[str, ...], *, generator: torch.Generator
+        self,
+        anchor: Tensor,
+        kernel: Kernel,
+        rank: int,
+        n: int,
+        components: tuple[str, ...],
+        *,
+        generator: torch.Generator,
     ) -> None:
         super().__init__()
         self.components = components

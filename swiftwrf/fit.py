@@ -15,7 +15,7 @@ from swiftwrf.data.splits import MIN_TRAINING, slabs
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
 from swiftwrf.model import SwiftWRF
-from swiftwrf.optimise import FitConfig, Optimisation, Record, fingerprint, read_state
+from swiftwrf.optimise import FitConfig, Optimisation, Record, Stage, fingerprint, read_state
 from swiftwrf.prior import choose_kernel, choose_rank
 from swiftwrf.progress import progress_bar
 
@@ -65,7 +65,7 @@ def fit(
     saved = read_state(checkpoint, fingerprint(config, work))
     with progress_bar(progress) as bar:
 
-        def run(stage: str, rows: Tensor, steps: int, held_out: Spectra | None = None) -> Optimisation:
+        def run(stage: Stage, rows: Tensor, steps: int, held_out: Spectra | None = None) -> Optimisation:
             optimisation = Optimisation(stage, steps, work.subset(rows), kernel, config, device, held_out)
             optimisation.run(saved, checkpoint, fingerprint(config, work), bar, on_record)
             return optimisation
@@ -86,3 +86,6 @@ def folds(position: Tensor, validation: Literal["random", "block"], seed: int) -
         return slabs(position, FOLDS)
     order = torch.randperm(len(position), generator=torch.Generator().manual_seed(seed))
     return order % FOLDS
+
+
+__all__ = ["FitConfig", "fit", "folds"]

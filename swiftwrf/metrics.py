@@ -94,7 +94,14 @@ def summary(errors: ArrayLike) -> dict[str, float | int]:
     values = np.asarray(errors, dtype=float)
     values = values[np.isfinite(values)]
     if len(values) == 0:
-        return {"median": float("nan"), "p90": float("nan"), "mean": float("nan"), "low": float("nan"), "high": float("nan"), "n": 0}
+        return {
+            "median": float("nan"),
+            "p90": float("nan"),
+            "mean": float("nan"),
+            "low": float("nan"),
+            "high": float("nan"),
+            "n": 0,
+        }
     low, high = median_interval(values)
     return {
         "median": float(np.median(values)),

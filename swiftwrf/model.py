@@ -63,10 +63,10 @@ class SwiftWRF(nn.Module):
         self.primitives = Primitives(config.n_primitives, grid, bounded=config.bounded, generator=generator)
         self.deformation: MotionBasis | PerPrimitiveMLP | None
         if config.deformation == "motion_basis":
+            normalised, scaled, rank = self.normalise(anchor), kernel.scaled(1 / scale), config.rank or DEFAULT_RANK
             self.deformation = MotionBasis(
-                self.normalise(anchor), kernel.scaled(1 / scale), config.rank or DEFAULT_RANK, config.n_primitives, config.components,
-                generator=generator,
-            )  # fmt: skip
+                normalised, scaled, rank, config.n_primitives, config.components, generator=generator
+            )
         elif config.deformation == "per_primitive_mlp":
             self.deformation = PerPrimitiveMLP(config.components, generator=generator)
         else:

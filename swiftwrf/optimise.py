@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from rich.progress import Progress
@@ -121,7 +121,9 @@ def read_state(path: Path | None, expected: str) -> State | None:
         return None
     tensors, header = files.read(path, "fit state")
     if header["fingerprint"] != expected:
-        raise InputError(f"{path} is the state of another fit (other spectra or settings); remove it or give another path")
+        raise InputError(
+            f"{path} is the state of another fit (other spectra or settings); remove it or give another path"
+        )
     return State(header["stage"], header["steps"], header, tensors)
 
 
@@ -166,15 +168,19 @@ class Optimisation:
         rate, deformation = self.config.rate, self.model.deformation
         groups: list[dict[str, Any]] = [{"params": list(self.model.primitives.parameters()), "peak": rate}]
         if isinstance(deformation, MotionBasis):
-            groups += [{"params": [deformation.coefficient], "peak": rate}, {"params": [deformation.basis], "peak": rate / 2}]
+            groups += [
+                {"params": [deformation.coefficient], "peak": rate},
+                {"params": [deformation.basis], "peak": rate / 2},
+            ]
         elif deformation is not None:
             groups += [{"params": list(deformation.parameters()), "peak": self.config.deformation_rate or rate}]
         return torch.optim.Adam(groups, betas=(0.9, 0.99))
 
     def _rate(self, step: int) -> float:
-        """Share of the peak learning rate: warm-up, then cosine decay over the configured steps, whatever the stage stops at."""
+        """Share of the peak rate: warm-up, then cosine decay over the configured steps, whatever the stage stops at."""
         cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, step / self.config.steps)))
-        return min(1.0, (step + 1) / self.config.warm_up) * (self.config.final_rate + (1 - self.config.final_rate) * cosine)
+        decayed = self.config.final_rate + (1 - self.config.final_rate) * cosine
+        return min(1.0, (step + 1) / self.config.warm_up) * decayed
 
     def loss(self, drawn: Tensor, measured: Tensor) -> Tensor:
         """Paper, equation of the loss: 0.7 L1 + 0.3 (1 - SSIM) at the default weight."""
@@ -186,7 +192,7 @@ class Optimisation:
         smoothing); 2 is the side of the box [-1, 1]^3, so that this is the distance between N_s even positions."""
         fine = self.step - self.config.coarse_steps
         left = max(0.0, 1 - fine / self.config.smoothing_steps)
-        return self.config.smoothing * 2 / len(self.position) ** (1 / 3) * left
+        return self.config.smoothing * 2 / math.cbrt(len(self.position)) * left
 
     def advance(self) -> float:
         """One step; its loss.
@@ -229,8 +235,7 @@ class Optimisation:
     @property
     def result(self) -> SwiftWRF:
         """The model with averaged parameters."""
-        result: SwiftWRF = self.average.module
-        return result
+        return cast(SwiftWRF, self.average.module)
 
     @torch.no_grad()
     def look(self) -> float | None:
@@ -244,7 +249,12 @@ class Optimisation:
         return sum(losses) / len(position)
 
     def run(
-        self, saved: State | None, path: Path | None, owner: str, bar: Progress, on_record: Callable[[Record], None] | None
+        self,
+        saved: State | None,
+        path: Path | None,
+        owner: str,
+        bar: Progress,
+        on_record: Callable[[Record], None] | None,
     ) -> None:
         """Goes on from `saved` where it is of this stage; keeps its state at `path` at each look."""
         if saved is not None and saved.stage == self.stage:
@@ -265,7 +275,13 @@ class Optimisation:
                 self._save(path, owner)
             if on_record is not None:
                 on_record(
-                    {"stage": self.stage, "step": self.step, "loss": loss, "validation": held_out, "seconds": self.seconds}
+                    {
+                        "stage": self.stage,
+                        "step": self.step,
+                        "loss": loss,
+                        "validation": held_out,
+                        "seconds": self.seconds,
+                    }
                 )
         bar.remove_task(task)
 

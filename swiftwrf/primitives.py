@@ -64,7 +64,7 @@ class Primitives(nn.Module):
         return torch.stack([diagonal[..., 0], cholesky[..., 1] * diagonal[..., 1], diagonal[..., 1]], dim=-1)
 
     def forward(self) -> Gaussians:
-        mean = self.mean
+        mean: Tensor = self.mean
         if self.bounded:
             mean = (torch.tanh(mean) + 1) * mean.new_tensor([math.pi, math.pi / 4])
         return Gaussians(mean, self.constrained(self.cholesky), torch.sigmoid(self.attenuation), self.response)

@@ -16,7 +16,9 @@ from torch import Tensor
 from swiftwrf.deformation import Kernel
 
 MIN_RANK, MAX_RANK = 24, 64
-EXPLAINED = 0.05  # least share of a component's variance that counts as predicted: half of pure noise exceeds 0 by chance
+EXPLAINED = (
+    0.05  # least share of a component's variance that counts as predicted: half of pure noise exceeds 0 by chance
+)
 MAX_ROWS = 400  # more do not change the choice, and a candidate costs their number cubed
 
 

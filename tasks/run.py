@@ -45,7 +45,9 @@ def command_line(
     try:
         if arguments and arguments[0] == "--resume":
             if len(arguments) != 2:
-                raise InputError("--resume takes one directory and no other option; the run's own configuration is used")
+                raise InputError(
+                    "--resume takes one directory and no other option; the run's own configuration is used"
+                )
             folder = Path(arguments[1])
             task(_saved_config(folder, config_type), folder)
         else:
@@ -124,7 +126,7 @@ class Run:
             taken = self.final if self.final.exists() else self.folder
             hint = "" if self.final.exists() else f" or go on with --resume {self.folder}"
             raise InputError(f"{taken} exists already and a run is never overwritten; choose another --out{hint}")
-        self._environment = _environment(device, source)
+        self._environment = environment(device, source)
         self.folder.mkdir(parents=True, exist_ok=True)
         (self.folder / "steps").mkdir(exist_ok=True)
         if resume is None:
@@ -199,7 +201,8 @@ def _strict(value: Any) -> Any:
     return value
 
 
-def _environment(device: torch.device, source: dict[str, str]) -> Row:
+def environment(device: torch.device, source: dict[str, str]) -> Row:
+    """Code, versions, machine and input of a run."""
     packages = ("torch", "torchvision", "numpy", "scipy", "scikit-learn", "numba")
     return {
         "commit": _commit(),

@@ -54,7 +54,9 @@ def test_what_comes_from_behind_is_folded_up():
 
 @given(ANGLE, st.floats(0.01, math.pi / 2 - 0.01))
 def test_angles_and_direction_are_inverse(azimuth, elevation):
-    a, e = to_angles(to_direction(torch.tensor(azimuth, dtype=torch.float64), torch.tensor(elevation, dtype=torch.float64)))
+    a, e = to_angles(
+        to_direction(torch.tensor(azimuth, dtype=torch.float64), torch.tensor(elevation, dtype=torch.float64))
+    )
     assert 0 <= a < 2 * math.pi
     assert abs(wrap(a - azimuth)) < 1e-9
     assert abs(e - elevation) < 1e-9
@@ -83,6 +85,8 @@ def test_pose_refuses_what_is_no_rotation():
 
 def test_pose_turned_a_quarter_sees_north_in_front():
     pose = ArrayPose((0.0, 0.0, 0.0), (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)))  # x axis of the array points north
-    angles = pose.line_of_sight(torch.tensor([[0.0, 5.0, 0.0]], dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    angles = pose.line_of_sight(
+        torch.tensor([[0.0, 5.0, 0.0]], dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    )
     torch.testing.assert_close(angles, torch.zeros(1, 2, dtype=torch.float64), atol=1e-12, rtol=0)
     torch.testing.assert_close(pose.rotation @ pose.rotation.T, torch.eye(3, dtype=torch.float64))

@@ -45,7 +45,9 @@ def test_peak_of_a_known_spectrum():
 
 
 def test_constant_is_the_mean_direction_over_the_seam():
-    train = Mixed(torch.zeros(2, 1, 1), torch.tensor([[350.0, 10], [10, 10]]).deg2rad(), torch.arange(2), torch.zeros(2).bool())
+    train = Mixed(
+        torch.zeros(2, 1, 1), torch.tensor([[350.0, 10], [10, 10]]).deg2rad(), torch.arange(2), torch.zeros(2).bool()
+    )
     constant = Constant()
     constant.fit(train)
     azimuth = constant.estimate(torch.zeros(3, 1, 1))[:, 0]
@@ -97,7 +99,12 @@ def test_whole_run(small, tmp_path):
     out = tmp_path / "run"
     assert run("--mix", 0.5, 1.0, "--synthesizer", "swiftwrf", "idw", "--repeats", 2, "--out", out) == 0
     metrics = json.loads((out / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(name))
-    assert (metrics["task"], metrics["data"], metrics["split"], metrics["seed"]) == ("aoa", "simulated-room", "random", 0)
+    assert (metrics["task"], metrics["data"], metrics["split"], metrics["seed"]) == (
+        "aoa",
+        "simulated-room",
+        "random",
+        0,
+    )
     methods = metrics["mixes"]["0.5"]["methods"]
     expected = {"measured_only", "turbo_swiftwrf", "turbo_idw", "measured_all", "constant", "nearest_spectrum", "peak"}
     assert set(methods) == expected
@@ -110,7 +117,7 @@ def test_whole_run(small, tmp_path):
     median = own.groupby("index").great_circle_deg.mean().median()
     assert methods["turbo_swiftwrf"]["great_circle_deg"]["median"] == pytest.approx(median)
     assert methods["turbo_swiftwrf"]["great_circle_deg"]["low"] <= median
-    truth = np.degrees(small.label[own["index"].to_numpy()].numpy())
+    truth = np.degrees(small.label[own["index"].tolist()].numpy())
     np.testing.assert_allclose(own[["truth_azimuth_deg", "truth_elevation_deg"]], truth, rtol=1e-9)
 
     html = (out / "report.html").read_text()
@@ -141,7 +148,9 @@ def test_interrupted_run_goes_on_to_the_same_numbers(small, tmp_path, monkeypatc
     assert not (tmp_path / "cut").exists()
     monkeypatch.setattr(AANN, "fit", honest)
     assert run("--resume", tmp_path / "cut.partial") == 0
-    whole, cut = (json.loads((tmp_path / name / "metrics.json").read_text())["mixes"]["0.5"] for name in ("whole", "cut"))
+    whole, cut = (
+        json.loads((tmp_path / name / "metrics.json").read_text())["mixes"]["0.5"] for name in ("whole", "cut")
+    )
     assert whole["methods"] == cut["methods"]
     assert whole["synthesis"] == cut["synthesis"]
 

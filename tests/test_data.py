@@ -66,7 +66,10 @@ WRONG = {
         "unit quaternion",
     ),
     "no gateway": (_write("gateway_info.yml", "name: x\n"), "one gateway"),
-    "short position": (_write("gateway_info.yml", "g:\n  position: [0, 0]\n  orientation: [0, 0, 0, 1]\n"), "3 numbers"),
+    "short position": (
+        _write("gateway_info.yml", "g:\n  position: [0, 0]\n  orientation: [0, 0, 0, 1]\n"),
+        "3 numbers",
+    ),
     "no positions": (lambda f: (f / "tx_pos.csv").unlink(), "one of tx_pos.csv"),
     "both ends move": (_write("rx_pos.csv", "x,y,z\n1,1,1\n"), "one of tx_pos.csv"),
     "header": (_write("tx_pos.csv", "a,b,c\n1,2,3\n"), "header x,y,z"),
@@ -79,7 +82,10 @@ WRONG = {
     "at the gateway": (_positions("0,0,0"), "equal to the gateway's"),
     "more positions than images": (_write("tx_pos.csv", "x,y,z\n" + "1,1,1\n" * 13), "12 images, but there are 13"),
     "no images": (lambda f: [p.unlink() for p in (f / "spectrum").iterdir()], "0 images"),
-    "a gap in the numbers": (lambda f: (f / "spectrum/00003.png").rename(f / "spectrum/00099.png"), "00003.png is missing"),
+    "a gap in the numbers": (
+        lambda f: (f / "spectrum/00003.png").rename(f / "spectrum/00099.png"),
+        "00003.png is missing",
+    ),
     "shape": (_image("00003.png", np.zeros((10, 30), np.uint8)), "10 x 30 pixels"),
     "another shape": (_image("00003.png", np.zeros((20, 80), np.uint8)), "must have one shape"),
     "colour": (_image("00003.png", np.zeros((10, 40, 3), np.uint8)), "mode RGB"),
@@ -206,7 +212,13 @@ def test_coarsen_averages(nerf2):
 
 @pytest.mark.parametrize(
     ("shape", "most", "rows", "factor"),
-    [((90, 360), 0, 1, 1), ((90, 360), 180, 7, 2), ((90, 360), 100, 7, 5), ((45, 180), 120, 1, 3), ((15, 60), 30, 7, 1)],
+    [
+        ((90, 360), 0, 1, 1),
+        ((90, 360), 180, 7, 2),
+        ((90, 360), 100, 7, 5),
+        ((45, 180), 120, 1, 3),
+        ((15, 60), 30, 7, 1),
+    ],
 )
 def test_coarsening_divides_both_sizes(shape, most, rows, factor):
     assert coarsening(shape, most, rows) == factor

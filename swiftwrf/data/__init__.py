@@ -18,7 +18,9 @@ def load_spectra(path: str | Path) -> Spectra:
     """
     folder = Path(path)
     if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder; expected one with gateway_info.yml and spectrum/, or with paths.npz")
+        raise InputError(
+            f"{folder} is not a folder; expected one with gateway_info.yml and spectrum/, or with paths.npz"
+        )
     return load_paths(folder) if (folder / "paths.npz").is_file() else load_nerf2(folder)
 
 

@@ -98,7 +98,7 @@ def _read_image(file: Path) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
             if image.mode != "L":
                 raise InputError(f"{file} has mode {image.mode}; a spectrum is an 8-bit grey image")
             rows, columns = image.height, image.width
-            if not (2 <= rows and columns == 4 * rows):
+            if not (rows >= 2 and columns == 4 * rows):
                 raise InputError(
                     f"{file} has {rows} x {columns} pixels; a spectrum has 4 columns a row "
                     "(elevations to 90, azimuths to 360 degrees), e.g. 90 x 360"

@@ -18,7 +18,15 @@ from swiftwrf.errors import InputError
 
 ARRAY_SIDE = 4
 GRID = AngularGrid.hemisphere(90, 360)
-NAMES = ("transmitter_position", "receiver_position", "path_count", "last_point", "gain", "line_of_sight", "frequency_hz")
+NAMES = (
+    "transmitter_position",
+    "receiver_position",
+    "path_count",
+    "last_point",
+    "gain",
+    "line_of_sight",
+    "frequency_hz",
+)
 
 
 def load_paths(folder: Path) -> Spectra:

@@ -100,10 +100,12 @@ class Room:
         return blocked
 
 
-def _mirrored_rooms() -> list[tuple[int, int, int]]:
+def _mirrored_rooms() -> list[tuple[int, ...]]:
     """Mirrored rooms reached by at most two reflections, the room itself first."""
     steps = range(-MAX_ORDER, MAX_ORDER + 1)
-    return sorted((r for r in itertools.product(steps, repeat=3) if sum(map(abs, r)) <= MAX_ORDER), key=lambda r: sum(map(abs, r)))
+    return sorted(
+        (r for r in itertools.product(steps, repeat=3) if sum(map(abs, r)) <= MAX_ORDER), key=lambda r: sum(map(abs, r))
+    )
 
 
 def _fold(point: Tensor, size: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Which measurements train a model and which test it: named splits from files, seeded random and spatially blocked ones."""
+"""Which measurements train a model and which test it: named splits from files, seeded random and blocked ones."""
 
 from __future__ import annotations
 
@@ -55,7 +55,9 @@ def _read_indices(file: Path, n: int, first: int) -> list[int]:
         except ValueError:
             raise InputError(f"{file} entry {line} is {text!r}; expected a whole number") from None
         if not 0 <= row < n:
-            raise InputError(f"{file} entry {line} is {text}; expected {first} to {n - 1 + first}, the measurements there are")
+            raise InputError(
+                f"{file} entry {line} is {text}; expected {first} to {n - 1 + first}, the measurements there are"
+            )
         if row in seen:
             raise InputError(f"{file} lists index {text} twice; each measurement belongs to a part once")
         seen.add(row)
@@ -78,7 +80,8 @@ def slabs(position: Tensor, n_slabs: int) -> Tensor:
     centred = position.double() - position.double().mean(dim=0)
     direction = torch.linalg.svd(centred, full_matrices=False).Vh[0]
     rank = (centred @ direction).argsort(stable=True).argsort()
-    return rank * n_slabs // len(position)
+    slab: Tensor = rank * n_slabs // len(position)
+    return slab
 
 
 def block_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:
@@ -103,7 +106,9 @@ def choose_split(
     elif name == "block":
         train, test = block_split(position, seed)
     else:
-        raise InputError(f"{data} has no split {name!r}; choose one of {', '.join(sorted({*named, 'random', 'block'}))}")
+        raise InputError(
+            f"{data} has no split {name!r}; choose one of {', '.join(sorted({*named, 'random', 'block'}))}"
+        )
     if len(train) < MIN_TRAINING:
         raise InputError(
             f"split {name!r} of {data} has {len(train)} training measurements, too few to fit anything; "

@@ -4,7 +4,6 @@
 |-------------|------------------------------|-----------------------------------------------------------------|
 | `reference` | any device, float32, float64 | the definition, dense                                           |
 | `cpu`       | CPU, float32                 | culled rows, compiled by numba at first use                     |
-| `cuda`      | NVIDIA GPU, float32          | gather kernels, compiled at first use by the NVRTC in torch     |
 | `auto`      |                              | the fast one for the tensors' device and dtype, else `reference`|
 """
 
@@ -19,7 +18,7 @@ from swiftwrf.angles import AngularGrid
 from swiftwrf.errors import InputError
 from swiftwrf.rasterize import reference
 
-Maker = Literal["auto", "reference", "cpu", "cuda"]
+Maker = Literal["auto", "reference", "cpu"]
 
 
 def rasterize(
@@ -61,14 +60,9 @@ def rasterize(
     flat_mean, flat_weight = (x.reshape(batch.numel(), n, 2) for x in (mean, weight))
     if cholesky.dim() > 2:
         cholesky = cholesky.reshape(batch.numel(), n, 3)
-    if chosen == "cpu":
-        from swiftwrf.rasterize import cpu  # numba is imported by those who use it
+    from swiftwrf.rasterize import cpu  # numba is imported by those who use it
 
-        drawn = cpu.rasterize(flat_mean, cholesky, flat_weight, grid, cutoff)
-    else:
-        from swiftwrf.rasterize import cuda
-
-        drawn = cuda.rasterize(flat_mean, cholesky, flat_weight, grid, cutoff)
+    drawn = cpu.rasterize(flat_mean, cholesky, flat_weight, grid, cutoff)
     return drawn.reshape(*batch, 2, *grid.shape)
 
 
@@ -76,7 +70,7 @@ def _choose(maker: Maker, mean: Tensor) -> str:
     if maker not in get_args(Maker):
         raise InputError(f"unknown maker {maker!r}; choose one of {', '.join(get_args(Maker))}")
     if maker == "auto":
-        return mean.device.type if mean.dtype == torch.float32 and mean.device.type in ("cpu", "cuda") else "reference"
+        return "cpu" if mean.dtype == torch.float32 and mean.device.type == "cpu" else "reference"
     if maker != "reference" and (mean.device.type != maker or mean.dtype != torch.float32):
         raise InputError(
             f"maker {maker!r} draws float32 tensors on {maker}, got {mean.dtype} on {mean.device}; "
@@ -108,7 +102,9 @@ def _check(mean: Tensor, cholesky: Tensor, weight: Tensor, cutoff: float | None)
             if not torch.isfinite(tensor).all():
                 raise InputError(f"{name} holds a value that is not finite; a primitive there would silently vanish")
         if n and bool((cholesky[..., ::2] == 0).any()):
-            raise InputError("a Cholesky factor has a zero on its diagonal (a primitive of no width); keep l1 and l3 off 0")
+            raise InputError(
+                "a Cholesky factor has a zero on its diagonal (a primitive of no width); keep l1 and l3 off 0"
+            )
 
 
 __all__ = ["Maker", "rasterize"]

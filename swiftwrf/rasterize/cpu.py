@@ -7,7 +7,7 @@ bands of rows (forward) or blocks of primitives (backward); no sum depends on ho
 for any number of threads and any batch size.
 """
 
-# mypy: disable-error-code="no-untyped-def, no-untyped-call, misc"
+# mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, call-arg, no-any-return"
 # (the jitted functions take NumPy arrays and scalars; numba types them itself)
 
 from __future__ import annotations
@@ -189,9 +189,7 @@ def _rasterize_backward(
     threads = numba.get_num_threads()
     block = max(1, mean.shape[1] if mean.shape[0] >= threads else -(-mean.shape[1] // threads))
     arguments = _arguments(mean, cholesky, weight, cutoff)
-    _draw_backward(
-        grad.contiguous().numpy(), *arguments, block, d_mean.numpy(), d_cholesky.numpy(), d_weight.numpy()
-    )
+    _draw_backward(grad.contiguous().numpy(), *arguments, block, d_mean.numpy(), d_cholesky.numpy(), d_weight.numpy())
     return d_mean, d_cholesky if cholesky.dim() == 3 else d_cholesky.sum(0), d_weight
 
 

@@ -1,4 +1,4 @@
-"""The definition of the rasterizer: dense, plain torch, any device and floating dtype. Every fast maker is tested against it.
+"""The definition of the rasterizer, against which every fast maker is tested: dense, plain torch, any device and dtype.
 
     A(az, el) = sum_n weight_n exp(-1/2 |L_n^-1 d_n|^2),    d_n = (az - az_n wrapped to [-pi, pi], el - el_n)
 

@@ -8,9 +8,8 @@ labels' spread, so that training starts from the constant estimator.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 import torchvision
@@ -50,19 +49,20 @@ class _CircularConv(nn.Module):
 
     def __init__(self, inner: nn.Conv2d) -> None:
         super().__init__()
-        rows, self.columns = inner.padding  # type: ignore[assignment]
-        inner.padding = (rows, 0)
+        self.columns = inner.kernel_size[1] // 2
+        inner.padding = (inner.kernel_size[0] // 2, 0)
         self.inner = inner
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.inner(functional.pad(x, (self.columns, self.columns, 0, 0), mode="circular"))  # type: ignore[no-any-return]
+        wrapped = functional.pad(x, (self.columns, self.columns, 0, 0), mode="circular")
+        return cast(Tensor, self.inner(wrapped))
 
 
 def _backbone(circular: bool) -> nn.Module:
-    network = torchvision.models.resnet50(weights=None)
+    network: nn.Module = torchvision.models.resnet50(weights=None)
     network.conv1 = nn.Conv2d(1, 64, kernel_size=7, stride=2, padding=3, bias=False)
-    network.fc = nn.Sequential(nn.Linear(2048, 256), nn.ReLU(), nn.Linear(256, 3))
-    last = network.fc[-1]
+    last = nn.Linear(256, 3)
+    network.fc = nn.Sequential(nn.Linear(2048, 256), nn.ReLU(), last)
     nn.init.zeros_(last.weight)
     nn.init.zeros_(last.bias)
     if circular:
@@ -80,7 +80,6 @@ class AANN:
         config: how it is trained.
         seed: of weights and batches.
         device: where it is trained.
-        on_record: called with step, loss and seconds as training goes on.
     """
 
     def __init__(
@@ -88,13 +87,13 @@ class AANN:
         config: AANNConfig,
         seed: int,
         device: torch.device,
-        on_record: Callable[[dict[str, Any]], None] | None = None,
     ) -> None:
-        self._config, self._device, self._on_record = config, device, on_record
+        self._config, self._device = config, device
+        self.history: list[dict[str, Any]] = []  # step, loss and seconds as training goes on
         with torch.random.fork_rng(devices=[]):  # torchvision draws its weights from the global generator
             torch.manual_seed(seed)
             network = _backbone(config.circular)
-        self._network = network.to(device, memory_format=torch.channels_last)
+        self._network = network.to(device).to(memory_format=torch.channels_last)
         self._generator = torch.Generator().manual_seed(seed)
         self._autocast = torch.autocast(device.type, torch.bfloat16, enabled=_gains_from_bfloat16(device))
 
@@ -125,8 +124,8 @@ class AANN:
                 nn.utils.clip_grad_norm_(network.parameters(), 1.0)
                 optimiser.step()
                 schedule.step()
-                if self._on_record is not None and (step % 10 == 0 or step == config.steps):
-                    self._on_record({"step": step, "loss": loss.item(), "seconds": time.perf_counter() - began})
+                if step % 10 == 0 or step == config.steps:
+                    self.history.append({"step": step, "loss": loss.item(), "seconds": time.perf_counter() - began})
 
         # a short training leaves the batch norms' running statistics behind the weights, so they are taken anew
         with self._autocast:
@@ -148,5 +147,5 @@ class AANN:
 def _gains_from_bfloat16(device: torch.device) -> bool:
     """GPUs do, and CPUs that multiply in it: three times faster there, slower elsewhere."""
     if device.type == "cuda":
-        return torch.cuda.is_bf16_supported()
+        return bool(torch.cuda.is_bf16_supported())
     return bool(torch.cpu._is_avx512_bf16_supported())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -101,7 +100,9 @@ def _check(config: AoaConfig) -> None:
     if unknown:
         raise InputError(f"unknown synthesizer {unknown[0]!r}; choose from {', '.join(SYNTHESIZERS)}")
     if not config.mix or not all(0 < share <= 1 for share in config.mix):
-        raise InputError(f"--mix takes measured shares in (0, 1], got {' '.join(f'{s:g}' for s in config.mix) or 'none'}")
+        raise InputError(
+            f"--mix takes measured shares in (0, 1], got {' '.join(f'{s:g}' for s in config.mix) or 'none'}"
+        )
     if len(set(config.mix)) < len(config.mix):
         raise InputError(f"--mix names a share twice: {' '.join(f'{s:g}' for s in config.mix)}")
     if config.repeats < 1:
@@ -126,31 +127,35 @@ class _Experiment:
         few = Mixed.measured(measured)
         at = {"mix": share, "repeat": repeat}
         suffix = f"mix{share:g}-r{repeat}"
-        baselines = {"peak": Peak(self.train.grid), "constant": Constant(), "nearest_spectrum": NearestSpectrum()}
+        baselines: dict[str, Estimator] = {
+            "peak": Peak(self.train.grid),
+            "constant": Constant(),
+            "nearest_spectrum": NearestSpectrum(),
+        }
         for name, baseline in baselines.items():
-            self._arm(at | {"method": name}, f"{name}-{suffix}", few, lambda _, baseline=baseline: baseline)
+            self._arm(at | {"method": name}, f"{name}-{suffix}", few, baseline)
         self._arm(at | {"method": "measured_only"}, f"measured_only-{suffix}", few, self._network(repeat))
         for name in dict.fromkeys((*self.config.synthesizer, *COMPARED)):
             mixed = self._synthesize(at | {"synthesizer": name}, f"synthesis_{name}-{suffix}", measured, withheld)
             if name in self.config.synthesizer:
                 self._arm(at | {"method": f"turbo_{name}"}, f"turbo_{name}-{suffix}", mixed, self._network(repeat))
         # the same whatever the share, so its step is shared by all of them
-        self._arm(at | {"method": "measured_all"}, f"measured_all-r{repeat}", Mixed.measured(self.train), self._network(repeat))
+        self._arm(
+            at | {"method": "measured_all"},
+            f"measured_all-r{repeat}",
+            Mixed.measured(self.train),
+            self._network(repeat),
+        )
 
-    def _network(self, repeat: int) -> Callable[[list[Row]], Estimator]:
-        def make(history: list[Row]) -> Estimator:
-            return AANN(self.aann_config, self.config.seed + repeat, self.device, history.append)
+    def _network(self, repeat: int) -> AANN:
+        return AANN(self.aann_config, self.config.seed + repeat, self.device)
 
-        return make
-
-    def _arm(self, arm: Row, step: str, train: Mixed, make: Callable[[list[Row]], Estimator]) -> None:
+    def _arm(self, arm: Row, step: str, train: Mixed, estimator: Estimator) -> None:
         """Trains one estimator and tests it."""
 
         def compute() -> Row:
-            history: list[Row] = []
-            estimator = make(history)
             estimator.fit(train)
-            return {"estimate": estimator.estimate(self.test.spectrum), "history": history}
+            return {"estimate": estimator.estimate(self.test.spectrum), "history": getattr(estimator, "history", [])}
 
         done = self.directory.step(step, compute)
         estimate = torch.tensor(done["value"]["estimate"], dtype=torch.float64)

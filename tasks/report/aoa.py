@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from tasks.report import figures
 from tasks.report.page import Page, Plot, Section, Table
@@ -49,8 +48,9 @@ def _lead(run: Records, share: str, mix: dict[str, Any]) -> str:
     gain = "lowers" if median[turbo] < median["measured_only"] else "does not lower"
     best = min(("constant", "nearest_spectrum", "peak"), key=lambda name: median[name])
     return (
-        f"On {_scene(run)}, with {mix['n_measured']} of {run.metrics['n_train']} training spectra measured ({float(share):.0%}), "
-        f"turbo learning with {turbo.removeprefix('turbo_')} {gain} the network's median great-circle error: "
+        f"On {_scene(run)}, with {mix['n_measured']} of {run.metrics['n_train']} training spectra measured "
+        f"({float(share):.0%}), turbo learning with {turbo.removeprefix('turbo_')} {gain} the network's median "
+        f"great-circle error: "
         f"{median[turbo]:.2f} degrees against {median['measured_only']:.2f} without synthetic spectra and "
         f"{median['measured_all']:.2f} with all of them measured. The best baseline without a network, {best}, "
         f"reaches {median[best]:.2f}. {run.metrics['n_test']} test spectra."
@@ -67,7 +67,7 @@ def _results(run: Records, share: str, mix: dict[str, Any], several: bool) -> Se
     strong = frozenset(name for name in mix["methods"] if name.startswith("turbo"))
     paragraphs = [
         "; ".join(f"{name}: {text}" for name, text in MEANING.items())
-        + ". turbo_NAME: the network trained on the measured share and on spectra synthesized by NAME at the other positions."
+        + ". turbo_NAME: the network trained on the measured share and on spectra that NAME synthesized at the others."
     ]
     if share in PAPER:
         elevation, azimuth = PAPER[share]
@@ -89,11 +89,11 @@ def _cdf(run: Records, share: str) -> Plot:
     figure, axes = figures.new_figure(1, 3, 10, 3.3)
     for ax, (column, name) in zip(axes, ERRORS.items(), strict=True):
         groups = {str(method): part[column] for method, part in own.groupby("method", sort=False)}
-        shown = [part.quantile(0.95) for method, part in groups.items() if method != "peak"]
+        shown = [float(np.quantile(part, 0.95)) for method, part in groups.items() if method != "peak"]
         figures.cdf(ax, groups, f"{name} error [deg]", limit=max(*shown, 1e-3))
     axes[1].set_ylabel("")
     axes[2].set_ylabel("")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
+    figures.legend_below(figure, axes[0])
     scene = _file_name(run, share)
     return Plot(f"cdf-{scene}", figure, "Distribution of the errors; full lines are networks, dashed ones baselines.")
 
@@ -106,7 +106,10 @@ def _over_shares(shares: list[tuple[Records, str, dict[str, Any]]]) -> Section:
     names = list(dict.fromkeys(name for _, _, mix in shares for name in mix["methods"] if name != "peak"))
     labels = [f"{float(share):.0%}" for _, share, _ in shares]
     if len({_scene(run) for run, _, _ in shares}) > 1:
-        labels = [f"{label}\n{run.metrics['data']}\n{run.metrics['split']}" for label, (run, _, _) in zip(labels, shares, strict=True)]
+        labels = [
+            f"{label}\n{run.metrics['data']}\n{run.metrics['split']}"
+            for label, (run, _, _) in zip(labels, shares, strict=True)
+        ]
     missing = (np.nan, np.nan, np.nan)
     heights = {
         name: [
@@ -119,21 +122,18 @@ def _over_shares(shares: list[tuple[Records, str, dict[str, Any]]]) -> Section:
     }
     figure, axes = figures.new_figure(1, 1, 8, 3.4)
     figures.bars(axes[0], labels, heights, "median great-circle error [deg]")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
+    figures.legend_below(figure, axes[0])
     return Section("Error against the measured share", plots=[Plot("shares", figure, "Whiskers: 95 % intervals.")])
 
 
 def _synthesis(shares: list[tuple[Records, str, dict[str, Any]]], several: bool) -> Section:
-    rows = [
-        [
-            f"{float(share):.0%} {name}" + (f", {_scene(run)}" if several else ""),
-            number(scores["ssim"]["median"], 3),
-            f"{number(scores['psnr_db']['median'], 1)} [{number(scores['psnr_db']['low'], 1)}, {number(scores['psnr_db']['high'], 1)}]",
-            number(scores["l1"]["mean"], 4),
-        ]
-        for run, share, mix in shares
-        for name, scores in mix["synthesis"].items()
-    ]
+    rows = []
+    for run, share, mix in shares:
+        for name, scores in mix["synthesis"].items():
+            what = f"{float(share):.0%} {name}" + (f", {_scene(run)}" if several else "")
+            db = scores["psnr_db"]
+            interval = f"{number(db['median'], 1)} [{number(db['low'], 1)}, {number(db['high'], 1)}]"
+            rows.append([what, number(scores["ssim"]["median"], 3), interval, number(scores["l1"]["mean"], 4)])
     caption = (
         "SSIM: scikit-image's default (7 x 7 uniform window, data range 1), median; PSNR: 10 log10(1 / MSE), median with "
         "its 95 % interval; L1: mean. Over the test spectra, which no synthesizer saw."
@@ -147,7 +147,7 @@ def _examples(run: Records, share: str) -> Section:
         example = dict(file)
     captions = [f"no. {i + 1}\n{db:.1f} dB" for i, db in zip(example["index"], example["psnr_db"], strict=True)]
     figure = figures.spectra(example["measured"] / 255.0, example["synthetic"] / 255.0, captions)
-    text = "From the best to the worst of the test spectra by PSNR (quantiles 1, 0.8, ..., 0); azimuth and elevation in degrees."
+    text = "From the best to the worst of the test spectra by PSNR (quantiles 1, 0.8, ..., 0); angles in degrees."
     return Section(
         f"Six spectra at positions nobody measured ({float(share):.0%} measured)",
         plots=[Plot(f"spectra-{_file_name(run, share)}", figure, text)],
@@ -162,25 +162,28 @@ def _training(runs: list[Records]) -> Section:
         figure, axes = figures.new_figure(1, 2, 9, 3)
         networks = {str(name): (part["step"], part["loss"]) for name, part in history.groupby("method", sort=False)}
         figures.curves(axes[0], networks, "step", "loss of the network")
-        axes[0].legend(fontsize=7)
-        fits = history[history["synthesizer"] == "swiftwrf"] if "synthesizer" in history else pd.DataFrame()
+        fits = history[history["synthesizer"] == "swiftwrf"] if "stage" in history else history.iloc[:0]
+        lines = {
+            f"{stage}: training": (part["step"], part["loss"]) for stage, part in fits.groupby("stage", sort=False)
+        }
         if len(fits):
-            for stage, part in fits.groupby("stage", sort=False):
-                axes[1].plot(part["step"], part["loss"], label=f"{stage}: training", linewidth=1)
             search = fits[fits["stage"] == "search"]
-            axes[1].plot(search["step"], search["validation"], label="search: held-out", linewidth=1.4)
-            axes[1].set(xlabel="step", ylabel="loss of SwiftWRF", yscale="log")
-            axes[1].legend(fontsize=7)
-        else:
-            axes[1].set_visible(False)
-        caption = f"{_scene(run)}, first share and repeat. The final fit stops where the search saw the best held-out loss."
+            lines["search: held-out"] = (search["step"], search["validation"])
+        figures.curves(axes[1], lines, "step", "loss of SwiftWRF")
+        axes[1].set_visible(bool(lines))
+        caption = (
+            f"{_scene(run)}, first share and repeat. The final fit stops where the search saw the best held-out loss."
+        )
         plots.append(Plot(f"training-{_file_name(run, next(iter(run.metrics['mixes'])))}", figure, caption))
     return Section("Training", plots=plots)
 
 
 def _time(shares: list[tuple[Records, str, dict[str, Any]]], several: bool) -> Section:
     rows = [
-        [f"{float(share):.0%}" + (f", {_scene(run)}" if several else ""), *(number(mix["seconds"][k], 1) for k in ("fit", "synthesize", "train"))]
+        [
+            f"{float(share):.0%}" + (f", {_scene(run)}" if several else ""),
+            *(number(mix["seconds"][k], 1) for k in ("fit", "synthesize", "train")),
+        ]
         for run, share, mix in shares
     ]
     caption = "Seconds on the machine named below; train: the networks of all arms together."
@@ -189,12 +192,12 @@ def _time(shares: list[tuple[Records, str, dict[str, Any]]], several: bool) -> S
 
 def _limits(run: Records) -> Section:
     texts = [
-        "The test positions lie in the region and time of one measurement campaign; nothing here says how the network does in "
-        "another room, after furniture moved, or with another array.",
+        "The test positions lie in the region and time of one measurement campaign; nothing here says how the network does "
+        "in another room, after furniture moved, or with another array.",
         "The label is the geometric direction of the transmitter, computed from positions; where the direct path is blocked "
         "the spectrum may not contain it.",
-        "Intervals treat test spectra as independent draws. Along a measured path they are not, so on such data the intervals "
-        "are too narrow.",
+        "Intervals treat test spectra as independent draws. Along a measured path they are not, so on such data the "
+        "intervals are too narrow.",
     ]
     if run.metrics["split"] == "random":
         texts.append(
@@ -202,5 +205,7 @@ def _limits(run: Records) -> Section:
             "millimetres away. Use --split block for positions in a region without measurements."
         )
     if run.metrics["data"] == "simulated-room":
-        texts.append("These spectra are simulated: image sources in an idealised room. They show that the software works, no more.")
+        texts.append(
+            "These spectra are simulated: image sources in an idealised room. They show that the software works, no more."
+        )
     return Section("What this does not show", texts)

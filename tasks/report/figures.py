@@ -6,7 +6,7 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib
+import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -21,8 +21,6 @@ STYLE: dict[str, Any] = {
     "axes.grid": True,
     "grid.color": "#e4e8ef",
     "axes.axisbelow": True,
-    "legend.frameon": False,
-    "figure.constrained_layout.use": True,
 }
 # colour-blind safe (P. Tol, "bright"); bounds and baselines are grey, so that what the product adds stands out
 COLOURS = {
@@ -31,6 +29,9 @@ COLOURS = {
     "turbo_swiftwrf": "#4477aa",
     "turbo_nearest": "#ccbb44",
     "turbo_idw": "#66ccee",
+    "search: training": "#99bbdd",
+    "search: held-out": "#4477aa",
+    "final: training": "#ee8866",
     "turbo_gp": "#aa3377",
     "swiftwrf": "#4477aa",
     "peak": "#bbbbbb",
@@ -47,7 +48,7 @@ def colour(name: str) -> str:
 
 def new_figure(rows: int, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
     """A figure of width x height inches in the house style, and its axes row by row."""
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.style.context(STYLE):
         figure = Figure(figsize=(width, height), layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False)
     return figure, list(axes.flat)
@@ -56,9 +57,14 @@ def new_figure(rows: int, columns: int, width: float, height: float) -> tuple[Fi
 def as_svg(figure: Figure) -> str:
     """The figure as SVG without date or random names."""
     stream = io.StringIO()
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.style.context(STYLE):
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
     return stream.getvalue()
+
+
+def legend_below(figure: Figure, axes: Axes) -> None:
+    """One legend for all axes, from the entries of one of them."""
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
 
 
 def cdf(axes: Axes, errors: Mapping[str, ArrayLike], label: str, limit: float | None = None) -> None:
@@ -91,8 +97,16 @@ def spectra(measured: NDArray[Any], synthetic: NDArray[Any], captions: Sequence[
         pair = (measured[row], synthetic[row], synthetic[row] - measured[row])
         for column, image in enumerate(pair):
             ax = axes[3 * row + column]
-            style = {"cmap": "RdBu_r", "vmin": -1, "vmax": 1} if column == 2 else {"cmap": "viridis", "vmin": 0, "vmax": 1}
-            drawn = ax.imshow(image, origin="lower", extent=(0, 360, 0, 90), aspect="auto", interpolation="nearest", **style)
+            drawn = ax.imshow(
+                image,
+                origin="lower",
+                extent=(0, 360, 0, 90),
+                aspect="auto",
+                interpolation="nearest",
+                cmap="viridis" if column < 2 else "RdBu_r",
+                vmin=0 if column < 2 else -1,
+                vmax=1,
+            )
             ax.set(yticks=(0, 90), xticks=(0, 180, 360) if row == len(captions) - 1 else ())
             ax.grid(visible=False)
             if row == 0:
@@ -109,3 +123,4 @@ def curves(axes: Axes, lines: Mapping[str, tuple[ArrayLike, ArrayLike]], x: str,
     for name, (xs, ys) in lines.items():
         axes.plot(np.asarray(xs), np.asarray(ys), label=name, color=colour(name), linewidth=1.2)
     axes.set(xlabel=x, ylabel=y, yscale="log")
+    axes.legend(fontsize=7, frameon=False)

@@ -58,6 +58,8 @@ def write_page(folder: Path, page: Page) -> None:
             svg = as_svg(plot.figure)
             (figures / f"{plot.name}.svg").write_text(svg)
             inlined[plot.name] = Markup(svg[svg.index("<svg") :])  # our own drawing; its texts are escaped in it
-    environment = Environment(loader=PackageLoader("tasks.report", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(
+        loader=PackageLoader("tasks.report", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
     html = environment.get_template("template.html").render(page=page, svg=inlined)
     (folder / "report.html").write_text(html)

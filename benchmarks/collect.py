@@ -1,0 +1,22 @@
+"""Keeps the metrics of a finished run: python benchmarks/collect.py RUN NAME."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+from tasks.report.records import Records
+
+
+def collect(folder: Path, name: str) -> None:
+    """Writes the run's command, environment and metrics to `results/NAME.json`."""
+    run = Records(folder)
+    content = {"command": run.config["command"], "environment": run.environment, "metrics": run.metrics}
+    file = Path(__file__).parent / "results" / f"{name}.json"
+    file.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+    print(f"wrote {file}")
+
+
+if __name__ == "__main__":
+    collect(Path(sys.argv[1]), sys.argv[2])

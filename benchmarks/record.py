@@ -1,0 +1,25 @@
+"""What every benchmark's result says beside its numbers."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from tasks.run import environment
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def write_result(name: str, content: dict[str, Any]) -> None:
+    """Writes `results/NAME.json`: strict JSON with the command and where it ran."""
+    RESULTS.mkdir(exist_ok=True)
+    command = shlex.join(["python", *(Path(a).name if Path(a).exists() else a for a in sys.argv)])
+    record = {"command": command, "environment": environment(torch.device("cpu"), {}), **content}
+    file = RESULTS / f"{name}.json"
+    file.write_text(json.dumps(record, indent=1, allow_nan=False) + "\n")
+    print(f"wrote {file}")

@@ -1,0 +1,70 @@
+"""How well each synthesizer draws spectra at positions that it has not seen, and how long it takes."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from record import write_result
+
+from augment import make_synthesizer
+from swiftwrf import Spectra, load_spectra, simulated_room
+from swiftwrf.metrics import l1, psnr, ssim, summary
+
+SCENES = (("s23-200", "random"), ("s23-200", "block"), ("newrf-bedroom", "random"), ("newrf-office", "random"))
+
+
+@dataclass(frozen=True)
+class Config:
+    data: Path
+    """the folder that holds s23-200, newrf-bedroom and newrf-office"""
+    scenes: tuple[str, ...] = ()
+    """only these data sets"""
+    seed: int = 0
+
+
+def main(config: Config) -> None:
+    """Measures every synthesizer on every scene."""
+    scenes = [(name, split) for name, split in SCENES if not config.scenes or name in config.scenes]
+    results = {
+        f"{name} {split}": measure(load_spectra(config.data / name), split, config.seed) for name, split in scenes
+    }
+    if not config.scenes:
+        results["simulated-room random"] = measure(simulated_room(), "random", config.seed)
+    write_result("synthesis", {"seed": config.seed, "scenes": results})
+
+
+def measure(data: Spectra, split: str, seed: int) -> dict[str, Any]:
+    """Scores of each synthesizer, and of the mean training spectrum, at the test positions."""
+    train, test = data.split(split, seed)
+    drawn = {"mean": train.spectrum.mean(dim=0).expand_as(test.spectrum)}
+    seconds: dict[str, dict[str, float]] = {}
+    for name in ("nearest", "idw", "gp", "swiftwrf"):
+        synthesizer = make_synthesizer(name, validation="block" if split == "block" else "random", seed=seed)
+        began = time.perf_counter()
+        synthesizer.fit(train)
+        fitted = time.perf_counter()
+        drawn[name] = synthesizer.synthesize(test.position)
+        seconds[name] = {"fit": fitted - began, "synthesize": time.perf_counter() - fitted}
+    scores = {
+        name: {
+            "ssim": summary(ssim(spectrum, test.spectrum)),
+            "psnr_db": summary(psnr(spectrum, test.spectrum)),
+            "l1": summary(l1(spectrum, test.spectrum)),
+            "seconds": seconds.get(name),
+        }
+        for name, spectrum in drawn.items()
+    }
+    for name, score in scores.items():
+        print(
+            f"{data.name} {split} {name}: SSIM {score['ssim']['median']:.4f} PSNR {score['psnr_db']['median']:.2f}",
+            flush=True,
+        )
+    return {"n_train": len(train), "n_test": len(test), "grid": data.grid.shape, "synthesizers": scores}
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

@@ -1,0 +1,1 @@
+"""RSSI at receivers, from positions."""
