@@ -5,17 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from swiftwrf import FitConfig, InputError, Spectra, SwiftWRF, fit
 from swiftwrf.deformation import Kernel
-from swiftwrf.fit import folds
+from swiftwrf.fit import Validation, folds
 from swiftwrf.prior import choose_kernel
 
-Validation = Literal["random", "block"]
 
 
 class Synthesizer(Protocol):

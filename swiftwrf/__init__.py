@@ -7,7 +7,7 @@ spectrum = model.synthesize(test.position)
 """
 
 from swiftwrf.angles import AngularGrid, ArrayPose
-from swiftwrf.data import Spectra, load_spectra
+from swiftwrf.data import Rssi, Spectra, load_rssi, load_spectra
 from swiftwrf.data.room import simulated_room
 from swiftwrf.errors import FitError, InputError
 from swiftwrf.fit import FitConfig, fit
@@ -21,10 +21,12 @@ __all__ = [
     "FitError",
     "InputError",
     "ModelConfig",
+    "Rssi",
     "Spectra",
     "SwiftWRF",
     "fit",
     "load",
+    "load_rssi",
     "load_spectra",
     "rasterize",
     "simulated_room",

@@ -113,53 +113,61 @@ class Kernel:
         return self.share * torch.exp(-r / self.long) + (1 - self.share) * (1 + near) * torch.exp(-near)
 
 
-class MotionBasis(nn.Module):
-    """Low-rank motion: all primitives move by one basis, whose K coefficients are a smooth random function of position.
+class SmoothField(nn.Module):
+    """K smooth random functions of position, c(s) = k(s, Z) R^-T z with anchors Z and k(Z, Z) + noise = R R^T.
 
-    The coefficients have a Gaussian-process prior: c(s) = k(s, Z) R^-T z with the training positions as anchors Z,
-    k(Z, Z) + noise = R R^T and z standard normal under the prior, so that a small |z|^2 is a smooth motion. Near measured
-    positions the model follows them; far from all of them it falls back to the canonical primitives, instead of
-    extrapolating. One small matrix product a position, whatever the number of primitives.
+    Under the Gaussian-process prior z is standard normal, so that a small |z|^2 is a smooth function. Near the anchors the
+    functions follow them; far from all of them they fall back to 0 instead of extrapolating.
 
     Args:
         anchor: Z, normalised positions (M, 3).
         kernel: k, on normalised positions.
         rank: K.
-        n: number of primitives.
     """
 
-    def __init__(
-        self,
-        anchor: Tensor,
-        kernel: Kernel,
-        rank: int,
-        n: int,
-        components: tuple[str, ...],
-        *,
-        generator: torch.Generator,
-    ) -> None:
+    def __init__(self, anchor: Tensor, kernel: Kernel, rank: int) -> None:
         super().__init__()
-        self.components = components
         self.kernel = kernel
-        size = sum(COMPONENTS[c] for c in components)
         self.register_buffer("anchor", anchor)
         gram = kernel(anchor.double(), anchor.double()) + kernel.noise * torch.eye(len(anchor), dtype=torch.float64)
         inverse = torch.linalg.inv(torch.linalg.cholesky(gram))  # of R; in float64, for nearby anchors are nearly alike
         self.register_buffer("whiten", inverse.T.to(anchor))
         self.coefficient = nn.Parameter(torch.zeros(len(anchor), rank))
-        self.basis = nn.Parameter(0.1 / math.sqrt(rank) * torch.randn(rank, n, size, generator=generator))
 
     anchor: Tensor
     whiten: Tensor
 
-    def coefficients(self, position: Tensor) -> Tensor:
+    def forward(self, position: Tensor) -> Tensor:
         """c(s) at positions (B, 3), (B, K)."""
-        return self.kernel(position, self.anchor) @ self.whiten @ self.coefficient
+        return self.kernel(position, self.anchor) @ (self.whiten @ self.coefficient)
+
+    def prior(self) -> Tensor:
+        """|z|^2, the negative log prior up to a factor 1/2."""
+        return self.coefficient.square().sum()
+
+
+class MotionBasis(nn.Module):
+    """Low-rank motion: all primitives move by one basis, mixed by smooth functions of position.
+
+    Far from all measured positions the model falls back to the canonical primitives. One small matrix product a position,
+    whatever the number of primitives.
+
+    Args:
+        anchor: normalised positions (M, 3) of the training spectra.
+        kernel: of the prior, on normalised positions.
+        rank: K, number of basis motions.
+        n: number of primitives.
+    """
+
+    def __init__(
+        self, anchor: Tensor, kernel: Kernel, rank: int, n: int, components: tuple[str, ...], *, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.components = components
+        self.field = SmoothField(anchor, kernel, rank)
+        size = sum(COMPONENTS[c] for c in components)
+        self.basis = nn.Parameter(0.1 / math.sqrt(rank) * torch.randn(rank, n, size, generator=generator))
 
     def forward(self, position: Tensor, mean: Tensor) -> Offsets:
         """Offsets at positions (B, 3); the canonical means are not looked at."""
-        return _offsets(torch.einsum("bk,kns->bns", self.coefficients(position), self.basis), self.components)
-
-    def prior(self) -> Tensor:
-        """|z|^2, the negative log prior of the motion up to a factor 1/2."""
-        return self.coefficient.square().sum()
+        return _offsets(torch.einsum("bk,kns->bns", self.field(position), self.basis), self.components)

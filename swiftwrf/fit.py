@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -15,7 +14,7 @@ from swiftwrf.data.splits import MIN_TRAINING, slabs
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
 from swiftwrf.model import SwiftWRF
-from swiftwrf.optimise import FitConfig, Optimisation, Record, Stage, fingerprint, read_state
+from swiftwrf.optimise import FitConfig, Optimisation, Record, Stage, Validation, fingerprint, read_state
 from swiftwrf.prior import choose_kernel, choose_rank
 from swiftwrf.progress import progress_bar
 
@@ -80,7 +79,7 @@ def fit(
     return model.eval()
 
 
-def folds(position: Tensor, validation: Literal["random", "block"], seed: int) -> Tensor:
+def folds(position: Tensor, validation: Validation, seed: int) -> Tensor:
     """Number of the fold, 0 to 4, of each training position."""
     if validation == "block":
         return slabs(position, FOLDS)
@@ -88,4 +87,4 @@ def folds(position: Tensor, validation: Literal["random", "block"], seed: int) -
     return order % FOLDS
 
 
-__all__ = ["FitConfig", "fit", "folds"]
+__all__ = ["FitConfig", "Validation", "fit", "folds"]

@@ -141,7 +141,7 @@ class SwiftWRF(nn.Module):
 
     def save(self, path: str | Path, provenance: dict[str, str] | None = None) -> None:
         """Writes the model to one safetensors file, its configuration and `provenance` in the header."""
-        motion = self.deformation.kernel if isinstance(self.deformation, MotionBasis) else Kernel()
+        motion = self.deformation.field.kernel if isinstance(self.deformation, MotionBasis) else Kernel()
         header = {
             "config": asdict(self.config),
             "grid": asdict(self.grid),
@@ -159,10 +159,10 @@ def load(path: str | Path) -> SwiftWRF:
     """
     tensors, header = checkpoint.read(path, "swiftwrf model")
     config = ModelConfig(**{**header["config"], "components": tuple(header["config"]["components"])})
-    anchor = torch.zeros_like(tensors.get("deformation.anchor", torch.empty(1, 3)))  # of the right shape, for now
+    anchor = torch.zeros_like(tensors.get("deformation.field.anchor", torch.empty(1, 3)))  # of the right shape, for now
     grid = AngularGrid(**header["grid"])
     model = SwiftWRF(config, grid, anchor, Kernel(), generator=torch.Generator())
     model.load_state_dict(tensors)
     if isinstance(model.deformation, MotionBasis):
-        model.deformation.kernel = Kernel(**header["kernel"])
+        model.deformation.field.kernel = Kernel(**header["kernel"])
     return model.eval()

@@ -27,6 +27,7 @@ from swiftwrf.model import ModelConfig, SwiftWRF
 AVERAGING = 0.98  # a step's weight decays by this much a step: averaged parameters predict better than the last ones
 Record = dict[str, Any]
 Stage = Literal["search", "final"]
+Validation = Literal["random", "block"]
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class FitConfig:
     """keep the canonical means where the coarse stage left them"""
     max_azimuths: int = 180
     """spectra with more columns are averaged down to at most this many for fitting; 0 fits all pixels"""
-    validation: Literal["random", "block"] = "random"
+    validation: Validation = "random"
     """what is held out inside the training part: single spectra, or a region where the model must extrapolate"""
     check_every: int = 100
     """steps between two looks at the validation spectra"""
@@ -169,7 +170,7 @@ class Optimisation:
         groups: list[dict[str, Any]] = [{"params": list(self.model.primitives.parameters()), "peak": rate}]
         if isinstance(deformation, MotionBasis):
             groups += [
-                {"params": [deformation.coefficient], "peak": rate},
+                {"params": [deformation.field.coefficient], "peak": rate},
                 {"params": [deformation.basis], "peak": rate / 2},
             ]
         elif deformation is not None:
@@ -213,7 +214,7 @@ class Optimisation:
             raise FitError(f"the fit broke at step {self.step}: {error}; {self._advice()}") from None
         loss = self.loss(drawn, self.spectrum[rows])
         if isinstance(model.deformation, MotionBasis):
-            loss = loss + config.prior_weight / len(self.position) * model.deformation.prior()
+            loss = loss + config.prior_weight / len(self.position) * model.deformation.field.prior()
         self.optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         norm = nn.utils.clip_grad_norm_(model.parameters(), max_norm=1.0)

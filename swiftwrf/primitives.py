@@ -37,26 +37,29 @@ class Primitives(nn.Module):
             Otherwise means are free: azimuth is periodic anyway, and a mean below the plane or beyond the pole draws
             its flank, which the tanh map cannot.
         generator: for the initial means (uniform over the grid, as in the paper) and responses.
+        scenes: leading dimensions of independent sets of n primitives, e.g. (receivers,).
     """
 
-    def __init__(self, n: int, grid: AngularGrid, *, bounded: bool, generator: torch.Generator) -> None:
+    def __init__(
+        self, n: int, grid: AngularGrid, *, bounded: bool, generator: torch.Generator, scenes: tuple[int, ...] = ()
+    ) -> None:
         super().__init__()
         self.bounded = bounded
-        unit = torch.rand(n, 2, generator=generator).clamp(1e-3, 1 - 1e-3)
+        unit = torch.rand(*scenes, n, 2, generator=generator).clamp(1e-3, 1 - 1e-3)
         extent = torch.tensor([2 * math.pi, math.pi / 2])
         pixel = torch.tensor([grid.azimuth_step, grid.elevation_step], dtype=torch.float32)
         self.register_buffer("floor", FLOOR * pixel)
         # one standard deviation so that N of them, evenly spread, overlap at about 60 % of their peaks
         width = extent / math.sqrt(max(n, 1)) * torch.tensor([0.5, 0.5])
         self.mean = nn.Parameter(torch.atanh(2 * unit - 1) if bounded else unit * extent)
-        self.cholesky = nn.Parameter(torch.stack([width[0].log(), torch.zeros(()), width[1].log()]).repeat(n, 1))
-        self.attenuation = nn.Parameter(torch.zeros(n))
-        self.response = nn.Parameter(0.2 * torch.randn(n, 2, generator=generator))
+        self.cholesky = nn.Parameter(torch.stack([width[0].log(), torch.zeros(()), width[1].log()]).repeat(*scenes, n, 1))
+        self.attenuation = nn.Parameter(torch.zeros(*scenes, n))
+        self.response = nn.Parameter(0.2 * torch.randn(*scenes, n, 2, generator=generator))
 
     floor: Tensor
 
     def __len__(self) -> int:
-        return self.mean.shape[0]
+        return self.mean.shape[-2]
 
     def constrained(self, cholesky: Tensor) -> Tensor:
         """l1, l2, l3 [rad] of raw numbers (..., 3): positive diagonal above the floor; l2 is free, in units of l3."""

@@ -8,13 +8,14 @@ costs a few small linear solves and no rendering.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
 
 from swiftwrf.deformation import Kernel
 
+NOISES = (1e-3, 1e-2, 1e-1)  # of spectra: little of a measured one is not a function of position
 MIN_RANK, MAX_RANK = 24, 64
 EXPLAINED = (
     0.05  # least share of a component's variance that counts as predicted: half of pure noise exceeds 0 by chance
@@ -30,19 +31,18 @@ def choose_kernel(position: Tensor, spectrum: Tensor, fold: Tensor) -> Kernel:
         spectrum: the training spectra, (n, H, W).
         fold: number of the part that each is held out with, (n,).
     """
-    position, spectrum, fold = _thinned(position, spectrum, fold)
+    position, spectrum, fold = thinned(position, spectrum, fold)
     gram = _gram(spectrum)
-    extent = float((position.max(0).values - position.min(0).values).max()) or 1.0
 
     def score(kernel: Kernel) -> float:
         total = 0.0
-        for out, kept, gain in _predictions(kernel, position, fold):
+        for out, kept, gain in held_out_weights(kernel, position, fold):
             own = gram.diagonal()[out]
             error = own - 2 * (gain * gram[out][:, kept]).sum(1) + ((gain @ gram[kept][:, kept]) * gain).sum(1)
             total -= float(error.clamp_min(1e-12).log().sum())
         return total
 
-    return max(_candidates(extent), key=score)
+    return max(candidates(position, NOISES), key=score)
 
 
 def choose_rank(position: Tensor, spectrum: Tensor, fold: Tensor, kernel: Kernel) -> int:
@@ -55,17 +55,18 @@ def choose_rank(position: Tensor, spectrum: Tensor, fold: Tensor, kernel: Kernel
         position, spectrum, fold: as for `choose_kernel`.
         kernel: what it chose.
     """
-    position, spectrum, fold = _thinned(position, spectrum, fold)
+    position, spectrum, fold = thinned(position, spectrum, fold)
     eigenvalue, eigenvector = torch.linalg.eigh(_gram(spectrum))
     component = eigenvector * eigenvalue.clamp_min(0).sqrt()  # (n, n), one column a component
     missed = torch.zeros_like(component)
-    for out, kept, gain in _predictions(kernel, position, fold):
+    for out, kept, gain in held_out_weights(kernel, position, fold):
         missed[out] = component[out] - gain @ component[kept]
     predicted = missed.square().sum(dim=0) < (1 - EXPLAINED) * component.square().sum(dim=0)
     return int(predicted.sum().clamp(MIN_RANK, MAX_RANK))
 
 
-def _thinned(*tensors: Tensor) -> list[Tensor]:
+def thinned(*tensors: Tensor) -> list[Tensor]:
+    """The same at most 400 rows of each, evenly spread."""
     n = len(tensors[0])
     return [t[torch.linspace(0, n - 1, MAX_ROWS).long()] if n > MAX_ROWS else t for t in tensors]
 
@@ -77,15 +78,17 @@ def _gram(spectrum: Tensor) -> Tensor:
     return flat @ flat.T / flat.shape[1]
 
 
-def _candidates(extent: float) -> Iterator[Kernel]:
-    for noise in (1e-3, 1e-2, 1e-1):
+def candidates(position: Tensor, noises: Sequence[float]) -> Iterator[Kernel]:
+    """Kernels with lengths from the extent of the positions (n, 3) [m] down, with and without a short-range part."""
+    extent = float((position.max(0).values - position.min(0).values).max()) or 1.0
+    for noise in noises:
         for k in range(5):
             long = extent / 2**k
             yield Kernel(long=long, short=extent, share=1.0, noise=noise)
             yield from (Kernel(long=long, short=extent / 3 / 2**j, share=0.6, noise=noise) for j in range(1, 6))
 
 
-def _predictions(kernel: Kernel, position: Tensor, fold: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+def held_out_weights(kernel: Kernel, position: Tensor, fold: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """For each fold: which rows are out and which are kept, and the weights (out, kept) that predict the former."""
     covariance = kernel(position.double(), position.double())
     noisy = covariance + kernel.noise * torch.eye(len(position), dtype=covariance.dtype)

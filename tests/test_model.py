@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from swiftwrf import AngularGrid, InputError, ModelConfig, SwiftWRF, load
-from swiftwrf.deformation import COMPONENTS, Kernel, MotionBasis, PerPrimitiveMLP, encode
+from swiftwrf.deformation import COMPONENTS, Kernel, PerPrimitiveMLP, SmoothField, encode
 from swiftwrf.primitives import FLOOR, Primitives
 
 GRID = AngularGrid.hemisphere(15, 60)
@@ -68,10 +68,10 @@ def test_kernel_is_positive_definite_and_one_at_home(generator):
 def test_motion_is_a_draw_of_its_prior(generator):
     """With standard normal z the coefficients at the anchors have the prior's covariance k K^-1 k, close to k."""
     anchor = torch.rand(6, 3, generator=generator)
-    basis = MotionBasis(anchor, KERNEL, 20_000, 1, ("mean",), generator=generator)
+    basis = SmoothField(anchor, KERNEL, 20_000)
     with torch.no_grad():
         basis.coefficient.normal_(generator=generator)
-    drawn = basis.coefficients(anchor)
+    drawn = basis(anchor)
     covariance = (drawn @ drawn.T / 20_000).detach()
     gram = KERNEL(anchor, anchor)
     expected = gram @ torch.linalg.inv(gram + KERNEL.noise * torch.eye(6)) @ gram

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from swiftwrf.data.nerf2 import load_nerf2
 from swiftwrf.data.paths import load_paths
+from swiftwrf.data.rssi import Rssi, load_rssi
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
 
@@ -24,4 +25,4 @@ def load_spectra(path: str | Path) -> Spectra:
     return load_paths(folder) if (folder / "paths.npz").is_file() else load_nerf2(folder)
 
 
-__all__ = ["Spectra", "load_spectra"]
+__all__ = ["Rssi", "Spectra", "load_rssi", "load_spectra"]

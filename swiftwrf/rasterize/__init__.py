@@ -4,6 +4,7 @@
 |-------------|------------------------------|-----------------------------------------------------------------|
 | `reference` | any device, float32, float64 | the definition, dense                                           |
 | `cpu`       | CPU, float32                 | culled rows, compiled by numba at first use                     |
+| `cuda`      | NVIDIA GPU, float32          | culled tiles, compiled at first use by the NVRTC of torch       |
 | `auto`      |                              | the fast one for the tensors' device and dtype, else `reference`|
 """
 
@@ -16,9 +17,9 @@ from torch import Tensor
 
 from swiftwrf.angles import AngularGrid
 from swiftwrf.errors import InputError
-from swiftwrf.rasterize import reference
+from swiftwrf.rasterize import cuda, reference
 
-Maker = Literal["auto", "reference", "cpu"]
+Maker = Literal["auto", "reference", "cpu", "cuda"]
 
 
 def rasterize(
@@ -49,8 +50,8 @@ def rasterize(
 
     Raises:
         InputError: shapes, dtypes or devices that do not fit, a cutoff outside (0, 1), a maker that cannot draw these
-            tensors, or (outside compiled and CUDA code, where looking would wait for the device) a value that is not
-            finite or a zero on a Cholesky factor's diagonal.
+            tensors or cannot be built here, or (outside compiled and CUDA code, where looking would wait for the device)
+            a value that is not finite or a zero on a Cholesky factor's diagonal.
     """
     _check(mean, cholesky, weight, cutoff)
     chosen = _choose(maker, mean)
@@ -60,9 +61,12 @@ def rasterize(
     flat_mean, flat_weight = (x.reshape(batch.numel(), n, 2) for x in (mean, weight))
     if cholesky.dim() > 2:
         cholesky = cholesky.reshape(batch.numel(), n, 3)
-    from swiftwrf.rasterize import cpu  # numba is imported by those who use it
+    if chosen == "cuda":
+        drawn = cuda.rasterize(flat_mean, cholesky, flat_weight, grid, cutoff)
+    else:
+        from swiftwrf.rasterize import cpu  # numba is imported by those who use it
 
-    drawn = cpu.rasterize(flat_mean, cholesky, flat_weight, grid, cutoff)
+        drawn = cpu.rasterize(flat_mean, cholesky, flat_weight, grid, cutoff)
     return drawn.reshape(*batch, 2, *grid.shape)
 
 
@@ -70,7 +74,9 @@ def _choose(maker: Maker, mean: Tensor) -> str:
     if maker not in get_args(Maker):
         raise InputError(f"unknown maker {maker!r}; choose one of {', '.join(get_args(Maker))}")
     if maker == "auto":
-        return "cpu" if mean.dtype == torch.float32 and mean.device.type == "cpu" else "reference"
+        if mean.dtype != torch.float32 or mean.device.type not in ("cpu", "cuda"):
+            return "reference"
+        return "reference" if mean.is_cuda and not cuda.available(mean.device) else mean.device.type
     if maker != "reference" and (mean.device.type != maker or mean.dtype != torch.float32):
         raise InputError(
             f"maker {maker!r} draws float32 tensors on {maker}, got {mean.dtype} on {mean.device}; "

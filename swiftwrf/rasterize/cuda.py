@@ -1,0 +1,187 @@
+"""The fast maker for NVIDIA GPUs: `rasterize.cu`, compiled at first use and launched on torch's current stream.
+
+The kernels take angles and factors in radians and bring them to pixels themselves, because a chain of float64 tensors here
+would cost as much memory traffic as drawing does. Nothing waits for the device, so calls can be captured in CUDA graphs
+once the kernels have been built.
+"""
+
+# mypy: disable-error-code="no-untyped-def, untyped-decorator"
+# (the signatures of autograd functions are torch's)
+
+from __future__ import annotations
+
+import ctypes
+import math
+import warnings
+from ctypes import c_float, c_int, c_void_p
+from dataclasses import astuple
+from functools import cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from swiftwrf.angles import AngularGrid
+from swiftwrf.errors import InputError
+from swiftwrf.rasterize.nvrtc import CudaUnavailable, Kernels
+
+SOURCE = Path(__file__).with_name("rasterize.cu")
+
+# as in rasterize.cu
+_THREADS, _WARPS, _LANES = 256, 8, 32
+_TILE_COLUMNS, _TILE_ROWS = 16, 8
+
+
+class _Axis(ctypes.Structure):
+    _fields_ = (("scale", c_float), ("scale_rest", c_float), ("start", c_float), ("start_rest", c_float))
+
+    @classmethod
+    def of(cls, start: float, step: float) -> _Axis:
+        """pixel = angle * scale - start, each as a float32 and what it leaves; `start` a multiple of 1/2."""
+        scale, pixels = 1 / step, start / step
+        halves = round(2 * pixels) / 2
+        return cls(scale, scale - c_float(scale).value, halves, pixels - halves)
+
+
+class _Grid(ctypes.Structure):
+    _fields_ = (("azimuth", _Axis), ("elevation", _Axis), ("n_azimuth", c_int), ("n_elevation", c_int))
+
+    @classmethod
+    def of(cls, grid: AngularGrid) -> _Grid:
+        azimuth = _Axis.of(grid.azimuth_start, grid.azimuth_step)
+        return cls(azimuth, _Axis.of(grid.elevation_start, grid.elevation_step), grid.n_azimuth, grid.n_elevation)
+
+
+class _Cutoff(ctypes.Structure):
+    _fields_ = (("least", c_float), ("reach", c_float))
+
+    @classmethod
+    def of(cls, cutoff: float | None) -> _Cutoff:
+        least = (
+            -126.0 if cutoff is None else math.log2(cutoff)
+        )  # below 2^-126 float32 has only zero, subnormals flushed
+        return cls(least, math.sqrt(-2 * math.log(2) * least))
+
+
+@cache
+def kernels(device: torch.device) -> Kernels:
+    """The kernels, built for the GPU at its first use and kept.
+
+    Raises:
+        CudaUnavailable: no driver, no NVRTC, or a GPU too old.
+    """
+    return Kernels(SOURCE.read_text(), device)
+
+
+@torch.compiler.assume_constant_result  # asked while torch.compile traces
+def available(device: torch.device) -> bool:
+    """Whether the kernels can be built for the GPU; warns, once, where they cannot."""
+    return _available(device)
+
+
+@cache
+def _available(device: torch.device) -> bool:
+    try:
+        kernels(device)
+    except CudaUnavailable as error:
+        warnings.warn(f"drawing with the slow maker 'reference': {error}", stacklevel=2)
+        return False
+    return True
+
+
+def _checked(*tensors: Tensor) -> list[Tensor]:
+    """The tensors as the kernels read them: float32, contiguous, pairs of floats aligned."""
+    for tensor in tensors:
+        if tensor.dtype != torch.float32 or tensor.device != tensors[0].device:
+            raise InputError(f"expected float32 tensors on {tensors[0].device}, got {tensor.dtype} on {tensor.device}")
+    ready = (tensor.contiguous() for tensor in tensors)
+    return [tensor if tensor.data_ptr() % 8 == 0 else tensor.clone() for tensor in ready]
+
+
+def _pointer(tensor: Tensor) -> c_void_p:
+    return c_void_p(tensor.data_ptr())
+
+
+def _draw(
+    mean: Tensor, cholesky: Tensor, weight: Tensor,
+    elevation_start: float, elevation_step: float, n_elevation: int, azimuth_start: float, n_azimuth: int,
+    cutoff: float | None,
+) -> Tensor:  # fmt: skip
+    batch, n = mean.shape[:2]
+    out = mean.new_empty(batch, 2, n_elevation, n_azimuth)
+    if not out.numel():
+        return out
+    mean, cholesky, weight = _checked(mean, cholesky, weight)
+    grid = AngularGrid(elevation_start, elevation_step, n_elevation, azimuth_start, n_azimuth)
+    common = c_int(n), c_int(cholesky.dim() == 3), _Grid.of(grid), _Cutoff.of(cutoff)
+    across, down = -(-n_azimuth // _TILE_COLUMNS), -(-n_elevation // _TILE_ROWS)
+    words = -(-n // _LANES)
+    reached = torch.empty(batch, across + down, words, dtype=torch.int32, device=mean.device)
+    launch = kernels(mean.device).launch
+    if n:
+        launch(
+            "find_reach", batch * -(-words // _WARPS), _THREADS,
+            _pointer(mean), _pointer(cholesky), _pointer(reached), *common,
+        )  # fmt: skip
+    launch(
+        "rasterize", -(-batch * across * down // _WARPS), _THREADS,
+        _pointer(mean), _pointer(cholesky), _pointer(weight), _pointer(reached), _pointer(out), c_int(batch), *common,
+    )  # fmt: skip
+    return out
+
+
+def _draw_backward(
+    grad: Tensor, mean: Tensor, cholesky: Tensor, weight: Tensor,
+    elevation_start: float, elevation_step: float, n_elevation: int, azimuth_start: float, n_azimuth: int,
+    cutoff: float | None,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    grad, mean, cholesky, weight = _checked(grad, mean, cholesky, weight)
+    batch, n = mean.shape[:2]
+    d_mean, d_weight = torch.empty_like(mean), torch.empty_like(weight)
+    d_cholesky = cholesky.new_empty(batch, n, 3)
+    if mean.numel():
+        grid = AngularGrid(elevation_start, elevation_step, n_elevation, azimuth_start, n_azimuth)
+        # threads for a primitive: about as many as its footprint has columns where N primitives share the grid
+        pixels = n_elevation * n_azimuth / n
+        group = 8 if pixels < 10 else 16 if pixels < 60 else 32
+        kernels(mean.device).launch(
+            "rasterize_backward", batch * -(-n * group // _THREADS), _THREADS,
+            *(_pointer(x) for x in (grad, mean, cholesky, weight, d_mean, d_cholesky, d_weight)),
+            c_int(n), c_int(group), c_int(cholesky.dim() == 3), _Grid.of(grid), _Cutoff.of(cutoff),
+        )  # fmt: skip
+    return d_mean, d_cholesky if cholesky.dim() == 3 else d_cholesky.sum(0), d_weight
+
+
+_rasterize = torch.library.custom_op("swiftwrf::rasterize_cuda", _draw, mutates_args=(), device_types="cuda")
+_rasterize_backward = torch.library.custom_op(
+    "swiftwrf::rasterize_cuda_backward", _draw_backward, mutates_args=(), device_types="cuda"
+)
+
+
+@_rasterize.register_fake
+def _(mean, cholesky, weight, elevation_start, elevation_step, n_elevation, azimuth_start, n_azimuth, cutoff):
+    return mean.new_empty(mean.shape[0], 2, n_elevation, n_azimuth)
+
+
+@_rasterize_backward.register_fake
+def _(grad, mean, cholesky, weight, *settings):
+    return tuple(x.new_empty(x.shape) for x in (mean, cholesky, weight))
+
+
+def _setup_context(ctx, inputs, output) -> None:
+    mean, cholesky, weight, *ctx.settings = inputs
+    ctx.save_for_backward(mean, cholesky, weight)
+
+
+def _backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
+    return (*_rasterize_backward(grad, *ctx.saved_tensors, *ctx.settings), *(None for _ in ctx.settings))
+
+
+_rasterize.register_autograd(_backward, setup_context=_setup_context)
+
+
+def rasterize(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None) -> Tensor:
+    """See `swiftwrf.rasterize`: mean (B, N, 2), cholesky (N, 3) or (B, N, 3), weight (B, N, 2), all float32 on one GPU,
+    to (B, 2, n_elevation, n_azimuth)."""
+    drawn: Tensor = _rasterize(mean, cholesky, weight, *astuple(grid), cutoff)
+    return drawn

@@ -1,0 +1,318 @@
+// Sum of complex 2D Gaussians on an angular grid that is periodic in azimuth: forward and backward, for many positions at
+// once. No headers and no templates, so that NVRTC compiles it as it is; a test compiles it for the CPU.
+//
+//   A(az, el) = sum_n weight_n exp(-1/2 |L_n^-1 d_n|^2),   L = [[l1, 0], [l2, l3]],   d = (az - az_n wrapped, el - el_n)
+//
+// evaluated as 2^-(u^2 + v^2) with (u, v) = sqrt(log2(e) / 2) L^-1 d: no determinant is formed, the exponent is never
+// positive, and one instruction of the GPU gives the power. Distances are in pixels.
+//
+// Nothing depends on the order in which threads run: every pixel adds its primitives in the order of their index, every
+// gradient is summed by one group of threads in a fixed order, and positions do not know of each other. Hence the bits are
+// the same every time and for any batch.
+//
+// Tests for what is out of reach are written `!(distance > reach)`, so that a mean that is not a number is drawn and seen.
+
+constexpr unsigned WARP = 0xffffffffu;  // all of its threads take part
+constexpr int LANES = 32, WARPS = 8, THREADS = WARPS * LANES;  // of a warp, of a block
+
+// pixel = angle * scale - start. Both factors are split into a float and the rest, because one float would lose the fraction
+// of a pixel: `start` is a multiple of 1/2, so that it can be moved by whole pixels without rounding.
+struct Axis {
+    float scale, scale_rest, start, start_rest;
+};
+
+struct Grid {
+    Axis azimuth, elevation;
+    int n_azimuth, n_elevation;
+};
+
+// Kernel values below 2^least count as 0; `reach` is how many standard deviations that is.
+struct Cutoff {
+    float least, reach;
+};
+
+// An angle in pixels: the nearest pixel (a whole number) and how far beyond it.
+struct Place {
+    float pixel, beyond;
+};
+
+// u = s1 dx, v = s3 dy + s21 dx
+struct Whitening {
+    float s1, s21, s3;
+};
+
+__device__ __forceinline__ Place locate(float angle, const Axis& axis) {
+    Place place;
+    place.pixel = rintf(fmaf(angle, axis.scale, -axis.start));
+    // the product is exact inside fmaf, so what is left is rounded relative to itself and not to the pixel's number
+    place.beyond = fmaf(angle, axis.scale, -(axis.start + place.pixel)) + fmaf(angle, axis.scale_rest, -axis.start_rest);
+    return place;
+}
+
+// A distance in columns, brought to at most half a turn. Adding and subtracting 1.5 * 2^23 rounds to a whole number
+// without the conversion unit, which the exponentials keep busy.
+__device__ __forceinline__ float wrapped(float columns, float turn, float turns_per_column) {
+    const float shift = 12582912.0f;
+    return fmaf(-turn, fmaf(columns, turns_per_column, shift) - shift, columns);
+}
+
+// A Cholesky factor in pixels.
+__device__ __forceinline__ float3 factor(const float* __restrict__ cholesky, const Grid& grid) {
+    return make_float3(
+        cholesky[0] * grid.azimuth.scale, cholesky[1] * grid.elevation.scale, cholesky[2] * grid.elevation.scale);
+}
+
+__device__ __forceinline__ Whitening whiten(float3 l) {
+    const float root = 0.84932180028801907f;  // sqrt(log2(e) / 2)
+    Whitening w;
+    w.s1 = root / l.x;
+    w.s3 = root / l.z;
+    w.s21 = -l.y / l.x * w.s3;
+    return w;
+}
+
+// How far a kernel reaches: its covariance is L L^T.
+__device__ __forceinline__ float reach_columns(float3 l, float reach) { return reach * fabsf(l.x); }
+__device__ __forceinline__ float reach_rows(float3 l, float reach) { return reach * sqrtf(l.y * l.y + l.z * l.z); }
+
+// ------------------------------------------------------------------------------------------------------------------ reach
+//
+// The grid is cut into tiles of 16 x 8 pixels. A primitive reaches a tile if it reaches the tile's columns and its rows, so
+// one bit for each primitive and each strip of tiles (first the strips of columns, then those of rows) says everything.
+
+constexpr int TILE_COLUMNS = 16, TILE_ROWS = 8;
+
+__device__ __forceinline__ int strips_of_columns(const Grid& grid) { return (grid.n_azimuth + TILE_COLUMNS - 1) / TILE_COLUMNS; }
+__device__ __forceinline__ int strips_of_rows(const Grid& grid) { return (grid.n_elevation + TILE_ROWS - 1) / TILE_ROWS; }
+
+// One warp for 32 primitives of one position.
+extern "C" __global__ void __launch_bounds__(THREADS) find_reach(
+    const float2* __restrict__ mean,     // (B, N) azimuth, elevation [rad]
+    const float* __restrict__ cholesky,  // (N, 3) or (B, N, 3) [rad]
+    unsigned* __restrict__ reached,      // (B, strips, words): bit i % 32 of word i / 32 is primitive i
+    int n, int cholesky_per_position, Grid grid, Cutoff cutoff) {
+    const int words = (n + LANES - 1) / LANES, blocks = (words + WARPS - 1) / WARPS;
+    const int position = blockIdx.x / blocks, word = blockIdx.x % blocks * WARPS + threadIdx.x / LANES;
+    const int lane = threadIdx.x % LANES, i = word * LANES + lane;
+    if (word >= words) return;
+
+    Place azimuth = {}, elevation = {};
+    float columns = -1e30f, rows = 0.0f;  // beyond the last primitive: reaches nothing
+    if (i < n) {
+        const size_t at = static_cast<size_t>(position) * n + i;
+        const float3 l = factor(cholesky + 3 * (cholesky_per_position ? at : i), grid);
+        azimuth = locate(mean[at].x, grid.azimuth);
+        elevation = locate(mean[at].y, grid.elevation);
+        columns = reach_columns(l, cutoff.reach);
+        rows = reach_rows(l, cutoff.reach);
+    }
+    const float turn = grid.n_azimuth, turns_per_column = 1.0f / turn;
+    const int across = strips_of_columns(grid), down = strips_of_rows(grid);
+    unsigned* out = reached + static_cast<size_t>(position) * (across + down) * words + word;
+    for (int strip = 0; strip < across; ++strip, out += words) {
+        const float centre = strip * TILE_COLUMNS + 0.5f * (TILE_COLUMNS - 1);
+        const float dx = wrapped(azimuth.pixel - centre, turn, turns_per_column) + azimuth.beyond;
+        const unsigned reach = __ballot_sync(WARP, !(fabsf(dx) > columns + 0.5f * (TILE_COLUMNS - 1)));
+        if (lane == 0) *out = reach;
+    }
+    for (int strip = 0; strip < down; ++strip, out += words) {
+        const float dy = elevation.pixel - (strip * TILE_ROWS + 0.5f * (TILE_ROWS - 1)) + elevation.beyond;
+        const unsigned reach = __ballot_sync(WARP, !(fabsf(dy) > rows + 0.5f * (TILE_ROWS - 1)));
+        if (lane == 0) *out = reach;
+    }
+}
+
+// ---------------------------------------------------------------------------------------------------------------- forward
+//
+// A warp draws a tile, each of its threads four pixels of one column. It goes through the bits, collects the primitives that
+// reach the tile, and draws them 32 at a time: each thread prepares one of them, then all draw all 32.
+
+constexpr int ROW_STEP = LANES / TILE_COLUMNS;  // rows between two pixels of a thread
+constexpr int PIXELS = TILE_ROWS / ROW_STEP;    // of a thread
+
+extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
+    const float2* __restrict__ mean,       // (B, N) azimuth, elevation [rad]
+    const float* __restrict__ cholesky,    // (N, 3) or (B, N, 3) [rad]
+    const float2* __restrict__ weight,     // (B, N) real and imaginary part
+    const unsigned* __restrict__ reached,  // (B, strips, words), from find_reach
+    float* __restrict__ out,               // (B, 2, n_elevation, n_azimuth)
+    int n_positions, int n, int cholesky_per_position, Grid grid, Cutoff cutoff) {
+    __shared__ int s_collected[WARPS][LANES];  // indices: fewer than 32 wait while up to 32 come
+    __shared__ float4 s_place[WARPS][LANES];       // column and row from the tile's centre; weight
+    __shared__ float4 s_whitening[WARPS][LANES];   // s1, s21, s3
+
+    const int warp = threadIdx.x / LANES, lane = threadIdx.x % LANES;
+    const int across = strips_of_columns(grid), down = strips_of_rows(grid);
+    const long long task = static_cast<long long>(blockIdx.x) * WARPS + warp;
+    const int position = static_cast<int>(task / (across * down)), tile = static_cast<int>(task % (across * down));
+    if (position >= n_positions) return;
+    const int tile_column = tile % across * TILE_COLUMNS, tile_row = tile / across * TILE_ROWS;
+    const float centre_column = tile_column + 0.5f * (TILE_COLUMNS - 1), centre_row = tile_row + 0.5f * (TILE_ROWS - 1);
+    const float x = lane % TILE_COLUMNS - 0.5f * (TILE_COLUMNS - 1), y = lane / TILE_COLUMNS - 0.5f * (TILE_ROWS - 1);
+    const float turn = grid.n_azimuth, turns_per_column = 1.0f / turn;
+    const size_t first = static_cast<size_t>(position) * n, first_factor = cholesky_per_position ? first : 0;
+
+    float re[PIXELS] = {}, im[PIXELS] = {};
+    const auto draw = [&](int count) {
+        __syncwarp();
+        if (lane < count) {
+            const size_t i = s_collected[warp][lane];
+            const float2 angles = mean[first + i], psi = weight[first + i];
+            const Place azimuth = locate(angles.x, grid.azimuth), elevation = locate(angles.y, grid.elevation);
+            const Whitening w = whiten(factor(cholesky + 3 * (first_factor + i), grid));
+            s_place[warp][lane] = make_float4(
+                wrapped(azimuth.pixel - centre_column, turn, turns_per_column) + azimuth.beyond,
+                elevation.pixel - centre_row + elevation.beyond, psi.x, psi.y);
+            s_whitening[warp][lane] = make_float4(w.s1, w.s21, w.s3, 0.0f);
+        }
+        __syncwarp();
+#pragma unroll 1
+        for (int j = 0; j < count; ++j) {
+            const float4 place = s_place[warp][j], w = s_whitening[warp][j];
+            // wrapped for each pixel: on the far side of a wide primitive a tile may see it from both directions
+            const float dx = wrapped(x - place.x, turn, turns_per_column);
+            const float u = w.x * dx, v = fmaf(w.z, y - place.y, w.y * dx);
+#pragma unroll
+            for (int k = 0; k < PIXELS; ++k) {
+                const float v_k = k ? fmaf(w.z, static_cast<float>(k * ROW_STEP), v) : v;
+                const float exponent = fmaf(-v_k, v_k, -u * u);
+                if (!(exponent < cutoff.least)) {
+                    const float kernel = exp2f(exponent);
+                    re[k] = fmaf(place.z, kernel, re[k]);
+                    im[k] = fmaf(place.w, kernel, im[k]);
+                }
+            }
+        }
+    };
+
+    const int words = (n + LANES - 1) / LANES;
+    const unsigned* by_column = reached + (static_cast<size_t>(position) * (across + down) + tile % across) * words;
+    const unsigned* by_row = reached + (static_cast<size_t>(position) * (across + down) + across + tile / across) * words;
+    int waiting = 0;
+    for (int begin = 0; begin < words; begin += LANES) {
+        const int word = begin + lane;
+        unsigned left = word < words ? by_column[word] & by_row[word] : 0;
+        // every thread that has bits left gives one
+        for (unsigned giving = __ballot_sync(WARP, left != 0); giving; giving = __ballot_sync(WARP, left != 0)) {
+            if (left) s_collected[warp][waiting + __popc(giving & ((1u << lane) - 1))] = word * LANES + __ffs(left) - 1;
+            left &= left - 1;
+            waiting += __popc(giving);
+            if (waiting >= LANES) {
+                draw(LANES);
+                waiting -= LANES;
+                if (lane < waiting) s_collected[warp][lane] = s_collected[warp][LANES + lane];
+                __syncwarp();
+            }
+        }
+    }
+    draw(waiting);
+
+    const size_t plane = static_cast<size_t>(grid.n_elevation) * grid.n_azimuth;
+    out += 2 * plane * position;
+#pragma unroll
+    for (int k = 0; k < PIXELS; ++k) {
+        const int row = tile_row + lane / TILE_COLUMNS + k * ROW_STEP, column = tile_column + lane % TILE_COLUMNS;
+        if (row < grid.n_elevation && column < grid.n_azimuth) {
+            const size_t pixel = static_cast<size_t>(row) * grid.n_azimuth + column;
+            out[pixel] = re[k];
+            out[plane + pixel] = im[k];
+        }
+    }
+}
+
+// --------------------------------------------------------------------------------------------------------------- backward
+//
+// A group of 8, 16 or 32 threads gathers the gradient of one primitive at one position: it walks the box around the
+// footprint, columns over the threads, rows in a loop. With z the kernel times the derivative by it, the sums over the
+// footprint of z, z u, z v, z u^2, z u v, z v^2 give every gradient; u is constant in a column.
+
+extern "C" __global__ void __launch_bounds__(THREADS, 4) rasterize_backward(
+    const float* __restrict__ grad,      // (B, 2, n_elevation, n_azimuth)
+    const float2* __restrict__ mean,     // (B, N)
+    const float* __restrict__ cholesky,  // (N, 3) or (B, N, 3)
+    const float2* __restrict__ weight,   // (B, N)
+    float2* __restrict__ d_mean,         // (B, N)
+    float* __restrict__ d_cholesky,      // (B, N, 3)
+    float2* __restrict__ d_weight,       // (B, N)
+    int n, int group, int cholesky_per_position, Grid grid, Cutoff cutoff) {
+    const int groups = THREADS / group, member = threadIdx.x % group;
+    const int blocks = (n + groups - 1) / groups;  // for a position
+    const int position = blockIdx.x / blocks, primitive = blockIdx.x % blocks * groups + threadIdx.x / group;
+    const size_t i = static_cast<size_t>(position) * n + primitive;
+
+    float3 l = make_float3(1.0f, 0.0f, 1.0f);
+    float d_re = 0, d_im = 0, z_u = 0, z_v = 0, z_uu = 0, z_uv = 0, z_vv = 0;
+    if (primitive < n) {
+        l = factor(cholesky + 3 * (cholesky_per_position ? i : primitive), grid);
+        const Whitening w = whiten(l);
+        const Place azimuth = locate(mean[i].x, grid.azimuth), elevation = locate(mean[i].y, grid.elevation);
+        const float2 psi = weight[i];
+        const size_t plane = static_cast<size_t>(grid.n_elevation) * grid.n_azimuth;
+        const float* re = grad + 2 * plane * position;
+
+        // columns counted from the mean's, at most one turn; rows clipped to the grid
+        const float turn = grid.n_azimuth;
+        const float columns = fminf(reach_columns(l, cutoff.reach), 0.5f * turn), rows = reach_rows(l, cutoff.reach);
+        const int first_column = static_cast<int>(ceilf(azimuth.beyond - columns));
+        const int last_column =
+            min(static_cast<int>(floorf(azimuth.beyond + columns)), first_column + grid.n_azimuth - 1);
+        const int first_row =
+            static_cast<int>(fminf(fmaxf(elevation.pixel + ceilf(elevation.beyond - rows), 0.0f), 1.0f * grid.n_elevation));
+        const int last_row = static_cast<int>(
+            fmaxf(fminf(elevation.pixel + floorf(elevation.beyond + rows), grid.n_elevation - 1.0f), -1.0f));
+
+        int c = static_cast<int>(azimuth.pixel - turn * floorf(azimuth.pixel / turn)) + first_column + member;
+        c %= grid.n_azimuth;
+        c += c < 0 ? grid.n_azimuth : 0;
+        for (int column = first_column + member; column <= last_column; column += group) {
+            const float dx = column - azimuth.beyond;
+            const float u = w.s1 * dx, v_x = w.s21 * dx;
+            float dy = first_row - elevation.pixel - elevation.beyond;
+            float s_0 = 0, s_1 = 0, s_2 = 0;  // sums over the column of z, z v, z v^2
+            const float* pixel = re + static_cast<size_t>(first_row) * grid.n_azimuth + c;
+#pragma unroll 2
+            for (int row = first_row; row <= last_row; ++row) {
+                const float g_re = pixel[0], g_im = pixel[plane];
+                const float v = fmaf(w.s3, dy, v_x);
+                const float exponent = fmaf(-v, v, -u * u);
+                const float kernel = exponent < cutoff.least ? 0.0f : exp2f(exponent);
+                d_re = fmaf(kernel, g_re, d_re);
+                d_im = fmaf(kernel, g_im, d_im);
+                const float z = kernel * fmaf(psi.x, g_re, psi.y * g_im);
+                const float z_times_v = z * v;
+                s_0 += z;
+                s_1 += z_times_v;
+                s_2 = fmaf(z_times_v, v, s_2);
+                dy += 1.0f;
+                pixel += grid.n_azimuth;
+            }
+            z_u = fmaf(u, s_0, z_u);
+            z_v += s_1;
+            z_uu = fmaf(u * u, s_0, z_uu);
+            z_uv = fmaf(u, s_1, z_uv);
+            z_vv += s_2;
+            c += group;
+            while (c >= grid.n_azimuth) c -= grid.n_azimuth;
+        }
+    }
+
+    for (int s = group / 2; s; s /= 2) {
+        d_re += __shfl_xor_sync(WARP, d_re, s);
+        d_im += __shfl_xor_sync(WARP, d_im, s);
+        z_u += __shfl_xor_sync(WARP, z_u, s);
+        z_v += __shfl_xor_sync(WARP, z_v, s);
+        z_uu += __shfl_xor_sync(WARP, z_uu, s);
+        z_uv += __shfl_xor_sync(WARP, z_uv, s);
+        z_vv += __shfl_xor_sync(WARP, z_vv, s);
+    }
+    if (primitive < n && member == 0) {
+        // sums of first and second order in (u, v), in standard deviations: times sqrt(2 ln 2) and 2 ln 2
+        const float first = 1.1774100225154747f, second = 1.3862943611198906f;
+        const float u_x = grid.azimuth.scale / l.x, v_x = -l.y * u_x / l.z, v_y = grid.elevation.scale / l.z;  // per radian
+        d_weight[i] = make_float2(d_re, d_im);
+        d_mean[i] = make_float2(first * (u_x * z_u + v_x * z_v), first * v_y * z_v);
+        d_cholesky[3 * i] = second * (u_x * z_uu + v_x * z_uv);
+        d_cholesky[3 * i + 1] = second * v_y * z_uv;
+        d_cholesky[3 * i + 2] = second * v_y * z_vv;
+    }
+}

@@ -1,0 +1,261 @@
+"""RSSI from SwiftWRF: for each receiver a small spectrum that moves with the transmitter, averaged to one number.
+
+    rssi_r(s) = T_r - 10 gamma_r log10 |s - receiver_r| + 100 (pooled_r(s) - pooled_r)                         [dBm]
+
+pooled_r(s) is the magnitude of receiver r's primitives on a 16 x 16 grid, averaged over the grid; pooled_r that of the
+canonical ones; 100 dB a unit is the scale of the NeRF2 data (rssi = 100 (a - 1)). Only the responses move, by smooth
+functions of position, so the field at any position is a sum of a few fields that are drawn once, and 100,000 positions
+cost two matrix products. All receivers are one batched program.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from rich.progress import Progress
+from torch import Tensor, nn
+from torch.nn import functional
+
+from swiftwrf.angles import AngularGrid
+from swiftwrf.data.rssi import Rssi
+from swiftwrf.data.splits import MIN_TRAINING
+from swiftwrf.deformation import Kernel, SmoothField
+from swiftwrf.errors import FitError, InputError
+from swiftwrf.fit import Validation, folds
+from swiftwrf.primitives import Primitives
+from swiftwrf.prior import candidates, held_out_weights, thinned
+from swiftwrf.progress import progress_bar
+from swiftwrf.rasterize import rasterize
+from swiftwrf.rasterize.magnitude import magnitude
+
+GRID = AngularGrid.hemisphere(16, 16)
+SCALE = 100.0  # dB per unit of pooled magnitude
+NEAREST = 0.3  # [m] distances below it count as it: the log-distance law ends somewhere
+MAX_ANCHORS = 1500
+JITTER = 1e-3  # of the field's prior where anchors nearly coincide
+NOISES = (0.3, 1.0, 3.0)  # variance of a packet relative to that of the field: fading is as large as shadowing
+
+
+@dataclass(frozen=True)
+class RssiConfig:
+    """How RSSI is modelled and fitted."""
+
+    n_primitives: int = 50
+    """a receiver; none where held-out rows are predicted no better with a field than by the log-distance law"""
+    rank: int = 4
+    """smooth functions of position that move the responses of a receiver"""
+    steps: int = 200
+    batch: int = 1024
+    """rows a step"""
+    rate: float = 5e-2
+    huber: float = 1.0
+    """errors beyond so many standard deviations of the noise count linearly, for packets have outliers"""
+    coverage: float = 0.8
+    """share of measurements that the interval should cover"""
+    validation: Validation = "random"
+    """what is held out inside the training part: single rows, or a region"""
+    seed: int = 0
+
+
+class RssiModel(nn.Module):
+    """RSSI at R receivers for any position of the transmitter.
+
+    Args:
+        receiver: positions (R, 3) [m].
+        anchor: positions (M, 3) [m] of training rows.
+        kernel: of the field's prior, lengths in [m]; its noise is that of the packets, relative to the field.
+        n_primitives: a receiver; 0 leaves the log-distance law.
+        rank: functions a receiver.
+        generator: for the initial primitives.
+    """
+
+    def __init__(
+        self, receiver: Tensor, anchor: Tensor, kernel: Kernel, n_primitives: int, rank: int, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        n = len(receiver)
+        self.rank, self.kernel = rank, kernel
+        self.register_buffer("receiver", receiver.double())
+        self.register_buffer("centre", anchor.double().mean(dim=0))
+        self.register_buffer("field_db", torch.zeros(n))  # standard deviation of the field under its prior
+        self.register_buffer("noise_db", torch.ones(n))  # of a packet about the field
+        self.register_buffer("widening", torch.ones(()))  # half of the interval in standard deviations
+        self.level = nn.Parameter(torch.zeros(n))  # T [dBm]
+        self.slope = nn.Parameter(torch.zeros(n))  # -10 gamma [dB a decade]
+        local = (anchor.double() - self.centre).float()
+        gram = kernel(local.double(), local.double())
+        precision = torch.linalg.inv(gram + kernel.noise * torch.eye(len(gram), dtype=gram.dtype))
+        self.register_buffer("precision", precision.float())
+        self.field = SmoothField(local, replace(kernel, noise=JITTER), n * rank)
+        self.primitives = Primitives(n_primitives, GRID, bounded=False, generator=generator, scenes=(n,))
+        self.basis = nn.Parameter(1 + 0.3 * torch.randn(n, rank, n_primitives, generator=generator))
+
+    receiver: Tensor
+    centre: Tensor
+    field_db: Tensor
+    noise_db: Tensor
+    widening: Tensor
+    precision: Tensor
+
+    def log_distance(self, position: Tensor) -> Tensor:
+        """log10 of the distances to the receivers, (B, R)."""
+        return torch.cdist(position, self.receiver).clamp_min(NEAREST).log10().float()
+
+    def forward(self, position: Tensor) -> Tensor:
+        """RSSI (B, R) [dBm] at positions (B, 3) [m], float64."""
+        law = self.level + self.slope * self.log_distance(position)
+        if not len(self.primitives):
+            return law
+        drawn = self._draw()  # (R, 1 + K, 2, pixels): the canonical field and the K that move it
+        motion = self.field((position - self.centre).float()).reshape(len(position), -1, self.rank)
+        moved = drawn[:, 0] + torch.einsum("brk,rkcp->brcp", motion, drawn[:, 1:])
+        pooled = magnitude(moved[..., None]).mean(dim=(-2, -1))
+        return law + SCALE * (pooled - magnitude(drawn[:, 0, :, :, None]).mean(dim=(-2, -1)))
+
+    def _draw(self) -> Tensor:
+        """Canonical and basis fields, the latter scaled so that to first order RSSI has the prior's deviation."""
+        mean, cholesky, attenuation, response = self.primitives()
+        weight = attenuation[:, None, :, None] * torch.cat([response[:, None], self.basis[..., None] * response[:, None]], dim=1)  # (R, 1 + K, N, 2)
+        shape = weight.shape[:2]
+        means, choleskys = (x[:, None].expand(*shape, -1, -1) for x in (mean, cholesky))
+        drawn = rasterize(means, choleskys, weight, GRID).flatten(-2)
+        canonical, basis = drawn[:, :1], drawn[:, 1:]
+        phase = canonical / magnitude(canonical[..., None]).squeeze(-1).unsqueeze(-2).clamp_min(1e-6)
+        gain = SCALE * (phase * basis).sum(dim=-2).mean(dim=-1)  # (R, K) dB for a unit of each function
+        scale = self.field_db / gain.norm(dim=-1).clamp_min(1e-6)
+        return torch.cat([canonical, scale[:, None, None, None] * basis], dim=1)
+
+    @torch.no_grad()
+    def predict(self, position: Tensor, batch: int = 4096) -> tuple[Tensor, Tensor, Tensor]:
+        """RSSI at any positions, with an interval for a measurement there.
+
+        Args:
+            position: of the transmitter [m], (n, 3).
+            batch: positions at a time, which bounds the memory.
+
+        Returns:
+            Prediction, lower and upper end of the interval, each float32 (n, R) [dBm].
+
+        Raises:
+            InputError: positions of another shape, or not finite.
+        """
+        position = torch.as_tensor(position, dtype=torch.float64)
+        if position.dim() != 2 or position.shape[1] != 3 or not position.isfinite().all():
+            raise InputError(f"positions must be finite and of shape (n, 3) [m], got shape {tuple(position.shape)}")
+        parts = [(self(p), self.deviation(p)) for p in position.split(batch)] or [(torch.empty(0, len(self.receiver)),) * 2]
+        middle, deviation = (torch.cat(x) for x in zip(*parts, strict=True))
+        return middle, middle - self.widening * deviation, middle + self.widening * deviation
+
+    def deviation(self, position: Tensor) -> Tensor:
+        """Standard deviation of a measurement about the prediction, (B, R) [dB]: packet noise, and the field's
+        uncertainty, which grows away from measured positions."""
+        cross = self.kernel((position - self.centre).float(), self.field.anchor)
+        unknown = (1 - (cross @ self.precision * cross).sum(dim=1)).clamp(0, 1)
+        return (self.noise_db**2 + self.field_db**2 * unknown[:, None]).sqrt()
+
+
+def fit_rssi(train: Rssi, config: RssiConfig | None = None, *, progress: bool = True) -> RssiModel:
+    """Fits all receivers at once; same data, configuration and machine give the same model.
+
+    The kernel is chosen by cross-validation on what the log-distance law leaves; the number of primitives and the width
+    of the interval on a held-out fold of the training rows.
+
+    Args:
+        train: the only rows it sees; a receiver's missing values do not count.
+        config: how; `RssiConfig()` unless given.
+        progress: show a progress bar on a terminal.
+
+    Raises:
+        InputError: a receiver heard in too few rows.
+        FitError: a loss that is not finite.
+    """
+    config = config or RssiConfig()
+    for name, count in zip(train.receiver_names, (~train.rssi_dbm.isnan()).sum(dim=0).tolist(), strict=True):
+        if count < MIN_TRAINING:
+            raise InputError(f"receiver {name!r} is heard in {count} training rows; at least {MIN_TRAINING} are needed")
+    fold = folds(train.transmitter_position, config.validation, config.seed)
+    kernel, helps = _choose_field(train.transmitter_position, _log_distance_law(train)[1], fold)
+    n_primitives = config.n_primitives if helps else 0
+    with progress_bar(progress) as bar:
+        rest, held_out = train.subset((fold != 0).nonzero()[:, 0]), train.subset((fold == 0).nonzero()[:, 0])
+        search = _optimise(rest, n_primitives, kernel, config, bar)
+        standardised = _missed(search, held_out) / search.deviation(held_out.transmitter_position)
+        model = _optimise(train, n_primitives, kernel, config, bar)
+    model.widening.fill_(standardised[standardised.isfinite()].quantile(config.coverage))
+    return model.eval()
+
+
+def _choose_field(position: Tensor, residual: Tensor, fold: Tensor) -> tuple[Kernel, bool]:
+    """The kernel that best predicts what the log-distance law leaves (n, R) where it is held out, by mean absolute error
+    [dB], and whether that is better than leaving it. Missing values count as 0 when they predict; they are not scored."""
+    position, residual, fold = thinned(position, residual, fold)
+    filled = residual.nan_to_num()
+
+    def missed(kernel: Kernel) -> float:
+        parts = held_out_weights(kernel, position, fold)
+        return float(torch.cat([(gain @ filled[kept] - residual[out]).abs() for out, kept, gain in parts]).nanmean())
+
+    best = min(candidates(position, NOISES), key=missed)
+    return best, missed(best) < float(residual.abs().nanmean())
+
+
+@torch.no_grad()
+def _missed(model: RssiModel, rows: Rssi) -> Tensor:
+    """Absolute errors (n, R) [dB], nan where nothing was heard."""
+    return (model.predict(rows.transmitter_position)[0] - rows.rssi_dbm).abs().float()
+
+
+def _log_distance_law(train: Rssi) -> tuple[Tensor, Tensor]:
+    """Level and slope (R, 2) of each receiver by least squares, and what they leave (n, R), nan where not heard."""
+    distance = torch.cdist(train.transmitter_position, train.receiver_position).clamp_min(NEAREST).log10()
+    law, residual = torch.zeros(len(train.receiver_names), 2), torch.full_like(train.rssi_dbm, torch.nan)
+    for r in range(len(law)):
+        heard = ~train.rssi_dbm[:, r].isnan()
+        design = torch.stack([torch.ones(int(heard.sum()), dtype=torch.float64), distance[heard, r]], dim=1)
+        coefficients = torch.linalg.lstsq(design, train.rssi_dbm[heard, r]).solution
+        law[r] = coefficients.float()
+        residual[heard, r] = train.rssi_dbm[heard, r] - design @ coefficients
+    return law, residual
+
+
+def _optimise(train: Rssi, n_primitives: int, kernel: Kernel, config: RssiConfig, bar: Progress) -> RssiModel:
+    """Maximum a posteriori: Huber's loss in units of the noise, and the prior of the functions of position."""
+    generator = torch.Generator().manual_seed(config.seed)
+    position, rssi = train.transmitter_position, train.rssi_dbm.float()
+    rows = torch.randperm(len(train), generator=generator)[:MAX_ANCHORS].sort().values
+    model = RssiModel(train.receiver_position, position[rows], kernel, n_primitives, config.rank, generator)
+    law, residual = _log_distance_law(train)
+    variance = residual.square().nanmean(dim=0).float().clamp_min(1e-6)
+    with torch.no_grad():
+        model.level.copy_(law[:, 0])
+        model.slope.copy_(law[:, 1])
+        share = kernel.noise / (1 + kernel.noise) if n_primitives else 1.0
+        model.noise_db.copy_((share * variance).sqrt())
+        model.field_db.copy_(((1 - share) * variance).sqrt())
+    shapes = [model.basis, *model.primitives.parameters()]
+    groups = [
+        {"params": [model.level, model.slope, model.field.coefficient], "peak": config.rate},
+        {"params": shapes, "peak": config.rate / 10},
+    ]
+    optimiser = torch.optim.Adam(groups, lr=config.rate)
+    heard = int((~rssi.isnan()).sum())
+    task = bar.add_task(f"{len(train.receiver_names)} receivers, {n_primitives} primitives", total=config.steps)
+    for step in range(config.steps):
+        batch = torch.randint(len(train), (min(config.batch, len(train)),), generator=generator)
+        measured = rssi[batch]
+        missed = ((model(position[batch]) - measured) / model.noise_db)[~measured.isnan()]
+        loss = functional.huber_loss(missed, torch.zeros_like(missed), delta=config.huber)
+        loss = loss + 0.5 * model.field.prior() / heard
+        if not math.isfinite(loss.item()):
+            raise FitError(f"the RSSI fit broke at step {step}: loss {loss.item():.3g}; try a rate below {config.rate:g}")
+        optimiser.zero_grad()
+        loss.backward()
+        decay = 0.5 * (1 + math.cos(math.pi * step / config.steps))
+        for group in optimiser.param_groups:
+            group["lr"] = group["peak"] * decay
+        optimiser.step()
+        bar.update(task, advance=1)
+    bar.remove_task(task)
+    return model.requires_grad_(False)

@@ -1,0 +1,526 @@
+"""The CUDA maker: what it compiles to, what it draws on the CPU through a shim, and, where there is a GPU, on it."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import GRADIENT_TOLERANCE, VALUE_TOLERANCE
+from test_rasterize import scene
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from swiftwrf import AngularGrid, InputError, rasterize
+from swiftwrf.rasterize import _choose, cuda, nvrtc, reference
+from swiftwrf.rasterize.magnitude import magnitude
+
+SHIM = Path(__file__).parent / "cuda_shim"
+KERNELS = {"find_reach", "rasterize", "rasterize_backward"}
+SANITIZERS = os.environ.get(
+    "CUDA_SHIM_SANITIZERS", ""
+)  # set by the test that runs this file's `small` tests under them
+
+
+# ---------------------------------------------------------------------------------------------------------- compilation
+
+
+@pytest.fixture(scope="module")
+def compiler():
+    try:
+        return nvrtc.Nvrtc()
+    except nvrtc.CudaUnavailable as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.parametrize("architecture", [75, 80, 86, 89, 90, 100, 120])
+def test_compiles_without_stack_and_within_64_registers(compiler, architecture):
+    if architecture not in compiler.architectures:
+        pytest.skip(f"NVRTC {compiler.version} does not compile for sm_{architecture}")
+    image, log = compiler.compile(cuda.SOURCE.read_text(), f"sm_{architecture}", "--ptxas-options=-v")
+    assert image.startswith(b"\x7fELF")
+    assert set(re.findall(r"entry function '(\w+)'", log)) == KERNELS
+    assert re.findall(r"(\d+) bytes stack frame, (\d+) bytes spill", log) == [("0", "0")] * len(KERNELS)
+    assert max(int(n) for n in re.findall(r"Used (\d+) registers", log)) <= 64
+
+
+def test_newer_gpus_get_portable_code_and_older_ones_a_sentence(compiler):
+    newest = compiler.architectures[-1]
+    assert compiler.target(newest) == f"sm_{newest}"
+    assert compiler.target(newest + 10) == f"compute_{newest}"
+    with pytest.raises(nvrtc.CudaUnavailable, match=r"compute capability 7\.5 or more, got 6\.1"):
+        compiler.target(61)
+
+
+def test_says_what_does_not_compile(compiler):
+    with pytest.raises(nvrtc.CudaUnavailable, match="cannot compile the rasterizer for sm_90"):
+        compiler.compile("nonsense", "sm_90")
+
+
+class CountingCompiler:
+    """Counts how often it compiles."""
+
+    version = "1.2"
+
+    def __init__(self):
+        self.compilations = 0
+
+    def target(self, capability):
+        return f"sm_{capability}"
+
+    def compile(self, source, target):
+        self.compilations += 1
+        return f"{source} for {target}".encode(), ""
+
+
+def test_images_are_cached_and_damaged_ones_built_anew(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    compiler = CountingCompiler()
+    for _ in range(2):
+        assert nvrtc._image(compiler, "source", 90) == b"source for sm_90"
+    assert compiler.compilations == 1
+    (cached,) = (tmp_path / "swiftwrf").iterdir()
+    for damaged in (cached.read_bytes()[:-1], b""):
+        cached.write_bytes(damaged)
+        assert nvrtc._image(compiler, "source", 90) == b"source for sm_90"
+    assert compiler.compilations == 3
+    nvrtc._image(compiler, "source", 80)
+    nvrtc._image(compiler, "other source", 90)
+    assert compiler.compilations == 5
+    assert len(list((tmp_path / "swiftwrf").iterdir())) == 3
+
+
+def test_a_cache_that_cannot_be_written_does_not_matter(tmp_path, monkeypatch):
+    (tmp_path / "swiftwrf").write_text("a file where the folder should be")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert nvrtc._image(CountingCompiler(), "source", 90) == b"source for sm_90"
+
+
+# ------------------------------------------------------------------------------------------------------- unavailability
+
+
+def test_a_missing_library_is_one_sentence():
+    with pytest.raises(InputError, match="needs the NVIDIA driver, and it was not found; use maker='reference'"):
+        nvrtc._load("the NVIDIA driver", ["libnot-there.so.1"])
+
+
+def test_auto_falls_back_to_the_definition_with_one_warning(monkeypatch):
+    def fail(device):
+        raise nvrtc.CudaUnavailable("no driver")
+
+    monkeypatch.setattr(cuda, "kernels", fail)
+    cuda._available.cache_clear()
+    with FakeTensorMode():
+        mean = torch.empty(1, 3, 2, device="cuda")
+    with pytest.warns(UserWarning, match="slow maker 'reference': no driver") as warned:
+        chosen = [_choose("auto", mean) for _ in range(2)]
+    assert chosen == ["reference", "reference"]
+    assert len(warned) == 1
+    cuda._available.cache_clear()
+    monkeypatch.setattr(cuda, "kernels", lambda device: None)
+    assert _choose("auto", mean) == "cuda"
+    assert _choose("auto", mean.double()) == "reference"
+    cuda._available.cache_clear()
+
+
+# -------------------------------------------------------------------------------------------- the source, run on the CPU
+
+
+class KernelsOnCpu:
+    """Launches like `nvrtc.Kernels`, on the CPU."""
+
+    def __init__(self, library: Path) -> None:
+        self._library = ctypes.CDLL(str(library))
+
+    def launch(self, kernel, blocks, threads, *arguments):
+        pointers = (ctypes.c_void_p * len(arguments))(*(ctypes.addressof(a) for a in arguments))
+        assert self._library.launch(kernel.encode(), ctypes.c_uint(blocks), threads, pointers) == 0
+
+
+@pytest.fixture(scope="module")
+def shim(tmp_path_factory):
+    """Lets the CUDA maker's operators draw CPU tensors."""
+    if shutil.which("g++") is None or sys.platform != "linux":
+        pytest.skip("needs g++ on Linux")
+    library = tmp_path_factory.mktemp("shim") / "rasterize.so"
+    flags = [f"-fsanitize={SANITIZERS}", "-fno-sanitize-recover=all", "-O1"] if SANITIZERS else ["-O2"]
+    command = ["g++", "-std=c++17", *flags, "-ffp-contract=off", "-shared", "-fPIC", f"-I{cuda.SOURCE.parent}"]
+    subprocess.run([*command, str(SHIM / "rasterize.cpp"), "-o", str(library)], check=True)
+    on_cpu, on_gpu = KernelsOnCpu(library), cuda.kernels
+    cuda._rasterize.register_kernel("cpu", cuda._draw)
+    cuda._rasterize_backward.register_kernel("cpu", cuda._draw_backward)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cuda, "kernels", lambda device: on_cpu if device.type == "cpu" else on_gpu(device))
+        yield
+
+
+@pytest.fixture
+def poisoned():
+    """Fresh memory holds not-a-number, so that a pixel or gradient that nobody writes shows."""
+    torch.use_deterministic_algorithms(True)  # torch then fills what it hands out empty
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+def errors(inputs, grid, cutoff, device="cpu"):
+    """Largest value error as a share of sum |weight|, and relative L2 error of each gradient, against float64."""
+    exact_inputs = [x.detach().double().requires_grad_() for x in inputs]
+    exact = reference.rasterize(*exact_inputs, grid, cutoff)
+    inputs = [x.detach().to(device).requires_grad_() for x in inputs]
+    drawn = cuda.rasterize(*inputs, grid, cutoff)
+    cotangent = torch.randn(exact.shape, generator=torch.Generator().manual_seed(1))
+    wanted = torch.autograd.grad(exact, exact_inputs, cotangent.double())
+    got = torch.autograd.grad(drawn, inputs, cotangent.to(device))
+    scale = exact_inputs[2].detach().norm(dim=-1).sum(dim=-1).max().clamp_min(1e-12)
+    value = float((drawn.detach().cpu() - exact.detach()).abs().max() / scale)
+    return value, [float((g.cpu() - w).norm() / w.norm().clamp_min(1e-12)) for g, w in zip(got, wanted, strict=True)]
+
+
+def degrees(*angles):
+    """Means (1, N, 2) of pairs of azimuth and elevation."""
+    return torch.deg2rad(torch.tensor([angles], dtype=torch.float64)).float()
+
+
+def hard_case(name):
+    """Inputs and grid."""
+    generator = torch.Generator().manual_seed(2)
+    step = math.radians(90 / 16)
+    if name == "5,000 primitives on one pixel":
+        mean = degrees((100.0, 40.0)) + 0.1 * step * torch.randn(1, 5000, 2, generator=generator)
+        cholesky = step * torch.tensor([0.8, 0.3, 0.6]).repeat(5000, 1)
+        return [mean, cholesky, torch.randn(1, 5000, 2, generator=generator)], AngularGrid.hemisphere(16, 48)
+    mean = {
+        "both sides of the seam": degrees((359.9, 30.0), (-0.1, 60.0), (0.1, 45.0)),
+        "turns away": degrees((3700.0, 30.0), (-7300.0, 45.0)),
+        "beyond the poles": degrees((10.0, -8.0), (200.0, 97.0)),
+        "far beyond the poles": degrees((10.0, -4e5), (200.0, 3e7), (30.0, 50.0)),
+        "wider than the grid": degrees((10.0, 30.0), (200.0, 60.0)),
+        "narrow and sheared": degrees((10.1, 30.2), (200.3, 60.4)),
+        "flipped factors": degrees((10.0, 30.0), (200.0, 60.0)),
+    }[name]
+    factor = {
+        "wider than the grid": [60 * step, 10 * step, 80 * step],
+        "narrow and sheared": [0.3 * step, 3 * step, 0.3 * step],
+        "flipped factors": [-2 * step, step, -1.5 * step],
+    }.get(name, [1.2 * step, 0.7 * step, 1.5 * step])
+    return [mean, torch.tensor([factor]).repeat(mean.shape[1], 1), torch.randn(mean.shape, generator=generator)], (
+        AngularGrid.hemisphere(17, 33)
+    )
+
+
+HARD_CASES = (
+    "both sides of the seam", "turns away", "beyond the poles", "far beyond the poles", "wider than the grid",
+    "narrow and sheared", "flipped factors", "5,000 primitives on one pixel",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("cutoff", [None, 1e-4])
+@pytest.mark.parametrize("case", HARD_CASES)
+@pytest.mark.usefixtures("shim", "poisoned")
+def test_small_hard_cases(case, cutoff):
+    value, gradients = errors(*hard_case(case), cutoff)
+    assert value < VALUE_TOLERANCE[cutoff]
+    assert max(gradients) < GRADIENT_TOLERANCE[cutoff]
+
+
+@pytest.mark.parametrize("cutoff", [None, 1e-4])
+@pytest.mark.parametrize("per_position", [False, True])
+@pytest.mark.parametrize(("shape", "n"), [((7, 12), 33), ((16, 16), 50), ((17, 33), 100), ((30, 120), 40)])
+@pytest.mark.usefixtures("shim", "poisoned")
+def test_agrees_with_the_definition(shape, n, per_position, cutoff):
+    grid = AngularGrid.hemisphere(*shape)
+    value, gradients = errors(scene(n, 3, per_position=per_position, grid=grid), grid, cutoff)
+    assert value < VALUE_TOLERANCE[cutoff]
+    assert max(gradients) < GRADIENT_TOLERANCE[cutoff]
+
+
+def many(n, grid, batch=1):
+    """Primitives about as wide as their distance from each other."""
+    inputs = [x.detach() for x in scene(n, batch, grid=grid)]
+    width = math.sqrt(math.pi**2 / n) / 2
+    inputs[1] = (
+        width * torch.tensor([1.0, 0.3, 0.8]) * (1 + torch.rand(n, 3, generator=torch.Generator().manual_seed(3)))
+    )
+    return inputs
+
+
+@pytest.mark.parametrize("n", [50, 500])
+@pytest.mark.usefixtures("shim", "poisoned")
+def test_agrees_on_the_measured_grid(n):
+    grid = AngularGrid.hemisphere(90, 360)
+    value, gradients = errors(many(n, grid), grid, None)
+    assert value < VALUE_TOLERANCE[None]
+    assert max(gradients) < GRADIENT_TOLERANCE[None]
+
+
+@pytest.mark.usefixtures("shim", "poisoned")
+def test_small_tiles_that_nothing_reaches_are_zero():
+    mean, cholesky = degrees((180.0, 45.0)), torch.tensor([[0.05, 0.0, 0.05]])
+    drawn = cuda.rasterize(mean, cholesky, torch.ones(1, 1, 2), AngularGrid.hemisphere(30, 120), 1e-4)
+    assert 0 < torch.count_nonzero(drawn) < 400
+    assert drawn.isfinite().all()
+
+
+@pytest.mark.parametrize(("batch", "n"), [(2, 0), (0, 4), (0, 0)])
+@pytest.mark.usefixtures("shim", "poisoned")
+def test_small_nothing_to_draw(batch, n):
+    inputs = [x.requires_grad_() for x in (torch.zeros(batch, n, 2), torch.ones(n, 3), torch.zeros(batch, n, 2))]
+    drawn = cuda.rasterize(*inputs, AngularGrid.hemisphere(17, 33), 1e-4)
+    assert drawn.shape == (batch, 2, 17, 33)
+    assert not drawn.any()
+    for gradient, x in zip(torch.autograd.grad(drawn.sum(), inputs), inputs, strict=True):
+        assert torch.equal(gradient, torch.zeros_like(x))
+
+
+@pytest.mark.usefixtures("shim")
+def test_cutoff_means_what_it_means_to_the_definition():
+    grid = AngularGrid.hemisphere(30, 120)
+    mean, cholesky = degrees((100.0, 45.0)), torch.tensor([[0.3, 0.1, 0.2]])
+    drawn = cuda.rasterize(mean, cholesky, torch.ones(1, 1, 2), grid, 1e-2)
+    exact = reference.rasterize(mean.double(), cholesky.double(), torch.ones(1, 1, 2, dtype=torch.float64), grid, 1e-2)
+    assert torch.equal(drawn != 0, exact != 0)
+
+
+@pytest.mark.usefixtures("shim")
+def test_same_bits_twice_and_whatever_the_batch():
+    check_bits("cpu")
+
+
+def check_bits(device):
+    """The same bits twice, and for one position alone."""
+    grid = AngularGrid.hemisphere(17, 33)
+    inputs = [x.detach().to(device) for x in scene(200, 5, per_position=True, grid=grid)]
+    cotangent = torch.randn(5, 2, *grid.shape, generator=torch.Generator().manual_seed(1)).to(device)
+    whole, gradients = value_and_gradients(inputs, grid, cotangent)
+    again, gradients_again = value_and_gradients(inputs, grid, cotangent)
+    assert torch.equal(whole, again)
+    assert all(torch.equal(a, b) for a, b in zip(gradients, gradients_again, strict=True))
+    for i in range(5):
+        alone, alone_gradients = value_and_gradients([x[i : i + 1] for x in inputs], grid, cotangent[i : i + 1])
+        assert torch.equal(whole[i : i + 1], alone)
+        assert all(torch.equal(a[i : i + 1], b) for a, b in zip(gradients, alone_gradients, strict=True))
+
+
+def value_and_gradients(inputs, grid, cotangent):
+    """What the CUDA maker draws, and its gradients."""
+    leaves = [x.detach().requires_grad_() for x in inputs]
+    drawn = cuda.rasterize(*leaves, grid, 1e-4)
+    return drawn.detach(), torch.autograd.grad(drawn, leaves, cotangent)
+
+
+@pytest.mark.usefixtures("shim")
+def test_takes_strided_and_misaligned_tensors():
+    grid = AngularGrid.hemisphere(17, 33)
+    mean, cholesky, weight = (x.detach() for x in scene(20, 1, grid=grid))
+    expected = cuda.rasterize(mean.repeat(3, 1, 1), cholesky, weight.repeat(3, 1, 1), grid, 1e-4)
+    misaligned = torch.cat([torch.zeros(1), weight.flatten()])[1:].view_as(weight)
+    assert misaligned.data_ptr() % 8
+    assert torch.equal(cuda.rasterize(mean.expand(3, -1, -1), cholesky, weight.expand(3, -1, -1), grid, 1e-4), expected)
+    assert torch.equal(cuda.rasterize(mean, cholesky, misaligned, grid, 1e-4), expected[:1])
+
+
+@pytest.mark.usefixtures("shim")
+def test_operator_refuses_other_dtypes():
+    mean, cholesky, weight = (x.detach() for x in scene(4, 1))
+    with pytest.raises(InputError, match=r"expected float32 tensors on cpu, got torch\.float64"):
+        cuda.rasterize(mean, cholesky.double(), weight, AngularGrid.hemisphere(17, 33), 1e-4)
+
+
+@pytest.mark.usefixtures("shim")
+def test_a_primitive_that_is_not_a_number_shows():
+    mean, cholesky, weight = (x.detach() for x in scene(4, 1))
+    mean[0, 1, 0] = float("nan")
+    assert cuda.rasterize(mean, cholesky, weight, AngularGrid.hemisphere(17, 33), 1e-4).isnan().any()
+
+
+@pytest.mark.usefixtures("shim")
+def test_operators_are_registered_properly():
+    check_registration("cpu")
+
+
+def check_registration(device):
+    """PyTorch's own checks of the two operators."""
+    inputs = [x.detach().to(device).requires_grad_() for x in scene(4, 2)]
+    torch.library.opcheck(cuda._rasterize, (*inputs, 0.1, 0.2, 5, 0.0, 9, 1e-4))
+    grad = torch.ones(2, 2, 5, 9, device=device)
+    torch.library.opcheck(cuda._rasterize_backward, (grad, *(x.detach() for x in inputs), 0.1, 0.2, 5, 0.0, 9, None))
+
+
+@pytest.mark.usefixtures("shim")
+def test_compiles_into_a_full_graph():
+    check_full_graph("cpu", "aot_eager")
+
+
+def check_full_graph(device, backend):
+    """Magnitude and gradient of a compiled function against the same one run eagerly."""
+    grid = AngularGrid.hemisphere(7, 12)
+    inputs = [x.detach().to(device).requires_grad_() for x in scene(4, 2)]
+
+    def draw(*tensors):
+        return magnitude(cuda.rasterize(*tensors, grid, 1e-4))
+
+    compiled = torch.compile(draw, fullgraph=True, backend=backend)
+    torch.testing.assert_close(compiled(*inputs), draw(*inputs))
+    for a, b in zip(
+        torch.autograd.grad(compiled(*inputs).sum(), inputs),
+        torch.autograd.grad(draw(*inputs).sum(), inputs),
+        strict=True,
+    ):
+        torch.testing.assert_close(a, b)
+
+
+@pytest.mark.skipif(bool(SANITIZERS), reason="is running under them")
+@pytest.mark.usefixtures("shim")
+def test_sanitizers_find_nothing():
+    runtime = [
+        subprocess.run(
+            ["g++", f"-print-file-name=lib{name}.so"], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        for name in ("asan", "ubsan")
+    ]
+    if not all(Path(library).is_absolute() for library in runtime):
+        pytest.skip("g++ comes without its sanitizers")
+    environment = os.environ | {
+        "LD_PRELOAD": " ".join(runtime),
+        "ASAN_OPTIONS": "detect_leaks=0",  # Python's own
+        "CUDA_SHIM_SANITIZERS": "address,undefined",
+    }
+    run = subprocess.run(
+        [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", __file__, "-k", "small and not pixel or 100"],
+        env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stdout[-4000:] + run.stderr[-4000:]
+
+
+# ------------------------------------------------------------------------------------------------------------ on a GPU
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("cutoff", [None, 1e-4])
+@pytest.mark.parametrize("case", HARD_CASES)
+@pytest.mark.usefixtures("poisoned")
+def test_gpu_hard_cases(case, cutoff):
+    value, gradients = errors(*hard_case(case), cutoff, "cuda")
+    assert value < VALUE_TOLERANCE[cutoff]
+    assert max(gradients) < GRADIENT_TOLERANCE[cutoff]
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("per_position", [False, True])
+@pytest.mark.parametrize(("shape", "n"), [((16, 16), 50), ((17, 33), 100), ((30, 120), 40)])
+@pytest.mark.usefixtures("poisoned")
+def test_gpu_agrees_with_the_definition(shape, n, per_position):
+    grid = AngularGrid.hemisphere(*shape)
+    for cutoff in (None, 1e-4):
+        value, gradients = errors(scene(n, 3, per_position=per_position, grid=grid), grid, cutoff, "cuda")
+        assert value < VALUE_TOLERANCE[cutoff]
+        assert max(gradients) < GRADIENT_TOLERANCE[cutoff]
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize(("shape", "n"), [((90, 360), 2000), ((180, 720), 200)])
+def test_gpu_agrees_on_large_grids(shape, n):
+    grid = AngularGrid.hemisphere(*shape)
+    value, gradients = errors(many(n, grid), grid, None, "cuda")
+    assert value < VALUE_TOLERANCE[None]
+    assert max(gradients) < GRADIENT_TOLERANCE[None]
+
+
+@pytest.mark.cuda
+def test_gpu_same_bits_twice_and_whatever_the_batch():
+    check_bits("cuda")
+
+
+@pytest.mark.cuda
+def test_gpu_is_what_auto_draws_with():
+    inputs = [x.detach().cuda() for x in scene(20, 2)]
+    grid = AngularGrid.hemisphere(17, 33)
+    assert torch.equal(rasterize(*inputs, grid), rasterize(*inputs, grid, maker="cuda"))
+    doubles = [x.double() for x in inputs]
+    assert torch.equal(rasterize(*doubles, grid), rasterize(*doubles, grid, maker="reference"))
+
+
+@pytest.mark.cuda
+def test_gpu_follows_the_current_stream():
+    grid = AngularGrid.hemisphere(90, 360)
+    inputs = [x.cuda() for x in many(1000, grid)]
+    expected = cuda.rasterize(*inputs, grid, 1e-4)
+    other = torch.cuda.Stream()
+    other.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(other):
+        torch.cuda._sleep(50_000_000)  # cycles: a launch on another stream would overtake the next line
+        late = [x * 1 for x in inputs]
+        drawn = cuda.rasterize(*late, grid, 1e-4)
+    other.synchronize()
+    assert torch.equal(drawn, expected)
+
+
+@pytest.mark.cuda
+def test_gpu_graph_capture():
+    grid = AngularGrid.hemisphere(17, 33)
+    leaves = [x.detach().cuda().requires_grad_() for x in scene(20, 2, grid=grid)]
+    cotangent = torch.ones(2, 2, *grid.shape, device="cuda")
+
+    def step():
+        drawn = cuda.rasterize(*leaves, grid, 1e-4)
+        return drawn, *torch.autograd.grad(drawn, leaves, cotangent)
+
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        step()  # builds and loads the kernels
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        captured = step()
+    with torch.no_grad():
+        leaves[0].add_(0.1)
+    graph.replay()
+    for got, expected in zip(captured, step(), strict=True):
+        assert torch.equal(got, expected)
+
+
+@pytest.mark.cuda
+def test_gpu_operators_are_registered_properly():
+    check_registration("cuda")
+
+
+@pytest.mark.cuda
+def test_gpu_compiles_into_a_full_graph():
+    check_full_graph("cuda", "inductor")
+
+
+@pytest.mark.cuda
+def test_gpu_every_device():
+    if torch.cuda.device_count() < 2:
+        pytest.skip("needs two GPUs")
+    grid = AngularGrid.hemisphere(17, 33)
+    inputs = [x.detach() for x in scene(20, 2, grid=grid)]
+    drawn = [cuda.rasterize(*(x.to(f"cuda:{i}") for x in inputs), grid, 1e-4) for i in (1, 0)]
+    assert [d.device.index for d in drawn] == [1, 0]
+    torch.testing.assert_close(drawn[0].cpu(), drawn[1].cpu())
+
+
+@pytest.mark.cuda
+def test_gpu_memory_checker_finds_nothing():
+    if shutil.which("compute-sanitizer") is None:
+        pytest.skip("needs compute-sanitizer, which comes with the CUDA toolkit")
+    command = [
+        "compute-sanitizer",
+        "--error-exitcode=1",
+        sys.executable,
+        "-m",
+        "pytest",
+        "-p",
+        "no:cacheprovider",
+        __file__,
+    ]
+    selected = ["-k", "test_gpu_hard_cases and (seam or pole)"]
+    run = subprocess.run([*command, *selected], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stdout[-4000:] + run.stderr[-4000:]
