@@ -16,7 +16,6 @@ from swiftwrf.fit import Validation, folds
 from swiftwrf.prior import choose_kernel
 
 
-
 class Synthesizer(Protocol):
     """Learns from spectra, then draws one at any position."""
 

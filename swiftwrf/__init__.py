@@ -9,10 +9,12 @@ spectrum = model.synthesize(test.position)
 from swiftwrf.angles import AngularGrid, ArrayPose
 from swiftwrf.data import Rssi, Spectra, load_rssi, load_spectra
 from swiftwrf.data.room import simulated_room
+from swiftwrf.data.rssi_room import rssi_room
 from swiftwrf.errors import FitError, InputError
 from swiftwrf.fit import FitConfig, fit
 from swiftwrf.model import ModelConfig, SwiftWRF, load
 from swiftwrf.rasterize import rasterize
+from swiftwrf.rssi import RssiConfig, RssiModel, fit_rssi
 
 __all__ = [
     "AngularGrid",
@@ -22,12 +24,16 @@ __all__ = [
     "InputError",
     "ModelConfig",
     "Rssi",
+    "RssiConfig",
+    "RssiModel",
     "Spectra",
     "SwiftWRF",
     "fit",
+    "fit_rssi",
     "load",
     "load_rssi",
     "load_spectra",
     "rasterize",
+    "rssi_room",
     "simulated_room",
 ]

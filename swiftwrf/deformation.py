@@ -160,7 +160,14 @@ class MotionBasis(nn.Module):
     """
 
     def __init__(
-        self, anchor: Tensor, kernel: Kernel, rank: int, n: int, components: tuple[str, ...], *, generator: torch.Generator
+        self,
+        anchor: Tensor,
+        kernel: Kernel,
+        rank: int,
+        n: int,
+        components: tuple[str, ...],
+        *,
+        generator: torch.Generator,
     ) -> None:
         super().__init__()
         self.components = components

@@ -52,7 +52,9 @@ class Primitives(nn.Module):
         # one standard deviation so that N of them, evenly spread, overlap at about 60 % of their peaks
         width = extent / math.sqrt(max(n, 1)) * torch.tensor([0.5, 0.5])
         self.mean = nn.Parameter(torch.atanh(2 * unit - 1) if bounded else unit * extent)
-        self.cholesky = nn.Parameter(torch.stack([width[0].log(), torch.zeros(()), width[1].log()]).repeat(*scenes, n, 1))
+        self.cholesky = nn.Parameter(
+            torch.stack([width[0].log(), torch.zeros(()), width[1].log()]).repeat(*scenes, n, 1)
+        )
         self.attenuation = nn.Parameter(torch.zeros(*scenes, n))
         self.response = nn.Parameter(0.2 * torch.randn(*scenes, n, 2, generator=generator))
 

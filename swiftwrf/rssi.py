@@ -117,7 +117,9 @@ class RssiModel(nn.Module):
     def _draw(self) -> Tensor:
         """Canonical and basis fields, the latter scaled so that to first order RSSI has the prior's deviation."""
         mean, cholesky, attenuation, response = self.primitives()
-        weight = attenuation[:, None, :, None] * torch.cat([response[:, None], self.basis[..., None] * response[:, None]], dim=1)  # (R, 1 + K, N, 2)
+        weight = attenuation[:, None, :, None] * torch.cat(
+            [response[:, None], self.basis[..., None] * response[:, None]], dim=1
+        )  # (R, 1 + K, N, 2)
         shape = weight.shape[:2]
         means, choleskys = (x[:, None].expand(*shape, -1, -1) for x in (mean, cholesky))
         drawn = rasterize(means, choleskys, weight, GRID).flatten(-2)
@@ -144,7 +146,9 @@ class RssiModel(nn.Module):
         position = torch.as_tensor(position, dtype=torch.float64)
         if position.dim() != 2 or position.shape[1] != 3 or not position.isfinite().all():
             raise InputError(f"positions must be finite and of shape (n, 3) [m], got shape {tuple(position.shape)}")
-        parts = [(self(p), self.deviation(p)) for p in position.split(batch)] or [(torch.empty(0, len(self.receiver)),) * 2]
+        parts = [(self(p), self.deviation(p)) for p in position.split(batch)] or [
+            (torch.empty(0, len(self.receiver)),) * 2
+        ]
         middle, deviation = (torch.cat(x) for x in zip(*parts, strict=True))
         return middle, middle - self.widening * deviation, middle + self.widening * deviation
 
@@ -249,7 +253,9 @@ def _optimise(train: Rssi, n_primitives: int, kernel: Kernel, config: RssiConfig
         loss = functional.huber_loss(missed, torch.zeros_like(missed), delta=config.huber)
         loss = loss + 0.5 * model.field.prior() / heard
         if not math.isfinite(loss.item()):
-            raise FitError(f"the RSSI fit broke at step {step}: loss {loss.item():.3g}; try a rate below {config.rate:g}")
+            raise FitError(
+                f"the RSSI fit broke at step {step}: loss {loss.item():.3g}; try a rate below {config.rate:g}"
+            )
         optimiser.zero_grad()
         loss.backward()
         decay = 0.5 * (1 + math.cos(math.pi * step / config.steps))

@@ -103,11 +103,15 @@ def load_rssi(path: str | Path) -> Rssi:
     """
     folder = Path(path)
     if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder; expected one with gateway_position.yml, tx_pos.csv, gateway_rssi.csv")
+        raise InputError(
+            f"{folder} is not a folder; expected one with gateway_position.yml, tx_pos.csv, gateway_rssi.csv"
+        )
     names, rssi = read_table(folder / "gateway_rssi.csv")
     position = read_positions(folder / "tx_pos.csv")
     if len(rssi) != len(position):
-        raise InputError(f"{folder}: gateway_rssi.csv has {len(rssi)} rows, tx_pos.csv {len(position)}; they must match")
+        raise InputError(
+            f"{folder}: gateway_rssi.csv has {len(rssi)} rows, tx_pos.csv {len(position)}; they must match"
+        )
     _check_values(folder / "gateway_rssi.csv", names, rssi)
     heard = torch.where(rssi == NOT_HEARD, torch.nan, rssi)
     described = ["gateway_position.yml", "tx_pos.csv", "gateway_rssi.csv"]

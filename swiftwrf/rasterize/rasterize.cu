@@ -125,7 +125,8 @@ extern "C" __global__ void __launch_bounds__(THREADS) find_reach(
 // ---------------------------------------------------------------------------------------------------------------- forward
 //
 // A warp draws a tile, each of its threads four pixels of one column. It goes through the bits, collects the primitives that
-// reach the tile, and draws them 32 at a time: each thread prepares one of them, then all draw all 32.
+// reach the tile, and draws them 32 at a time: each thread prepares one of them, then all draw all 32. The order in which
+// primitives are collected follows from the bits alone.
 
 constexpr int ROW_STEP = LANES / TILE_COLUMNS;  // rows between two pixels of a thread
 constexpr int PIXELS = TILE_ROWS / ROW_STEP;    // of a thread
@@ -136,87 +137,101 @@ extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
     const float2* __restrict__ weight,     // (B, N) real and imaginary part
     const unsigned* __restrict__ reached,  // (B, strips, words), from find_reach
     float* __restrict__ out,               // (B, 2, n_elevation, n_azimuth)
-    int n_positions, int n, int cholesky_per_position, Grid grid, Cutoff cutoff) {
-    __shared__ int s_collected[WARPS][LANES];  // indices: fewer than 32 wait while up to 32 come
-    __shared__ float4 s_place[WARPS][LANES];       // column and row from the tile's centre; weight
-    __shared__ float4 s_whitening[WARPS][LANES];   // s1, s21, s3
+    unsigned n_positions, int n, int cholesky_per_position, Grid grid, Cutoff cutoff) {
+    __shared__ int s_collected[WARPS][2 * LANES];   // indices: fewer than 32 wait while up to 32 come
+    __shared__ float4 s_prepared[WARPS][LANES][2];  // u at the tile's centre, s1, v there, s21; s3, weight, column
 
     const int warp = threadIdx.x / LANES, lane = threadIdx.x % LANES;
     const int across = strips_of_columns(grid), down = strips_of_rows(grid);
-    const long long task = static_cast<long long>(blockIdx.x) * WARPS + warp;
-    const int position = static_cast<int>(task / (across * down)), tile = static_cast<int>(task % (across * down));
+    const unsigned task = blockIdx.x * WARPS + warp;
+    const unsigned position = task / (across * down);
+    const int tile = task % (across * down);
     if (position >= n_positions) return;
     const int tile_column = tile % across * TILE_COLUMNS, tile_row = tile / across * TILE_ROWS;
     const float centre_column = tile_column + 0.5f * (TILE_COLUMNS - 1), centre_row = tile_row + 0.5f * (TILE_ROWS - 1);
     const float x = lane % TILE_COLUMNS - 0.5f * (TILE_COLUMNS - 1), y = lane / TILE_COLUMNS - 0.5f * (TILE_ROWS - 1);
     const float turn = grid.n_azimuth, turns_per_column = 1.0f / turn;
     const size_t first = static_cast<size_t>(position) * n, first_factor = cholesky_per_position ? first : 0;
-
-    float re[PIXELS] = {}, im[PIXELS] = {};
-    const auto draw = [&](int count) {
-        __syncwarp();
-        if (lane < count) {
-            const size_t i = s_collected[warp][lane];
-            const float2 angles = mean[first + i], psi = weight[first + i];
-            const Place azimuth = locate(angles.x, grid.azimuth), elevation = locate(angles.y, grid.elevation);
-            const Whitening w = whiten(factor(cholesky + 3 * (first_factor + i), grid));
-            s_place[warp][lane] = make_float4(
-                wrapped(azimuth.pixel - centre_column, turn, turns_per_column) + azimuth.beyond,
-                elevation.pixel - centre_row + elevation.beyond, psi.x, psi.y);
-            s_whitening[warp][lane] = make_float4(w.s1, w.s21, w.s3, 0.0f);
-        }
-        __syncwarp();
-#pragma unroll 1
-        for (int j = 0; j < count; ++j) {
-            const float4 place = s_place[warp][j], w = s_whitening[warp][j];
-            // wrapped for each pixel: on the far side of a wide primitive a tile may see it from both directions
-            const float dx = wrapped(x - place.x, turn, turns_per_column);
-            const float u = w.x * dx, v = fmaf(w.z, y - place.y, w.y * dx);
-#pragma unroll
-            for (int k = 0; k < PIXELS; ++k) {
-                const float v_k = k ? fmaf(w.z, static_cast<float>(k * ROW_STEP), v) : v;
-                const float exponent = fmaf(-v_k, v_k, -u * u);
-                if (!(exponent < cutoff.least)) {
-                    const float kernel = exp2f(exponent);
-                    re[k] = fmaf(place.z, kernel, re[k]);
-                    im[k] = fmaf(place.w, kernel, im[k]);
-                }
-            }
-        }
-    };
-
     const int words = (n + LANES - 1) / LANES;
     const unsigned* by_column = reached + (static_cast<size_t>(position) * (across + down) + tile % across) * words;
     const unsigned* by_row = reached + (static_cast<size_t>(position) * (across + down) + across + tile / across) * words;
-    int waiting = 0;
-    for (int begin = 0; begin < words; begin += LANES) {
-        const int word = begin + lane;
-        unsigned left = word < words ? by_column[word] & by_row[word] : 0;
-        // every thread that has bits left gives one
-        for (unsigned giving = __ballot_sync(WARP, left != 0); giving; giving = __ballot_sync(WARP, left != 0)) {
-            if (left) s_collected[warp][waiting + __popc(giving & ((1u << lane) - 1))] = word * LANES + __ffs(left) - 1;
-            left &= left - 1;
-            waiting += __popc(giving);
-            if (waiting >= LANES) {
-                draw(LANES);
-                waiting -= LANES;
-                if (lane < waiting) s_collected[warp][lane] = s_collected[warp][LANES + lane];
-                __syncwarp();
+
+    float re[PIXELS] = {}, im[PIXELS] = {};
+    int begin = 0, waiting = 0, count;
+    unsigned left = 0;  // of the 32 primitives of the thread's word
+    do {
+        // Collect: every thread that has primitives left gives one.
+        while (waiting < LANES) {
+            const unsigned giving = __ballot_sync(WARP, left != 0);
+            if (giving) {
+                const int slot = waiting + __popc(giving & ((1u << lane) - 1));
+                if (left) s_collected[warp][slot] = (begin - LANES + lane) * LANES + __ffs(left) - 1;
+                left &= left - 1;
+                waiting += __popc(giving);
+            } else if (begin < words) {
+                left = begin + lane < words ? by_column[begin + lane] & by_row[begin + lane] : 0;
+                begin += LANES;
+            } else {
+                break;
             }
         }
-    }
-    draw(waiting);
+        count = min(waiting, LANES);
+        __syncwarp();
+
+        // Prepare.
+        bool wide = false;
+        if (lane < count) {
+            const size_t i = s_collected[warp][lane];
+            const float2 angles = mean[first + i], psi = weight[first + i];
+            const float3 l = factor(cholesky + 3 * (first_factor + i), grid);
+            const Place azimuth = locate(angles.x, grid.azimuth), elevation = locate(angles.y, grid.elevation);
+            const Whitening w = whiten(l);
+            const float dx = wrapped(azimuth.pixel - centre_column, turn, turns_per_column) + azimuth.beyond;
+            const float dy = elevation.pixel - centre_row + elevation.beyond;
+            s_prepared[warp][lane][0] = make_float4(-w.s1 * dx, w.s1, fmaf(-w.s3, dy, -w.s21 * dx), w.s21);
+            s_prepared[warp][lane][1] = make_float4(w.s3, psi.x, psi.y, dx);
+            wide = !(reach_columns(l, cutoff.reach) < 0.5f * (turn - TILE_COLUMNS));
+        }
+        // a tile may see a wide primitive from both directions
+        const bool any_wide = __ballot_sync(WARP, wide);
+        __syncwarp();
+
+        // Draw.
+#pragma unroll 1
+        for (int j = 0; j < count; ++j) {
+            const float4 c = s_prepared[warp][j][0], r = s_prepared[warp][j][1];
+            float u = fmaf(c.y, x, c.x), v = fmaf(r.x, y, fmaf(c.w, x, c.z));
+            if (any_wide) {
+                const float dx = x - r.w, turned = wrapped(dx, turn, turns_per_column) - dx;
+                u = fmaf(c.y, turned, u);
+                v = fmaf(c.w, turned, v);
+            }
+#pragma unroll
+            for (int k = 0; k < PIXELS; ++k) {
+                const float v_k = k ? fmaf(r.x, static_cast<float>(k * ROW_STEP), v) : v;
+                const float exponent = fmaf(-v_k, v_k, -u * u);
+                if (!(exponent < cutoff.least)) {
+                    const float kernel = exp2f(exponent);
+                    re[k] = fmaf(r.y, kernel, re[k]);
+                    im[k] = fmaf(r.z, kernel, im[k]);
+                }
+            }
+        }
+        waiting -= count;
+        if (lane < waiting) s_collected[warp][lane] = s_collected[warp][LANES + lane];
+        __syncwarp();
+    } while (count == LANES);
 
     const size_t plane = static_cast<size_t>(grid.n_elevation) * grid.n_azimuth;
-    out += 2 * plane * position;
+    const int column = tile_column + lane % TILE_COLUMNS, row = tile_row + lane / TILE_COLUMNS;
+    out += 2 * plane * position + static_cast<size_t>(row) * grid.n_azimuth + column;
 #pragma unroll
     for (int k = 0; k < PIXELS; ++k) {
-        const int row = tile_row + lane / TILE_COLUMNS + k * ROW_STEP, column = tile_column + lane % TILE_COLUMNS;
-        if (row < grid.n_elevation && column < grid.n_azimuth) {
-            const size_t pixel = static_cast<size_t>(row) * grid.n_azimuth + column;
-            out[pixel] = re[k];
-            out[plane + pixel] = im[k];
+        if (row + k * ROW_STEP < grid.n_elevation && column < grid.n_azimuth) {
+            out[0] = re[k];
+            out[plane] = im[k];
         }
+        out += ROW_STEP * grid.n_azimuth;
     }
 }
 

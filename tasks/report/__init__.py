@@ -10,8 +10,9 @@ from swiftwrf import InputError
 from tasks.report.aoa import aoa_page
 from tasks.report.page import write_page
 from tasks.report.records import Records
+from tasks.report.rssi import rssi_page
 
-PAGES = {"aoa": aoa_page}
+PAGES = {"aoa": aoa_page, "rssi": rssi_page}
 
 
 def write_report(folder: Path, metrics: dict[str, Any]) -> None:

@@ -34,6 +34,12 @@ COLOURS = {
     "final: training": "#ee8866",
     "turbo_gp": "#aa3377",
     "swiftwrf": "#4477aa",
+    "mean": "#bbbbbb",
+    "mri_pooled": "#ee6677",
+    "mri_receiver": "#ee8866",
+    "mri_residual": "#ccbb44",
+    "knn": "#66ccee",
+    "gp": "#228833",
     "peak": "#bbbbbb",
     "constant": "#999999",
     "nearest_spectrum": "#666666",
@@ -70,7 +76,7 @@ def legend_below(figure: Figure, axes: Axes) -> None:
 def cdf(axes: Axes, errors: Mapping[str, ArrayLike], label: str, limit: float | None = None) -> None:
     """Empirical distribution of each method's errors, with the median marked by the line at 0.5."""
     for name, values in errors.items():
-        dashed = name in ("peak", "constant", "nearest_spectrum")
+        dashed = name in ("peak", "constant", "nearest_spectrum", "mean")
         axes.ecdf(np.asarray(values), label=name, color=colour(name), linestyle="--" if dashed else "-", linewidth=1.4)
     axes.axhline(0.5, color="#aeb7c6", linewidth=0.8)
     axes.set(xlabel=label, ylabel="share of test spectra", ylim=(0, 1), xlim=(0, limit))

@@ -1,0 +1,205 @@
+"""RSSI at the receivers asked for, at positions nobody measured: SwiftWRF against what practitioners use."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from PIL import Image, UnidentifiedImageError
+
+from swiftwrf import InputError, Rssi, load_rssi, rssi_room
+from swiftwrf.metrics import summary
+from tasks.report import write_report
+from tasks.rssi.predictors import PREDICTORS, SwiftWRFPredictor, make_predictor
+from tasks.run import Row, Run, choose_device, console
+
+MAP_CELLS = 80  # along the longer side of the floor
+
+
+@dataclass(frozen=True)
+class RssiTaskConfig:
+    """RSSI of a moving transmitter at fixed receivers, against baselines.
+
+    Without --data the built-in simulated floor is used. An interrupted run goes on with --resume DIR.
+    """
+
+    rx: tuple[str, ...]
+    """receivers: names, numbers counted from 1, or all"""
+    data: str | None = None
+    """folder with gateway_position.yml, tx_pos.csv and gateway_rssi.csv (NeRF2 layout)"""
+    split: str = "random"
+    """a split that comes with the data, or a seeded one: random or block"""
+    floor_plan: str | None = None
+    """an image to draw behind the maps"""
+    floor_extent: tuple[float, float, float, float] | None = None
+    """x0 x1 y0 y1 of that image [m]"""
+    seed: int = 0
+    """of everything random"""
+    out: str | None = None
+    """directory of the run; must not exist (default: a new one under runs/rssi)"""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """where to compute; RSSI models are small, so auto is the CPU"""
+
+
+def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
+    """Runs the experiment and writes its directory, or goes on with an interrupted one.
+
+    Raises:
+        InputError: what the configuration asks for is not there or makes no sense.
+    """
+    device = choose_device("cpu" if config.device == "auto" else config.device)
+    _check_floor_plan(config)
+    data = (load_rssi(config.data) if config.data else rssi_room(seed=config.seed)).receivers(config.rx)
+    train, test = data.split(config.split, config.seed)
+    train.receivers(["all"])  # refuses receivers heard too rarely to learn from
+    if not bool((~test.rssi_dbm.isnan()).any()):
+        raise InputError(f"split {config.split!r} of {data.name} has no heard test rows for these receivers")
+    label = f"rx{'_'.join(config.rx)}-s{config.seed}"
+    with Run("rssi", config.out, label, config, device, data.source, resume) as directory:
+        tables = _Tables(data, train, test, config, directory)
+        for name in PREDICTORS:
+            tables.add(name)
+        directory.write_csv("errors.csv", tables.errors)
+        directory.write_csv("predictions.csv", tables.predictions)
+        metrics = {
+            "task": "rssi",
+            "data": data.name,
+            "split": config.split,
+            "seed": config.seed,
+            "n_train": len(train),
+            "n_test": len(test),
+            **tables.summary(),
+        }
+        final = directory.finish(metrics, write_report)
+    console.print(f"report: [bold]{final / 'report.html'}[/]")
+
+
+def _check_floor_plan(config: RssiTaskConfig) -> None:
+    if (config.floor_plan is None) != (config.floor_extent is None):
+        raise InputError("--floor-plan needs --floor-extent x0 x1 y0 y1 [m], and the other way round")
+    if config.floor_plan is None or config.floor_extent is None:
+        return
+    x0, x1, y0, y1 = config.floor_extent
+    if not (x0 < x1 and y0 < y1):
+        raise InputError(f"--floor-extent must be x0 x1 y0 y1 with x0 < x1 and y0 < y1, got {config.floor_extent}")
+    try:
+        with Image.open(config.floor_plan) as image:
+            image.verify()
+    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+        raise InputError(f"--floor-plan {config.floor_plan} is not a readable image ({error})") from None
+
+
+class _Tables:
+    """Fits and tests every predictor, each a step of the run's directory, and gathers the tables of the run."""
+
+    def __init__(self, data: Rssi, train: Rssi, test: Rssi, config: RssiTaskConfig, directory: Run) -> None:
+        self.train, self.test, self.config, self.directory = train, test, config, directory
+        self.errors: list[Row] = []
+        self.predictions: list[Row] = []
+        self.seconds: dict[str, Row] = {}
+        self.coverage = float("nan")
+        self.chosen: Row = {}
+        test_position = test.transmitter_position
+        self.from_receiver = torch.cdist(test_position, data.receiver_position)
+        self.from_training = torch.cdist(test_position, train.transmitter_position).min(dim=1).values
+
+    def add(self, name: str) -> None:
+        """One predictor."""
+
+        def compute() -> Row:
+            predictor = make_predictor(
+                name, validation="random" if self.config.split == "random" else "block", seed=self.config.seed
+            )
+            began = time.perf_counter()
+            predictor.fit(self.train)
+            fitted = time.perf_counter()
+            result: Row = {"predicted": predictor.predict(self.test.transmitter_position)}
+            result |= {"fit": fitted - began, "predict": time.perf_counter() - fitted}
+            if isinstance(predictor, SwiftWRFPredictor):
+                _, low, high = predictor.model.predict(self.test.transmitter_position)
+                result |= {"low": low, "high": high, "n_primitives": len(predictor.model.primitives)}
+                self._keep_maps(predictor)
+            return result
+
+        value = self.directory.step(name, compute)["value"]
+        self.seconds[name] = {"fit": value["fit"], "predict": value["predict"]}
+        predicted = torch.tensor(value["predicted"], dtype=torch.float64)
+        measured = self.test.rssi_dbm
+        for row, column in (~measured.isnan()).nonzero().tolist():
+            self.errors.append(
+                {
+                    "method": name,
+                    "receiver": self.test.receiver_names[column],
+                    "index": int(self.test.index[row]),
+                    "measured_dbm": float(measured[row, column]),
+                    "predicted_dbm": float(predicted[row, column]),
+                    "abs_error_db": abs(float(predicted[row, column] - measured[row, column])),
+                    "from_receiver_m": float(self.from_receiver[row, column]),
+                    "from_training_m": float(self.from_training[row]),
+                }
+            )
+        if name == "swiftwrf":
+            self._predict_rows(predicted, torch.tensor(value["low"]), torch.tensor(value["high"]))
+            self.chosen = {"n_primitives": value["n_primitives"]}
+
+    def _predict_rows(self, predicted: torch.Tensor, low: torch.Tensor, high: torch.Tensor) -> None:
+        measured, heard = self.test.rssi_dbm, ~self.test.rssi_dbm.isnan()
+        self.coverage = float(((measured >= low) & (measured <= high))[heard].double().mean())
+        for row, column in heard.nonzero().tolist():
+            x, y, z = self.test.transmitter_position[row].tolist()
+            values = (measured, predicted, low, high)
+            self.predictions.append(
+                {"x": x, "y": y, "z": z, "receiver": self.test.receiver_names[column]}
+                | {
+                    k: float(v[row, column])
+                    for k, v in zip(("measured", "predicted", "low", "high"), values, strict=True)
+                }
+            )
+
+    def _keep_maps(self, predictor: SwiftWRFPredictor) -> None:
+        """Predicted field and width of the interval over the floor, at the median height of the measurements."""
+        position = self.train.transmitter_position
+        low, high = position.min(dim=0).values, position.max(dim=0).values
+        cell = float((high - low)[:2].max()) / MAP_CELLS or 1.0
+        xs, ys = (
+            torch.arange(float(a), float(b) + cell, cell, dtype=torch.float64)
+            for a, b in zip(low[:2], high[:2], strict=True)
+        )
+        grid = torch.stack([*torch.meshgrid(xs, ys, indexing="xy")], dim=-1).reshape(-1, 2)
+        places = torch.cat([grid, position[:, 2].median().expand(len(grid), 1)], dim=1)
+        middle, lower, upper = (p.T.reshape(-1, len(ys), len(xs)).numpy() for p in predictor.model.predict(places))
+        plan = {}
+        if self.config.floor_plan is not None:
+            with Image.open(self.config.floor_plan) as image:
+                plan = {"plan": np.asarray(image.convert("RGB")), "plan_extent": np.array(self.config.floor_extent)}
+        np.savez_compressed(
+            self.directory.path("maps.npz"),
+            x=xs.numpy(),
+            y=ys.numpy(),
+            predicted=middle.astype(np.float32),
+            width=(upper - lower).astype(np.float32),
+            measured_position=self.train.transmitter_position.numpy(),
+            measured=self.train.rssi_dbm.numpy(),
+            receiver=self.train.receiver_position.numpy(),
+            receiver_names=np.array(self.train.receiver_names),
+            **plan,
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """What metrics.json says of the methods."""
+
+        def of(method: str, receiver: str | None = None) -> Row:
+            own = [r for r in self.errors if r["method"] == method and receiver in (None, r["receiver"])]
+            return {"abs_error_db": summary([r["abs_error_db"] for r in own])}
+
+        return {
+            "overall": {name: of(name) | {"seconds": self.seconds[name]} for name in PREDICTORS},
+            "receivers": {r: {name: of(name, r) for name in PREDICTORS} for r in self.test.receiver_names},
+            "seconds": self.seconds["swiftwrf"],
+            "interval": {"nominal": 0.8, "coverage": self.coverage},
+            "chosen": self.chosen,
+        }
