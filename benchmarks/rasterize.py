@@ -1,96 +1,189 @@
-"""Spectra per second of each maker, against the definition in the same run, and the error that the speed costs."""
+"""Spectra per second: each maker alone and the whole model, on the machine's GPU where there is one, else on its CPU.
+
+Rates are medians over repeats with the least and the most; makers are compared within one run. On a GPU every rate also
+comes as a share of two bounds: the exponentials of the pixels inside the cutoff (16 a clock and multiprocessor), and the
+writing of the spectrum at the speed of a measured copy.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+import tyro
 from record import write_result
 from torch import Tensor
 
-from swiftwrf import AngularGrid, rasterize
+from swiftwrf import AngularGrid, ModelConfig, SwiftWRF, rasterize
+from swiftwrf.deformation import Kernel
+from swiftwrf.rasterize import Maker
 
-GRID = AngularGrid.hemisphere(90, 360)
-NUMBERS = (50, 200, 1000)
-BATCH = 8
-REPEATS = 5
-
-
-def scene(n: int, batch: int) -> list[Tensor]:
-    """Random primitives that cover the grid alike whatever their number."""
-    generator = torch.Generator().manual_seed(0)
-    mean = torch.rand(batch, n, 2, generator=generator) * torch.tensor([2 * torch.pi, torch.pi / 2])
-    width = torch.tensor([2 * torch.pi, 0.0, torch.pi / 2]) / n**0.5 / 2
-    cholesky = width.repeat(n, 1)
-    cholesky[:, 1] = 0.3 * width[2] * torch.randn(n, generator=generator)
-    return [mean, cholesky, torch.randn(batch, n, 2, generator=generator)]
+Rate = dict[str, float]
+CUTOFF = 1e-3
+LARGEST_DENSE = 5e7  # kernel values of one spectrum: the definition keeps several such tensors
+LARGEST_OUTPUT = 2**31  # bytes of the spectra of one call
 
 
-def rate(draw: Callable[[], Any], batch: int, repeats: int) -> dict[str, float]:
-    """Spectra per second: median, least and most of the repeats after one warm-up."""
-    draw()
-    seconds = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        draw()
-        seconds.append(time.perf_counter() - began)
-    return {"median": batch / float(np.median(seconds)), "low": batch / max(seconds), "high": batch / min(seconds)}
+@dataclass(frozen=True)
+class Config:
+    quick: bool = False
+    """few primitives, small grids, one batch size"""
+    seconds: float = 1.0
+    """time for the repeats of one rate; at least 3, at most 50 of them"""
 
 
-def forward_backward(inputs: list[Tensor], maker: str, cutoff: float | None) -> None:
-    """One drawing and its gradients."""
-    leaves = [x.clone().requires_grad_() for x in inputs]
-    rasterize(*leaves, GRID, maker=maker, cutoff=cutoff).square().sum().backward()
-
-
-def main() -> None:
-    """Measures forward and forward + backward."""
+def main(config: Config) -> None:
+    """Measures every combination and writes `results/rasterize_<cpu or GPU>.json`."""
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    sizes = {"n": [50, 200], "grid": [(16, 16), (90, 360)], "batch": [8]}
+    if not config.quick:
+        batch = [1, 8] if device.type == "cpu" else [1, 16, 256, 4096]
+        sizes = {"n": [50, 200, 1000, 10_000], "grid": [(16, 16), (90, 360), (180, 720)], "batch": batch}
+    machine = gpu_rates() if device.type == "cuda" else None
     rows = []
-    for n in NUMBERS:
-        inputs = scene(n, BATCH)
-        exact = rasterize(
-            *(x[:1] if x.dim() == 3 else x for x in (t.double() for t in inputs)), GRID, "reference", None
-        )
-        scale = float(inputs[2][:1].norm(dim=-1).sum())
-        for maker, cutoff, batch, repeats in (
-            ("reference", None, 1, 3),
-            ("cpu", None, BATCH, REPEATS),
-            ("cpu", 1e-4, BATCH, REPEATS),
-        ):
-            few = [x[:batch] if x.dim() == 3 else x for x in inputs]
-            drawn = rasterize(*few, GRID, maker=maker, cutoff=cutoff)
-            row = {
-                "maker": maker,
-                "cutoff": cutoff,
-                "n": n,
-                "batch": batch,
-                "forward_per_s": rate(
-                    lambda f=few, m=maker, c=cutoff: rasterize(*f, GRID, maker=m, cutoff=c), batch, repeats
-                ),
-                "forward_backward_per_s": rate(
-                    lambda f=few, m=maker, c=cutoff: forward_backward(f, m, c), batch, repeats
-                ),
-                "value_error_of_sum_weight": float((drawn[:1] - exact).abs().max()) / scale,
-            }
-            rows.append(row)
-            print(
-                maker, cutoff, n, {k: round(v["median"], 1) for k, v in row.items() if isinstance(v, dict)}, flush=True
-            )
-    ratio = {
-        f"n{n}": {
-            key: next(r for r in rows if r["n"] == n and r["maker"] == "cpu" and r["cutoff"])[key]["median"]
-            / next(r for r in rows if r["n"] == n and r["maker"] == "reference")[key]["median"]
+    for shape in sizes["grid"]:
+        for n in sizes["n"]:
+            for batch in sizes["batch"]:
+                if batch * 8 * shape[0] * shape[1] <= LARGEST_OUTPUT:
+                    rows.append(measure(AngularGrid.hemisphere(*shape), n, batch, device, machine, config.seconds))
+                    report(rows[-1])
+    name = torch.cuda.get_device_name().replace(" ", "-").lower() if device.type == "cuda" else "cpu"
+    content = {"cutoff": CUTOFF, "quick": config.quick, "machine": machine, "rows": rows}
+    write_result(f"rasterize_{name}", content, device)
+
+
+def measure(
+    grid: AngularGrid, n: int, batch: int, device: torch.device, machine: Rate | None, seconds: float
+) -> dict[str, Any]:
+    """One row: every maker alone, forward and with gradients, and the model from positions to magnitudes."""
+    inputs = scene(n, batch, device)
+    exact = exact_spectrum(inputs, grid)
+    makers: dict[str, Any] = {}
+    for maker in ("reference", "cuda" if device.type == "cuda" else "cpu"):
+        # the definition draws one position at a time: its rate does not grow with the batch
+        few = [x[:1] if x.dim() == 3 else x for x in inputs] if maker == "reference" else inputs
+        if maker == "reference" and exact is None:
+            continue
+        drawn = rasterize(*few, grid, maker, CUTOFF)
+        makers[maker] = {
+            "forward_per_s": rate(lambda f=few, m=maker: rasterize(*f, grid, m, CUTOFF), len(few[0]), device, seconds),
+            "forward_backward_per_s": rate(
+                lambda f=few, m=maker: with_gradients(f, grid, m), len(few[0]), device, seconds
+            ),
+            "error_of_sum_weight": None if exact is None else value_error(drawn[:1], exact, inputs[2][:1]),
+        }
+    row: dict[str, Any] = {"grid": grid.shape, "n": n, "batch": batch, "makers": makers}
+    fast = makers["cuda" if device.type == "cuda" else "cpu"]
+    if "reference" in makers:
+        row["over_reference"] = {
+            key: fast[key]["median"] / makers["reference"][key]["median"]
             for key in ("forward_per_s", "forward_backward_per_s")
         }
-        for n in NUMBERS
+    row["end_to_end_per_s"] = end_to_end(n, batch, grid, device, seconds)
+    row["end_to_end_share"] = row["end_to_end_per_s"]["median"] / fast["forward_per_s"]["median"]
+    if machine is not None:
+        row["share_of_bounds"] = {
+            "exponentials": fast["forward_per_s"]["median"] * kernel_values(inputs, grid) / machine["exponentials_per_s"],
+            "writing": fast["forward_per_s"]["median"] * 8 * grid.n_elevation * grid.n_azimuth / machine["bytes_per_s"],
+        }  # fmt: skip
+        row["peak_memory_bytes"] = torch.cuda.max_memory_allocated()
+        torch.cuda.reset_peak_memory_stats()
+    return row
+
+
+def scene(n: int, batch: int, device: torch.device) -> list[Tensor]:
+    """Random primitives of which each pixel sees equally many whatever their number: standard deviations of one degree
+    for 10,000, as in a published model with that many."""
+    generator = torch.Generator().manual_seed(0)
+    mean = torch.rand(batch, n, 2, generator=generator) * torch.tensor([2 * torch.pi, torch.pi / 2])
+    cholesky = np.radians(100) / n**0.5 * torch.exp(0.35 * torch.randn(n, 3, generator=generator))
+    cholesky[:, 1] *= 0.5 * torch.randn(n, generator=generator)
+    return [x.to(device) for x in (mean, cholesky, torch.randn(batch, n, 2, generator=generator))]
+
+
+def exact_spectrum(inputs: list[Tensor], grid: AngularGrid) -> Tensor | None:
+    """The first position in float64 without a cutoff; None where the definition would not fit in memory."""
+    if inputs[0].shape[1] * grid.n_elevation * grid.n_azimuth > LARGEST_DENSE:
+        return None
+    return rasterize(*(x[:1] if x.dim() == 3 else x for x in (t.double() for t in inputs)), grid, "reference", None)
+
+
+def value_error(drawn: Tensor, exact: Tensor, weight: Tensor) -> float:
+    """Largest difference as a share of sum |weight|."""
+    return float((drawn - exact).abs().max() / weight.norm(dim=-1).sum())
+
+
+def kernel_values(inputs: list[Tensor], grid: AngularGrid) -> float:
+    """Pixels inside the cutoff of a primitive, summed over the primitives of one position, drawn with weight 1."""
+    mean, cholesky, _ = (x[:1] if x.dim() == 3 else x for x in inputs)
+    total = 0
+    for i in range(0, mean.shape[1], 256):  # one primitive a position
+        one = mean[0, i : i + 256, None]
+        drawn = rasterize(one, cholesky[i : i + 256, None], torch.ones_like(one), grid, "auto", CUTOFF)
+        total += int(torch.count_nonzero(drawn[:, 0]))
+    return float(total)
+
+
+def with_gradients(inputs: list[Tensor], grid: AngularGrid, maker: Maker) -> None:
+    """One drawing and the gradients of everything."""
+    leaves = [x.detach().requires_grad_() for x in inputs]
+    drawn = rasterize(*leaves, grid, maker, CUTOFF)
+    torch.autograd.grad(drawn, leaves, torch.ones_like(drawn))
+
+
+def end_to_end(n: int, batch: int, grid: AngularGrid, device: torch.device, seconds: float) -> Rate:
+    """Positions in, magnitudes out, with the motion basis; initial primitives are about as wide as those of `scene`."""
+    generator = torch.Generator().manual_seed(0)
+    anchor = torch.rand(200, 3, generator=generator)
+    config = ModelConfig(n_primitives=n, cutoff=CUTOFF)
+    model = SwiftWRF(config, grid, anchor, Kernel(), generator=generator).to(device)
+    with torch.no_grad():
+        position = model.normalise(torch.rand(batch, 3, generator=generator).to(device))
+        return rate(lambda: model(position), batch, device, seconds)
+
+
+def rate(draw: Callable[[], Any], batch: int, device: torch.device, seconds: float) -> Rate:
+    """Spectra per second after two warm-up calls: median, least and most of the repeats."""
+
+    def timed() -> float:
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        began = time.perf_counter()
+        draw()
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        return time.perf_counter() - began
+
+    timed()
+    repeats = int(np.clip(seconds / timed(), 3, 50))
+    taken = [timed() for _ in range(repeats)]
+    return {"median": batch / float(np.median(taken)), "low": batch / max(taken), "high": batch / min(taken)}
+
+
+def gpu_rates() -> Rate:
+    """What the GPU can do: exponentials from its clock, bytes written (and as many read) from a copy of 1 GiB."""
+    properties = torch.cuda.get_device_properties(0)
+    source = torch.empty(2**28, device="cuda")
+    target = torch.empty_like(source)
+    copies = rate(lambda: target.copy_(source), 1, torch.device("cuda"), 0.5)["median"]
+    return {
+        "exponentials_per_s": 16.0 * properties.multi_processor_count * properties.clock_rate * 1e3,
+        "bytes_per_s": 2 * 2.0**30 * copies,
     }
-    write_result(
-        "rasterize", {"grid": GRID.shape, "threads": torch.get_num_threads(), "cpu_over_reference": ratio, "rows": rows}
-    )
+
+
+def report(row: dict[str, Any]) -> None:
+    """One line."""
+    rates = {
+        name: {k: f"{v['median']:.4g}" for k, v in m.items() if k.endswith("_s")} for name, m in row["makers"].items()
+    }
+    print(row["grid"], "N", row["n"], "batch", row["batch"], rates, f"end to end {row['end_to_end_per_s']['median']:.4g}",
+          row.get("share_of_bounds", ""), flush=True)  # fmt: skip
 
 
 if __name__ == "__main__":
-    main()
+    main(tyro.cli(Config))

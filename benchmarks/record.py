@@ -15,11 +15,11 @@ from tasks.run import environment
 RESULTS = Path(__file__).parent / "results"
 
 
-def write_result(name: str, content: dict[str, Any]) -> None:
-    """Writes `results/NAME.json`: strict JSON with the command and where it ran."""
+def write_result(name: str, content: dict[str, Any], device: torch.device | None = None) -> None:
+    """Writes `results/NAME.json`: strict JSON with the command and where it ran, on the CPU unless told otherwise."""
     RESULTS.mkdir(exist_ok=True)
     command = shlex.join(["python", *(Path(a).name if Path(a).exists() else a for a in sys.argv)])
-    record = {"command": command, "environment": environment(torch.device("cpu"), {}), **content}
+    record = {"command": command, "environment": environment(device or torch.device("cpu"), {}), **content}
     file = RESULTS / f"{name}.json"
     file.write_text(json.dumps(record, indent=1, allow_nan=False) + "\n")
     print(f"wrote {file}")

@@ -50,8 +50,9 @@ class RssiConfig:
     batch: int = 1024
     """rows a step"""
     rate: float = 5e-2
-    huber: float = 1.0
-    """errors beyond so many standard deviations of the noise count linearly, for packets have outliers"""
+    huber: float = 1.345
+    """errors beyond so many standard deviations of the noise count linearly (Huber's constant: 95 % efficient where the
+    noise is Gaussian), for packets have outliers"""
     coverage: float = 0.8
     """share of measurements that the interval should cover"""
     validation: Validation = "random"

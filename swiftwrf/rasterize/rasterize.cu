@@ -290,14 +290,16 @@ extern "C" __global__ void __launch_bounds__(THREADS, 4) rasterize_backward(
                 const float g_re = pixel[0], g_im = pixel[plane];
                 const float v = fmaf(w.s3, dy, v_x);
                 const float exponent = fmaf(-v, v, -u * u);
-                const float kernel = exponent < cutoff.least ? 0.0f : exp2f(exponent);
-                d_re = fmaf(kernel, g_re, d_re);
-                d_im = fmaf(kernel, g_im, d_im);
-                const float z = kernel * fmaf(psi.x, g_re, psi.y * g_im);
-                const float z_times_v = z * v;
-                s_0 += z;
-                s_1 += z_times_v;
-                s_2 = fmaf(z_times_v, v, s_2);
+                if (!(exponent < cutoff.least)) {
+                    const float kernel = exp2f(exponent);
+                    const float z = kernel * fmaf(psi.x, g_re, psi.y * g_im);
+                    const float z_times_v = z * v;
+                    d_re = fmaf(kernel, g_re, d_re);
+                    d_im = fmaf(kernel, g_im, d_im);
+                    s_0 += z;
+                    s_1 += z_times_v;
+                    s_2 = fmaf(z_times_v, v, s_2);
+                }
                 dy += 1.0f;
                 pixel += grid.n_azimuth;
             }

@@ -70,7 +70,8 @@ def as_svg(figure: Figure) -> str:
 
 def legend_below(figure: Figure, axes: Axes) -> None:
     """One legend for all axes, from the entries of one of them."""
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
+    columns = max(1, int(figure.get_figwidth() / 1.6))
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=columns, frameon=False)
 
 
 def cdf(axes: Axes, errors: Mapping[str, ArrayLike], label: str, limit: float | None = None) -> None:

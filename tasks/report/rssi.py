@@ -37,11 +37,14 @@ def _lead(run: Records) -> str:
     error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
     best = min((name for name in error if name != "swiftwrf"), key=lambda name: error[name]["median"])
     interval = run.metrics["interval"]
+
+    def told(name: str) -> str:
+        return f"{error[name]['median']:.2f} dB (90 %: {error[name]['p90']:.1f})"
+
     return (
         f"On {_scene(run)}, SwiftWRF's median absolute error over {error['swiftwrf']['n']} heard pairs at "
-        f"{len(run.metrics['receivers'])} receivers is {error['swiftwrf']['median']:.2f} dB (90 %: {error['swiftwrf']['p90']:.1f}); "
-        f"the best baseline, {best}, reaches {error[best]['median']:.2f} dB ({error[best]['p90']:.1f}) and the log-distance law "
-        f"for all receivers {error['mri_pooled']['median']:.2f} dB. The {interval['nominal']:.0%} interval covers "
+        f"{len(run.metrics['receivers'])} receiver(s) is {told('swiftwrf')}; the best baseline, {best}, reaches {told(best)} "
+        f"and one log-distance law for all receivers {told('mri_pooled')}. The {interval['nominal']:.0%} interval covers "
         f"{interval['coverage']:.0%} of the test measurements."
     )
 
@@ -75,8 +78,8 @@ def _run(run: Records, several: bool) -> list[Section]:
 
 
 _MAP_CAPTION = (
-    "The predicted field with the training measurements in the same colours; a cross marks the receiver. At the median height "
-    "of the measurements."
+    "The predicted field with the training measurements in the same colours; a cross marks the receiver. At the median "
+    "height of the measurements."
 )
 _WHERE_CAPTION = (
     "Predicted against measured, and the absolute error (dots; line: running median) against the distance from the receiver "
@@ -116,7 +119,7 @@ def _paired(run: Records) -> Table:
         low, high = np.percentile(sums[:, 0] / sums[:, 1], (2.5, 97.5))
         mean = difference[:, 0].sum() / difference[:, 1].sum()
         rows.append([name, f"{mean:+.2f} [{low:+.2f}, {high:+.2f}]"])
-    caption = "SwiftWRF's absolute error minus the method's on the same pairs, mean, with a 95 % bootstrap interval over test rows."
+    caption = "Mean of SwiftWRF's absolute error minus the method's on the same pairs; 95 % bootstrap over test rows."
     return Table(["against", "difference [dB]"], rows, caption)
 
 
@@ -174,11 +177,9 @@ def _maps(run: Records, field: str, label: str) -> Figure:
         )
         if field == "predicted":
             heard = ~np.isnan(maps["measured"][:, i])
-            place = maps["measured_position"][heard]
-            ax.scatter(
-                *place[:, :2].T, c=maps["measured"][heard, i], s=9, cmap=colours, vmin=low, vmax=high,
-                edgecolors="white", linewidths=0.3, zorder=2,
-            )  # fmt: skip
+            x, y = maps["measured_position"][heard, :2].T
+            dots = {"cmap": colours, "vmin": low, "vmax": high, "edgecolors": "white", "linewidths": 0.3}
+            ax.scatter(x, y, s=9, c=maps["measured"][heard, i], zorder=2, **dots)
         ax.plot(*maps["receiver"][i, :2], "x", color="#ee6677", markersize=9, markeredgewidth=2, zorder=3)
         ax.set_title(str(maps["receiver_names"][i]), fontsize=9)
         ax.grid(visible=False)
@@ -202,7 +203,7 @@ def _where(run: Records) -> Figure:
     for ax, (column, label) in zip(axes[1:], columns.items(), strict=True):
         ordered = own.sort_values(column)
         ax.plot(ordered[column], ordered["abs_error_db"], ".", markersize=2, color="#bbbbbb")
-        window = max(len(ordered) // 10, 1)
+        window = max(len(ordered) // 5, 1)
         running = ordered["abs_error_db"].rolling(window, center=True).median()
         ax.plot(ordered[column], running, color=figures.colour("swiftwrf"), linewidth=1.6)
         ax.set(xlabel=label, ylabel="absolute error [dB]")
@@ -223,9 +224,9 @@ def _speed(run: Records) -> Figure:
 
 def _limits(run: Records) -> Section:
     texts = [
-        "A single packet scatters about the mean of its place by 2 to 3 dB, mostly because it says nothing of its channel; no "
-        "predictor of the mean can be better than that.",
-        "Values that were not heard are neither learnt from nor scored, so nothing here says where a receiver is out of reach.",
+        "A single packet scatters about the mean of its place by 2 to 3 dB, mostly because it says nothing of its channel; "
+        "no predictor of the mean can be better than that.",
+        "Values that were not heard are neither learnt from nor scored; nothing here says where a receiver is out of reach.",
         "Intervals of medians treat pairs as independent draws; along a walked path they are not, and the intervals are too "
         "narrow. The paired table draws whole test rows, which mends that in part.",
         "The paper's table (2.91 dB for SwiftWRF, 6.74 for MRI) is of other data; compare methods here, not with it.",

@@ -172,7 +172,7 @@ class _Tables:
         grid = torch.stack([*torch.meshgrid(xs, ys, indexing="xy")], dim=-1).reshape(-1, 2)
         places = torch.cat([grid, position[:, 2].median().expand(len(grid), 1)], dim=1)
         middle, lower, upper = (p.T.reshape(-1, len(ys), len(xs)).numpy() for p in predictor.model.predict(places))
-        plan = {}
+        plan: dict[str, Any] = {}
         if self.config.floor_plan is not None:
             with Image.open(self.config.floor_plan) as image:
                 plan = {"plan": np.asarray(image.convert("RGB")), "plan_extent": np.array(self.config.floor_extent)}
