@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numba
 import numpy as np
 import torch
 import tyro
@@ -52,7 +53,8 @@ def main(config: Config) -> None:
                     rows.append(measure(AngularGrid.hemisphere(*shape), n, batch, device, machine, config.seconds))
                     report(rows[-1])
     name = torch.cuda.get_device_name().replace(" ", "-").lower() if device.type == "cuda" else "cpu"
-    content = {"cutoff": CUTOFF, "quick": config.quick, "machine": machine, "rows": rows}
+    threads = {"torch": torch.get_num_threads(), "numba": numba.get_num_threads()}
+    content = {"cutoff": CUTOFF, "quick": config.quick, "threads": threads, "gpu": machine, "rows": rows}
     write_result(f"rasterize_{name}", content, device)
 
 
@@ -136,12 +138,16 @@ def with_gradients(inputs: list[Tensor], grid: AngularGrid, maker: Maker) -> Non
 
 
 def end_to_end(n: int, batch: int, grid: AngularGrid, device: torch.device, seconds: float) -> Rate:
-    """Positions in, magnitudes out, with the motion basis; initial primitives are about as wide as those of `scene`."""
+    """Positions in, magnitudes out, with the motion basis."""
     generator = torch.Generator().manual_seed(0)
     anchor = torch.rand(200, 3, generator=generator)
     config = ModelConfig(n_primitives=n, cutoff=CUTOFF)
     model = SwiftWRF(config, grid, anchor, Kernel(), generator=generator).to(device)
     with torch.no_grad():
+        mean, cholesky, _ = scene(n, 1, device)  # the primitives that are drawn alone
+        l1, l2, l3 = cholesky.unbind(-1)
+        model.primitives.mean.copy_(mean[0])
+        model.primitives.cholesky.copy_(torch.stack([l1.log(), l2 / l3, l3.log()], dim=-1))
         position = model.normalise(torch.rand(batch, 3, generator=generator).to(device))
         return rate(lambda: model(position), batch, device, seconds)
 

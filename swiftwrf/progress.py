@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from typing import TypeVar
+
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
@@ -15,3 +18,12 @@ def progress_bar(shown: bool = True) -> Progress:
     """A bar with steps, rate and time left; it disappears when it is done."""
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"))
     return Progress(*columns, _Rate(), TimeRemainingColumn(), transient=True, disable=not shown)
+
+
+Item = TypeVar("Item")
+
+
+def progress(items: Sequence[Item], description: str) -> Iterator[Item]:
+    """The items, with a bar."""
+    with progress_bar() as bar:
+        yield from bar.track(items, description=description)

@@ -10,11 +10,13 @@ cost two matrix products. All receivers are one batched program.
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import torch
-from rich.progress import Progress
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -26,7 +28,7 @@ from swiftwrf.errors import FitError, InputError
 from swiftwrf.fit import Validation, folds
 from swiftwrf.primitives import Primitives
 from swiftwrf.prior import candidates, held_out_weights, thinned
-from swiftwrf.progress import progress_bar
+from swiftwrf.progress import progress
 from swiftwrf.rasterize import rasterize
 from swiftwrf.rasterize.magnitude import magnitude
 
@@ -34,8 +36,11 @@ GRID = AngularGrid.hemisphere(16, 16)
 SCALE = 100.0  # dB per unit of pooled magnitude
 NEAREST = 0.3  # [m] distances below it count as it: the log-distance law ends somewhere
 MAX_ANCHORS = 1500
+UNCERTAINTY_ANCHORS = 400  # are enough to tell measured regions from others, at a tenth of the cost
+GROUP = 16  # receivers fitted as one program: bounds the memory of hundreds
 JITTER = 1e-3  # of the field's prior where anchors nearly coincide
 NOISES = (0.3, 1.0, 3.0)  # variance of a packet relative to that of the field: fading is as large as shadowing
+Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
 @dataclass(frozen=True)
@@ -60,8 +65,8 @@ class RssiConfig:
     seed: int = 0
 
 
-class RssiModel(nn.Module):
-    """RSSI at R receivers for any position of the transmitter.
+class ReceiverGroup(nn.Module):
+    """Some receivers, fitted as one batched program.
 
     Args:
         receiver: positions (R, 3) [m].
@@ -82,11 +87,12 @@ class RssiModel(nn.Module):
         self.register_buffer("centre", anchor.double().mean(dim=0))
         self.register_buffer("field_db", torch.zeros(n))  # standard deviation of the field under its prior
         self.register_buffer("noise_db", torch.ones(n))  # of a packet about the field
-        self.register_buffer("widening", torch.ones(()))  # half of the interval in standard deviations
         self.level = nn.Parameter(torch.zeros(n))  # T [dBm]
         self.slope = nn.Parameter(torch.zeros(n))  # -10 gamma [dB a decade]
         local = (anchor.double() - self.centre).float()
-        gram = kernel(local.double(), local.double())
+        few = local[:: max(1, len(local) // UNCERTAINTY_ANCHORS)]
+        self.register_buffer("few", few)
+        gram = kernel(few.double(), few.double())
         precision = torch.linalg.inv(gram + kernel.noise * torch.eye(len(gram), dtype=gram.dtype))
         self.register_buffer("precision", precision.float())
         self.field = SmoothField(local, replace(kernel, noise=JITTER), n * rank)
@@ -97,7 +103,7 @@ class RssiModel(nn.Module):
     centre: Tensor
     field_db: Tensor
     noise_db: Tensor
-    widening: Tensor
+    few: Tensor
     precision: Tensor
 
     def log_distance(self, position: Tensor) -> Tensor:
@@ -130,8 +136,40 @@ class RssiModel(nn.Module):
         scale = self.field_db / gain.norm(dim=-1).clamp_min(1e-6)
         return torch.cat([canonical, scale[:, None, None, None] * basis], dim=1)
 
+    def deviation(self, position: Tensor) -> Tensor:
+        """Standard deviation of a measurement about the prediction, (B, R) [dB]: packet noise, and the field's
+        uncertainty, which grows away from measured positions."""
+        cross = self.kernel((position - self.centre).float(), self.few)
+        unknown = (1 - (cross @ self.precision * cross).sum(dim=1)).clamp(0, 1)
+        return (self.noise_db**2 + self.field_db**2 * unknown[:, None]).sqrt()
+
+
+class RssiModel(nn.Module):
+    """RSSI at R receivers for any position of the transmitter; what `fit_rssi` returns.
+
+    Args:
+        groups: of receivers, in their order.
+    """
+
+    def __init__(self, groups: Sequence[ReceiverGroup]) -> None:
+        super().__init__()
+        self.groups = nn.ModuleList(groups)
+        self.register_buffer("widening", torch.ones(()))  # half of the interval in standard deviations
+
+    widening: Tensor
+
+    @property
+    def n_primitives(self) -> int:
+        """A receiver; 0 where the log-distance law is all."""
+        return len(cast(ReceiverGroup, self.groups[0]).primitives)
+
+    def forward(self, position: Tensor) -> tuple[Tensor, Tensor]:
+        """RSSI and the standard deviation of a measurement about it, (B, R) [dBm] and [dB], at positions (B, 3) [m]."""
+        groups = [cast(ReceiverGroup, group) for group in self.groups]
+        return tuple(torch.cat([f(position) for f in fs], dim=1) for fs in (groups, [g.deviation for g in groups]))  # type: ignore[return-value]
+
     @torch.no_grad()
-    def predict(self, position: Tensor, batch: int = 4096) -> tuple[Tensor, Tensor, Tensor]:
+    def predict(self, position: Tensor, batch: int = 2048) -> tuple[Tensor, Tensor, Tensor]:
         """RSSI at any positions, with an interval for a measurement there.
 
         Args:
@@ -147,21 +185,13 @@ class RssiModel(nn.Module):
         position = torch.as_tensor(position, dtype=torch.float64)
         if position.dim() != 2 or position.shape[1] != 3 or not position.isfinite().all():
             raise InputError(f"positions must be finite and of shape (n, 3) [m], got shape {tuple(position.shape)}")
-        parts = [(self(p), self.deviation(p)) for p in position.split(batch)] or [
-            (torch.empty(0, len(self.receiver)),) * 2
-        ]
-        middle, deviation = (torch.cat(x) for x in zip(*parts, strict=True))
+        if not len(position):
+            return (torch.empty(0, sum(len(cast(ReceiverGroup, group).receiver) for group in self.groups)),) * 3
+        middle, deviation = (torch.cat(x) for x in zip(*(self(p) for p in position.split(batch)), strict=True))
         return middle, middle - self.widening * deviation, middle + self.widening * deviation
 
-    def deviation(self, position: Tensor) -> Tensor:
-        """Standard deviation of a measurement about the prediction, (B, R) [dB]: packet noise, and the field's
-        uncertainty, which grows away from measured positions."""
-        cross = self.kernel((position - self.centre).float(), self.field.anchor)
-        unknown = (1 - (cross @ self.precision * cross).sum(dim=1)).clamp(0, 1)
-        return (self.noise_db**2 + self.field_db**2 * unknown[:, None]).sqrt()
 
-
-def fit_rssi(train: Rssi, config: RssiConfig | None = None, *, progress: bool = True) -> RssiModel:
+def fit_rssi(train: Rssi, config: RssiConfig | None = None, *, parallel: Map = map) -> RssiModel:
     """Fits all receivers at once; same data, configuration and machine give the same model.
 
     The kernel is chosen by cross-validation on what the log-distance law leaves; the number of primitives and the width
@@ -170,7 +200,7 @@ def fit_rssi(train: Rssi, config: RssiConfig | None = None, *, progress: bool = 
     Args:
         train: the only rows it sees; a receiver's missing values do not count.
         config: how; `RssiConfig()` unless given.
-        progress: show a progress bar on a terminal.
+        parallel: maps the fit over groups of receivers; give one that spreads work over processes or machines.
 
     Raises:
         InputError: a receiver heard in too few rows.
@@ -182,14 +212,20 @@ def fit_rssi(train: Rssi, config: RssiConfig | None = None, *, progress: bool = 
             raise InputError(f"receiver {name!r} is heard in {count} training rows; at least {MIN_TRAINING} are needed")
     fold = folds(train.transmitter_position, config.validation, config.seed)
     kernel, helps = _choose_field(train.transmitter_position, _log_distance_law(train)[1], fold)
-    n_primitives = config.n_primitives if helps else 0
-    with progress_bar(progress) as bar:
-        rest, held_out = train.subset((fold != 0).nonzero()[:, 0]), train.subset((fold == 0).nonzero()[:, 0])
-        search = _optimise(rest, n_primitives, kernel, config, bar)
-        standardised = _missed(search, held_out) / search.deviation(held_out.transmitter_position)
-        model = _optimise(train, n_primitives, kernel, config, bar)
+    rest, held_out = train.subset((fold != 0).nonzero()[:, 0]), train.subset((fold == 0).nonzero()[:, 0])
+    task = functools.partial(_optimise, n_primitives=config.n_primitives if helps else 0, kernel=kernel, config=config)
+    searched, model = (RssiModel(list(parallel(task, _groups(rows)))) for rows in (rest, train))
+    with torch.no_grad():
+        predicted, deviation = searched(held_out.transmitter_position)
+    standardised = (predicted - held_out.rssi_dbm).abs() / deviation
     model.widening.fill_(standardised[standardised.isfinite()].quantile(config.coverage))
     return model.eval()
+
+
+def _groups(rows: Rssi) -> list[Rssi]:
+    """The receivers in groups of a fixed size, so that the numbers do not depend on who fits which group."""
+    names = rows.receiver_names
+    return [rows.receivers(names[start : start + GROUP]) for start in range(0, len(names), GROUP)]
 
 
 def _choose_field(position: Tensor, residual: Tensor, fold: Tensor) -> tuple[Kernel, bool]:
@@ -206,12 +242,6 @@ def _choose_field(position: Tensor, residual: Tensor, fold: Tensor) -> tuple[Ker
     return best, missed(best) < float(residual.abs().nanmean())
 
 
-@torch.no_grad()
-def _missed(model: RssiModel, rows: Rssi) -> Tensor:
-    """Absolute errors (n, R) [dB], nan where nothing was heard."""
-    return (model.predict(rows.transmitter_position)[0] - rows.rssi_dbm).abs().float()
-
-
 def _log_distance_law(train: Rssi) -> tuple[Tensor, Tensor]:
     """Level and slope (R, 2) of each receiver by least squares, and what they leave (n, R), nan where not heard."""
     distance = torch.cdist(train.transmitter_position, train.receiver_position).clamp_min(NEAREST).log10()
@@ -225,12 +255,12 @@ def _log_distance_law(train: Rssi) -> tuple[Tensor, Tensor]:
     return law, residual
 
 
-def _optimise(train: Rssi, n_primitives: int, kernel: Kernel, config: RssiConfig, bar: Progress) -> RssiModel:
+def _optimise(train: Rssi, n_primitives: int, kernel: Kernel, config: RssiConfig) -> ReceiverGroup:
     """Maximum a posteriori: Huber's loss in units of the noise, and the prior of the functions of position."""
     generator = torch.Generator().manual_seed(config.seed)
     position, rssi = train.transmitter_position, train.rssi_dbm.float()
     rows = torch.randperm(len(train), generator=generator)[:MAX_ANCHORS].sort().values
-    model = RssiModel(train.receiver_position, position[rows], kernel, n_primitives, config.rank, generator)
+    model = ReceiverGroup(train.receiver_position, position[rows], kernel, n_primitives, config.rank, generator)
     law, residual = _log_distance_law(train)
     variance = residual.square().nanmean(dim=0).float().clamp_min(1e-6)
     with torch.no_grad():
@@ -246,8 +276,8 @@ def _optimise(train: Rssi, n_primitives: int, kernel: Kernel, config: RssiConfig
     ]
     optimiser = torch.optim.Adam(groups, lr=config.rate)
     heard = int((~rssi.isnan()).sum())
-    task = bar.add_task(f"{len(train.receiver_names)} receivers, {n_primitives} primitives", total=config.steps)
-    for step in range(config.steps):
+    described = f"{len(train.receiver_names)} receivers, {n_primitives} primitives"
+    for step in progress(range(config.steps), described):
         batch = torch.randint(len(train), (min(config.batch, len(train)),), generator=generator)
         measured = rssi[batch]
         missed = ((model(position[batch]) - measured) / model.noise_db)[~measured.isnan()]
@@ -263,6 +293,4 @@ def _optimise(train: Rssi, n_primitives: int, kernel: Kernel, config: RssiConfig
         for group in optimiser.param_groups:
             group["lr"] = group["peak"] * decay
         optimiser.step()
-        bar.update(task, advance=1)
-    bar.remove_task(task)
     return model.requires_grad_(False)

@@ -13,6 +13,7 @@ from PIL import Image
 from swiftwrf import FitError, InputError, Rssi, RssiConfig, fit_rssi, rssi_room
 from swiftwrf import rssi as rssi_module
 from tasks.rssi import experiment
+from tasks.rssi.cluster import on_cluster
 from tasks.rssi.predictors import PREDICTORS, make_predictor
 from tasks.run import command_line
 
@@ -45,41 +46,53 @@ def with_field(n=150, noise=0.5, seed=0):
 
 def test_fit_learns_the_field_that_the_law_leaves():
     train, test = with_field().split("random")
-    model = fit_rssi(train, QUICK, progress=False)
+    model = fit_rssi(train, QUICK)
     law = make_predictor("mri_receiver", validation="random", seed=0)
     law.fit(train)
     errors = [
         (p - test.rssi_dbm).abs().median()
         for p in (model.predict(test.transmitter_position)[0], law.predict(test.transmitter_position))
     ]
-    assert len(model.primitives) == 50
+    assert model.n_primitives == 50
     assert errors[0] < 0.6 * errors[1]
 
 
 def test_no_primitives_where_the_law_is_all_there_is():
-    model = fit_rssi(law_only(noise=3.0), QUICK, progress=False)
-    assert len(model.primitives) == 0
+    model = fit_rssi(law_only(noise=3.0), QUICK)
+    assert model.n_primitives == 0
 
 
 def test_interval_covers_about_what_it_says():
     train, test = with_field(n=300, noise=2.0).split("random")
-    _, low, high = fit_rssi(train, QUICK, progress=False).predict(test.transmitter_position)
+    _, low, high = fit_rssi(train, QUICK).predict(test.transmitter_position)
     covered = ((test.rssi_dbm >= low) & (test.rssi_dbm <= high)).double().mean()
     assert 0.65 < covered < 0.93
 
 
 def test_interval_widens_away_from_measurements():
-    model = fit_rssi(with_field(), QUICK, progress=False)
+    model = fit_rssi(with_field(), QUICK)
     _, low, high = model.predict(torch.tensor([[5.0, 5, 0.5], [40.0, 40, 0.5]]))
     assert (high[1] - low[1] > high[0] - low[0]).all()
 
 
 def test_far_away_only_the_law_is_left():
-    model = fit_rssi(with_field(), QUICK, progress=False)
+    model = fit_rssi(with_field(), QUICK)
     far = torch.tensor([[4000.0, 0, 0]], dtype=torch.float64)
-    torch.testing.assert_close(
-        model.predict(far)[0], model.level + model.slope * model.log_distance(far), atol=1e-3, rtol=0
-    )
+    group = model.groups[0]
+    law = group.level + group.slope * group.log_distance(far)
+    torch.testing.assert_close(model.predict(far)[0], law, atol=1e-3, rtol=0)
+
+
+def test_groups_of_receivers_may_be_fitted_anywhere(monkeypatch):
+    """Two groups fitted one after the other or by two processes of a cluster: the same bits."""
+    distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
+    monkeypatch.setattr(rssi_module, "GROUP", 2)
+    data = with_field(n=40)
+    here = fit_rssi(data, QUICK)
+    assert len(here.groups) == 2
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        there = fit_rssi(data, QUICK, parallel=on_cluster(cluster.scheduler_address))
+    assert torch.equal(there.predict(data.transmitter_position)[0], here.predict(data.transmitter_position)[0])
 
 
 def test_missing_values_do_not_matter_to_other_receivers():
@@ -97,23 +110,23 @@ def test_missing_values_do_not_matter_to_other_receivers():
 
 def test_same_seed_same_model_and_any_batch():
     data = with_field(n=60)
-    a, b = (fit_rssi(data, QUICK, progress=False).predict(data.transmitter_position)[0] for _ in range(2))
+    a, b = (fit_rssi(data, QUICK).predict(data.transmitter_position)[0] for _ in range(2))
     assert torch.equal(a, b)
-    model = fit_rssi(data, QUICK, progress=False)
+    model = fit_rssi(data, QUICK)
     torch.testing.assert_close(model.predict(data.transmitter_position, batch=7)[0], a)
 
 
 def test_model_refuses(monkeypatch):
-    model = fit_rssi(law_only(), QUICK, progress=False)
+    model = fit_rssi(law_only(), QUICK)
     with pytest.raises(InputError, match="finite and of shape"):
         model.predict(torch.tensor([[0.0, 0.0, float("nan")]]))
     rare = law_only()
     rare.rssi_dbm[9:, 1] = torch.nan
     with pytest.raises(InputError, match="'b' is heard in 9"):
-        fit_rssi(rare, QUICK, progress=False)
-    monkeypatch.setattr(rssi_module.RssiModel, "forward", lambda self, p: self.level * torch.nan + p[:, :1].float())
+        fit_rssi(rare, QUICK)
+    monkeypatch.setattr(rssi_module.ReceiverGroup, "forward", lambda self, p: self.level * torch.nan + p[:, :1].float())
     with pytest.raises(FitError, match="step 0"):
-        fit_rssi(law_only(), QUICK, progress=False)
+        fit_rssi(law_only(), QUICK)
 
 
 @pytest.mark.parametrize("name", [n for n in PREDICTORS if n.startswith(("mri", "gp"))])
@@ -198,6 +211,7 @@ def test_whole_run(small, tmp_path):
         (("--rx", "1", "--floor-plan", "x.png", "--floor-extent", 0, 1, 0, 1), "not a readable image"),
         (("--rx", "1", "--floor-plan", "x.png", "--floor-extent", 1, 0, 0, 1), "x0 < x1"),
         (("--rx", "1", "--data", "/nowhere"), "is not a folder"),
+        (("--rx", "1", "--scheduler", "tcp://127.0.0.1:1"), "no Dask scheduler"),
     ],
 )
 def test_wrong_input_is_one_sentence_and_code_2(small, tmp_path, capsys, arguments, says):

@@ -57,9 +57,8 @@ class _Cutoff(ctypes.Structure):
 
     @classmethod
     def of(cls, cutoff: float | None) -> _Cutoff:
-        least = (
-            -126.0 if cutoff is None else math.log2(cutoff)
-        )  # below 2^-126 float32 has only zero, subnormals flushed
+        # with subnormals flushed, float32 has nothing but zero below 2^-126
+        least = -126.0 if cutoff is None else math.log2(cutoff)
         return cls(least, math.sqrt(-2 * math.log(2) * least))
 
 

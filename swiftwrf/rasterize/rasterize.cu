@@ -6,14 +6,15 @@
 // evaluated as 2^-(u^2 + v^2) with (u, v) = sqrt(log2(e) / 2) L^-1 d: no determinant is formed, the exponent is never
 // positive, and one instruction of the GPU gives the power. Distances are in pixels.
 //
-// Nothing depends on the order in which threads run: every pixel adds its primitives in the order of their index, every
-// gradient is summed by one group of threads in a fixed order, and positions do not know of each other. Hence the bits are
-// the same every time and for any batch.
+// Nothing depends on the order in which threads run: every pixel adds its primitives in an order that follows from them
+// alone, every gradient is summed by one group of threads in a fixed order, and positions do not know of each other. Hence
+// the bits are the same every time and for any batch.
 //
 // Tests for what is out of reach are written `!(distance > reach)`, so that a mean that is not a number is drawn and seen.
 
 constexpr unsigned WARP = 0xffffffffu;  // all of its threads take part
-constexpr int LANES = 32, WARPS = 8, THREADS = WARPS * LANES;  // of a warp, of a block
+constexpr int LANES = 32, WARPS = 8;    // of a warp, of a block
+constexpr int THREADS = WARPS * LANES;  // of a block
 
 // pixel = angle * scale - start. Both factors are split into a float and the rest, because one float would lose the fraction
 // of a pixel: `start` is a multiple of 1/2, so that it can be moved by whole pixels without rounding.
@@ -82,8 +83,8 @@ __device__ __forceinline__ float reach_rows(float3 l, float reach) { return reac
 
 constexpr int TILE_COLUMNS = 16, TILE_ROWS = 8;
 
-__device__ __forceinline__ int strips_of_columns(const Grid& grid) { return (grid.n_azimuth + TILE_COLUMNS - 1) / TILE_COLUMNS; }
-__device__ __forceinline__ int strips_of_rows(const Grid& grid) { return (grid.n_elevation + TILE_ROWS - 1) / TILE_ROWS; }
+__device__ __forceinline__ int tiles_across(const Grid& grid) { return (grid.n_azimuth + TILE_COLUMNS - 1) / TILE_COLUMNS; }
+__device__ __forceinline__ int tiles_down(const Grid& grid) { return (grid.n_elevation + TILE_ROWS - 1) / TILE_ROWS; }
 
 // One warp for 32 primitives of one position.
 extern "C" __global__ void __launch_bounds__(THREADS) find_reach(
@@ -107,7 +108,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) find_reach(
         rows = reach_rows(l, cutoff.reach);
     }
     const float turn = grid.n_azimuth, turns_per_column = 1.0f / turn;
-    const int across = strips_of_columns(grid), down = strips_of_rows(grid);
+    const int across = tiles_across(grid), down = tiles_down(grid);
     unsigned* out = reached + static_cast<size_t>(position) * (across + down) * words + word;
     for (int strip = 0; strip < across; ++strip, out += words) {
         const float centre = strip * TILE_COLUMNS + 0.5f * (TILE_COLUMNS - 1);
@@ -142,7 +143,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
     __shared__ float4 s_prepared[WARPS][LANES][2];  // u at the tile's centre, s1, v there, s21; s3, weight, column
 
     const int warp = threadIdx.x / LANES, lane = threadIdx.x % LANES;
-    const int across = strips_of_columns(grid), down = strips_of_rows(grid);
+    const int across = tiles_across(grid), down = tiles_down(grid);
     const unsigned task = blockIdx.x * WARPS + warp;
     const unsigned position = task / (across * down);
     const int tile = task % (across * down);
@@ -153,14 +154,15 @@ extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
     const float turn = grid.n_azimuth, turns_per_column = 1.0f / turn;
     const size_t first = static_cast<size_t>(position) * n, first_factor = cholesky_per_position ? first : 0;
     const int words = (n + LANES - 1) / LANES;
-    const unsigned* by_column = reached + (static_cast<size_t>(position) * (across + down) + tile % across) * words;
-    const unsigned* by_row = reached + (static_cast<size_t>(position) * (across + down) + across + tile / across) * words;
+    const unsigned* strips = reached + static_cast<size_t>(position) * (across + down) * words;
+    const unsigned* by_column = strips + static_cast<size_t>(tile % across) * words;
+    const unsigned* by_row = strips + static_cast<size_t>(across + tile / across) * words;
 
     float re[PIXELS] = {}, im[PIXELS] = {};
     int begin = 0, waiting = 0, count;
-    unsigned left = 0;  // of the 32 primitives of the thread's word
+    unsigned left = 0;  // of the 32 primitives of the thread's word, those not given yet
     do {
-        // Collect: every thread that has primitives left gives one.
+        // Collect at least 32, or what is left: every thread that has primitives left gives one.
         while (waiting < LANES) {
             const unsigned giving = __ballot_sync(WARP, left != 0);
             if (giving) {
@@ -178,7 +180,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
         count = min(waiting, LANES);
         __syncwarp();
 
-        // Prepare.
+        // Prepare: each thread one.
         bool wide = false;
         if (lane < count) {
             const size_t i = s_collected[warp][lane];
@@ -196,7 +198,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
         const bool any_wide = __ballot_sync(WARP, wide);
         __syncwarp();
 
-        // Draw.
+        // Draw all of them.
 #pragma unroll 1
         for (int j = 0; j < count; ++j) {
             const float4 c = s_prepared[warp][j][0], r = s_prepared[warp][j][1];
@@ -239,7 +241,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
 //
 // A group of 8, 16 or 32 threads gathers the gradient of one primitive at one position: it walks the box around the
 // footprint, columns over the threads, rows in a loop. With z the kernel times the derivative by it, the sums over the
-// footprint of z, z u, z v, z u^2, z u v, z v^2 give every gradient; u is constant in a column.
+// footprint of z u, z v, z u^2, z u v, z v^2 give the gradients of mean and factor; u is constant in a column.
 
 extern "C" __global__ void __launch_bounds__(THREADS, 4) rasterize_backward(
     const float* __restrict__ grad,      // (B, 2, n_elevation, n_azimuth)

@@ -20,7 +20,7 @@ from torch.optim.swa_utils import update_bn
 from augment import Mixed
 from swiftwrf.angles import to_angles, to_direction
 from swiftwrf.data.spectra import coarsening
-from swiftwrf.progress import progress_bar
+from swiftwrf.progress import progress
 
 
 @dataclass(frozen=True)
@@ -112,20 +112,19 @@ class AANN:
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, config.rate, total_steps=config.steps)
         network.train()
         began, order = time.perf_counter(), torch.empty(0, dtype=torch.int64)
-        with progress_bar() as bar:
-            for step in bar.track(range(1, config.steps + 1), description="AANN"):
-                if len(order) < min(config.batch, len(train)):
-                    order = torch.randperm(len(train), generator=self._generator)
-                rows, order = order[: config.batch], order[config.batch :]
-                miss = (self._point(spectrum[rows]) - direction[rows]) / self._spread
-                loss = functional.smooth_l1_loss(miss, torch.zeros_like(miss))
-                optimiser.zero_grad()
-                loss.backward()
-                nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-                optimiser.step()
-                schedule.step()
-                if step % 10 == 0 or step == config.steps:
-                    self.history.append({"step": step, "loss": loss.item(), "seconds": time.perf_counter() - began})
+        for step in progress(range(1, config.steps + 1), "AANN"):
+            if len(order) < min(config.batch, len(train)):
+                order = torch.randperm(len(train), generator=self._generator)
+            rows, order = order[: config.batch], order[config.batch :]
+            miss = (self._point(spectrum[rows]) - direction[rows]) / self._spread
+            loss = functional.smooth_l1_loss(miss, torch.zeros_like(miss))
+            optimiser.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+            optimiser.step()
+            schedule.step()
+            if step % 10 == 0 or step == config.steps:
+                self.history.append({"step": step, "loss": loss.item(), "seconds": time.perf_counter() - began})
 
         # a short training leaves the batch norms' running statistics behind the weights, so they are taken anew
         with self._autocast:

@@ -43,9 +43,9 @@ def _lead(run: Records) -> str:
 
     return (
         f"On {_scene(run)}, SwiftWRF's median absolute error over {error['swiftwrf']['n']} heard pairs at "
-        f"{len(run.metrics['receivers'])} receiver(s) is {told('swiftwrf')}; the best baseline, {best}, reaches {told(best)} "
-        f"and one log-distance law for all receivers {told('mri_pooled')}. The {interval['nominal']:.0%} interval covers "
-        f"{interval['coverage']:.0%} of the test measurements."
+        f"{len(run.metrics['receivers'])} receiver(s) is {told('swiftwrf')}; the best baseline, {best}, reaches "
+        f"{told(best)} and one log-distance law for all receivers {told('mri_pooled')}. "
+        f"The {interval['nominal']:.0%} interval covers {interval['coverage']:.0%} of the test measurements."
     )
 
 

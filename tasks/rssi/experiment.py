@@ -12,8 +12,11 @@ import torch
 from PIL import Image, UnidentifiedImageError
 
 from swiftwrf import InputError, Rssi, load_rssi, rssi_room
+from swiftwrf.fit import Validation
 from swiftwrf.metrics import summary
+from swiftwrf.rssi import Map
 from tasks.report import write_report
+from tasks.rssi.cluster import on_cluster
 from tasks.rssi.predictors import PREDICTORS, SwiftWRFPredictor, make_predictor
 from tasks.run import Row, Run, choose_device, console
 
@@ -37,6 +40,8 @@ class RssiTaskConfig:
     """an image to draw behind the maps"""
     floor_extent: tuple[float, float, float, float] | None = None
     """x0 x1 y0 y1 of that image [m]"""
+    scheduler: str | None = None
+    """address of a Dask scheduler whose workers fit groups of receivers (extra: cluster)"""
     seed: int = 0
     """of everything random"""
     out: str | None = None
@@ -55,12 +60,13 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     _check_floor_plan(config)
     data = (load_rssi(config.data) if config.data else rssi_room(seed=config.seed)).receivers(config.rx)
     train, test = data.split(config.split, config.seed)
+    parallel = on_cluster(config.scheduler) if config.scheduler else map
     train.receivers(["all"])  # refuses receivers heard too rarely to learn from
     if not bool((~test.rssi_dbm.isnan()).any()):
         raise InputError(f"split {config.split!r} of {data.name} has no heard test rows for these receivers")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     with Run("rssi", config.out, label, config, device, data.source, resume) as directory:
-        tables = _Tables(data, train, test, config, directory)
+        tables = _Tables(data, train, test, config, directory, parallel)
         for name in PREDICTORS:
             tables.add(name)
         directory.write_csv("errors.csv", tables.errors)
@@ -96,8 +102,10 @@ def _check_floor_plan(config: RssiTaskConfig) -> None:
 class _Tables:
     """Fits and tests every predictor, each a step of the run's directory, and gathers the tables of the run."""
 
-    def __init__(self, data: Rssi, train: Rssi, test: Rssi, config: RssiTaskConfig, directory: Run) -> None:
-        self.train, self.test, self.config, self.directory = train, test, config, directory
+    def __init__(
+        self, data: Rssi, train: Rssi, test: Rssi, config: RssiTaskConfig, directory: Run, parallel: Map
+    ) -> None:
+        self.train, self.test, self.config, self.directory, self.parallel = train, test, config, directory, parallel
         self.errors: list[Row] = []
         self.predictions: list[Row] = []
         self.seconds: dict[str, Row] = {}
@@ -111,9 +119,8 @@ class _Tables:
         """One predictor."""
 
         def compute() -> Row:
-            predictor = make_predictor(
-                name, validation="random" if self.config.split == "random" else "block", seed=self.config.seed
-            )
+            validation: Validation = "random" if self.config.split == "random" else "block"
+            predictor = make_predictor(name, validation=validation, seed=self.config.seed, parallel=self.parallel)
             began = time.perf_counter()
             predictor.fit(self.train)
             fitted = time.perf_counter()
@@ -121,7 +128,7 @@ class _Tables:
             result |= {"fit": fitted - began, "predict": time.perf_counter() - fitted}
             if isinstance(predictor, SwiftWRFPredictor):
                 _, low, high = predictor.model.predict(self.test.transmitter_position)
-                result |= {"low": low, "high": high, "n_primitives": len(predictor.model.primitives)}
+                result |= {"low": low, "high": high, "n_primitives": predictor.model.n_primitives}
                 self._keep_maps(predictor)
             return result
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from swiftwrf import InputError, Rssi, RssiConfig, RssiModel, fit_rssi
 from swiftwrf.fit import Validation, folds
-from swiftwrf.rssi import NEAREST
+from swiftwrf.rssi import NEAREST, Map
 
 NEIGHBOURS = (1, 3, 5, 8, 12, 20, 40, 80, 120)
 TUNED_ROWS, KEPT_ROWS = 500, 1500  # of the Gaussian process: its cost grows with their cube
@@ -128,11 +128,11 @@ class GaussianProcess(_PerReceiver):
 class SwiftWRFPredictor:
     """The model of this package; all receivers at once."""
 
-    def __init__(self, config: RssiConfig) -> None:
-        self._config = config
+    def __init__(self, config: RssiConfig, parallel: Map) -> None:
+        self._config, self._parallel = config, parallel
 
     def fit(self, train: Rssi) -> None:
-        self.model: RssiModel = fit_rssi(train, self._config)
+        self.model: RssiModel = fit_rssi(train, self._config, parallel=self._parallel)
 
     def predict(self, position: Tensor) -> Tensor:
         return self.model.predict(position)[0]
@@ -141,13 +141,14 @@ class SwiftWRFPredictor:
 PREDICTORS = ("swiftwrf", "mean", "mri_pooled", "mri_receiver", "mri_residual", "knn", "gp")
 
 
-def make_predictor(name: str, *, validation: Validation, seed: int) -> Predictor:
+def make_predictor(name: str, *, validation: Validation, seed: int, parallel: Map = map) -> Predictor:
     """The predictor of that name.
 
     Args:
         name: one of `PREDICTORS`.
         validation: how training rows are held out to choose settings.
         seed: of what is random.
+        parallel: of `fit_rssi`.
 
     Raises:
         InputError: an unknown name.
@@ -161,5 +162,5 @@ def make_predictor(name: str, *, validation: Validation, seed: int) -> Predictor
     if name == "gp":
         return GaussianProcess(validation, seed, on_law=True)
     if name == "swiftwrf":
-        return SwiftWRFPredictor(RssiConfig(validation=validation, seed=seed))
+        return SwiftWRFPredictor(RssiConfig(validation=validation, seed=seed), parallel)
     raise InputError(f"unknown predictor {name!r}; choose from {', '.join(PREDICTORS)}")
