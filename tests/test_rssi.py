@@ -103,7 +103,6 @@ def test_missing_values_do_not_matter_to_other_receivers():
     model = fit_rssi(
         Rssi("m", data.receiver_names, data.receiver_position, data.transmitter_position, missing, data.index),
         QUICK,
-        progress=False,
     )
     assert model.predict(data.transmitter_position)[0].isfinite().all()
 
