@@ -12,7 +12,8 @@ from torch import Tensor
 
 from swiftwrf import FitConfig, InputError, Spectra, SwiftWRF, fit
 from swiftwrf.deformation import Kernel
-from swiftwrf.fit import Validation, folds
+from swiftwrf.fit import folds
+from swiftwrf.fit_config import Validation
 from swiftwrf.prior import choose_kernel
 
 
@@ -39,7 +40,7 @@ class Nearest:
 class InverseDistance:
     """Inverse-distance weighting of the k nearest spectra (Shepard 1968); k predicts held-out training spectra best."""
 
-    CANDIDATES = (1, 2, 3, 5, 8, 13, 20)
+    CANDIDATES = (1, 2, 3, 5, 8, 13, 20, 30)
 
     def __init__(self, validation: Validation, seed: int) -> None:
         self._validation: Validation = validation
@@ -57,7 +58,7 @@ class InverseDistance:
         for number in range(int(fold.max()) + 1):
             out = fold == number
             predicted = _inverse_distance(position[out], position[~out], k) @ flat[~out]
-            loss += float((predicted - flat[out]).square().mean(dim=1).clamp_min(1e-12).log().sum())
+            loss += float((predicted - flat[out]).square().sum())
         return loss
 
     def synthesize(self, position: Tensor) -> Tensor:

@@ -12,9 +12,10 @@ from torch import Tensor
 from swiftwrf.data.spectra import Spectra, coarsening
 from swiftwrf.data.splits import MIN_TRAINING, slabs
 from swiftwrf.errors import InputError
+from swiftwrf.fit_config import FitConfig, Validation
 from swiftwrf.metrics import WINDOW
 from swiftwrf.model import SwiftWRF
-from swiftwrf.optimise import FitConfig, Optimisation, Record, Stage, Validation, fingerprint, read_state
+from swiftwrf.optimise import Optimisation, Record, Stage, fingerprint, read_state
 from swiftwrf.prior import choose_kernel, choose_rank
 from swiftwrf.progress import progress_bar
 
@@ -85,6 +86,3 @@ def folds(position: Tensor, validation: Validation, seed: int) -> Tensor:
         return slabs(position, FOLDS)
     order = torch.randperm(len(position), generator=torch.Generator().manual_seed(seed))
     return order % FOLDS
-
-
-__all__ = ["FitConfig", "Validation", "fit", "folds"]

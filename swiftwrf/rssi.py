@@ -25,7 +25,8 @@ from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.deformation import Kernel, SmoothField
 from swiftwrf.errors import FitError, InputError
-from swiftwrf.fit import Validation, folds
+from swiftwrf.fit import folds
+from swiftwrf.fit_config import Validation
 from swiftwrf.primitives import Primitives
 from swiftwrf.prior import candidates, held_out_weights, thinned
 from swiftwrf.progress import progress

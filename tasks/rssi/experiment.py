@@ -12,7 +12,7 @@ import torch
 from PIL import Image, UnidentifiedImageError
 
 from swiftwrf import InputError, Rssi, load_rssi, rssi_room
-from swiftwrf.fit import Validation
+from swiftwrf.fit_config import Validation
 from swiftwrf.metrics import summary
 from swiftwrf.rssi import Map
 from tasks.report import write_report

@@ -15,7 +15,8 @@ from sklearn.neighbors import KNeighborsRegressor
 from torch import Tensor
 
 from swiftwrf import InputError, Rssi, RssiConfig, RssiModel, fit_rssi
-from swiftwrf.fit import Validation, folds
+from swiftwrf.fit import folds
+from swiftwrf.fit_config import Validation
 from swiftwrf.rssi import NEAREST, Map
 
 NEIGHBOURS = (1, 3, 5, 8, 12, 20, 40, 80, 120)

@@ -1,0 +1,73 @@
+"""What a fit is told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+from swiftwrf.model import ModelConfig
+
+Validation = Literal["random", "block"]
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How a model is fitted. The defaults are what measured best; `FitConfig.paper()` is the paper."""
+
+    model: ModelConfig = field(default_factory=ModelConfig)
+    steps: int = 2000
+    """optimisation steps, coarse ones included"""
+    coarse_steps: int = 300
+    """of them on shared primitives, without deformation"""
+    batch: int = 16
+    """spectra a step"""
+    rate: float = 3e-2
+    """learning rate of primitives and coefficients (half of it for the motion basis)"""
+    deformation_rate: float | None = None
+    """learning rate of the paper's network"""
+    warm_up: int = 50
+    """steps over which the rates rise"""
+    final_rate: float = 0.02
+    """share of the rates left after cosine decay"""
+    ssim_weight: float = 0.3
+    """weight of 1 - SSIM in the loss; L1 has the rest"""
+    prior_weight: float = 1e-4
+    """weight of the motion's negative log prior per training spectrum"""
+    smoothing: float = 0.0
+    """the paper's gamma: scale of the noise on positions, annealed to 0"""
+    smoothing_steps: int = 10_000
+    """the paper's tau: fine steps until that noise is gone"""
+    stop_mean: bool = False
+    """keep the canonical means where the coarse stage left them"""
+    max_azimuths: int = 180
+    """spectra with more columns are averaged down to at most this many for fitting; 0 fits all pixels"""
+    validation: Validation = "random"
+    """what is held out inside the training part: single spectra, or a region where the model must extrapolate"""
+    check_every: int = 100
+    """steps between two looks at the validation spectra"""
+    patience: int = 6
+    """looks without a better one until the search ends"""
+    seed: int = 0
+
+    @classmethod
+    def paper(cls, **changes: Any) -> FitConfig:
+        """The paper's settings: 10,000 bounded primitives, its network, means kept, annealed noise, all pixels."""
+        model = ModelConfig(
+            n_primitives=10_000,
+            deformation="per_primitive_mlp",
+            components=("mean", "response", "attenuation"),
+            bounded=True,
+        )
+        paper = cls(
+            model=model,
+            steps=110_000,
+            coarse_steps=10_000,
+            batch=1,
+            rate=1e-2,
+            deformation_rate=8e-3,
+            smoothing=1.0,
+            stop_mean=True,
+            max_azimuths=0,
+            check_every=1000,
+        )
+        return replace(paper, **changes)
