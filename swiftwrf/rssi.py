@@ -1,9 +1,10 @@
 """RSSI from SwiftWRF: for each receiver a small spectrum that moves with the transmitter, averaged to one number.
 
-    rssi_r(s) = T_r - 10 gamma_r log10 |s - receiver_r| + 100 (pooled_r(s) - pooled_r)                         [dBm]
+    rssi_r(s) = T_r - 10 gamma_r log10 |s - receiver_r| + directivity_r(s) + 100 (pooled_r(s) - pooled_r)       [dBm]
 
 pooled_r(s) is the magnitude of receiver r's primitives on a 16 x 16 grid, averaged over the grid; pooled_r that of the
-canonical ones; 100 dB a unit is the scale of the NeRF2 data (rssi = 100 (a - 1)). Only the responses move, by smooth
+canonical ones; 100 dB a unit is the scale of the NeRF2 data (rssi = 100 (a - 1)). The directivity is a few harmonics of the
+direction from the receiver. Only the responses move, by smooth
 functions of position, so the field at any position is a sum of a few fields that are drawn once, and 100,000 positions
 cost two matrix products. All receivers are one batched program.
 """
@@ -39,8 +40,10 @@ NEAREST = 0.3  # [m] distances below it count as it: the log-distance law ends s
 MAX_ANCHORS = 1500
 UNCERTAINTY_ANCHORS = 400  # are enough to tell measured regions from others, at a tenth of the cost
 GROUP = 16  # receivers fitted as one program: bounds the memory of hundreds
+DIRECTIVITY_DB = 2.0  # prior deviation of each harmonic of a receiver's antenna and surroundings
+HARMONICS = 8  # real spherical harmonics of degree 1 and 2
 JITTER = 1e-3  # of the field's prior where anchors nearly coincide
-NOISES = (0.3, 1.0, 3.0)  # variance of a packet relative to that of the field: fading is as large as shadowing
+NOISES = (0.3, 1.0, 2.0, 3.0)  # variance of a packet relative to that of the field: fading is as large as shadowing
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
@@ -90,6 +93,7 @@ class ReceiverGroup(nn.Module):
         self.register_buffer("noise_db", torch.ones(n))  # of a packet about the field
         self.level = nn.Parameter(torch.zeros(n))  # T [dBm]
         self.slope = nn.Parameter(torch.zeros(n))  # -10 gamma [dB a decade]
+        self.directivity = nn.Parameter(torch.zeros(n, HARMONICS))  # in units of its prior deviation
         local = (anchor.double() - self.centre).float()
         few = local[:: max(1, len(local) // UNCERTAINTY_ANCHORS)]
         self.register_buffer("few", few)
@@ -99,6 +103,9 @@ class ReceiverGroup(nn.Module):
         self.field = SmoothField(local, replace(kernel, noise=JITTER), n * rank)
         self.primitives = Primitives(n_primitives, GRID, bounded=False, generator=generator, scenes=(n,))
         self.basis = nn.Parameter(1 + 0.3 * torch.randn(n, rank, n_primitives, generator=generator))
+        # only sums over all pixels are ever measured, which cannot tell shapes: learning them did worse on held-out rows
+        self.primitives.requires_grad_(False)
+        self.basis.requires_grad_(False)
 
     receiver: Tensor
     centre: Tensor
@@ -111,9 +118,21 @@ class ReceiverGroup(nn.Module):
         """log10 of the distances to the receivers, (B, R)."""
         return torch.cdist(position, self.receiver).clamp_min(NEAREST).log10().float()
 
+    def harmonics(self, position: Tensor) -> Tensor:
+        """Harmonics of degree 1 and 2 of the direction from each receiver, of unit mean square, (B, R, 8)."""
+        x, y, z = functional.normalize(position[:, None] - self.receiver, dim=-1).float().unbind(-1)
+        first = [math.sqrt(3) * c for c in (x, y, z)]
+        second = [math.sqrt(15) * c for c in (x * y, y * z, z * x, (x * x - y * y) / 2)]
+        return torch.stack([*first, *second, math.sqrt(5) / 2 * (3 * z * z - 1)], dim=-1)
+
+    def prior(self) -> Tensor:
+        """Negative log prior of the functions of position and of the directivity."""
+        return 0.5 * (self.field.prior() + self.directivity.square().sum())
+
     def forward(self, position: Tensor) -> Tensor:
         """RSSI (B, R) [dBm] at positions (B, 3) [m], float64."""
         law = self.level + self.slope * self.log_distance(position)
+        law = law + DIRECTIVITY_DB * torch.einsum("brh,rh->br", self.harmonics(position), self.directivity)
         if not len(self.primitives):
             return law
         drawn = self._draw()  # (R, 1 + K, 2, pixels): the canonical field and the K that move it
@@ -226,7 +245,7 @@ def fit_rssi(train: Rssi, config: RssiConfig | None = None, *, parallel: Map = m
 def _groups(rows: Rssi) -> list[Rssi]:
     """The receivers in groups of a fixed size, so that the numbers do not depend on who fits which group."""
     names = rows.receiver_names
-    return [rows.receivers(names[start : start + GROUP]) for start in range(0, len(names), GROUP)]
+    return [rows.columns(list(range(len(names)))[start : start + GROUP]) for start in range(0, len(names), GROUP)]
 
 
 def _choose_field(position: Tensor, residual: Tensor, fold: Tensor) -> tuple[Kernel, bool]:
@@ -270,12 +289,7 @@ def _optimise(train: Rssi, n_primitives: int, kernel: Kernel, config: RssiConfig
         share = kernel.noise / (1 + kernel.noise) if n_primitives else 1.0
         model.noise_db.copy_((share * variance).sqrt())
         model.field_db.copy_(((1 - share) * variance).sqrt())
-    shapes = [model.basis, *model.primitives.parameters()]
-    groups = [
-        {"params": [model.level, model.slope, model.field.coefficient], "peak": config.rate},
-        {"params": shapes, "peak": config.rate / 10},
-    ]
-    optimiser = torch.optim.Adam(groups, lr=config.rate)
+    optimiser = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], lr=config.rate)
     heard = int((~rssi.isnan()).sum())
     described = f"{len(train.receiver_names)} receivers, {n_primitives} primitives"
     for step in progress(range(config.steps), described):
@@ -283,15 +297,13 @@ def _optimise(train: Rssi, n_primitives: int, kernel: Kernel, config: RssiConfig
         measured = rssi[batch]
         missed = ((model(position[batch]) - measured) / model.noise_db)[~measured.isnan()]
         loss = functional.huber_loss(missed, torch.zeros_like(missed), delta=config.huber)
-        loss = loss + 0.5 * model.field.prior() / heard
+        loss = loss + model.prior() / heard
         if not math.isfinite(loss.item()):
             raise FitError(
                 f"the RSSI fit broke at step {step}: loss {loss.item():.3g}; try a rate below {config.rate:g}"
             )
         optimiser.zero_grad()
         loss.backward()
-        decay = 0.5 * (1 + math.cos(math.pi * step / config.steps))
-        for group in optimiser.param_groups:
-            group["lr"] = group["peak"] * decay
+        optimiser.param_groups[0]["lr"] = config.rate * 0.5 * (1 + math.cos(math.pi * step / config.steps))
         optimiser.step()
     return model.requires_grad_(False)

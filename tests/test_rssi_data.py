@@ -58,6 +58,7 @@ WRONG = {
     "another number of rows": (_write("gateway_rssi.csv", "a,b,c\n-50,-60,-70\n"), "has 1 rows, tx_pos.csv 15"),
     "empty": (_write("gateway_rssi.csv", ""), "is empty"),
     "receiver without a place": (_write("gateway_position.yml", "a: [0, 0, 1]\n"), "no position of receiver 'b'"),
+    "two places of one name": (_write("gateway_position.yml", "a: [0, 0, 1]\na: [1, 1, 1]\n"), "'a' twice"),
     "place of two numbers": (_write("gateway_position.yml", "a: [0, 0]\nb: [1, 1]\nc: [1, 2]\n"), "3 finite numbers"),
     "nan position": (_write("tx_pos.csv", "x,y,z\n" + "nan,1,1\n" * N), "row 1 is"),
     "index out of range": (

@@ -23,16 +23,21 @@ def read_yaml(file: Path) -> dict[str, object]:
     """A YAML mapping, read without running code.
 
     Raises:
-        InputError: no such file, not YAML, or not a mapping.
+        InputError: no such file, not YAML, not a mapping, or a name twice.
     """
     if not file.is_file():
         raise InputError(f"{file} is missing")
     try:
-        content = yaml.safe_load(file.read_text())
+        text = file.read_text()
+        content, tree = yaml.safe_load(text), yaml.compose(text, Loader=yaml.SafeLoader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"{file} is not valid YAML: {' '.join(str(error).split())}") from None
     if not isinstance(content, dict):
         raise InputError(f"{file} must hold names and values, got {type(content).__name__}")
+    names = [str(key.value) for key, _ in tree.value]
+    if len(set(names)) < len(names):  # YAML would silently keep the last
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"{file} names {twice!r} twice; each needs a name of its own")
     return content
 
 

@@ -79,6 +79,10 @@ class Rssi:
                     f"receiver {self.receiver_names[column]!r} of {self.name} was heard in {heard} rows; "
                     f"at least {MIN_TRAINING} are needed"
                 )
+        return self.columns(columns)
+
+    def columns(self, columns: list[int]) -> Rssi:
+        """The receivers of these columns, in this order."""
         return replace(
             self,
             receiver_names=tuple(self.receiver_names[c] for c in columns),
