@@ -32,7 +32,7 @@ def read_yaml(file: Path) -> dict[str, object]:
         content, tree = yaml.safe_load(text), yaml.compose(text, Loader=yaml.SafeLoader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"{file} is not valid YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(content, dict):
+    if not isinstance(content, dict) or not isinstance(tree, yaml.MappingNode):
         raise InputError(f"{file} must hold names and values, got {type(content).__name__}")
     names = [str(key.value) for key, _ in tree.value]
     if len(set(names)) < len(names):  # YAML would silently keep the last

@@ -10,6 +10,7 @@ from tasks.report.page import Page, Plot, Section, Table
 from tasks.report.provenance import number, provenance
 from tasks.report.records import Records
 
+MANY = 300  # dots, from which on white edges would hide their colours
 MEANING = {
     "swiftwrf": "50 primitives a receiver on a 16 x 16 grid, averaged, on a log-distance law",
     "mean": "the mean of the receiver's training values",
@@ -178,7 +179,13 @@ def _maps(run: Records, field: str, label: str) -> Figure:
         if field == "predicted":
             heard = ~np.isnan(maps["measured"][:, i])
             x, y = maps["measured_position"][heard, :2].T
-            dots = {"cmap": colours, "vmin": low, "vmax": high, "edgecolors": "white", "linewidths": 0.3}
+            dots = {
+                "cmap": colours,
+                "vmin": low,
+                "vmax": high,
+                "edgecolors": "white",
+                "linewidths": 0.3 if len(x) < MANY else 0,
+            }
             ax.scatter(x, y, s=9, c=maps["measured"][heard, i], zorder=2, **dots)
         ax.plot(*maps["receiver"][i, :2], "x", color="#ee6677", markersize=9, markeredgewidth=2, zorder=3)
         ax.set_title(str(maps["receiver_names"][i]), fontsize=9)

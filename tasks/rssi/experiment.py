@@ -170,7 +170,8 @@ class _Tables:
     def _keep_maps(self, predictor: SwiftWRFPredictor) -> None:
         """Predicted field and width of the interval over the floor, at the median height of the measurements."""
         position = self.train.transmitter_position
-        low, high = position.min(dim=0).values, position.max(dim=0).values
+        shown = torch.cat([position, self.test.transmitter_position, self.train.receiver_position])
+        low, high = shown.min(dim=0).values, shown.max(dim=0).values
         cell = float((high - low)[:2].max()) / MAP_CELLS or 1.0
         xs, ys = (
             torch.arange(float(a), float(b) + cell, cell, dtype=torch.float64)
