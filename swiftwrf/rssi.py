@@ -14,7 +14,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, cast
 
 import torch
@@ -27,7 +27,7 @@ from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.deformation import Kernel, SmoothField
 from swiftwrf.errors import FitError, InputError
 from swiftwrf.fit import folds
-from swiftwrf.fit_config import Validation
+from swiftwrf.fit_config import RssiConfig
 from swiftwrf.primitives import Primitives
 from swiftwrf.prior import candidates, held_out_weights, thinned
 from swiftwrf.progress import progress
@@ -47,28 +47,6 @@ NOISES = (0.3, 1.0, 2.0, 3.0)  # variance of a packet relative to that of the fi
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
-@dataclass(frozen=True)
-class RssiConfig:
-    """How RSSI is modelled and fitted."""
-
-    n_primitives: int = 50
-    """a receiver; none where held-out rows are predicted no better with a field than by the log-distance law"""
-    rank: int = 4
-    """smooth functions of position that move the responses of a receiver"""
-    steps: int = 200
-    batch: int = 1024
-    """rows a step"""
-    rate: float = 5e-2
-    huber: float = 1.345
-    """errors beyond so many standard deviations of the noise count linearly (Huber's constant: 95 % efficient where the
-    noise is Gaussian), for packets have outliers"""
-    coverage: float = 0.8
-    """share of measurements that the interval should cover"""
-    validation: Validation = "random"
-    """what is held out inside the training part: single rows, or a region"""
-    seed: int = 0
-
-
 class ReceiverGroup(nn.Module):
     """Some receivers, fitted as one batched program.
 
@@ -77,16 +55,14 @@ class ReceiverGroup(nn.Module):
         anchor: positions (M, 3) [m] of training rows.
         kernel: of the field's prior, lengths in [m]; its noise is that of the packets, relative to the field.
         n_primitives: a receiver; 0 leaves the log-distance law.
-        rank: functions a receiver.
-        generator: for the initial primitives.
+        config: rank, and what is learnt.
     """
 
-    def __init__(
-        self, receiver: Tensor, anchor: Tensor, kernel: Kernel, n_primitives: int, rank: int, generator: torch.Generator
-    ) -> None:
+    def __init__(self, receiver: Tensor, anchor: Tensor, kernel: Kernel, n_primitives: int, config: RssiConfig) -> None:
         super().__init__()
-        n = len(receiver)
-        self.rank, self.kernel = rank, kernel
+        n, rank = len(receiver), config.rank
+        generator = torch.Generator().manual_seed(config.seed)
+        self.rank, self.kernel, self.on_law = rank, kernel, config.law
         self.register_buffer("receiver", receiver.double())
         self.register_buffer("centre", anchor.double().mean(dim=0))
         self.register_buffer("field_db", torch.zeros(n))  # standard deviation of the field under its prior
@@ -103,9 +79,10 @@ class ReceiverGroup(nn.Module):
         self.field = SmoothField(local, replace(kernel, noise=JITTER), n * rank)
         self.primitives = Primitives(n_primitives, GRID, bounded=False, generator=generator, scenes=(n,))
         self.basis = nn.Parameter(1 + 0.3 * torch.randn(n, rank, n_primitives, generator=generator))
-        # only sums over all pixels are ever measured, which cannot tell shapes: learning them did worse on held-out rows
-        self.primitives.requires_grad_(False)
-        self.basis.requires_grad_(False)
+        self.primitives.requires_grad_(config.learn_shapes)
+        self.basis.requires_grad_(config.learn_shapes)
+        for parameter in (self.level, self.slope, self.directivity):
+            parameter.requires_grad_(config.law)
 
     receiver: Tensor
     centre: Tensor
@@ -139,7 +116,8 @@ class ReceiverGroup(nn.Module):
         motion = self.field((position - self.centre).float()).reshape(len(position), -1, self.rank)
         moved = drawn[:, 0] + torch.einsum("brk,rkcp->brcp", motion, drawn[:, 1:])
         pooled = magnitude(moved[..., None]).mean(dim=(-2, -1))
-        return law + SCALE * (pooled - magnitude(drawn[:, 0, :, :, None]).mean(dim=(-2, -1)))
+        canonical = magnitude(drawn[:, 0, :, :, None]).mean(dim=(-2, -1)) if self.on_law else 1.0
+        return law + SCALE * (pooled - canonical)
 
     def _draw(self) -> Tensor:
         """Canonical and basis fields, the latter scaled so that to first order RSSI has the prior's deviation."""
@@ -233,7 +211,9 @@ def fit_rssi(train: Rssi, config: RssiConfig | None = None, *, parallel: Map = m
     fold = folds(train.transmitter_position, config.validation, config.seed)
     kernel, helps = _choose_field(train.transmitter_position, _log_distance_law(train)[1], fold)
     rest, held_out = train.subset((fold != 0).nonzero()[:, 0]), train.subset((fold == 0).nonzero()[:, 0])
-    task = functools.partial(_optimise, n_primitives=config.n_primitives if helps else 0, kernel=kernel, config=config)
+    task = functools.partial(
+        _optimise, n_primitives=config.n_primitives if helps or not config.law else 0, kernel=kernel, config=config
+    )
     searched, model = (RssiModel(list(parallel(task, _groups(rows)))) for rows in (rest, train))
     with torch.no_grad():
         predicted, deviation = searched(held_out.transmitter_position)
@@ -280,12 +260,13 @@ def _optimise(train: Rssi, n_primitives: int, kernel: Kernel, config: RssiConfig
     generator = torch.Generator().manual_seed(config.seed)
     position, rssi = train.transmitter_position, train.rssi_dbm.float()
     rows = torch.randperm(len(train), generator=generator)[:MAX_ANCHORS].sort().values
-    model = ReceiverGroup(train.receiver_position, position[rows], kernel, n_primitives, config.rank, generator)
+    model = ReceiverGroup(train.receiver_position, position[rows], kernel, n_primitives, config)
     law, residual = _log_distance_law(train)
     variance = residual.square().nanmean(dim=0).float().clamp_min(1e-6)
     with torch.no_grad():
-        model.level.copy_(law[:, 0])
-        model.slope.copy_(law[:, 1])
+        if config.law:
+            model.level.copy_(law[:, 0])
+            model.slope.copy_(law[:, 1])
         share = kernel.noise / (1 + kernel.noise) if n_primitives else 1.0
         model.noise_db.copy_((share * variance).sqrt())
         model.field_db.copy_(((1 - share) * variance).sqrt())

@@ -62,6 +62,15 @@ def test_no_primitives_where_the_law_is_all_there_is():
     assert model.n_primitives == 0
 
 
+def test_plain_head_learns_without_a_law():
+    train, test = with_field().split("random")
+    model = fit_rssi(train, RssiConfig.paper(steps=200))
+    assert not model.groups[0].slope.any()
+    missed = (model.predict(test.transmitter_position)[0] - test.rssi_dbm).abs().median()
+    mean = (train.rssi_dbm.mean(dim=0) - test.rssi_dbm).abs().median()
+    assert missed < 0.8 * mean
+
+
 def test_interval_covers_about_what_it_says():
     train, test = with_field(n=300, noise=2.0).split("random")
     _, low, high = fit_rssi(train, QUICK).predict(test.transmitter_position)

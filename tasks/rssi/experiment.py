@@ -36,6 +36,8 @@ class RssiTaskConfig:
     """folder with gateway_position.yml, tx_pos.csv and gateway_rssi.csv (NeRF2 layout)"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
+    preset: Literal["default", "paper"] = "default"
+    """of SwiftWRF: default corrects a log-distance law; paper is the plain head"""
     floor_plan: str | None = None
     """an image to draw behind the maps"""
     floor_extent: tuple[float, float, float, float] | None = None
@@ -75,6 +77,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             "task": "rssi",
             "data": data.name,
             "split": config.split,
+            "preset": config.preset,
             "seed": config.seed,
             "n_train": len(train),
             "n_test": len(test),
@@ -120,7 +123,9 @@ class _Tables:
 
         def compute() -> Row:
             validation: Validation = "random" if self.config.split == "random" else "block"
-            predictor = make_predictor(name, validation=validation, seed=self.config.seed, parallel=self.parallel)
+            predictor = make_predictor(
+                name, validation=validation, seed=self.config.seed, parallel=self.parallel, preset=self.config.preset
+            )
             began = time.perf_counter()
             predictor.fit(self.train)
             fitted = time.perf_counter()

@@ -142,7 +142,9 @@ class SwiftWRFPredictor:
 PREDICTORS = ("swiftwrf", "mean", "mri_pooled", "mri_receiver", "mri_residual", "knn", "gp")
 
 
-def make_predictor(name: str, *, validation: Validation, seed: int, parallel: Map = map) -> Predictor:
+def make_predictor(
+    name: str, *, validation: Validation, seed: int, parallel: Map = map, preset: str = "default"
+) -> Predictor:
     """The predictor of that name.
 
     Args:
@@ -150,6 +152,7 @@ def make_predictor(name: str, *, validation: Validation, seed: int, parallel: Ma
         validation: how training rows are held out to choose settings.
         seed: of what is random.
         parallel: of `fit_rssi`.
+        preset: of SwiftWRF: `default`, or `paper` for the plain head.
 
     Raises:
         InputError: an unknown name.
@@ -163,5 +166,6 @@ def make_predictor(name: str, *, validation: Validation, seed: int, parallel: Ma
     if name == "gp":
         return GaussianProcess(validation, seed, on_law=True)
     if name == "swiftwrf":
-        return SwiftWRFPredictor(RssiConfig(validation=validation, seed=seed), parallel)
+        make = RssiConfig.paper if preset == "paper" else RssiConfig
+        return SwiftWRFPredictor(make(validation=validation, seed=seed), parallel)
     raise InputError(f"unknown predictor {name!r}; choose from {', '.join(PREDICTORS)}")
