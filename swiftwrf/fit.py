@@ -62,12 +62,13 @@ def fit(
     if config.model.rank is None:
         rank = choose_rank(work.position, work.spectrum, fold, kernel)
         config = replace(config, model=replace(config.model, rank=rank))
-    saved = read_state(checkpoint, fingerprint(config, work))
+    owner = fingerprint(config, work)
+    saved = read_state(checkpoint, owner)
     with progress_bar(progress) as bar:
 
         def run(stage: Stage, rows: Tensor, steps: int, held_out: Spectra | None = None) -> Optimisation:
             optimisation = Optimisation(stage, steps, work.subset(rows), kernel, config, device, held_out)
-            optimisation.run(saved, checkpoint, fingerprint(config, work), bar, on_record)
+            optimisation.run(saved, checkpoint, owner, bar, on_record)
             return optimisation
 
         if saved is None or saved.stage == "search":

@@ -4,9 +4,8 @@
 
 pooled_r(s) is the magnitude of receiver r's primitives on a 16 x 16 grid, averaged over the grid; pooled_r that of the
 canonical ones; 100 dB a unit is the scale of the NeRF2 data (rssi = 100 (a - 1)). The directivity is a few harmonics of the
-direction from the receiver. Only the responses move, by smooth
-functions of position, so the field at any position is a sum of a few fields that are drawn once, and 100,000 positions
-cost two matrix products. All receivers are one batched program.
+direction from the receiver. Only the responses move, by smooth functions of position, so the field at any position is a
+sum of a few fields, the same for all positions. All receivers of a group are one batched program.
 """
 
 from __future__ import annotations
@@ -45,6 +44,11 @@ HARMONICS = 8  # real spherical harmonics of degree 1 and 2
 JITTER = 1e-3  # of the field's prior where anchors nearly coincide
 NOISES = (0.3, 1.0, 2.0, 3.0)  # variance of a packet relative to that of the field: fading is as large as shadowing
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+
+
+def log_distance(position: Tensor, receiver: Tensor) -> Tensor:
+    """log10 of the distances [m] from positions (B, 3) to receivers (R, 3), float64 (B, R)."""
+    return torch.cdist(position.double(), receiver).clamp_min(NEAREST).log10()
 
 
 class ReceiverGroup(nn.Module):
@@ -91,10 +95,6 @@ class ReceiverGroup(nn.Module):
     few: Tensor
     precision: Tensor
 
-    def log_distance(self, position: Tensor) -> Tensor:
-        """log10 of the distances to the receivers, (B, R)."""
-        return torch.cdist(position, self.receiver).clamp_min(NEAREST).log10().float()
-
     def harmonics(self, position: Tensor) -> Tensor:
         """Harmonics of degree 1 and 2 of the direction from each receiver, of unit mean square, (B, R, 8)."""
         x, y, z = functional.normalize(position[:, None] - self.receiver, dim=-1).float().unbind(-1)
@@ -107,8 +107,8 @@ class ReceiverGroup(nn.Module):
         return 0.5 * (self.field.prior() + self.directivity.square().sum())
 
     def forward(self, position: Tensor) -> Tensor:
-        """RSSI (B, R) [dBm] at positions (B, 3) [m], float64."""
-        law = self.level + self.slope * self.log_distance(position)
+        """RSSI float32 (B, R) [dBm] at positions (B, 3) [m], float64."""
+        law = self.level + self.slope * log_distance(position, self.receiver).float()
         law = law + DIRECTIVITY_DB * torch.einsum("brh,rh->br", self.harmonics(position), self.directivity)
         if not len(self.primitives):
             return law
@@ -192,8 +192,8 @@ class RssiModel(nn.Module):
 def fit_rssi(train: Rssi, config: RssiConfig | None = None, *, parallel: Map = map) -> RssiModel:
     """Fits all receivers at once; same data, configuration and machine give the same model.
 
-    The kernel is chosen by cross-validation on what the log-distance law leaves; the number of primitives and the width
-    of the interval on a held-out fold of the training rows.
+    The kernel, and whether there are primitives at all, are chosen by cross-validation on what the log-distance law leaves;
+    the width of the interval on one held-out fold of the training rows.
 
     Args:
         train: the only rows it sees; a receiver's missing values do not count.
@@ -224,8 +224,8 @@ def fit_rssi(train: Rssi, config: RssiConfig | None = None, *, parallel: Map = m
 
 def _groups(rows: Rssi) -> list[Rssi]:
     """The receivers in groups of a fixed size, so that the numbers do not depend on who fits which group."""
-    names = rows.receiver_names
-    return [rows.columns(list(range(len(names)))[start : start + GROUP]) for start in range(0, len(names), GROUP)]
+    columns = list(range(len(rows.receiver_names)))
+    return [rows.columns(columns[start : start + GROUP]) for start in range(0, len(columns), GROUP)]
 
 
 def _choose_field(position: Tensor, residual: Tensor, fold: Tensor) -> tuple[Kernel, bool]:
@@ -244,7 +244,7 @@ def _choose_field(position: Tensor, residual: Tensor, fold: Tensor) -> tuple[Ker
 
 def _log_distance_law(train: Rssi) -> tuple[Tensor, Tensor]:
     """Level and slope (R, 2) of each receiver by least squares, and what they leave (n, R), nan where not heard."""
-    distance = torch.cdist(train.transmitter_position, train.receiver_position).clamp_min(NEAREST).log10()
+    distance = log_distance(train.transmitter_position, train.receiver_position)
     law, residual = torch.zeros(len(train.receiver_names), 2), torch.full_like(train.rssi_dbm, torch.nan)
     for r in range(len(law)):
         heard = ~train.rssi_dbm[:, r].isnan()

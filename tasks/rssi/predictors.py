@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,7 +18,7 @@ from torch import Tensor
 from swiftwrf import InputError, Rssi, RssiConfig, RssiModel, fit_rssi
 from swiftwrf.fit import folds
 from swiftwrf.fit_config import Validation
-from swiftwrf.rssi import NEAREST, Map
+from swiftwrf.rssi import Map, log_distance
 
 NEIGHBOURS = (1, 3, 5, 8, 12, 20, 40, 80, 120)
 TUNED_ROWS, KEPT_ROWS = 500, 1500  # of the Gaussian process: its cost grows with their cube
@@ -56,7 +57,7 @@ class LogDistance:
 
     def fit(self, train: Rssi) -> None:
         self._receiver = train.receiver_position
-        distance, n = self._distance(train.transmitter_position), len(train.receiver_names)
+        distance, n = log_distance(train.transmitter_position, self._receiver), len(train.receiver_names)
         laws = []
         for columns in [list(range(n))] * n if self._pooled else [[r] for r in range(n)]:
             heard = ~train.rssi_dbm[:, columns].isnan()
@@ -65,14 +66,11 @@ class LogDistance:
         self._level = torch.tensor([law.intercept_ for law in laws], dtype=torch.float64)
         self._slope = torch.tensor([law.coef_[0] for law in laws], dtype=torch.float64)
 
-    def _distance(self, position: Tensor) -> Tensor:
-        return torch.cdist(position.double(), self._receiver).clamp_min(NEAREST).log10()
-
     def predict(self, position: Tensor) -> Tensor:
-        return self._level + self._slope * self._distance(position)
+        return self._level + self._slope * log_distance(position, self._receiver)
 
 
-class _PerReceiver:
+class _PerReceiver(ABC):
     """One scikit-learn regressor on the position for each receiver, on what a log-distance law leaves or on RSSI itself."""
 
     def __init__(self, validation: Validation, seed: int, on_law: bool) -> None:
@@ -92,8 +90,9 @@ class _PerReceiver:
             heard = ~np.isnan(values)
             self._regressors.append(self._regressor(position[heard], values[heard], fold[heard]))
 
+    @abstractmethod
     def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
-        raise NotImplementedError
+        """A regressor fitted to one receiver's positions (n, 3) and values (n,)."""
 
     def predict(self, position: Tensor) -> Tensor:
         x = position.double().numpy()
