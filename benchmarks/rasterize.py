@@ -1,8 +1,8 @@
 """Spectra per second: each maker alone and the whole model, on the machine's GPU where there is one, else on its CPU.
 
-Rates are medians over repeats with the least and the most; makers are compared within one run. On a GPU every rate also
-comes as a share of two bounds: the exponentials of the pixels inside the cutoff (16 a clock and multiprocessor), and the
-writing of the spectrum at the speed of a measured copy.
+Rates are of magnitudes |A|: medians over repeats with the least and the most, makers compared within one run. On a GPU every
+rate also comes as a share of two bounds: the exponentials of the pixels inside the cutoff (16 a clock and multiprocessor),
+and the writing of the magnitude at the speed of a measured copy.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from swiftwrf import AngularGrid, ModelConfig, SwiftWRF, rasterize
 from swiftwrf.deformation import Kernel
-from swiftwrf.rasterize import Maker
+from swiftwrf.rasterize import Maker, rasterize_magnitude
 
 Rate = dict[str, float]
 CUTOFF = 1e-3
@@ -72,7 +72,9 @@ def measure(
             continue
         drawn = rasterize(*few, grid, maker, CUTOFF)
         makers[maker] = {
-            "forward_per_s": rate(lambda f=few, m=maker: rasterize(*f, grid, m, CUTOFF), len(few[0]), device, seconds),
+            "forward_per_s": rate(
+                lambda f=few, m=maker: rasterize_magnitude(*f, grid, m, CUTOFF), len(few[0]), device, seconds
+            ),
             "forward_backward_per_s": rate(
                 lambda f=few, m=maker: with_gradients(f, grid, m), len(few[0]), device, seconds
             ),
@@ -90,7 +92,7 @@ def measure(
     if machine is not None:
         row["share_of_bounds"] = {
             "exponentials": fast["forward_per_s"]["median"] * kernel_values(inputs, grid) / machine["exponentials_per_s"],
-            "writing": fast["forward_per_s"]["median"] * 8 * grid.n_elevation * grid.n_azimuth / machine["bytes_per_s"],
+            "writing": fast["forward_per_s"]["median"] * 4 * grid.n_elevation * grid.n_azimuth / machine["bytes_per_s"],
         }  # fmt: skip
         row["peak_memory_bytes"] = torch.cuda.max_memory_allocated()
         torch.cuda.reset_peak_memory_stats()
@@ -131,9 +133,9 @@ def kernel_values(inputs: list[Tensor], grid: AngularGrid) -> float:
 
 
 def with_gradients(inputs: list[Tensor], grid: AngularGrid, maker: Maker) -> None:
-    """One drawing and the gradients of everything."""
+    """One drawing of |A| and the gradients of everything."""
     leaves = [x.detach().requires_grad_() for x in inputs]
-    drawn = rasterize(*leaves, grid, maker, CUTOFF)
+    drawn = rasterize_magnitude(*leaves, grid, maker, CUTOFF)
     torch.autograd.grad(drawn, leaves, torch.ones_like(drawn))
 
 

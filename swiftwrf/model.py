@@ -14,8 +14,7 @@ from swiftwrf.angles import AngularGrid
 from swiftwrf.deformation import Kernel, MotionBasis, Offsets, PerPrimitiveMLP
 from swiftwrf.errors import InputError
 from swiftwrf.primitives import Gaussians, Primitives
-from swiftwrf.rasterize import rasterize
-from swiftwrf.rasterize.magnitude import magnitude
+from swiftwrf.rasterize import rasterize_magnitude
 
 DEFAULT_RANK = 32  # where nobody chose one
 Deformation = Literal["motion_basis", "per_primitive_mlp", "none"]
@@ -106,7 +105,7 @@ class SwiftWRF(nn.Module):
         """Magnitudes (n, H, W) of primitives at n positions."""
         mean = gaussians.mean.expand(n, -1, -1)
         weight = gaussians.weight.expand(n, -1, -1)
-        return magnitude(rasterize(mean, gaussians.cholesky, weight, grid, cutoff=self.config.cutoff))
+        return rasterize_magnitude(mean, gaussians.cholesky, weight, grid, cutoff=self.config.cutoff)
 
     def forward(self, position: Tensor, *, deform: bool = True, stop_mean: bool = False) -> Tensor:
         """Magnitudes (B, H, W) at normalised positions (B, 3), on the model's grid, differentiable."""

@@ -88,14 +88,20 @@ class Optimisation:
     ) -> None:
         self.stage: Stage = stage
         self.steps, self.config = steps, config
-        self.generator = torch.Generator().manual_seed(config.seed)
-        model = SwiftWRF(config.model, train.grid, train.position, kernel, generator=self.generator)
+        generator = torch.Generator().manual_seed(config.seed)
+        model = SwiftWRF(config.model, train.grid, train.position, kernel, generator=generator)
         self.model = model.to(device)
         self.position, self.spectrum = self._tensors(train)
+        # everything random is drawn now: nothing is copied to the device between two looks
+        batch = min(config.batch, len(train))
+        self.rows = torch.randint(len(train), (config.steps, batch), generator=generator).to(device)
+        noisy = config.steps if config.smoothing else 0
+        self.noise = torch.randn(noisy, batch, 3, generator=generator).to(device)
         self.held_out = None if held_out is None else self._tensors(held_out)
         self.optimiser = self._optimiser()
         self.average = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(AVERAGING))
         self.step, self.best_step, self.best_loss = 0, steps, math.inf
+        self.broken_at = torch.tensor(steps, device=device)  # the first step whose loss was not finite
         self.seconds = 0.0
 
     def _tensors(self, spectra: Spectra) -> tuple[Tensor, Tensor]:
@@ -132,19 +138,18 @@ class Optimisation:
         left = max(0.0, 1 - fine / self.config.smoothing_steps)
         return self.config.smoothing * 2 / math.cbrt(len(self.position)) * left
 
-    def advance(self) -> float:
+    def advance(self) -> Tensor:
         """One step; its loss.
 
         Raises:
-            FitError: a loss or gradient that is not finite; the parameters are those before the step.
+            FitError: a loss or gradient that is not finite. A GPU is only asked at each look, for asking waits for it.
         """
         config, model = self.config, self.model
-        rows = torch.randint(len(self.position), (min(config.batch, len(self.position)),), generator=self.generator)
+        rows = self.rows[self.step]
         position = self.position[rows]
         deform = self.step >= config.coarse_steps
         if deform and (scale := self.smoothing()):
-            noise = torch.randn(position.shape, generator=self.generator).to(position)
-            position = position + scale * noise
+            position = position + scale * self.noise[self.step]
         try:
             drawn = model(position, deform=deform, stop_mean=config.stop_mean and deform)
         except InputError as error:  # parameters ran away, so that a primitive is no longer one
@@ -155,17 +160,21 @@ class Optimisation:
         self.optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         norm = nn.utils.clip_grad_norm_(model.parameters(), max_norm=1.0)
-        if not (math.isfinite(loss.item()) and math.isfinite(norm.item())):
+        finite = loss.detach().isfinite() & norm.isfinite()
+        self.broken_at = torch.where(finite, self.broken_at, self.broken_at.clamp(max=self.step))
+        if (not loss.is_cuda or self._looks_after(self.step + 1)) and (broken := int(self.broken_at)) <= self.step:
             raise FitError(
-                f"the fit broke at step {self.step}: loss {loss.item():.3g}, gradient {norm.item():.3g}; "
-                f"{self._advice()}"
+                f"the fit broke at step {broken}: its loss or gradient is not a finite number; {self._advice()}"
             )
         for group in self.optimiser.param_groups:
             group["lr"] = group["peak"] * self._rate(self.step)
         self.optimiser.step()
         self.average.update_parameters(self.model)
         self.step += 1
-        return loss.item()
+        return loss.detach()
+
+    def _looks_after(self, step: int) -> bool:
+        return step % self.config.check_every == 0 or step == self.steps
 
     def _advice(self) -> str:
         return f"try a learning rate below {self.config.rate:g}"
@@ -203,7 +212,7 @@ class Optimisation:
         while self.step < self.steps and not (self.held_out and self.step - self.best_step >= patience * every):
             loss = self.advance()
             bar.update(task, completed=self.step)
-            if self.step % every and self.step != self.steps:
+            if not self._looks_after(self.step):
                 continue
             held_out = self.look()
             if held_out is not None and held_out < self.best_loss:
@@ -216,7 +225,7 @@ class Optimisation:
                     {
                         "stage": self.stage,
                         "step": self.step,
-                        "loss": loss,
+                        "loss": float(loss),
                         "validation": held_out,
                         "seconds": self.seconds,
                     }
@@ -228,7 +237,6 @@ class Optimisation:
         tensors |= {f"average.{name}": value for name, value in self.average.state_dict().items()}
         for number, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{number}.{name}": torch.as_tensor(value) for name, value in moments.items()}
-        tensors["generator"] = self.generator.get_state()
         header = {name: getattr(self, name) for name in ("stage", "steps", "step", "best_step", "seconds")}
         header |= {"best_loss": None if math.isinf(self.best_loss) else self.best_loss, "fingerprint": owner}
         files.write(path, "fit state", tensors, header)
@@ -245,4 +253,3 @@ class Optimisation:
                 _, number, moment = name.split(".")
                 state["state"].setdefault(int(number), {})[moment] = value
         self.optimiser.load_state_dict(state)
-        self.generator.set_state(tensors["generator"])

@@ -189,7 +189,9 @@ class RssiModel(nn.Module):
         return middle, middle - self.widening * deviation, middle + self.widening * deviation
 
 
-def fit_rssi(train: Rssi, config: RssiConfig | None = None, *, parallel: Map = map) -> RssiModel:
+def fit_rssi(
+    train: Rssi, config: RssiConfig | None = None, *, device: torch.device | str = "cpu", parallel: Map = map
+) -> RssiModel:
     """Fits all receivers at once; same data, configuration and machine give the same model.
 
     The kernel, and whether there are primitives at all, are chosen by cross-validation on what the log-distance law leaves;
@@ -198,6 +200,7 @@ def fit_rssi(train: Rssi, config: RssiConfig | None = None, *, parallel: Map = m
     Args:
         train: the only rows it sees; a receiver's missing values do not count.
         config: how; `RssiConfig()` unless given.
+        device: where to optimise; the model that comes back is on the CPU.
         parallel: maps the fit over groups of receivers; give one that spreads work over processes or machines.
 
     Raises:
@@ -212,7 +215,11 @@ def fit_rssi(train: Rssi, config: RssiConfig | None = None, *, parallel: Map = m
     kernel, helps = _choose_field(train.transmitter_position, _log_distance_law(train)[1], fold)
     rest, held_out = train.subset((fold != 0).nonzero()[:, 0]), train.subset((fold == 0).nonzero()[:, 0])
     task = functools.partial(
-        _optimise, n_primitives=config.n_primitives if helps or not config.law else 0, kernel=kernel, config=config
+        _optimise,
+        n_primitives=config.n_primitives if helps or not config.law else 0,
+        kernel=kernel,
+        config=config,
+        device=torch.device(device),
     )
     searched, model = (RssiModel(list(parallel(task, _groups(rows)))) for rows in (rest, train))
     with torch.no_grad():
@@ -255,7 +262,9 @@ def _log_distance_law(train: Rssi) -> tuple[Tensor, Tensor]:
     return law, residual
 
 
-def _optimise(train: Rssi, n_primitives: int, kernel: Kernel, config: RssiConfig) -> ReceiverGroup:
+def _optimise(
+    train: Rssi, n_primitives: int, kernel: Kernel, config: RssiConfig, device: torch.device
+) -> ReceiverGroup:
     """Maximum a posteriori: Huber's loss in units of the noise, and the prior of the functions of position."""
     generator = torch.Generator().manual_seed(config.seed)
     position, rssi = train.transmitter_position, train.rssi_dbm.float()
@@ -270,6 +279,7 @@ def _optimise(train: Rssi, n_primitives: int, kernel: Kernel, config: RssiConfig
         share = kernel.noise / (1 + kernel.noise) if n_primitives else 1.0
         model.noise_db.copy_((share * variance).sqrt())
         model.field_db.copy_(((1 - share) * variance).sqrt())
+    model, position, rssi = model.to(device), position.to(device), rssi.to(device)
     optimiser = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], lr=config.rate)
     heard = int((~rssi.isnan()).sum())
     described = f"{len(train.receiver_names)} receivers, {n_primitives} primitives"
@@ -287,4 +297,4 @@ def _optimise(train: Rssi, n_primitives: int, kernel: Kernel, config: RssiConfig
         loss.backward()
         optimiser.param_groups[0]["lr"] = config.rate * 0.5 * (1 + math.cos(math.pi * step / config.steps))
         optimiser.step()
-    return model.requires_grad_(False)
+    return model.requires_grad_(False).cpu()

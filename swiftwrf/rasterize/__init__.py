@@ -18,6 +18,7 @@ from torch import Tensor
 from swiftwrf.angles import AngularGrid
 from swiftwrf.errors import InputError
 from swiftwrf.rasterize import cuda, reference
+from swiftwrf.rasterize.magnitude import magnitude
 
 Maker = Literal["auto", "reference", "cpu", "cuda"]
 
@@ -57,17 +58,39 @@ def rasterize(
     chosen = _choose(maker, mean)
     if chosen == "reference":
         return reference.rasterize(mean, cholesky, weight, grid, cutoff)
-    batch, n = mean.shape[:-2], mean.shape[-2]
-    flat_mean, flat_weight = (x.reshape(batch.numel(), n, 2) for x in (mean, weight))
-    if cholesky.dim() > 2:
-        cholesky = cholesky.reshape(batch.numel(), n, 3)
+    flat = _flattened(mean, cholesky, weight)
     if chosen == "cuda":
-        drawn = cuda.rasterize(flat_mean, cholesky, flat_weight, grid, cutoff)
+        drawn = cuda.rasterize(*flat, grid, cutoff)
     else:
         from swiftwrf.rasterize import cpu  # numba is imported by those who use it
 
-        drawn = cpu.rasterize(flat_mean, cholesky, flat_weight, grid, cutoff)
-    return drawn.reshape(*batch, 2, *grid.shape)
+        drawn = cpu.rasterize(*flat, grid, cutoff)
+    return drawn.reshape(*mean.shape[:-2], 2, *grid.shape)
+
+
+def rasterize_magnitude(
+    mean: Tensor,
+    cholesky: Tensor,
+    weight: Tensor,
+    grid: AngularGrid,
+    maker: Maker = "auto",
+    cutoff: float | None = 1e-4,
+) -> Tensor:
+    """|A| of what `rasterize` draws, (..., n_elevation, n_azimuth), with gradient 0 where A = 0; the same arguments and
+    errors. The CUDA maker draws it without writing A."""
+    if _choose(maker, mean) != "cuda":
+        return magnitude(rasterize(mean, cholesky, weight, grid, maker, cutoff))
+    _check(mean, cholesky, weight, cutoff)
+    drawn = cuda.magnitude(*_flattened(mean, cholesky, weight), grid, cutoff)
+    return drawn.reshape(*mean.shape[:-2], *grid.shape)
+
+
+def _flattened(mean: Tensor, cholesky: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """All positions in one leading dimension."""
+    n_position, n = mean.shape[:-2].numel(), mean.shape[-2]
+    if cholesky.dim() > 2:
+        cholesky = cholesky.reshape(n_position, n, 3)
+    return mean.reshape(n_position, n, 2), cholesky, weight.reshape(n_position, n, 2)
 
 
 def _choose(maker: Maker, mean: Tensor) -> str:
@@ -113,4 +136,4 @@ def _check(mean: Tensor, cholesky: Tensor, weight: Tensor, cutoff: float | None)
             )
 
 
-__all__ = ["Maker", "rasterize"]
+__all__ = ["Maker", "rasterize", "rasterize_magnitude"]

@@ -13,10 +13,12 @@ from __future__ import annotations
 import ctypes
 import math
 import warnings
+from collections.abc import Callable
 from ctypes import c_float, c_int, c_void_p
 from dataclasses import astuple
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -97,8 +99,8 @@ def _checked(*tensors: Tensor) -> list[Tensor]:
     return [tensor if tensor.data_ptr() % 8 == 0 else tensor.clone() for tensor in ready]
 
 
-def _pointer(tensor: Tensor) -> c_void_p:
-    return c_void_p(tensor.data_ptr())
+def _pointer(tensor: Tensor | None) -> c_void_p:
+    return c_void_p(tensor.data_ptr() if tensor is not None and tensor.numel() else None)
 
 
 def _draw(
@@ -106,14 +108,37 @@ def _draw(
     elevation_start: float, elevation_step: float, n_elevation: int, azimuth_start: float, n_azimuth: int,
     cutoff: float | None,
 ) -> Tensor:  # fmt: skip
-    batch, n = mean.shape[:2]
-    out = mean.new_empty(batch, 2, n_elevation, n_azimuth)
-    if not out.numel():
-        return out
-    mean, cholesky, weight = _checked(mean, cholesky, weight)
+    field = mean.new_empty(mean.shape[0], 2, n_elevation, n_azimuth)
     grid = AngularGrid(elevation_start, elevation_step, n_elevation, azimuth_start, n_azimuth)
+    _launch(mean, cholesky, weight, grid, cutoff, field, None)
+    return field
+
+
+def _draw_magnitude(
+    mean: Tensor, cholesky: Tensor, weight: Tensor,
+    elevation_start: float, elevation_step: float, n_elevation: int, azimuth_start: float, n_azimuth: int,
+    cutoff: float | None, keep_phase: bool,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """|A|, and A / |A| for the backward pass, empty where it is not kept."""
+    batch = mean.shape[0]
+    magnitude = mean.new_empty(batch, n_elevation, n_azimuth)
+    phase = mean.new_empty(batch if keep_phase else 0, 2, n_elevation, n_azimuth)
+    grid = AngularGrid(elevation_start, elevation_step, n_elevation, azimuth_start, n_azimuth)
+    _launch(mean, cholesky, weight, grid, cutoff, phase, magnitude)
+    return magnitude, phase
+
+
+def _launch(
+    mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None,
+    field: Tensor, magnitude: Tensor | None,
+) -> None:  # fmt: skip
+    """Draws into field and magnitude."""
+    batch, n = mean.shape[:2]
+    if not batch:
+        return
+    mean, cholesky, weight = _checked(mean, cholesky, weight)
     common = c_int(n), c_int(cholesky.dim() == 3), _Grid.of(grid), _Cutoff.of(cutoff)
-    across, down = -(-n_azimuth // _TILE_COLUMNS), -(-n_elevation // _TILE_ROWS)
+    across, down = -(-grid.n_azimuth // _TILE_COLUMNS), -(-grid.n_elevation // _TILE_ROWS)
     words = -(-n // _LANES)
     reached = torch.empty(batch, across + down, words, dtype=torch.int32, device=mean.device)
     launch = kernels(mean.device).launch
@@ -124,9 +149,8 @@ def _draw(
         )  # fmt: skip
     launch(
         "rasterize", -(-batch * across * down // _WARPS), _THREADS,
-        _pointer(mean), _pointer(cholesky), _pointer(weight), _pointer(reached), _pointer(out), c_int(batch), *common,
+        *(_pointer(x) for x in (mean, cholesky, weight, reached, field, magnitude)), c_int(batch), *common,
     )  # fmt: skip
-    return out
 
 
 def _draw_backward(
@@ -134,27 +158,48 @@ def _draw_backward(
     elevation_start: float, elevation_step: float, n_elevation: int, azimuth_start: float, n_azimuth: int,
     cutoff: float | None,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    grad, mean, cholesky, weight = _checked(grad, mean, cholesky, weight)
+    grid = AngularGrid(elevation_start, elevation_step, n_elevation, azimuth_start, n_azimuth)
+    return _gather("rasterize_backward", [grad], mean, cholesky, weight, grid, cutoff)
+
+
+def _draw_magnitude_backward(
+    grad: Tensor, phase: Tensor, mean: Tensor, cholesky: Tensor, weight: Tensor,
+    elevation_start: float, elevation_step: float, n_elevation: int, azimuth_start: float, n_azimuth: int,
+    cutoff: float | None,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    grid = AngularGrid(elevation_start, elevation_step, n_elevation, azimuth_start, n_azimuth)
+    return _gather("magnitude_backward", [grad, phase], mean, cholesky, weight, grid, cutoff)
+
+
+def _gather(
+    kernel: str, incoming: list[Tensor], mean: Tensor, cholesky: Tensor, weight: Tensor,
+    grid: AngularGrid, cutoff: float | None,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Gradients by mean, Cholesky factor and weight from those that come in."""
+    *incoming, mean, cholesky, weight = _checked(*incoming, mean, cholesky, weight)
     batch, n = mean.shape[:2]
     d_mean, d_weight = torch.empty_like(mean), torch.empty_like(weight)
     d_cholesky = cholesky.new_empty(batch, n, 3)
     if mean.numel():
-        grid = AngularGrid(elevation_start, elevation_step, n_elevation, azimuth_start, n_azimuth)
         # threads for a primitive: about as many as its footprint has columns where N primitives share the grid
-        pixels = n_elevation * n_azimuth / n
+        pixels = grid.n_elevation * grid.n_azimuth / n
         group = 8 if pixels < 10 else 16 if pixels < 60 else 32
         kernels(mean.device).launch(
-            "rasterize_backward", batch * -(-n * group // _THREADS), _THREADS,
-            *(_pointer(x) for x in (grad, mean, cholesky, weight, d_mean, d_cholesky, d_weight)),
+            kernel, batch * -(-n * group // _THREADS), _THREADS,
+            *(_pointer(x) for x in (*incoming, mean, cholesky, weight, d_mean, d_cholesky, d_weight)),
             c_int(n), c_int(group), c_int(cholesky.dim() == 3), _Grid.of(grid), _Cutoff.of(cutoff),
         )  # fmt: skip
     return d_mean, d_cholesky if cholesky.dim() == 3 else d_cholesky.sum(0), d_weight
 
 
-_rasterize = torch.library.custom_op("swiftwrf::rasterize_cuda", _draw, mutates_args=(), device_types="cuda")
-_rasterize_backward = torch.library.custom_op(
-    "swiftwrf::rasterize_cuda_backward", _draw_backward, mutates_args=(), device_types="cuda"
-)
+def _operator(name: str, function: Callable[..., Any]) -> Any:
+    return torch.library.custom_op(f"swiftwrf::{name}", function, mutates_args=(), device_types="cuda")
+
+
+_rasterize = _operator("rasterize_cuda", _draw)
+_rasterize_backward = _operator("rasterize_cuda_backward", _draw_backward)
+_magnitude = _operator("magnitude_cuda", _draw_magnitude)
+_magnitude_backward = _operator("magnitude_cuda_backward", _draw_magnitude_backward)
 
 
 @_rasterize.register_fake
@@ -162,25 +207,60 @@ def _(mean, cholesky, weight, elevation_start, elevation_step, n_elevation, azim
     return mean.new_empty(mean.shape[0], 2, n_elevation, n_azimuth)
 
 
+@_magnitude.register_fake
+def _(
+    mean, cholesky, weight, elevation_start, elevation_step, n_elevation, azimuth_start, n_azimuth, cutoff, keep_phase
+):
+    batch = mean.shape[0]
+    phase = mean.new_empty(batch if keep_phase else 0, 2, n_elevation, n_azimuth)
+    return mean.new_empty(batch, n_elevation, n_azimuth), phase
+
+
 @_rasterize_backward.register_fake
 def _(grad, mean, cholesky, weight, *settings):
     return tuple(x.new_empty(x.shape) for x in (mean, cholesky, weight))
 
 
-def _setup_context(ctx, inputs, output) -> None:
+@_magnitude_backward.register_fake
+def _(grad, phase, mean, cholesky, weight, *settings):
+    return tuple(x.new_empty(x.shape) for x in (mean, cholesky, weight))
+
+
+def _keep_inputs(ctx, inputs, output) -> None:
     mean, cholesky, weight, *ctx.settings = inputs
     ctx.save_for_backward(mean, cholesky, weight)
+
+
+def _keep_inputs_and_phase(ctx, inputs, output) -> None:
+    mean, cholesky, weight, *ctx.settings = inputs
+    ctx.save_for_backward(output[1], mean, cholesky, weight)
+    ctx.set_materialize_grads(False)  # no zeros for the phase, which nobody differentiates
 
 
 def _backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
     return (*_rasterize_backward(grad, *ctx.saved_tensors, *ctx.settings), *(None for _ in ctx.settings))
 
 
-_rasterize.register_autograd(_backward, setup_context=_setup_context)
+def _backward_magnitude(ctx, grad: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
+    gradients = _magnitude_backward(grad, *ctx.saved_tensors, *ctx.settings[:-1])  # all but keep_phase
+    return (*gradients, *(None for _ in ctx.settings))
+
+
+_rasterize.register_autograd(_backward, setup_context=_keep_inputs)
+_magnitude.register_autograd(_backward_magnitude, setup_context=_keep_inputs_and_phase)
 
 
 def rasterize(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None) -> Tensor:
     """See `swiftwrf.rasterize`: mean (B, N, 2), cholesky (N, 3) or (B, N, 3), weight (B, N, 2), all float32 on one GPU,
     to (B, 2, n_elevation, n_azimuth)."""
     drawn: Tensor = _rasterize(mean, cholesky, weight, *astuple(grid), cutoff)
+    return drawn
+
+
+def magnitude(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None) -> Tensor:
+    """See `swiftwrf.rasterize.rasterize_magnitude`: as `rasterize`, to (B, n_elevation, n_azimuth) without the field ever
+    being written. Where a gradient will be asked for, A / |A| is kept: with it the backward pass needs no root a
+    primitive and pixel."""
+    keep_phase = torch.is_grad_enabled() and any(x.requires_grad for x in (mean, cholesky, weight))
+    drawn: Tensor = _magnitude(mean, cholesky, weight, *astuple(grid), cutoff, keep_phase)[0]
     return drawn

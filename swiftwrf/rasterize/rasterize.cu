@@ -137,7 +137,8 @@ extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
     const float* __restrict__ cholesky,    // (N, 3) or (B, N, 3) [rad]
     const float2* __restrict__ weight,     // (B, N) real and imaginary part
     const unsigned* __restrict__ reached,  // (B, strips, words), from find_reach
-    float* __restrict__ out,               // (B, 2, n_elevation, n_azimuth)
+    float* __restrict__ field,             // (B, 2, n_elevation, n_azimuth): A; with `magnitude` A / |A|, 0 where A is 0
+    float* __restrict__ magnitude,         // (B, n_elevation, n_azimuth): |A|; either may be null
     unsigned n_positions, int n, int cholesky_per_position, Grid grid, Cutoff cutoff) {
     __shared__ int s_collected[WARPS][2 * LANES];   // indices: fewer than 32 wait while up to 32 come
     __shared__ float4 s_prepared[WARPS][LANES][2];  // u at the tile's centre, s1, v there, s21; s3, weight, column
@@ -226,14 +227,22 @@ extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
 
     const size_t plane = static_cast<size_t>(grid.n_elevation) * grid.n_azimuth;
     const int column = tile_column + lane % TILE_COLUMNS, row = tile_row + lane / TILE_COLUMNS;
-    out += 2 * plane * position + static_cast<size_t>(row) * grid.n_azimuth + column;
+    const size_t pixel = static_cast<size_t>(row) * grid.n_azimuth + column;
 #pragma unroll
     for (int k = 0; k < PIXELS; ++k) {
         if (row + k * ROW_STEP < grid.n_elevation && column < grid.n_azimuth) {
-            out[0] = re[k];
-            out[plane] = im[k];
+            const size_t at = pixel + static_cast<size_t>(k) * ROW_STEP * grid.n_azimuth;
+            float scale = 1.0f;
+            if (magnitude) {
+                const float length = hypotf(re[k], im[k]);
+                magnitude[plane * position + at] = length;
+                scale = length == 0.0f ? 0.0f : 1.0f / length;
+            }
+            if (field) {
+                field[2 * plane * position + at] = scale * re[k];
+                field[2 * plane * position + plane + at] = scale * im[k];
+            }
         }
-        out += ROW_STEP * grid.n_azimuth;
     }
 }
 
@@ -243,15 +252,11 @@ extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
 // footprint, columns over the threads, rows in a loop. With z the kernel times the derivative by it, the sums over the
 // footprint of z u, z v, z u^2, z u v, z v^2 give the gradients of mean and factor; u is constant in a column.
 
-extern "C" __global__ void __launch_bounds__(THREADS, 4) rasterize_backward(
-    const float* __restrict__ grad,      // (B, 2, n_elevation, n_azimuth)
-    const float2* __restrict__ mean,     // (B, N)
-    const float* __restrict__ cholesky,  // (N, 3) or (B, N, 3)
-    const float2* __restrict__ weight,   // (B, N)
-    float2* __restrict__ d_mean,         // (B, N)
-    float* __restrict__ d_cholesky,      // (B, N, 3)
-    float2* __restrict__ d_weight,       // (B, N)
-    int n, int group, int cholesky_per_position, Grid grid, Cutoff cutoff) {
+__device__ __forceinline__ void gather(
+    const float* __restrict__ grad, const float* __restrict__ phase,
+    const float2* __restrict__ mean, const float* __restrict__ cholesky, const float2* __restrict__ weight,
+    float2* __restrict__ d_mean, float* __restrict__ d_cholesky, float2* __restrict__ d_weight,
+    int n, int group, int cholesky_per_position, const Grid& grid, const Cutoff& cutoff) {
     const int groups = THREADS / group, member = threadIdx.x % group;
     const int blocks = (n + groups - 1) / groups;  // for a position
     const int position = blockIdx.x / blocks, primitive = blockIdx.x % blocks * groups + threadIdx.x / group;
@@ -264,8 +269,10 @@ extern "C" __global__ void __launch_bounds__(THREADS, 4) rasterize_backward(
         const Whitening w = whiten(l);
         const Place azimuth = locate(mean[i].x, grid.azimuth), elevation = locate(mean[i].y, grid.elevation);
         const float2 psi = weight[i];
-        const size_t plane = static_cast<size_t>(grid.n_elevation) * grid.n_azimuth;
-        const float* re = grad + 2 * plane * position;
+        const int plane = grid.n_elevation * grid.n_azimuth;
+        // the gradient by A = re + j im, itself or as the gradient by |A| times A / |A|
+        grad += static_cast<size_t>(phase ? 1 : 2) * plane * position;
+        if (phase) phase += static_cast<size_t>(2) * plane * position;
 
         // columns counted from the mean's, at most one turn; rows clipped to the grid
         const float turn = grid.n_azimuth;
@@ -286,10 +293,11 @@ extern "C" __global__ void __launch_bounds__(THREADS, 4) rasterize_backward(
             const float u = w.s1 * dx, v_x = w.s21 * dx;
             float dy = first_row - elevation.pixel - elevation.beyond;
             float s_0 = 0, s_1 = 0, s_2 = 0;  // sums over the column of z, z v, z v^2
-            const float* pixel = re + static_cast<size_t>(first_row) * grid.n_azimuth + c;
+            int at = first_row * grid.n_azimuth + c;
 #pragma unroll 2
             for (int row = first_row; row <= last_row; ++row) {
-                const float g_re = pixel[0], g_im = pixel[plane];
+                const float g_re = phase ? grad[at] * phase[at] : grad[at];
+                const float g_im = phase ? grad[at] * phase[at + plane] : grad[at + plane];
                 const float v = fmaf(w.s3, dy, v_x);
                 const float exponent = fmaf(-v, v, -u * u);
                 if (!(exponent < cutoff.least)) {
@@ -303,7 +311,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 4) rasterize_backward(
                     s_2 = fmaf(z_times_v, v, s_2);
                 }
                 dy += 1.0f;
-                pixel += grid.n_azimuth;
+                at += grid.n_azimuth;
             }
             z_u = fmaf(u, s_0, z_u);
             z_v += s_1;
@@ -334,4 +342,29 @@ extern "C" __global__ void __launch_bounds__(THREADS, 4) rasterize_backward(
         d_cholesky[3 * i + 1] = second * v_y * z_uv;
         d_cholesky[3 * i + 2] = second * v_y * z_vv;
     }
+}
+
+extern "C" __global__ void __launch_bounds__(THREADS, 4) rasterize_backward(
+    const float* __restrict__ grad,      // (B, 2, n_elevation, n_azimuth), by A
+    const float2* __restrict__ mean,     // (B, N)
+    const float* __restrict__ cholesky,  // (N, 3) or (B, N, 3)
+    const float2* __restrict__ weight,   // (B, N)
+    float2* __restrict__ d_mean,         // (B, N)
+    float* __restrict__ d_cholesky,      // (B, N, 3)
+    float2* __restrict__ d_weight,       // (B, N)
+    int n, int group, int cholesky_per_position, Grid grid, Cutoff cutoff) {
+    gather(grad, nullptr, mean, cholesky, weight, d_mean, d_cholesky, d_weight, n, group, cholesky_per_position, grid, cutoff);
+}
+
+extern "C" __global__ void __launch_bounds__(THREADS, 4) magnitude_backward(
+    const float* __restrict__ grad,      // (B, n_elevation, n_azimuth), by |A|
+    const float* __restrict__ phase,     // (B, 2, n_elevation, n_azimuth): A / |A|, 0 where A is 0
+    const float2* __restrict__ mean,     // (B, N)
+    const float* __restrict__ cholesky,  // (N, 3) or (B, N, 3)
+    const float2* __restrict__ weight,   // (B, N)
+    float2* __restrict__ d_mean,         // (B, N)
+    float* __restrict__ d_cholesky,      // (B, N, 3)
+    float2* __restrict__ d_weight,       // (B, N)
+    int n, int group, int cholesky_per_position, Grid grid, Cutoff cutoff) {
+    gather(grad, phase, mean, cholesky, weight, d_mean, d_cholesky, d_weight, n, group, cholesky_per_position, grid, cutoff);
 }

@@ -14,7 +14,6 @@ from PIL import Image, UnidentifiedImageError
 from swiftwrf import InputError, Rssi, load_rssi, rssi_room
 from swiftwrf.fit_config import Validation
 from swiftwrf.metrics import summary
-from swiftwrf.rssi import Map
 from tasks.report import write_report
 from tasks.rssi.cluster import on_cluster
 from tasks.rssi.predictors import PREDICTORS, SwiftWRFPredictor, make_predictor
@@ -62,13 +61,13 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     _check_floor_plan(config)
     data = (load_rssi(config.data) if config.data else rssi_room(seed=config.seed)).receivers(config.rx)
     train, test = data.split(config.split, config.seed)
-    parallel = on_cluster(config.scheduler) if config.scheduler else map
+    options = {"device": device} | ({"parallel": on_cluster(config.scheduler)} if config.scheduler else {})
     train.receivers(["all"])  # refuses receivers heard too rarely to learn from
     if not bool((~test.rssi_dbm.isnan()).any()):
         raise InputError(f"split {config.split!r} of {data.name} has no heard test rows for these receivers")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     with Run("rssi", config.out, label, config, device, data.source, resume) as directory:
-        tables = _Tables(data, train, test, config, directory, parallel)
+        tables = _Tables(data, train, test, config, directory, options)
         for name in PREDICTORS:
             tables.add(name)
         directory.write_csv("errors.csv", tables.errors)
@@ -106,9 +105,9 @@ class _Tables:
     """Fits and tests every predictor, each a step of the run's directory, and gathers the tables of the run."""
 
     def __init__(
-        self, data: Rssi, train: Rssi, test: Rssi, config: RssiTaskConfig, directory: Run, parallel: Map
+        self, data: Rssi, train: Rssi, test: Rssi, config: RssiTaskConfig, directory: Run, options: Row
     ) -> None:
-        self.train, self.test, self.config, self.directory, self.parallel = train, test, config, directory, parallel
+        self.train, self.test, self.config, self.directory, self.options = train, test, config, directory, options
         self.errors: list[Row] = []
         self.predictions: list[Row] = []
         self.seconds: dict[str, Row] = {}
@@ -124,7 +123,7 @@ class _Tables:
         def compute() -> Row:
             validation: Validation = "random" if self.config.split == "random" else "block"
             predictor = make_predictor(
-                name, validation=validation, seed=self.config.seed, parallel=self.parallel, preset=self.config.preset
+                name, validation=validation, seed=self.config.seed, preset=self.config.preset, **self.options
             )
             began = time.perf_counter()
             predictor.fit(self.train)

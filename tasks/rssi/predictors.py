@@ -18,7 +18,7 @@ from torch import Tensor
 from swiftwrf import InputError, Rssi, RssiConfig, RssiModel, fit_rssi
 from swiftwrf.fit import folds
 from swiftwrf.fit_config import Validation
-from swiftwrf.rssi import Map, log_distance
+from swiftwrf.rssi import log_distance
 
 NEIGHBOURS = (1, 3, 5, 8, 12, 20, 40, 80, 120)
 TUNED_ROWS, KEPT_ROWS = 500, 1500  # of the Gaussian process: its cost grows with their cube
@@ -128,11 +128,11 @@ class GaussianProcess(_PerReceiver):
 class SwiftWRFPredictor:
     """The model of this package; all receivers at once."""
 
-    def __init__(self, config: RssiConfig, parallel: Map) -> None:
-        self._config, self._parallel = config, parallel
+    def __init__(self, config: RssiConfig, **options: Any) -> None:
+        self._config, self._options = config, options
 
     def fit(self, train: Rssi) -> None:
-        self.model: RssiModel = fit_rssi(train, self._config, parallel=self._parallel)
+        self.model: RssiModel = fit_rssi(train, self._config, **self._options)
 
     def predict(self, position: Tensor) -> Tensor:
         return self.model.predict(position)[0]
@@ -142,7 +142,7 @@ PREDICTORS = ("swiftwrf", "mean", "mri_pooled", "mri_receiver", "mri_residual", 
 
 
 def make_predictor(
-    name: str, *, validation: Validation, seed: int, parallel: Map = map, preset: str = "default"
+    name: str, *, validation: Validation, seed: int, preset: str = "default", **options: Any
 ) -> Predictor:
     """The predictor of that name.
 
@@ -150,8 +150,8 @@ def make_predictor(
         name: one of `PREDICTORS`.
         validation: how training rows are held out to choose settings.
         seed: of what is random.
-        parallel: of `fit_rssi`.
         preset: of SwiftWRF: `default`, or `paper` for the plain head.
+        options: device and parallel of `fit_rssi`.
 
     Raises:
         InputError: an unknown name.
@@ -166,5 +166,5 @@ def make_predictor(
         return GaussianProcess(validation, seed, on_law=True)
     if name == "swiftwrf":
         make = RssiConfig.paper if preset == "paper" else RssiConfig
-        return SwiftWRFPredictor(make(validation=validation, seed=seed), parallel)
+        return SwiftWRFPredictor(make(validation=validation, seed=seed), **options)
     raise InputError(f"unknown predictor {name!r}; choose from {', '.join(PREDICTORS)}")
