@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf import FitConfig, InputError, Spectra, SwiftWRF, fit
+from swiftwrf.coarray import fit_coarray
 from swiftwrf.deformation import Kernel
 from swiftwrf.fit import folds
 from swiftwrf.fit_config import Validation
@@ -97,6 +98,20 @@ class GaussianProcess:
         return drawn.clamp(0, 1)
 
 
+class Coarray:
+    """The array's physics: 49 numbers a position for a 4 x 4 array, known in a second."""
+
+    def __init__(self, validation: Validation, seed: int) -> None:
+        self._validation: Validation = validation
+        self._seed = seed
+
+    def fit(self, train: Spectra) -> None:
+        self._model = fit_coarray(train, validation=self._validation, seed=self._seed)
+
+    def synthesize(self, position: Tensor) -> Tensor:
+        return self._model.synthesize(position)
+
+
 class SwiftWRFSynthesizer:
     """The model of this package."""
 
@@ -142,10 +157,12 @@ def make_synthesizer(
         return InverseDistance(validation, seed)
     if name == "gp":
         return GaussianProcess(validation, seed)
+    if name == "coarray":
+        return Coarray(validation, seed)
     if name == "swiftwrf":
         config = replace(config or FitConfig(), validation=validation, seed=seed)
         return SwiftWRFSynthesizer(config, device=device, checkpoint=checkpoint, on_record=on_record)
     raise InputError(f"unknown synthesizer {name!r}; choose from {', '.join(SYNTHESIZERS)}")
 
 
-SYNTHESIZERS = ("swiftwrf", "nearest", "idw", "gp")
+SYNTHESIZERS = ("swiftwrf", "nearest", "idw", "gp", "coarray")

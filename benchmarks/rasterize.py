@@ -143,7 +143,7 @@ def end_to_end(n: int, batch: int, grid: AngularGrid, device: torch.device, seco
     """Positions in, magnitudes out, with the motion basis."""
     generator = torch.Generator().manual_seed(0)
     anchor = torch.rand(200, 3, generator=generator)
-    config = ModelConfig(n_primitives=n, cutoff=CUTOFF)
+    config = ModelConfig(n_primitives=n, rank=32, cutoff=CUTOFF)
     model = SwiftWRF(config, grid, anchor, Kernel(), generator=generator).to(device)
     with torch.no_grad():
         mean, cholesky, _ = scene(n, 1, device)  # the primitives that are drawn alone

@@ -7,6 +7,7 @@ spectrum = model.synthesize(test.position)
 """
 
 from swiftwrf.angles import AngularGrid, ArrayPose
+from swiftwrf.coarray import CoarrayModel, fit_coarray, project
 from swiftwrf.data import Rssi, Spectra, load_rssi, load_spectra
 from swiftwrf.data.room import simulated_room
 from swiftwrf.data.rssi_room import rssi_room
@@ -20,6 +21,7 @@ from swiftwrf.rssi import RssiModel, fit_rssi
 __all__ = [
     "AngularGrid",
     "ArrayPose",
+    "CoarrayModel",
     "FitConfig",
     "FitError",
     "InputError",
@@ -30,10 +32,12 @@ __all__ = [
     "Spectra",
     "SwiftWRF",
     "fit",
+    "fit_coarray",
     "fit_rssi",
     "load",
     "load_rssi",
     "load_spectra",
+    "project",
     "rasterize",
     "rssi_room",
     "simulated_room",

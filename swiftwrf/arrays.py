@@ -26,10 +26,10 @@ class PlanarArray:
     wavelength: float
 
     @classmethod
-    def square(cls, side: int, frequency_hz: float) -> PlanarArray:
-        """side x side elements half a wavelength apart, the first at the origin."""
+    def square(cls, side: int, frequency_hz: float, spacing: float | None = None) -> PlanarArray:
+        """side x side elements, `spacing` [m] or else half a wavelength apart, the first at the origin."""
         wavelength = LIGHT_SPEED / frequency_hz
-        steps = torch.arange(side, dtype=torch.float64) * wavelength / 2
+        steps = torch.arange(side, dtype=torch.float64) * (spacing or wavelength / 2)
         return cls(torch.cartesian_prod(steps, steps), wavelength)
 
     def phase(self, direction: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""From measured spectra to a model: what a fit is told, and its two rounds."""
+"""From measured spectra to a model: how much the scene needs, then one fit of that size."""
 
 from __future__ import annotations
 
@@ -9,17 +9,21 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from swiftwrf import checks
 from swiftwrf.data.spectra import Spectra, coarsening
-from swiftwrf.data.splits import MIN_TRAINING, slabs
-from swiftwrf.errors import InputError
+from swiftwrf.data.splits import slabs
 from swiftwrf.fit_config import FitConfig, Validation
 from swiftwrf.metrics import WINDOW
 from swiftwrf.model import SwiftWRF
-from swiftwrf.optimise import Optimisation, Record, Stage, fingerprint, read_state
+from swiftwrf.optimise import Optimisation, Record, Session, fingerprint
 from swiftwrf.prior import choose_kernel, choose_rank
 from swiftwrf.progress import progress_bar
+from swiftwrf.search import climb
 
-FOLDS = 5  # validation holds out one; the kernel is chosen over all
+FOLDS = 5  # the search holds out one; the kernel is chosen over all
+FEWEST, MOST = 16, 2048  # primitives that the search tries
+SHORTEST, LONGEST = 300, 1200  # steps that it tries
+SEARCH_AZIMUTHS = 90  # columns of the spectra in the search: coarser ones rank the candidates alike
 
 
 def fit(
@@ -33,15 +37,16 @@ def fit(
 ) -> SwiftWRF:
     """Fits a SwiftWRF model to spectra.
 
-    A first fit without one fold of the training spectra finds the number of steps after which they are predicted best; a
-    second one takes that many with all of them. Same data, configuration and machine give the same model.
+    Short fits without one fold of the training spectra find how many primitives and then how many steps predict that fold
+    best; one fit of that size takes all spectra. Same data, configuration and machine give the same model.
 
     Args:
         train: the only spectra it sees.
         config: how; `FitConfig()` unless given.
         device: where to compute.
         checkpoint: a file that keeps the state of the fit; where it exists, the fit goes on from it.
-        on_record: called with stage, step, loss, validation loss (final stage: none) and seconds at each look.
+        on_record: called at each look with stage (search, final), n_primitives, steps, step, loss, validation loss (final
+            stage: none) and seconds.
         progress: show a progress bar on a terminal.
 
     Raises:
@@ -49,36 +54,42 @@ def fit(
         FitError: a loss or gradient that is not finite; the checkpoint holds the last good state.
     """
     config = config or FitConfig()
-    if len(train) < MIN_TRAINING:
-        raise InputError(f"a fit needs at least {MIN_TRAINING} spectra, got {len(train)}")
-    for name, tensor in (("position", train.position), ("spectrum", train.spectrum)):
-        bad = (~tensor.isfinite()).flatten(1).any(dim=1).nonzero()
-        if len(bad):
-            raise InputError(f"{name} of training spectrum {int(bad[0])} is not finite; mend or leave it out")
+    checks.training(train)
     fold = folds(train.position, config.validation, config.seed)
     # an array's beams are far wider than a pixel, so little is lost at the coarser resolution of the fit
-    work = train.coarsen(coarsening(train.grid.shape, config.max_azimuths, least_rows=WINDOW))
+    work = _at_most(config.max_azimuths, train)
     kernel = choose_kernel(work.position, work.spectrum, fold)
-    if config.model.rank is None:
+    if config.model.rank == "auto":
         rank = choose_rank(work.position, work.spectrum, fold, kernel)
         config = replace(config, model=replace(config.model, rank=rank))
-    owner = fingerprint(config, work)
-    saved = read_state(checkpoint, owner)
     with progress_bar(progress) as bar:
+        session = Session(checkpoint, fingerprint(config, work), bar, on_record)
+        small = _at_most(SEARCH_AZIMUTHS, work)
+        kept, held_out = (small.subset(rows.nonzero()[:, 0]) for rows in (fold != 0, fold == 0))
 
-        def run(stage: Stage, rows: Tensor, steps: int, held_out: Spectra | None = None) -> Optimisation:
-            optimisation = Optimisation(stage, steps, work.subset(rows), kernel, config, device, held_out)
-            optimisation.run(saved, checkpoint, owner, bar, on_record)
-            return optimisation
+        def loss(n: int, steps: int) -> float:
+            optimisation = Optimisation(_sized(config, n), steps, kept, kernel, device, held_out)
+            if optimisation.name not in session.losses:
+                session.losses[optimisation.name] = optimisation.run(session).held_out_loss()
+            return session.losses[optimisation.name]
 
-        if saved is None or saved.stage == "search":
-            held_out = work.subset((fold == 0).nonzero()[:, 0])
-            steps = run("search", (fold != 0).nonzero()[:, 0], config.steps, held_out).best_step
-        else:
-            steps = saved.steps
-        model = run("final", torch.arange(len(work)), steps).result
+        n, steps = config.model.n_primitives, config.steps
+        if n == "auto":
+            shortest = SHORTEST if steps == "auto" else min(SHORTEST, steps)
+            n = climb(lambda n: loss(n, shortest), FEWEST, MOST, patience=2)
+        if steps == "auto":
+            steps = climb(lambda steps: loss(n, steps), SHORTEST, LONGEST, patience=1)
+        model = Optimisation(_sized(config, n), steps, work, kernel, device).run(session).result
     model.grid = train.grid
     return model.eval()
+
+
+def _at_most(azimuths: int, spectra: Spectra) -> Spectra:
+    return spectra.coarsen(coarsening(spectra.grid.shape, azimuths, least_rows=WINDOW))
+
+
+def _sized(config: FitConfig, n: int) -> FitConfig:
+    return replace(config, model=replace(config.model, n_primitives=n))
 
 
 def folds(position: Tensor, validation: Validation, seed: int) -> Tensor:

@@ -15,10 +15,10 @@ class FitConfig:
     """How a model is fitted. The defaults are what measured best; `FitConfig.paper()` is the paper."""
 
     model: ModelConfig = field(default_factory=ModelConfig)
-    steps: int = 2000
-    """optimisation steps, coarse ones included"""
-    coarse_steps: int = 300
-    """of them on shared primitives, without deformation"""
+    steps: int | Literal["auto"] = "auto"
+    """optimisation steps, coarse ones included; auto finds how many held-out spectra call for"""
+    coarse_share: float = 0.0
+    """share of them on shared primitives, without deformation (the paper's coarse stage)"""
     batch: int = 16
     """spectra a step"""
     rate: float = 3e-2
@@ -44,9 +44,7 @@ class FitConfig:
     validation: Validation = "random"
     """what is held out inside the training part: single spectra, or a region where the model must extrapolate"""
     check_every: int = 100
-    """steps between two looks at the validation spectra"""
-    patience: int = 6
-    """looks without a better one until the search ends"""
+    """steps between two looks, at which progress is recorded and the state kept"""
     seed: int = 0
 
     @classmethod
@@ -54,6 +52,7 @@ class FitConfig:
         """The paper's settings: 10,000 bounded primitives, its network, means kept, annealed noise, all pixels."""
         model = ModelConfig(
             n_primitives=10_000,
+            rank=0,
             deformation="per_primitive_mlp",
             components=("mean", "response", "attenuation"),
             bounded=True,
@@ -61,7 +60,7 @@ class FitConfig:
         paper = cls(
             model=model,
             steps=110_000,
-            coarse_steps=10_000,
+            coarse_share=1 / 11,
             batch=1,
             rate=1e-2,
             deformation_rate=8e-3,

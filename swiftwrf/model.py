@@ -9,14 +9,13 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from swiftwrf import checkpoint
+from swiftwrf import checkpoint, checks
 from swiftwrf.angles import AngularGrid
 from swiftwrf.deformation import Kernel, MotionBasis, Offsets, PerPrimitiveMLP
 from swiftwrf.errors import InputError
 from swiftwrf.primitives import Gaussians, Primitives
 from swiftwrf.rasterize import rasterize_magnitude
 
-DEFAULT_RANK = 32  # where nobody chose one
 Deformation = Literal["motion_basis", "per_primitive_mlp", "none"]
 
 
@@ -24,18 +23,36 @@ Deformation = Literal["motion_basis", "per_primitive_mlp", "none"]
 class ModelConfig:
     """What a SwiftWRF model consists of."""
 
-    n_primitives: int = 128
-    """number N of primitives"""
+    n_primitives: int | Literal["auto"] = "auto"
+    """number N of primitives; auto lets the fit find how many the scene needs"""
     deformation: Deformation = "motion_basis"
     """how they move: low-rank motion (fast), the paper's network per primitive, or not at all"""
-    components: tuple[Literal["mean", "response", "attenuation", "cholesky"], ...] = ("mean", "response")
+    components: tuple[Literal["mean", "response", "attenuation", "cholesky"], ...] = (
+        "mean",
+        "response",
+        "attenuation",
+        "cholesky",
+    )
     """which of their parameters move"""
-    rank: int | None = None
-    """number K of motions that the motion basis mixes; None lets the fit choose it from the spectra"""
+    rank: int | Literal["auto"] = "auto"
+    """number K of motions that the motion basis mixes; auto lets the fit find how many the scene needs"""
     bounded: bool = False
     """keep canonical means inside the grid by the paper's tanh map"""
     cutoff: float = 1e-4
     """kernel values below it are not drawn"""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """N and K.
+
+        Raises:
+            InputError: one is still to be found.
+        """
+        if self.n_primitives == "auto" or self.rank == "auto":
+            raise InputError(
+                "a model needs numbers for n_primitives and rank; swiftwrf.fit finds those that are 'auto'"
+            )
+        return self.n_primitives, self.rank
 
 
 class SwiftWRF(nn.Module):
@@ -55,17 +72,16 @@ class SwiftWRF(nn.Module):
     ) -> None:
         super().__init__()
         self.config, self.grid = config, grid
+        n, rank = config.size
         low, high = anchor.min(dim=0).values, anchor.max(dim=0).values
         scale = float((high - low).max()) / 2 or 1.0
         self.register_buffer("centre", ((low + high) / 2).double())
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float64))
-        self.primitives = Primitives(config.n_primitives, grid, bounded=config.bounded, generator=generator)
+        self.primitives = Primitives(n, grid, bounded=config.bounded, generator=generator)
         self.deformation: MotionBasis | PerPrimitiveMLP | None
         if config.deformation == "motion_basis":
-            normalised, scaled, rank = self.normalise(anchor), kernel.scaled(1 / scale), config.rank or DEFAULT_RANK
-            self.deformation = MotionBasis(
-                normalised, scaled, rank, config.n_primitives, config.components, generator=generator
-            )
+            normalised, scaled = self.normalise(anchor), kernel.scaled(1 / scale)
+            self.deformation = MotionBasis(normalised, scaled, rank, n, config.components, generator=generator)
         elif config.deformation == "per_primitive_mlp":
             self.deformation = PerPrimitiveMLP(config.components, generator=generator)
         else:
@@ -126,11 +142,7 @@ class SwiftWRF(nn.Module):
         Raises:
             InputError: positions of another shape, or not finite.
         """
-        position = torch.as_tensor(position, dtype=torch.float64)
-        if position.dim() != 2 or position.shape[1] != 3:
-            raise InputError(f"positions must have shape (n, 3), got {tuple(position.shape)}")
-        if not position.isfinite().all():
-            raise InputError("positions must be finite numbers [m]")
+        position = checks.positions(position)
         grid = grid or self.grid
         spectrum = torch.empty(len(position), *grid.shape)
         for start in range(0, len(position), batch):

@@ -8,9 +8,9 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import torch
 from rich.progress import Progress
@@ -27,18 +27,44 @@ from swiftwrf.model import SwiftWRF
 
 AVERAGING = 0.98  # a step's weight decays by this much a step: averaged parameters predict better than the last ones
 Record = dict[str, Any]
-Stage = Literal["search", "final"]
 
 
 @dataclass(frozen=True)
 class State:
     """Where an interrupted fit stood."""
 
-    stage: Stage
-    steps: int
-    """steps of that stage"""
     header: dict[str, Any]
     tensors: dict[str, Tensor]
+
+
+@dataclass
+class Session:
+    """What the runs of one fit share: where their state is kept, and who is told.
+
+    Args:
+        path: of the state; None keeps none.
+        owner: fingerprint of configuration and spectra.
+        bar: shows progress.
+        on_record: is told at each look.
+        saved: the state of an earlier session of the same fit.
+        losses: of runs that are done, on held-out spectra, by their name.
+    """
+
+    path: Path | None
+    owner: str
+    bar: Progress
+    on_record: Callable[[Record], None] | None
+    saved: State | None = None
+    losses: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.path is not None and self.path.exists():
+            tensors, header = files.read(self.path, "fit state")
+            if header["fingerprint"] != self.owner:
+                raise InputError(
+                    f"{self.path} is the state of another fit (other spectra or settings); remove it or give another path"
+                )
+            self.saved, self.losses = State(header, tensors), header["losses"]
 
 
 def fingerprint(config: FitConfig, train: Spectra) -> str:
@@ -49,28 +75,12 @@ def fingerprint(config: FitConfig, train: Spectra) -> str:
     return digest.hexdigest()
 
 
-def read_state(path: Path | None, expected: str) -> State | None:
-    """The state at `path`, or None where there is none yet.
-
-    Raises:
-        InputError: the state of another fit.
-    """
-    if path is None or not path.exists():
-        return None
-    tensors, header = files.read(path, "fit state")
-    if header["fingerprint"] != expected:
-        raise InputError(
-            f"{path} is the state of another fit (other spectra or settings); remove it or give another path"
-        )
-    return State(header["stage"], header["steps"], header, tensors)
-
-
 class Optimisation:
     """Adam on the primitives and their motion, from a seeded start; the result is the running average of the parameters.
 
     Args:
-        stage: `search` looks at held-out spectra and stops when they are no longer predicted better; `final` runs through.
-        steps: when to stop at the latest.
+        config: with numbers for everything that may be `auto`.
+        steps: their number.
         train: spectra to fit.
         kernel: of the motion's prior, lengths in [m].
         held_out: spectra to look at.
@@ -78,31 +88,32 @@ class Optimisation:
 
     def __init__(
         self,
-        stage: Stage,
+        config: FitConfig,
         steps: int,
         train: Spectra,
         kernel: Kernel,
-        config: FitConfig,
         device: torch.device | str,
         held_out: Spectra | None = None,
     ) -> None:
-        self.stage: Stage = stage
+        self.name = (
+            f"{'final' if held_out is None else 'search'}, {config.model.n_primitives} primitives, {steps} steps"
+        )
         self.steps, self.config = steps, config
+        self.coarse_steps = round(config.coarse_share * steps)
         generator = torch.Generator().manual_seed(config.seed)
         model = SwiftWRF(config.model, train.grid, train.position, kernel, generator=generator)
         self.model = model.to(device)
         self.position, self.spectrum = self._tensors(train)
         # everything random is drawn now: nothing is copied to the device between two looks
         batch = min(config.batch, len(train))
-        self.rows = torch.randint(len(train), (config.steps, batch), generator=generator).to(device)
-        noisy = config.steps if config.smoothing else 0
+        self.rows = torch.randint(len(train), (steps, batch), generator=generator).to(device)
+        noisy = steps if config.smoothing else 0
         self.noise = torch.randn(noisy, batch, 3, generator=generator).to(device)
         self.held_out = None if held_out is None else self._tensors(held_out)
         self.optimiser = self._optimiser()
         self.average = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(AVERAGING))
-        self.step, self.best_step, self.best_loss = 0, steps, math.inf
+        self.step, self.seconds = 0, 0.0
         self.broken_at = torch.tensor(steps, device=device)  # the first step whose loss was not finite
-        self.seconds = 0.0
 
     def _tensors(self, spectra: Spectra) -> tuple[Tensor, Tensor]:
         device = self.model.centre.device
@@ -121,8 +132,8 @@ class Optimisation:
         return torch.optim.Adam(groups, betas=(0.9, 0.99))
 
     def _rate(self, step: int) -> float:
-        """Share of the peak rate: warm-up, then cosine decay over the configured steps, whatever the stage stops at."""
-        cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, step / self.config.steps)))
+        """Share of the peak rate: warm-up, then cosine decay."""
+        cosine = 0.5 * (1 + math.cos(math.pi * step / self.steps))
         decayed = self.config.final_rate + (1 - self.config.final_rate) * cosine
         return min(1.0, (step + 1) / self.config.warm_up) * decayed
 
@@ -134,7 +145,7 @@ class Optimisation:
     def smoothing(self) -> float:
         """Standard deviation of the noise on normalised positions: gamma 2 / cbrt(N_s) (1 - i / tau) (paper, annealed
         smoothing); 2 is the side of the box [-1, 1]^3, so that this is the distance between N_s even positions."""
-        fine = self.step - self.config.coarse_steps
+        fine = self.step - self.coarse_steps
         left = max(0.0, 1 - fine / self.config.smoothing_steps)
         return self.config.smoothing * 2 / math.cbrt(len(self.position)) * left
 
@@ -147,7 +158,7 @@ class Optimisation:
         config, model = self.config, self.model
         rows = self.rows[self.step]
         position = self.position[rows]
-        deform = self.step >= config.coarse_steps
+        deform = self.step >= self.coarse_steps
         if deform and (scale := self.smoothing()):
             position = position + scale * self.noise[self.step]
         try:
@@ -185,66 +196,61 @@ class Optimisation:
         return cast(SwiftWRF, self.average.module)
 
     @torch.no_grad()
-    def look(self) -> float | None:
-        """Loss on the held-out spectra."""
+    def held_out_loss(self) -> float:
+        """Mean over the held-out spectra; nan where there are none."""
         if self.held_out is None:
-            return None
+            return math.nan
         position, measured = self.held_out
         parts = zip(position.split(64), measured.split(64), strict=True)
-        deform = self.step > self.config.coarse_steps
+        deform = self.step > self.coarse_steps
         losses = [float(self.loss(self.result(p, deform=deform), m)) * len(p) for p, m in parts]
         return sum(losses) / len(position)
 
-    def run(
-        self,
-        saved: State | None,
-        path: Path | None,
-        owner: str,
-        bar: Progress,
-        on_record: Callable[[Record], None] | None,
-    ) -> None:
-        """Goes on from `saved` where it is of this stage; keeps its state at `path` at each look."""
-        if saved is not None and saved.stage == self.stage:
-            self._restore(saved)
-        task = bar.add_task(self.stage, total=self.steps, completed=self.step)
-        every, patience = self.config.check_every, self.config.patience
+    def run(self, session: Session) -> Optimisation:
+        """Takes all steps, from where the session's saved state stands if that is of this run; keeps the state at each
+        look."""
+        if session.saved is not None and session.saved.header["name"] == self.name:
+            self._restore(session.saved)
+        task = session.bar.add_task(self.name, total=self.steps, completed=self.step)
         began = time.perf_counter() - self.seconds
-        while self.step < self.steps and not (self.held_out and self.step - self.best_step >= patience * every):
+        while self.step < self.steps:
             loss = self.advance()
-            bar.update(task, completed=self.step)
-            if not self._looks_after(self.step):
-                continue
-            held_out = self.look()
-            if held_out is not None and held_out < self.best_loss:
-                self.best_loss, self.best_step = held_out, self.step
-            self.seconds = time.perf_counter() - began
-            if path is not None:
-                self._save(path, owner)
-            if on_record is not None:
-                on_record(
-                    {
-                        "stage": self.stage,
-                        "step": self.step,
-                        "loss": float(loss),
-                        "validation": held_out,
-                        "seconds": self.seconds,
-                    }
-                )
-        bar.remove_task(task)
+            session.bar.update(task, completed=self.step)
+            if self._looks_after(self.step):
+                self.seconds = time.perf_counter() - began
+                self._save(session)
+                self._record(session, loss)
+        session.bar.remove_task(task)
+        return self
 
-    def _save(self, path: Path, owner: str) -> None:
+    def _record(self, session: Session, loss: Tensor) -> None:
+        if session.on_record is not None:
+            session.on_record(
+                {
+                    "stage": "search" if self.held_out else "final",
+                    "n_primitives": self.config.model.n_primitives,
+                    "steps": self.steps,
+                    "step": self.step,
+                    "loss": float(loss),
+                    "validation": self.held_out_loss() if self.held_out else None,
+                    "seconds": self.seconds,
+                }
+            )
+
+    def _save(self, session: Session) -> None:
+        if session.path is None:
+            return
         tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
         tensors |= {f"average.{name}": value for name, value in self.average.state_dict().items()}
         for number, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{number}.{name}": torch.as_tensor(value) for name, value in moments.items()}
-        header = {name: getattr(self, name) for name in ("stage", "steps", "step", "best_step", "seconds")}
-        header |= {"best_loss": None if math.isinf(self.best_loss) else self.best_loss, "fingerprint": owner}
-        files.write(path, "fit state", tensors, header)
+        header = {name: getattr(self, name) for name in ("name", "step", "seconds")}
+        header |= {"losses": session.losses, "fingerprint": session.owner}
+        files.write(session.path, "fit state", tensors, header)
 
     def _restore(self, saved: State) -> None:
         header, tensors = saved.header, saved.tensors
-        self.step, self.best_step, self.seconds = header["step"], header["best_step"], header["seconds"]
-        self.best_loss = math.inf if header["best_loss"] is None else header["best_loss"]
+        self.step, self.seconds = header["step"], header["seconds"]
         for prefix, module in (("model.", self.model), ("average.", self.average)):
             module.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
         state = copy.deepcopy(self.optimiser.state_dict())

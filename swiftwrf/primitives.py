@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from swiftwrf.angles import AngularGrid
 
+WIDEST = 4 * math.pi  # [rad]: flat over the whole grid within 5 %; wider ones would only overflow
 FLOOR = 0.3  # of a pixel: narrower primitives fall between pixel centres, draw nothing and get no gradient
 
 
@@ -64,8 +65,9 @@ class Primitives(nn.Module):
         return self.mean.shape[-2]
 
     def constrained(self, cholesky: Tensor) -> Tensor:
-        """l1, l2, l3 [rad] of raw numbers (..., 3): positive diagonal above the floor; l2 is free, in units of l3."""
-        diagonal = torch.exp(cholesky[..., ::2]) + self.floor
+        """l1, l2, l3 [rad] of raw numbers (..., 3): positive diagonal between the floor and two turns; l2 is free, in units
+        of l3."""
+        diagonal = torch.exp(cholesky[..., ::2].clamp(max=math.log(WIDEST))) + self.floor
         return torch.stack([diagonal[..., 0], cholesky[..., 1] * diagonal[..., 1], diagonal[..., 1]], dim=-1)
 
     def forward(self) -> Gaussians:

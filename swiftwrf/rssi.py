@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from swiftwrf import checks
 from swiftwrf.angles import AngularGrid
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
@@ -180,9 +181,7 @@ class RssiModel(nn.Module):
         Raises:
             InputError: positions of another shape, or not finite.
         """
-        position = torch.as_tensor(position, dtype=torch.float64)
-        if position.dim() != 2 or position.shape[1] != 3 or not position.isfinite().all():
-            raise InputError(f"positions must be finite and of shape (n, 3) [m], got shape {tuple(position.shape)}")
+        position = checks.positions(position)
         if not len(position):
             return (torch.empty(0, sum(len(cast(ReceiverGroup, group).receiver) for group in self.groups)),) * 3
         middle, deviation = (torch.cat(x) for x in zip(*(self(p) for p in position.split(batch)), strict=True))

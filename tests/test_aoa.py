@@ -20,7 +20,7 @@ from tasks.aoa.estimators import Constant, NearestSpectrum, Peak
 from tasks.report import merge
 from tasks.run import command_line
 
-TINY_FIT = FitConfig(model=ModelConfig(n_primitives=8), steps=20, coarse_steps=10, check_every=10)
+TINY_FIT = FitConfig(model=ModelConfig(n_primitives=8), steps=20, check_every=10)
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from swiftwrf.metrics import psnr
 
 ROOM = simulated_room(n=60, seed=3, grid=AngularGrid.hemisphere(15, 60))
 TRAIN, TEST = ROOM.split("random", 0)
-QUICK = FitConfig(model=ModelConfig(n_primitives=16), steps=100, coarse_steps=50, check_every=50)
+QUICK = FitConfig(model=ModelConfig(n_primitives=16), steps=100, check_every=50)
 
 
 class Recorder:

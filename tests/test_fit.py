@@ -12,8 +12,9 @@ from swiftwrf.fit import folds
 from swiftwrf.metrics import psnr
 from swiftwrf.optimise import Optimisation
 from swiftwrf.prior import MIN_RANK, choose_kernel, choose_rank
+from swiftwrf.search import climb
 
-QUICK = FitConfig(model=ModelConfig(n_primitives=24), steps=200, coarse_steps=50, check_every=50)
+QUICK = FitConfig(model=ModelConfig(n_primitives=24), steps=200, check_every=50)
 
 
 def test_fit_beats_the_mean_spectrum(room):
@@ -40,44 +41,87 @@ def test_paper_preset_is_the_paper():
 
 
 def test_paper_model_fits_a_toy(room):
-    paper = FitConfig.paper(steps=40, coarse_steps=20, check_every=20)
+    paper = FitConfig.paper(steps=40, check_every=20)
     config = replace(paper, model=replace(paper.model, n_primitives=20))
     records = []
     fit(room, config, progress=False, on_record=records.append)
-    assert [r["stage"] for r in records if r["step"] == 20] == ["search", "final"]
+    assert [(r["stage"], r["step"]) for r in records] == [("final", 20), ("final", 40)]
 
 
 def test_smoothing_is_annealed(room):
     config = replace(QUICK, smoothing=1.0, smoothing_steps=100)
     kernel = choose_kernel(room.position, room.spectrum, folds(room.position, "random", 0))
-    optimisation = Optimisation("final", 200, room, kernel, config, "cpu")
-    optimisation.step = config.coarse_steps
+    config = replace(config, model=replace(config.model, rank=4))
+    optimisation = Optimisation(config, 200, room, kernel, "cpu")
+    optimisation.step = optimisation.coarse_steps
     assert optimisation.smoothing() == pytest.approx(2 / len(room) ** (1 / 3))
-    optimisation.step = config.coarse_steps + 50
+    optimisation.step = optimisation.coarse_steps + 50
     assert optimisation.smoothing() == pytest.approx(1 / len(room) ** (1 / 3))
-    optimisation.step = config.coarse_steps + 101
+    optimisation.step = optimisation.coarse_steps + 101
     assert optimisation.smoothing() == 0
 
 
 def test_interrupted_fit_goes_on_to_the_same_bits(room, tmp_path):
-    whole = fit(room, QUICK, progress=False).synthesize(room.position)
+    config = FitConfig(steps=60, check_every=30)
+    records = []
+    whole = fit(room, config, progress=False, on_record=records.append).synthesize(room.position)
+    runs = list(dict.fromkeys((r["stage"], r["n_primitives"]) for r in records))
+    assert [stage for stage, _ in runs].count("final") == 1
 
     class Stop(Exception):
         pass
 
-    for stop_at in (("search", 100), ("final", 50)):
+    for stop_at in ((*runs[0], 30), (*runs[1], 60), (*runs[-1], 30)):
 
         def stop(record, stop_at=stop_at):
-            if (record["stage"], record["step"]) == stop_at:
+            if (record["stage"], record["n_primitives"], record["step"]) == stop_at:
                 raise Stop
 
-        state = tmp_path / f"state-{stop_at[0]}"
+        state = tmp_path / "-".join(map(str, stop_at))
         with pytest.raises(Stop):
-            fit(room, QUICK, progress=False, checkpoint=state, on_record=stop)
-        records = []
-        again = fit(room, QUICK, progress=False, checkpoint=state, on_record=records.append)
-        assert (records[0]["stage"], records[0]["step"]) == (stop_at[0], stop_at[1] + 50)
+            fit(room, config, progress=False, checkpoint=state, on_record=stop)
+        rest = []
+        again = fit(room, config, progress=False, checkpoint=state, on_record=rest.append)
+        assert [describe(r) for r in rest] == [describe(r) for r in records][-len(rest) :]
+        assert len(rest) == len(records) - 1 - [describe(r)[:3] for r in records].index(stop_at)
         assert torch.equal(again.synthesize(room.position), whole)
+
+
+def describe(record):
+    return record["stage"], record["n_primitives"], record["step"], record["loss"], record["validation"]
+
+
+def test_finds_a_size_and_a_length(room):
+    """What was chosen is among what was tried, and only the final run sees all spectra."""
+    records = []
+    model = fit(room, FitConfig(check_every=1000), progress=False, on_record=records.append)
+    tried = [(r["n_primitives"], r["steps"]) for r in records if r["stage"] == "search"]
+    final = records[-1]
+    assert final["stage"] == "final"
+    assert model.config.n_primitives == final["n_primitives"]
+    assert (final["n_primitives"], final["steps"]) in tried
+    assert len(tried) == len(set(tried))
+
+
+@pytest.mark.parametrize(
+    ("losses", "found", "looked_at"),
+    [
+        ([8, 4, 2, 1, 0.5], 160, 5),  # the more the better: the largest
+        ([8, 4, 2, 2.1, 2.2, 0.1], 40, 5),  # two doublings in vain end the search
+        ([8, 4, 3.98, 2, 1.995, 1.99], 80, 6),  # one in vain does not; a difference of less than 1 % is chance
+        ([3, 3, 3], 10, 3),  # nothing helps: the smallest
+        ([0, 0, 0], 10, 3),
+    ],
+)
+def test_climb_finds_the_smallest_that_does_as_well_as_any(losses, found, looked_at):
+    asked = []
+
+    def loss(size):
+        asked.append(size)
+        return losses[len(asked) - 1]
+
+    assert climb(loss, 10, 10 * 2 ** (len(losses) - 1), patience=2) == found
+    assert asked == [10 * 2**i for i in range(looked_at)]
 
 
 def test_refuses_the_state_of_another_fit(room, tmp_path):

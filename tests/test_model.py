@@ -144,6 +144,8 @@ def test_load_refuses_other_files(tmp_path):
 def test_positions_in_kilometres_keep_their_millimetres():
     generator = torch.Generator().manual_seed(0)
     near = torch.rand(9, 3, generator=generator, dtype=torch.float64)
-    a = SwiftWRF(ModelConfig(n_primitives=3), GRID, near, KERNEL, generator=torch.Generator().manual_seed(0))
-    b = SwiftWRF(ModelConfig(n_primitives=3), GRID, near + 5e5, KERNEL, generator=torch.Generator().manual_seed(0))
+    a = SwiftWRF(ModelConfig(n_primitives=3, rank=4), GRID, near, KERNEL, generator=torch.Generator().manual_seed(0))
+    b = SwiftWRF(
+        ModelConfig(n_primitives=3, rank=4), GRID, near + 5e5, KERNEL, generator=torch.Generator().manual_seed(0)
+    )
     torch.testing.assert_close(a.normalise(near), b.normalise(near + 5e5), atol=1e-6, rtol=0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,6 +14,7 @@ from torch import Tensor
 from augment import SYNTHESIZERS, Mixed, Places, make_synthesizer, mix, withhold
 from augment.synthesize import SwiftWRFSynthesizer
 from swiftwrf import FitConfig, InputError, Spectra, load_spectra, simulated_room
+from swiftwrf.arrays import PlanarArray
 from swiftwrf.checkpoint import read, write
 from swiftwrf.metrics import angle_errors, l1, psnr, ssim, summary
 from tasks.aoa.aann import AANN, AANNConfig
@@ -41,7 +42,9 @@ class AoaConfig:
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
     synthesizer: tuple[str, ...] = ("swiftwrf",)
-    """who draws the synthetic spectra: swiftwrf, nearest, idw, gp"""
+    """who draws the synthetic spectra: swiftwrf, nearest, idw, gp, coarray"""
+    array: tuple[int, float, float] | None = None
+    """square array that took the spectra, where the data do not say: elements a side, spacing [m], carrier [Hz]"""
     preset: Literal["quick", "paper"] = "quick"
     """quick: sized for a CPU; paper: the paper's model and a long training, for a GPU"""
     repeats: int = 1
@@ -63,6 +66,11 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
     device = choose_device(config.device)
     _check(config)
     data = load_spectra(config.data) if config.data else simulated_room(seed=config.seed)
+    if config.array is not None:
+        side, spacing, frequency = config.array
+        data = replace(data, array=PlanarArray.square(side, frequency, spacing))
+    if "coarray" in config.synthesizer and data.array is None:
+        raise InputError(f"synthesizer coarray needs the array, which {data.name} does not tell; give it with --array")
     train, test = data.split(config.split, config.seed)
     if len(test) == 0:
         raise InputError(f"split {config.split!r} of {data.name} has no test spectra")
@@ -105,6 +113,10 @@ def _check(config: AoaConfig) -> None:
         )
     if len(set(config.mix)) < len(config.mix):
         raise InputError(f"--mix names a share twice: {' '.join(f'{s:g}' for s in config.mix)}")
+    if config.array is not None and not (config.array[0] >= 2 and min(config.array[1:]) > 0):
+        raise InputError(
+            f"--array takes at least 2 elements a side, a spacing [m] and a carrier [Hz], got {config.array}"
+        )
     if config.repeats < 1:
         raise InputError(f"--repeats must be at least 1, got {config.repeats}")
 

@@ -1,0 +1,204 @@
+"""What a planar array can report at all: the linear space of its squared spectra, and a model that lives in it.
+
+    |S(k)|^2 = sum over element differences l of r(l) exp(j 2 pi l . k / wavelength),    r(-l) = conj(r(l))
+
+The differences form the array's *difference co-array* (Hoctor and Kassam 1990). A 4 x 4 array has 49 of them, so its squared
+spectrum is exactly 49 real numbers, at any resolution, at the pole and around the azimuth: a constant and, for each pair
+l, -l, a cosine and a sine. Gaussians need neither the array's geometry nor its carrier; this needs both.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from swiftwrf import checkpoint, checks
+from swiftwrf.angles import AngularGrid
+from swiftwrf.arrays import PlanarArray
+from swiftwrf.data.spectra import Spectra
+from swiftwrf.deformation import Kernel
+from swiftwrf.errors import InputError
+from swiftwrf.fit import folds
+from swiftwrf.fit_config import Validation
+from swiftwrf.prior import choose_kernel
+
+COMPONENTS = 64  # principal components of the training magnitudes that the model keeps at most
+SAME = 1e-6  # differences closer than this share of a wavelength are one
+
+
+def differences(array: PlanarArray) -> Tensor:
+    """The co-array without 0, one of each pair l, -l, float64 (P, 2) [wavelengths]."""
+    element = array.element.double() / array.wavelength
+    difference = torch.round((element[:, None] - element).reshape(-1, 2) / SAME).unique(dim=0)
+    first = (difference[:, 0] > 0) | ((difference[:, 0] == 0) & (difference[:, 1] > 0))
+    kept: Tensor = difference[first] * SAME
+    return kept
+
+
+def basis(array: PlanarArray, grid: AngularGrid) -> Tensor:
+    """The functions that squared spectra consist of: 1, P cosines, P sines, float64 (1 + 2 P, pixels)."""
+    phase = 2 * math.pi * differences(array) @ grid.direction[..., :2].reshape(-1, 2).T
+    return torch.cat([torch.ones_like(phase[:1]), phase.cos(), phase.sin()])
+
+
+def project(spectrum: Tensor, array: PlanarArray, grid: AngularGrid, *, stretched: bool = False) -> Tensor:
+    """The nearest spectra that the array can produce: least squares on the squares.
+
+    Args:
+        spectrum: magnitudes in [0, 1], (n, n_elevation, n_azimuth), from any synthesizer.
+        array: with its geometry and carrier.
+        grid: of the spectra.
+        stretched: each spectrum was stretched to [0, 1] by itself, which took an offset from it; it is found, added for
+            the projection and taken off again.
+
+    Returns:
+        float32, of the same shape, in [0, 1].
+
+    Raises:
+        InputError: spectra of another shape than the grid's.
+    """
+    if spectrum.dim() != 3 or tuple(spectrum.shape[1:]) != grid.shape:
+        raise InputError(
+            f"expected spectra of shape (n, {grid.shape[0]}, {grid.shape[1]}), got {tuple(spectrum.shape)}"
+        )
+    functions, flat = basis(array, grid), spectrum.flatten(1).double()
+    inverse = torch.linalg.pinv(functions)
+    offset = _offset(flat, functions, inverse) if stretched else torch.zeros(len(flat), 1, dtype=torch.float64)
+    power = (flat + offset).square() @ inverse @ functions
+    projected: Tensor = power.clamp_min(0).sqrt() - offset
+    return projected.clamp(0, 1).reshape(spectrum.shape).float()
+
+
+def _offset(flat: Tensor, functions: Tensor, inverse: Tensor) -> Tensor:
+    """What has to be added to each spectrum (n, pixels) so that its square comes closest to the array's space, (n, 1).
+
+    The residual of (s + c)^2 is that of s^2 plus 2 c times that of s: a line in c, whose shortest point is known.
+    """
+    residual, of_square = (x - x @ inverse @ functions for x in (flat, flat.square()))
+    least = -(residual * of_square).sum(1) / (2 * residual.square().sum(1)).clamp_min(1e-300)
+    return least.clamp_min(0)[:, None]
+
+
+@dataclass(frozen=True)
+class CoarrayModel:
+    """Spectrum at any position by the array's physics; what `fit_coarray` returns.
+
+    A Gaussian process tells the mean magnitude between the positions; its square, projected, gives the coefficients. The
+    coefficients themselves would be the mean of squares, in which strong spectra drown the others (0.2 dB worse in rooms).
+
+    Args:
+        array: the antenna array.
+        grid: what `synthesize` draws unless told otherwise.
+        kernel: of the process, lengths in [m].
+        anchor: the training positions, float64 (n, 3) [m].
+        readout: kernel weights to K component scores and the offset, float64 (n, K + 1).
+        offset: the mean of what stretching took from a spectrum.
+        form: scores, with a 1 in front, to coefficients by a quadratic form, float64 (1 + 2 P, K + 1, K + 1).
+    """
+
+    array: PlanarArray
+    grid: AngularGrid
+    kernel: Kernel
+    anchor: Tensor
+    readout: Tensor
+    offset: Tensor
+    form: Tensor
+
+    @property
+    def n_parameters(self) -> int:
+        """Numbers that were fitted."""
+        return self.readout.numel() + self.form.numel()
+
+    def coefficients(self, position: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the squared spectrum, (n, 1 + 2 P), and the offset to take off its root, (n, 1); float64."""
+        predicted = self.kernel(position, self.anchor) @ self.readout
+        score = torch.cat([torch.ones_like(predicted[:, :1]), predicted[:, :-1]], dim=1)
+        return torch.einsum("nk,ckl,nl->nc", score, self.form, score), self.offset + predicted[:, -1:]
+
+    @torch.no_grad()
+    def synthesize(self, position: Tensor, grid: AngularGrid | None = None, batch: int = 32) -> Tensor:
+        """Spectra at any positions: one matrix product and a root a pixel.
+
+        Args:
+            position: of the moving end [m], (n, 3).
+            grid: directions to draw; the training spectra's unless given.
+            batch: spectra at a time, so many that they stay in the processor's cache.
+
+        Returns:
+            Magnitudes in [0, 1], float32 (n, n_elevation, n_azimuth).
+
+        Raises:
+            InputError: positions of another shape, or not finite.
+        """
+        position = checks.positions(position)
+        grid = grid or self.grid
+        functions = basis(self.array, grid).float()
+        spectrum = torch.empty(len(position), functions.shape[1])
+        for start in range(0, len(position), batch):
+            rows = slice(start, start + batch)
+            coefficient, offset = self.coefficients(position[rows])
+            drawn = torch.mm(coefficient.float(), functions, out=spectrum[rows])
+            drawn.clamp_(min=0).sqrt_().sub_(offset.float()).clamp_(0, 1)
+        return spectrum.reshape(-1, *grid.shape)
+
+    def save(self, path: str | Path) -> None:
+        """Writes the model to one safetensors file."""
+        names = ("anchor", "readout", "offset", "form")
+        tensors = {name: getattr(self, name) for name in names} | {"element": self.array.element}
+        header = {"grid": asdict(self.grid), "kernel": asdict(self.kernel), "wavelength": self.array.wavelength}
+        checkpoint.write(path, "co-array model", tensors, header)
+
+    @classmethod
+    def load(cls, path: str | Path) -> CoarrayModel:
+        """The model that `save` wrote.
+
+        Raises:
+            InputError: not such a file.
+        """
+        tensors, header = checkpoint.read(path, "co-array model")
+        array = PlanarArray(tensors.pop("element"), header["wavelength"])
+        return cls(array, AngularGrid(**header["grid"]), Kernel(**header["kernel"]), **tensors)
+
+
+def fit_coarray(train: Spectra, *, validation: Validation = "random", seed: int = 0) -> CoarrayModel:
+    """Fits the model; nothing is optimised step by step.
+
+    Args:
+        train: the only spectra it sees, with their array.
+        validation: how training spectra are held out to choose the kernel.
+        seed: of what is held out.
+
+    Raises:
+        InputError: no array, fewer than 10 spectra, or something not finite.
+    """
+    checks.training(train)
+    if train.array is None:
+        raise InputError(f"{train.name} does not say which array took the spectra; give its geometry and carrier")
+    functions, flat = basis(train.array, train.grid), train.spectrum.flatten(1).double()
+    inverse = torch.linalg.pinv(functions)
+    offset = _offset(flat, functions, inverse)
+    flat = flat + offset
+    mean = flat.mean(dim=0)
+    # principal components from the inner products, of which there are far fewer than pixels
+    value, vector = torch.linalg.eigh((flat - mean) @ (flat - mean).T)
+    vector = vector[:, value > 1e-12 * value.sum()][:, -COMPONENTS:]
+    component = torch.cat([mean[None], vector.T @ (flat - mean)])
+    form = torch.stack([(row * component) @ inverse for row in component])  # (K + 1, K + 1, coefficients)
+
+    kernel = choose_kernel(train.position, train.spectrum, folds(train.position, validation, seed))
+    gram = kernel(train.position, train.position) + kernel.noise * torch.eye(len(train), dtype=torch.float64)
+    target = torch.cat([vector, offset - offset.mean()], dim=1)
+    readout = torch.linalg.solve(gram, target)
+    return CoarrayModel(
+        train.array,
+        train.grid,
+        kernel,
+        train.position,
+        readout,
+        offset.mean()[None],
+        form.permute(2, 0, 1).contiguous(),
+    )
