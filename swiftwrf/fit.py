@@ -18,7 +18,7 @@ from swiftwrf.model import SwiftWRF
 from swiftwrf.optimise import Optimisation, Record, Session, fingerprint
 from swiftwrf.prior import choose_kernel, choose_rank
 from swiftwrf.progress import progress_bar
-from swiftwrf.search import climb
+from swiftwrf.search import climb, settle
 
 FOLDS = 5  # the search holds out one; the kernel is chosen over all
 FEWEST, MOST = 16, 2048  # primitives that the search tries
@@ -51,7 +51,8 @@ def fit(
 
     Raises:
         InputError: fewer than 10 spectra, something not finite, or a checkpoint of another fit.
-        FitError: a loss or gradient that is not finite; the checkpoint holds the last good state.
+        FitError: a loss or gradient that is not finite (the checkpoint holds the last good state), or a fit that ends
+            worse than it began.
     """
     config = config or FitConfig()
     checks.training(train)
@@ -73,15 +74,26 @@ def fit(
                 session.losses[optimisation.name] = optimisation.run(session).held_out_loss()
             return session.losses[optimisation.name]
 
-        n, steps = config.model.n_primitives, config.steps
-        if n == "auto":
-            shortest = SHORTEST if steps == "auto" else min(SHORTEST, steps)
-            n = climb(lambda n: loss(n, shortest), FEWEST, MOST, patience=2)
-        if steps == "auto":
-            steps = climb(lambda steps: loss(n, steps), SHORTEST, LONGEST, patience=1)
+        n, steps = _choose_size(loss, config)
         model = Optimisation(_sized(config, n), steps, work, kernel, device).run(session).result
     model.grid = train.grid
     return model.eval()
+
+
+def _choose_size(loss: Callable[[int, int], float], config: FitConfig) -> tuple[int, int]:
+    """Numbers of primitives and steps: those given, or those that held-out spectra call for.
+
+    Args:
+        loss: of a fit of so many primitives and steps on held-out spectra.
+    """
+    given, steps = config.model.n_primitives, config.steps
+    shortest = SHORTEST if steps == "auto" else min(SHORTEST, steps)
+    n = climb(lambda n: loss(n, shortest), FEWEST, MOST, patience=2) if given == "auto" else given
+    if steps == "auto":
+        steps = climb(lambda steps: loss(n, steps), SHORTEST, LONGEST, patience=1)
+    if given == "auto" and steps > shortest:
+        n = settle(lambda n: loss(n, steps), FEWEST, n)
+    return n, steps
 
 
 def _at_most(azimuths: int, spectra: Spectra) -> Spectra:

@@ -24,8 +24,10 @@ from swiftwrf.errors import FitError, InputError
 from swiftwrf.fit_config import FitConfig
 from swiftwrf.metrics import ssim
 from swiftwrf.model import SwiftWRF
+from swiftwrf.prior import thinned
 
 AVERAGING = 0.98  # a step's weight decays by this much a step: averaged parameters predict better than the last ones
+MAX_ANCHORS = 1000  # of the motion: a step costs their square
 Record = dict[str, Any]
 
 
@@ -101,7 +103,8 @@ class Optimisation:
         self.steps, self.config = steps, config
         self.coarse_steps = round(config.coarse_share * steps)
         generator = torch.Generator().manual_seed(config.seed)
-        model = SwiftWRF(config.model, train.grid, train.position, kernel, generator=generator)
+        (anchor,) = thinned(train.position, rows=MAX_ANCHORS)
+        model = SwiftWRF(config.model, train.grid, anchor, kernel, generator=generator)
         self.model = model.to(device)
         self.position, self.spectrum = self._tensors(train)
         # everything random is drawn now: nothing is copied to the device between two looks
@@ -112,7 +115,7 @@ class Optimisation:
         self.held_out = None if held_out is None else self._tensors(held_out)
         self.optimiser = self._optimiser()
         self.average = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(AVERAGING))
-        self.step, self.seconds = 0, 0.0
+        self.step, self.seconds, self.first_loss = 0, 0.0, math.inf
         self.broken_at = torch.tensor(steps, device=device)  # the first step whose loss was not finite
 
     def _tensors(self, spectra: Spectra) -> tuple[Tensor, Tensor]:
@@ -208,18 +211,29 @@ class Optimisation:
 
     def run(self, session: Session) -> Optimisation:
         """Takes all steps, from where the session's saved state stands if that is of this run; keeps the state at each
-        look."""
+        look.
+
+        Raises:
+            FitError: it ended worse than it began.
+        """
         if session.saved is not None and session.saved.header["name"] == self.name:
             self._restore(session.saved)
         task = session.bar.add_task(self.name, total=self.steps, completed=self.step)
         began = time.perf_counter() - self.seconds
         while self.step < self.steps:
             loss = self.advance()
+            if self.step == 1:
+                self.first_loss = float(loss)
             session.bar.update(task, completed=self.step)
             if self._looks_after(self.step):
                 self.seconds = time.perf_counter() - began
                 self._save(session)
                 self._record(session, loss)
+                if self.step == self.steps and float(loss) > self.first_loss:
+                    raise FitError(
+                        f"the fit ended with a loss of {float(loss):.3g}, worse than the {self.first_loss:.3g} it began "
+                        f"with; {self._advice()}"
+                    )
         session.bar.remove_task(task)
         return self
 
@@ -244,13 +258,13 @@ class Optimisation:
         tensors |= {f"average.{name}": value for name, value in self.average.state_dict().items()}
         for number, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{number}.{name}": torch.as_tensor(value) for name, value in moments.items()}
-        header = {name: getattr(self, name) for name in ("name", "step", "seconds")}
+        header = {name: getattr(self, name) for name in ("name", "step", "seconds", "first_loss")}
         header |= {"losses": session.losses, "fingerprint": session.owner}
         files.write(session.path, "fit state", tensors, header)
 
     def _restore(self, saved: State) -> None:
         header, tensors = saved.header, saved.tensors
-        self.step, self.seconds = header["step"], header["seconds"]
+        self.step, self.seconds, self.first_loss = header["step"], header["seconds"], header["first_loss"]
         for prefix, module in (("model.", self.model), ("average.", self.average)):
             module.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
         state = copy.deepcopy(self.optimiser.state_dict())

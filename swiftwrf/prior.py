@@ -65,10 +65,10 @@ def choose_rank(position: Tensor, spectrum: Tensor, fold: Tensor, kernel: Kernel
     return int(predicted.sum().clamp(MIN_RANK, MAX_RANK))
 
 
-def thinned(*tensors: Tensor) -> list[Tensor]:
-    """The same at most 400 rows of each, evenly spread."""
+def thinned(*tensors: Tensor, rows: int = MAX_ROWS) -> list[Tensor]:
+    """At most so many rows of each, the same ones, evenly spread."""
     n = len(tensors[0])
-    return [t[torch.linspace(0, n - 1, MAX_ROWS).long()] if n > MAX_ROWS else t for t in tensors]
+    return [t[torch.linspace(0, n - 1, rows).long()] if n > rows else t for t in tensors]
 
 
 def _gram(spectrum: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Shared fixtures: the toy scene, the measured data where they are, and the one table of tolerances."""
+"""Shared fixtures: the toy scene and the measured data where they are."""
 
 from __future__ import annotations
 
@@ -9,11 +9,6 @@ import pytest
 import torch
 
 from swiftwrf import Spectra, simulated_room
-
-# Largest error of a fast maker against the float64 definition: values as a share of the sum of |weight|, gradients as
-# relative L2. Float32 rounding sets the first row; the cutoff itself the second.
-VALUE_TOLERANCE = {None: 5e-6, 1e-4: 3e-4}
-GRADIENT_TOLERANCE = {None: 1e-5, 1e-4: 1e-5}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

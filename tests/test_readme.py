@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import runpy
+import re
 from pathlib import Path
+
+from tables import rewrite
 
 ROOT = Path(__file__).parent.parent
 
 
 def test_tables_come_from_the_results():
-    rewrite = runpy.run_path(str(ROOT / "benchmarks" / "tables.py"))["rewrite"]
     text = (ROOT / "README.md").read_text()
     assert rewrite(text) == text, "run python benchmarks/tables.py"
 
 
 def test_every_file_that_the_readme_names_is_there():
-    import re
-
     for target in re.findall(r"\]\(([^)#:]+)\)", (ROOT / "README.md").read_text()):
         assert (ROOT / target).exists(), target

@@ -232,15 +232,15 @@ extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
     for (int k = 0; k < PIXELS; ++k) {
         if (row + k * ROW_STEP < grid.n_elevation && column < grid.n_azimuth) {
             const size_t at = pixel + static_cast<size_t>(k) * ROW_STEP * grid.n_azimuth;
-            float scale = 1.0f;
+            float unit = 1.0f;  // what the field is divided by
             if (magnitude) {
                 const float length = hypotf(re[k], im[k]);
                 magnitude[plane * position + at] = length;
-                scale = length == 0.0f ? 0.0f : 1.0f / length;
+                unit = length == 0.0f ? 1.0f : length;
             }
             if (field) {
-                field[2 * plane * position + at] = scale * re[k];
-                field[2 * plane * position + plane + at] = scale * im[k];
+                field[2 * plane * position + at] = re[k] / unit;
+                field[2 * plane * position + plane + at] = im[k] / unit;
             }
         }
     }

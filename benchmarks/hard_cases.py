@@ -1,0 +1,150 @@
+"""Hard cases of the rasterizer with the rule that each follows, and how far a maker is from the definition in float64.
+
+The benchmark `stability.py` tabulates them; the tests hold every maker to the tolerances here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from swiftwrf import AngularGrid
+from swiftwrf.rasterize import reference
+from swiftwrf.rasterize.magnitude import magnitude
+
+# Largest error of a fast maker against the float64 definition: values as a share of the sum of |weight|, gradients as
+# relative L2, both times `Case.slack`. Float32 rounding sets the first row; for values the cutoff itself the second.
+VALUE_TOLERANCE = {None: 5e-6, 1e-4: 3e-4}
+GRADIENT_TOLERANCE = {None: 1e-5, 1e-4: 1e-5}
+
+Draw = Callable[[Tensor, Tensor, Tensor, AngularGrid, float | None], Tensor]
+STEP = math.radians(90 / 16)  # about two pixels of the small grid
+SMALL = AngularGrid.hemisphere(17, 33)  # no multiple of any tile
+
+
+@dataclass(frozen=True)
+class Case:
+    """One hard case.
+
+    Args:
+        rule: what every maker does with it.
+        mean: azimuth and elevation, (1, N, 2) [rad].
+        cholesky: (N, 3) [rad].
+        weight: (1, N, 2).
+        grid: to draw on.
+        slack: how much looser its tolerance is, where `why` says why.
+    """
+
+    rule: str
+    mean: Tensor
+    cholesky: Tensor
+    weight: Tensor
+    grid: AngularGrid = SMALL
+    slack: float = 1.0
+    why: str = ""
+
+    @property
+    def inputs(self) -> list[Tensor]:
+        """Mean, Cholesky factor, weight."""
+        return [self.mean, self.cholesky, self.weight]
+
+
+def degrees(*angles: tuple[float, float]) -> Tensor:
+    """Means (1, N, 2) of pairs of azimuth and elevation."""
+    return torch.deg2rad(torch.tensor([angles], dtype=torch.float64)).float()
+
+
+def _case(rule: str, mean: Tensor, factor: tuple[float, float, float] = (1.2, 0.7, 1.5), **changes: object) -> Case:
+    """Primitives of one factor (in `STEP`) and random weights."""
+    weight = torch.randn(mean.shape, generator=torch.Generator().manual_seed(2))
+    cholesky = STEP * torch.tensor([factor]).repeat(mean.shape[1], 1)
+    return Case(**({"rule": rule, "mean": mean, "cholesky": cholesky, "weight": weight} | changes))  # type: ignore[arg-type]
+
+
+def _crowd() -> Tensor:
+    """5,000 primitives within a tenth of a pixel."""
+    return degrees((100.0, 40.0)) + 0.1 * STEP * torch.randn(1, 5000, 2, generator=torch.Generator().manual_seed(2))
+
+
+def _cancelling(strength: float) -> Case:
+    """Pairs of opposite sign, 0.05 pixels apart, that leave a sum of order 1."""
+    generator = torch.Generator().manual_seed(2)
+    mean = torch.rand(1, 20, 2, generator=generator) * torch.tensor([2 * math.pi, math.pi / 2])
+    weight = torch.randn(1, 20, 2, generator=generator)
+    shifted = mean + 0.05 * SMALL.elevation_step
+    return _case(
+        "error grows with the sum of |weight|, not with |A|",
+        torch.cat([mean, shifted], dim=1),
+        weight=torch.cat([strength * weight, (0.01 - strength) * weight], dim=1),
+        slack=10,
+        why="the direction of a small difference A is rounded more coarsely than its parts, and the gradient of |A| has it",
+    )
+
+
+TWO = degrees((10.1, 30.2), (200.3, 60.4))
+ON_PIXELS = degrees((10.91, 31.77), (207.27, 58.24))  # a hundredth of a pixel off their centres
+SHEARED = "v = (dy - l2 u) / l3 magnifies rounding by l2 / l3"
+HARD_CASES: dict[str, Case] = {
+    "both sides of the seam": _case(
+        "azimuth is periodic: distances are wrapped, coordinates never",
+        degrees((359.9, 30.0), (-0.1, 60.0), (0.1, 45.0)),
+    ),
+    "turns away": _case("whole turns change nothing", degrees((3700.0, 30.0), (-7300.0, 45.0))),
+    "beyond the poles": _case("elevation ends: nothing folds back at the poles", degrees((10.0, -8.0), (200.0, 97.0))),
+    "far beyond the poles": _case("rows are clipped", degrees((10.0, -4e5), (200.0, 3e7), (30.0, 50.0))),
+    "wider than the grid": _case("one turn, centred on the mean, is drawn", TWO, (60.0, 10.0, 80.0)),
+    "a fiftieth of a pixel": _case(
+        "what no pixel centre sees draws nothing; parameters are kept above 0.3 pixels", ON_PIXELS, (0.04, 0.01, 0.04)
+    ),
+    "narrow and sheared": _case("no determinant is formed", TWO, (0.3, 3.0, 0.3)),
+    "correlation 0.9998": _case("no determinant is formed", TWO, (2.0, 50.0, 1.0), slack=50, why=SHEARED),
+    "correlation 0.9999995": _case("no determinant is formed", ON_PIXELS, (2.0, 1000.0, 1.0), slack=1000, why=SHEARED),
+    "flipped factors": _case("signs of the diagonal mean nothing to the covariance", TWO, (-2.0, 1.0, -1.5)),
+    "5,000 primitives on one pixel": _case("no limit a pixel or tile", _crowd(), (0.8, 0.3, 0.6)),
+    "pairs that cancel, S = 1": _cancelling(1.0),
+    "pairs that cancel, S = 10": _cancelling(10.0),
+    "pairs that cancel, S = 100": _cancelling(100.0),
+    "pairs that cancel, S = 1000": _cancelling(1000.0),
+    "responses of 1e-15": _case("magnitudes from 1e-18 to 1e18", TWO, weight=1e-15 * torch.ones(1, 2, 2)),
+    "responses of 1e15": _case("magnitudes from 1e-18 to 1e18", TWO, weight=1e15 * torch.ones(1, 2, 2)),
+}
+
+
+def field_errors(draw: Draw, case: Case, cutoff: float | None, device: str = "cpu") -> tuple[float, float]:
+    """Errors of A from a maker: value and the worst of the gradients; see `_compare`."""
+    exact_inputs, inputs = _leaves(case, device)
+    exact = reference.rasterize(*exact_inputs, case.grid, cutoff)
+    return _compare(exact, draw(*inputs, case.grid, cutoff), exact_inputs, inputs)
+
+
+def magnitude_errors(draw: Draw, case: Case, cutoff: float | None, device: str = "cpu") -> tuple[float, float]:
+    """Errors of |A|: value and the worst of the gradients. Beside |A| = 0 its gradient turns with the rounding of A, so the
+    cotangent fades there."""
+    exact_inputs, inputs = _leaves(case, device)
+    exact = magnitude(reference.rasterize(*exact_inputs, case.grid, cutoff))
+    fade = (exact / exact.mean().clamp_min(1e-300)).clamp(max=1).detach()
+    return _compare(exact, draw(*inputs, case.grid, cutoff), exact_inputs, inputs, fade)
+
+
+def _leaves(case: Case, device: str) -> tuple[list[Tensor], list[Tensor]]:
+    """The inputs in float64, and as they are, both awaiting gradients."""
+    exact = [x.detach().double().requires_grad_() for x in case.inputs]
+    return exact, [x.detach().to(device).requires_grad_() for x in case.inputs]
+
+
+def _compare(
+    exact: Tensor, drawn: Tensor, exact_inputs: list[Tensor], inputs: list[Tensor], fade: Tensor | float = 1.0
+) -> tuple[float, float]:
+    """Largest value error as a share of sum |weight|, and the largest relative L2 error of the gradients by mean, Cholesky
+    factor and weight for a random cotangent; infinite where something is not finite."""
+    cotangent = fade * torch.randn(exact.shape, generator=torch.Generator().manual_seed(1)).double()
+    wanted = torch.autograd.grad(exact, exact_inputs, cotangent)
+    got = torch.autograd.grad(drawn, inputs, cotangent.to(drawn))
+    scale = exact_inputs[2].detach().norm(dim=-1).sum(dim=-1).max().clamp_min(1e-300)
+    value = (drawn.detach().cpu() - exact.detach()).abs().max() / scale
+    gradients = [(g.cpu() - w).norm() / w.norm().clamp_min(1e-300) for g, w in zip(got, wanted, strict=True)]
+    return float(value.nan_to_num(math.inf)), float(torch.stack(gradients).nan_to_num(math.inf).max())
