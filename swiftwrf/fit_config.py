@@ -30,7 +30,9 @@ class FitConfig:
     final_rate: float = 0.02
     """share of the rates left after cosine decay"""
     ssim_weight: float = 0.3
-    """weight of 1 - SSIM in the loss; L1 has the rest"""
+    """weight of 1 - SSIM in the loss; the pixels' error has the rest"""
+    pixel_loss: Literal["l1", "l2"] = "l1"
+    """absolute or squared error"""
     prior_weight: float = 1e-4
     """weight of the motion's negative log prior per training spectrum"""
     smoothing: float = 0.0

@@ -36,6 +36,8 @@ class ModelConfig:
     """which of their parameters move"""
     rank: int | Literal["auto"] = "auto"
     """number K of motions that the motion basis mixes; auto lets the fit find how many the scene needs"""
+    axis_aligned: bool = False
+    """primitives do not lean: l2 = 0"""
     bounded: bool = False
     """keep canonical means inside the grid by the paper's tanh map"""
     cutoff: float = 1e-4
@@ -77,7 +79,9 @@ class SwiftWRF(nn.Module):
         scale = float((high - low).max()) / 2 or 1.0
         self.register_buffer("centre", ((low + high) / 2).double())
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float64))
-        self.primitives = Primitives(n, grid, bounded=config.bounded, generator=generator)
+        self.primitives = Primitives(
+            n, grid, bounded=config.bounded, axis_aligned=config.axis_aligned, generator=generator
+        )
         self.deformation: MotionBasis | PerPrimitiveMLP | None
         if config.deformation == "motion_basis":
             normalised, scaled = self.normalise(anchor), kernel.scaled(1 / scale)

@@ -142,8 +142,9 @@ class Optimisation:
 
     def loss(self, drawn: Tensor, measured: Tensor) -> Tensor:
         """Paper, equation of the loss: 0.7 L1 + 0.3 (1 - SSIM) at the default weight."""
-        weight = self.config.ssim_weight
-        return (1 - weight) * (drawn - measured).abs().mean() + weight * (1 - ssim(drawn, measured).mean())
+        weight, error = self.config.ssim_weight, drawn - measured
+        pixels = error.abs() if self.config.pixel_loss == "l1" else error.square()
+        return (1 - weight) * pixels.mean() + weight * (1 - ssim(drawn, measured).mean())
 
     def smoothing(self) -> float:
         """Standard deviation of the noise on normalised positions: gamma 2 / cbrt(N_s) (1 - i / tau) (paper, annealed

@@ -37,15 +37,23 @@ class Primitives(nn.Module):
         bounded: keep means inside the grid by the paper's tanh map, az = pi (tanh + 1), el = pi/4 (tanh + 1).
             Otherwise means are free: azimuth is periodic anyway, and a mean below the plane or beyond the pole draws
             its flank, which the tanh map cannot.
+        axis_aligned: keep l2 at 0.
         generator: for the initial means (uniform over the grid, as in the paper) and responses.
         scenes: leading dimensions of independent sets of n primitives, e.g. (receivers,).
     """
 
     def __init__(
-        self, n: int, grid: AngularGrid, *, bounded: bool, generator: torch.Generator, scenes: tuple[int, ...] = ()
+        self,
+        n: int,
+        grid: AngularGrid,
+        *,
+        generator: torch.Generator,
+        bounded: bool = False,
+        axis_aligned: bool = False,
+        scenes: tuple[int, ...] = (),
     ) -> None:
         super().__init__()
-        self.bounded = bounded
+        self.bounded, self.lean = bounded, 0.0 if axis_aligned else 1.0
         unit = torch.rand(*scenes, n, 2, generator=generator).clamp(1e-3, 1 - 1e-3)
         extent = torch.tensor([2 * math.pi, math.pi / 2])
         pixel = torch.tensor([grid.azimuth_step, grid.elevation_step], dtype=torch.float32)
@@ -68,7 +76,9 @@ class Primitives(nn.Module):
         """l1, l2, l3 [rad] of raw numbers (..., 3): positive diagonal between the floor and two turns; l2 is free, in units
         of l3."""
         diagonal = torch.exp(cholesky[..., ::2].clamp(max=math.log(WIDEST))) + self.floor
-        return torch.stack([diagonal[..., 0], cholesky[..., 1] * diagonal[..., 1], diagonal[..., 1]], dim=-1)
+        return torch.stack(
+            [diagonal[..., 0], self.lean * cholesky[..., 1] * diagonal[..., 1], diagonal[..., 1]], dim=-1
+        )
 
     def forward(self) -> Gaussians:
         mean: Tensor = self.mean

@@ -82,7 +82,7 @@ class ReceiverGroup(nn.Module):
         precision = torch.linalg.inv(gram + kernel.noise * torch.eye(len(gram), dtype=gram.dtype))
         self.register_buffer("precision", precision.float())
         self.field = SmoothField(local, replace(kernel, noise=JITTER), n * rank)
-        self.primitives = Primitives(n_primitives, GRID, bounded=False, generator=generator, scenes=(n,))
+        self.primitives = Primitives(n_primitives, GRID, generator=generator, scenes=(n,))
         self.basis = nn.Parameter(1 + 0.3 * torch.randn(n, rank, n_primitives, generator=generator))
         self.primitives.requires_grad_(config.learn_shapes)
         self.basis.requires_grad_(config.learn_shapes)

@@ -151,6 +151,9 @@ def test_interrupted_run_goes_on_to_the_same_numbers(small, tmp_path, monkeypatc
     whole, cut = (
         json.loads((tmp_path / name / "metrics.json").read_text())["mixes"]["0.5"] for name in ("whole", "cut")
     )
+    for mix in (whole, cut):
+        for entry in (*mix["methods"].values(), *mix["synthesis"].values()):
+            assert all(seconds >= 0 for seconds in entry.pop("seconds").values())
     assert whole["methods"] == cut["methods"]
     assert whole["synthesis"] == cut["synthesis"]
 

@@ -29,7 +29,7 @@ NAMES = (
 )
 
 
-def load_paths(folder: Path) -> Spectra:
+def load_paths(folder: Path, grid: AngularGrid = GRID) -> Spectra:
     """Spectra of a 4 x 4 array at half a wavelength, lying level at each receiver (array axes are world axes).
 
     The array sees the upper half space and folds what comes from below.
@@ -50,8 +50,8 @@ def load_paths(folder: Path) -> Spectra:
     return Spectra(
         name=folder.resolve().name,
         position=receiver if moving == "receiver" else transmitter,
-        spectrum=array.spectrum(array.channel(direction, arrays["gain"], owner, len(count)), GRID),
-        grid=GRID,
+        spectrum=array.spectrum(array.channel(direction, arrays["gain"], owner, len(count)), grid),
+        grid=grid,
         label=torch.stack(to_angles(transmitter - receiver), dim=-1),
         line_of_sight=arrays["line_of_sight"].bool(),
         moving=moving,

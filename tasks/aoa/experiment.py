@@ -166,8 +166,12 @@ class _Experiment:
         """Trains one estimator and tests it."""
 
         def compute() -> Row:
+            began = time.perf_counter()
             estimator.fit(train)
-            return {"estimate": estimator.estimate(self.test.spectrum), "history": getattr(estimator, "history", [])}
+            fitted = time.perf_counter()
+            estimate = estimator.estimate(self.test.spectrum)
+            seconds = {"train": fitted - began, "estimate": time.perf_counter() - fitted}
+            return {"estimate": estimate, "seconds": seconds, "history": getattr(estimator, "history", [])}
 
         done = self.directory.step(step, compute)
         estimate = torch.tensor(done["value"]["estimate"], dtype=torch.float64)
@@ -183,7 +187,7 @@ class _Experiment:
         }
         self.errors += _rows(arm, columns)
         self.history += [arm | row for row in done["value"]["history"]]
-        self.seconds.append(arm | {"train": done["seconds"]})
+        self.seconds.append(arm | done["value"]["seconds"])
 
     def _synthesize(self, arm: Row, step: str, measured: Spectra, withheld: Places) -> Mixed:
         """The mixed training set of one synthesizer, and its quality at the test positions."""
@@ -245,8 +249,8 @@ class _Experiment:
         networks = [row for row in seconds if row.get("method", "").startswith(("measured", "turbo"))]
         return {
             "n_measured": round(share * len(self.train)),
-            "synthesis": _summaries(synthesis, "synthesizer", tuple(SCORES)),
-            "methods": _summaries(errors, "method", ANGLES),
+            "synthesis": _summaries(synthesis, "synthesizer", tuple(SCORES), seconds),
+            "methods": _summaries(errors, "method", ANGLES, seconds),
             "seconds": {
                 "fit": sum(row["fit"] for row in own),
                 "synthesize": sum(row["synthesize"] for row in own),
@@ -260,9 +264,9 @@ def _rows(arm: Row, columns: dict[str, Tensor]) -> list[Row]:
     return [arm | dict(zip(lists, values, strict=True)) for values in zip(*lists.values(), strict=True)]
 
 
-def _summaries(rows: list[Row], key: str, columns: tuple[str, ...]) -> dict[str, Any]:
-    """Summary of each column under each value of `key`. Repeats of a test spectrum are averaged first: they are not
-    independent, and the interval must not shrink with their number."""
+def _summaries(rows: list[Row], key: str, columns: tuple[str, ...], seconds: list[Row]) -> dict[str, Any]:
+    """Summary of each column under each value of `key`, and the seconds that its stages took, a repeat. Repeats of a test
+    spectrum are averaged first: they are not independent, and the interval must not shrink with their number."""
     result: dict[str, Any] = {}
     for name in dict.fromkeys(row[key] for row in rows):
         own = [row for row in rows if row[key] == name]
@@ -271,6 +275,9 @@ def _summaries(rows: list[Row], key: str, columns: tuple[str, ...]) -> dict[str,
             column: summary([np.mean([row[column] for row in own if row["index"] == index]) for index in indices])
             for column in columns
         }
+        spent = [row for row in seconds if row.get(key) == name]
+        stages = [stage for stage in ("fit", "synthesize", "train", "estimate") if stage in spent[0]]
+        result[name]["seconds"] = {stage: float(np.mean([row[stage] for row in spent])) for stage in stages}
     return result
 
 

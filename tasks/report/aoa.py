@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from pandas import DataFrame
 
 from tasks.report import figures
 from tasks.report.page import Page, Plot, Section, Table
@@ -30,7 +31,8 @@ def aoa_page(runs: list[Records]) -> Page:
     sections = [_results(run, share, mix, several) for run, share, mix in shares]
     if len(shares) > 1:
         sections.insert(0, _over_shares(shares))
-    sections += [_synthesis(shares, several), *(_examples(run, share) for run, share, _ in shares), _training(runs)]
+    sections += [_synthesis(shares, several), *(_examples(run, share) for run, share, _ in shares), _size(runs)]
+    sections += [*(_speed(*each) for each in shares), _training(runs)]
     sections += [_time(shares, several), _limits(runs[0]), provenance(runs)]
     names = ", ".join(dict.fromkeys(_scene(run) for run in runs))
     return Page(f"Angle of arrival: {names}", _lead(*shares[0]), sections)
@@ -154,28 +156,85 @@ def _examples(run: Records, share: str) -> Section:
     )
 
 
+def _size(runs: list[Records]) -> Section:
+    """Quality against size: what the fit of SwiftWRF tried, and what it took."""
+    plots = []
+    for run in runs:
+        search, final = _fits(run)
+        if not len(search):
+            continue
+        figure, axes = figures.new_figure(1, 1, 6, 3)
+        for steps, part in search.groupby("steps"):
+            by_size = part.sort_values("n_primitives")
+            axes[0].plot(by_size["n_primitives"], by_size["validation"], "o-", markersize=4, label=f"{steps} steps")
+        n, steps = int(final["n_primitives"].iloc[0]), int(final["steps"].iloc[0])
+        axes[0].axvline(n, color="#aeb7c6", linewidth=1)
+        axes[0].set_xscale("log", base=2)
+        axes[0].set(xlabel="primitives", ylabel="loss on held-out spectra")
+        figures.legend_below(figure, axes[0])
+        caption = (
+            f"{_scene(run)}, first share. Loss of short fits on a fifth of the measured spectra that they did not see, at "
+            f"coarse resolution; the model took the smallest size within 1 % of the best: {n} primitives (line), {steps} "
+            "steps."
+        )
+        plots.append(Plot(f"size-{_file_name(run, next(iter(run.metrics['mixes'])))}", figure, caption))
+    return Section("How large a model the scene needs", plots=plots)
+
+
+def _fits(run: Records) -> tuple[DataFrame, DataFrame]:
+    """History of the fits of SwiftWRF for the first share and repeat: the last look of each of the search, and the final
+    one."""
+    history = run.table("history")
+    fits = history[(history["repeat"] == 0) & (history["mix"] == history["mix"].iloc[0])]
+    if "stage" not in fits:
+        return fits.iloc[:0], fits.iloc[:0]
+    fits = fits[fits["synthesizer"] == "swiftwrf"]
+    search = fits[fits["stage"] == "search"].groupby(["n_primitives", "steps"], as_index=False).last()
+    return search, fits[fits["stage"] == "final"]
+
+
 def _training(runs: list[Records]) -> Section:
     plots = []
     for run in runs:
         history = run.table("history")
         history = history[(history["repeat"] == 0) & (history["mix"] == history["mix"].iloc[0])]
+        _, final = _fits(run)
         figure, axes = figures.new_figure(1, 2, 9, 3)
         networks = {str(name): (part["step"], part["loss"]) for name, part in history.groupby("method", sort=False)}
         figures.curves(axes[0], networks, "step", "loss of the network")
-        fits = history[history["synthesizer"] == "swiftwrf"] if "stage" in history else history.iloc[:0]
-        lines = {
-            f"{stage}: training": (part["step"], part["loss"]) for stage, part in fits.groupby("stage", sort=False)
-        }
-        if len(fits):
-            search = fits[fits["stage"] == "search"]
-            lines["search: held-out"] = (search["step"], search["validation"])
-        figures.curves(axes[1], lines, "step", "loss of SwiftWRF")
-        axes[1].set_visible(bool(lines))
-        caption = (
-            f"{_scene(run)}, first share and repeat. The final fit stops where the search saw the best held-out loss."
+        figures.curves(axes[1], {"swiftwrf": (final["step"], final["loss"])}, "step", "loss of SwiftWRF")
+        axes[1].set_visible(bool(len(final)))
+        plots.append(
+            Plot(
+                f"training-{_file_name(run, next(iter(run.metrics['mixes'])))}",
+                figure,
+                f"{_scene(run)}, first share and repeat: the networks, and the final fit of SwiftWRF.",
+            )
         )
-        plots.append(Plot(f"training-{_file_name(run, next(iter(run.metrics['mixes'])))}", figure, caption))
     return Section("Training", plots=plots)
+
+
+def _speed(run: Records, share: str, mix: dict[str, Any]) -> Section:
+    figure, axes = figures.new_figure(1, 3, 10.5, 3.4)
+    synthesis = mix["synthesis"].items()
+    for ax, stage in zip(axes, ("fit", "synthesize"), strict=False):
+        points = {
+            name: (max(scores["seconds"][stage], 1e-5), 10 ** (-scores["psnr_db"]["median"] / 20))
+            for name, scores in synthesis
+        }
+        figures.speed(ax, points, f"seconds to {stage}", "RMS error of a spectrum")
+    methods = {
+        name: (max(sum(method["seconds"].values()), 1e-5), method["great_circle_deg"]["median"])
+        for name, method in mix["methods"].items()
+    }
+    figures.speed(axes[2], methods, "seconds to train and estimate", "median great-circle error [deg]")
+    caption = (
+        "Left and middle: synthesizers, seconds to fit and to draw the withheld and the test spectra. Right: estimators, "
+        "the synthesizer's time not counted. The line is the Pareto front: what is not on it is beaten in both."
+    )
+    title = f"Speed against error ({float(share):.0%} measured)"
+    figures.legend_of(figure, [*mix["synthesis"], *mix["methods"]])
+    return Section(title, plots=[Plot(f"speed-{_file_name(run, share)}", figure, caption)])
 
 
 def _time(shares: list[tuple[Records, str, dict[str, Any]]], several: bool) -> Section:

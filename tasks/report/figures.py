@@ -10,6 +10,7 @@ import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
 STYLE: dict[str, Any] = {
@@ -29,10 +30,8 @@ COLOURS = {
     "turbo_swiftwrf": "#4477aa",
     "turbo_nearest": "#ccbb44",
     "turbo_idw": "#66ccee",
-    "search: training": "#99bbdd",
-    "search: held-out": "#4477aa",
-    "final: training": "#ee8866",
-    "turbo_gp": "#aa3377",
+    "turbo_gp": "#ee8866",
+    "turbo_coarray": "#aa3377",
     "swiftwrf": "#4477aa",
     "mean": "#bbbbbb",
     "mri_pooled": "#ee6677",
@@ -40,6 +39,9 @@ COLOURS = {
     "mri_residual": "#ccbb44",
     "knn": "#66ccee",
     "gp": "#228833",
+    "nearest": "#ccbb44",
+    "idw": "#66ccee",
+    "coarray": "#aa3377",
     "peak": "#bbbbbb",
     "constant": "#999999",
     "nearest_spectrum": "#666666",
@@ -72,6 +74,14 @@ def legend_below(figure: Figure, axes: Axes) -> None:
     """One legend for all axes, from the entries of one of them."""
     columns = max(1, int(figure.get_figwidth() / 1.6))
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=columns, frameon=False)
+
+
+def legend_of(figure: Figure, names: Sequence[str]) -> None:
+    """A legend of dots in the colours of methods."""
+    dots = [Line2D([], [], marker="o", linestyle="", color=colour(name), label=name) for name in names]
+    figure.legend(
+        handles=dots, loc="outside lower center", ncols=max(1, int(figure.get_figwidth() / 1.3)), frameon=False
+    )
 
 
 def cdf(axes: Axes, errors: Mapping[str, ArrayLike], label: str, limit: float | None = None) -> None:
@@ -131,3 +141,25 @@ def curves(axes: Axes, lines: Mapping[str, tuple[ArrayLike, ArrayLike]], x: str,
         axes.plot(np.asarray(xs), np.asarray(ys), label=name, color=colour(name), linewidth=1.2)
     axes.set(xlabel=x, ylabel=y, yscale="log")
     axes.legend(fontsize=7, frameon=False)
+
+
+def pareto(points: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Names of the points (cost, error) that no other one beats or equals in both, by cost."""
+    front: list[str] = []
+    for name in sorted(points, key=lambda name: points[name]):
+        if not front or points[name][1] < points[front[-1]][1]:
+            front.append(name)
+    return front
+
+
+def speed(axes: Axes, points: Mapping[str, tuple[float, float]], x: str, y: str) -> None:
+    """Cost against error, both logarithmic: the Pareto front is drawn and its members are named. Names are coloured as
+    methods by what stands before their first comma."""
+    front = pareto(points)
+    axes.plot(*zip(*(points[name] for name in front), strict=True), color="#aeb7c6", linewidth=1, zorder=1)
+    for name, (cost, error) in points.items():
+        axes.plot(cost, error, "o", color=colour(name.split(",")[0]), markersize=5 if name in front else 3.5, zorder=2)
+        if name in front:
+            axes.annotate(name, (cost, error), textcoords="offset points", xytext=(5, 3), fontsize=7)
+    axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
+    axes.margins(x=0.25, y=0.1)

@@ -87,7 +87,8 @@ _WHERE_CAPTION = (
     "and from the nearest training position. SwiftWRF, all receivers."
 )
 _SPEED_CAPTION = (
-    "Seconds to fit and to predict the test rows against the median error; nearer to the lower left is better."
+    "Seconds to fit and to predict the test rows against the median error, both logarithmic. The line is the Pareto front: "
+    "whatever is not on it is beaten in both by a method that is."
 )
 
 
@@ -220,12 +221,12 @@ def _where(run: Records) -> Figure:
 def _speed(run: Records) -> Figure:
     figure, axes = figures.new_figure(1, 2, 9, 3.2)
     for ax, stage in zip(axes, ("fit", "predict"), strict=True):
-        for name, entry in run.metrics["overall"].items():
-            seconds, median = max(entry["seconds"][stage], 1e-5), entry["abs_error_db"]["median"]
-            ax.plot(seconds, median, "o", color=figures.colour(name))
-            ax.annotate(name, (seconds, median), textcoords="offset points", xytext=(5, 3), fontsize=7)
-        ax.set(xscale="log", xlabel=f"seconds to {stage}", ylabel="median absolute error [dB]")
-        ax.margins(x=0.25)
+        overall = run.metrics["overall"].items()
+        points = {
+            name: (max(entry["seconds"][stage], 1e-5), entry["abs_error_db"]["median"]) for name, entry in overall
+        }
+        figures.speed(ax, points, f"seconds to {stage}", "median absolute error [dB]")
+    figures.legend_of(figure, list(run.metrics["overall"]))
     return figure
 
 
