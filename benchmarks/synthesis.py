@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,11 @@ import tyro
 from record import write_result
 
 from augment import make_synthesizer
-from swiftwrf import Spectra, load_spectra, simulated_room
+from swiftwrf import Spectra, load_spectra, project, simulated_room
+from swiftwrf.arrays import PlanarArray
 from swiftwrf.metrics import l1, psnr, ssim, summary
 
+S23_ARRAY = PlanarArray.square(4, 915e6, spacing=0.16)  # which the files of s23-200 do not tell
 SCENES = (("s23-200", "random"), ("s23-200", "block"), ("newrf-bedroom", "random"), ("newrf-office", "random"))
 
 
@@ -28,27 +30,35 @@ class Config:
 
 def main(config: Config) -> None:
     """Measures every synthesizer on every scene."""
-    scenes = [(name, split) for name, split in SCENES if not config.scenes or name in config.scenes]
-    results = {
-        f"{name} {split}": measure(load_spectra(config.data / name), split, config.seed) for name, split in scenes
-    }
+    chosen = [(name, split) for name, split in SCENES if not config.scenes or name in config.scenes]
+    results = {f"{name} {split}": measure(load(config.data / name), split, config.seed) for name, split in chosen}
     if not config.scenes:
         results["simulated-room random"] = measure(simulated_room(), "random", config.seed)
     write_result("synthesis", {"seed": config.seed, "scenes": results})
 
 
+def load(folder: Path) -> Spectra:
+    """The spectra, with the array that took them."""
+    data = load_spectra(folder)
+    return replace(data, array=S23_ARRAY) if data.name.startswith("s23") else data
+
+
 def measure(data: Spectra, split: str, seed: int) -> dict[str, Any]:
-    """Scores of each synthesizer, and of the mean training spectrum, at the test positions."""
+    """Scores of each synthesizer, of the mean training spectrum, and of SwiftWRF projected onto what the array can
+    produce, at the test positions."""
     train, test = data.split(split, seed)
     drawn = {"mean": train.spectrum.mean(dim=0).expand_as(test.spectrum)}
     seconds: dict[str, dict[str, float]] = {}
-    for name in ("nearest", "idw", "gp", "swiftwrf"):
+    for name in ("nearest", "idw", "gp", "coarray", "swiftwrf"):
         synthesizer = make_synthesizer(name, validation="block" if split == "block" else "random", seed=seed)
         began = time.perf_counter()
         synthesizer.fit(train)
         fitted = time.perf_counter()
         drawn[name] = synthesizer.synthesize(test.position)
         seconds[name] = {"fit": fitted - began, "synthesize": time.perf_counter() - fitted}
+    if train.array is not None:
+        stretched = data.name.startswith("s23")
+        drawn["swiftwrf, projected"] = project(drawn["swiftwrf"], train.array, train.grid, stretched=stretched)
     scores = {
         name: {
             "ssim": summary(ssim(spectrum, test.spectrum)),

@@ -152,14 +152,14 @@ def pareto(points: Mapping[str, tuple[float, float]]) -> list[str]:
     return front
 
 
-def speed(axes: Axes, points: Mapping[str, tuple[float, float]], x: str, y: str) -> None:
-    """Cost against error, both logarithmic: the Pareto front is drawn and its members are named. Names are coloured as
-    methods by what stands before their first comma."""
+def speed(axes: Axes, points: Mapping[str, tuple[float, float]], x: str, y: str, also: Sequence[str] = ()) -> None:
+    """Cost against error, both logarithmic: the Pareto front is drawn, its members and those in `also` are named. Names
+    are coloured as methods by what stands before their first comma."""
     front = pareto(points)
     axes.plot(*zip(*(points[name] for name in front), strict=True), color="#aeb7c6", linewidth=1, zorder=1)
     for name, (cost, error) in points.items():
         axes.plot(cost, error, "o", color=colour(name.split(",")[0]), markersize=5 if name in front else 3.5, zorder=2)
-        if name in front:
+        if name in front or name in also:
             axes.annotate(name, (cost, error), textcoords="offset points", xytext=(5, 3), fontsize=7)
     axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
     axes.margins(x=0.25, y=0.1)

@@ -1,0 +1,250 @@
+"""Speed against error: for every setting the seconds a spectrum takes and how wrong it is, with the Pareto front.
+
+Two errors. *Numerical*: against the exact float64 drawing of the same model, for settings that only change how it is drawn.
+*Held-out*: against measured spectra that no model saw, for all. Both are RMS over pixels, the median over spectra.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from record import write_result
+from synthesis import load
+from torch import Tensor
+
+from augment import make_synthesizer
+from swiftwrf import (
+    AngularGrid,
+    FitConfig,
+    ModelConfig,
+    Spectra,
+    SwiftWRF,
+    fit,
+    fit_coarray,
+    project,
+    simulated_room,
+)
+from swiftwrf.arrays import PlanarArray
+from swiftwrf.fit_config import Validation
+from swiftwrf.metrics import psnr
+from swiftwrf.rasterize import Maker, rasterize_magnitude
+from tasks.report import figures
+
+CUTOFFS = (None, 1e-5, 1e-4, 1e-3, 1e-2)
+GRIDS = ((45, 180), (90, 360), (180, 720))
+BATCH = 32  # spectra a call
+Point = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Config:
+    data: Path | None = None
+    """a folder of spectra; without it the simulated room"""
+    split: str = "random"
+    name: str | None = None
+    """of the result (default: that of the data)"""
+    array: tuple[int, float, float] | None = None
+    """square array that took the spectra, where the data do not say: elements a side, spacing [m], carrier [Hz]"""
+    seconds: float = 1.0
+    """for the repeats of one rate; at least 3, at most 30 of them"""
+    seed: int = 0
+
+
+def main(config: Config) -> None:
+    """Measures every setting, writes `results/speed_NAME.json` and draws `docs/figures/speed_NAME.svg`."""
+    data = load(config.data) if config.data else simulated_room(seed=config.seed)
+    if config.array is not None:
+        side, spacing, frequency = config.array
+        data = replace(data, array=PlanarArray.square(side, frequency, spacing))
+    train, test = data.split(config.split, config.seed)
+    study = Study(train, test, config)
+    drawing, models = study.drawing(), study.models() + study.others()
+    name = config.name or f"{data.name}_{config.split}".replace("-", "_")
+    content = {
+        "data": data.name,
+        "split": config.split,
+        "seed": config.seed,
+        "n_train": len(train),
+        "n_test": len(test),
+    }
+    content |= {"grid": data.grid.shape, "drawing": drawing, "models": models}
+    write_result(f"speed_{name}", content)
+    draw(content, Path(__file__).parent.parent / "docs" / "figures" / f"speed_{name}.svg")
+
+
+class Study:
+    """One scene, with the model that the default fit finds for it."""
+
+    def __init__(self, train: Spectra, test: Spectra, config: Config) -> None:
+        self.train, self.test, self.seconds = train, test, config.seconds
+        validation: Validation = "block" if config.split == "block" else "random"
+        self.validation: Validation = validation
+        self.seed = config.seed
+        self.config = FitConfig(validation=validation, seed=config.seed)
+        records: list[dict[str, Any]] = []
+        began = time.perf_counter()
+        self.model = fit(train, self.config, progress=False, on_record=records.append)
+        self.fit_seconds = time.perf_counter() - began
+        self.config = replace(self.config, model=self.model.config, steps=records[-1]["steps"])
+
+    def rate(self, synthesize: Callable[[Tensor], Tensor]) -> dict[str, float]:
+        """Seconds a spectrum, from positions to magnitudes: median, least and most of the repeats."""
+        position = self.test.position.repeat(-(-BATCH // len(self.test)), 1)[:BATCH]
+
+        def once() -> float:
+            began = time.perf_counter()
+            synthesize(position)
+            return (time.perf_counter() - began) / BATCH
+
+        once()
+        repeats = max(3, min(30, int(self.seconds / (BATCH * once()))))
+        taken = sorted(once() for _ in range(repeats))
+        return {"median": taken[repeats // 2], "low": taken[0], "high": taken[-1]}
+
+    def point(self, setting: str, synthesize: Callable[[Tensor], Tensor], fit_seconds: float, **more: Any) -> Point:
+        """Of a synthesizer on the grid of the data."""
+        drawn = synthesize(self.test.position)
+        result = {
+            "setting": setting,
+            "seconds": self.rate(synthesize),
+            "fit_seconds": fit_seconds,
+            "held_out": rms(drawn, self.test.spectrum),
+            "psnr_db": float(psnr(drawn, self.test.spectrum).median()),
+            **more,
+        }
+        print(setting, f"{result['seconds']['median'] * 1e3:.3f} ms, {result['psnr_db']:.2f} dB", more, flush=True)
+        return result
+
+    def drawing(self) -> list[Point]:
+        """The default model, drawn in every way; the exact one first."""
+        points: list[Point] = []
+        own_grid = self.train.grid
+        others = [AngularGrid.hemisphere(*shape) for shape in GRIDS if shape != own_grid.shape]
+        grids = [(own_grid, True), *((grid, False) for grid in others)]
+        exact = {g: self._drawer(g, "reference", None, torch.float64)(self.test.position) for g, _ in grids}
+        for maker in ("reference", "cpu"):
+            for cutoff in CUTOFFS:
+                for dtype in (torch.float32, torch.float16, torch.bfloat16):
+                    for grid, own in grids:
+                        if not own and (dtype != torch.float32 or cutoff not in (None, 1e-4)):
+                            continue
+                        if maker == "reference" and (cutoff is not None or dtype != torch.float32):
+                            continue  # as fast and as wrong as without
+                        points.append(self._drawn(grid, maker, cutoff, dtype, exact[grid], own))
+        return points
+
+    def _drawn(
+        self, grid: AngularGrid, maker: Maker, cutoff: float | None, dtype: torch.dtype, exact: Tensor, own: bool
+    ) -> Point:
+        size = f"{grid.n_elevation} x {grid.n_azimuth}"
+        weights = "" if dtype == torch.float32 else f", weights {str(dtype).removeprefix('torch.')}"
+        setting = f"{maker}, cutoff {'none' if cutoff is None else f'{cutoff:g}'}{weights}, {size}"
+        synthesize = self._drawer(grid, maker, cutoff, dtype)
+        drawn = synthesize(self.test.position)
+        result: Point = {"setting": setting, "maker": maker, "seconds": self.rate(synthesize), "own_grid": own}
+        result |= {"numerical": rms(drawn, exact), "largest": float((drawn - exact).abs().max())}
+        if own:
+            result |= {"held_out": rms(drawn, self.test.spectrum)}
+        print(setting, f"{result['seconds']['median'] * 1e3:.3f} ms, numerical {result['numerical']:.2e}", flush=True)
+        return result
+
+    @torch.no_grad()
+    def _drawer(
+        self, grid: AngularGrid, maker: Maker, cutoff: float | None, dtype: torch.dtype
+    ) -> Callable[[Tensor], Tensor]:
+        """Positions to magnitudes with the default model; weights are rounded to `dtype`, all is float64 if that is."""
+        wide = dtype == torch.float64
+
+        @torch.no_grad()
+        def synthesize(position: Tensor) -> Tensor:
+            spectrum = torch.empty(len(position), *grid.shape, dtype=torch.float64 if wide else torch.float32)
+            step = 1 if maker == "reference" else BATCH
+            for start in range(0, len(position), step):
+                rows = slice(start, start + step)
+                mean, cholesky, attenuation, response = self.model.gaussians(self.model.normalise(position[rows]))
+                weight = (attenuation[..., None] * response).to(dtype)
+                n = len(position[rows])
+                tensors = (mean.expand(n, -1, -1), cholesky, weight.expand(n, -1, -1))
+                tensors = tuple(x.double() if wide else x.float() for x in tensors)
+                spectrum[rows] = rasterize_magnitude(*tensors, grid, maker, cutoff)
+            return spectrum.clamp_(0, 1)
+
+        return synthesize
+
+    def models(self) -> list[Point]:
+        """Other models of the same family with the length of fit that the default found."""
+        size, rank = self.model.config.size
+        parameters = sum(p.numel() for p in self.model.parameters())
+        points = [
+            self.point(
+                f"swiftwrf, default (N {size}, K {rank})",
+                self.model.synthesize,
+                self.fit_seconds,
+                parameters=parameters,
+            )
+        ]
+        variants: dict[str, dict[str, Any]] = {f"swiftwrf, N {n}": {"n_primitives": n} for n in (16, 64, 256, 1024)}
+        variants |= {f"swiftwrf, K {k}": {"rank": k} for k in (4, 12, 48)}
+        variants["swiftwrf, axis-aligned"] = {"axis_aligned": True}
+        variants["swiftwrf, per-primitive network"] = {"deformation": "per_primitive_mlp"}
+        for setting, changes in variants.items():
+            slow = {"rate": 1e-2, "deformation_rate": 2e-3} if "network" in setting else {}
+            began = time.perf_counter()
+            changed: ModelConfig = replace(self.model.config, **changes)
+            model: SwiftWRF = fit(self.train, replace(self.config, model=changed, **slow), progress=False)
+            seconds = time.perf_counter() - began
+            parameters = sum(p.numel() for p in model.parameters())
+            points.append(self.point(setting, model.synthesize, seconds, parameters=parameters))
+        return points
+
+    def others(self) -> list[Point]:
+        """The other synthesizers, and projections onto what the array can produce."""
+        array, grid, points = self.train.array, self.train.grid, []
+        for name in ("nearest", "idw", "gp"):
+            synthesizer = make_synthesizer(name, validation=self.validation, seed=self.seed)
+            began = time.perf_counter()
+            synthesizer.fit(self.train)
+            points.append(self.point(name, synthesizer.synthesize, time.perf_counter() - began))
+        if array is None:
+            return points
+        began = time.perf_counter()
+        coarray = fit_coarray(self.train, validation=self.validation, seed=self.seed)
+        seconds = time.perf_counter() - began
+        points.append(self.point("coarray", coarray.synthesize, seconds, parameters=coarray.n_parameters))
+        stretched = float(coarray.offset) > 1e-3
+        for name, synthesize in (("swiftwrf, default", self.model.synthesize), ("gp", synthesizer.synthesize)):
+
+            def projected(position: Tensor, synthesize: Callable[[Tensor], Tensor] = synthesize) -> Tensor:
+                return project(synthesize(position), array, grid, stretched=stretched)
+
+            points.append(self.point(f"{name}, projected", projected, 0.0))
+        return points
+
+
+def rms(drawn: Tensor, truth: Tensor) -> float:
+    """Root of the mean square over pixels, median over spectra."""
+    return float((drawn.double() - truth.double()).square().mean(dim=(-2, -1)).sqrt().median())
+
+
+def draw(content: dict[str, Any], file: Path) -> None:
+    """Numerical and held-out error against seconds a spectrum, log-log, with the fronts."""
+    figure, axes = figures.new_figure(1, 2, 10.5, 4.2)
+    own = [p for p in content["drawing"] if p["own_grid"]]
+    short = {p["setting"]: p["setting"].rsplit(", ", 1)[0] for p in own}
+    numerical = {short[p["setting"]]: (p["seconds"]["median"], max(p["numerical"], 1e-9)) for p in own}
+    held_out = {p["setting"]: (p["seconds"]["median"], p["held_out"]) for p in content["models"]}
+    figures.speed(axes[0], numerical, "seconds a spectrum", "RMS error against the exact drawing")
+    default = [name for name in held_out if name.startswith("swiftwrf, default (") or name == "coarray"]
+    figures.speed(axes[1], held_out, "seconds a spectrum", "RMS error against held-out spectra", also=default)
+    file.write_text(figures.as_svg(figure))
+    print(f"drew {file}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
