@@ -108,7 +108,7 @@ def test_whole_run(small, tmp_path):
     methods = metrics["mixes"]["0.5"]["methods"]
     expected = {"measured_only", "turbo_swiftwrf", "turbo_idw", "measured_all", "constant", "nearest_spectrum", "peak"}
     assert set(methods) == expected
-    assert set(metrics["mixes"]["0.5"]["synthesis"]) == {"swiftwrf", "nearest", "idw"}
+    assert set(metrics["mixes"]["0.5"]["synthesis"]) == {"swiftwrf", "nearest", "idw", "gp", "coarray"}
     assert set(metrics["mixes"]["1"]["seconds"]) == {"fit", "synthesize", "train"}
 
     errors = pd.read_csv(out / "errors.csv")

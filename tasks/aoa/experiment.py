@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,7 +26,7 @@ from tasks.run import Row, Run, choose_device, console
 
 ANGLES = ("azimuth_deg", "elevation_deg", "great_circle_deg")
 SCORES = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
-COMPARED = ("nearest", "idw")  # synthesizers that are always measured beside those asked for
+COMPARED = ("nearest", "idw", "gp")  # synthesizers that are always measured beside those asked for
 EXAMPLE_QUANTILES = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)  # of the PSNR at the test positions: the best to the worst spectrum
 
 
@@ -139,34 +141,28 @@ class _Experiment:
         few = Mixed.measured(measured)
         at = {"mix": share, "repeat": repeat}
         suffix = f"mix{share:g}-r{repeat}"
-        baselines: dict[str, Estimator] = {
-            "peak": Peak(self.train.grid),
-            "constant": Constant(),
-            "nearest_spectrum": NearestSpectrum(),
+        network = partial(AANN, self.aann_config, self.config.seed + repeat, self.device)
+        without: dict[str, Callable[[], Estimator]] = {
+            "peak": partial(Peak, self.train.grid),
+            "constant": Constant,
+            "nearest_spectrum": NearestSpectrum,
+            "measured_only": network,
         }
-        for name, baseline in baselines.items():
-            self._arm(at | {"method": name}, f"{name}-{suffix}", few, baseline)
-        self._arm(at | {"method": "measured_only"}, f"measured_only-{suffix}", few, self._network(repeat))
-        for name in dict.fromkeys((*self.config.synthesizer, *COMPARED)):
+        for name, make in without.items():
+            self._arm(at | {"method": name}, f"{name}-{suffix}", few, make)
+        compared = COMPARED if self.train.array is None else (*COMPARED, "coarray")
+        for name in dict.fromkeys((*self.config.synthesizer, *compared)):
             mixed = self._synthesize(at | {"synthesizer": name}, f"synthesis_{name}-{suffix}", measured, withheld)
             if name in self.config.synthesizer:
-                self._arm(at | {"method": f"turbo_{name}"}, f"turbo_{name}-{suffix}", mixed, self._network(repeat))
+                self._arm(at | {"method": f"turbo_{name}"}, f"turbo_{name}-{suffix}", mixed, network)
         # the same whatever the share, so its step is shared by all of them
-        self._arm(
-            at | {"method": "measured_all"},
-            f"measured_all-r{repeat}",
-            Mixed.measured(self.train),
-            self._network(repeat),
-        )
+        self._arm(at | {"method": "measured_all"}, f"measured_all-r{repeat}", Mixed.measured(self.train), network)
 
-    def _network(self, repeat: int) -> AANN:
-        return AANN(self.aann_config, self.config.seed + repeat, self.device)
-
-    def _arm(self, arm: Row, step: str, train: Mixed, estimator: Estimator) -> None:
+    def _arm(self, arm: Row, step: str, train: Mixed, make: Callable[[], Estimator]) -> None:
         """Trains one estimator and tests it."""
 
         def compute() -> Row:
-            began = time.perf_counter()
+            estimator, began = make(), time.perf_counter()
             estimator.fit(train)
             fitted = time.perf_counter()
             estimate = estimator.estimate(self.test.spectrum)
