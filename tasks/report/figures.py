@@ -163,3 +163,7 @@ def speed(axes: Axes, points: Mapping[str, tuple[float, float]], x: str, y: str,
             axes.annotate(name, (cost, error), textcoords="offset points", xytext=(5, 3), fontsize=7)
     axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
     axes.margins(x=0.25, y=0.1)
+    low, high = axes.get_ylim()
+    if high < 30 * low:  # plain numbers where powers of ten would be few
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("{x:g}")
