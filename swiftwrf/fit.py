@@ -18,10 +18,10 @@ from swiftwrf.model import SwiftWRF
 from swiftwrf.optimise import Optimisation, Record, Session, fingerprint
 from swiftwrf.prior import choose_kernel, choose_rank
 from swiftwrf.progress import progress_bar
-from swiftwrf.search import climb, settle
+from swiftwrf.search import climb
 
 FOLDS = 5  # the search holds out one; the kernel is chosen over all
-FEWEST, MOST = 16, 2048  # primitives that the search tries
+FEWEST, TYPICAL, MOST = 16, 64, 2048  # primitives that the search tries
 SHORTEST, LONGEST = 300, 1200  # steps that it tries
 SEARCH_AZIMUTHS = 90  # columns of the spectra in the search: coarser ones rank the candidates alike
 
@@ -86,13 +86,11 @@ def _choose_size(loss: Callable[[int, int], float], config: FitConfig) -> tuple[
     Args:
         loss: of a fit of so many primitives and steps on held-out spectra.
     """
-    given, steps = config.model.n_primitives, config.steps
-    shortest = SHORTEST if steps == "auto" else min(SHORTEST, steps)
-    n = climb(lambda n: loss(n, shortest), FEWEST, MOST, patience=2) if given == "auto" else given
-    if steps == "auto":
-        steps = climb(lambda steps: loss(n, steps), SHORTEST, LONGEST, patience=1)
-    if given == "auto" and steps > shortest:
-        n = settle(lambda n: loss(n, steps), FEWEST, n)
+    n, steps = config.model.n_primitives, config.steps
+    if steps == "auto":  # first, for sizes that are compared in short fits favour large ones
+        steps = climb(lambda steps: loss(TYPICAL if n == "auto" else n, steps), SHORTEST, LONGEST, patience=1)
+    if n == "auto":
+        n = climb(lambda n: loss(n, steps), FEWEST, MOST, patience=2)
     return n, steps
 
 

@@ -25,22 +25,3 @@ def climb(loss: Callable[[int], float], first: int, last: int, patience: int) ->
         lowest = min(lowest, losses[size])
         size *= 2
     return next(size for size, found in losses.items() if found <= (1 + GAIN) * lowest)
-
-
-def settle(loss: Callable[[int], float], first: int, last: int) -> int:
-    """The smallest of first, 2 first, ... last whose loss is within 1 % of that of `last`, by bisection: larger is better.
-
-    For sizes that were ranked by short fits, in which large ones are ahead.
-    """
-    sizes = [first]
-    while sizes[-1] < last:
-        sizes.append(2 * sizes[-1])
-    bound = (1 + GAIN) * loss(last)
-    low, high = 0, len(sizes) - 1  # the place of what is sought lies between them
-    while low < high:
-        middle = (low + high) // 2
-        if loss(sizes[middle]) <= bound:
-            high = middle
-        else:
-            low = middle + 1
-    return sizes[high]

@@ -12,7 +12,7 @@ from swiftwrf.fit import folds
 from swiftwrf.metrics import psnr
 from swiftwrf.optimise import Optimisation
 from swiftwrf.prior import MIN_RANK, choose_kernel, choose_rank
-from swiftwrf.search import climb, settle
+from swiftwrf.search import climb
 
 QUICK = FitConfig(model=ModelConfig(n_primitives=24), steps=200, check_every=50)
 
@@ -122,12 +122,6 @@ def test_climb_finds_the_smallest_that_does_as_well_as_any(losses, found, looked
 
     assert climb(loss, 10, 10 * 2 ** (len(losses) - 1), patience=2) == found
     assert asked == [10 * 2**i for i in range(looked_at)]
-
-
-@pytest.mark.parametrize("enough", [10, 20, 40, 80, 160])
-def test_settle_finds_the_smallest_that_is_enough(enough):
-    assert settle(lambda size: 1.0 if size >= enough else 1.5, 10, 160) == enough
-    assert settle(lambda size: 1.009 if size >= enough else 1.5 - 0.5 * (size == 160), 10, 160) == enough
 
 
 def test_refuses_the_state_of_another_fit(room, tmp_path):
