@@ -98,7 +98,7 @@ def hard_cases() -> str:
             value = {entry["cutoff"]: entry["value"] for entry in entries}
             gradient = max(max(entry["gradient"], entry["magnitude_gradient"]) for entry in entries)
             cells.append(f"{value[None]:.0e}, {value[1e-4]:.0e}; {gradient:.0e}")
-        rows.append([case, next(iter(makers.values()))[0]["rule"], *cells])
+        rows.append([case, next(iter(makers.values()))[0]["rule"].replace("|", "\\|"), *cells])
     return _table(["case", "rule", *(f"`{maker}` (float32)" for maker in found[rows[0][0]])], rows)
 
 

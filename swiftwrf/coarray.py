@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import torch
@@ -39,10 +40,18 @@ def differences(array: PlanarArray) -> Tensor:
     return kept
 
 
-def basis(array: PlanarArray, grid: AngularGrid) -> Tensor:
-    """The functions that squared spectra consist of: 1, P cosines, P sines, float64 (1 + 2 P, pixels)."""
+@lru_cache(maxsize=8)
+def basis(array: PlanarArray, grid: AngularGrid, dtype: torch.dtype = torch.float64) -> Tensor:
+    """The functions that squared spectra consist of: 1, P cosines, P sines, (1 + 2 P, pixels); kept for the next call."""
     phase = 2 * math.pi * differences(array) @ grid.direction[..., :2].reshape(-1, 2).T
-    return torch.cat([torch.ones_like(phase[:1]), phase.cos(), phase.sin()])
+    return torch.cat([torch.ones_like(phase[:1]), phase.cos(), phase.sin()]).to(dtype)
+
+
+@lru_cache(maxsize=4)
+def _inverse(array: PlanarArray, grid: AngularGrid) -> Tensor:
+    """Squared spectra to coefficients by least squares, float64 (pixels, 1 + 2 P)."""
+    inverse: Tensor = torch.linalg.pinv(basis(array, grid))
+    return inverse
 
 
 def project(spectrum: Tensor, array: PlanarArray, grid: AngularGrid, *, stretched: bool = False) -> Tensor:
@@ -66,7 +75,7 @@ def project(spectrum: Tensor, array: PlanarArray, grid: AngularGrid, *, stretche
             f"expected spectra of shape (n, {grid.shape[0]}, {grid.shape[1]}), got {tuple(spectrum.shape)}"
         )
     functions, flat = basis(array, grid), spectrum.flatten(1).double()
-    inverse = torch.linalg.pinv(functions)
+    inverse = _inverse(array, grid)
     offset = _offset(flat, functions, inverse) if stretched else torch.zeros(len(flat), 1, dtype=torch.float64)
     power = (flat + offset).square() @ inverse @ functions
     projected: Tensor = power.clamp_min(0).sqrt() - offset
@@ -136,13 +145,17 @@ class CoarrayModel:
         """
         position = checks.positions(position)
         grid = grid or self.grid
-        functions = basis(self.array, grid).float()
+        functions = basis(self.array, grid, torch.float32)
         spectrum = torch.empty(len(position), functions.shape[1])
+        stretched = bool(self.offset > 0)
         for start in range(0, len(position), batch):
             rows = slice(start, start + batch)
             coefficient, offset = self.coefficients(position[rows])
             drawn = torch.mm(coefficient.float(), functions, out=spectrum[rows])
-            drawn.clamp_(min=0).sqrt_().sub_(offset.float()).clamp_(0, 1)
+            drawn.clamp_(min=0).sqrt_()
+            if stretched:
+                drawn.sub_(offset.float())
+            drawn.clamp_(0, 1)
         return spectrum.reshape(-1, *grid.shape)
 
     def save(self, path: str | Path) -> None:
@@ -179,7 +192,7 @@ def fit_coarray(train: Spectra, *, validation: Validation = "random", seed: int 
     if train.array is None:
         raise InputError(f"{train.name} does not say which array took the spectra; give its geometry and carrier")
     functions, flat = basis(train.array, train.grid), train.spectrum.flatten(1).double()
-    inverse = torch.linalg.pinv(functions)
+    inverse = _inverse(train.array, train.grid)
     offset = _offset(flat, functions, inverse)
     flat = flat + offset
     mean = flat.mean(dim=0)
@@ -187,7 +200,7 @@ def fit_coarray(train: Spectra, *, validation: Validation = "random", seed: int 
     value, vector = torch.linalg.eigh((flat - mean) @ (flat - mean).T)
     vector = vector[:, value > 1e-12 * value.sum()][:, -COMPONENTS:]
     component = torch.cat([mean[None], vector.T @ (flat - mean)])
-    form = torch.stack([(row * component) @ inverse for row in component])  # (K + 1, K + 1, coefficients)
+    form = _quadratic_form(component.float(), inverse.float())
 
     kernel = choose_kernel(train.position, train.spectrum, folds(train.position, validation, seed))
     gram = kernel(train.position, train.position) + kernel.noise * torch.eye(len(train), dtype=torch.float64)
@@ -202,3 +215,13 @@ def fit_coarray(train: Spectra, *, validation: Validation = "random", seed: int 
         offset.mean()[None],
         form.permute(2, 0, 1).contiguous(),
     )
+
+
+def _quadratic_form(component: Tensor, inverse: Tensor) -> Tensor:
+    """Coefficients of the products of all pairs of components (K + 1, pixels), float64 (coefficients, K + 1, K + 1)."""
+    n = len(component)
+    form = torch.zeros(n, n, inverse.shape[1], dtype=torch.float64)
+    for i in range(n):
+        form[i, i:] = (component[i] * component[i:]) @ inverse
+        form[i:, i] = form[i, i:].clone()
+    return form.permute(2, 0, 1).contiguous()
