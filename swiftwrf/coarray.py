@@ -105,8 +105,8 @@ class CoarrayModel:
         kernel: of the process, lengths in [m].
         anchor: the training positions, float64 (n, 3) [m].
         readout: kernel weights to K component scores and the offset, float64 (n, K + 1).
-        offset: the mean of what stretching took from a spectrum.
-        form: scores, with a 1 in front, to coefficients by a quadratic form, float64 (1 + 2 P, K + 1, K + 1).
+        offset: the mean of what stretching took from a spectrum, (1,).
+        form: scores, with a 1 in front, to coefficients by a quadratic form, (1 + 2 P, K + 1, K + 1).
     """
 
     array: PlanarArray
@@ -123,8 +123,8 @@ class CoarrayModel:
         return self.readout.numel() + self.form.numel()
 
     def coefficients(self, position: Tensor) -> tuple[Tensor, Tensor]:
-        """Of the squared spectrum, (n, 1 + 2 P), and the offset to take off its root, (n, 1); float64."""
-        predicted = self.kernel(position, self.anchor) @ self.readout
+        """Of the squared spectrum, (n, 1 + 2 P), and the offset to take off its root, (n, 1)."""
+        predicted = (self.kernel(position, self.anchor) @ self.readout).float()
         score = torch.cat([torch.ones_like(predicted[:, :1]), predicted[:, :-1]], dim=1)
         return torch.einsum("nk,ckl,nl->nc", score, self.form, score), self.offset + predicted[:, -1:]
 
@@ -151,10 +151,10 @@ class CoarrayModel:
         for start in range(0, len(position), batch):
             rows = slice(start, start + batch)
             coefficient, offset = self.coefficients(position[rows])
-            drawn = torch.mm(coefficient.float(), functions, out=spectrum[rows])
+            drawn = torch.mm(coefficient, functions, out=spectrum[rows])
             drawn.clamp_(min=0).sqrt_()
             if stretched:
-                drawn.sub_(offset.float())
+                drawn.sub_(offset)
             drawn.clamp_(0, 1)
         return spectrum.reshape(-1, *grid.shape)
 
@@ -191,36 +191,28 @@ def fit_coarray(train: Spectra, *, validation: Validation = "random", seed: int 
     checks.training(train)
     if train.array is None:
         raise InputError(f"{train.name} does not say which array took the spectra; give its geometry and carrier")
-    functions, flat = basis(train.array, train.grid), train.spectrum.flatten(1).double()
-    inverse = _inverse(train.array, train.grid)
+    functions, flat = basis(train.array, train.grid, torch.float32), train.spectrum.flatten(1)
+    inverse = _inverse(train.array, train.grid).float()
     offset = _offset(flat, functions, inverse)
     flat = flat + offset
     mean = flat.mean(dim=0)
     # principal components from the inner products, of which there are far fewer than pixels
-    value, vector = torch.linalg.eigh((flat - mean) @ (flat - mean).T)
-    vector = vector[:, value > 1e-12 * value.sum()][:, -COMPONENTS:]
-    component = torch.cat([mean[None], vector.T @ (flat - mean)])
-    form = _quadratic_form(component.float(), inverse.float())
+    value, vector = torch.linalg.eigh(((flat - mean) @ (flat - mean).T).double())
+    vector = vector[:, value > 1e-6 * value.sum()][:, -COMPONENTS:]
+    component = torch.cat([mean[None], vector.T.float() @ (flat - mean)])
+    form = _quadratic_form(component, inverse)
 
     kernel = choose_kernel(train.position, train.spectrum, folds(train.position, validation, seed))
     gram = kernel(train.position, train.position) + kernel.noise * torch.eye(len(train), dtype=torch.float64)
-    target = torch.cat([vector, offset - offset.mean()], dim=1)
+    target = torch.cat([vector, (offset - offset.mean()).double()], dim=1)
     readout = torch.linalg.solve(gram, target)
-    return CoarrayModel(
-        train.array,
-        train.grid,
-        kernel,
-        train.position,
-        readout,
-        offset.mean()[None],
-        form.permute(2, 0, 1).contiguous(),
-    )
+    return CoarrayModel(train.array, train.grid, kernel, train.position, readout, offset.mean()[None], form)
 
 
 def _quadratic_form(component: Tensor, inverse: Tensor) -> Tensor:
-    """Coefficients of the products of all pairs of components (K + 1, pixels), float64 (coefficients, K + 1, K + 1)."""
+    """Coefficients of the products of all pairs of components (K + 1, pixels), (coefficients, K + 1, K + 1)."""
     n = len(component)
-    form = torch.zeros(n, n, inverse.shape[1], dtype=torch.float64)
+    form = torch.empty(n, n, inverse.shape[1])
     for i in range(n):
         form[i, i:] = (component[i] * component[i:]) @ inverse
         form[i:, i] = form[i, i:].clone()
