@@ -111,6 +111,10 @@ class Coarray:
     def synthesize(self, position: Tensor) -> Tensor:
         return self._model.synthesize(position)
 
+    def save(self, path: Path) -> None:
+        """Writes the fitted model."""
+        self._model.save(path)
+
 
 class SwiftWRFSynthesizer:
     """The model of this package."""

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from augment import Mixed
-from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, load, simulated_room
+from swiftwrf import AngularGrid, CoarrayModel, FitConfig, InputError, ModelConfig, load, simulated_room
 from swiftwrf.metrics import angle_errors
 from tasks.aoa import experiment
 from tasks.aoa.aann import AANN, AANNConfig
@@ -179,6 +179,18 @@ def test_wrong_input_is_one_sentence_and_code_2(small, tmp_path, capsys, argumen
     assert says in error
     assert error.count("\n") == 0
     assert not list(tmp_path.iterdir())
+
+
+def test_coarray_needs_the_array_and_takes_it_from_the_command_line(small, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(experiment, "simulated_room", lambda seed: replace(small, array=None))
+    turbo = ("--mix", 0.5, "--synthesizer", "coarray", "--out", tmp_path / "run")
+    assert run(*turbo) == 2
+    assert "give it with --array" in capsys.readouterr().err
+    assert run(*turbo, "--array", 1, 0.16, 915e6) == 2
+    assert "at least 2 elements a side" in capsys.readouterr().err
+    assert run(*turbo, "--array", 4, 0.164, 915e6) == 0
+    model = CoarrayModel.load(tmp_path / "run" / "coarray-mix0.5.safetensors")
+    assert model.synthesize(small.position[:2]).shape == (2, 10, 40)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from augment import SYNTHESIZERS, Mixed, Places, make_synthesizer, mix, withhold
-from augment.synthesize import SwiftWRFSynthesizer
+from augment.synthesize import Coarray, SwiftWRFSynthesizer
 from swiftwrf import FitConfig, InputError, Spectra, load_spectra, simulated_room
 from swiftwrf.arrays import PlanarArray
 from swiftwrf.checkpoint import read, write
@@ -210,8 +210,10 @@ class _Experiment:
             }
             seconds = {"fit": fitted - began, "synthesize": time.perf_counter() - fitted}
             write(file, "synthetic spectra", synthetic, {})
-            if isinstance(synthesizer, SwiftWRFSynthesizer) and arm["repeat"] == 0:
-                synthesizer.save(self.directory.path(f"model-mix{arm['mix']:g}.safetensors"))
+            asked_for = name in self.config.synthesizer and arm["repeat"] == 0
+            if asked_for and isinstance(synthesizer, SwiftWRFSynthesizer | Coarray):
+                prefix = "model" if name == "swiftwrf" else name
+                synthesizer.save(self.directory.path(f"{prefix}-mix{arm['mix']:g}.safetensors"))
             return {"history": history, "seconds": seconds}
 
         value = self.directory.step(step, compute)["value"]
