@@ -45,7 +45,7 @@ class FitConfig:
     """spectra with more columns are averaged down to at most this many for fitting; 0 fits all pixels"""
     validation: Validation = "random"
     """what is held out inside the training part: single spectra, or a region where the model must extrapolate"""
-    check_every: int = 100
+    check_every: int = 50
     """steps between two looks, at which progress is recorded and the state kept"""
     seed: int = 0
 

@@ -166,10 +166,11 @@ def _size(runs: list[Records]) -> Section:
         figure, axes = figures.new_figure(1, 1, 6, 3)
         for steps, part in search.groupby("steps"):
             by_size = part.sort_values("n_primitives")
-            axes[0].plot(by_size["n_primitives"], by_size["validation"], "o-", markersize=4, label=f"{steps} steps")
+            axes[0].plot(by_size["n_primitives"], by_size["validation"], "o-", markersize=4, label=f"{steps:.0f} steps")
         n, steps = int(final["n_primitives"].iloc[0]), int(final["steps"].iloc[0])
         axes[0].axvline(n, color="#aeb7c6", linewidth=1)
         axes[0].set_xscale("log", base=2)
+        axes[0].xaxis.set_major_formatter("{x:g}")
         axes[0].set(xlabel="primitives", ylabel="loss on held-out spectra")
         figures.legend_below(figure, axes[0])
         caption = (

@@ -80,7 +80,7 @@ def legend_of(figure: Figure, names: Sequence[str]) -> None:
     """A legend of dots in the colours of methods."""
     dots = [Line2D([], [], marker="o", linestyle="", color=colour(name), label=name) for name in names]
     figure.legend(
-        handles=dots, loc="outside lower center", ncols=max(1, int(figure.get_figwidth() / 1.3)), frameon=False
+        handles=dots, loc="outside lower center", ncols=max(1, int(figure.get_figwidth() / 1.8)), frameon=False
     )
 
 
