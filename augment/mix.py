@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,15 +11,22 @@ from swiftwrf import InputError, Spectra
 from swiftwrf.data.splits import MIN_TRAINING
 
 
-class Places(NamedTuple):
-    """Where spectra are withheld: what one knows of a place without measuring there. It has no spectrum to leak."""
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where spectra are withheld: what one knows of a place without measuring there. It has no spectrum to leak.
 
-    position: Tensor  # (n, 3) [m]
-    label: Tensor  # (n, 2) direction of the transmitter [rad], from the positions of both ends
-    number: Tensor  # (n,) in the data set
+    Args:
+        position: of the moving end (n, 3) [m].
+        label: direction of the transmitter (n, 2) [rad], from the positions of both ends.
+        index: (n,) in the data set.
+    """
+
+    position: Tensor
+    label: Tensor
+    index: Tensor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mixed:
     """A training set for an estimator of the angle of arrival.
 
@@ -70,13 +76,13 @@ def mix(measured: Spectra, withheld: Places, synthetic: Tensor) -> Mixed:
 
     The synthesizer that drew them was fitted on `measured` alone, which is all that `withhold` hands out.
     """
-    if len(synthetic) != len(withheld.number):
+    if len(synthetic) != len(withheld.index):
         raise InputError(
-            f"expected one synthetic spectrum for each of {len(withheld.number)} places, got {len(synthetic)}"
+            f"expected one synthetic spectrum for each of {len(withheld.index)} places, got {len(synthetic)}"
         )
     return Mixed(
         torch.cat([measured.spectrum, synthetic]),
         torch.cat([measured.label, withheld.label]),
-        torch.cat([measured.index, withheld.number]),
+        torch.cat([measured.index, withheld.index]),
         torch.cat([torch.zeros(len(measured), dtype=torch.bool), torch.ones(len(synthetic), dtype=torch.bool)]),
     )

@@ -18,8 +18,8 @@ import tyro
 from record import write_result
 
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, Spectra, fit, load_spectra, simulated_room
-from swiftwrf.data.paths import load_paths
-from swiftwrf.fit_config import Validation
+from swiftwrf.data.formats.paths import load_paths
+from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import l1, psnr, ssim, summary
 
 SCENES = (("s23-200", "block"), ("newrf-bedroom", "random"), ("newrf-office", "random"))
@@ -52,7 +52,7 @@ def main(config: Config) -> None:
 def study(name: str, data: Spectra, split: str, config: Config) -> dict[str, Any]:
     """All variants on one scene."""
     train, test = data.split(split)
-    validation: Validation = "block" if split == "block" else "random"
+    validation = validation_for(split)
     base = FitConfig(validation=validation)
     if config.quick:
         base = replace(base, model=ModelConfig(n_primitives=64), steps=150)

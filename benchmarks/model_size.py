@@ -12,7 +12,7 @@ from record import write_result
 from synthesis import SCENES
 
 from swiftwrf import FitConfig, ModelConfig, Spectra, fit, load_spectra, simulated_room
-from swiftwrf.fit_config import Validation
+from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import psnr, ssim, summary
 
 SIZES = (16, 32, 64, 128, 256, 512, 1024, 2048)
@@ -37,7 +37,7 @@ def main(config: Config) -> None:
 def measure(name: str, data: Spectra, split: str, seed: int) -> dict[str, Any]:
     """The fit that chooses, and one of each size."""
     train, test = data.split(split, seed)
-    validation: Validation = "block" if split == "block" else "random"
+    validation = validation_for(split)
 
     def fitted(n: int | None) -> dict[str, Any]:
         model_config = ModelConfig() if n is None else ModelConfig(n_primitives=n)

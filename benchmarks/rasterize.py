@@ -20,7 +20,7 @@ from record import write_result
 from torch import Tensor
 
 from swiftwrf import AngularGrid, ModelConfig, SwiftWRF, rasterize
-from swiftwrf.deformation import Kernel
+from swiftwrf.gp import Kernel
 from swiftwrf.rasterize import Maker, rasterize_magnitude
 
 Rate = dict[str, float]
@@ -144,7 +144,7 @@ def end_to_end(n: int, batch: int, grid: AngularGrid, device: torch.device, seco
     generator = torch.Generator().manual_seed(0)
     anchor = torch.rand(200, 3, generator=generator)
     config = ModelConfig(n_primitives=n, rank=32, cutoff=CUTOFF)
-    model = SwiftWRF(config, grid, anchor, Kernel(), generator=generator).to(device)
+    model = SwiftWRF.make(config, grid, anchor, Kernel(), generator=generator).to(device)
     with torch.no_grad():
         mean, cholesky, _ = scene(n, 1, device)  # the primitives that are drawn alone
         l1, l2, l3 = cholesky.unbind(-1)

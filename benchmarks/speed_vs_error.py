@@ -18,7 +18,7 @@ from record import write_result
 from synthesis import load
 from torch import Tensor
 
-from augment import make_synthesizer
+from augment import Settings, make_synthesizer
 from swiftwrf import (
     AngularGrid,
     FitConfig,
@@ -31,7 +31,7 @@ from swiftwrf import (
     simulated_room,
 )
 from swiftwrf.arrays import PlanarArray
-from swiftwrf.fit_config import Validation
+from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import psnr
 from swiftwrf.rasterize import Maker, rasterize_magnitude
 from tasks.report import figures
@@ -83,8 +83,8 @@ class Study:
 
     def __init__(self, train: Spectra, test: Spectra, config: Config) -> None:
         self.train, self.test, self.seconds = train, test, config.seconds
-        validation: Validation = "block" if config.split == "block" else "random"
-        self.validation: Validation = validation
+        validation = validation_for(config.split)
+        self.validation = validation
         self.seed = config.seed
         self.config = FitConfig(validation=validation, seed=config.seed)
         records: list[dict[str, Any]] = []
@@ -207,7 +207,7 @@ class Study:
         """The other synthesizers, and projections onto what the array can produce."""
         array, grid, points = self.train.array, self.train.grid, []
         for name in ("nearest", "idw", "gp"):
-            synthesizer = make_synthesizer(name, validation=self.validation, seed=self.seed)
+            synthesizer = make_synthesizer(name, Settings(validation=self.validation, seed=self.seed))
             began = time.perf_counter()
             synthesizer.fit(self.train)
             points.append(self.point(name, synthesizer.synthesize, time.perf_counter() - began))

@@ -13,7 +13,6 @@ from typing import Any
 
 import torch
 import tyro
-from hard_cases import GRADIENT_TOLERANCE, HARD_CASES, VALUE_TOLERANCE, field_errors, magnitude_errors
 from record import write_result
 from torch import Tensor
 
@@ -29,9 +28,11 @@ from swiftwrf import (
     rasterize,
     simulated_room,
 )
-from swiftwrf.deformation import Kernel
+from swiftwrf.gp import Kernel
 from swiftwrf.metrics import psnr
 from swiftwrf.rasterize import Maker, rasterize_magnitude
+from swiftwrf.testing.hard_cases import HARD_CASES, field_errors, magnitude_errors
+from swiftwrf.testing.tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ def precision(device: torch.device) -> list[dict[str, Any]]:
     generator = torch.Generator().manual_seed(0)
     grid = AngularGrid.hemisphere(90, 360)
     anchor = torch.rand(100, 3, generator=generator)
-    model = SwiftWRF(ModelConfig(n_primitives=200, rank=32), grid, anchor, Kernel(), generator=generator)
+    model = SwiftWRF.make(ModelConfig(n_primitives=200, rank=32), grid, anchor, Kernel(), generator=generator)
     for parameter in model.parameters():
         parameter.data += 0.3 * torch.randn(parameter.shape, generator=generator)
     model = model.to(device).requires_grad_(False)

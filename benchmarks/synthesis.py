@@ -10,9 +10,10 @@ from typing import Any
 import tyro
 from record import write_result
 
-from augment import make_synthesizer
+from augment import Settings, make_synthesizer
 from swiftwrf import Spectra, load_spectra, project, simulated_room
 from swiftwrf.arrays import PlanarArray
+from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import l1, psnr, ssim, summary
 
 S23_ARRAY = PlanarArray.square(4, 915e6, spacing=0.16)  # which the files of s23-200 do not tell
@@ -50,7 +51,7 @@ def measure(data: Spectra, split: str, seed: int) -> dict[str, Any]:
     drawn = {"mean": train.spectrum.mean(dim=0).expand_as(test.spectrum)}
     seconds: dict[str, dict[str, float]] = {}
     for name in ("nearest", "idw", "gp", "coarray", "swiftwrf"):
-        synthesizer = make_synthesizer(name, validation="block" if split == "block" else "random", seed=seed)
+        synthesizer = make_synthesizer(name, Settings(validation=validation_for(split), seed=seed))
         began = time.perf_counter()
         synthesizer.fit(train)
         fitted = time.perf_counter()

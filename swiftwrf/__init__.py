@@ -7,15 +7,15 @@ spectrum = model.synthesize(test.position)
 """
 
 from swiftwrf.angles import AngularGrid, ArrayPose
+from swiftwrf.checkpoint import load
 from swiftwrf.coarray import CoarrayModel, fit_coarray, project
 from swiftwrf.data import Rssi, Spectra, load_rssi, load_spectra
-from swiftwrf.data.room import simulated_room
-from swiftwrf.data.rssi_room import rssi_room
+from swiftwrf.data.simulated import rssi_room, simulated_room
 from swiftwrf.errors import FitError, InputError
-from swiftwrf.fit import fit
-from swiftwrf.fit_config import FitConfig, RssiConfig
-from swiftwrf.model import ModelConfig, SwiftWRF, load
-from swiftwrf.rasterize import rasterize
+from swiftwrf.fitting import FitConfig, fit
+from swiftwrf.fitting.config import RssiConfig
+from swiftwrf.model import ModelConfig, SwiftWRF
+from swiftwrf.rasterize import rasterize, rasterize_magnitude
 from swiftwrf.rssi import RssiModel, fit_rssi
 
 __all__ = [
@@ -39,6 +39,7 @@ __all__ = [
     "load_spectra",
     "project",
     "rasterize",
+    "rasterize_magnitude",
     "rssi_room",
     "simulated_room",
 ]

@@ -80,16 +80,19 @@ class AngularGrid:
         return self.n_elevation, self.n_azimuth
 
     @cached_property
+    @torch.inference_mode(False)  # what is kept must also serve calls that await gradients
     def elevation(self) -> Tensor:
         """Elevation of each row, float64 (n_elevation,) [rad]."""
         return self.elevation_start + self.elevation_step * torch.arange(self.n_elevation, dtype=torch.float64)
 
     @cached_property
+    @torch.inference_mode(False)
     def azimuth(self) -> Tensor:
         """Azimuth of each column, float64 (n_azimuth,) [rad]."""
         return self.azimuth_start + self.azimuth_step * torch.arange(self.n_azimuth, dtype=torch.float64)
 
     @cached_property
+    @torch.inference_mode(False)
     def direction(self) -> Tensor:
         """Unit vector of each pixel in array coordinates, float64 (n_elevation, n_azimuth, 3)."""
         return to_direction(self.azimuth[None, :], self.elevation[:, None])
@@ -160,6 +163,7 @@ class ArrayPose:
             )
 
     @cached_property
+    @torch.inference_mode(False)
     def rotation(self) -> Tensor:
         """Matrix R that turns array into world coordinates, float64 (3, 3)."""
         x, y, z, w = (q / math.hypot(*self.orientation) for q in self.orientation)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -13,7 +14,7 @@ from swiftwrf.angles import AngularGrid
 LIGHT_SPEED = 299_792_458.0  # [m / s]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlanarArray:
     """Elements in the plane z = 0 of the array's coordinates.
 
@@ -24,6 +25,16 @@ class PlanarArray:
 
     element: Tensor
     wavelength: float
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, PlanarArray) and self._content == other._content
+
+    def __hash__(self) -> int:  # equal arrays share what is computed for one
+        return hash(self._content)
+
+    @cached_property
+    def _content(self) -> tuple[float, ...]:
+        return (self.wavelength, *self.element.flatten().tolist())
 
     @classmethod
     def square(cls, side: int, frequency_hz: float, spacing: float | None = None) -> PlanarArray:

@@ -1,11 +1,15 @@
-"""Tensors and plain values in one safetensors file, written whole or not at all; opening one never runs code."""
+"""Tensors and plain values in one safetensors file, written whole or not at all; opening one never runs code.
+
+Every fitted model is saved and opened the same way: it derives from `Saved`, and `load` opens any of them.
+"""
 
 from __future__ import annotations
 
 import json
 import os
+from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
@@ -14,9 +18,10 @@ from torch import Tensor
 from swiftwrf.errors import InputError
 
 FORMAT = 1
+Header = dict[str, Any]  # values that JSON can carry
 
 
-def write(path: str | Path, kind: str, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
+def write(path: str | Path, kind: str, tensors: dict[str, Tensor], header: Header) -> None:
     """Writes under a temporary name and renames, so that an interrupted write leaves the old file.
 
     Args:
@@ -35,8 +40,8 @@ def write(path: str | Path, kind: str, tensors: dict[str, Tensor], header: dict[
         temporary.unlink(missing_ok=True)
 
 
-def read(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and header of a file of the given kind.
+def read(path: str | Path, *kinds: str) -> tuple[str, dict[str, Tensor], Header]:
+    """Kind, tensors and header of a file of one of the given kinds.
 
     Raises:
         InputError: no such file, not a safetensors file, another kind or a newer format.
@@ -47,9 +52,46 @@ def read(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
     except (OSError, SafetensorError) as error:
         raise InputError(f"{path} is not a readable safetensors file ({error})") from None
-    if metadata.get("kind") != kind or metadata.get("format") != str(FORMAT):
+    kind = metadata.get("kind", "something else")
+    if kind not in kinds or metadata.get("format") != str(FORMAT):
         raise InputError(
-            f"{path} holds {metadata.get('kind', 'something else')!r} in format {metadata.get('format')}; "
-            f"expected {kind!r} in format {FORMAT}"
+            f"{path} holds {kind!r} in format {metadata.get('format')}; expected {' or '.join(map(repr, kinds))} in "
+            f"format {FORMAT}"
         )
-    return tensors, json.loads(metadata["header"])
+    return kind, tensors, json.loads(metadata["header"])
+
+
+class Saved(ABC):
+    """A fitted model that one file can hold; subclasses name their kind and are known to `load` from then on."""
+
+    kind: ClassVar[str]
+    kinds: ClassVar[dict[str, type[Saved]]] = {}
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "kind" in cls.__dict__:
+            Saved.kinds[cls.kind] = cls
+
+    @abstractmethod
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        """Tensors by name, and plain values."""
+
+    @classmethod
+    @abstractmethod
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
+        """The model of which `state` gave these."""
+
+    def save(self, path: str | Path, provenance: dict[str, str] | None = None) -> None:
+        """Writes the model to one safetensors file, its configuration and `provenance` in the header."""
+        tensors, header = self.state()
+        write(path, self.kind, tensors, header | {"provenance": provenance or {}})
+
+
+def load(path: str | Path) -> Saved:
+    """The model that was saved there, of whatever kind.
+
+    Raises:
+        InputError: not such a file.
+    """
+    kind, tensors, header = read(path, *Saved.kinds)
+    return Saved.kinds[kind].from_state(tensors, header)

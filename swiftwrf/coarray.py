@@ -10,22 +10,25 @@ l, -l, a cosine and a sine. Gaussians need neither the array's geometry nor its 
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from swiftwrf import checkpoint, checks
 from swiftwrf.angles import AngularGrid
 from swiftwrf.arrays import PlanarArray
-from swiftwrf.data.spectra import Spectra
-from swiftwrf.deformation import Kernel
+from swiftwrf.checkpoint import Header, Saved, read
+from swiftwrf.data.spectra import Spectra, check_training, fingerprint
+from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
-from swiftwrf.fit import folds
-from swiftwrf.fit_config import Validation
-from swiftwrf.prior import choose_kernel
+from swiftwrf.gp import Kernel, choose_kernel
+from swiftwrf.positions import check_positions
+from swiftwrf.progress import progress_bar
 
 COMPONENTS = 64  # principal components of the training magnitudes that the model keeps at most
 SAME = 1e-6  # differences closer than this share of a wavelength are one
@@ -41,6 +44,7 @@ def differences(array: PlanarArray) -> Tensor:
 
 
 @lru_cache(maxsize=8)
+@torch.inference_mode(False)  # what is kept must also serve calls that await gradients
 def basis(array: PlanarArray, grid: AngularGrid, dtype: torch.dtype = torch.float64) -> Tensor:
     """The functions that squared spectra consist of: 1, P cosines, P sines, (1 + 2 P, pixels); kept for the next call."""
     phase = 2 * math.pi * differences(array) @ grid.direction[..., :2].reshape(-1, 2).T
@@ -48,6 +52,7 @@ def basis(array: PlanarArray, grid: AngularGrid, dtype: torch.dtype = torch.floa
 
 
 @lru_cache(maxsize=4)
+@torch.inference_mode(False)
 def _inverse(array: PlanarArray, grid: AngularGrid) -> Tensor:
     """Squared spectra to coefficients by least squares, float64 (pixels, 1 + 2 P)."""
     inverse: Tensor = torch.linalg.pinv(basis(array, grid))
@@ -92,8 +97,8 @@ def _offset(flat: Tensor, functions: Tensor, inverse: Tensor) -> Tensor:
     return least.clamp_min(0)[:, None]
 
 
-@dataclass(frozen=True)
-class CoarrayModel:
+@dataclass(frozen=True, eq=False)
+class CoarrayModel(Saved):
     """Spectrum at any position by the array's physics; what `fit_coarray` returns.
 
     A Gaussian process tells the mean magnitude between the positions; its square, projected, gives the coefficients. The
@@ -108,6 +113,8 @@ class CoarrayModel:
         offset: the mean of what stretching took from a spectrum, (1,).
         form: scores, with a 1 in front, to coefficients by a quadratic form, (1 + 2 P, K + 1, K + 1).
     """
+
+    kind: ClassVar[str] = "co-array model"
 
     array: PlanarArray
     grid: AngularGrid
@@ -143,7 +150,7 @@ class CoarrayModel:
         Raises:
             InputError: positions of another shape, or not finite.
         """
-        position = checks.positions(position)
+        position = check_positions(position)
         grid = grid or self.grid
         functions = basis(self.array, grid, torch.float32)
         spectrum = torch.empty(len(position), functions.shape[1])
@@ -158,41 +165,65 @@ class CoarrayModel:
             drawn.clamp_(0, 1)
         return spectrum.reshape(-1, *grid.shape)
 
-    def save(self, path: str | Path) -> None:
-        """Writes the model to one safetensors file."""
+    def state(self) -> tuple[dict[str, Tensor], Header]:
         names = ("anchor", "readout", "offset", "form")
         tensors = {name: getattr(self, name) for name in names} | {"element": self.array.element}
-        header = {"grid": asdict(self.grid), "kernel": asdict(self.kernel), "wavelength": self.array.wavelength}
-        checkpoint.write(path, "co-array model", tensors, header)
+        return tensors, {"grid": asdict(self.grid), "kernel": asdict(self.kernel), "wavelength": self.array.wavelength}
 
     @classmethod
-    def load(cls, path: str | Path) -> CoarrayModel:
-        """The model that `save` wrote.
-
-        Raises:
-            InputError: not such a file.
-        """
-        tensors, header = checkpoint.read(path, "co-array model")
-        array = PlanarArray(tensors.pop("element"), header["wavelength"])
-        return cls(array, AngularGrid(**header["grid"]), Kernel(**header["kernel"]), **tensors)
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> CoarrayModel:
+        own = {name: tensors[name] for name in ("anchor", "readout", "offset", "form")}
+        array = PlanarArray(tensors["element"], header["wavelength"])
+        return cls(array, AngularGrid(**header["grid"]), Kernel(**header["kernel"]), **own)
 
 
-def fit_coarray(train: Spectra, *, validation: Validation = "random", seed: int = 0) -> CoarrayModel:
+def fit_coarray(
+    train: Spectra,
+    *,
+    validation: Validation = "random",
+    seed: int = 0,
+    checkpoint: Path | None = None,
+    on_record: Callable[[dict[str, Any]], None] | None = None,
+    progress: bool = True,
+) -> CoarrayModel:
     """Fits the model; nothing is optimised step by step.
 
     Args:
         train: the only spectra it sees, with their array.
         validation: how training spectra are held out to choose the kernel.
         seed: of what is held out.
+        checkpoint: a file that keeps the fitted model; where it exists and is of these spectra, it is opened instead.
+        on_record: called once, with stage (final) and seconds.
+        progress: show a progress bar on a terminal.
 
     Raises:
         InputError: no array, fewer than 10 spectra, or something not finite.
     """
-    checks.training(train)
+    check_training(train)
     if train.array is None:
         raise InputError(f"{train.name} does not say which array took the spectra; give its geometry and carrier")
-    functions, flat = basis(train.array, train.grid, torch.float32), train.spectrum.flatten(1)
-    inverse = _inverse(train.array, train.grid).float()
+    owner = fingerprint(train, validation, seed)
+    if checkpoint is not None and checkpoint.exists():
+        _, tensors, header = read(checkpoint, CoarrayModel.kind)
+        if header["provenance"] != {"fit": owner}:
+            raise InputError(
+                f"{checkpoint} is of another fit (other spectra or settings); remove it or give another path"
+            )
+        return CoarrayModel.from_state(tensors, header)
+    began = time.perf_counter()
+    with progress_bar(progress) as bar:
+        bar.add_task("co-array model", total=1)
+        model = _solve(train, train.array, folds(train.position, validation, seed))
+    if checkpoint is not None:
+        model.save(checkpoint, {"fit": owner})
+    if on_record is not None:
+        on_record({"stage": "final", "seconds": time.perf_counter() - began})
+    return model
+
+
+def _solve(train: Spectra, array: PlanarArray, fold: Tensor) -> CoarrayModel:
+    functions, flat = basis(array, train.grid, torch.float32), train.spectrum.flatten(1)
+    inverse = _inverse(array, train.grid).float()
     offset = _offset(flat, functions, inverse)
     flat = flat + offset
     mean = flat.mean(dim=0)
@@ -202,11 +233,10 @@ def fit_coarray(train: Spectra, *, validation: Validation = "random", seed: int 
     component = torch.cat([mean[None], vector.T.float() @ (flat - mean)])
     form = _quadratic_form(component, inverse)
 
-    kernel = choose_kernel(train.position, train.spectrum, folds(train.position, validation, seed))
-    gram = kernel(train.position, train.position) + kernel.noise * torch.eye(len(train), dtype=torch.float64)
+    kernel = choose_kernel(train.position, train.spectrum, fold)
     target = torch.cat([vector, (offset - offset.mean()).double()], dim=1)
-    readout = torch.linalg.solve(gram, target)
-    return CoarrayModel(train.array, train.grid, kernel, train.position, readout, offset.mean()[None], form)
+    readout = torch.linalg.solve(kernel.noisy_gram(train.position), target)
+    return CoarrayModel(array, train.grid, kernel, train.position, readout, offset.mean()[None], form)
 
 
 def _quadratic_form(component: Tensor, inverse: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ WINDOW = 7
 
 
 @lru_cache(maxsize=16)
+@torch.inference_mode(False)  # what is kept must also serve calls that await gradients
 def _window_mean(size: int, device: torch.device, dtype: torch.dtype) -> Tensor:
     """Banded matrix (size - 6, size) that averages 7 neighbours: two products replace a convolution, 15 times faster."""
     rows = size - WINDOW + 1

@@ -1,4 +1,4 @@
-"""One registry for each kind of thing that comes in several makes: synthesizers, predictors, estimators, deformations, formats.
+"""One registry for each kind of thing that comes in several makes: synthesizers, predictors, deformations, formats, ...
 
 Help texts, reports, colours and benchmarks read the registry; adding a make is one new file in the folder of its kind.
 """

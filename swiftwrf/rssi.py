@@ -20,16 +20,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from swiftwrf import checks
 from swiftwrf.angles import AngularGrid
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import MIN_TRAINING
-from swiftwrf.deformation import Kernel, SmoothField
+from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.errors import FitError, InputError
-from swiftwrf.fit import folds
-from swiftwrf.fit_config import RssiConfig
-from swiftwrf.primitives import Primitives
-from swiftwrf.prior import candidates, held_out_weights, thinned
+from swiftwrf.fitting.config import RssiConfig
+from swiftwrf.gp import Kernel, SmoothField, candidates, held_out_weights, thinned
+from swiftwrf.model.primitives import Primitives
+from swiftwrf.positions import check_positions
 from swiftwrf.progress import progress
 from swiftwrf.rasterize import rasterize
 from swiftwrf.rasterize.magnitude import magnitude
@@ -181,7 +179,7 @@ class RssiModel(nn.Module):
         Raises:
             InputError: positions of another shape, or not finite.
         """
-        position = checks.positions(position)
+        position = check_positions(position)
         if not len(position):
             return (torch.empty(0, sum(len(cast(ReceiverGroup, group).receiver) for group in self.groups)),) * 3
         middle, deviation = (torch.cat(x) for x in zip(*(self(p) for p in position.split(batch)), strict=True))

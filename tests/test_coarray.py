@@ -86,10 +86,27 @@ def test_model_draws_any_resolution_what_the_array_would(room):
 def test_a_saved_model_synthesizes_the_same_bits(room, tmp_path):
     model = fit_coarray(room)
     model.save(tmp_path / "model.safetensors")
-    again = CoarrayModel.load(tmp_path / "model.safetensors")
+    again = load(tmp_path / "model.safetensors")
     assert torch.equal(again.synthesize(room.position), model.synthesize(room.position))
-    with pytest.raises(InputError, match="expected 'swiftwrf model'"):
-        load(tmp_path / "model.safetensors")
+    assert isinstance(again, CoarrayModel)
+
+
+def test_equal_arrays_are_equal_and_share_their_basis():
+    one, two = PlanarArray.square(4, 1e9), PlanarArray.square(4, 1e9)
+    assert one == two
+    assert one != PlanarArray.square(4, 2e9)
+    assert basis(one, GRID) is basis(two, GRID)
+
+
+def test_fit_goes_on_from_what_was_kept_and_refuses_what_is_of_others(room, tmp_path):
+    records = []
+    kept = tmp_path / "kept"
+    model = fit_coarray(room, checkpoint=kept, on_record=records.append)
+    again = fit_coarray(room, checkpoint=kept, on_record=records.append)
+    assert [record["stage"] for record in records] == ["final"]
+    assert torch.equal(again.synthesize(room.position), model.synthesize(room.position))
+    with pytest.raises(InputError, match="another fit"):
+        fit_coarray(room, seed=1, checkpoint=kept)
 
 
 def test_refuses_spectra_of_an_unknown_array_and_positions_that_are_none(room):

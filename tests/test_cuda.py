@@ -15,21 +15,14 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from hard_cases import (
-    GRADIENT_TOLERANCE,
-    HARD_CASES,
-    VALUE_TOLERANCE,
-    Case,
-    degrees,
-    field_errors,
-    magnitude_errors,
-)
-from test_rasterize import scene
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from swiftwrf import AngularGrid, InputError, rasterize
 from swiftwrf.rasterize import _choose, cuda, nvrtc, reference
 from swiftwrf.rasterize.magnitude import magnitude
+from swiftwrf.testing.hard_cases import HARD_CASES, Case, degrees, field_errors, magnitude_errors
+from swiftwrf.testing.scenes import random_scene
+from swiftwrf.testing.tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
 
 SHIM = Path(__file__).parent / "cuda_shim"
 KERNELS = {"find_reach", "rasterize", "rasterize_backward", "magnitude_backward"}
@@ -183,7 +176,7 @@ def test_launches_as_the_driver_expects(shim, compiler, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda: SimpleNamespace(cuda_stream=0x123456789ABC))
     kernels = nvrtc.Kernels(cuda.SOURCE.read_text(), torch.device("cpu"))
-    inputs = [x.detach() for x in scene(4, 2)]
+    inputs = [x.detach() for x in random_scene(4, 2)]
     grid = AngularGrid.hemisphere(17, 33)
     expected = cuda.rasterize(*inputs, grid, 1e-4)
     monkeypatch.setattr(cuda, "kernels", lambda device: kernels)
@@ -230,12 +223,12 @@ def test_small_hard_cases(case, cutoff):
 @pytest.mark.usefixtures("shim", "poisoned")
 def test_agrees_with_the_definition(shape, n, per_position, cutoff):
     grid = AngularGrid.hemisphere(*shape)
-    assert_close(ordinary(scene(n, 3, per_position=per_position, grid=grid), grid), cutoff)
+    assert_close(ordinary(random_scene(n, 3, per_position=per_position, grid=grid), grid), cutoff)
 
 
 def many(n, grid, batch=1):
     """Primitives about as wide as their distance from each other."""
-    inputs = [x.detach() for x in scene(n, batch, grid=grid)]
+    inputs = [x.detach() for x in random_scene(n, batch, grid=grid)]
     width = math.sqrt(math.pi**2 / n) / 2
     inputs[1] = (
         width * torch.tensor([1.0, 0.3, 0.8]) * (1 + torch.rand(n, 3, generator=torch.Generator().manual_seed(3)))
@@ -286,7 +279,7 @@ def test_same_bits_twice_and_whatever_the_batch():
 def check_bits(device):
     """The same bits twice, and for one position alone."""
     grid = AngularGrid.hemisphere(17, 33)
-    inputs = [x.detach().to(device) for x in scene(200, 5, per_position=True, grid=grid)]
+    inputs = [x.detach().to(device) for x in random_scene(200, 5, per_position=True, grid=grid)]
     cotangent = torch.randn(5, 2, *grid.shape, generator=torch.Generator().manual_seed(1)).to(device)
     whole, gradients = value_and_gradients(inputs, grid, cotangent)
     again, gradients_again = value_and_gradients(inputs, grid, cotangent)
@@ -322,7 +315,7 @@ def test_magnitude_is_that_of_the_field_and_has_no_gradient_where_nothing_is():
 @pytest.mark.usefixtures("shim")
 def test_takes_strided_and_misaligned_tensors():
     grid = AngularGrid.hemisphere(17, 33)
-    mean, cholesky, weight = (x.detach() for x in scene(20, 1, grid=grid))
+    mean, cholesky, weight = (x.detach() for x in random_scene(20, 1, grid=grid))
     expected = cuda.rasterize(mean.repeat(3, 1, 1), cholesky, weight.repeat(3, 1, 1), grid, 1e-4)
     misaligned = torch.cat([torch.zeros(1), weight.flatten()])[1:].view_as(weight)
     assert misaligned.data_ptr() % 8
@@ -332,14 +325,14 @@ def test_takes_strided_and_misaligned_tensors():
 
 @pytest.mark.usefixtures("shim")
 def test_operator_refuses_other_dtypes():
-    mean, cholesky, weight = (x.detach() for x in scene(4, 1))
+    mean, cholesky, weight = (x.detach() for x in random_scene(4, 1))
     with pytest.raises(InputError, match=r"expected float32 tensors on cpu, got torch\.float64"):
         cuda.rasterize(mean, cholesky.double(), weight, AngularGrid.hemisphere(17, 33), 1e-4)
 
 
 @pytest.mark.usefixtures("shim")
 def test_a_primitive_that_is_not_a_number_shows():
-    mean, cholesky, weight = (x.detach() for x in scene(4, 1))
+    mean, cholesky, weight = (x.detach() for x in random_scene(4, 1))
     mean[0, 1, 0] = float("nan")
     assert cuda.rasterize(mean, cholesky, weight, AngularGrid.hemisphere(17, 33), 1e-4).isnan().any()
 
@@ -351,7 +344,7 @@ def test_operators_are_registered_properly():
 
 def check_registration(device):
     """PyTorch's own checks of the operators."""
-    inputs = [x.detach().to(device).requires_grad_() for x in scene(4, 2)]
+    inputs = [x.detach().to(device).requires_grad_() for x in random_scene(4, 2)]
     torch.library.opcheck(cuda._rasterize, (*inputs, 0.1, 0.2, 5, 0.0, 9, 1e-4))
     grad = torch.ones(2, 2, 5, 9, device=device)
     torch.library.opcheck(cuda._rasterize_backward, (grad, *(x.detach() for x in inputs), 0.1, 0.2, 5, 0.0, 9, None))
@@ -369,7 +362,7 @@ def test_compiles_into_a_full_graph():
 def check_full_graph(device, backend):
     """Magnitude and gradient of a compiled function against the same one run eagerly."""
     grid = AngularGrid.hemisphere(7, 12)
-    inputs = [x.detach().to(device).requires_grad_() for x in scene(4, 2)]
+    inputs = [x.detach().to(device).requires_grad_() for x in random_scene(4, 2)]
 
     def draw(*tensors):
         return cuda.magnitude(*tensors, grid, 1e-4)
@@ -425,7 +418,7 @@ def test_gpu_hard_cases(case, cutoff):
 def test_gpu_agrees_with_the_definition(shape, n, per_position):
     grid = AngularGrid.hemisphere(*shape)
     for cutoff in (None, 1e-4):
-        assert_close(ordinary(scene(n, 3, per_position=per_position, grid=grid), grid), cutoff, "cuda")
+        assert_close(ordinary(random_scene(n, 3, per_position=per_position, grid=grid), grid), cutoff, "cuda")
 
 
 @pytest.mark.cuda
@@ -442,7 +435,7 @@ def test_gpu_same_bits_twice_and_whatever_the_batch():
 
 @pytest.mark.cuda
 def test_gpu_is_what_auto_draws_with():
-    inputs = [x.detach().cuda() for x in scene(20, 2)]
+    inputs = [x.detach().cuda() for x in random_scene(20, 2)]
     grid = AngularGrid.hemisphere(17, 33)
     assert torch.equal(rasterize(*inputs, grid), rasterize(*inputs, grid, maker="cuda"))
     doubles = [x.double() for x in inputs]
@@ -467,7 +460,7 @@ def test_gpu_follows_the_current_stream():
 @pytest.mark.cuda
 def test_gpu_graph_capture():
     grid = AngularGrid.hemisphere(17, 33)
-    leaves = [x.detach().cuda().requires_grad_() for x in scene(20, 2, grid=grid)]
+    leaves = [x.detach().cuda().requires_grad_() for x in random_scene(20, 2, grid=grid)]
     cotangent = torch.ones(2, 2, *grid.shape, device="cuda")
 
     def step():
@@ -504,7 +497,7 @@ def test_gpu_every_device():
     if torch.cuda.device_count() < 2:
         pytest.skip("needs two GPUs")
     grid = AngularGrid.hemisphere(17, 33)
-    inputs = [x.detach() for x in scene(20, 2, grid=grid)]
+    inputs = [x.detach() for x in random_scene(20, 2, grid=grid)]
     drawn = [cuda.rasterize(*(x.to(f"cuda:{i}") for x in inputs), grid, 1e-4) for i in (1, 0)]
     assert [d.device.index for d in drawn] == [1, 0]
     torch.testing.assert_close(drawn[0].cpu(), drawn[1].cpu())

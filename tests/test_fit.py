@@ -7,12 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from swiftwrf import FitConfig, FitError, InputError, ModelConfig, fit
-from swiftwrf.fit import folds
+from swiftwrf import AngularGrid, FitConfig, FitError, InputError, ModelConfig, Spectra, SwiftWRF, fit
+from swiftwrf.data.splits import folds
+from swiftwrf.fitting.optimise import Optimisation
+from swiftwrf.fitting.search import doubling_search
+from swiftwrf.gp import Kernel, choose_kernel
 from swiftwrf.metrics import psnr
-from swiftwrf.optimise import Optimisation
-from swiftwrf.prior import MIN_RANK, choose_kernel, choose_rank
-from swiftwrf.search import climb
 
 QUICK = FitConfig(model=ModelConfig(n_primitives=24), steps=200, check_every=50)
 
@@ -104,7 +104,7 @@ def test_finds_a_size_and_a_length(room):
 
 
 @pytest.mark.parametrize(
-    ("losses", "found", "looked_at"),
+    ("losses", "found", "tried"),
     [
         ([8, 4, 2, 1, 0.5], 160, 5),  # the more the better: the largest
         ([8, 4, 2, 2.1, 2.2, 0.1], 40, 5),  # two doublings in vain end the search
@@ -113,15 +113,15 @@ def test_finds_a_size_and_a_length(room):
         ([0, 0, 0], 10, 3),
     ],
 )
-def test_climb_finds_the_smallest_that_does_as_well_as_any(losses, found, looked_at):
+def test_doubling_search_finds_the_smallest_that_does_as_well_as_any(losses, found, tried):
     asked = []
 
     def loss(size):
         asked.append(size)
         return losses[len(asked) - 1]
 
-    assert climb(loss, 10, 10 * 2 ** (len(losses) - 1), patience=2) == found
-    assert asked == [10 * 2**i for i in range(looked_at)]
+    assert doubling_search(loss, 10, 10 * 2 ** (len(losses) - 1), patience=2) == found
+    assert asked == [10 * 2**i for i in range(tried)]
 
 
 def test_refuses_the_state_of_another_fit(room, tmp_path):
@@ -162,20 +162,44 @@ def test_folds_partition_and_repeat(room):
         assert torch.equal(fold, folds(room.position, kind, 3))
 
 
-def test_kernel_choice_finds_smooth_and_rough_fields(generator):
-    position = torch.rand(80, 3, generator=generator, dtype=torch.float64)
-    fold = torch.arange(80) % 5
-    smooth = torch.sin(position @ torch.rand(3, 64, generator=generator, dtype=torch.float64)).reshape(80, 8, 8)
-    noise = torch.rand(80, 8, 8, generator=generator)
-    assert choose_kernel(position, smooth, fold).noise < choose_kernel(position, noise, fold).noise
+def test_recovers_a_scene_that_it_can_represent_exactly(generator):
+    """Spectra drawn from known primitives and motions: a fit of the same size that starts beside the truth returns to it."""
+    position = torch.rand(60, 3, generator=generator, dtype=torch.float64)
+    grid = AngularGrid.hemisphere(15, 60)
+    config = ModelConfig(n_primitives=4, rank=2, components=("mean", "response"))
+    kernel = Kernel(long=2.0, short=1.0, share=0.2, noise=1e-3)
+    truth = SwiftWRF.make(config, grid, position, kernel, generator=generator)
+    with torch.no_grad():
+        truth.primitives.response.mul_(3)
+        truth.deformation.field.coefficient.normal_(std=1.0, generator=generator)
+    scene = Spectra(
+        name="exact",
+        position=position,
+        spectrum=truth(truth.normalise(position)).detach(),
+        grid=grid,
+        label=torch.zeros(60, 2, dtype=torch.float64),
+        line_of_sight=torch.ones(60, dtype=torch.bool),
+        moving="transmitter",
+        index=torch.arange(60),
+    )
+    fitting = FitConfig(model=config, rate=3e-3, prior_weight=0.0, ssim_weight=0.0, pixel_loss="l2")
+    optimisation = Optimisation(fitting, 300, scene, kernel, "cpu")
+    start = {
+        name: value + 0.05 * torch.randn(value.shape, generator=generator) for name, value in truth.named_parameters()
+    }
+    optimisation.model.load_state_dict(start, strict=False)
+    optimisation.average.module.load_state_dict(start, strict=False)
 
+    @torch.no_grad()
+    def apart(model):
+        """Largest error of a mean at the positions [rad]."""
+        means = [m.gaussians(optimisation.position).mean for m in (model, truth)]
+        return float((means[0] - means[1]).abs().max())
 
-def test_rank_counts_what_can_be_predicted(generator):
-    """Thirty smooth fields over three directions: their rank is found; noise has none."""
-    position = torch.rand(200, 3, generator=generator, dtype=torch.float64)
-    fold = torch.arange(200) % 5
-    fields = torch.sin(position @ torch.randn(3, 40, generator=generator, dtype=torch.float64) * 4)
-    smooth = (fields @ torch.randn(40, 64, generator=generator, dtype=torch.float64)).reshape(200, 8, 8)
-    noise = torch.rand(200, 8, 8, generator=generator)
-    assert 28 <= choose_rank(position, smooth, fold, choose_kernel(position, smooth, fold)) <= 40
-    assert choose_rank(position, noise, fold, choose_kernel(position, noise, fold)) == MIN_RANK
+    before = psnr(optimisation.model(optimisation.position).detach(), scene.spectrum).median()
+    began = apart(optimisation.model)
+    while optimisation.step < 300:
+        optimisation.advance()
+    after = psnr(optimisation.result(optimisation.position).detach(), scene.spectrum).median()
+    assert before < 35 < 50 < after
+    assert apart(optimisation.result) < 0.2 * began

@@ -10,7 +10,7 @@ import torch
 from swiftwrf import AngularGrid, InputError, simulated_room
 from swiftwrf.angles import great_circle, to_direction
 from swiftwrf.arrays import LIGHT_SPEED, PlanarArray
-from swiftwrf.data.room import Room
+from swiftwrf.data.simulated.room import Room
 
 FINE = AngularGrid.hemisphere(90, 360)
 

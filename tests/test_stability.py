@@ -7,12 +7,14 @@ import math
 import pytest
 import stability
 import torch
-from hard_cases import HARD_CASES
 
-from swiftwrf import FitConfig, InputError, ModelConfig, rasterize
-from swiftwrf.deformation import Kernel, MotionBasis, PerPrimitiveMLP, SmoothField
+from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, rasterize
+from swiftwrf.gp import Kernel, SmoothField
 from swiftwrf.metrics import ssim
+from swiftwrf.model.deformation import Setting, deformation_type
 from swiftwrf.rasterize.magnitude import magnitude
+from swiftwrf.testing.hard_cases import HARD_CASES
+from swiftwrf.testing.scenes import random_scene
 
 REFUSED = {
     "a pixel that is not a number": "spectrum of training spectrum 3 is not finite; mend or leave it out",
@@ -78,6 +80,11 @@ def double(*shape, seed=0):
     return torch.randn(*shape, generator=generator, dtype=torch.float64).requires_grad_()
 
 
+def test_gradcheck_of_the_definition():
+    inputs = random_scene(n=3, batch=2, dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda *x: rasterize(*x, AngularGrid.hemisphere(7, 12), "reference", None), inputs)
+
+
 def test_gradcheck_of_the_magnitude():
     assert torch.autograd.gradcheck(magnitude, double(2, 2, 3, 4))
 
@@ -95,12 +102,12 @@ def test_gradcheck_of_the_smooth_field():
 @pytest.mark.parametrize("make", ["motion_basis", "per_primitive_mlp"])
 def test_gradcheck_of_the_deformations(make):
     generator, components = torch.Generator().manual_seed(0), ("mean", "response", "attenuation", "cholesky")
+    anchor = torch.rand(5, 3, generator=generator, dtype=torch.float64)
+    setting = Setting(3, components, 2, anchor, Kernel())
+    module = deformation_type(make).initial(setting, generator=generator).double()
     if make == "motion_basis":
-        anchor = torch.rand(5, 3, generator=generator, dtype=torch.float64)
-        module = MotionBasis(anchor, Kernel(), 2, 3, components, generator=generator).double()
         parameters = {"field.coefficient": double(5, 2), "basis": double(2, 3, 8)}
     else:
-        module = PerPrimitiveMLP(components, generator=generator).double()
         parameters = {"output.weight": double(8, 156), "output.bias": double(8)}
     position, mean = torch.rand(2, 3, generator=generator, dtype=torch.float64), torch.rand(3, 2, dtype=torch.float64)
 

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 from torch import Tensor
 from torch.nn import functional
 
 from swiftwrf.angles import AngularGrid
 from swiftwrf.arrays import PlanarArray
-from swiftwrf.data.splits import choose_split
+from swiftwrf.data.splits import MIN_TRAINING, choose_split
 from swiftwrf.errors import InputError
 
 Moving = Literal["transmitter", "receiver"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Spectra:
     """Spectra and where the moving end of the link stood when each was taken.
 
@@ -92,3 +94,25 @@ def coarsening(shape: Sequence[int], max_azimuths: int, least_rows: int = 1) -> 
     least = math.ceil(shape[1] / max_azimuths) if max_azimuths else 1
     factors = range(least, shape[0] // least_rows + 1)
     return next((factor for factor in factors if all(size % factor == 0 for size in shape)), 1)
+
+
+def check_training(train: Spectra) -> None:
+    """Enough spectra to learn from, all finite.
+
+    Raises:
+        InputError: fewer than 10, or the first that is not finite.
+    """
+    if len(train) < MIN_TRAINING:
+        raise InputError(f"a fit needs at least {MIN_TRAINING} spectra, got {len(train)}")
+    for name, tensor in (("position", train.position), ("spectrum", train.spectrum)):
+        bad = (~tensor.isfinite()).flatten(1).any(dim=1).nonzero()
+        if len(bad):
+            raise InputError(f"{name} of training spectrum {int(bad[0])} is not finite; mend or leave it out")
+
+
+def fingerprint(train: Spectra, *settings: Any) -> str:
+    """Tells whether something kept on disk belongs to these spectra and settings (plain values)."""
+    digest = hashlib.sha256(json.dumps(settings).encode())
+    for tensor in (train.position, train.spectrum):
+        digest.update(tensor.numpy().tobytes())
+    return digest.hexdigest()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -11,6 +12,9 @@ from swiftwrf.errors import InputError
 
 TEST_SHARE = 0.2
 MIN_TRAINING = 10
+FOLDS = 5  # parts of the training rows that are held out in turn to choose settings
+
+Validation = Literal["random", "block"]
 
 
 def split_names(folder: Path) -> list[str]:
@@ -89,6 +93,20 @@ def block_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:
     n_slabs = round(1 / TEST_SHARE)
     held_out = slabs(position, n_slabs) == seed % n_slabs
     return (~held_out).nonzero()[:, 0], held_out.nonzero()[:, 0]
+
+
+def folds(position: Tensor, validation: Validation, seed: int) -> Tensor:
+    """Number of the fold, 0 to 4, of each training position (n, 3): drawn at random, or slabs."""
+    if validation == "block":
+        return slabs(position, FOLDS)
+    order = torch.randperm(len(position), generator=torch.Generator().manual_seed(seed))
+    return order % FOLDS
+
+
+def validation_for(split: str) -> Validation:
+    """How training rows are held out so that it is like the split: single rows where test rows lie among training rows,
+    whole regions where the test part is a place of its own or its making is unknown."""
+    return "random" if split == "random" else "block"
 
 
 def choose_split(

@@ -11,10 +11,10 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from augment.synthesize import Coarray, SwiftWRFSynthesizer
 from torch import Tensor
 
 from augment import SYNTHESIZERS, Mixed, Places, make_synthesizer, mix, withhold
-from augment.synthesize import Coarray, SwiftWRFSynthesizer
 from swiftwrf import FitConfig, InputError, Spectra, load_spectra, simulated_room
 from swiftwrf.arrays import PlanarArray
 from swiftwrf.checkpoint import read, write

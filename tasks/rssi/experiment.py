@@ -10,9 +10,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from PIL import Image, UnidentifiedImageError
+from swiftwrf.fit_config import Validation
 
 from swiftwrf import InputError, Rssi, load_rssi, rssi_room
-from swiftwrf.fit_config import Validation
 from swiftwrf.metrics import summary
 from tasks.report import write_report
 from tasks.rssi.cluster import on_cluster

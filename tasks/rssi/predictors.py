@@ -13,11 +13,11 @@ from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 from sklearn.linear_model import LinearRegression
 from sklearn.model_selection import GridSearchCV, PredefinedSplit
 from sklearn.neighbors import KNeighborsRegressor
+from swiftwrf.fit import folds
+from swiftwrf.fit_config import Validation
 from torch import Tensor
 
 from swiftwrf import InputError, Rssi, RssiConfig, RssiModel, fit_rssi
-from swiftwrf.fit import folds
-from swiftwrf.fit_config import Validation
 from swiftwrf.rssi import log_distance
 
 NEIGHBOURS = (1, 3, 5, 8, 12, 20, 40, 80, 120)

@@ -8,11 +8,11 @@ from collections.abc import Callable
 GAIN = 0.01  # a share of the loss below which the difference between two fits is chance
 
 
-def climb(loss: Callable[[int], float], first: int, last: int, patience: int) -> int:
+def doubling_search(loss: Callable[[int], float], first: int, last: int, patience: int) -> int:
     """The smallest of first, 2 first, 4 first, ... whose loss is within 1 % of the lowest that was found.
 
     Doubles until that has lowered the loss by less than 1 % `patience` times in a row, or up to `last`. What lies beyond is
-    not looked at, so the search costs about as much as its last members.
+    not tried, so the search costs about as much as its last members.
 
     Args:
         loss: of a fit of that size on spectra that it has not seen.

@@ -11,17 +11,24 @@ from torch import Tensor
 
 from swiftwrf.angles import AngularGrid, ArrayPose
 from swiftwrf.data.files import read_positions, read_yaml, sha256
+from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format
 from swiftwrf.data.spectra import Moving, Spectra
 from swiftwrf.data.splits import read_split, split_names
 from swiftwrf.errors import InputError
 
 
-def load_nerf2(folder: Path) -> Spectra:
-    """Spectra of a folder in the NeRF2 layout; row i of the positions belongs to the image numbered i from 1.
+@SPECTRA_FORMATS.register("nerf2", meaning="gateway_info.yml, tx_pos.csv or rx_pos.csv, spectrum/00001.png, ...")
+class Nerf2(Format[Spectra]):
+    """Images; row i of the positions belongs to the image numbered i from 1."""
 
-    Raises:
-        InputError: what is missing, does not fit together or is not what the layout says.
-    """
+    def recognises(self, path: Path) -> bool:
+        return (path / "gateway_info.yml").is_file() or (path / "spectrum").is_dir()
+
+    def read(self, path: Path) -> Spectra:
+        return _read(path)
+
+
+def _read(folder: Path) -> Spectra:
     pose = _read_pose(folder / "gateway_info.yml")
     tables = [file for file in (folder / "tx_pos.csv", folder / "rx_pos.csv") if file.is_file()]
     if len(tables) != 1:

@@ -53,7 +53,7 @@ class Primitives(nn.Module):
         scenes: tuple[int, ...] = (),
     ) -> None:
         super().__init__()
-        self.bounded, self.lean = bounded, 0.0 if axis_aligned else 1.0
+        self.bounded, self.shear = bounded, 0.0 if axis_aligned else 1.0
         unit = torch.rand(*scenes, n, 2, generator=generator).clamp(1e-3, 1 - 1e-3)
         extent = torch.tensor([2 * math.pi, math.pi / 2])
         pixel = torch.tensor([grid.azimuth_step, grid.elevation_step], dtype=torch.float32)
@@ -77,7 +77,7 @@ class Primitives(nn.Module):
         of l3."""
         diagonal = torch.exp(cholesky[..., ::2].clamp(max=math.log(WIDEST))) + self.floor
         return torch.stack(
-            [diagonal[..., 0], self.lean * cholesky[..., 1] * diagonal[..., 1], diagonal[..., 1]], dim=-1
+            [diagonal[..., 0], self.shear * cholesky[..., 1] * diagonal[..., 1], diagonal[..., 1]], dim=-1
         )
 
     def forward(self) -> Gaussians:

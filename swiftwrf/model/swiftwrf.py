@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal, Self
 
 import torch
 from torch import Tensor, nn
 
-from swiftwrf import checkpoint, checks
 from swiftwrf.angles import AngularGrid
-from swiftwrf.deformation import Kernel, MotionBasis, Offsets, PerPrimitiveMLP
+from swiftwrf.checkpoint import Header, Saved
 from swiftwrf.errors import InputError
-from swiftwrf.primitives import Gaussians, Primitives
+from swiftwrf.gp import Kernel
+from swiftwrf.model.deformation import Deformation, Offsets, Setting, deformation_type
+from swiftwrf.model.primitives import Gaussians, Primitives
+from swiftwrf.positions import check_positions
 from swiftwrf.rasterize import rasterize_magnitude
-
-Deformation = Literal["motion_basis", "per_primitive_mlp", "none"]
 
 
 @dataclass(frozen=True)
@@ -25,8 +24,8 @@ class ModelConfig:
 
     n_primitives: int | Literal["auto"] = "auto"
     """number N of primitives; auto lets the fit find how many the scene needs"""
-    deformation: Deformation = "motion_basis"
-    """how they move: low-rank motion (fast), the paper's network per primitive, or not at all"""
+    deformation: str = "motion_basis"
+    """how they move: a name of `swiftwrf.model.deformation.DEFORMATIONS`"""
     components: tuple[Literal["mean", "response", "attenuation", "cholesky"], ...] = (
         "mean",
         "response",
@@ -37,7 +36,7 @@ class ModelConfig:
     rank: int | Literal["auto"] = "auto"
     """number K of motions that the motion basis mixes; auto lets the fit find how many the scene needs"""
     axis_aligned: bool = False
-    """primitives do not lean: l2 = 0"""
+    """keep the axes of the primitives along azimuth and elevation: l2 = 0"""
     bounded: bool = False
     """keep canonical means inside the grid by the paper's tanh map"""
     cutoff: float = 1e-4
@@ -56,48 +55,69 @@ class ModelConfig:
             )
         return self.n_primitives, self.rank
 
+    def make_primitives(self, grid: AngularGrid, generator: torch.Generator) -> Primitives:
+        """Canonical primitives at their start."""
+        n, _ = self.size
+        return Primitives(n, grid, bounded=self.bounded, axis_aligned=self.axis_aligned, generator=generator)
 
-class SwiftWRF(nn.Module):
+
+class SwiftWRF(nn.Module, Saved):
     """Spectrum at any position: |sum_n psi_n delta_n kernel_n|, with parameters deformed by the position.
 
     Args:
         config: what it consists of.
         grid: the grid that it is fitted on and that `synthesize` draws unless told otherwise.
-        anchor: positions (M, 3) [m] of the training spectra; they give the frame in which positions are normalised and
-            the anchors of the motion basis.
-        kernel: of the motion basis, with lengths [m].
-        generator: for the initial parameters.
+        centre, scale: of the frame in which positions are normalised, float64 (3,) and () [m].
+        primitives: canonical ones.
+        deformation: how they move.
     """
 
+    kind: ClassVar[str] = "swiftwrf model"
+
     def __init__(
-        self, config: ModelConfig, grid: AngularGrid, anchor: Tensor, kernel: Kernel, *, generator: torch.Generator
+        self,
+        config: ModelConfig,
+        grid: AngularGrid,
+        centre: Tensor,
+        scale: Tensor,
+        primitives: Primitives,
+        deformation: Deformation,
     ) -> None:
         super().__init__()
         self.config, self.grid = config, grid
-        n, rank = config.size
-        low, high = anchor.min(dim=0).values, anchor.max(dim=0).values
-        scale = float((high - low).max()) / 2 or 1.0
-        self.register_buffer("centre", ((low + high) / 2).double())
-        self.register_buffer("scale", torch.tensor(scale, dtype=torch.float64))
-        self.primitives = Primitives(
-            n, grid, bounded=config.bounded, axis_aligned=config.axis_aligned, generator=generator
-        )
-        self.deformation: MotionBasis | PerPrimitiveMLP | None
-        if config.deformation == "motion_basis":
-            normalised, scaled = self.normalise(anchor), kernel.scaled(1 / scale)
-            self.deformation = MotionBasis(normalised, scaled, rank, n, config.components, generator=generator)
-        elif config.deformation == "per_primitive_mlp":
-            self.deformation = PerPrimitiveMLP(config.components, generator=generator)
-        else:
-            self.deformation = None
+        self.register_buffer("centre", centre)
+        self.register_buffer("scale", scale)
+        self.primitives, self.deformation = primitives, deformation
 
     centre: Tensor
     scale: Tensor
 
+    @classmethod
+    def make(
+        cls, config: ModelConfig, grid: AngularGrid, anchor: Tensor, kernel: Kernel, *, generator: torch.Generator
+    ) -> Self:
+        """A model at its start.
+
+        Args:
+            config, grid: see the class.
+            anchor: positions (M, 3) [m] of training spectra; they give the frame in which positions are normalised and
+                the anchors of the motion.
+            kernel: of the motion's prior, with lengths [m].
+            generator: for the initial parameters.
+        """
+        n, rank = config.size
+        low, high = anchor.min(dim=0).values, anchor.max(dim=0).values
+        scale = float((high - low).max()) / 2 or 1.0
+        frame = ((low + high) / 2).double(), torch.tensor(scale, dtype=torch.float64)
+        primitives = config.make_primitives(grid, generator)
+        setting = Setting(n, config.components, rank, _normalise(anchor, *frame), kernel.scaled(1 / scale))
+        deformation = deformation_type(config.deformation).initial(setting, generator=generator)
+        return cls(config, grid, *frame, primitives, deformation)
+
     def normalise(self, position: Tensor) -> Tensor:
         """Positions (n, 3) [m] in the training positions' frame, float32: their box is centred in [-1, 1]^3 and scaled
         alike on all axes. In float64 first, so that coordinates in kilometres keep their millimetres."""
-        return ((position.double() - self.centre) / self.scale).float()
+        return _normalise(position, self.centre, self.scale)
 
     def gaussians(self, position: Tensor, *, deform: bool = True, stop_mean: bool = False) -> Gaussians:
         """The primitives at normalised positions (B, 3).
@@ -106,10 +126,12 @@ class SwiftWRF(nn.Module):
             deform: False leaves them canonical (the coarse stage).
             stop_mean: no gradient reaches the canonical means (the paper's fine stage).
         """
-        canonical = self.primitives()
+        canonical: Gaussians = self.primitives()
         if stop_mean:
             canonical = canonical._replace(mean=canonical.mean.detach())
-        offsets = Offsets() if self.deformation is None or not deform else self.deformation(position, canonical.mean)
+        if not deform:
+            return canonical
+        offsets: Offsets = self.deformation(position, canonical.mean)
         mean, cholesky, attenuation, response = canonical
         if offsets.cholesky is not None:
             cholesky = self.primitives.constrained(self.primitives.cholesky + offsets.cholesky)
@@ -146,7 +168,7 @@ class SwiftWRF(nn.Module):
         Raises:
             InputError: positions of another shape, or not finite.
         """
-        position = checks.positions(position)
+        position = check_positions(position)
         grid = grid or self.grid
         spectrum = torch.empty(len(position), *grid.shape)
         for start in range(0, len(position), batch):
@@ -154,30 +176,21 @@ class SwiftWRF(nn.Module):
             spectrum[start : start + batch] = self.draw(self.gaussians(x), len(x), grid).clamp(0, 1)
         return spectrum
 
-    def save(self, path: str | Path, provenance: dict[str, str] | None = None) -> None:
-        """Writes the model to one safetensors file, its configuration and `provenance` in the header."""
-        motion = self.deformation.field.kernel if isinstance(self.deformation, MotionBasis) else Kernel()
-        header = {
-            "config": asdict(self.config),
-            "grid": asdict(self.grid),
-            "kernel": asdict(motion),
-            "provenance": provenance or {},
-        }
-        checkpoint.write(path, "swiftwrf model", self.state_dict(), header)
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        header = {"config": asdict(self.config), "grid": asdict(self.grid)}
+        return self.state_dict(), header | self.deformation.header()
+
+    @classmethod
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
+        config = ModelConfig(**{**header["config"], "components": tuple(header["config"]["components"])})
+        grid = AngularGrid(**header["grid"])
+        primitives = config.make_primitives(grid, torch.Generator())
+        own = {name.removeprefix("deformation."): t for name, t in tensors.items() if name.startswith("deformation.")}
+        deformation = deformation_type(config.deformation).restore(config.components, header, own)
+        model = cls(config, grid, tensors["centre"], tensors["scale"], primitives, deformation)
+        model.load_state_dict(tensors)
+        return model.eval()
 
 
-def load(path: str | Path) -> SwiftWRF:
-    """The model that `SwiftWRF.save` wrote.
-
-    Raises:
-        InputError: not such a file.
-    """
-    tensors, header = checkpoint.read(path, "swiftwrf model")
-    config = ModelConfig(**{**header["config"], "components": tuple(header["config"]["components"])})
-    anchor = torch.zeros_like(tensors.get("deformation.field.anchor", torch.empty(1, 3)))  # of the right shape, for now
-    grid = AngularGrid(**header["grid"])
-    model = SwiftWRF(config, grid, anchor, Kernel(), generator=torch.Generator())
-    model.load_state_dict(tensors)
-    if isinstance(model.deformation, MotionBasis):
-        model.deformation.field.kernel = Kernel(**header["kernel"])
-    return model.eval()
+def _normalise(position: Tensor, centre: Tensor, scale: Tensor) -> Tensor:
+    return ((position.double() - centre) / scale).float()

@@ -12,6 +12,7 @@ from torch import Tensor
 from swiftwrf.angles import AngularGrid, to_angles
 from swiftwrf.arrays import PlanarArray
 from swiftwrf.data.files import sha256
+from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format
 from swiftwrf.data.spectra import Moving, Spectra
 from swiftwrf.data.splits import read_split, split_names
 from swiftwrf.errors import InputError
@@ -27,6 +28,17 @@ NAMES = (
     "line_of_sight",
     "frequency_hz",
 )
+
+
+@SPECTRA_FORMATS.register("paths", meaning="ray paths in paths.npz")
+class Paths(Format[Spectra]):
+    """Traced paths, turned into spectra."""
+
+    def recognises(self, path: Path) -> bool:
+        return (path / "paths.npz").is_file()
+
+    def read(self, path: Path) -> Spectra:
+        return load_paths(path)
 
 
 def load_paths(folder: Path, grid: AngularGrid = GRID) -> Spectra:

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
-from swiftwrf import checks
-from swiftwrf.data.spectra import Spectra, coarsening
-from swiftwrf.data.splits import slabs
-from swiftwrf.fit_config import FitConfig, Validation
+from swiftwrf.data.spectra import Spectra, check_training, coarsening, fingerprint
+from swiftwrf.data.splits import folds
+from swiftwrf.fitting.config import FitConfig
+from swiftwrf.fitting.optimise import Optimisation
+from swiftwrf.fitting.search import doubling_search
+from swiftwrf.fitting.state import Record, Session, Size
+from swiftwrf.gp import choose_kernel
 from swiftwrf.metrics import WINDOW
 from swiftwrf.model import SwiftWRF
-from swiftwrf.optimise import Optimisation, Record, Session, fingerprint
-from swiftwrf.prior import choose_kernel, choose_rank
+from swiftwrf.model.deformation import deformation_type
 from swiftwrf.progress import progress_bar
-from swiftwrf.search import climb
 
-FOLDS = 5  # the search holds out one; the kernel is chosen over all
 FEWEST, TYPICAL, MOST = 16, 64, 2048  # primitives that the search tries
 SHORTEST, LONGEST = 300, 1200  # steps that it tries
 SEARCH_AZIMUTHS = 90  # columns of the spectra in the search: coarser ones rank the candidates alike
@@ -45,8 +44,8 @@ def fit(
         config: how; `FitConfig()` unless given.
         device: where to compute.
         checkpoint: a file that keeps the state of the fit; where it exists, the fit goes on from it.
-        on_record: called at each look with stage (search, final), n_primitives, steps, step, loss, validation loss (final
-            stage: none) and seconds.
+        on_record: called at each evaluation with stage (search, final), n_primitives, steps, step, loss, validation loss
+            (final stage: none) and seconds.
         progress: show a progress bar on a terminal.
 
     Raises:
@@ -55,24 +54,26 @@ def fit(
             worse than it began.
     """
     config = config or FitConfig()
-    checks.training(train)
+    check_training(train)
     fold = folds(train.position, config.validation, config.seed)
     # an array's beams are far wider than a pixel, so little is lost at the coarser resolution of the fit
     work = _at_most(config.max_azimuths, train)
     kernel = choose_kernel(work.position, work.spectrum, fold)
     if config.model.rank == "auto":
-        rank = choose_rank(work.position, work.spectrum, fold, kernel)
+        deformation = deformation_type(config.model.deformation)
+        rank = deformation.choose_rank(work.position, work.spectrum, fold, kernel)
         config = replace(config, model=replace(config.model, rank=rank))
     with progress_bar(progress) as bar:
-        session = Session(checkpoint, fingerprint(config, work), bar, on_record)
+        session = Session(checkpoint, fingerprint(work, asdict(config)), bar, on_record)
         small = _at_most(SEARCH_AZIMUTHS, work)
         kept, held_out = (small.subset(rows.nonzero()[:, 0]) for rows in (fold != 0, fold == 0))
 
         def loss(n: int, steps: int) -> float:
-            optimisation = Optimisation(_sized(config, n), steps, kept, kernel, device, held_out)
-            if optimisation.name not in session.losses:
-                session.losses[optimisation.name] = optimisation.run(session).held_out_loss()
-            return session.losses[optimisation.name]
+            key = Size(False, n, steps).key
+            if key not in session.losses:
+                run = Optimisation(_sized(config, n), steps, kept, kernel, device, held_out).run(session)
+                session.losses[key] = run.held_out_loss()
+            return session.losses[key]
 
         n, steps = _choose_size(loss, config)
         model = Optimisation(_sized(config, n), steps, work, kernel, device).run(session).result
@@ -88,9 +89,9 @@ def _choose_size(loss: Callable[[int, int], float], config: FitConfig) -> tuple[
     """
     n, steps = config.model.n_primitives, config.steps
     if steps == "auto":  # first, for sizes that are compared in short fits favour large ones
-        steps = climb(lambda steps: loss(TYPICAL if n == "auto" else n, steps), SHORTEST, LONGEST, patience=1)
+        steps = doubling_search(lambda steps: loss(TYPICAL if n == "auto" else n, steps), SHORTEST, LONGEST, patience=1)
     if n == "auto":
-        n = climb(lambda n: loss(n, steps), FEWEST, MOST, patience=2)
+        n = doubling_search(lambda n: loss(n, steps), FEWEST, MOST, patience=2)
     return n, steps
 
 
@@ -100,11 +101,3 @@ def _at_most(azimuths: int, spectra: Spectra) -> Spectra:
 
 def _sized(config: FitConfig, n: int) -> FitConfig:
     return replace(config, model=replace(config.model, n_primitives=n))
-
-
-def folds(position: Tensor, validation: Validation, seed: int) -> Tensor:
-    """Number of the fold, 0 to 4, of each training position."""
-    if validation == "block":
-        return slabs(position, FOLDS)
-    order = torch.randperm(len(position), generator=torch.Generator().manual_seed(seed))
-    return order % FOLDS

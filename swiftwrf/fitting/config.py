@@ -1,13 +1,12 @@
-"""What a fit is told."""
+"""How models of spectra are fitted."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+from swiftwrf.data.splits import Validation
 from swiftwrf.model import ModelConfig
-
-Validation = Literal["random", "block"]
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class FitConfig:
     validation: Validation = "random"
     """what is held out inside the training part: single spectra, or a region where the model must extrapolate"""
     check_every: int = 50
-    """steps between two looks, at which progress is recorded and the state kept"""
+    """steps between two evaluations, at which progress is recorded and the state kept"""
     seed: int = 0
 
     @classmethod

@@ -7,8 +7,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from swiftwrf.data.room import Room
 from swiftwrf.data.rssi import Rssi
+from swiftwrf.data.simulated.room import Room
 
 FLOOR = Room(
     size=(20.0, 16.0, 3.0),

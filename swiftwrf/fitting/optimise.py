@@ -1,80 +1,26 @@
-"""One optimisation of a model: schedule, loss, guards, state on disk."""
+"""One optimisation of a model: steps, rates, guards."""
 
 from __future__ import annotations
 
 import copy
-import hashlib
-import json
 import math
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any, cast
 
 import torch
-from rich.progress import Progress
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from swiftwrf import checkpoint as files
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.deformation import Kernel, MotionBasis
 from swiftwrf.errors import FitError, InputError
-from swiftwrf.fit_config import FitConfig
-from swiftwrf.metrics import ssim
+from swiftwrf.fitting.config import FitConfig
+from swiftwrf.fitting.loss import spectrum_loss
+from swiftwrf.fitting.state import Session, Size, State
+from swiftwrf.gp import Kernel, thinned
 from swiftwrf.model import SwiftWRF
-from swiftwrf.prior import thinned
 
 AVERAGING = 0.98  # a step's weight decays by this much a step: averaged parameters predict better than the last ones
 MAX_ANCHORS = 1000  # of the motion: a step costs their square
-Record = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class State:
-    """Where an interrupted fit stood."""
-
-    header: dict[str, Any]
-    tensors: dict[str, Tensor]
-
-
-@dataclass
-class Session:
-    """What the runs of one fit share: where their state is kept, and who is told.
-
-    Args:
-        path: of the state; None keeps none.
-        owner: fingerprint of configuration and spectra.
-        bar: shows progress.
-        on_record: is told at each look.
-        saved: the state of an earlier session of the same fit.
-        losses: of runs that are done, on held-out spectra, by their name.
-    """
-
-    path: Path | None
-    owner: str
-    bar: Progress
-    on_record: Callable[[Record], None] | None
-    saved: State | None = None
-    losses: dict[str, float] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if self.path is not None and self.path.exists():
-            tensors, header = files.read(self.path, "fit state")
-            if header["fingerprint"] != self.owner:
-                raise InputError(
-                    f"{self.path} is the state of another fit (other spectra or settings); remove it or give another path"
-                )
-            self.saved, self.losses = State(header, tensors), header["losses"]
-
-
-def fingerprint(config: FitConfig, train: Spectra) -> str:
-    """Says whether a saved state belongs to this configuration and these spectra."""
-    digest = hashlib.sha256(json.dumps(asdict(config)).encode())
-    for tensor in (train.position, train.spectrum):
-        digest.update(tensor.numpy().tobytes())
-    return digest.hexdigest()
 
 
 class Optimisation:
@@ -85,7 +31,7 @@ class Optimisation:
         steps: their number.
         train: spectra to fit.
         kernel: of the motion's prior, lengths in [m].
-        held_out: spectra to look at.
+        held_out: spectra to evaluate on.
     """
 
     def __init__(
@@ -97,23 +43,23 @@ class Optimisation:
         device: torch.device | str,
         held_out: Spectra | None = None,
     ) -> None:
-        self.name = (
-            f"{'final' if held_out is None else 'search'}, {config.model.n_primitives} primitives, {steps} steps"
-        )
-        self.steps, self.config = steps, config
+        n, _ = config.model.size
+        self.size, self.steps, self.config = Size(held_out is None, n, steps), steps, config
         self.coarse_steps = round(config.coarse_share * steps)
         generator = torch.Generator().manual_seed(config.seed)
         (anchor,) = thinned(train.position, rows=MAX_ANCHORS)
-        model = SwiftWRF(config.model, train.grid, anchor, kernel, generator=generator)
+        model = SwiftWRF.make(config.model, train.grid, anchor, kernel, generator=generator)
         self.model = model.to(device)
         self.position, self.spectrum = self._tensors(train)
-        # everything random is drawn now: nothing is copied to the device between two looks
+        # everything random is drawn now: nothing is copied to the device between two evaluations
         batch = min(config.batch, len(train))
         self.rows = torch.randint(len(train), (steps, batch), generator=generator).to(device)
         noisy = steps if config.smoothing else 0
         self.noise = torch.randn(noisy, batch, 3, generator=generator).to(device)
         self.held_out = None if held_out is None else self._tensors(held_out)
-        self.optimiser = self._optimiser()
+        groups = [{"params": list(self.model.primitives.parameters()), "peak": config.rate}]
+        groups += self.model.deformation.parameter_groups(config.rate, config.deformation_rate)
+        self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99))
         self.average = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(AVERAGING))
         self.step, self.seconds, self.first_loss = 0, 0.0, math.inf
         self.broken_at = torch.tensor(steps, device=device)  # the first step whose loss was not finite
@@ -122,18 +68,6 @@ class Optimisation:
         device = self.model.centre.device
         return self.model.normalise(spectra.position.to(device)), spectra.spectrum.to(device)
 
-    def _optimiser(self) -> torch.optim.Adam:
-        rate, deformation = self.config.rate, self.model.deformation
-        groups: list[dict[str, Any]] = [{"params": list(self.model.primitives.parameters()), "peak": rate}]
-        if isinstance(deformation, MotionBasis):
-            groups += [
-                {"params": [deformation.field.coefficient], "peak": rate},
-                {"params": [deformation.basis], "peak": rate / 2},
-            ]
-        elif deformation is not None:
-            groups += [{"params": list(deformation.parameters()), "peak": self.config.deformation_rate or rate}]
-        return torch.optim.Adam(groups, betas=(0.9, 0.99))
-
     def _rate(self, step: int) -> float:
         """Share of the peak rate: warm-up, then cosine decay."""
         cosine = 0.5 * (1 + math.cos(math.pi * step / self.steps))
@@ -141,10 +75,8 @@ class Optimisation:
         return min(1.0, (step + 1) / self.config.warm_up) * decayed
 
     def loss(self, drawn: Tensor, measured: Tensor) -> Tensor:
-        """Paper, equation of the loss: 0.7 L1 + 0.3 (1 - SSIM) at the default weight."""
-        weight, error = self.config.ssim_weight, drawn - measured
-        pixels = error.abs() if self.config.pixel_loss == "l1" else error.square()
-        return (1 - weight) * pixels.mean() + weight * (1 - ssim(drawn, measured).mean())
+        """Of spectra; see `spectrum_loss`."""
+        return spectrum_loss(drawn, measured, self.config)
 
     def smoothing(self) -> float:
         """Standard deviation of the noise on normalised positions: gamma 2 / cbrt(N_s) (1 - i / tau) (paper, annealed
@@ -157,7 +89,7 @@ class Optimisation:
         """One step; its loss.
 
         Raises:
-            FitError: a loss or gradient that is not finite. A GPU is only asked at each look, for asking waits for it.
+            FitError: a loss or gradient that is not finite. A GPU is only asked at each evaluation, for asking waits for it.
         """
         config, model = self.config, self.model
         rows = self.rows[self.step]
@@ -170,14 +102,15 @@ class Optimisation:
         except InputError as error:  # parameters ran away, so that a primitive is no longer one
             raise FitError(f"the fit broke at step {self.step}: {error}; {self._advice()}") from None
         loss = self.loss(drawn, self.spectrum[rows])
-        if isinstance(model.deformation, MotionBasis):
-            loss = loss + config.prior_weight / len(self.position) * model.deformation.field.prior()
+        prior = model.deformation.prior()
+        if prior is not None:
+            loss = loss + config.prior_weight / len(self.position) * prior
         self.optimiser.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         norm = nn.utils.clip_grad_norm_(model.parameters(), max_norm=1.0)
         finite = loss.detach().isfinite() & norm.isfinite()
         self.broken_at = torch.where(finite, self.broken_at, self.broken_at.clamp(max=self.step))
-        if (not loss.is_cuda or self._looks_after(self.step + 1)) and (broken := int(self.broken_at)) <= self.step:
+        if (not loss.is_cuda or self._evaluates_after(self.step + 1)) and (broken := int(self.broken_at)) <= self.step:
             raise FitError(
                 f"the fit broke at step {broken}: its loss or gradient is not a finite number; {self._advice()}"
             )
@@ -188,7 +121,7 @@ class Optimisation:
         self.step += 1
         return loss.detach()
 
-    def _looks_after(self, step: int) -> bool:
+    def _evaluates_after(self, step: int) -> bool:
         return step % self.config.check_every == 0 or step == self.steps
 
     def _advice(self) -> str:
@@ -212,23 +145,23 @@ class Optimisation:
 
     def run(self, session: Session) -> Optimisation:
         """Takes all steps, from where the session's saved state stands if that is of this run; keeps the state at each
-        look.
+        evaluation.
 
         Raises:
             FitError: it ended worse than it began.
         """
-        if session.saved is not None and session.saved.header["name"] == self.name:
+        if session.saved is not None and session.saved.header["run"] == self.size.key:
             self._restore(session.saved)
-        task = session.bar.add_task(self.name, total=self.steps, completed=self.step)
+        task = session.bar.add_task(str(self.size), total=self.steps, completed=self.step)
         began = time.perf_counter() - self.seconds
         while self.step < self.steps:
             loss = self.advance()
             if self.step == 1:
                 self.first_loss = float(loss)
             session.bar.update(task, completed=self.step)
-            if self._looks_after(self.step):
+            if self._evaluates_after(self.step):
                 self.seconds = time.perf_counter() - began
-                self._save(session)
+                self._keep(session)
                 self._record(session, loss)
                 if self.step == self.steps and float(loss) > self.first_loss:
                     raise FitError(
@@ -242,8 +175,8 @@ class Optimisation:
         if session.on_record is not None:
             session.on_record(
                 {
-                    "stage": "search" if self.held_out else "final",
-                    "n_primitives": self.config.model.n_primitives,
+                    "stage": "final" if self.size.final else "search",
+                    "n_primitives": self.size.n_primitives,
                     "steps": self.steps,
                     "step": self.step,
                     "loss": float(loss),
@@ -252,23 +185,20 @@ class Optimisation:
                 }
             )
 
-    def _save(self, session: Session) -> None:
-        if session.path is None:
-            return
+    def _keep(self, session: Session) -> None:
         tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
         tensors |= {f"average.{name}": value for name, value in self.average.state_dict().items()}
         for number, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{number}.{name}": torch.as_tensor(value) for name, value in moments.items()}
-        header = {name: getattr(self, name) for name in ("name", "step", "seconds", "first_loss")}
-        header |= {"losses": session.losses, "fingerprint": session.owner}
-        files.write(session.path, "fit state", tensors, header)
+        header = {name: getattr(self, name) for name in ("step", "seconds", "first_loss")}
+        session.keep(tensors, header | {"run": self.size.key})
 
     def _restore(self, saved: State) -> None:
         header, tensors = saved.header, saved.tensors
         self.step, self.seconds, self.first_loss = header["step"], header["seconds"], header["first_loss"]
         for prefix, module in (("model.", self.model), ("average.", self.average)):
             module.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
-        state = copy.deepcopy(self.optimiser.state_dict())
+        state: dict[str, Any] = copy.deepcopy(self.optimiser.state_dict())
         for name, value in tensors.items():
             if name.startswith("optimiser."):
                 _, number, moment = name.split(".")

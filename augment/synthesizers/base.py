@@ -1,0 +1,73 @@
+"""What every synthesizer is, and how one is made by its name."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from swiftwrf import Spectra
+from swiftwrf.checkpoint import Saved
+from swiftwrf.data.splits import Validation
+from swiftwrf.registry import Registry
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a synthesizer may be given; each takes what it needs.
+
+    Args:
+        validation: how training spectra are held out to choose settings: at random, or a region at a time where the
+            positions to come lie apart from the measured ones.
+        seed: of what is random.
+        preset: quick is sized for a CPU, paper is the publication's.
+        device: where to compute.
+        checkpoint: a file that keeps the state of a long fit; where it exists, the fit goes on from it.
+        on_record: called with the records of a fit.
+        progress: show a progress bar on a terminal.
+    """
+
+    validation: Validation = "random"
+    seed: int = 0
+    preset: Literal["quick", "paper"] = "quick"
+    device: torch.device | str = "cpu"
+    checkpoint: Path | None = None
+    on_record: Callable[[dict[str, Any]], None] | None = None
+    progress: bool = True
+
+
+class Synthesizer(ABC):
+    """Learns from spectra, then draws one at any position."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+
+    @abstractmethod
+    def fit(self, train: Spectra) -> None:
+        """Learns; `train` is all it ever sees."""
+
+    @abstractmethod
+    def synthesize(self, position: Tensor) -> Tensor:
+        """Magnitudes in [0, 1], float32 (n, H, W), at positions (n, 3) [m]."""
+
+    @property
+    def model(self) -> Saved | None:
+        """What was fitted, where it can be saved."""
+        return None
+
+
+SYNTHESIZERS: Registry[Synthesizer] = Registry("synthesizer")
+
+
+def make_synthesizer(name: str, settings: Settings | None = None) -> Synthesizer:
+    """The synthesizer of that name.
+
+    Raises:
+        InputError: an unknown name.
+    """
+    return SYNTHESIZERS[name].make(settings or Settings())

@@ -1,0 +1,20 @@
+"""Look-up."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from augment.synthesizers.base import SYNTHESIZERS, Synthesizer
+from swiftwrf import Spectra
+from swiftwrf.positions import distance
+
+
+@SYNTHESIZERS.register("nearest", meaning="the spectrum of the nearest measured position", colour="#ccbb44")
+class Nearest(Synthesizer):
+    """The spectrum of the nearest measured position: the baseline that a dense path makes hard to beat."""
+
+    def fit(self, train: Spectra) -> None:
+        self._train = train
+
+    def synthesize(self, position: Tensor) -> Tensor:
+        return self._train.spectrum[distance(position.double(), self._train.position).argmin(dim=1)]

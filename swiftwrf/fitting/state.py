@@ -1,0 +1,83 @@
+"""Where an interrupted fit stands: what its runs share, kept in one file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.progress import Progress
+from torch import Tensor
+
+from swiftwrf import checkpoint
+from swiftwrf.errors import InputError
+
+Record = dict[str, Any]
+KIND = "fit state"
+
+
+@dataclass(frozen=True)
+class Size:
+    """What identifies a run of a fit.
+
+    Args:
+        final: on all spectra, or with some held out for the search.
+        n_primitives, steps: how large and how long.
+    """
+
+    final: bool
+    n_primitives: int
+    steps: int
+
+    @property
+    def key(self) -> str:
+        """Its name in a saved state."""
+        return f"{'final' if self.final else 'search'} {self.n_primitives} {self.steps}"
+
+    def __str__(self) -> str:
+        return f"{'final' if self.final else 'search'}, {self.n_primitives} primitives, {self.steps} steps"
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a run stood."""
+
+    header: dict[str, Any]
+    tensors: dict[str, Tensor]
+
+
+@dataclass
+class Session:
+    """What the runs of one fit share: where their state is kept, and who is informed.
+
+    Args:
+        path: of the state; None keeps none.
+        owner: fingerprint of configuration and spectra.
+        bar: shows progress.
+        on_record: is called at each evaluation.
+        saved: the state of an earlier session of the same fit.
+        losses: on held-out spectra, of runs that are done, by their key.
+    """
+
+    path: Path | None
+    owner: str
+    bar: Progress
+    on_record: Callable[[Record], None] | None
+    saved: State | None = None
+    losses: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.path is not None and self.path.exists():
+            _, tensors, header = checkpoint.read(self.path, KIND)
+            if header["fingerprint"] != self.owner:
+                raise InputError(
+                    f"{self.path} is the state of another fit (other spectra or settings); remove it or give another path"
+                )
+            self.saved, self.losses = State(header, tensors), header["losses"]
+
+    def keep(self, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
+        """Writes the state of the run under way."""
+        if self.path is not None:
+            shared = {"losses": self.losses, "fingerprint": self.owner}
+            checkpoint.write(self.path, KIND, tensors, header | shared)

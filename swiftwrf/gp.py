@@ -1,0 +1,196 @@
+"""The one Gaussian process: its kernel, how the kernel is chosen, regression, and smooth random fields under its prior.
+
+Positions whose spectra resemble each other should move alike. So the kernel is the one under which a Gaussian process on
+the spectra's pixels best predicts training spectra that are held out: at random, or a whole region at a time where the
+model will be asked for regions nobody measured. Everything follows from the spectra's inner products, hence a candidate
+costs a few small linear solves and no rendering (C. E. Rasmussen and C. K. I. Williams, "Gaussian Processes for Machine
+Learning", 2006, chapters 2 and 5).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+
+from swiftwrf.positions import distance
+
+NOISES = (1e-3, 1e-2, 1e-1)  # of spectra: little of a measured one is not a function of position
+MIN_RANK, MAX_RANK = 24, 64
+EXPLAINED = (
+    0.05  # least share of a component's variance that counts as predicted: half of pure noise exceeds 0 by chance
+)
+MAX_ROWS = 400  # more do not change the choice, and a candidate costs their number cubed
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """How alike a field is at two positions, by their distance r: a rough long-range and a smooth short-range part.
+
+        k(r) = share exp(-r / long) + (1 - share) (1 + sqrt(3) r / short) exp(-sqrt(3) r / short)
+
+    The long part (Matern 1/2) carries the rough field between rooms' positions, the short one (Matern 3/2) follows a path
+    sampled densely.
+
+    Args:
+        long, short: correlation lengths, in the unit of the positions.
+        share: of the long part, in [0, 1].
+        noise: variance of what is not a function of position, relative to k(0) = 1.
+    """
+
+    long: float = 0.5
+    short: float = 0.1
+    share: float = 0.6
+    noise: float = 1e-2
+
+    def scaled(self, factor: float) -> Kernel:
+        """The same kernel on positions multiplied by `factor`."""
+        return replace(self, long=self.long * factor, short=self.short * factor)
+
+    def __call__(self, a: Tensor, b: Tensor) -> Tensor:
+        """k between positions (n, 3) and (m, 3), (n, m)."""
+        r = distance(a, b)
+        near = math.sqrt(3) * r / self.short
+        value: Tensor = self.share * torch.exp(-r / self.long) + (1 - self.share) * (1 + near) * torch.exp(-near)
+        return value
+
+    def noisy_gram(self, position: Tensor) -> Tensor:
+        """Covariance of noisy values at positions (n, 3), float64 (n, n)."""
+        position = position.double()
+        noisy: Tensor = self(position, position) + self.noise * torch.eye(len(position), dtype=torch.float64)
+        return noisy
+
+
+class GaussianProcess:
+    """Regression with a given kernel and mean 0: values at any position as a weighted sum of those at known ones.
+
+    Args:
+        kernel: with its noise.
+        known: positions (n, 3) of the values.
+    """
+
+    def __init__(self, kernel: Kernel, known: Tensor) -> None:
+        self.kernel, self.known = kernel, known.double()
+        self.inverse = torch.linalg.inv(kernel.noisy_gram(known))
+
+    def weights(self, position: Tensor) -> Tensor:
+        """By which the known values make up the mean at positions (m, 3), float64 (m, n)."""
+        weights: Tensor = self.kernel(position.double(), self.known) @ self.inverse
+        return weights
+
+    def variance(self, position: Tensor) -> Tensor:
+        """Of the field (without noise) at positions (m, 3), relative to k(0) = 1, float64 (m,)."""
+        cross = self.kernel(position.double(), self.known)
+        variance: Tensor = 1 - (cross @ self.inverse * cross).sum(dim=1)
+        return variance.clamp(0, 1)
+
+
+class SmoothField(nn.Module):
+    """K smooth random functions of position, c(s) = k(s, Z) R^-T z with anchors Z and k(Z, Z) + noise = R R^T.
+
+    Under the Gaussian-process prior z is standard normal, so that a small |z|^2 is a smooth function. Near the anchors the
+    functions follow them; far from all of them they fall back to 0 instead of extrapolating.
+
+    Args:
+        anchor: Z, normalised positions (M, 3).
+        kernel: k, on normalised positions.
+        rank: K.
+        whiten: R^-T (M, M) where it is known already.
+    """
+
+    def __init__(self, anchor: Tensor, kernel: Kernel, rank: int, whiten: Tensor | None = None) -> None:
+        super().__init__()
+        self.kernel = kernel
+        self.register_buffer("anchor", anchor)
+        if whiten is None:  # in float64, for nearby anchors are nearly alike
+            whiten = torch.linalg.inv(torch.linalg.cholesky(kernel.noisy_gram(anchor))).T.to(anchor)
+        self.register_buffer("whiten", whiten)
+        self.coefficient = nn.Parameter(torch.zeros(len(anchor), rank))
+
+    anchor: Tensor
+    whiten: Tensor
+
+    def forward(self, position: Tensor) -> Tensor:
+        """c(s) at positions (B, 3), (B, K)."""
+        return self.kernel(position, self.anchor) @ (self.whiten @ self.coefficient)
+
+    def prior(self) -> Tensor:
+        """|z|^2, the negative log prior up to a factor 1/2."""
+        return self.coefficient.square().sum()
+
+
+def choose_kernel(position: Tensor, spectrum: Tensor, fold: Tensor) -> Kernel:
+    """The candidate with the highest mean logarithm of 1 / MSE over held-out spectra.
+
+    Args:
+        position: of the training spectra [m], (n, 3).
+        spectrum: the training spectra, (n, H, W).
+        fold: number of the part that each is held out with, (n,).
+    """
+    position, spectrum, fold = thinned(position, spectrum, fold)
+    gram = _inner_products(spectrum)
+
+    def score(kernel: Kernel) -> float:
+        total = 0.0
+        for out, kept, gain in held_out_weights(kernel, position, fold):
+            own = gram.diagonal()[out]
+            error = own - 2 * (gain * gram[out][:, kept]).sum(1) + ((gain @ gram[kept][:, kept]) * gain).sum(1)
+            total -= float(error.clamp_min(1e-12).log().sum())
+        return total
+
+    return max(candidates(position, NOISES), key=score)
+
+
+def choose_rank(position: Tensor, spectrum: Tensor, fold: Tensor, kernel: Kernel) -> int:
+    """How many principal components of the spectra are predicted better than by their mean where they are held out.
+
+    What varies from spectrum to spectrum in other components cannot be known at a position without measuring there, so
+    a motion that could draw it would only learn noise.
+
+    Args:
+        position, spectrum, fold: as for `choose_kernel`.
+        kernel: what it chose.
+    """
+    position, spectrum, fold = thinned(position, spectrum, fold)
+    eigenvalue, eigenvector = torch.linalg.eigh(_inner_products(spectrum))
+    component = eigenvector * eigenvalue.clamp_min(0).sqrt()  # (n, n), one column a component
+    missed = torch.zeros_like(component)
+    for out, kept, gain in held_out_weights(kernel, position, fold):
+        missed[out] = component[out] - gain @ component[kept]
+    predicted = missed.square().sum(dim=0) < (1 - EXPLAINED) * component.square().sum(dim=0)
+    return int(predicted.sum().clamp(MIN_RANK, MAX_RANK))
+
+
+def thinned(*tensors: Tensor, rows: int = MAX_ROWS) -> list[Tensor]:
+    """At most so many rows of each, the same ones, evenly spread."""
+    n = len(tensors[0])
+    return [t[torch.linspace(0, n - 1, rows).long()] if n > rows else t for t in tensors]
+
+
+def _inner_products(spectrum: Tensor) -> Tensor:
+    """Of the spectra's differences from their mean, a pixel, float64 (n, n)."""
+    flat = spectrum.flatten(1).double()
+    flat = flat - flat.mean(dim=0)
+    return flat @ flat.T / flat.shape[1]
+
+
+def candidates(position: Tensor, noises: Sequence[float]) -> Iterator[Kernel]:
+    """Kernels with lengths from the extent of the positions (n, 3) [m] down, with and without a short-range part."""
+    extent = float((position.max(0).values - position.min(0).values).max()) or 1.0
+    for noise in noises:
+        for k in range(5):
+            long = extent / 2**k
+            yield Kernel(long=long, short=extent, share=1.0, noise=noise)
+            yield from (Kernel(long=long, short=extent / 3 / 2**j, share=0.6, noise=noise) for j in range(1, 6))
+
+
+def held_out_weights(kernel: Kernel, position: Tensor, fold: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """For each fold: which rows are out and which are kept, and the weights (out, kept) that predict the former."""
+    noisy = kernel.noisy_gram(position)
+    covariance = noisy - kernel.noise * torch.eye(len(position), dtype=noisy.dtype)
+    for number in fold.unique():
+        out, kept = fold == number, fold != number
+        yield out, kept, torch.linalg.solve(noisy[kept][:, kept], covariance[kept][:, out]).T

@@ -1,0 +1,63 @@
+"""Low-rank motion with a Gaussian-process prior over positions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any, Self
+
+import torch
+from torch import Tensor, nn
+
+from swiftwrf import gp
+from swiftwrf.checkpoint import Header
+from swiftwrf.model.deformation.base import COMPONENTS, DEFORMATIONS, Deformation, Offsets, Setting
+
+
+@DEFORMATIONS.register("motion_basis", meaning="low-rank motion, smooth by a Gaussian-process prior; fast")
+class MotionBasis(Deformation):
+    """All primitives move by one basis, mixed by smooth functions of position.
+
+    Far from all measured positions the model falls back to the canonical primitives. One small matrix product a position,
+    whatever the number of primitives.
+
+    Args:
+        field: the smooth functions.
+        basis: motions of the primitives, (rank, N, numbers that deform).
+        components: that deform.
+    """
+
+    def __init__(self, field: gp.SmoothField, basis: Tensor, components: tuple[str, ...]) -> None:
+        super().__init__()
+        self.components, self.field, self.basis = components, field, nn.Parameter(basis)
+
+    @classmethod
+    def initial(cls, setting: Setting, *, generator: torch.Generator) -> Self:
+        rank, size = setting.rank, sum(COMPONENTS[c] for c in setting.components)
+        field = gp.SmoothField(setting.anchor, setting.kernel, rank)
+        basis = 0.1 / math.sqrt(rank) * torch.randn(rank, setting.n, size, generator=generator)
+        return cls(field, basis, setting.components)
+
+    @classmethod
+    def restore(cls, components: tuple[str, ...], header: Header, tensors: Mapping[str, Tensor]) -> Self:
+        anchor, whiten, basis = (tensors[name] for name in ("field.anchor", "field.whiten", "basis"))
+        field = gp.SmoothField(anchor, gp.Kernel(**header["kernel"]), len(basis), whiten)
+        return cls(field, basis.clone(), components)
+
+    def header(self) -> Header:
+        return {"kernel": asdict(self.field.kernel)}
+
+    @classmethod
+    def choose_rank(cls, position: Tensor, spectrum: Tensor, fold: Tensor, kernel: gp.Kernel) -> int:
+        return gp.choose_rank(position, spectrum, fold, kernel)
+
+    def forward(self, position: Tensor, mean: Tensor) -> Offsets:
+        """Offsets at positions (B, 3); the canonical means play no part."""
+        return Offsets.of(torch.einsum("bk,kns->bns", self.field(position), self.basis), self.components)
+
+    def prior(self) -> Tensor:
+        return self.field.prior()
+
+    def parameter_groups(self, rate: float, own_rate: float | None) -> list[dict[str, Any]]:
+        return [{"params": [self.field.coefficient], "peak": rate}, {"params": [self.basis], "peak": rate / 2}]

@@ -1,0 +1,28 @@
+"""No motion: one spectrum for all positions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from swiftwrf.checkpoint import Header
+from swiftwrf.model.deformation.base import DEFORMATIONS, Deformation, Offsets, Setting
+
+
+@DEFORMATIONS.register("none", meaning="the primitives do not move")
+class Static(Deformation):
+    """Leaves the primitives canonical."""
+
+    @classmethod
+    def initial(cls, setting: Setting, *, generator: torch.Generator) -> Self:
+        return cls()
+
+    @classmethod
+    def restore(cls, components: tuple[str, ...], header: Header, tensors: Mapping[str, Tensor]) -> Self:
+        return cls()
+
+    def forward(self, position: Tensor, mean: Tensor) -> Offsets:
+        return Offsets()

@@ -1,0 +1,35 @@
+"""Random scenes."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from swiftwrf.angles import AngularGrid
+from swiftwrf.model.primitives import FLOOR
+
+GRID = AngularGrid.hemisphere(30, 120)
+
+
+def random_scene(
+    n: int = 40,
+    batch: int = 3,
+    seed: int = 0,
+    per_position: bool = False,
+    dtype: torch.dtype = torch.float32,
+    grid: AngularGrid = GRID,
+) -> list[Tensor]:
+    """Mean, Cholesky factor and weight of random primitives from the width's floor to a radian, sheared, means beyond both
+    edges and turns away; they await gradients."""
+    generator = torch.Generator().manual_seed(seed)
+    mean = torch.rand(batch, n, 2, generator=generator) * torch.tensor([6 * math.pi, 2.2]) - torch.tensor(
+        [2 * math.pi, 0.3]
+    )
+    shape = (batch, n, 3) if per_position else (n, 3)
+    floor = FLOOR * torch.tensor([grid.azimuth_step, 0.0, grid.elevation_step])
+    cholesky = torch.exp(torch.rand(shape, generator=generator) * 4 - 4) + floor
+    cholesky[..., 1] *= torch.randn(shape[:-1], generator=generator)
+    weight = torch.randn(batch, n, 2, generator=generator)
+    return [x.to(dtype).requires_grad_() for x in (mean, cholesky, weight)]
