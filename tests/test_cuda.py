@@ -15,6 +15,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from conftest import scene
 from hard_cases import (
     GRADIENT_TOLERANCE,
     HARD_CASES,
@@ -24,7 +25,6 @@ from hard_cases import (
     field_errors,
     magnitude_errors,
 )
-from test_rasterize import scene
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from swiftwrf import AngularGrid, InputError, rasterize

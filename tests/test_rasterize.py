@@ -2,33 +2,17 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
+from conftest import scene
 from hard_cases import GRADIENT_TOLERANCE, VALUE_TOLERANCE, Case, field_errors
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from swiftwrf import AngularGrid, InputError, rasterize
-from swiftwrf.primitives import FLOOR
 from swiftwrf.rasterize.magnitude import magnitude
 
 GRID = AngularGrid.hemisphere(30, 120)
-
-
-def scene(n=40, batch=3, seed=0, per_position=False, dtype=torch.float32, grid=GRID):
-    """Random primitives from the width's floor to a radian, sheared, means beyond both edges and turns away."""
-    generator = torch.Generator().manual_seed(seed)
-    mean = torch.rand(batch, n, 2, generator=generator) * torch.tensor([6 * math.pi, 2.2]) - torch.tensor(
-        [2 * math.pi, 0.3]
-    )
-    shape = (batch, n, 3) if per_position else (n, 3)
-    floor = FLOOR * torch.tensor([grid.azimuth_step, 0.0, grid.elevation_step])
-    cholesky = torch.exp(torch.rand(shape, generator=generator) * 4 - 4) + floor
-    cholesky[..., 1] *= torch.randn(shape[:-1], generator=generator)
-    weight = torch.randn(batch, n, 2, generator=generator)
-    return [x.to(dtype).requires_grad_() for x in (mean, cholesky, weight)]
 
 
 def against_definition(inputs, grid, cutoff):
