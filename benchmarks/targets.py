@@ -65,7 +65,7 @@ def aoa_targets() -> str:
             above = [name for name in others if turbo["median"] >= error[name]["median"]]
             overlap = turbo["low"] <= lower["high"] and lower["low"] <= turbo["high"]
             verdict = f"reported: {turbo['median'] - lower['median']:+.2f} against measured_only"
-            verdict += ", inside the intervals" if overlap else ""
+            verdict += "; intervals overlap" if overlap else ""
             if scene in TURBO:
                 verdict = f"missed: not below {' and '.join(above)}" if above else "met"
             cells = [f"{error[name]['median']:.2f}" for name in ("turbo_swiftwrf", *others)]
