@@ -162,6 +162,16 @@ def test_a_new_estimator_is_in_help_metrics_report_and_colours(small, registered
     assert "#123456" in html
 
 
+def test_a_new_synthesizer_is_in_help_report_and_colours(monkeypatch, capsys):
+    monkeypatch.setattr(interim.SYNTHESIZERS, "_entries", dict(interim.SYNTHESIZERS._entries))
+    interim.SYNTHESIZERS.register("dark", meaning="nothing anywhere", colour="#123456")(object)
+    with pytest.raises(SystemExit):
+        run("--help")
+    assert "dark: nothing anywhere" in " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert arms.synthesizers(["dark", "gone"]) == "dark: nothing anywhere."
+    assert arms.palette().colour("dark") == arms.palette().colour("turbo_dark") == "#123456"
+
+
 def test_a_name_without_colour_has_one_that_depends_on_the_name_alone():
     assert Palette().colour("unknown") == Palette({"other": "#000000"}).colour("unknown")
 

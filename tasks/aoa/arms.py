@@ -5,6 +5,7 @@ Names, meanings and colours come from the registries of estimators and synthesiz
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from tasks.aoa.estimators import ESTIMATORS
@@ -46,6 +47,11 @@ def meaning() -> str:
         "; ".join(texts)
         + f". {TURBO}NAME: the network trained on the measured share and on spectra that NAME synthesized at the others."
     )
+
+
+def synthesizers(names: Iterable[str]) -> str:
+    """These synthesizers in words; runs may hold some that are registered no more."""
+    return "; ".join(f"{name}: {SYNTHESIZERS[name].meaning}" for name in names if name in SYNTHESIZERS) + "."
 
 
 def palette() -> Palette:

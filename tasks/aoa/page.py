@@ -124,7 +124,8 @@ def _synthesis(shares: list[Share], several: bool) -> Section:
         "its 95 % interval; L1: mean. Over the test spectra, which no synthesizer saw."
     )
     table = Table(["share and synthesizer", "SSIM", "PSNR [dB]", "L1"], rows, caption)
-    return Section("How good are the synthetic spectra?", tables=[table])
+    names = dict.fromkeys(name for share in shares for name in share.mix["synthesis"])
+    return Section("How good are the synthetic spectra?", [arms.synthesizers(names)], [table])
 
 
 def _examples(share: Share) -> Section:
