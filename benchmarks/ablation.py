@@ -71,7 +71,7 @@ def study(name: str, data: Spectra, split: str, config: Config) -> dict[str, Any
     results = {}
     for variant, case in cases.items():
         results[variant] = measure(*case, SEEDS[:1] if config.quick else SEEDS)
-        print(name, variant, told(results[variant]), flush=True)
+        print(name, variant, in_words(results[variant]), flush=True)
     default = {"n_primitives": base.model.n_primitives, "rank": base.model.rank, "steps": base.steps}
     return {"n_train": len(train), "n_test": len(test), "default": default, "variants": results}
 
@@ -118,7 +118,7 @@ def measure(train: Spectra, test: Spectra, config: FitConfig, seeds: tuple[int, 
     return result | {"seconds": (time.perf_counter() - began) / len(seeds)}
 
 
-def told(result: dict[str, Any]) -> str:
+def in_words(result: dict[str, Any]) -> str:
     """One line."""
     if "refusal" in result:
         return str(result["refusal"])

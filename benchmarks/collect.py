@@ -6,12 +6,13 @@ import json
 import sys
 from pathlib import Path
 
-from tasks.report.records import Records
+from tasks.metrics import RunMetrics
+from tasks.page.records import Records
 
 
 def collect(folder: Path, name: str) -> None:
     """Writes the run's command, environment and metrics to `results/NAME.json`."""
-    run = Records(folder)
+    run: Records[RunMetrics] = Records(folder)
     content = {"command": run.config["command"], "environment": run.environment, "metrics": run.metrics}
     file = Path(__file__).parent / "results" / f"{name}.json"
     file.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")

@@ -16,7 +16,7 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def write_result(name: str, content: dict[str, Any], device: torch.device | None = None) -> None:
-    """Writes `results/NAME.json`: strict JSON with the command and where it ran, on the CPU unless told otherwise."""
+    """Writes `results/NAME.json`: strict JSON with the command and where it ran (`device`, by default the CPU)."""
     RESULTS.mkdir(exist_ok=True)
     command = shlex.join(["python", *(Path(a).name if Path(a).exists() else a for a in sys.argv)])
     record = {"command": command, "environment": environment(device or torch.device("cpu"), {}), **content}

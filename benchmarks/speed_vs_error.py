@@ -18,7 +18,7 @@ from record import write_result
 from synthesis import load
 from torch import Tensor
 
-from augment import Settings, make_synthesizer
+from augment import SYNTHESIZERS, Settings, make_synthesizer
 from swiftwrf import (
     AngularGrid,
     FitConfig,
@@ -34,7 +34,8 @@ from swiftwrf.arrays import PlanarArray
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import psnr
 from swiftwrf.rasterize import Maker, rasterize_magnitude
-from tasks.report import figures
+from tasks.page import figures
+from tasks.page.palette import Palette
 
 CUTOFFS = (None, 1e-5, 1e-4, 1e-3, 1e-2)
 GRIDS = ((45, 180), (90, 360), (180, 720))
@@ -235,13 +236,14 @@ def rms(drawn: Tensor, truth: Tensor) -> float:
 def draw(content: dict[str, Any], file: Path) -> None:
     """Numerical and held-out error against seconds a spectrum, log-log, with the fronts."""
     figure, axes = figures.new_figure(1, 2, 10.5, 4.2)
+    palette = Palette.of(SYNTHESIZERS.entries())
     own = [p for p in content["drawing"] if p["own_grid"]]
     short = {p["setting"]: p["setting"].rsplit(", ", 1)[0] for p in own}
     numerical = {short[p["setting"]]: (p["seconds"]["median"], max(p["numerical"], 1e-9)) for p in own}
     held_out = {p["setting"]: (p["seconds"]["median"], p["held_out"]) for p in content["models"]}
-    figures.speed(axes[0], numerical, "seconds a spectrum", "RMS error against the exact drawing")
+    figures.speed(axes[0], palette, numerical, "seconds a spectrum", "RMS error against the exact drawing")
     default = [name for name in held_out if name.startswith("swiftwrf, default (") or name == "coarray"]
-    figures.speed(axes[1], held_out, "seconds a spectrum", "RMS error against held-out spectra", also=default)
+    figures.speed(axes[1], palette, held_out, "seconds a spectrum", "RMS error against held-out spectra", default)
     file.write_text(figures.as_svg(figure))
     print(f"drew {file}")
 

@@ -1,6 +1,6 @@
 """What hard cases do to every maker, to reduced precision and to a fit: errors, goodness or the refusal, measured.
 
-docs/stability.md tells the rules; its tables come from this benchmark's result.
+docs/stability.md gives the rules; its tables come from this benchmark's result.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from swiftwrf.arrays import PlanarArray
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import l1, psnr, ssim, summary
 
-S23_ARRAY = PlanarArray.square(4, 915e6, spacing=0.16)  # which the files of s23-200 do not tell
+S23_ARRAY = PlanarArray.square(4, 915e6, spacing=0.16)  # which the files of s23-200 do not describe
 SCENES = (("s23-200", "random"), ("s23-200", "block"), ("newrf-bedroom", "random"), ("newrf-office", "random"))
 
 

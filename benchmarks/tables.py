@@ -4,64 +4,51 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
 from typing import Any
 
-from tasks.report.figures import pareto
+from committed import RESULTS, ROOT, aoa_runs, load, markdown, rssi_runs
+from targets import aoa_targets, rssi_targets, synthesis_targets
 
-ROOT = Path(__file__).parent.parent
-RESULTS = ROOT / "benchmarks" / "results"
-
-
-def _load(name: str) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((RESULTS / f"{name}.json").read_text())
-    return content
-
-
-def _table(columns: list[str], rows: list[list[str]]) -> str:
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+from tasks.summarise import pareto
 
 
 def synthesis() -> str:
     """Median SSIM and PSNR of each synthesizer on each scene."""
     rows = []
-    for scene, result in _load("synthesis")["scenes"].items():
+    for scene, result in load("synthesis")["scenes"].items():
         scores = result["synthesizers"]
         cells = [f"{s['ssim']['median']:.3f} / {s['psnr_db']['median']:.1f}" for s in scores.values()]
         rows.append([scene, *cells, f"{scores['swiftwrf']['seconds']['fit']:.0f} s"])
-    return _table(["scene, split", *scores, "fit of swiftwrf"], rows)
+    return markdown(["scene, split", *scores, "fit of swiftwrf"], rows)
 
 
 def aoa() -> str:
     """Median great-circle errors of the arms of each run."""
     methods = ("constant", "nearest_spectrum", "measured_only", "turbo_swiftwrf", "measured_all")
     rows = []
-    for file in sorted(RESULTS.glob("aoa_*.json")):
-        metrics = json.loads(file.read_text())["metrics"]
+    for metrics in aoa_runs():
         for share, mix in metrics["mixes"].items():
             errors = [mix["methods"][name]["great_circle_deg"] for name in methods]
             cells = [f"{e['median']:.2f} [{e['low']:.2f}, {e['high']:.2f}]" for e in errors]
             rows.append([f"{metrics['data']}, {metrics['split']}", f"{float(share):.0%}", *cells])
-    return _table(["scene, split", "measured", *methods], rows)
+    return markdown(["scene, split", "measured", *methods], rows)
 
 
 def rssi() -> str:
     """Median and 90 % of the absolute errors of each predictor, and the interval's coverage."""
     methods = ("mean", "mri_pooled", "mri_receiver", "mri_residual", "knn", "gp", "swiftwrf")
     rows = []
-    for file in sorted(RESULTS.glob("rssi_*.json")):
-        metrics = json.loads(file.read_text())["metrics"]
+    for metrics in rssi_runs():
         errors = [metrics["overall"][name]["abs_error_db"] for name in methods]
         cells = [f"{e['median']:.2f} / {e['p90']:.1f}" for e in errors]
         rows.append([f"{metrics['data']}, {metrics['split']}", *cells, f"{metrics['interval']['coverage']:.0%}"])
-    return _table(["data, split", *methods, "80 % interval covers"], rows)
+    return markdown(["data, split", *methods, "80 % interval covers"], rows)
 
 
 def size() -> str:
     """What the fit chose beside the best of all sizes."""
     rows = []
-    for scene, result in _load("model_size")["scenes"].items():
+    for scene, result in load("model_size")["scenes"].items():
         auto, fixed = result["auto"], result["fixed"]
         quality = {entry["n_primitives"]: entry["psnr_db"]["median"] for entry in fixed}
         best = max(quality, key=lambda n: quality[n])
@@ -79,7 +66,7 @@ def size() -> str:
             ]
         )
     columns = ["scene, split", "N, K, steps", "PSNR [dB]", "of N = 16 ... 2048 (best)", "smallest within 0.1 dB"]
-    return _table([*columns, "parameters over its", "time", "time over that of a fit of fixed N"], rows)
+    return markdown([*columns, "parameters over its", "time", "time over that of a fit of fixed N"], rows)
 
 
 def _at(fixed: list[dict[str, Any]], n: int) -> dict[str, Any]:
@@ -89,7 +76,7 @@ def _at(fixed: list[dict[str, Any]], n: int) -> dict[str, Any]:
 def hard_cases() -> str:
     """The worst over cutoffs of each maker in each case."""
     found: dict[str, dict[str, list[dict[str, Any]]]] = {}
-    for row in _load("stability_cpu")["makers"]:
+    for row in load("stability_cpu")["makers"]:
         found.setdefault(row["case"], {}).setdefault(row["maker"], []).append(row)
     rows = []
     for case, makers in found.items():
@@ -99,27 +86,25 @@ def hard_cases() -> str:
             gradient = max(max(entry["gradient"], entry["magnitude_gradient"]) for entry in entries)
             cells.append(f"{value[None]:.0e}, {value[1e-4]:.0e}; {gradient:.0e}")
         rows.append([case, next(iter(makers.values()))[0]["rule"].replace("|", "\\|"), *cells])
-    return _table(["case", "rule", *(f"`{maker}` (float32)" for maker in found[rows[0][0]])], rows)
+    return markdown(["case", "rule", *(f"`{maker}` (float32)" for maker in found[rows[0][0]])], rows)
 
 
 def precision() -> str:
     """What rounding costs."""
-    rows = [
-        [row["what"], f"{row['error']:.0e}", f"{row['psnr_db']:.0f}"] for row in _load("stability_cpu")["precision"]
-    ]
-    return _table(["what is rounded", "largest error of \\|A\\| over the largest", "PSNR [dB]"], rows)
+    rows = [[row["what"], f"{row['error']:.0e}", f"{row['psnr_db']:.0f}"] for row in load("stability_cpu")["precision"]]
+    return markdown(["what is rounded", "largest error of \\|A\\| over the largest", "PSNR [dB]"], rows)
 
 
 def hard_fits() -> str:
     """How each hard fit ended."""
     rows = []
-    for row in _load("stability_cpu")["fits"]:
+    for row in load("stability_cpu")["fits"]:
         if row["refusal"]:
             ended = f"refused: {row['refusal']}"
         else:
             ended = f"{row['psnr_db']:.1f} dB on its own spectra (their mean: {row['mean_psnr_db']:.1f})"
         rows.append([row["case"], str(row["n"]), ended, f"{row['seconds']:.0f} s"])
-    return _table(["case", "spectra", "how the fit ended", "time"], rows)
+    return markdown(["case", "spectra", "how the fit ended", "time"], rows)
 
 
 def speed() -> str:
@@ -141,7 +126,7 @@ def speed() -> str:
                     f"{point['parameters']:,}" if "parameters" in point else "",
                 ]
             )
-    return _table(["scene, split", "setting", "ms a spectrum", "held-out PSNR [dB]", "fit [s]", "parameters"], rows)
+    return markdown(["scene, split", "setting", "ms a spectrum", "held-out PSNR [dB]", "fit [s]", "parameters"], rows)
 
 
 def drawing() -> str:
@@ -155,7 +140,7 @@ def drawing() -> str:
             name = f"**{p['setting']}**" if p["setting"] in front else p["setting"]
             cells = [f"{p['seconds']['median'] * 1e3:.2f}", f"{p['numerical']:.0e}", f"{p['held_out']:.4f}"]
             rows.append([f"{content['data']} {content['split']}", name, *cells])
-    return _table(["scene, split", "setting", "ms a spectrum", "RMS numerical", "RMS held-out"], rows)
+    return markdown(["scene, split", "setting", "ms a spectrum", "RMS numerical", "RMS held-out"], rows)
 
 
 # SSIM and mean L1 of the paper's tables, on its own data
@@ -175,7 +160,7 @@ PAPER = {
 
 def ablation() -> str:
     """The paper's studies: median SSIM / mean L1 / median PSNR of every variant on every scene."""
-    scenes = _load("ablation")["scenes"]
+    scenes = load("ablation")["scenes"]
     names = list(dict.fromkeys(name for scene in scenes.values() for name in scene["variants"]))
     rows = []
     for name in names:
@@ -183,14 +168,14 @@ def ablation() -> str:
         for scene in scenes.values():
             scores = scene["variants"].get(name, {})
             if "ssim" in scores:
-                told = (
+                quality = (
                     f"{scores['ssim']['median']:.3f} / {scores['l1']['mean']:.4f} / {scores['psnr_db']['median']:.1f}"
                 )
-                cells.append(f"{told} / {scores['seconds']:.0f} s")
+                cells.append(f"{quality} / {scores['seconds']:.0f} s")
             else:
                 cells.append(scores.get("refusal", ""))
         rows.append([name, *cells, PAPER.get(name, "")])
-    return _table(["variant", *scenes, "paper: SSIM / L1"], rows)
+    return markdown(["variant", *scenes, "paper: SSIM / L1"], rows)
 
 
 TABLES = {
@@ -204,8 +189,11 @@ TABLES = {
     "speed": speed,
     "drawing": drawing,
     "ablation": ablation,
+    "synthesis_targets": synthesis_targets,
+    "aoa_targets": aoa_targets,
+    "rssi_targets": rssi_targets,
 }
-FILES = ("README.md", "docs/speed.md", "docs/stability.md", "docs/ablation.md")
+FILES = ("README.md", "docs/speed.md", "docs/stability.md", "docs/ablation.md", "docs/targets.md")
 
 
 def rewrite(text: str) -> str:

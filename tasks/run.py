@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import inspect
 import json
 import math
 import os
@@ -12,35 +13,42 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import torch
 import tyro
 from rich.console import Console
 
 from swiftwrf import FitError, InputError
+from swiftwrf.registry import Registry
 
 PARTIAL = ".partial"  # suffix of a run that is not finished
 console = Console(stderr=True, highlight=False)
 Row = dict[str, Any]
+Preset = Literal["quick", "paper"]
 Config = TypeVar("Config")
 
 
 def command_line(
-    name: str, config_type: type[Config], task: Callable[[Config, Path | None], None], arguments: Sequence[str]
+    name: str,
+    config_type: type[Config],
+    task: Callable[[Config, Path | None], None],
+    arguments: Sequence[str],
+    more: Callable[[], str] | None = None,
 ) -> int:
     """Parses the arguments into `config_type`, runs the task and turns its errors into sentences and exit codes.
 
-    `--resume DIR` takes the configuration from an interrupted run instead.
+    `--resume DIR` takes the configuration from an interrupted run instead. The help says what the docstring of
+    `config_type` does, and `more`.
 
     Returns:
-        0: done; 2: wrong input, told in one sentence; 1: a fit that broke; 130: interrupted.
+        0: done; 2: wrong input, said in one sentence; 1: a fit that broke; 130: interrupted.
     """
     try:
         if arguments and arguments[0] == "--resume":
@@ -51,7 +59,8 @@ def command_line(
             folder = Path(arguments[1])
             task(_saved_config(folder, config_type), folder)
         else:
-            task(tyro.cli(config_type, prog=f"python -m {name}", args=arguments), None)
+            description = "\n\n".join([inspect.cleandoc(config_type.__doc__ or ""), *([more()] if more else [])])
+            task(tyro.cli(config_type, prog=f"python -m {name}", description=description, args=arguments), None)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -72,6 +81,15 @@ def _saved_config(folder: Path, config_type: type[Config]) -> Config:
         raise InputError(f"{folder} is no interrupted run; expected a directory *{PARTIAL} with a config.json")
     values = json.loads(file.read_text())["config"]
     return config_type(**{name: tuple(v) if isinstance(v, list) else v for name, v in values.items()})
+
+
+def choice(meaning: str, registry: Registry[Any]) -> Any:
+    """Annotation of an option that takes names of a registry; its help lists what is registered when it is shown."""
+
+    def entries(default: str) -> str:
+        return f"{'; '.join(f'{entry.name}: {entry.meaning}' for entry in registry.entries())} (default: {default})"
+
+    return tyro.conf.arg(help=f"{meaning}:", help_behavior_hint=entries)
 
 
 def choose_device(name: str) -> torch.device:
@@ -165,13 +183,13 @@ class Run:
         """A file in the run's directory."""
         return self.folder / name
 
-    def finish(self, metrics: dict[str, Any], report: Callable[[Path, Row], None]) -> Path:
+    def finish(self, metrics: Mapping[str, Any], report: Callable[[Path, Row], None]) -> Path:
         """Writes environment, report and, last, metrics; removes what only a resumed run needs; gives the run its name."""
         self._environment["end"] = datetime.now(UTC).isoformat(timespec="seconds")
         self.write_json("environment.json", self._environment)
-        metrics = _strict(metrics)
-        report(self.folder, metrics)
-        self.write_json("metrics.json", metrics)
+        strict: Row = _strict(metrics)
+        report(self.folder, strict)
+        self.write_json("metrics.json", strict)
         shutil.rmtree(self.folder / "steps", ignore_errors=True)
         self.folder.rename(self.final)
         return self.final

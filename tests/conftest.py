@@ -1,4 +1,4 @@
-"""Shared fixtures: the toy scene and the measured data where they are."""
+"""What several tests build on: toy scenes, and the measured data where they are."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from swiftwrf import Spectra, simulated_room
+from swiftwrf import AngularGrid, Spectra, simulated_room
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -23,8 +23,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session")
 def room() -> Spectra:
     """Forty spectra of the simulated room on a small grid."""
-    from swiftwrf import AngularGrid
-
     return simulated_room(n=40, seed=0, grid=AngularGrid.hemisphere(15, 60))
 
 

@@ -14,9 +14,11 @@ import torch
 from augment import Mixed
 from swiftwrf import AngularGrid, CoarrayModel, FitConfig, InputError, ModelConfig, load, simulated_room
 from swiftwrf.metrics import angle_errors
-from tasks.aoa import experiment
+from tasks.aoa import aann, arms, experiment
 from tasks.aoa.aann import AANN, AANNConfig
-from tasks.aoa.estimators import Constant, NearestSpectrum, Peak
+from tasks.aoa.config import AoaConfig
+from tasks.aoa.estimators import ESTIMATORS, Constant, NearestSpectrum, Peak, Settings
+from tasks.page.palette import Palette
 from tasks.report import merge
 from tasks.run import command_line
 
@@ -28,34 +30,34 @@ def small(monkeypatch):
     """The task on a toy: few spectra, few steps."""
     room = simulated_room(n=50, grid=AngularGrid.hemisphere(10, 40))
     monkeypatch.setattr(experiment, "simulated_room", lambda seed: room)
-    monkeypatch.setattr(experiment, "FitConfig", lambda: TINY_FIT)
-    monkeypatch.setattr(experiment, "AANNConfig", lambda: AANNConfig(steps=2, batch=4))
+    monkeypatch.setattr("augment.synthesizers.swiftwrf.FitConfig", lambda: TINY_FIT)
+    monkeypatch.setattr(aann, "AANNConfig", lambda: AANNConfig(steps=2, batch=4))
     return room
 
 
 def run(*arguments):
-    return command_line("tasks.aoa", experiment.AoaConfig, experiment.run, [str(a) for a in arguments])
+    return command_line("tasks.aoa", AoaConfig, experiment.run, [str(a) for a in arguments], arms.meaning)
 
 
 def test_peak_of_a_known_spectrum():
     grid = AngularGrid.hemisphere(10, 40)
     spectrum = torch.zeros(1, 10, 40)
     spectrum[0, 3, 10] = 1
-    assert Peak(grid).estimate(spectrum).rad2deg()[0].tolist() == pytest.approx([90, 36])
+    assert Peak(Settings(grid)).estimate(spectrum).rad2deg()[0].tolist() == pytest.approx([90, 36])
 
 
 def test_constant_is_the_mean_direction_over_the_seam():
     train = Mixed(
         torch.zeros(2, 1, 1), torch.tensor([[350.0, 10], [10, 10]]).deg2rad(), torch.arange(2), torch.zeros(2).bool()
     )
-    constant = Constant()
+    constant = Constant(Settings(AngularGrid.hemisphere(10, 40)))
     constant.fit(train)
     azimuth = constant.estimate(torch.zeros(3, 1, 1))[:, 0]
     assert (1 - torch.cos(azimuth)).max() < 1e-9
 
 
 def test_nearest_spectrum_returns_the_label_of_a_copy(room):
-    nearest = NearestSpectrum()
+    nearest = NearestSpectrum(Settings(room.grid))
     nearest.fit(Mixed.measured(room))
     torch.testing.assert_close(nearest.estimate(room.spectrum[5:8]), room.label[5:8])
 
@@ -68,11 +70,12 @@ def test_aann_learns_a_toy(circular):
     for i in range(16):
         spectrum[i, 4:10, 16 * (i % 4) : 16 * (i % 4) + 8] = 1
     train = Mixed(spectrum, label, torch.arange(16), torch.zeros(16).bool())
-    aann = AANN(AANNConfig(steps=30, batch=8, circular=circular), 0, torch.device("cpu"))
-    aann.fit(train)
-    constant = Constant()
+    settings = Settings(AngularGrid.hemisphere(16, 64))
+    network = AANN(settings, AANNConfig(steps=30, batch=8, circular=circular))
+    network.fit(train)
+    constant = Constant(settings)
     constant.fit(train)
-    errors = [angle_errors(e.estimate(spectrum), label)["great_circle"].mean() for e in (aann, constant)]
+    errors = [angle_errors(e.estimate(spectrum), label)["great_circle"].mean() for e in (network, constant)]
     assert errors[0] < 0.5 * errors[1]
 
 
@@ -88,9 +91,9 @@ def test_aann_is_seeded_and_leaves_the_global_generator_alone(room):
     state = torch.get_rng_state()
     estimates = []
     for _ in range(2):
-        aann = AANN(AANNConfig(steps=2, batch=4), 7, torch.device("cpu"))
-        aann.fit(Mixed.measured(room))
-        estimates.append(aann.estimate(room.spectrum))
+        network = AANN(Settings(room.grid, seed=7), AANNConfig(steps=2, batch=4))
+        network.fit(Mixed.measured(room))
+        estimates.append(network.estimate(room.spectrum))
     assert torch.equal(*estimates)
     assert torch.equal(torch.get_rng_state(), state)
 
@@ -129,6 +132,47 @@ def test_whole_run(small, tmp_path):
 
     merge([out, out], tmp_path / "both")
     assert (tmp_path / "both" / "report.html").stat().st_size > 10_000
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """One more estimator, for the time of a test."""
+    monkeypatch.setattr(ESTIMATORS, "_entries", dict(ESTIMATORS._entries))
+
+    @ESTIMATORS.register("northern", meaning="always due north", colour="#123456")
+    class Northern(Constant):
+        def estimate(self, spectrum):
+            return torch.zeros(len(spectrum), 2, dtype=torch.float64)
+
+
+def test_a_new_estimator_is_in_help_metrics_report_and_colours(small, registered, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        run("--help")
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "northern: always due north" in shown
+    assert "nearest: the spectrum of the nearest" in shown
+    assert arms.palette().colour("northern") == "#123456"
+    assert arms.palette().line("northern") == "--"
+    assert run("--mix", 0.5, "--synthesizer", "nearest", "--out", tmp_path / "run") == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["mixes"]["0.5"]["methods"]["northern"]["elevation_deg"]["median"] > 0
+    html = (tmp_path / "run" / "report.html").read_text()
+    assert "northern: always due north" in html
+    assert "#123456" in html
+
+
+def test_a_new_synthesizer_is_in_help_report_and_colours(monkeypatch, capsys):
+    monkeypatch.setattr(SYNTHESIZERS, "_entries", dict(SYNTHESIZERS._entries))
+    SYNTHESIZERS.register("dark", meaning="nothing anywhere", colour="#123456")(object)
+    with pytest.raises(SystemExit):
+        run("--help")
+    assert "dark: nothing anywhere" in " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert arms.synthesizers(["dark", "gone"]) == "dark: nothing anywhere."
+    assert arms.palette().colour("dark") == arms.palette().colour("turbo_dark") == "#123456"
+
+
+def test_a_name_without_colour_has_one_that_depends_on_the_name_alone():
+    assert Palette().colour("unknown") == Palette({"other": "#000000"}).colour("unknown")
 
 
 def test_interrupted_run_goes_on_to_the_same_numbers(small, tmp_path, monkeypatch):

@@ -14,7 +14,8 @@ from swiftwrf import FitError, InputError, Rssi, RssiConfig, fit_rssi, rssi_room
 from swiftwrf import rssi as rssi_module
 from tasks.rssi import experiment
 from tasks.rssi.cluster import on_cluster
-from tasks.rssi.predictors import PREDICTORS, make_predictor
+from tasks.rssi.interim import PREDICTORS
+from tasks.rssi.predictors import make_predictor
 from tasks.run import command_line
 
 QUICK = RssiConfig(steps=60)
@@ -169,7 +170,7 @@ def test_pooled_law_is_one_law():
     assert torch.allclose(pooled.predict(place)[0], pooled.predict(place)[0, 0])
 
 
-@pytest.mark.parametrize("name", PREDICTORS)
+@pytest.mark.parametrize("name", list(PREDICTORS))
 def test_predictors_ignore_what_was_not_heard(name):
     train, test = rssi_room(n=60).receivers(["1", "2"]).split("random")
     predictor = make_predictor(name, validation="block", seed=0)

@@ -2,8 +2,10 @@
 
 import sys
 
-from tasks.aoa.experiment import AoaConfig, run
+from tasks.aoa import arms
+from tasks.aoa.config import AoaConfig
+from tasks.aoa.experiment import run
 from tasks.run import command_line
 
 if __name__ == "__main__":
-    sys.exit(command_line("tasks.aoa", AoaConfig, run, sys.argv[1:]))
+    sys.exit(command_line("tasks.aoa", AoaConfig, run, sys.argv[1:], arms.meaning))

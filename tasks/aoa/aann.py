@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 import torch
 import torchvision
@@ -21,6 +21,7 @@ from augment import Mixed
 from swiftwrf.angles import to_angles, to_direction
 from swiftwrf.data.spectra import coarsening
 from swiftwrf.progress import progress
+from tasks.aoa.estimators import ESTIMATORS, Estimator, Settings
 
 
 @dataclass(frozen=True)
@@ -73,23 +74,20 @@ def _backbone(circular: bool) -> nn.Module:
     return network
 
 
-class AANN:
+@ESTIMATORS.register("aann", meaning="the angular neural network, trained in every arm that is no baseline")
+class AANN(Estimator):
     """ResNet-50 with one input channel and an MLP head, from a seeded start; weights are not downloaded.
 
     Args:
-        config: how it is trained.
-        seed: of weights and batches.
-        device: where it is trained.
+        settings: seed of weights and batches, device, and the preset of the training.
+        config: of the training, in place of the preset's.
     """
 
-    def __init__(
-        self,
-        config: AANNConfig,
-        seed: int,
-        device: torch.device,
-    ) -> None:
+    def __init__(self, settings: Settings, config: AANNConfig | None = None) -> None:
+        super().__init__(settings)
+        config = config or (AANNConfig.paper() if settings.preset == "paper" else AANNConfig())
+        seed, device = settings.seed, torch.device(settings.device)
         self._config, self._device = config, device
-        self.history: list[dict[str, Any]] = []  # step, loss and seconds as training goes on
         with torch.random.fork_rng(devices=[]):  # torchvision draws its weights from the global generator
             torch.manual_seed(seed)
             network = _backbone(config.circular)
@@ -147,4 +145,4 @@ def _gains_from_bfloat16(device: torch.device) -> bool:
     """GPUs do, and CPUs that multiply in it: three times faster there, slower elsewhere."""
     if device.type == "cuda":
         return bool(torch.cuda.is_bf16_supported())
-    return bool(torch.cpu._is_avx512_bf16_supported())
+    return bool(torch.cpu.get_capabilities().get("avx512_bf16")) if hasattr(torch.cpu, "get_capabilities") else False

@@ -3,60 +3,31 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
-from augment.synthesize import Coarray, SwiftWRFSynthesizer
+from pandas import DataFrame
 from torch import Tensor
 
-from augment import SYNTHESIZERS, Mixed, Places, make_synthesizer, mix, withhold
-from swiftwrf import FitConfig, InputError, Spectra, load_spectra, simulated_room
-from swiftwrf.arrays import PlanarArray
+from augment import Mixed, Places, make_synthesizer, mix, withhold
+from augment import Settings as SynthesizerSettings
+from swiftwrf import InputError, Spectra, load_spectra, simulated_room
 from swiftwrf.checkpoint import read, write
-from swiftwrf.metrics import angle_errors, l1, psnr, ssim, summary
-from tasks.aoa.aann import AANN, AANNConfig
-from tasks.aoa.estimators import Constant, Estimator, NearestSpectrum, Peak
-from tasks.report import write_report
+from swiftwrf.metrics import angle_errors, l1, psnr, ssim
+from tasks.aoa import arms
+from tasks.aoa.config import AoaConfig, can_draw, check, with_array
+from tasks.aoa.estimators import ESTIMATORS, Settings
+from tasks.aoa.page import page
+from tasks.metrics import ANGLES, SCORES, AoaMetrics, ArmMetrics, MixMetrics, SynthesisMetrics
+from tasks.page.page import reporting
 from tasks.run import Row, Run, choose_device, console
+from tasks.summarise import averaged, repeats_averaged
 
-ANGLES = ("azimuth_deg", "elevation_deg", "great_circle_deg")
-SCORES = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
-COMPARED = ("nearest", "idw", "gp")  # synthesizers that are always measured beside those asked for
+SCORE = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
+COMPARED = ("nearest", "idw", "gp", "coarray")  # synthesizers that are always measured beside those asked for
 EXAMPLE_QUANTILES = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)  # of the PSNR at the test positions: the best to the worst spectrum
-
-
-@dataclass(frozen=True)
-class AoaConfig:
-    """Angle of arrival with few measured spectra: turbo learning against its bounds and baselines.
-
-    Without --data the built-in simulated room is used. An interrupted run goes on with --resume DIR.
-    """
-
-    mix: tuple[float, ...]
-    """measured shares, each in (0, 1]: 0.3 keeps 30 % of the training spectra and synthesizes the others"""
-    data: str | None = None
-    """folder of spectra (NeRF2 layout) or of ray paths (paths.npz)"""
-    split: str = "random"
-    """a split that comes with the data, or a seeded one: random or block"""
-    synthesizer: tuple[str, ...] = ("swiftwrf",)
-    """who draws the synthetic spectra: swiftwrf, nearest, idw, gp, coarray"""
-    array: tuple[int, float, float] | None = None
-    """square array that took the spectra, where the data do not say: elements a side, spacing [m], carrier [Hz]"""
-    preset: Literal["quick", "paper"] = "quick"
-    """quick: sized for a CPU; paper: the paper's model and a long training, for a GPU"""
-    repeats: int = 1
-    """runs with different random shares and networks, pooled"""
-    seed: int = 0
-    """of everything random"""
-    out: str | None = None
-    """directory of the run; must not exist (default: a new one under runs/aoa)"""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """where to compute"""
 
 
 def run(config: AoaConfig, resume: Path | None = None) -> None:
@@ -66,13 +37,8 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         InputError: what the configuration asks for is not there or makes no sense.
     """
     device = choose_device(config.device)
-    _check(config)
-    data = load_spectra(config.data) if config.data else simulated_room(seed=config.seed)
-    if config.array is not None:
-        side, spacing, frequency = config.array
-        data = replace(data, array=PlanarArray.square(side, frequency, spacing))
-    if "coarray" in config.synthesizer and data.array is None:
-        raise InputError(f"synthesizer coarray needs the array, which {data.name} does not tell; give it with --array")
+    check(config)
+    data = with_array(load_spectra(config.data) if config.data else simulated_room(seed=config.seed), config)
     train, test = data.split(config.split, config.seed)
     if len(test) == 0:
         raise InputError(f"split {config.split!r} of {data.name} has no test spectra")
@@ -87,7 +53,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         directory.write_csv("errors.csv", experiment.errors)
         directory.write_csv("synthesis.csv", experiment.synthesis)
         directory.write_csv("history.csv", experiment.history)
-        metrics = {
+        metrics: AoaMetrics = {
             "task": "aoa",
             "data": data.name,
             "split": config.split,
@@ -101,26 +67,8 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
             "line_of_sight_share": float(test.line_of_sight.float().mean()),
             "mixes": {f"{share:g}": experiment.summary(share) for share in config.mix},
         }
-        final = directory.finish(metrics, write_report)
+        final = directory.finish(metrics, reporting(page))
     console.print(f"report: [bold]{final / 'report.html'}[/]")
-
-
-def _check(config: AoaConfig) -> None:
-    unknown = [name for name in config.synthesizer if name not in SYNTHESIZERS]
-    if unknown:
-        raise InputError(f"unknown synthesizer {unknown[0]!r}; choose from {', '.join(SYNTHESIZERS)}")
-    if not config.mix or not all(0 < share <= 1 for share in config.mix):
-        raise InputError(
-            f"--mix takes measured shares in (0, 1], got {' '.join(f'{s:g}' for s in config.mix) or 'none'}"
-        )
-    if len(set(config.mix)) < len(config.mix):
-        raise InputError(f"--mix names a share twice: {' '.join(f'{s:g}' for s in config.mix)}")
-    if config.array is not None and not (config.array[0] >= 2 and min(config.array[1:]) > 0):
-        raise InputError(
-            f"--array takes at least 2 elements a side, a spacing [m] and a carrier [Hz], got {config.array}"
-        )
-    if config.repeats < 1:
-        raise InputError(f"--repeats must be at least 1, got {config.repeats}")
 
 
 class _Experiment:
@@ -128,12 +76,11 @@ class _Experiment:
 
     def __init__(self, config: AoaConfig, train: Spectra, test: Spectra, device: torch.device, directory: Run) -> None:
         self.config, self.train, self.test, self.device, self.directory = config, train, test, device, directory
-        self.fit_config = FitConfig.paper() if config.preset == "paper" else FitConfig()
-        self.aann_config = AANNConfig.paper() if config.preset == "paper" else AANNConfig()
         self.errors: list[Row] = []
         self.synthesis: list[Row] = []
         self.history: list[Row] = []
-        self.seconds: list[Row] = []
+        self.training_seconds: list[Row] = []
+        self.synthesis_seconds: list[Row] = []
 
     def turbo(self, share: float, repeat: int) -> None:
         """All arms at one measured share."""
@@ -141,33 +88,28 @@ class _Experiment:
         few = Mixed.measured(measured)
         at = {"mix": share, "repeat": repeat}
         suffix = f"mix{share:g}-r{repeat}"
-        network = partial(AANN, self.aann_config, self.config.seed + repeat, self.device)
-        without: dict[str, Callable[[], Estimator]] = {
-            "peak": partial(Peak, self.train.grid),
-            "constant": Constant,
-            "nearest_spectrum": NearestSpectrum,
-            "measured_only": network,
-        }
-        for name, make in without.items():
-            self._arm(at | {"method": name}, f"{name}-{suffix}", few, make)
-        compared = COMPARED if self.train.array is None else (*COMPARED, "coarray")
-        for name in dict.fromkeys((*self.config.synthesizer, *compared)):
+        for name in arms.baselines():
+            self._arm(at | {"method": name}, f"{name}-{suffix}", few, name)
+        self._arm(at | {"method": arms.LOWER.name}, f"{arms.LOWER.name}-{suffix}", few)
+        asked_for = self.config.synthesizer
+        for name in dict.fromkeys((*asked_for, *(name for name in COMPARED if can_draw(name, self.train)))):
             mixed = self._synthesize(at | {"synthesizer": name}, f"synthesis_{name}-{suffix}", measured, withheld)
-            if name in self.config.synthesizer:
-                self._arm(at | {"method": f"turbo_{name}"}, f"turbo_{name}-{suffix}", mixed, network)
+            if name in asked_for:
+                self._arm(at | {"method": arms.turbo(name)}, f"{arms.turbo(name)}-{suffix}", mixed)
         # the same whatever the share, so its step is shared by all of them
-        self._arm(at | {"method": "measured_all"}, f"measured_all-r{repeat}", Mixed.measured(self.train), network)
+        self._arm(at | {"method": arms.UPPER.name}, f"{arms.UPPER.name}-r{repeat}", Mixed.measured(self.train))
 
-    def _arm(self, arm: Row, step: str, train: Mixed, make: Callable[[], Estimator]) -> None:
+    def _arm(self, arm: Row, step: str, train: Mixed, name: str = arms.NETWORK) -> None:
         """Trains one estimator and tests it."""
 
         def compute() -> Row:
-            estimator, began = make(), time.perf_counter()
+            settings = Settings(self.train.grid, self.config.seed + arm["repeat"], self.device, self.config.preset)
+            estimator, began = ESTIMATORS[name].make(settings), time.perf_counter()
             estimator.fit(train)
             fitted = time.perf_counter()
             estimate = estimator.estimate(self.test.spectrum)
             seconds = {"train": fitted - began, "estimate": time.perf_counter() - fitted}
-            return {"estimate": estimate, "seconds": seconds, "history": getattr(estimator, "history", [])}
+            return {"estimate": estimate, "seconds": seconds, "history": estimator.history}
 
         done = self.directory.step(step, compute)
         estimate = torch.tensor(done["value"]["estimate"], dtype=torch.float64)
@@ -183,7 +125,7 @@ class _Experiment:
         }
         self.errors += _rows(arm, columns)
         self.history += [arm | row for row in done["value"]["history"]]
-        self.seconds.append(arm | done["value"]["seconds"])
+        self.training_seconds.append(arm | done["value"]["seconds"])
 
     def _synthesize(self, arm: Row, step: str, measured: Spectra, withheld: Places) -> Mixed:
         """The mixed training set of one synthesizer, and its quality at the test positions."""
@@ -192,15 +134,15 @@ class _Experiment:
 
         def compute() -> Row:
             history: list[Row] = []
-            synthesizer = make_synthesizer(
-                name,
+            settings = SynthesizerSettings(
                 validation="random",  # the withheld places lie among the measured ones, whatever the split of the test
                 seed=self.config.seed + arm["repeat"],
-                config=self.fit_config,
+                preset=self.config.preset,
                 device=self.device,
                 checkpoint=self.directory.path(f"steps/{step}-fit.safetensors"),
                 on_record=history.append,
             )
+            synthesizer = make_synthesizer(name, settings)
             began = time.perf_counter()
             synthesizer.fit(measured)
             fitted = time.perf_counter()
@@ -210,18 +152,18 @@ class _Experiment:
             }
             seconds = {"fit": fitted - began, "synthesize": time.perf_counter() - fitted}
             write(file, "synthetic spectra", synthetic, {})
-            asked_for = name in self.config.synthesizer and arm["repeat"] == 0
-            if asked_for and isinstance(synthesizer, SwiftWRFSynthesizer | Coarray):
+            model = synthesizer.model
+            if model is not None and name in self.config.synthesizer and arm["repeat"] == 0:
                 prefix = "model" if name == "swiftwrf" else name
-                synthesizer.save(self.directory.path(f"{prefix}-mix{arm['mix']:g}.safetensors"))
+                model.save(self.directory.path(f"{prefix}-mix{arm['mix']:g}.safetensors"))
             return {"history": history, "seconds": seconds}
 
         value = self.directory.step(step, compute)["value"]
-        synthetic, _ = read(file, "synthetic spectra")
-        scores = {key: score(synthetic["test"], self.test.spectrum) for key, score in SCORES.items()}
+        _, synthetic, _ = read(file, "synthetic spectra")
+        scores = {key: score(synthetic["test"], self.test.spectrum) for key, score in SCORE.items()}
         self.synthesis += _rows(arm, {"index": self.test.index} | scores)
         self.history += [arm | row for row in value["history"]]
-        self.seconds.append(arm | value["seconds"])
+        self.synthesis_seconds.append(arm | value["seconds"])
         if arm["repeat"] == 0 and name == self.config.synthesizer[0]:
             self._keep_examples(arm["mix"], synthetic["test"], scores["psnr_db"])
         return mix(measured, withheld, synthetic["withheld"])
@@ -238,45 +180,56 @@ class _Experiment:
             psnr_db=score[chosen].numpy(),
         )
 
-    def summary(self, share: float) -> Row:
+    def summary(self, share: float) -> MixMetrics:
         """What metrics.json says of one share."""
-        errors = [row for row in self.errors if row["mix"] == share]
-        synthesis = [row for row in self.synthesis if row["mix"] == share]
-        seconds = [row for row in self.seconds if row["mix"] == share]
-        own = [row for row in seconds if row.get("synthesizer") in self.config.synthesizer]
-        networks = [row for row in seconds if row.get("method", "").startswith(("measured", "turbo"))]
+        training, fits = (_of(share, rows) for rows in (self.training_seconds, self.synthesis_seconds))
+        asked_for = fits[fits["synthesizer"].isin(self.config.synthesizer)]
+        networks = training[~training["method"].isin(arms.baselines())]
         return {
             "n_measured": round(share * len(self.train)),
-            "synthesis": _summaries(synthesis, "synthesizer", tuple(SCORES), seconds),
-            "methods": _summaries(errors, "method", ANGLES, seconds),
+            "synthesis": _synthesis_metrics(_of(share, self.synthesis), fits),
+            "methods": _arm_metrics(_of(share, self.errors), training),
             "seconds": {
-                "fit": sum(row["fit"] for row in own),
-                "synthesize": sum(row["synthesize"] for row in own),
-                "train": sum(row["train"] for row in networks),
+                "fit": float(asked_for["fit"].sum()),
+                "synthesize": float(asked_for["synthesize"].sum()),
+                "train": float(networks["train"].sum()),
             },
         }
+
+
+def _of(share: float, rows: list[Row]) -> DataFrame:
+    return DataFrame([row for row in rows if row["mix"] == share])
+
+
+def _synthesis_metrics(scores: DataFrame, seconds: DataFrame) -> dict[str, SynthesisMetrics]:
+    spent = averaged(seconds, "synthesizer", ("fit", "synthesize"))
+    return {
+        name: {
+            "psnr_db": of["psnr_db"],
+            "ssim": of["ssim"],
+            "l1": of["l1"],
+            "seconds": {"fit": spent[name]["fit"], "synthesize": spent[name]["synthesize"]},
+        }
+        for name, of in repeats_averaged(scores, "synthesizer", SCORES).items()
+    }
+
+
+def _arm_metrics(errors: DataFrame, seconds: DataFrame) -> dict[str, ArmMetrics]:
+    spent = averaged(seconds, "method", ("train", "estimate"))
+    return {
+        name: {
+            "azimuth_deg": of["azimuth_deg"],
+            "elevation_deg": of["elevation_deg"],
+            "great_circle_deg": of["great_circle_deg"],
+            "seconds": {"train": spent[name]["train"], "estimate": spent[name]["estimate"]},
+        }
+        for name, of in repeats_averaged(errors, "method", ANGLES).items()
+    }
 
 
 def _rows(arm: Row, columns: dict[str, Tensor]) -> list[Row]:
     lists = {name: column.tolist() for name, column in columns.items()}
     return [arm | dict(zip(lists, values, strict=True)) for values in zip(*lists.values(), strict=True)]
-
-
-def _summaries(rows: list[Row], key: str, columns: tuple[str, ...], seconds: list[Row]) -> dict[str, Any]:
-    """Summary of each column under each value of `key`, and the seconds that its stages took, a repeat. Repeats of a test
-    spectrum are averaged first: they are not independent, and the interval must not shrink with their number."""
-    result: dict[str, Any] = {}
-    for name in dict.fromkeys(row[key] for row in rows):
-        own = [row for row in rows if row[key] == name]
-        indices = dict.fromkeys(row["index"] for row in own)
-        result[name] = {
-            column: summary([np.mean([row[column] for row in own if row["index"] == index]) for index in indices])
-            for column in columns
-        }
-        spent = [row for row in seconds if row.get(key) == name]
-        stages = [stage for stage in ("fit", "synthesize", "train", "estimate") if stage in spent[0]]
-        result[name]["seconds"] = {stage: float(np.mean([row[stage] for row in spent])) for stage in stages}
-    return result
 
 
 def _as_bytes(spectrum: Tensor) -> np.ndarray[Any, np.dtype[np.uint8]]:

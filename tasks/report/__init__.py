@@ -1,23 +1,19 @@
-"""Records to figures and one self-contained HTML page."""
+"""One report over several finished runs; knows all tasks, and none of them knows it."""
 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from swiftwrf import InputError
-from tasks.report.aoa import aoa_page
-from tasks.report.page import write_page
-from tasks.report.records import Records
-from tasks.report.rssi import rssi_page
+from tasks.aoa import page as aoa
+from tasks.page.page import Page, write_page
+from tasks.page.records import Records
+from tasks.rssi import page as rssi
 
-PAGES = {"aoa": aoa_page, "rssi": rssi_page}
-
-
-def write_report(folder: Path, metrics: dict[str, Any]) -> None:
-    """Writes `figures/*.svg` and `report.html` of one run into its directory, from the records that lie there."""
-    write_page(folder, PAGES[metrics["task"]]([Records(folder, metrics)]))
+PAGES: dict[str, Callable[[list[Records[Any]]], Page]] = {"aoa": aoa.page, "rssi": rssi.page}
 
 
 def merge(folders: list[Path], out: Path) -> None:
@@ -26,7 +22,7 @@ def merge(folders: list[Path], out: Path) -> None:
     Raises:
         InputError: no runs, an unfinished one, runs of several tasks, or `out` exists.
     """
-    runs = [Records(folder) for folder in folders]
+    runs: list[Records[Any]] = [Records(folder) for folder in folders]
     tasks = sorted({run.metrics["task"] for run in runs})
     if len(tasks) != 1:
         raise InputError(f"a report takes runs of one task, got {', '.join(tasks) or 'no runs'}")
@@ -37,6 +33,3 @@ def merge(folders: list[Path], out: Path) -> None:
     partial.mkdir(parents=True)
     write_page(partial, PAGES[tasks[0]](runs))
     partial.rename(out)
-
-
-__all__ = ["merge", "write_report"]

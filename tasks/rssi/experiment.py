@@ -9,15 +9,19 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from pandas import DataFrame
 from PIL import Image, UnidentifiedImageError
-from swiftwrf.fit_config import Validation
 
 from swiftwrf import InputError, Rssi, load_rssi, rssi_room
-from swiftwrf.metrics import summary
-from tasks.report import write_report
+from swiftwrf.fit_config import Validation
+from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
+from tasks.page.page import reporting
 from tasks.rssi.cluster import on_cluster
-from tasks.rssi.predictors import PREDICTORS, SwiftWRFPredictor, make_predictor
-from tasks.run import Row, Run, choose_device, console
+from tasks.rssi.interim import PREDICTORS
+from tasks.rssi.page import page
+from tasks.rssi.predictors import SwiftWRFPredictor
+from tasks.run import Preset, Row, Run, choose_device, console
+from tasks.summarise import error_summary, grouped
 
 MAP_CELLS = 80  # along the longer side of the floor
 
@@ -35,8 +39,8 @@ class RssiTaskConfig:
     """folder with gateway_position.yml, tx_pos.csv and gateway_rssi.csv (NeRF2 layout)"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
-    preset: Literal["default", "paper"] = "default"
-    """of SwiftWRF: default corrects a log-distance law; paper is the plain head"""
+    preset: Preset = "quick"
+    """of SwiftWRF: quick corrects a log-distance law; paper is the plain head"""
     floor_plan: str | None = None
     """an image to draw behind the maps"""
     floor_extent: tuple[float, float, float, float] | None = None
@@ -72,7 +76,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             tables.add(name)
         directory.write_csv("errors.csv", tables.errors)
         directory.write_csv("predictions.csv", tables.predictions)
-        metrics = {
+        metrics: RssiMetrics = {
             "task": "rssi",
             "data": data.name,
             "split": config.split,
@@ -80,9 +84,13 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             "seed": config.seed,
             "n_train": len(train),
             "n_test": len(test),
-            **tables.summary(),
+            "overall": tables.overall(),
+            "receivers": tables.receivers(),
+            "seconds": tables.seconds["swiftwrf"],
+            "interval": {"nominal": 0.8, "coverage": tables.coverage},
+            "chosen": {"n_primitives": tables.n_primitives},
         }
-        final = directory.finish(metrics, write_report)
+        final = directory.finish(metrics, reporting(page))
     console.print(f"report: [bold]{final / 'report.html'}[/]")
 
 
@@ -110,9 +118,9 @@ class _Tables:
         self.train, self.test, self.config, self.directory, self.options = train, test, config, directory, options
         self.errors: list[Row] = []
         self.predictions: list[Row] = []
-        self.seconds: dict[str, Row] = {}
+        self.seconds: dict[str, PredictorSeconds] = {}
         self.coverage = float("nan")
-        self.chosen: Row = {}
+        self.n_primitives = 0
         test_position = test.transmitter_position
         self.from_receiver = torch.cdist(test_position, data.receiver_position)
         self.from_training = torch.cdist(test_position, train.transmitter_position).min(dim=1).values
@@ -122,8 +130,8 @@ class _Tables:
 
         def compute() -> Row:
             validation: Validation = "random" if self.config.split == "random" else "block"
-            predictor = make_predictor(
-                name, validation=validation, seed=self.config.seed, preset=self.config.preset, **self.options
+            predictor = PREDICTORS[name].make(
+                validation=validation, seed=self.config.seed, preset=self.config.preset, **self.options
             )
             began = time.perf_counter()
             predictor.fit(self.train)
@@ -155,7 +163,7 @@ class _Tables:
             )
         if name == "swiftwrf":
             self._predict_rows(predicted, torch.tensor(value["low"]), torch.tensor(value["high"]))
-            self.chosen = {"n_primitives": value["n_primitives"]}
+            self.n_primitives = value["n_primitives"]
 
     def _predict_rows(self, predicted: torch.Tensor, low: torch.Tensor, high: torch.Tensor) -> None:
         measured, heard = self.test.rssi_dbm, ~self.test.rssi_dbm.isnan()
@@ -201,17 +209,15 @@ class _Tables:
             **plan,
         )
 
-    def summary(self) -> dict[str, Any]:
-        """What metrics.json says of the methods."""
+    def overall(self) -> dict[str, PredictorMetrics]:
+        """What metrics.json says of each method."""
+        errors = grouped(DataFrame(self.errors), ["method"], "abs_error_db")
+        return {name: {"abs_error_db": errors[name,], "seconds": self.seconds[name]} for name in PREDICTORS}
 
-        def of(method: str, receiver: str | None = None) -> Row:
-            own = [r for r in self.errors if r["method"] == method and receiver in (None, r["receiver"])]
-            return {"abs_error_db": summary([r["abs_error_db"] for r in own])}
-
+    def receivers(self) -> dict[str, dict[str, ReceiverMetrics]]:
+        """What metrics.json says of each method at each receiver; one that no test row heard has no errors."""
+        errors, none = grouped(DataFrame(self.errors), ["receiver", "method"], "abs_error_db"), error_summary([])
         return {
-            "overall": {name: of(name) | {"seconds": self.seconds[name]} for name in PREDICTORS},
-            "receivers": {r: {name: of(name, r) for name in PREDICTORS} for r in self.test.receiver_names},
-            "seconds": self.seconds["swiftwrf"],
-            "interval": {"nominal": 0.8, "coverage": self.coverage},
-            "chosen": self.chosen,
+            receiver: {name: {"abs_error_db": errors.get((receiver, name), none)} for name in PREDICTORS}
+            for receiver in self.test.receiver_names
         }

@@ -5,52 +5,54 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from tasks.report import figures
-from tasks.report.page import Page, Plot, Section, Table
-from tasks.report.provenance import number, provenance
-from tasks.report.records import Records
+from tasks.metrics import RssiMetrics
+from tasks.page import figures
+from tasks.page.page import Page, Plot, Section, Table
+from tasks.page.palette import Palette
+from tasks.page.provenance import number, provenance
+from tasks.page.records import Records
+from tasks.rssi.interim import PREDICTORS
+from tasks.summarise import SHORTEST, paired_difference, running_median
 
+RssiRecords = Records[RssiMetrics]
+OWN = "swiftwrf"  # the predictor that all others are compared with
 MANY = 300  # dots, from which on white edges would hide their colours
-MEANING = {
-    "swiftwrf": "50 primitives a receiver on a 16 x 16 grid, averaged, on a log-distance law",
-    "mean": "the mean of the receiver's training values",
-    "mri_pooled": "one log-distance law for all receivers",
-    "mri_receiver": "a log-distance law for each receiver",
-    "mri_residual": "the same, and what it leaves interpolated from the nearest measurements",
-    "knn": "inverse-distance mean of the nearest measurements",
-    "gp": "a Gaussian process on what the log-distance law leaves",
-}
 
 
-def rssi_page(runs: list[Records]) -> Page:
+def palette() -> Palette:
+    """Of the predictors; the mean, which uses no position, is dashed."""
+    return Palette.of(PREDICTORS.entries(), dashed=["mean"])
+
+
+def page(runs: list[RssiRecords]) -> Page:
     """The page of these runs."""
     sections = [section for run in runs for section in _run(run, several=len(runs) > 1)]
     names = ", ".join(dict.fromkeys(_scene(run) for run in runs))
     return Page(f"RSSI: {names}", _lead(runs[0]), [*sections, _limits(runs[0]), provenance(runs)])
 
 
-def _scene(run: Records) -> str:
+def _scene(run: RssiRecords) -> str:
     name = "the simulated floor" if run.metrics["data"] == "simulated-room" else run.metrics["data"]
     return f"{name}, {run.metrics['split']} split"
 
 
-def _lead(run: Records) -> str:
+def _lead(run: RssiRecords) -> str:
     error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
     best = min((name for name in error if name != "swiftwrf"), key=lambda name: error[name]["median"])
     interval = run.metrics["interval"]
 
-    def told(name: str) -> str:
+    def in_words(name: str) -> str:
         return f"{error[name]['median']:.2f} dB (90 %: {error[name]['p90']:.1f})"
 
     return (
         f"On {_scene(run)}, SwiftWRF's median absolute error over {error['swiftwrf']['n']} heard pairs at "
-        f"{len(run.metrics['receivers'])} receiver(s) is {told('swiftwrf')}; the best baseline, {best}, reaches "
-        f"{told(best)} and one log-distance law for all receivers {told('mri_pooled')}. "
+        f"{len(run.metrics['receivers'])} receiver(s) is {in_words('swiftwrf')}; the best baseline, {best}, reaches "
+        f"{in_words(best)} and one log-distance law for all receivers {in_words('mri_pooled')}. "
         f"The {interval['nominal']:.0%} interval covers {interval['coverage']:.0%} of the test measurements."
     )
 
 
-def _run(run: Records, several: bool) -> list[Section]:
+def _run(run: RssiRecords, several: bool) -> list[Section]:
     suffix = f" - {_scene(run)}" if several else ""
     name = f"{run.metrics['data']}-{run.metrics['split']}-s{run.metrics['seed']}"
     plots = [Plot(f"bars-{name}", _bars(run), "Median absolute error; whiskers: its 95 % interval.")]
@@ -58,7 +60,7 @@ def _run(run: Records, several: bool) -> list[Section]:
     return [
         Section(
             f"Errors{suffix}",
-            ["; ".join(f"{k}: {v}" for k, v in MEANING.items()) + "."],
+            ["; ".join(f"{entry.name}: {entry.meaning}" for entry in PREDICTORS.entries()) + "."],
             [_table(run), _paired(run)],
             plots,
         ),
@@ -92,7 +94,7 @@ _SPEED_CAPTION = (
 )
 
 
-def _table(run: Records) -> Table:
+def _table(run: RssiRecords) -> Table:
     rows = []
     for name, entry in run.metrics["overall"].items():
         error = entry["abs_error_db"]
@@ -104,54 +106,46 @@ def _table(run: Records) -> Table:
         columns,
         rows,
         "Absolute error over all heard test pairs; median with its 95 % interval.",
-        frozenset(["swiftwrf"]),
+        frozenset([OWN]),
     )
 
 
-def _paired(run: Records) -> Table:
-    """Differences of the same pairs' errors, with a bootstrap over test rows, for rows are not independent of receivers."""
+def _paired(run: RssiRecords) -> Table:
     errors = run.table("errors").pivot_table(index=["index", "receiver"], columns="method", values="abs_error_db")
     rows = []
     for name in run.metrics["overall"]:
-        if name == "swiftwrf":
-            continue
-        difference = (errors["swiftwrf"] - errors[name]).groupby(level="index").agg(["sum", "count"]).to_numpy()
-        draws = np.random.default_rng(0).integers(len(difference), size=(1000, len(difference)))
-        sums = difference[draws].sum(axis=1)
-        low, high = np.percentile(sums[:, 0] / sums[:, 1], (2.5, 97.5))
-        mean = difference[:, 0].sum() / difference[:, 1].sum()
-        rows.append([name, f"{mean:+.2f} [{low:+.2f}, {high:+.2f}]"])
+        if name != OWN:
+            mean, low, high = paired_difference(errors, OWN, name)
+            rows.append([name, f"{mean:+.2f} [{low:+.2f}, {high:+.2f}]"])
     caption = "Mean of SwiftWRF's absolute error minus the method's on the same pairs; 95 % bootstrap over test rows."
     return Table(["against", "difference [dB]"], rows, caption)
 
 
-def _bars(run: Records) -> Figure:
-    receivers = list(run.metrics["receivers"])
-    heights = {
-        name: [
-            tuple(run.metrics["receivers"][r][name]["abs_error_db"][k] for k in ("median", "low", "high"))
-            for r in receivers
-        ]
-        for name in run.metrics["overall"]
-    }
+def _bars(run: RssiRecords) -> Figure:
+    receivers = run.metrics["receivers"]
+    heights = {}
+    for name in run.metrics["overall"]:
+        errors = [methods[name]["abs_error_db"] for methods in receivers.values()]
+        heights[name] = [(error["median"], error["low"], error["high"]) for error in errors]
     figure, axes = figures.new_figure(1, 1, max(5, 1.1 * len(receivers)), 3.6)
-    figures.bars(axes[0], receivers, heights, "median absolute error [dB]")
+    figures.bars(axes[0], palette(), list(receivers), heights, "median absolute error [dB]")
     axes[0].tick_params(axis="x", labelrotation=30 if len(receivers) > 6 else 0)
     figures.legend_below(figure, axes[0])
     return figure
 
 
-def _cdf(run: Records) -> Figure:
+def _cdf(run: RssiRecords) -> Figure:
     errors = run.table("errors")
     figure, axes = figures.new_figure(1, 1, 6, 3.6)
     groups = {str(name): part["abs_error_db"] for name, part in errors.groupby("method", sort=False)}
-    figures.cdf(axes[0], groups, "absolute error [dB]", limit=float(errors["abs_error_db"].quantile(0.98)))
+    limit = float(errors["abs_error_db"].quantile(0.98))
+    figures.cdf(axes[0], palette(), groups, "absolute error [dB]", limit)
     axes[0].set_ylabel("share of heard test pairs")
     figures.legend_below(figure, axes[0])
     return figure
 
 
-def _maps(run: Records, field: str, label: str) -> Figure:
+def _maps(run: RssiRecords, field: str, label: str) -> Figure:
     with np.load(run.folder / "maps.npz") as file:
         maps = dict(file)
     n = len(maps["receiver_names"])
@@ -196,11 +190,12 @@ def _maps(run: Records, field: str, label: str) -> Figure:
     return figure
 
 
-def _where(run: Records) -> Figure:
+def _where(run: RssiRecords) -> Figure:
     errors = run.table("errors")
-    own = errors[errors["method"] == "swiftwrf"]
+    own = errors[errors["method"] == OWN]
+    colour = palette().colour(OWN)
     figure, axes = figures.new_figure(1, 3, 10, 3.3)
-    axes[0].plot(own["measured_dbm"], own["predicted_dbm"], ".", markersize=2, color=figures.colour("swiftwrf"))
+    axes[0].plot(own["measured_dbm"], own["predicted_dbm"], ".", markersize=2, color=colour)
     ends = [own["measured_dbm"].min(), own["measured_dbm"].max()]
     axes[0].plot(ends, ends, color="#aeb7c6", linewidth=1)
     axes[0].set(xlabel="measured [dBm]", ylabel="predicted [dBm]")
@@ -211,26 +206,25 @@ def _where(run: Records) -> Figure:
     for ax, (column, label) in zip(axes[1:], columns.items(), strict=True):
         ordered = own.sort_values(column)
         ax.plot(ordered[column], ordered["abs_error_db"], ".", markersize=2, color="#bbbbbb")
-        window = max(len(ordered) // 5, 1)
-        running = ordered["abs_error_db"].rolling(window, center=True).median()
-        ax.plot(ordered[column], running, color=figures.colour("swiftwrf"), linewidth=1.6)
+        ax.plot(ordered[column], running_median(ordered["abs_error_db"]), color=colour, linewidth=1.6)
         ax.set(xlabel=label, ylabel="absolute error [dB]")
     return figure
 
 
-def _speed(run: Records) -> Figure:
+def _speed(run: RssiRecords) -> Figure:
+    overall = run.metrics["overall"]
+    error = {name: entry["abs_error_db"]["median"] for name, entry in overall.items()}
+    fit = {name: max(entry["seconds"]["fit"], SHORTEST) for name, entry in overall.items()}
+    predict = {name: max(entry["seconds"]["predict"], SHORTEST) for name, entry in overall.items()}
     figure, axes = figures.new_figure(1, 2, 9, 3.2)
-    for ax, stage in zip(axes, ("fit", "predict"), strict=True):
-        overall = run.metrics["overall"].items()
-        points = {
-            name: (max(entry["seconds"][stage], 1e-5), entry["abs_error_db"]["median"]) for name, entry in overall
-        }
-        figures.speed(ax, points, f"seconds to {stage}", "median absolute error [dB]")
-    figures.legend_of(figure, list(run.metrics["overall"]))
+    for ax, stage, seconds in zip(axes, ("fit", "predict"), (fit, predict), strict=True):
+        points = {name: (seconds[name], error[name]) for name in overall}
+        figures.speed(ax, palette(), points, f"seconds to {stage}", "median absolute error [dB]")
+    figures.legend_of(figure, palette(), list(overall))
     return figure
 
 
-def _limits(run: Records) -> Section:
+def _limits(run: RssiRecords) -> Section:
     texts = [
         "A single packet scatters about the mean of its place by 2 to 3 dB, mostly because it says nothing of its channel; "
         "no predictor of the mean can be better than that.",

@@ -13,6 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
+from tasks.page.palette import Palette
+from tasks.summarise import pareto
+
 STYLE: dict[str, Any] = {
     "svg.hashsalt": "swiftwrf-tasks",
     "svg.fonttype": "path",
@@ -23,39 +26,10 @@ STYLE: dict[str, Any] = {
     "grid.color": "#e4e8ef",
     "axes.axisbelow": True,
 }
-# colour-blind safe (P. Tol, "bright"); bounds and baselines are grey, so that what the product adds stands out
-COLOURS = {
-    "measured_only": "#ee6677",
-    "measured_all": "#228833",
-    "turbo_swiftwrf": "#4477aa",
-    "turbo_nearest": "#ccbb44",
-    "turbo_idw": "#66ccee",
-    "turbo_gp": "#ee8866",
-    "turbo_coarray": "#aa3377",
-    "swiftwrf": "#4477aa",
-    "mean": "#bbbbbb",
-    "mri_pooled": "#ee6677",
-    "mri_receiver": "#ee8866",
-    "mri_residual": "#ccbb44",
-    "knn": "#66ccee",
-    "gp": "#228833",
-    "nearest": "#ccbb44",
-    "idw": "#66ccee",
-    "coarray": "#aa3377",
-    "peak": "#bbbbbb",
-    "constant": "#999999",
-    "nearest_spectrum": "#666666",
-}
-
-
-def colour(name: str) -> str:
-    """The colour of a method, the same in all figures."""
-    others = ("#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")
-    return COLOURS.get(name) or others[sum(name.encode()) % len(others)]
 
 
 def new_figure(rows: int, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure of width x height inches in the house style, and its axes row by row."""
+    """A figure of width x height inches in the style of the reports, and its axes row by row."""
     with matplotlib.style.context(STYLE):
         figure = Figure(figsize=(width, height), layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False)
@@ -76,25 +50,29 @@ def legend_below(figure: Figure, axes: Axes) -> None:
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=columns, frameon=False)
 
 
-def legend_of(figure: Figure, names: Sequence[str]) -> None:
+def legend_of(figure: Figure, palette: Palette, names: Sequence[str]) -> None:
     """A legend of dots in the colours of methods."""
-    dots = [Line2D([], [], marker="o", linestyle="", color=colour(name), label=name) for name in names]
+    dots = [Line2D([], [], marker="o", linestyle="", color=palette.colour(name), label=name) for name in names]
     figure.legend(
         handles=dots, loc="outside lower center", ncols=max(1, int(figure.get_figwidth() / 1.8)), frameon=False
     )
 
 
-def cdf(axes: Axes, errors: Mapping[str, ArrayLike], label: str, limit: float | None = None) -> None:
+def cdf(axes: Axes, palette: Palette, errors: Mapping[str, ArrayLike], label: str, limit: float | None = None) -> None:
     """Empirical distribution of each method's errors, with the median marked by the line at 0.5."""
     for name, values in errors.items():
-        dashed = name in ("peak", "constant", "nearest_spectrum", "mean")
-        axes.ecdf(np.asarray(values), label=name, color=colour(name), linestyle="--" if dashed else "-", linewidth=1.4)
+        style: dict[str, Any] = {"color": palette.colour(name), "linestyle": palette.line(name)}
+        axes.ecdf(np.asarray(values), label=name, linewidth=1.4, **style)
     axes.axhline(0.5, color="#aeb7c6", linewidth=0.8)
     axes.set(xlabel=label, ylabel="share of test spectra", ylim=(0, 1), xlim=(0, limit))
 
 
 def bars(
-    axes: Axes, groups: Sequence[str], heights: Mapping[str, Sequence[tuple[float, float, float]]], label: str
+    axes: Axes,
+    palette: Palette,
+    groups: Sequence[str],
+    heights: Mapping[str, Sequence[tuple[float, float, float]]],
+    label: str,
 ) -> None:
     """Bars with whiskers: for each method one (value, low, high) a group."""
     width = 0.8 / max(len(heights), 1)
@@ -102,7 +80,8 @@ def bars(
         value, low, high = np.array(values, dtype=float).reshape(-1, 3).T
         at = np.arange(len(groups)) + (i - (len(heights) - 1) / 2) * width
         error = np.clip([value - low, high - value], 0, None)
-        axes.bar(at, value, width * 0.92, yerr=error, label=name, color=colour(name), error_kw={"elinewidth": 0.8})
+        style: dict[str, Any] = {"color": palette.colour(name), "error_kw": {"elinewidth": 0.8}}
+        axes.bar(at, value, width * 0.92, yerr=error, label=name, **style)
     axes.set(xticks=range(len(groups)), xticklabels=groups, ylabel=label)
     axes.grid(axis="x", visible=False)
 
@@ -135,30 +114,29 @@ def spectra(measured: NDArray[Any], synthetic: NDArray[Any], captions: Sequence[
     return figure
 
 
-def curves(axes: Axes, lines: Mapping[str, tuple[ArrayLike, ArrayLike]], x: str, y: str) -> None:
+def curves(axes: Axes, palette: Palette, lines: Mapping[str, tuple[ArrayLike, ArrayLike]], x: str, y: str) -> None:
     """One line a name, y logarithmic."""
     for name, (xs, ys) in lines.items():
-        axes.plot(np.asarray(xs), np.asarray(ys), label=name, color=colour(name), linewidth=1.2)
+        axes.plot(np.asarray(xs), np.asarray(ys), label=name, color=palette.colour(name), linewidth=1.2)
     axes.set(xlabel=x, ylabel=y, yscale="log")
     axes.legend(fontsize=7, frameon=False)
 
 
-def pareto(points: Mapping[str, tuple[float, float]]) -> list[str]:
-    """Names of the points (cost, error) that no other one beats or equals in both, by cost."""
-    front: list[str] = []
-    for name in sorted(points, key=lambda name: points[name]):
-        if not front or points[name][1] < points[front[-1]][1]:
-            front.append(name)
-    return front
-
-
-def speed(axes: Axes, points: Mapping[str, tuple[float, float]], x: str, y: str, also: Sequence[str] = ()) -> None:
+def speed(
+    axes: Axes,
+    palette: Palette,
+    points: Mapping[str, tuple[float, float]],
+    x: str,
+    y: str,
+    also: Sequence[str] = (),
+) -> None:
     """Cost against error, both logarithmic: the Pareto front is drawn, its members and those in `also` are named. Names
     are coloured as methods by what stands before their first comma."""
     front = pareto(points)
     axes.plot(*zip(*(points[name] for name in front), strict=True), color="#aeb7c6", linewidth=1, zorder=1)
     for name, (cost, error) in points.items():
-        axes.plot(cost, error, "o", color=colour(name.split(",")[0]), markersize=5 if name in front else 3.5, zorder=2)
+        colour = palette.colour(name.split(",")[0])
+        axes.plot(cost, error, "o", color=colour, markersize=5 if name in front else 3.5, zorder=2)
         if name in front or name in also:
             axes.annotate(name, (cost, error), textcoords="offset points", xytext=(5, 3), fontsize=7)
     axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from tasks.report.figures import as_svg
+from tasks.page.figures import as_svg
+from tasks.page.records import Metrics, Records
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,16 @@ def write_page(folder: Path, page: Page) -> None:
             (figures / f"{plot.name}.svg").write_text(svg)
             inlined[plot.name] = Markup(svg[svg.index("<svg") :])  # our own drawing; its texts are escaped in it
     environment = Environment(
-        loader=PackageLoader("tasks.report", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
+        loader=PackageLoader("tasks.page", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
     html = environment.get_template("template.html").render(page=page, svg=inlined)
     (folder / "report.html").write_text(html)
+
+
+def reporting(page: Callable[[list[Records[Metrics]]], Page]) -> Callable[[Path, dict[str, Any]], None]:
+    """Writes a run's report into its directory, from the records that lie there and its metrics, as this page shows it."""
+
+    def report(folder: Path, metrics: dict[str, Any]) -> None:
+        write_page(folder, page([Records(folder, metrics)]))
+
+    return report

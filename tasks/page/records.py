@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar, cast
 
 import pandas as pd
 
 from swiftwrf import InputError
+from tasks.metrics import RunMetrics
+
+Metrics = TypeVar("Metrics", bound=RunMetrics)
 
 
-class Records:
+class Records(Generic[Metrics]):
     """The files of one run.
 
     Args:
@@ -30,7 +33,7 @@ class Records:
             if not file.is_file():
                 raise InputError(f"{folder} is no finished run: it has no metrics.json")
             metrics = json.loads(file.read_text())
-        self.metrics: dict[str, Any] = metrics
+        self.metrics = cast(Metrics, metrics)
 
     @cached_property
     def config(self) -> dict[str, Any]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from tasks.report.page import Section, Table
-from tasks.report.records import Records
+from collections.abc import Sequence
+from typing import Any
+
+from tasks.page.page import Section, Table
+from tasks.page.records import Records
 
 
 def number(value: float | None, digits: int = 2) -> str:
@@ -11,7 +14,7 @@ def number(value: float | None, digits: int = 2) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def provenance(runs: list[Records]) -> Section:
+def provenance(runs: Sequence[Records[Any]]) -> Section:
     """Command, code, versions, machine, input and time of each run."""
     tables = []
     for run in runs:

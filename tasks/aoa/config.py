@@ -1,0 +1,85 @@
+"""The options of python -m tasks.aoa, and what is wrong with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
+
+from augment import SYNTHESIZERS
+from swiftwrf import InputError, Spectra
+from swiftwrf.arrays import PlanarArray
+from tasks.run import Preset, choice
+
+
+@dataclass(frozen=True)
+class AoaConfig:
+    """Angle of arrival with few measured spectra: turbo learning against its bounds and baselines.
+
+    Without --data the built-in simulated room is used. An interrupted run goes on with --resume DIR.
+    """
+
+    mix: tuple[float, ...]
+    """measured shares, each in (0, 1]: 0.3 keeps 30 % of the training spectra and synthesizes the others"""
+    data: str | None = None
+    """folder of spectra (NeRF2 layout) or of ray paths (paths.npz)"""
+    split: str = "random"
+    """a split that comes with the data, or a seeded one: random or block"""
+    synthesizer: Annotated[tuple[str, ...], choice("methods that draw the synthetic spectra", SYNTHESIZERS)] = (
+        "swiftwrf",
+    )
+    array: tuple[int, float, float] | None = None
+    """square array that took the spectra, where the data do not say: elements a side, spacing [m], carrier [Hz]"""
+    preset: Preset = "quick"
+    """quick: sized for a CPU; paper: the paper's model and a long training, for a GPU"""
+    repeats: int = 1
+    """runs with different random shares and networks, pooled"""
+    seed: int = 0
+    """of everything random"""
+    out: str | None = None
+    """directory of the run; must not exist (default: a new one under runs/aoa)"""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """where to compute"""
+
+
+def check(config: AoaConfig) -> None:
+    """Refuses what makes no sense whatever the data.
+
+    Raises:
+        InputError: such an option.
+    """
+    for name in config.synthesizer:
+        SYNTHESIZERS[name]  # refuses an unknown one
+    if not config.mix or not all(0 < share <= 1 for share in config.mix):
+        raise InputError(
+            f"--mix takes measured shares in (0, 1], got {' '.join(f'{s:g}' for s in config.mix) or 'none'}"
+        )
+    if len(set(config.mix)) < len(config.mix):
+        raise InputError(f"--mix names a share twice: {' '.join(f'{s:g}' for s in config.mix)}")
+    if config.array is not None and not (config.array[0] >= 2 and min(config.array[1:]) > 0):
+        raise InputError(
+            f"--array takes at least 2 elements a side, a spacing [m] and a carrier [Hz], got {config.array}"
+        )
+    if config.repeats < 1:
+        raise InputError(f"--repeats must be at least 1, got {config.repeats}")
+
+
+def with_array(data: Spectra, config: AoaConfig) -> Spectra:
+    """The data, with the array of the command line.
+
+    Raises:
+        InputError: a synthesizer needs the array, and neither data nor command line describe it.
+    """
+    if config.array is not None:
+        side, spacing, frequency = config.array
+        data = replace(data, array=PlanarArray.square(side, frequency, spacing))
+    for name in config.synthesizer:
+        if not can_draw(name, data):
+            raise InputError(
+                f"synthesizer {name} needs the array, which {data.name} does not describe; give it with --array"
+            )
+    return data
+
+
+def can_draw(synthesizer: str, data: Spectra) -> bool:
+    """Whether the data have what the synthesizer needs."""
+    return data.array is not None or "array" not in SYNTHESIZERS[synthesizer].needs

@@ -1,0 +1,74 @@
+"""One measured share of one run, as the report shows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pandas import DataFrame
+
+from tasks.metrics import AoaMetrics, MixMetrics
+from tasks.page.records import Records
+
+AoaRecords = Records[AoaMetrics]
+
+
+@dataclass(frozen=True)
+class Share:
+    """One measured share of one run.
+
+    Args:
+        run: the records of the run.
+        key: the share as metrics.json and file names have it.
+    """
+
+    run: AoaRecords
+    key: str
+
+    @classmethod
+    def of(cls, run: AoaRecords) -> list[Share]:
+        """All shares of a run."""
+        return [cls(run, key) for key in run.metrics["mixes"]]
+
+    @property
+    def mix(self) -> MixMetrics:
+        """Its numbers."""
+        return self.run.metrics["mixes"][self.key]
+
+    @property
+    def percent(self) -> str:
+        """The measured share in words."""
+        return f"{float(self.key):.0%}"
+
+    @property
+    def scene(self) -> str:
+        """The data and their split in words."""
+        return scene(self.run)
+
+    @property
+    def file_name(self) -> str:
+        """What its figures are called after."""
+        metrics = self.run.metrics
+        return f"{metrics['data']}-{metrics['split']}-mix{self.key}-s{metrics['seed']}"
+
+
+def scene(run: AoaRecords) -> str:
+    """The data and the split of a run in words."""
+    name = "the simulated room" if run.metrics["data"] == "simulated-room" else run.metrics["data"]
+    return f"{name}, {run.metrics['split']} split"
+
+
+def first_history(run: AoaRecords) -> DataFrame:
+    """History of everything trained for the first share and repeat."""
+    history = run.table("history")
+    return history[(history["repeat"] == 0) & (history["mix"] == history["mix"].iloc[0])]
+
+
+def fits(run: AoaRecords) -> tuple[DataFrame, DataFrame]:
+    """History of the fits of SwiftWRF for the first share and repeat: the last evaluation of each of the search, and the
+    final fit."""
+    history = first_history(run)
+    if "stage" not in history:
+        return history.iloc[:0], history.iloc[:0]
+    own = history[history["synthesizer"] == "swiftwrf"]
+    search = own[own["stage"] == "search"].groupby(["n_primitives", "steps"], as_index=False).last()
+    return search, own[own["stage"] == "final"]

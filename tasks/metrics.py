@@ -1,0 +1,137 @@
+"""The keys of metrics.json, shared by the experiments that write it and the pages and tables that read it.
+
+Numbers are degrees, dB and seconds; a number that does not exist is nan here and null in the file.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, TypedDict, get_args
+
+Angle = Literal["azimuth_deg", "elevation_deg", "great_circle_deg"]
+Score = Literal["psnr_db", "ssim", "l1"]
+ANGLES: tuple[Angle, ...] = get_args(Angle)
+SCORES: tuple[Score, ...] = get_args(Score)
+
+
+class ErrorSummary(TypedDict):
+    """Of `n` errors or scores; `low` and `high` are the 95 % interval of the median."""
+
+    median: float
+    p90: float
+    mean: float
+    low: float
+    high: float
+    n: int
+
+
+class RunMetrics(TypedDict):
+    """What every task says of a run."""
+
+    task: str
+    data: str
+    split: str
+    preset: str
+    seed: int
+    n_train: int
+    n_test: int
+
+
+class SynthesisSeconds(TypedDict):
+    """Of one synthesizer, the mean of the repeats."""
+
+    fit: float
+    synthesize: float
+
+
+class SynthesisMetrics(TypedDict):
+    """How well one synthesizer draws the test spectra."""
+
+    psnr_db: ErrorSummary
+    ssim: ErrorSummary
+    l1: ErrorSummary
+    seconds: SynthesisSeconds
+
+
+class ArmSeconds(TypedDict):
+    """Of one estimator, the mean of the repeats."""
+
+    train: float
+    estimate: float
+
+
+class ArmMetrics(TypedDict):
+    """How wrong one estimator is."""
+
+    azimuth_deg: ErrorSummary
+    elevation_deg: ErrorSummary
+    great_circle_deg: ErrorSummary
+    seconds: ArmSeconds
+
+
+class MixSeconds(TypedDict):
+    """Of the synthesizers asked for and of all networks together."""
+
+    fit: float
+    synthesize: float
+    train: float
+
+
+class MixMetrics(TypedDict):
+    """One measured share."""
+
+    n_measured: int
+    synthesis: dict[str, SynthesisMetrics]
+    methods: dict[str, ArmMetrics]
+    seconds: MixSeconds
+
+
+class AoaMetrics(RunMetrics):
+    """Of a run of tasks.aoa; `mixes` by measured share."""
+
+    repeats: int
+    moving: str
+    grid: tuple[int, int]
+    line_of_sight_share: float
+    mixes: dict[str, MixMetrics]
+
+
+class PredictorSeconds(TypedDict):
+    """Of one predictor."""
+
+    fit: float
+    predict: float
+
+
+class ReceiverMetrics(TypedDict):
+    """How wrong a predictor is at one receiver."""
+
+    abs_error_db: ErrorSummary
+
+
+class PredictorMetrics(ReceiverMetrics):
+    """How wrong a predictor is at all receivers, and how long it took."""
+
+    seconds: PredictorSeconds
+
+
+class IntervalMetrics(TypedDict):
+    """Nominal and measured share of the test values inside SwiftWRF's interval."""
+
+    nominal: float
+    coverage: float
+
+
+class ChosenMetrics(TypedDict):
+    """What the fit of SwiftWRF chose."""
+
+    n_primitives: int
+
+
+class RssiMetrics(RunMetrics):
+    """Of a run of tasks.rssi; `receivers` by receiver and method."""
+
+    overall: dict[str, PredictorMetrics]
+    receivers: dict[str, dict[str, ReceiverMetrics]]
+    seconds: PredictorSeconds
+    interval: IntervalMetrics
+    chosen: ChosenMetrics

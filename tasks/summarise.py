@@ -1,0 +1,76 @@
+"""The statistics of tables and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pandas import DataFrame, Series
+
+from swiftwrf.metrics import summary
+from tasks.metrics import ErrorSummary
+
+SHORTEST = 1e-5  # seconds: what took less is drawn here, for logarithmic axes have no zero
+
+
+def error_summary(values: ArrayLike) -> ErrorSummary:
+    """Median, 90th percentile, mean, interval of the median and number of the finite values."""
+    return cast(ErrorSummary, summary(values))
+
+
+def repeats_averaged(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, ErrorSummary]]:
+    """Summary of each column under each value of `by`.
+
+    Repeats of a test sample (rows of one `index`) are averaged first: they are not independent, and the interval must not
+    shrink with their number.
+    """
+    means = table.groupby([by, "index"], sort=False)[list(columns)].mean()
+    groups = means.groupby(level=by, sort=False)
+    return {str(name): {column: error_summary(part[column]) for column in columns} for name, part in groups}
+
+
+def grouped(table: DataFrame, by: Sequence[str], column: str) -> dict[tuple[str, ...], ErrorSummary]:
+    """Summary of a column under each combination of values of `by` that occurs."""
+    return {key: error_summary(part) for key, part in table.groupby(list(by), sort=False)[column]}
+
+
+def averaged(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Mean of each column under each value of `by`."""
+    means: dict[str, dict[str, float]] = table.groupby(by, sort=False)[list(columns)].mean().to_dict("index")
+    return means
+
+
+def paired_difference(errors: DataFrame, method: str, other: str) -> tuple[float, float, float]:
+    """Mean of one method's errors minus another's on the same pairs, and its 95 % interval.
+
+    The interval is a bootstrap over test rows, for the receivers of one row are not independent.
+
+    Args:
+        errors: a column a method, one row a pair, indexed by `index` (the test row) and `receiver`.
+    """
+    difference = (errors[method] - errors[other]).groupby(level="index").agg(["sum", "count"]).to_numpy()
+    draws = np.random.default_rng(0).integers(len(difference), size=(1000, len(difference)))
+    sums = difference[draws].sum(axis=1)
+    low, high = np.percentile(sums[:, 0] / sums[:, 1], (2.5, 97.5))
+    return float(difference[:, 0].sum() / difference[:, 1].sum()), float(low), float(high)
+
+
+def running_median(values: Series) -> Series:
+    """Median of the values around each, in a window of a fifth of them."""
+    return values.rolling(max(len(values) // 5, 1), center=True).median()
+
+
+def rms_of_psnr(psnr_db: float) -> float:
+    """Root of the mean square error of a spectrum with this PSNR."""
+    return float(10 ** (-psnr_db / 20))
+
+
+def pareto(points: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Names of the points (cost, error) that no other one beats or equals in both, by cost."""
+    front: list[str] = []
+    for name in sorted(points, key=lambda name: points[name]):
+        if not front or points[name][1] < points[front[-1]][1]:
+            front.append(name)
+    return front
