@@ -13,10 +13,10 @@ from swiftwrf.data.room import simulated_room
 from swiftwrf.data.rssi_room import rssi_room
 from swiftwrf.errors import FitError, InputError
 from swiftwrf.fit import fit
-from swiftwrf.fit_config import FitConfig, RssiConfig
+from swiftwrf.fit_config import FitConfig
 from swiftwrf.model import ModelConfig, SwiftWRF, load
 from swiftwrf.rasterize import rasterize
-from swiftwrf.rssi import RssiModel, fit_rssi
+from swiftwrf.rssi import RssiConfig, RssiModel, fit_rssi
 
 __all__ = [
     "AngularGrid",

@@ -16,7 +16,7 @@ from swiftwrf.fit_config import Validation
 from swiftwrf.metrics import summary
 from tasks.report import write_report
 from tasks.rssi.cluster import on_cluster
-from tasks.rssi.predictors import PREDICTORS, SwiftWRFPredictor, make_predictor
+from tasks.rssi.predictors import PREDICTORS, Settings, SwiftWRFPredictor
 from tasks.run import Row, Run, choose_device, console
 
 MAP_CELLS = 80  # along the longer side of the floor
@@ -59,15 +59,18 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     """
     device = choose_device("cpu" if config.device == "auto" else config.device)
     _check_floor_plan(config)
-    data = (load_rssi(config.data) if config.data else rssi_room(seed=config.seed)).receivers(config.rx)
+    whole = load_rssi(config.data) if config.data else rssi_room(seed=config.seed)
+    data, (pool, _) = whole.receivers(config.rx), whole.split(config.split, config.seed)
     train, test = data.split(config.split, config.seed)
-    options = {"device": device} | ({"parallel": on_cluster(config.scheduler)} if config.scheduler else {})
+    validation: Validation = "random" if config.split == "random" else "block"
+    parallel = on_cluster(config.scheduler) if config.scheduler else map
+    settings = Settings(validation, config.seed, config.preset, device, parallel, pool)
     train.receivers(["all"])  # refuses receivers heard too rarely to learn from
     if not bool((~test.rssi_dbm.isnan()).any()):
         raise InputError(f"split {config.split!r} of {data.name} has no heard test rows for these receivers")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     with Run("rssi", config.out, label, config, device, data.source, resume) as directory:
-        tables = _Tables(data, train, test, config, directory, options)
+        tables = _Tables(data, train, test, config, directory, settings)
         for name in PREDICTORS:
             tables.add(name)
         directory.write_csv("errors.csv", tables.errors)
@@ -105,9 +108,9 @@ class _Tables:
     """Fits and tests every predictor, each a step of the run's directory, and gathers the tables of the run."""
 
     def __init__(
-        self, data: Rssi, train: Rssi, test: Rssi, config: RssiTaskConfig, directory: Run, options: Row
+        self, data: Rssi, train: Rssi, test: Rssi, config: RssiTaskConfig, directory: Run, settings: Settings
     ) -> None:
-        self.train, self.test, self.config, self.directory, self.options = train, test, config, directory, options
+        self.train, self.test, self.config, self.directory, self.settings = train, test, config, directory, settings
         self.errors: list[Row] = []
         self.predictions: list[Row] = []
         self.seconds: dict[str, Row] = {}
@@ -121,10 +124,7 @@ class _Tables:
         """One predictor."""
 
         def compute() -> Row:
-            validation: Validation = "random" if self.config.split == "random" else "block"
-            predictor = make_predictor(
-                name, validation=validation, seed=self.config.seed, preset=self.config.preset, **self.options
-            )
+            predictor = PREDICTORS[name].make(self.settings)
             began = time.perf_counter()
             predictor.fit(self.train)
             fitted = time.perf_counter()
