@@ -13,10 +13,9 @@ from swiftwrf.data import Rssi, Spectra, load_rssi, load_spectra
 from swiftwrf.data.simulated import rssi_room, simulated_room
 from swiftwrf.errors import FitError, InputError
 from swiftwrf.fitting import FitConfig, fit
-from swiftwrf.fitting.config import RssiConfig
 from swiftwrf.model import ModelConfig, SwiftWRF
 from swiftwrf.rasterize import rasterize, rasterize_magnitude
-from swiftwrf.rssi import RssiModel, fit_rssi
+from swiftwrf.rssi import RssiConfig, RssiModel, fit_rssi
 
 __all__ = [
     "AngularGrid",

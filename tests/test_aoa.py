@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 import torch
 
-from augment import Mixed
+from augment import SYNTHESIZERS, Mixed
 from swiftwrf import AngularGrid, CoarrayModel, FitConfig, InputError, ModelConfig, load, simulated_room
 from swiftwrf.metrics import angle_errors
 from tasks.aoa import aann, arms, experiment

@@ -11,11 +11,12 @@ import torch
 from PIL import Image
 
 from swiftwrf import FitError, InputError, Rssi, RssiConfig, fit_rssi, rssi_room
-from swiftwrf import rssi as rssi_module
+from swiftwrf.rssi import fit as rssi_fit
+from swiftwrf.rssi import log_distance
+from swiftwrf.rssi import model as rssi_model
 from tasks.rssi import experiment
 from tasks.rssi.cluster import on_cluster
-from tasks.rssi.interim import PREDICTORS
-from tasks.rssi.predictors import make_predictor
+from tasks.rssi.predictors import PREDICTORS, Settings
 from tasks.run import command_line
 
 QUICK = RssiConfig(steps=60)
@@ -48,7 +49,7 @@ def with_field(n=150, noise=0.5, seed=0):
 def test_fit_learns_the_field_that_the_law_leaves():
     train, test = with_field().split("random")
     model = fit_rssi(train, QUICK)
-    law = make_predictor("mri_receiver", validation="random", seed=0)
+    law = PREDICTORS["mri_receiver"].make(Settings())
     law.fit(train)
     errors = [
         (p - test.rssi_dbm).abs().median()
@@ -90,14 +91,14 @@ def test_far_away_only_the_law_is_left():
     far = torch.tensor([[4000.0, 0, 0]], dtype=torch.float64)
     group = model.groups[0]
     bearing = 2.0 * torch.einsum("brh,rh->br", group.harmonics(far), group.directivity)
-    law = group.level + group.slope * rssi_module.log_distance(far, group.receiver).float() + bearing
+    law = group.level + group.slope * log_distance(far, group.receiver).float() + bearing
     torch.testing.assert_close(model.predict(far)[0], law, atol=1e-3, rtol=0)
 
 
 def test_groups_of_receivers_may_be_fitted_anywhere(monkeypatch):
     """Two groups fitted one after the other or by two processes of a cluster: the same bits."""
     distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    monkeypatch.setattr(rssi_module, "GROUP", 2)
+    monkeypatch.setattr(rssi_fit, "GROUP", 2)
     data = with_field(n=40)
     here = fit_rssi(data, QUICK)
     assert len(here.groups) == 2
@@ -140,7 +141,7 @@ def test_model_refuses(monkeypatch):
     rare.rssi_dbm[9:, 1] = torch.nan
     with pytest.raises(InputError, match="'b' is heard in 9"):
         fit_rssi(rare, QUICK)
-    monkeypatch.setattr(rssi_module.ReceiverGroup, "forward", lambda self, p: self.level * torch.nan + p[:, :1].float())
+    monkeypatch.setattr(rssi_model.ReceiverGroup, "forward", lambda self, p: self.level * torch.nan + p[:, :1].float())
     with pytest.raises(FitError, match="step 0"):
         fit_rssi(law_only(), QUICK)
 
@@ -148,7 +149,7 @@ def test_model_refuses(monkeypatch):
 @pytest.mark.parametrize("name", [n for n in PREDICTORS if n.startswith(("mri", "gp"))])
 def test_predictors_with_a_law_recover_it(name):
     data = law_only()
-    predictor = make_predictor(name, validation="random", seed=0)
+    predictor = PREDICTORS[name].make(Settings())
     predictor.fit(data)
     place = torch.tensor([[3.0, 4.0, 2.0]], dtype=torch.float64)
     assert predictor.predict(place)[0, 0].item() == pytest.approx(-50 - 20 * np.log10(5), abs=0.05)
@@ -164,16 +165,28 @@ def test_pooled_law_is_one_law():
         data.rssi_dbm + torch.tensor([0.0, 3, 6]),
         data.index,
     )
-    pooled = make_predictor("mri_pooled", validation="random", seed=0)
+    pooled = PREDICTORS["mri_pooled"].make(Settings())
     pooled.fit(shifted)
     place = torch.tensor([[5.0, 5.0, 2.0]], dtype=torch.float64)  # equally far from all receivers
     assert torch.allclose(pooled.predict(place)[0], pooled.predict(place)[0, 0])
 
 
+def test_pooled_law_pools_over_all_receivers_of_the_data():
+    """Asked for one receiver, it learns from the others, too."""
+    data = rssi_room(n=60)
+    one, every = data.receivers(["6"]), PREDICTORS["mri_pooled"].make(Settings())
+    every.fit(data)
+    pooled = PREDICTORS["mri_pooled"].make(Settings(pool=data))
+    pooled.fit(one)
+    torch.testing.assert_close(
+        pooled.predict(data.transmitter_position)[:, 0], every.predict(data.transmitter_position)[:, 5]
+    )
+
+
 @pytest.mark.parametrize("name", list(PREDICTORS))
 def test_predictors_ignore_what_was_not_heard(name):
     train, test = rssi_room(n=60).receivers(["1", "2"]).split("random")
-    predictor = make_predictor(name, validation="block", seed=0)
+    predictor = PREDICTORS[name].make(Settings("block"))
     predictor.fit(train)
     predicted = predictor.predict(test.transmitter_position)
     assert predicted.shape == (12, 2)
@@ -184,7 +197,7 @@ def test_predictors_ignore_what_was_not_heard(name):
 
 def test_unknown_predictor():
     with pytest.raises(InputError, match="choose from swiftwrf"):
-        make_predictor("forest", validation="random", seed=0)
+        PREDICTORS["forest"]
 
 
 @pytest.fixture

@@ -13,13 +13,13 @@ from pandas import DataFrame
 from PIL import Image, UnidentifiedImageError
 
 from swiftwrf import InputError, Rssi, load_rssi, rssi_room
-from swiftwrf.fit_config import Validation
+from swiftwrf.data.splits import validation_for
+from swiftwrf.positions import distance
 from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
 from tasks.page.page import reporting
 from tasks.rssi.cluster import on_cluster
-from tasks.rssi.interim import PREDICTORS
 from tasks.rssi.page import page
-from tasks.rssi.predictors import SwiftWRFPredictor
+from tasks.rssi.predictors import PREDICTORS, Settings, SwiftWRFPredictor
 from tasks.run import Preset, Row, Run, choose_device, console
 from tasks.summarise import error_summary, grouped
 
@@ -63,15 +63,17 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     """
     device = choose_device("cpu" if config.device == "auto" else config.device)
     _check_floor_plan(config)
-    data = (load_rssi(config.data) if config.data else rssi_room(seed=config.seed)).receivers(config.rx)
+    whole = load_rssi(config.data) if config.data else rssi_room(seed=config.seed)
+    data, (pool, _) = whole.receivers(config.rx), whole.split(config.split, config.seed)
     train, test = data.split(config.split, config.seed)
-    options = {"device": device} | ({"parallel": on_cluster(config.scheduler)} if config.scheduler else {})
+    parallel = on_cluster(config.scheduler) if config.scheduler else map
+    settings = Settings(validation_for(config.split), config.seed, config.preset, device, parallel, pool)
     train.receivers(["all"])  # refuses receivers heard too rarely to learn from
     if not bool((~test.rssi_dbm.isnan()).any()):
         raise InputError(f"split {config.split!r} of {data.name} has no heard test rows for these receivers")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     with Run("rssi", config.out, label, config, device, data.source, resume) as directory:
-        tables = _Tables(data, train, test, config, directory, options)
+        tables = _Tables(data, train, test, config, directory, settings)
         for name in PREDICTORS:
             tables.add(name)
         directory.write_csv("errors.csv", tables.errors)
@@ -113,26 +115,23 @@ class _Tables:
     """Fits and tests every predictor, each a step of the run's directory, and gathers the tables of the run."""
 
     def __init__(
-        self, data: Rssi, train: Rssi, test: Rssi, config: RssiTaskConfig, directory: Run, options: Row
+        self, data: Rssi, train: Rssi, test: Rssi, config: RssiTaskConfig, directory: Run, settings: Settings
     ) -> None:
-        self.train, self.test, self.config, self.directory, self.options = train, test, config, directory, options
+        self.train, self.test, self.config, self.directory, self.settings = train, test, config, directory, settings
         self.errors: list[Row] = []
         self.predictions: list[Row] = []
         self.seconds: dict[str, PredictorSeconds] = {}
         self.coverage = float("nan")
         self.n_primitives = 0
         test_position = test.transmitter_position
-        self.from_receiver = torch.cdist(test_position, data.receiver_position)
-        self.from_training = torch.cdist(test_position, train.transmitter_position).min(dim=1).values
+        self.from_receiver = distance(test_position, data.receiver_position)
+        self.from_training = distance(test_position, train.transmitter_position).min(dim=1).values
 
     def add(self, name: str) -> None:
         """One predictor."""
 
         def compute() -> Row:
-            validation: Validation = "random" if self.config.split == "random" else "block"
-            predictor = PREDICTORS[name].make(
-                validation=validation, seed=self.config.seed, preset=self.config.preset, **self.options
-            )
+            predictor = PREDICTORS[name].make(self.settings)
             began = time.perf_counter()
             predictor.fit(self.train)
             fitted = time.perf_counter()

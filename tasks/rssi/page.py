@@ -11,7 +11,7 @@ from tasks.page.page import Page, Plot, Section, Table
 from tasks.page.palette import Palette
 from tasks.page.provenance import number, provenance
 from tasks.page.records import Records
-from tasks.rssi.interim import PREDICTORS
+from tasks.rssi.predictors import PREDICTORS
 from tasks.summarise import SHORTEST, paired_difference, running_median
 
 RssiRecords = Records[RssiMetrics]

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
-from sklearn.linear_model import LinearRegression
 from sklearn.model_selection import GridSearchCV, PredefinedSplit
 from sklearn.neighbors import KNeighborsRegressor
-from swiftwrf.fit import folds
-from swiftwrf.fit_config import Validation
 from torch import Tensor
 
-from swiftwrf import InputError, Rssi, RssiConfig, RssiModel, fit_rssi
-from swiftwrf.rssi import log_distance
+from swiftwrf import Rssi, RssiConfig, RssiModel, fit_rssi
+from swiftwrf.data.splits import Validation, folds
+from swiftwrf.registry import Registry
+from swiftwrf.rssi import Map, fit_law, log_distance
 
 NEIGHBOURS = (1, 3, 5, 8, 12, 20, 40, 80, 120)
 TUNED_ROWS, KEPT_ROWS = 500, 1500  # of the Gaussian process: its cost grows with their cube
@@ -34,6 +34,30 @@ class Predictor(Protocol):
         """RSSI (n, R) [dBm] at transmitter positions (n, 3) [m]."""
 
 
+@dataclass(frozen=True)
+class Settings:
+    """What a predictor is made from.
+
+    Args:
+        validation: how training rows are held out to choose its settings.
+        seed: of what is random.
+        preset: of SwiftWRF: `quick`, or `paper` for the plain head.
+        device: where SwiftWRF computes.
+        parallel: how SwiftWRF's groups of receivers are mapped.
+        pool: the training rows of every receiver of the data; those asked for unless given.
+    """
+
+    validation: Validation = "random"
+    seed: int = 0
+    preset: Literal["quick", "paper"] = "quick"
+    device: torch.device | str = "cpu"
+    parallel: Map = map
+    pool: Rssi | None = None
+
+
+PREDICTORS = Registry[Predictor]("predictor")
+
+
 class Mean:
     """The mean of each receiver's training values, wherever the transmitter is."""
 
@@ -46,28 +70,24 @@ class Mean:
 
 class LogDistance:
     """RSSI = T - 10 gamma log10 d by least squares (the log-distance law; "MRI" in the NeRF2 repository and, most likely,
-    in the paper's table), with one T and gamma for all receivers, or one for each.
+    in the paper's table), for each receiver, or one for all.
 
     Args:
         pooled: one law for all receivers.
+        pool: the rows it is fitted to; None: those that `fit` is given.
     """
 
-    def __init__(self, pooled: bool) -> None:
-        self._pooled = pooled
+    def __init__(self, pooled: bool, pool: Rssi | None = None) -> None:
+        self._pooled, self._pool = pooled, pool
 
     def fit(self, train: Rssi) -> None:
         self._receiver = train.receiver_position
-        distance, n = log_distance(train.transmitter_position, self._receiver), len(train.receiver_names)
-        laws = []
-        for columns in [list(range(n))] * n if self._pooled else [[r] for r in range(n)]:
-            heard = ~train.rssi_dbm[:, columns].isnan()
-            x = distance[:, columns][heard][:, None].numpy()
-            laws.append(LinearRegression().fit(x, train.rssi_dbm[:, columns][heard].numpy()))
-        self._level = torch.tensor([law.intercept_ for law in laws], dtype=torch.float64)
-        self._slope = torch.tensor([law.coef_[0] for law in laws], dtype=torch.float64)
+        rows = self._pool or train
+        distance = log_distance(rows.transmitter_position, rows.receiver_position)
+        self._law = fit_law(distance, rows.rssi_dbm, pooled=self._pooled)
 
     def predict(self, position: Tensor) -> Tensor:
-        return self._level + self._slope * log_distance(position, self._receiver)
+        return self._law(log_distance(position, self._receiver))
 
 
 class _PerReceiver(ABC):
@@ -138,33 +158,64 @@ class SwiftWRFPredictor:
         return self.model.predict(position)[0]
 
 
-PREDICTORS = ("swiftwrf", "mean", "mri_pooled", "mri_receiver", "mri_residual", "knn", "gp")
+@PREDICTORS.register(
+    "swiftwrf",
+    meaning="50 primitives a receiver on a 16 x 16 grid, averaged, on a log-distance law",
+    needs=("positions of the receivers",),
+    colour="#4477aa",
+)
+def _swiftwrf(settings: Settings) -> Predictor:
+    config = RssiConfig.paper if settings.preset == "paper" else RssiConfig
+    return SwiftWRFPredictor(
+        config(validation=settings.validation, seed=settings.seed), device=settings.device, parallel=settings.parallel
+    )
 
 
-def make_predictor(
-    name: str, *, validation: Validation, seed: int, preset: str = "default", **options: Any
-) -> Predictor:
-    """The predictor of that name.
+@PREDICTORS.register("mean", meaning="the mean of the receiver's training values", colour="#bbbbbb")
+def _mean(settings: Settings) -> Predictor:
+    return Mean()
 
-    Args:
-        name: one of `PREDICTORS`.
-        validation: how training rows are held out to choose settings.
-        seed: of what is random.
-        preset: of SwiftWRF: `default`, or `paper` for the plain head.
-        options: device and parallel of `fit_rssi`.
 
-    Raises:
-        InputError: an unknown name.
-    """
-    if name == "mean":
-        return Mean()
-    if name in ("mri_pooled", "mri_receiver"):
-        return LogDistance(pooled=name == "mri_pooled")
-    if name in ("mri_residual", "knn"):
-        return NearestNeighbours(validation, seed, on_law=name == "mri_residual")
-    if name == "gp":
-        return GaussianProcess(validation, seed, on_law=True)
-    if name == "swiftwrf":
-        make = RssiConfig.paper if preset == "paper" else RssiConfig
-        return SwiftWRFPredictor(make(validation=validation, seed=seed), **options)
-    raise InputError(f"unknown predictor {name!r}; choose from {', '.join(PREDICTORS)}")
+@PREDICTORS.register(
+    "mri_pooled",
+    meaning="one log-distance law for all receivers of the data",
+    needs=("positions of the receivers",),
+    colour="#ee6677",
+)
+def _mri_pooled(settings: Settings) -> Predictor:
+    return LogDistance(pooled=True, pool=settings.pool)
+
+
+@PREDICTORS.register(
+    "mri_receiver",
+    meaning="a log-distance law for each receiver",
+    needs=("positions of the receivers",),
+    colour="#ee8866",
+)
+def _mri_receiver(settings: Settings) -> Predictor:
+    return LogDistance(pooled=False)
+
+
+@PREDICTORS.register(
+    "mri_residual",
+    meaning="the same, and what it leaves interpolated from the nearest measurements",
+    needs=("positions of the receivers",),
+    colour="#ccbb44",
+)
+def _mri_residual(settings: Settings) -> Predictor:
+    return NearestNeighbours(settings.validation, settings.seed, on_law=True)
+
+
+@PREDICTORS.register("knn", meaning="inverse-distance mean of the nearest measurements", colour="#66ccee")
+def _knn(settings: Settings) -> Predictor:
+    return NearestNeighbours(settings.validation, settings.seed, on_law=False)
+
+
+@PREDICTORS.register(
+    "gp",
+    meaning="a Gaussian process on what the log-distance law leaves",
+    needs=("positions of the receivers",),
+    colour="#228833",
+)
+def _gp(settings: Settings) -> Predictor:
+    return GaussianProcess(settings.validation, settings.seed, on_law=True)

@@ -10,44 +10,30 @@ sum of a few fields, the same for all positions. All receivers of a group are on
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from swiftwrf.angles import AngularGrid
-from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import MIN_TRAINING, folds
-from swiftwrf.errors import FitError, InputError
-from swiftwrf.fitting.config import RssiConfig
-from swiftwrf.gp import Kernel, SmoothField, candidates, held_out_weights, thinned
+from swiftwrf.gp import Kernel, SmoothField
 from swiftwrf.model.primitives import Primitives
 from swiftwrf.positions import check_positions
-from swiftwrf.progress import progress
 from swiftwrf.rasterize import rasterize
 from swiftwrf.rasterize.magnitude import magnitude
+from swiftwrf.rssi.config import RssiConfig
+from swiftwrf.rssi.law import log_distance
 
 GRID = AngularGrid.hemisphere(16, 16)
 SCALE = 100.0  # dB per unit of pooled magnitude
-NEAREST = 0.3  # [m] distances below it count as it: the log-distance law ends somewhere
-MAX_ANCHORS = 1500
 UNCERTAINTY_ANCHORS = 400  # are enough to tell measured regions from others, at a tenth of the cost
-GROUP = 16  # receivers fitted as one program: bounds the memory of hundreds
 DIRECTIVITY_DB = 2.0  # prior deviation of each harmonic of a receiver's antenna and surroundings
 HARMONICS = 8  # real spherical harmonics of degree 1 and 2
 JITTER = 1e-3  # of the field's prior where anchors nearly coincide
-NOISES = (0.3, 1.0, 2.0, 3.0)  # variance of a packet relative to that of the field: fading is as large as shadowing
-Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
-
-
-def log_distance(position: Tensor, receiver: Tensor) -> Tensor:
-    """log10 of the distances [m] from positions (B, 3) to receivers (R, 3), float64 (B, R)."""
-    return torch.cdist(position.double(), receiver).clamp_min(NEAREST).log10()
 
 
 class ReceiverGroup(nn.Module):
@@ -184,114 +170,3 @@ class RssiModel(nn.Module):
             return (torch.empty(0, sum(len(cast(ReceiverGroup, group).receiver) for group in self.groups)),) * 3
         middle, deviation = (torch.cat(x) for x in zip(*(self(p) for p in position.split(batch)), strict=True))
         return middle, middle - self.widening * deviation, middle + self.widening * deviation
-
-
-def fit_rssi(
-    train: Rssi, config: RssiConfig | None = None, *, device: torch.device | str = "cpu", parallel: Map = map
-) -> RssiModel:
-    """Fits all receivers at once; same data, configuration and machine give the same model.
-
-    The kernel, and whether there are primitives at all, are chosen by cross-validation on what the log-distance law leaves;
-    the width of the interval on one held-out fold of the training rows.
-
-    Args:
-        train: the only rows it sees; a receiver's missing values do not count.
-        config: how; `RssiConfig()` unless given.
-        device: where to optimise; the model that comes back is on the CPU.
-        parallel: maps the fit over groups of receivers; give one that spreads work over processes or machines.
-
-    Raises:
-        InputError: a receiver heard in too few rows.
-        FitError: a loss that is not finite.
-    """
-    config = config or RssiConfig()
-    for name, count in zip(train.receiver_names, (~train.rssi_dbm.isnan()).sum(dim=0).tolist(), strict=True):
-        if count < MIN_TRAINING:
-            raise InputError(f"receiver {name!r} is heard in {count} training rows; at least {MIN_TRAINING} are needed")
-    fold = folds(train.transmitter_position, config.validation, config.seed)
-    kernel, helps = _choose_field(train.transmitter_position, _log_distance_law(train)[1], fold)
-    rest, held_out = train.subset((fold != 0).nonzero()[:, 0]), train.subset((fold == 0).nonzero()[:, 0])
-    task = functools.partial(
-        _optimise,
-        n_primitives=config.n_primitives if helps or not config.law else 0,
-        kernel=kernel,
-        config=config,
-        device=torch.device(device),
-    )
-    searched, model = (RssiModel(list(parallel(task, _groups(rows)))) for rows in (rest, train))
-    with torch.no_grad():
-        predicted, deviation = searched(held_out.transmitter_position)
-    standardised = (predicted - held_out.rssi_dbm).abs() / deviation
-    model.widening.fill_(standardised[standardised.isfinite()].quantile(config.coverage))
-    return model.eval()
-
-
-def _groups(rows: Rssi) -> list[Rssi]:
-    """The receivers in groups of a fixed size, so that the numbers do not depend on who fits which group."""
-    columns = list(range(len(rows.receiver_names)))
-    return [rows.columns(columns[start : start + GROUP]) for start in range(0, len(columns), GROUP)]
-
-
-def _choose_field(position: Tensor, residual: Tensor, fold: Tensor) -> tuple[Kernel, bool]:
-    """The kernel that best predicts what the log-distance law leaves (n, R) where it is held out, by mean absolute error
-    [dB], and whether that is better than leaving it. Missing values count as 0 when they predict; they are not scored."""
-    position, residual, fold = thinned(position, residual, fold)
-    filled = residual.nan_to_num()
-
-    def missed(kernel: Kernel) -> float:
-        parts = held_out_weights(kernel, position, fold)
-        return float(torch.cat([(gain @ filled[kept] - residual[out]).abs() for out, kept, gain in parts]).nanmean())
-
-    best = min(candidates(position, NOISES), key=missed)
-    return best, missed(best) < float(residual.abs().nanmean())
-
-
-def _log_distance_law(train: Rssi) -> tuple[Tensor, Tensor]:
-    """Level and slope (R, 2) of each receiver by least squares, and what they leave (n, R), nan where not heard."""
-    distance = log_distance(train.transmitter_position, train.receiver_position)
-    law, residual = torch.zeros(len(train.receiver_names), 2), torch.full_like(train.rssi_dbm, torch.nan)
-    for r in range(len(law)):
-        heard = ~train.rssi_dbm[:, r].isnan()
-        design = torch.stack([torch.ones(int(heard.sum()), dtype=torch.float64), distance[heard, r]], dim=1)
-        coefficients = torch.linalg.lstsq(design, train.rssi_dbm[heard, r]).solution
-        law[r] = coefficients.float()
-        residual[heard, r] = train.rssi_dbm[heard, r] - design @ coefficients
-    return law, residual
-
-
-def _optimise(
-    train: Rssi, n_primitives: int, kernel: Kernel, config: RssiConfig, device: torch.device
-) -> ReceiverGroup:
-    """Maximum a posteriori: Huber's loss in units of the noise, and the prior of the functions of position."""
-    generator = torch.Generator().manual_seed(config.seed)
-    position, rssi = train.transmitter_position, train.rssi_dbm.float()
-    rows = torch.randperm(len(train), generator=generator)[:MAX_ANCHORS].sort().values
-    model = ReceiverGroup(train.receiver_position, position[rows], kernel, n_primitives, config)
-    law, residual = _log_distance_law(train)
-    variance = residual.square().nanmean(dim=0).float().clamp_min(1e-6)
-    with torch.no_grad():
-        if config.law:
-            model.level.copy_(law[:, 0])
-            model.slope.copy_(law[:, 1])
-        share = kernel.noise / (1 + kernel.noise) if n_primitives else 1.0
-        model.noise_db.copy_((share * variance).sqrt())
-        model.field_db.copy_(((1 - share) * variance).sqrt())
-    model, position, rssi = model.to(device), position.to(device), rssi.to(device)
-    optimiser = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], lr=config.rate)
-    heard = int((~rssi.isnan()).sum())
-    described = f"{len(train.receiver_names)} receivers, {n_primitives} primitives"
-    for step in progress(range(config.steps), described):
-        batch = torch.randint(len(train), (min(config.batch, len(train)),), generator=generator)
-        measured = rssi[batch]
-        missed = ((model(position[batch]) - measured) / model.noise_db)[~measured.isnan()]
-        loss = functional.huber_loss(missed, torch.zeros_like(missed), delta=config.huber)
-        loss = loss + model.prior() / heard
-        if not math.isfinite(loss.item()):
-            raise FitError(
-                f"the RSSI fit broke at step {step}: loss {loss.item():.3g}; try a rate below {config.rate:g}"
-            )
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.param_groups[0]["lr"] = config.rate * 0.5 * (1 + math.cos(math.pi * step / config.steps))
-        optimiser.step()
-    return model.requires_grad_(False).cpu()

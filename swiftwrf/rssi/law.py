@@ -1,0 +1,52 @@
+"""The log-distance law: received power falls by 10 gamma dB for each decade of distance."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+from swiftwrf.positions import distance
+
+NEAREST = 0.3  # [m] distances below it count as it: the law ends somewhere
+
+
+def log_distance(position: Tensor, receiver: Tensor) -> Tensor:
+    """log10 of the distances [m] from positions (n, 3) to receivers (R, 3), float64 (n, R)."""
+    return distance(position.double(), receiver.double()).clamp_min(NEAREST).log10()
+
+
+class Law(NamedTuple):
+    """rssi = level + slope log10 d, for each of R receivers, or one for all."""
+
+    level: Tensor  # float64 (R,) or (1,) [dBm] at 1 m
+    slope: Tensor  # float64 (R,) or (1,), -10 gamma [dB a decade]
+
+    def __call__(self, distance: Tensor) -> Tensor:
+        """RSSI [dBm] at log10 distances (n, R)."""
+        return self.level + self.slope * distance
+
+
+def fit_law(distance: Tensor, rssi: Tensor, *, pooled: bool = False) -> Law:
+    """The law by least squares (Rappaport, "Wireless Communications", 2nd ed., 2002, section 4.9).
+
+    A receiver whose measurements are all equally far has a level and no slope; one never heard has nan.
+
+    Args:
+        distance: log10 of the distances [m], (n, R).
+        rssi: (n, R) [dBm], nan where not heard.
+        pooled: one law for all receivers.
+    """
+    heard = ~rssi.isnan()
+    along = (0, 1) if pooled else (0,)
+    count = heard.sum(along)
+
+    def mean(x: Tensor) -> Tensor:
+        return x.where(heard, 0.0).sum(along) / count
+
+    middle, centre = mean(rssi), mean(distance)
+    away = distance - centre
+    variance = mean(away.square())
+    slope = (mean(away * (rssi - middle)) / variance).where(variance > 1e-12, 0.0)
+    level = middle - slope * centre
+    return Law(level.reshape(-1), slope.reshape(-1))
