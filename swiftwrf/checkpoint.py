@@ -9,7 +9,7 @@ import json
 import os
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
@@ -78,7 +78,7 @@ class Saved(ABC):
 
     @classmethod
     @abstractmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Saved:
         """The model of which `state` gave these."""
 
     def save(self, path: str | Path, provenance: dict[str, str] | None = None) -> None:

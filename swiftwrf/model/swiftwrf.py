@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
@@ -95,7 +95,7 @@ class SwiftWRF(nn.Module, Saved):
     @classmethod
     def make(
         cls, config: ModelConfig, grid: AngularGrid, anchor: Tensor, kernel: Kernel, *, generator: torch.Generator
-    ) -> Self:
+    ) -> SwiftWRF:
         """A model at its start.
 
         Args:
@@ -181,7 +181,7 @@ class SwiftWRF(nn.Module, Saved):
         return self.state_dict(), header | self.deformation.header()
 
     @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> SwiftWRF:
         config = ModelConfig(**{**header["config"], "components": tuple(header["config"]["components"])})
         grid = AngularGrid(**header["grid"])
         primitives = config.make_primitives(grid, torch.Generator())

@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -61,12 +61,12 @@ class Deformation(nn.Module, ABC):
 
     @classmethod
     @abstractmethod
-    def initial(cls, setting: Setting, *, generator: torch.Generator) -> Self:
+    def initial(cls, setting: Setting, *, generator: torch.Generator) -> Deformation:
         """One at its start."""
 
     @classmethod
     @abstractmethod
-    def restore(cls, components: tuple[str, ...], header: Header, tensors: Mapping[str, Tensor]) -> Self:
+    def restore(cls, components: tuple[str, ...], header: Header, tensors: Mapping[str, Tensor]) -> Deformation:
         """One of the shapes that saved `tensors` (by name within the deformation) have; they are copied in afterwards."""
 
     def header(self) -> Header:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -33,14 +33,14 @@ class MotionBasis(Deformation):
         self.components, self.field, self.basis = components, field, nn.Parameter(basis)
 
     @classmethod
-    def initial(cls, setting: Setting, *, generator: torch.Generator) -> Self:
+    def initial(cls, setting: Setting, *, generator: torch.Generator) -> MotionBasis:
         rank, size = setting.rank, sum(COMPONENTS[c] for c in setting.components)
         field = gp.SmoothField(setting.anchor, setting.kernel, rank)
         basis = 0.1 / math.sqrt(rank) * torch.randn(rank, setting.n, size, generator=generator)
         return cls(field, basis, setting.components)
 
     @classmethod
-    def restore(cls, components: tuple[str, ...], header: Header, tensors: Mapping[str, Tensor]) -> Self:
+    def restore(cls, components: tuple[str, ...], header: Header, tensors: Mapping[str, Tensor]) -> MotionBasis:
         anchor, whiten, basis = (tensors[name] for name in ("field.anchor", "field.whiten", "basis"))
         field = gp.SmoothField(anchor, gp.Kernel(**header["kernel"]), len(basis), whiten)
         return cls(field, basis.clone(), components)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Self, cast
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -47,11 +47,11 @@ class PerPrimitiveMLP(Deformation):
         nn.init.zeros_(self.output.bias)
 
     @classmethod
-    def initial(cls, setting: Setting, *, generator: torch.Generator) -> Self:
+    def initial(cls, setting: Setting, *, generator: torch.Generator) -> PerPrimitiveMLP:
         return cls(setting.components, generator=generator)
 
     @classmethod
-    def restore(cls, components: tuple[str, ...], header: Header, tensors: Mapping[str, Tensor]) -> Self:
+    def restore(cls, components: tuple[str, ...], header: Header, tensors: Mapping[str, Tensor]) -> PerPrimitiveMLP:
         return cls(components, generator=torch.Generator())
 
     def forward(self, position: Tensor, mean: Tensor) -> Offsets:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Self
 
 import torch
 from torch import Tensor
@@ -17,11 +16,11 @@ class Static(Deformation):
     """Leaves the primitives canonical."""
 
     @classmethod
-    def initial(cls, setting: Setting, *, generator: torch.Generator) -> Self:
+    def initial(cls, setting: Setting, *, generator: torch.Generator) -> Static:
         return cls()
 
     @classmethod
-    def restore(cls, components: tuple[str, ...], header: Header, tensors: Mapping[str, Tensor]) -> Self:
+    def restore(cls, components: tuple[str, ...], header: Header, tensors: Mapping[str, Tensor]) -> Static:
         return cls()
 
     def forward(self, position: Tensor, mean: Tensor) -> Offsets:
