@@ -4,6 +4,9 @@ data = swiftwrf.load_spectra(folder)
 train, test = data.split("block")
 model = swiftwrf.fit(train)
 spectrum = model.synthesize(test.position)
+
+"The paper" in all docstrings is M. Liu, C. Zhang, Q. Yang, Y. Cao, Y. Xu, Y. Xu, S. Sun, M. Dai and Y. Guan, "Deformable 2D
+Gaussian Splatting for Efficient Wireless Radiance Field Rendering", 2025.
 """
 
 from swiftwrf.angles import AngularGrid, ArrayPose
