@@ -46,6 +46,8 @@ def load_nerf2(folder: Path) -> Spectra:
         index=torch.arange(len(position)),
         named_splits=splits,
         source={file.name: sha256(file) for file in described},
+        fixed_position=fixed,
+        rotation=pose.rotation,
     )
 
 
