@@ -15,8 +15,10 @@ import torch
 from torch import Tensor
 
 from swiftwrf.arrays import PlanarArray
-from swiftwrf.coarray import SAME, differences
+from swiftwrf.coarray import SAME, basis, differences
+from swiftwrf.data.spectra import Spectra
 
+PIXELS = 6000  # of a spectrum that are enough for its few dozen coefficients
 STEPS = 40
 STARTS = 8
 SOLVED = 5e-3  # relative error of the autocorrelation below which a start counts as the solution
@@ -36,6 +38,18 @@ def autocorrelation(channel: Tensor, array: PlanarArray) -> Tensor:
     a, b, lag = pairs(array)
     r = torch.zeros(*channel.shape[:-1], int(lag.max()) + 1, dtype=channel.dtype)
     return r.index_add(-1, lag, channel[..., a] * channel[..., b].conj()) / channel.shape[-1] ** 2
+
+
+def correlations(spectra: Spectra) -> Tensor:
+    """r(l) of each spectrum by least squares on its square, complex128 (n, P); pixels are left out where there are many."""
+    assert spectra.array is not None
+    functions, flat = basis(spectra.array, spectra.grid), spectra.spectrum.flatten(1)
+    stride = max(1, flat.shape[1] // PIXELS)
+    stride += 1 - stride % 2  # odd, so that it does not keep to some columns only
+    inverse = torch.linalg.pinv(functions[:, ::stride])
+    coefficient = flat[:, ::stride].double().square() @ inverse
+    half = (coefficient.shape[1] - 1) // 2
+    return torch.complex(coefficient[:, 1 : 1 + half], coefficient[:, 1 + half :]) / 2
 
 
 def element_phases(observed: Tensor, array: PlanarArray, seed: int = 0) -> tuple[Tensor, Tensor]:

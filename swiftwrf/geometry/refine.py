@@ -65,8 +65,12 @@ def tangents(
     return found
 
 
-def normal_equations(scene: Scene, total: Tensor, change: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Score (B,), half its gradient (B, Q) and Gauss-Newton matrix (B, Q, Q), times the number of positions.
+def normal_equations(
+    scene: Scene, total: Tensor, change: Tensor, exact: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Score (B,), half its gradient at each position (B, Q, n) and its Gauss-Newton matrix (B, Q, Q), times n.
+
+    With `exact`, the matrix counts how far each phase is off, as deviations need it; it may then have no inverse.
 
     Only phases count: a field h that changes by dh turns by Im(dh / h), and one phase a position is free.
     """
@@ -84,8 +88,8 @@ def normal_equations(scene: Scene, total: Tensor, change: Tensor) -> tuple[Tenso
     turn = (change / safe[:, None]).imag.clamp(-1e3, 1e3)
     turn = turn - turn.mean(-1, keepdim=True)
     weight = mean.abs()[:, None, :, None] / match.shape[-1]
-    slope = (turn * weight * error.imag[:, None]).sum((-1, -2))
-    curve = torch.einsum("bqnk,brnk->bqr", turn * weight, turn)
+    slope = (turn * weight * error.imag[:, None]).sum(-1)
+    curve = torch.einsum("bqnk,brnk->bqr", turn * weight * (error.real[:, None] if exact else 1), turn)
     return score, slope, curve
 
 
@@ -114,7 +118,7 @@ def refine(
     for _ in range(steps):
         diagonal = curve.diagonal(dim1=1, dim2=2)
         system = curve + torch.diag_embed(damping[:, None] * diagonal + 1e-6 * diagonal.mean(1, keepdim=True) + 1e-9)
-        step = -torch.linalg.solve(system, slope[..., None])[..., 0]
+        step = -torch.linalg.solve(system, slope.sum(-1, keepdim=True))[..., 0]
         step = step.reshape(len(normal), -1, planes)
         trial_offset = offset + step[:, 0].clamp(-limit, limit).double()
         trial_gain = gain + step[:, 1].clamp(-0.3, 0.3)
@@ -132,6 +136,18 @@ def refine(
         damping = torch.where(better, damping * 0.3, damping * 6).clamp(1e-6, 1e4)
         offset, gain = (torch.where(better[:, None], a, b) for a, b in ((trial_offset, offset), (trial_gain, gain)))
         normal = torch.where(better[:, None, None], trial_normal, normal)
-        score, slope = torch.where(better, after[0], score), torch.where(better[:, None], after[1], slope)
+        score, slope = torch.where(better, after[0], score), torch.where(better[:, None, None], after[1], slope)
         curve = torch.where(better[:, None, None], after[2], curve)
     return score, normal, offset, gain
+
+
+def deviations(scene: Scene, normal: Tensor, offset: Tensor, gain: Tensor, sequence: list[Sequence]) -> Tensor:
+    """Covariance of the offsets [m^2], (P, P), of one room (1, P, 3): the curvature's inverse around the scatter of the
+    positions' gradients, so that what the model leaves unexplained counts as noise (P. J. Huber 1967)."""
+    total, change = derivatives(scene, normal, offset, gain, sequence, tilt=False)
+    _, slope, curve = normal_equations(scene, total, change, exact=True)
+    n, q = len(scene), curve.shape[-1]
+    inverse = torch.linalg.pinv(curve[0].double(), hermitian=True)
+    scatter = slope[0].double() @ slope[0].double().T * (n / max(n - q, 1))
+    planes = normal.shape[1]
+    return (inverse @ scatter @ inverse)[:planes, :planes]

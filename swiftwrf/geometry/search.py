@@ -9,18 +9,23 @@ all single and double reflections, until none is better.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, field as of
 
 import torch
 from torch import Tensor
 
-from swiftwrf.geometry.images import Scene, field, image_gain, images, sequences
+from swiftwrf.geometry.images import Scene, field, images, sequences
 from swiftwrf.geometry.refine import refine
 
 SIDES = torch.tensor(
     [[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], dtype=torch.float64
 )  # outward normals
+FEW = 36  # positions that moves of all sides are scored with first
+STARTS = 4  # of a search
+HOPELESS = 1.4  # a start with so many times the best score is given up
 CHUNK = 256  # candidates at a time
+MOVES = {2: 99, 3: 7, 4: 4, 6: 5}  # so many sides move at once, each to so many alternatives
 
 
 @dataclass
@@ -53,7 +58,7 @@ class Search:
     """
 
     def __init__(self, scene: Scene, reach: float, sign: float, order: int = 2) -> None:
-        self.scene, self.sign, self.order = scene, sign, order
+        self.scene, self.reach, self.sign, self.order = scene, reach, sign, order
         both = torch.cat([scene.transmitter, scene.receiver])
         near = (both @ SIDES.T).amax(0)
         self.step = 0.5 / scene.wavenumber
@@ -166,58 +171,99 @@ class Search:
             double[i, j] = waves.reshape(len(offset[i]), len(offset[j]), *waves.shape[1:])
         return single, double
 
-    def moves(self, room: Room, top: int, k: int, keep: int, widths: tuple[int, ...]) -> list[Room]:
-        """The best rooms in which up to k sides take other alternatives."""
-        alternatives = self.alternatives(room, top)
+    def moves(self, room: Room, top: int, k: int, keep: int) -> list[Room]:
+        """The best rooms in which k sides take other alternatives, of which the more are tried the fewer sides move."""
+        if k == 6 and len(self.scene) > FEW:
+            few = self.scene.subset(torch.linspace(0, len(self.scene) - 1, FEW).long())
+            return Search(few, self.reach, self.sign, self.order).moves(room, top, k, keep)
+        alternatives = self.alternatives(room, top) if k < 6 else self.wraps(room)
         single, double = self.table(alternatives)
-        now = [0] * 6
         pool: list[tuple[float, tuple[int, ...]]] = []
-        for count in range(1, k + 1):
-            width = widths[count - 1]
-            for which in itertools.combinations(range(6), count):
-                rest = [i for i in range(6) if i not in which]
-                base = self.direct + sum(single[i][0] for i in rest)
-                for i, j in itertools.combinations(rest, 2):
-                    base = base + double[i, j][0, 0]
-                total = base
-                for place, i in enumerate(which):
-                    own = single[i][:width]
-                    for j in rest:
-                        own = own + (double[i, j][:width, 0] if i < j else double[j, i][0, :width])
-                    shape = [1] * count
-                    shape[place] = len(own)
-                    total = total + own.reshape(*shape, *own.shape[1:])
-                for (p, i), (q, j) in itertools.combinations(enumerate(which), 2):
-                    both = double[i, j][:width, :width]
-                    shape = [1] * count
-                    shape[p], shape[q] = both.shape[:2]
-                    total = total + both.reshape(*shape, *both.shape[2:])
-                value = self.scene.score(total).flatten()
-                sizes = [len(single[i][:width]) for i in which]
-                for index in value.argsort()[:keep].tolist():
-                    choice, left = list(now), index
-                    for i, size in zip(reversed(which), reversed(sizes), strict=True):
-                        choice[i], left = left % size, left // size
-                    pool.append((float(value[index]), tuple(choice)))
-        rooms: list[Room] = []
-        for value, choice in sorted(set(pool))[: 2 * keep]:
-            picked = {i: alternatives[i][c] for i, c in enumerate(choice) if alternatives[i][c][1] != 0}
-            rooms.append(Room(value, {i: p[0] for i, p in picked.items()}, {i: p[1] for i, p in picked.items()}))
-        return rooms[:keep]
+        for which in itertools.combinations(range(6), k):
+            tried = [list(range(len(alternatives[i])))[: MOVES[k]] for i in which]
+            rest = [i for i in range(6) if i not in which]
+            total = self.direct + sum(single[i][0] for i in rest)
+            for i, j in itertools.combinations(rest, 2):
+                total = total + double[i, j][0, 0]
+            for place, i in enumerate(which):
+                own = single[i][tried[place]]
+                for j in rest:
+                    own = own + (double[i, j][tried[place], 0] if i < j else double[j, i][0, tried[place]])
+                total = total + _placed(own, [place], k)
+            for (p, i), (q, j) in itertools.combinations(enumerate(which), 2):
+                total = total + _placed(double[i, j][tried[p]][:, tried[q]], [p, q], k)
+            value = torch.stack([self.scene.score(t) for t in total])
+            for index in value.flatten().argsort()[:keep]:
+                choice = [0] * 6
+                for i, options, at in zip(which, tried, torch.unravel_index(index, value.shape), strict=True):
+                    choice[i] = options[int(at)]
+                pool.append((float(value.flatten()[index]), tuple(choice)))
+        rooms = []
+        for value_, choice_ in sorted(set(pool))[:keep]:
+            picked = {i: alternatives[i][c] for i, c in enumerate(choice_) if alternatives[i][c][1] != 0}
+            rooms.append(Room(value_, {i: p[0] for i, p in picked.items()}, {i: p[1] for i, p in picked.items()}))
+        return rooms
+
+    def wraps(self, room: Room) -> list[list[tuple[float, float]]]:
+        """For each side (offset, gain): where it is and where its wave has the same phase up to one or two turns."""
+        found = []
+        for side in range(6):
+            if side not in room.offset:
+                found.append([(0.0, 0.0)])
+                continue
+            one = Room(0.0, {side: room.offset[side]}, room.gain)
+            normal, offset, _ = one.tensors()
+            ray = images(self.scene, normal, offset, [(0,)])[0, 0] - self.scene.receiver
+            cosine = float((ray @ SIDES[side] / ray.norm(dim=-1)).mean().abs().clamp_min(0.3))
+            turn = torch.pi / (self.scene.wavenumber * cosine)
+            low = float(self.offsets[side][0])
+            steps = [room.offset[side] + m * turn for m in (0, -1, 1, -2, 2)]
+            found.append([(o, room.gain[side]) for o in steps if o >= low - self.step])
+        return found
 
     def improve(self, room: Room, *, top: int = 8, sweeps: int = 20, keep: int = 8) -> Room:
-        """Moves one to three planes at a time, with second-order images, until nothing is better."""
+        """Moves several planes at a time, with second-order images, until nothing is better."""
         best = self.refined([room], self.order)[0]
         for _ in range(sweeps):
-            for k in (2, 3):
-                tried = self.refined(self.moves(best, top, k, keep, (99, 99, 7)), self.order)
-                better = tried[0].score < best.score - 1e-4
-                if better:
+            before = best.score
+            for k in MOVES:
+                tried = self.refined(self.moves(best, top, k, keep), self.order)
+                if tried[0].score < best.score - 1e-4:
                     best = tried[0]
                     break
-            if not better:
+            if best.score == before:
                 break
         return best
 
 
-__all__ = ["SIDES", "Room", "Search", "image_gain", "images"]
+def _placed(waves: Tensor, axes: list[int], k: int) -> Tensor:
+    """Waves (A, [B,] n, K) with their first dimensions put on the given ones of k."""
+    shape = [1] * k
+    for axis, size in zip(axes, waves.shape, strict=False):
+        shape[axis] = size
+    return waves.reshape(*shape, *waves.shape[-2:])
+
+
+def find_room(scene: Scene, reach: float, order: int = 2, width: int = 8, tick: Callable[[], None] | None = None) -> Room:
+    """The best room over both signs of the gains, from beams with and without second-order images.
+
+    Args:
+        scene: with the positions to search with, best no more than a hundred.
+        reach: how far beyond the region of both ends planes are looked for [m].
+        order: of the images while planes move together.
+        width: of the beam.
+        tick: called after each of the STARTS starts.
+    """
+    starts = []
+    for sign in (-1.0, 1.0):
+        search = Search(scene, reach, sign, order)
+        starts += [(search.beam(width, first)[0], search) for first in (order, 1)]
+    best: Room | None = None
+    for start, search in sorted(starts, key=lambda s: s[0].score):
+        if best is None or start.score < HOPELESS * best.score or start.score < best.score + 0.02:
+            room = search.improve(start)
+            best = room if best is None or room.score < best.score else best
+        if tick:
+            tick()
+    assert best is not None
+    return best
