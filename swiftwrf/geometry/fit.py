@@ -18,11 +18,13 @@ from swiftwrf.geometry.model import GeometryModel, Plane
 from swiftwrf.geometry.observe import autocorrelation, correlations, element_phases
 from swiftwrf.geometry.refine import deviations, refine
 from swiftwrf.geometry.sample import Residual, residual_statistics
-from swiftwrf.geometry.search import STARTS, find_room
+from swiftwrf.geometry.search import STARTS, Room, Search, find_room
 from swiftwrf.progress import progress_bar
 
 SOLVED = 0.1  # relative error of a spectrum's autocorrelation up to which its phases are used
-NEEDED = 2.5  # standard errors by which held-out spectra must be better for a plane, an order or a carrier
+NEEDED = 2.5  # standard errors by which held-out spectra must be better for a plane or an order
+MANY = 300  # positions from which one held-out part decides, not all in turn
+MISFIT = 0.02  # wavelengths that planes are off where nothing is explained: what is not modelled is no random noise
 CERTAIN = 3.0  # the same against a rival place, for a plane to be certain
 RIVALS = 0.6  # how far beside a plane rivals are sought [m]
 SCALES = (0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05)  # of the carrier that rivals the given one
@@ -53,6 +55,11 @@ class _Room:
     offset: Tensor
     gain: Tensor
     order: int
+
+    @classmethod
+    def of(cls, found: Room) -> _Room:
+        normal, offset, gain = found.tensors()
+        return cls(normal, offset, gain, 2)
 
     @property
     def sequence(self) -> list[Sequence]:
@@ -97,21 +104,30 @@ def fit_geometry(
     config = config or GeometryConfig()
     scene, fold = _observe(train, validation, seed)
     kept, held = scene.subset((fold != 0).nonzero()[:, 0]), scene.subset((fold == 0).nonzero()[:, 0])
-    order = torch.randperm(len(kept), generator=torch.Generator().manual_seed(seed))
     with progress_bar(progress) as bar:
         task = bar.add_task("finding the room", total=STARTS)
-        found = find_room(
-            kept.subset(order[: config.positions].sort().values),
-            config.reach,
-            width=config.width,
-            tick=lambda: bar.advance(task),
+        sign, found = find_room(
+            _some(kept, config.positions, seed), config.reach, width=config.width, tick=lambda: bar.advance(task)
         )
-    normal, offset, gain = found.tensors()
-    room = _pruned(_Room(normal, offset, gain, 2).refined(kept), kept, held)
-    room = _with_order(room, kept, held, config.max_order)
-    score = _correlation_score(held, room, train)
-    final = room.refined(scene)
-    return _model(train, scene, final, room, held, score)
+    score = _correlation_score(held, _Room.of(found).refined(kept), train)
+    found = Search(_some(scene, config.positions, seed), config.reach, sign).improve(found)
+    room = _Room.of(found).refined(scene)
+    splits = _splits(scene, fold)
+    room = _pruned(room, scene, splits)
+    room = _with_order(room, splits, config.max_order)
+    return _model(train, scene, room.refined(scene), score)
+
+
+def _some(scene: Scene, most: int, seed: int) -> Scene:
+    """At most so many positions, drawn at random."""
+    rows = torch.randperm(len(scene), generator=torch.Generator().manual_seed(seed))[:most]
+    return scene.subset(rows.sort().values)
+
+
+def _splits(scene: Scene, fold: Tensor) -> list[tuple[Scene, Scene]]:
+    """Kept and held-out positions; all folds in turn where there are few positions."""
+    out = [fold == number for number in (fold.unique().tolist() if len(fold) < MANY else [0])]
+    return [(scene.subset((~o).nonzero()[:, 0]), scene.subset(o.nonzero()[:, 0])) for o in out]
 
 
 def _observe(train: Spectra, validation: Validation, seed: int) -> tuple[Scene, Tensor]:
@@ -137,33 +153,40 @@ def _observe(train: Spectra, validation: Validation, seed: int) -> tuple[Scene, 
     return scene, folds(train.position[solved], validation, seed)
 
 
-def _advantage(scene: Scene, a: Tensor, b: Tensor) -> float:
-    """By how many standard errors field a (n, K) agrees better with the positions' spectra than b."""
-    difference = scene.coherence(a) - scene.coherence(b)
+def _advantage(a: Tensor, b: Tensor) -> float:
+    """By how many standard errors the coherences a (n,) are higher than b."""
+    difference = a - b
     return float(difference.mean() / (difference.std() / math.sqrt(len(difference))).clamp_min(1e-9))
 
 
-def _pruned(room: _Room, kept: Scene, held: Scene) -> _Room:
+def _held_out(room: _Room, splits: list[tuple[Scene, Scene]], steps: int = 4) -> Tensor:
+    """Coherence at held-out positions (n,), planes and gains refined on the others."""
+    return torch.cat([held.coherence(room.refined(kept, steps).field(held)) for kept, held in splits])
+
+
+def _pruned(room: _Room, scene: Scene, splits: list[tuple[Scene, Scene]]) -> _Room:
     """Without the planes that held-out spectra do not need, the least needed first."""
     while room.normal.shape[1]:
-        rest = [room.without(i).refined(kept, 4) for i in range(room.normal.shape[1])]
-        needed = [_advantage(held, room.field(held), r.field(held)) for r in rest]
+        full = _held_out(room, splits)
+        rest = [room.without(i).refined(scene, 4) for i in range(room.normal.shape[1])]
+        needed = [_advantage(full, _held_out(r, splits)) for r in rest]
         least = min(range(len(rest)), key=needed.__getitem__)
         if needed[least] > NEEDED:
             break
         room = rest[least]
-    return room.refined(kept)
+    return room
 
 
-def _with_order(room: _Room, kept: Scene, held: Scene, most: int) -> _Room:
+def _with_order(room: _Room, splits: list[tuple[Scene, Scene]], most: int) -> _Room:
     """With images up to the order that explains held-out spectra best; a higher one must be clearly better."""
     if not room.normal.shape[1]:
         return replace(room, order=1)
-    tried = [replace(room, order=o).refined(kept) for o in range(1, most + 1)]
-    best = tried[0]
-    for other in tried[1:]:
-        if _advantage(held, other.field(held), best.field(held)) > NEEDED:
-            best = other
+    best, score = room, torch.empty(0)
+    for order in range(1, most + 1):
+        tried = replace(room, order=order)
+        held = _held_out(tried, splits, 8)
+        if not len(score) or _advantage(held, score) > NEEDED:
+            best, score = tried, held
     return best
 
 
@@ -177,18 +200,20 @@ def _correlation_score(scene: Scene, room: _Room, train: Spectra) -> float:
     return 1 - float((predicted * seen.conj()).real.sum()) / math.sqrt(power)
 
 
-def _model(
-    train: Spectra, scene: Scene, room: _Room, chosen: _Room, held: Scene, score: float
-) -> GeometryModel:
-    """The model with verdicts; `chosen` is the room that did not see the held-out spectra."""
+def _model(train: Spectra, scene: Scene, room: _Room, score: float) -> GeometryModel:
+    """The model with its verdicts."""
     assert train.array is not None and train.rotation is not None and train.fixed_position is not None
     planes: list[Plane] = []
     covariance = torch.zeros(0, 0, dtype=torch.float64)
     residual = Residual()
     doubt = ""
+    unexplained = 1 - (1 - _correlation_score(scene, room, train)) ** 2
     if room.normal.shape[1]:
         covariance = deviations(scene, room.normal, room.offset, room.gain, room.sequence)
-        residual = residual_statistics(scene, room.normal, room.offset, room.gain, room.sequence)
+        systematic = MISFIT * train.array.wavelength * math.sqrt(max(unexplained, 0))
+        covariance = covariance + systematic**2 * torch.eye(len(covariance), dtype=torch.float64)
+        direct = float(train.line_of_sight.double().mean())
+        residual = residual_statistics(scene, room.normal, room.offset, room.gain, room.sequence, direct)
         doubt = _other_carrier(scene, room)
         for i, std in enumerate(covariance.diagonal().clamp_min(0).sqrt().tolist()):
             rival = _rival(scene, room, i)
@@ -196,7 +221,6 @@ def _model(
             # where another place is as good, the deviation says how far that is
             normal = tuple(float(x) for x in room.normal[0, i])
             planes.append(Plane(normal, float(room.offset[0, i]), float(room.gain[0, i]), 1000 * std, certain))  # type: ignore[arg-type]
-    unexplained = 1 - (1 - _correlation_score(scene, room, train)) ** 2
     certain_planes = sum(p.certain for p in planes)
     verdict = (
         f"{len(planes)} planes, {certain_planes} of them certain{doubt}" if planes else "no plane explains the spectra"
@@ -239,13 +263,14 @@ def _rival(scene: Scene, room: _Room, plane: int) -> float:
         if float(value.max()) > best[0]:
             best = float(value.max()), int(chunk[value.argmax()])
             fields = [f[value.argmax()]]
-    return _advantage(scene, room.field(scene), fields[0])
+    return _advantage(scene.coherence(room.field(scene)), scene.coherence(fields[0]))
 
 
 def _other_carrier(scene: Scene, room: _Room) -> str:
     """A doubt where another carrier explains the spectra clearly better, else nothing."""
     for scale in SCALES:
         other = replace(scene, wavenumber=scale * scene.wavenumber)
-        if _advantage(scene, room.refined(other, 6).field(other), room.field(scene)) > CERTAIN:
+        rival = other.coherence(room.refined(other, 6).field(other))
+        if _advantage(rival, scene.coherence(room.field(scene))) > CERTAIN:
             return f"; a carrier {100 * (scale - 1):+.0f} % from the given one explains the spectra better"
     return ""

@@ -20,12 +20,10 @@ class Residual:
     """What the planes leave.
 
     Args:
-        visible: share of the positions at which a reflection helps to explain the spectrum.
-        direct: the same for the direct path.
+        direct: share of the positions with a line of sight.
         diffuse: amplitude of further paths, relative to the field of the planes.
     """
 
-    visible: float = 1.0
     direct: float = 1.0
     diffuse: float = 0.0
 
@@ -50,11 +48,11 @@ def draw(
         spread = root.eigenvectors * root.eigenvalues.clamp_min(0).sqrt()
         moved = offset + spread @ torch.randn(offset.shape[1], dtype=torch.float64, generator=generator)
         wave = scene.wave(images(scene, normal, moved, sequence))[0]
-        bounces = torch.tensor([len(s) for s in sequence])
-        there = torch.rand(len(sequence), n, generator=generator) < residual.visible ** bounces[:, None]
-        strength = image_gain(gain, sequence)[0][:, None] * there
+        full, share = _visibility(gain)
+        there = torch.rand(len(sequence), n, generator=generator) < image_gain(share, sequence)[0][:, None]
+        strength = image_gain(full, sequence)[0][:, None] * there
         total = total + (wave * strength[..., None]).sum(0)
-    mean = field(scene, normal, offset, gain, sequence)[0] + scene.wave(scene.transmitter)
+    mean = scene.wave(scene.transmitter) + field(scene, normal, offset, gain, sequence)[0]
     scale = mean.abs().square().mean(-1, keepdim=True).sqrt()
     direction = torch.nn.functional.normalize(torch.randn(n, DIFFUSE, 3, generator=generator), dim=-1)
     amplitude = torch.complex(*torch.randn(2, n, DIFFUSE, generator=generator)) / math.sqrt(2 * DIFFUSE)
@@ -65,36 +63,34 @@ def draw(
     return torch.where(drawn.abs().sum(-1, keepdim=True) > 0, drawn, mean).reshape(n, k)
 
 
-def residual_statistics(scene: Scene, normal: Tensor, offset: Tensor, gain: Tensor, sequence: list[Sequence]) -> Residual:
-    """How often paths are there, and how strong further paths must be that draws agree with the mean as much as the
-    observed channels do."""
-    direct = scene.wave(scene.transmitter)
-    total = direct + field(scene, normal, offset, gain, sequence)[0]
-    with_all = scene.coherence(total)
-    seen_direct = _share(with_all, scene.coherence(total - direct)) if sequence else 1.0
-    visible = 1.0
-    if sequence:
-        wave = scene.wave(images(scene, normal, offset, sequence))[0] * image_gain(gain, sequence)[0][:, None, None]
-        once = [row for row, s in enumerate(sequence) if len(s) == 1]
-        visible = sum(_share(with_all, scene.coherence(total - wave[row])) for row in once) / len(once)
-    aim = float(with_all.mean())
+def _visibility(gain: Tensor) -> tuple[Tensor, Tensor]:
+    """Gains (1, P) split into what a plane reflects and how often it does: all planes are taken to reflect like the
+    stronger ones, and the weaker to be hidden at times, which a fitted gain cannot tell apart."""
+    full = gain.abs().flatten().sort().values[len(gain.flatten()) // 2 :].median().clamp_min(1e-6)
+    share = (gain.abs() / full).clamp_max(1)
+    return gain / share.clamp_min(1e-6), share
+
+
+def residual_statistics(
+    scene: Scene, normal: Tensor, offset: Tensor, gain: Tensor, sequence: list[Sequence], direct: float
+) -> Residual:
+    """How strong further paths must be that draws agree with the mean as much as the observed channels do.
+
+    Args:
+        direct: share of the positions with a line of sight.
+    """
+    mean = scene.wave(scene.transmitter) + field(scene, normal, offset, gain, sequence)[0]
+    aim = float(scene.coherence(mean).mean())
+    still = torch.zeros(offset.shape[1], offset.shape[1], dtype=torch.float64)
     low, high = 0.0, 4.0
     for _ in range(CALIBRATION):
         middle = (low + high) / 2
         generator = torch.Generator().manual_seed(SEED)
-        trial = Residual(visible, seen_direct, middle)
-        covariance = torch.zeros(offset.shape[1], offset.shape[1], dtype=torch.float64)
-        drawn = draw(scene, normal, offset, gain, sequence, covariance, trial, generator)
-        match = ((drawn / drawn.abs().clamp_min(1e-12)).conj() * (total / total.abs().clamp_min(1e-12))).mean(-1)
-        low, high = (middle, high) if float(match.abs().square().mean()) > aim else (low, middle)
-    return Residual(visible, seen_direct, (low + high) / 2)
+        drawn = draw(scene, normal, offset, gain, sequence, still, Residual(direct, middle), generator)
+        match = (_phase(drawn).conj() * _phase(mean)).mean(-1).abs().square().mean()
+        low, high = (middle, high) if float(match) > aim else (low, middle)
+    return Residual(direct, (low + high) / 2)
 
 
-def _share(with_path: Tensor, without: Tensor) -> float:
-    """Positions that a path helps, of those where it matters; half of them help by chance where it is never there."""
-    gain = with_path - without
-    matters = gain.abs() > 0.02
-    if int(matters.sum()) < 10:
-        return 1.0
-    helped = float((gain[matters] > 0).double().mean())
-    return min(1.0, max(0.0, 2 * helped - 1))
+def _phase(field: Tensor) -> Tensor:
+    return field / field.abs().clamp_min(1e-12)

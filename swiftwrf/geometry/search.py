@@ -244,8 +244,8 @@ def _placed(waves: Tensor, axes: list[int], k: int) -> Tensor:
     return waves.reshape(*shape, *waves.shape[-2:])
 
 
-def find_room(scene: Scene, reach: float, order: int = 2, width: int = 8, tick: Callable[[], None] | None = None) -> Room:
-    """The best room over both signs of the gains, from beams with and without second-order images.
+def find_room(scene: Scene, reach: float, order: int = 2, width: int = 8, tick: Callable[[], None] | None = None) -> tuple[float, Room]:
+    """The sign of the gains and the best room over both signs, from beams with and without second-order images.
 
     Args:
         scene: with the positions to search with, best no more than a hundred.
@@ -258,11 +258,12 @@ def find_room(scene: Scene, reach: float, order: int = 2, width: int = 8, tick: 
     for sign in (-1.0, 1.0):
         search = Search(scene, reach, sign, order)
         starts += [(search.beam(width, first)[0], search) for first in (order, 1)]
-    best: Room | None = None
+    best: tuple[float, Room] | None = None
     for start, search in sorted(starts, key=lambda s: s[0].score):
-        if best is None or start.score < HOPELESS * best.score or start.score < best.score + 0.02:
+        if best is None or start.score < max(HOPELESS * best[1].score, best[1].score + 0.02):
             room = search.improve(start)
-            best = room if best is None or room.score < best.score else best
+            if best is None or room.score < best[1].score:
+                best = search.sign, room
         if tick:
             tick()
     assert best is not None
