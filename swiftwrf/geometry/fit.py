@@ -16,6 +16,7 @@ from swiftwrf.fit_config import Validation
 from swiftwrf.geometry.images import Scene, Sequence, field, sequences
 from swiftwrf.geometry.model import GeometryModel, Plane
 from swiftwrf.geometry.observe import autocorrelation, correlations, element_phases
+from swiftwrf.geometry.orient import candidates
 from swiftwrf.geometry.refine import deviations, refine
 from swiftwrf.geometry.sample import Residual, residual_statistics
 from swiftwrf.geometry.search import STARTS, Room, Search, find_room
@@ -23,6 +24,8 @@ from swiftwrf.progress import progress_bar
 
 SOLVED = 0.1  # relative error of a spectrum's autocorrelation up to which its phases are used
 NEEDED = 2.5  # standard errors by which held-out spectra must be better for a plane or an order
+FURTHER = 4.0  # the same for a plane of any orientation, of which far more are tried
+TRIED = 12  # candidates of any orientation that are refined
 MANY = 300  # positions from which one held-out part decides, not all in turn
 MISFIT = 0.02  # wavelengths that planes are off where nothing is explained: what is not modelled is no random noise
 CERTAIN = 3.0  # the same against a rival place, for a plane to be certain
@@ -39,12 +42,14 @@ class GeometryConfig:
         positions: that planes are searched with; all are used to refine what was found.
         width: of the beams that the search starts from.
         max_order: of the images that are tried.
+        further: planes of any orientation that are tried at most beyond those of the six sides.
     """
 
     reach: float = 3.0
     positions: int = 100
     width: int = 8
     max_order: int = 3
+    further: int = 3
 
 
 @dataclass(frozen=True)
@@ -73,10 +78,12 @@ class _Room:
         keep = [i for i in range(self.normal.shape[1]) if i != plane]
         return replace(self, normal=self.normal[:, keep], offset=self.offset[:, keep], gain=self.gain[:, keep])
 
-    def refined(self, scene: Scene, steps: int = 10) -> _Room:
+    def refined(self, scene: Scene, steps: int = 10, tilt: bool = False) -> _Room:
         if not self.sequence:
             return self
-        _, normal, offset, gain = refine(scene, self.normal, self.offset, self.gain, self.sequence, steps=steps)
+        _, normal, offset, gain = refine(
+            scene, self.normal, self.offset, self.gain, self.sequence, steps=steps, tilt=tilt
+        )
         return replace(self, normal=normal, offset=offset, gain=gain)
 
 
@@ -113,7 +120,7 @@ def fit_geometry(
     found = Search(_some(scene, config.positions, seed), config.reach, sign).improve(found)
     room = _Room.of(found).refined(scene)
     splits = _splits(scene, fold)
-    room = _pruned(room, scene, splits)
+    room = _extended(_pruned(room, scene, splits), scene, splits, sign, config)
     room = _with_order(room, splits, config.max_order)
     return _model(train, scene, room.refined(scene), score)
 
@@ -174,6 +181,32 @@ def _pruned(room: _Room, scene: Scene, splits: list[tuple[Scene, Scene]]) -> _Ro
         if needed[least] > NEEDED:
             break
         room = rest[least]
+    return room
+
+
+def _extended(
+    room: _Room, scene: Scene, splits: list[tuple[Scene, Scene]], sign: float, config: GeometryConfig
+) -> _Room:
+    """With further planes of any orientation, as long as held-out spectra need them."""
+    some = _some(scene, config.positions, 0)
+    for _ in range(config.further):
+        best: tuple[float, _Room] | None = None
+        normals, offsets = candidates(scene, room.field(scene), 0.7 * sign, config.reach, TRIED)
+        for normal, offset in zip(normals, offsets, strict=True):
+            wider = replace(
+                room,
+                normal=torch.cat([room.normal, normal[None, None]], dim=1),
+                offset=torch.cat([room.offset, offset[None, None]], dim=1),
+                gain=torch.cat([room.gain, torch.tensor([[0.7 * sign]])], dim=1),
+            ).refined(some, 12, tilt=True)
+            score = float(some.score(wider.field(some)))
+            if best is None or score < best[0]:
+                best = score, wider
+        assert best is not None
+        wider = _pruned(best[1].refined(scene, 20, tilt=True), scene, splits)
+        if _advantage(_held_out(wider, splits), _held_out(room, splits)) < FURTHER:
+            break
+        room = wider
     return room
 
 

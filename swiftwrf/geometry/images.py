@@ -16,7 +16,7 @@ from torch import Tensor
 
 from swiftwrf.arrays import PlanarArray
 
-RIGHT = 1e-6  # |cosine| below which two planes count as perpendicular
+RIGHT = 0.02  # |cosine| below which two planes count as perpendicular, above 1 - RIGHT**2 as parallel
 
 Sequence = tuple[int, ...]
 
@@ -89,7 +89,7 @@ def sequences(normal: Tensor, order: int) -> list[Sequence]:
         last = [
             (*s, i)
             for s, i in itertools.product(last, planes)
-            if cosine[s[-1]][i] < 1 - 1e-3 and i != s[-1] and not (abs(cosine[s[-1]][i]) < RIGHT and i < s[-1])
+            if cosine[s[-1]][i] < 1 - RIGHT**2 and i != s[-1] and not (abs(cosine[s[-1]][i]) < RIGHT and i < s[-1])
         ]
         found = found + last
     return found
@@ -117,10 +117,35 @@ def field(scene: Scene, normal: Tensor, offset: Tensor, gain: Tensor, sequence: 
     if not sequence:
         shape = (len(normal), len(scene), len(scene.element))
         return torch.zeros(shape, dtype=torch.complex64)
-    wave = scene.wave(images(scene, normal, offset, sequence))
-    return torch.einsum("bsnk,bs->bnk", wave, image_gain(gain, sequence).to(wave.dtype))
+    source = images(scene, normal, offset, sequence)
+    strength = image_gain(gain, sequence)[..., None] * visibility(scene, normal, offset, sequence, source)
+    wave = scene.wave(source)
+    return torch.einsum("bsnk,bsn->bnk", wave, strength.to(wave.dtype).expand(wave.shape[:3]))
 
 
 def image_gain(gain: Tensor, sequence: list[Sequence]) -> Tensor:
     """Product of the gains (B, P) along each sequence, (B, S)."""
     return torch.stack([gain[:, list(s)].prod(dim=1) for s in sequence], dim=1)
+
+
+def visibility(scene: Scene, normal: Tensor, offset: Tensor, sequence: list[Sequence], source: Tensor) -> Tensor:
+    """Whether the path of each image (B, S, n or 1, 3) exists, float32 (B, S, n or 1).
+
+    Between planes that are parallel or perpendicular all do, since the region is inside of all planes. Elsewhere the path
+    is followed back from the receiver: it must meet its last plane coming from the inside, and so on.
+    """
+    cosine = (normal @ normal.mT).abs()
+    if not bool(((cosine > RIGHT) & (cosine < 1 - RIGHT**2)).any()):
+        return torch.ones(source.shape[:2])[..., None]
+    row = {s: number for number, s in enumerate(sequence)}
+    there = torch.ones(*source.shape[:2], len(scene))
+    for number, s in enumerate(sequence):
+        point = scene.receiver.expand(len(normal), -1, -1)
+        for end in range(len(s), 0, -1):
+            n, o = normal[:, s[end - 1], None], offset[:, s[end - 1], None]
+            towards = source[:, row[s[:end]]] - point
+            before, slope = o - (point * n).sum(-1), (towards * n).sum(-1)
+            share = before / slope
+            there[:, number] *= ((share > 0) & (share < 1)).float()
+            point = point + share[..., None] * towards
+    return there

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from swiftwrf.geometry.images import Scene, Sequence, image_gain, images
+from swiftwrf.geometry.images import Scene, Sequence, image_gain, images, visibility
 
 
 def derivatives(
@@ -18,7 +18,8 @@ def derivatives(
     length = ray.norm(dim=-1, keepdim=True)
     unit = ray / length
     phase = unit @ scene.element.T - scene.wavenumber * length
-    wave = torch.polar((1 / length).expand_as(phase), phase) * image_gain(gain, sequence)[..., None, None]
+    strength = image_gain(gain, sequence)[..., None] * visibility(scene, normal, offset, sequence, source)
+    wave = torch.polar((1 / length).expand_as(phase), phase) * strength[..., None]
     direct = scene.wave(scene.transmitter)
     total = direct + wave.sum(1)
     moves = tangents(normal, offset, scene.transmitter, sequence, tilt)

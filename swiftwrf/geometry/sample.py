@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from swiftwrf.geometry.images import Scene, Sequence, field, image_gain, images
+from swiftwrf.geometry.images import Scene, Sequence, field, image_gain, images, visibility
 
 DIFFUSE = 8  # further paths in a draw
 SEED = 0
@@ -47,7 +47,8 @@ def draw(
         root = torch.linalg.eigh(covariance)
         spread = root.eigenvectors * root.eigenvalues.clamp_min(0).sqrt()
         moved = offset + spread @ torch.randn(offset.shape[1], dtype=torch.float64, generator=generator)
-        wave = scene.wave(images(scene, normal, moved, sequence))[0]
+        source = images(scene, normal, moved, sequence)
+        wave = scene.wave(source)[0] * visibility(scene, normal, moved, sequence, source)[0, ..., None]
         full, share = _visibility(gain)
         there = torch.rand(len(sequence), n, generator=generator) < image_gain(share, sequence)[0][:, None]
         strength = image_gain(full, sequence)[0][:, None] * there
