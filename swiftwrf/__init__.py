@@ -16,6 +16,7 @@ from swiftwrf.data import Rssi, Spectra, load_rssi, load_spectra
 from swiftwrf.data.simulated import rssi_room, simulated_room
 from swiftwrf.errors import FitError, InputError
 from swiftwrf.fitting import FitConfig, fit
+from swiftwrf.geometry import GeometryModel, fit_geometry
 from swiftwrf.model import ModelConfig, SwiftWRF
 from swiftwrf.rasterize import rasterize, rasterize_magnitude
 from swiftwrf.rssi import RssiConfig, RssiModel, fit_rssi
@@ -26,6 +27,7 @@ __all__ = [
     "CoarrayModel",
     "FitConfig",
     "FitError",
+    "GeometryModel",
     "InputError",
     "ModelConfig",
     "Rssi",
@@ -35,6 +37,7 @@ __all__ = [
     "SwiftWRF",
     "fit",
     "fit_coarray",
+    "fit_geometry",
     "fit_rssi",
     "load",
     "load_rssi",

@@ -36,6 +36,9 @@ class Spectra:
         named_splits: training and test rows of the splits that came with the data.
         array: the antenna array, where it is known.
         source: sha256 of each file that says what the data are, by file name.
+        fixed_position: of the end that does not move, float64 (3,) [m]; None where it is unknown or both ends move.
+        rotation: turns array into world coordinates, float64 (3, 3); the array stands at the fixed end when the
+            transmitter moves, and else moves with constant orientation. None where it is unknown.
     """
 
     name: str
@@ -49,6 +52,8 @@ class Spectra:
     named_splits: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
     array: PlanarArray | None = None
     source: dict[str, str] = field(default_factory=dict)
+    fixed_position: Tensor | None = None
+    rotation: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.position)

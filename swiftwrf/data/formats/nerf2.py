@@ -53,6 +53,8 @@ def _read(folder: Path) -> Spectra:
         index=torch.arange(len(position)),
         named_splits=splits,
         source={file.name: sha256(file) for file in described},
+        fixed_position=fixed,
+        rotation=pose.rotation,
     )
 
 
