@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-
 from record import write_result
+
 from swiftwrf import Spectra, load_spectra, simulated_room
 from swiftwrf.geometry import GeometryModel, fit_geometry
 from swiftwrf.geometry.hybrid import fit_hybrid
@@ -67,9 +67,7 @@ def measure(data: Spectra, share: float, draw: int) -> dict[str, Any]:
         "verdict": model.verdict,
         "psnr_db": {
             "geometry": summary(psnr(model.synthesize(test.position), test.spectrum)),
-            "sample": summary(
-                psnr(model.synthesize(test.position, torch.Generator().manual_seed(0)), test.spectrum)
-            ),
+            "sample": summary(psnr(model.synthesize(test.position, torch.Generator().manual_seed(0)), test.spectrum)),
             "hybrid": summary(psnr(hybrid.synthesize(test.position), test.spectrum)),
         },
     }

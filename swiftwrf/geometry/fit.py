@@ -10,6 +10,7 @@ from torch import Tensor
 
 from swiftwrf import checks
 from swiftwrf.data.spectra import Spectra
+from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError
 from swiftwrf.fit import folds
 from swiftwrf.fit_config import Validation
@@ -146,12 +147,13 @@ def _observe(train: Spectra, validation: Validation, seed: int) -> tuple[Scene, 
             raise InputError(f"{train.name} does not say {what}; the room can only be found where it is known")
     if train.fixed_position is None:
         raise InputError(f"{train.name} does not say where the fixed end stands; the room can only be found from there")
-    assert train.array is not None and train.rotation is not None
-    if len(train.position.unique(dim=0)) < checks.MIN_TRAINING:
-        raise InputError(f"the positions of {train.name} are fewer than {checks.MIN_TRAINING} different ones")
+    assert train.array is not None  # said above, which a type checker cannot follow
+    assert train.rotation is not None
+    if len(train.position.unique(dim=0)) < MIN_TRAINING:
+        raise InputError(f"the positions of {train.name} are fewer than {MIN_TRAINING} different ones")
     channel, error = element_phases(correlations(train), train.array, seed)
     solved = (error < SOLVED).nonzero()[:, 0]
-    if len(solved) < max(checks.MIN_TRAINING, len(train) / 2):
+    if len(solved) < max(MIN_TRAINING, len(train) / 2):
         raise InputError(
             f"only {len(solved)} of {len(train)} spectra of {train.name} fit its array; check its geometry and carrier"
         )
@@ -253,7 +255,9 @@ def _correlation_score(scene: Scene, room: _Room, train: Spectra) -> float:
 
 def _model(train: Spectra, scene: Scene, room: _Room, score: float, reach: float) -> GeometryModel:
     """The model with its verdicts."""
-    assert train.array is not None and train.rotation is not None and train.fixed_position is not None
+    assert train.array is not None
+    assert train.rotation is not None
+    assert train.fixed_position is not None
     planes: list[Plane] = []
     covariance = torch.zeros(0, 0, dtype=torch.float64)
     residual = Residual()
@@ -311,9 +315,7 @@ def _rival(scene: Scene, room: _Room, plane: int) -> tuple[float, float]:
     rest = [s for s in room.sequence if plane not in s]
     own = [s for s in room.sequence if plane in s]
     base = scene.wave(scene.transmitter) + field(scene, room.normal, room.offset, room.gain, rest)[0]
-    value = torch.stack(
-        [scene.score(base + field(scene, room.normal, o[None], room.gain, own)[0]) for o in offset]
-    )
+    value = torch.stack([scene.score(base + field(scene, room.normal, o[None], room.gain, own)[0]) for o in offset])
     moved = room.offset.clone()
     moved[:, plane] += beside[value.argmin()]
     here = scene.coherence(room.field(scene))

@@ -112,9 +112,7 @@ def _share(position: Tensor, seen: Tensor, known: Tensor, fold: Tensor, kernel: 
     """The share of `known` (n, pixels) that leaves least of `seen` where it is held out from the process, in [0, 1]."""
     product = power = 0.0
     for out, kept, weight in held_out_weights(kernel, position, fold):
-        missed, sharp = (
-            x[out] - x[kept].mean(0) - weight.float() @ (x[kept] - x[kept].mean(0)) for x in (seen, known)
-        )
+        missed, sharp = (x[out] - x[kept].mean(0) - weight.float() @ (x[kept] - x[kept].mean(0)) for x in (seen, known))
         product += float((missed * sharp).sum())
         power += float(sharp.square().sum())
     return min(1.0, max(0.0, product / power)) if power > 0 else 0.0

@@ -35,7 +35,9 @@ def derivatives(
             along = (unit[:, rows] * step).sum(-1, keepdim=True)
             turned = (step - unit[:, rows] * along) / length[:, rows]
             advance = turned @ scene.element.T - scene.wavenumber * along
-            change[:, q].index_add_(1, owner, part * torch.complex((-along / length[:, rows]).expand_as(advance), advance))
+            change[:, q].index_add_(
+                1, owner, part * torch.complex((-along / length[:, rows]).expand_as(advance), advance)
+            )
     return total, change
 
 
@@ -49,7 +51,8 @@ def tangents(
     for q in range(3 if tilt else 1):
         rows: list[list[Tensor]] = []
         for s in sequence:
-            point, steps = transmitter.expand(len(normal), -1, -1), []
+            point = transmitter.expand(len(normal), -1, -1)
+            steps: list[Tensor] = []
             for i in s:
                 n, o = normal[:, i, None], offset[:, i, None, None]
                 distance = (point * n).sum(-1, keepdim=True) - o
@@ -66,9 +69,7 @@ def tangents(
     return found
 
 
-def normal_equations(
-    scene: Scene, total: Tensor, change: Tensor, exact: bool = False
-) -> tuple[Tensor, Tensor, Tensor]:
+def normal_equations(scene: Scene, total: Tensor, change: Tensor, exact: bool = False) -> tuple[Tensor, Tensor, Tensor]:
     """Score (B,), half its gradient at each position (B, Q, n) and its Gauss-Newton matrix (B, Q, Q), times n.
 
     With `exact`, the matrix counts how far each phase is off, as deviations need it; it may then have no inverse.
@@ -151,4 +152,5 @@ def deviations(scene: Scene, normal: Tensor, offset: Tensor, gain: Tensor, seque
     inverse = torch.linalg.pinv(curve[0].double(), hermitian=True)
     scatter = slope[0].double() @ slope[0].double().T * (n / max(n - q, 1))
     planes = normal.shape[1]
-    return (inverse @ scatter @ inverse)[:planes, :planes]
+    covariance: Tensor = (inverse @ scatter @ inverse)[:planes, :planes]
+    return covariance

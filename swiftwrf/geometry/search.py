@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field as of
+from dataclasses import dataclass
+from dataclasses import field as of
 
 import torch
 from torch import Tensor
@@ -261,7 +262,9 @@ def _placed(waves: Tensor, axes: list[int], k: int) -> Tensor:
     return waves.reshape(*shape, *waves.shape[-2:])
 
 
-def find_room(scene: Scene, reach: float, order: int = 2, width: int = 8, tick: Callable[[], None] | None = None) -> tuple[float, Room]:
+def find_room(
+    scene: Scene, reach: float, order: int = 2, width: int = 8, tick: Callable[[], None] | None = None
+) -> tuple[float, Room]:
     """The sign of the gains and the best room over both signs, from beams with and without second-order images.
 
     Args:
