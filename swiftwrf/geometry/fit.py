@@ -11,23 +11,24 @@ from torch import Tensor
 from swiftwrf.data.spectra import Spectra, check_training
 from swiftwrf.data.splits import MIN_TRAINING, Validation, folds
 from swiftwrf.errors import InputError
-from swiftwrf.geometry.images import Scene, Sequence, field, sequences
+from swiftwrf.geometry.images import Scene, Sequence, field, images, sequences
 from swiftwrf.geometry.model import GeometryModel, Plane
 from swiftwrf.geometry.observe import autocorrelation, correlations, element_phases
-from swiftwrf.geometry.orient import candidates
+from swiftwrf.geometry.orient import GAIN, candidates
 from swiftwrf.geometry.refine import deviations, refine
 from swiftwrf.geometry.sample import Residual, residual_statistics
-from swiftwrf.geometry.search import STARTS, Room, Search, find_room
+from swiftwrf.geometry.search import PERFECT, STARTS, Room, Search, find_room
 from swiftwrf.progress import progress_bar
 
 SOLVED = 0.1  # relative error of a spectrum's autocorrelation up to which its phases are used
 NEEDED = 2.5  # standard errors by which held-out spectra must be better for a plane or an order
 FURTHER = 4.0  # the same for a plane of any orientation, of which far more are tried
-TRIED = 12  # candidates of any orientation that are refined
+TRIED = 8  # candidates of any orientation that are refined
 MANY = 300  # positions from which one held-out part decides, not all in turn
 MISFIT = 0.02  # wavelengths that planes are off where nothing is explained: what is not modelled is no random noise
 CERTAIN = 3.0  # the same against a rival place, for a plane to be certain
-RIVALS = 0.6  # how far beside a plane rivals are sought [m]
+VAGUE = 0.5  # deviation [rad of phase] beyond which a plane is not certain
+FLAT = 0.8  # spread of the positions in any direction [rad of phase] up to which they count as flat
 SCALES = (0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05)  # of the carrier that rivals the given one
 
 
@@ -118,9 +119,9 @@ def fit_geometry(
     found = Search(_some(scene, config.positions, seed), config.reach, sign).improve(found)
     room = _Room.of(found).refined(scene)
     splits = _splits(scene, fold)
-    room = _extended(_pruned(room, scene, splits), scene, splits, sign, config)
+    room = _extended(_pruned(room, scene, splits), scene, splits, config)
     room = _with_order(room, splits, config.max_order)
-    return _model(train, scene, room.refined(scene), score)
+    return _model(train, scene, room.refined(scene), score, config.reach)
 
 
 def _some(scene: Scene, most: int, seed: int) -> Scene:
@@ -143,7 +144,8 @@ def _observe(train: Spectra, validation: Validation, seed: int) -> tuple[Scene, 
             raise InputError(f"{train.name} does not say {what}; the room can only be found where it is known")
     if train.fixed_position is None:
         raise InputError(f"{train.name} does not say where the fixed end stands; the room can only be found from there")
-    assert train.array is not None and train.rotation is not None
+    assert train.array is not None  # said above, which a type checker cannot follow
+    assert train.rotation is not None
     if len(train.position.unique(dim=0)) < MIN_TRAINING:
         raise InputError(f"the positions of {train.name} are fewer than {MIN_TRAINING} different ones")
     channel, error = element_phases(correlations(train), train.array, seed)
@@ -182,29 +184,46 @@ def _pruned(room: _Room, scene: Scene, splits: list[tuple[Scene, Scene]]) -> _Ro
     return room
 
 
-def _extended(
-    room: _Room, scene: Scene, splits: list[tuple[Scene, Scene]], sign: float, config: GeometryConfig
-) -> _Room:
+def _turn(scene: Scene, room: _Room, plane: int) -> float:
+    """By how much a plane moves to turn the phase of its reflection by a full turn, on average [m]."""
+    ray = images(scene, room.normal, room.offset, [(plane,)])[0, 0] - scene.receiver
+    cosine = float((ray @ room.normal[0, plane] / ray.norm(dim=-1)).abs().mean().clamp_min(0.3))
+    return math.pi / (scene.wavenumber * cosine)
+
+
+def _flipped(scene: Scene, room: _Room, plane: int = -1) -> list[_Room]:
+    """The rooms in which a plane reflects with the other sign, and its wave is in step again to either side."""
+    plane %= room.normal.shape[1]
+    turn, rooms = _turn(scene, room, plane), []
+    for step in (-turn / 2, turn / 2):
+        offset, gain = room.offset.clone(), room.gain.clone()
+        offset[:, plane] += step
+        gain[:, plane] *= -1
+        rooms.append(replace(room, offset=offset, gain=gain))
+    return rooms
+
+
+def _extended(room: _Room, scene: Scene, splits: list[tuple[Scene, Scene]], config: GeometryConfig) -> _Room:
     """With further planes of any orientation, as long as held-out spectra need them."""
     some = _some(scene, config.positions, 0)
     for _ in range(config.further):
-        best: tuple[float, _Room] | None = None
-        normals, offsets = candidates(scene, room.field(scene), 0.7 * sign, config.reach, TRIED)
-        for normal, offset in zip(normals, offsets, strict=True):
-            wider = replace(
-                room,
-                normal=torch.cat([room.normal, normal[None, None]], dim=1),
-                offset=torch.cat([room.offset, offset[None, None]], dim=1),
-                gain=torch.cat([room.gain, torch.tensor([[0.7 * sign]])], dim=1),
-            ).refined(some, 12, tilt=True)
-            score = float(some.score(wider.field(some)))
-            if best is None or score < best[0]:
-                best = score, wider
-        assert best is not None
-        wider = _pruned(best[1].refined(scene, 20, tilt=True), scene, splits)
-        if _advantage(_held_out(wider, splits), _held_out(room, splits)) < FURTHER:
+        if float(some.score(room.field(some))) < PERFECT:
             break
-        room = wider
+        wider = []
+        for normal, offset, sign in candidates(scene, room.field(scene), config.reach, TRIED):
+            normals = torch.cat([room.normal, normal[None, None]], dim=1)
+            offsets = torch.cat([room.offset, torch.full((1, 1), offset, dtype=torch.float64)], dim=1)
+            gains = torch.cat([room.gain, torch.full((1, 1), GAIN * sign)], dim=1)
+            wider.append(_Room(normals, offsets, gains, room.order).refined(some, 8, tilt=True))
+        wider.sort(key=lambda r: float(some.score(r.field(some))))
+        wider = [r.refined(some, 20, tilt=True) for other in wider[:2] for r in (other, *_flipped(scene, other))]
+        best = min(wider, key=lambda r: float(some.score(r.field(some)))).refined(scene, 15, tilt=True)
+        if _advantage(scene.coherence(best.field(scene)), scene.coherence(room.field(scene))) < FURTHER:
+            break
+        best = _pruned(best, scene, splits)
+        if _advantage(_held_out(best, splits), _held_out(room, splits)) < FURTHER:
+            break
+        room = best
     return room
 
 
@@ -231,9 +250,11 @@ def _correlation_score(scene: Scene, room: _Room, train: Spectra) -> float:
     return 1 - float((predicted * seen.conj()).real.sum()) / math.sqrt(power)
 
 
-def _model(train: Spectra, scene: Scene, room: _Room, score: float) -> GeometryModel:
+def _model(train: Spectra, scene: Scene, room: _Room, score: float, reach: float) -> GeometryModel:
     """The model with its verdicts."""
-    assert train.array is not None and train.rotation is not None and train.fixed_position is not None
+    assert train.array is not None
+    assert train.rotation is not None
+    assert train.fixed_position is not None
     planes: list[Plane] = []
     covariance = torch.zeros(0, 0, dtype=torch.float64)
     residual = Residual()
@@ -245,13 +266,18 @@ def _model(train: Spectra, scene: Scene, room: _Room, score: float) -> GeometryM
         covariance = covariance + systematic**2 * torch.eye(len(covariance), dtype=torch.float64)
         direct = float(train.line_of_sight.double().mean())
         residual = residual_statistics(scene, room.normal, room.offset, room.gain, room.sequence, direct)
-        doubt = _other_carrier(scene, room)
-        for i, std in enumerate(covariance.diagonal().clamp_min(0).sqrt().tolist()):
-            rival = _rival(scene, room, i)
-            certain = rival > CERTAIN and std * scene.wavenumber < 0.5 and not doubt
-            # where another place is as good, the deviation says how far that is
-            normal = tuple(float(x) for x in room.normal[0, i])
-            planes.append(Plane(normal, float(room.offset[0, i]), float(room.gain[0, i]), 1000 * std, certain))  # type: ignore[arg-type]
+        doubt = _flat(scene) or _other_carrier(scene, room)
+        std = covariance.diagonal().clamp_min(0).sqrt().tolist()
+        rivals = [_rival(scene, room, i) for i in range(len(std))]
+        lost = [rival <= CERTAIN or s * scene.wavenumber > VAGUE for s, (rival, _) in zip(std, rivals, strict=True)]
+        # rooms most of whose planes could stand elsewhere may be wrong as a whole, each plane holding the others
+        all_lost = bool(doubt) or sum(lost) > len(lost) / 2
+        for i, (rival, distance) in enumerate(rivals):
+            away = reach if all_lost else distance if rival <= CERTAIN else 0.0
+            x, y, z = room.normal[0, i].tolist()
+            offset, gain = float(room.offset[0, i]), float(room.gain[0, i])
+            deviation = 1000 * max(std[i], away)
+            planes.append(Plane((x, y, z), offset, gain, deviation, not (lost[i] or all_lost)))
     certain_planes = sum(p.certain for p in planes)
     verdict = (
         f"{len(planes)} planes, {certain_planes} of them certain{doubt}" if planes else "no plane explains the spectra"
@@ -272,27 +298,41 @@ def _model(train: Spectra, scene: Scene, room: _Room, score: float) -> GeometryM
     )
 
 
-def _rival(scene: Scene, room: _Room, plane: int) -> float:
-    """By how many standard errors the plane's place is better than the best of those around it."""
-    step = 0.4 / scene.wavenumber
-    beside = torch.arange(-RIVALS, RIVALS, step, dtype=torch.float64)
-    beside = beside[beside.abs() * scene.wavenumber > 1.2]  # about a third of the way to the next minimum
+def _rival(scene: Scene, room: _Room, plane: int) -> tuple[float, float]:
+    """By how many standard errors the plane's place is better than the best rival's, and how far that is away [m].
+
+    Rivals are the best place of a scan around the plane, and the places where a wave of the other sign is in step; each is
+    refined together with all other planes.
+    """
+    turn = _turn(scene, room, plane)
+    step = torch.arange(turn / 2, 3.5 * turn, 0.4 / scene.wavenumber, dtype=torch.float64)
+    beside = torch.cat([-step.flip(0), step])
     offset = room.offset.repeat(len(beside), 1)
     offset[:, plane] += beside
-    count = len(beside)
     rest = [s for s in room.sequence if plane not in s]
     own = [s for s in room.sequence if plane in s]
     base = scene.wave(scene.transmitter) + field(scene, room.normal, room.offset, room.gain, rest)[0]
-    best = -math.inf, 0
-    fields = []
-    for chunk in torch.arange(count).split(max(1, 4000 // len(scene))):
-        size = len(chunk)
-        f = base + field(scene, room.normal.expand(size, -1, -1), offset[chunk], room.gain.expand(size, -1), own)
-        value = scene.coherence(f).mean(-1)
-        if float(value.max()) > best[0]:
-            best = float(value.max()), int(chunk[value.argmax()])
-            fields = [f[value.argmax()]]
-    return _advantage(scene.coherence(room.field(scene)), scene.coherence(fields[0]))
+    value = torch.stack([scene.score(base + field(scene, room.normal, o[None], room.gain, own)[0]) for o in offset])
+    moved = room.offset.clone()
+    moved[:, plane] += beside[value.argmin()]
+    here = scene.coherence(room.field(scene))
+    nearest = math.inf, 0.0
+    for rival in (replace(room, offset=moved), *_flipped(scene, room, plane)):
+        other = rival.refined(scene, 5)
+        distance = abs(float(other.offset[0, plane] - room.offset[0, plane]))
+        if distance > turn / 4:
+            nearest = min(nearest, (_advantage(here, scene.coherence(other.field(scene))), distance))
+    return nearest
+
+
+def _flat(scene: Scene) -> str:
+    """A doubt where the positions lie on a line or in a plane, from where many rooms look alike."""
+    moving = scene.transmitter if len(scene.transmitter) > 1 else scene.receiver
+    extent = torch.linalg.svdvals(moving - moving.mean(0)) / math.sqrt(len(moving))
+    if float(extent[2]) * scene.wavenumber > FLAT:
+        return ""
+    shape = "a line" if float(extent[1]) * scene.wavenumber <= FLAT else "a plane"
+    return f"; the positions lie on {shape}, from where many rooms look alike"
 
 
 def _other_carrier(scene: Scene, room: _Room) -> str:

@@ -12,7 +12,8 @@ from swiftwrf.geometry.images import Scene, mirror
 HORIZONTAL = 90  # normals of upright walls that are tried
 SPHERE = 1200  # normals all around
 NEAR = 24  # positions close together, whose waves stay in step over a few degrees of tilt
-BATCH = 256
+DIRECTIONS = 4  # at a time
+GAIN = 0.7  # that planes are tried with, of either sign
 
 
 def directions() -> Tensor:
@@ -25,13 +26,12 @@ def directions() -> Tensor:
     return torch.cat([upright, torch.stack([flat * turn.cos(), flat * turn.sin(), z], dim=1)])
 
 
-def candidates(scene: Scene, base: Tensor, gain: float, reach: float, top: int) -> tuple[Tensor, Tensor]:
-    """The best further planes in single reflections: normals (C, 3) and offsets (C,) [m], the best first.
+def candidates(scene: Scene, base: Tensor, reach: float, top: int) -> list[tuple[Tensor, float, float]]:
+    """The best further planes in single reflections: normal (3,), offset [m] and sign of the gain, the best first.
 
     Args:
         scene: all positions; the NEAR ones around their centre are used.
         base: field of what is known already, (n, K).
-        gain: that the planes are tried with.
         reach: how far beyond the region of both ends [m].
         top: how many.
     """
@@ -39,16 +39,13 @@ def candidates(scene: Scene, base: Tensor, gain: float, reach: float, top: int) 
     moving = scene.transmitter if len(scene.transmitter) > 1 else scene.receiver
     rows = (moving - moving.mean(0)).norm(dim=1).argsort()[:NEAR]
     near, base = scene.subset(rows), base[rows]
-    found: list[tuple[float, Tensor, float]] = []
+    found: list[tuple[float, Tensor, float, float]] = []
     distance = torch.arange(0.5, reach * scene.wavenumber, 0.6, dtype=torch.float64) / scene.wavenumber
-    for normal in directions().split(max(1, BATCH // len(distance) * 8)):
+    for normal in directions().split(DIRECTIONS):
         offset = (both @ normal.T).amax(0)[:, None] + distance
-        source = mirror(near.transmitter, normal[:, None, None], offset[..., None])
-        score = torch.stack([near.score(base + gain * near.wave(s)) for s in source])
-        best = score.min(1)
-        found += [
-            (float(v), n, float(o))
-            for v, n, o in zip(best.values, normal, offset.gather(1, best.indices[:, None])[:, 0], strict=True)
-        ]
-    found.sort(key=lambda f: f[0])
-    return torch.stack([f[1] for f in found[:top]]), torch.tensor([f[2] for f in found[:top]], dtype=torch.float64)
+        wave = near.wave(mirror(near.transmitter, normal[:, None, None], offset[..., None]))
+        for sign in (-1.0, 1.0):
+            best = near.score(base + GAIN * sign * wave).min(1)
+            at = offset.gather(1, best.indices[:, None])[:, 0].tolist()
+            found += [(v, n, o, sign) for v, n, o in zip(best.values.tolist(), normal, at, strict=True)]
+    return [f[1:] for f in sorted(found, key=lambda f: f[0])[:top]]

@@ -51,7 +51,8 @@ def tangents(
     for q in range(3 if tilt else 1):
         rows: list[list[Tensor]] = []
         for s in sequence:
-            point, steps = transmitter.expand(len(normal), -1, -1), []
+            point = transmitter.expand(len(normal), -1, -1)
+            steps: list[Tensor] = []
             for i in s:
                 n, o = normal[:, i, None], offset[:, i, None, None]
                 distance = (point * n).sum(-1, keepdim=True) - o
@@ -151,4 +152,5 @@ def deviations(scene: Scene, normal: Tensor, offset: Tensor, gain: Tensor, seque
     inverse = torch.linalg.pinv(curve[0].double(), hermitian=True)
     scatter = slope[0].double() @ slope[0].double().T * (n / max(n - q, 1))
     planes = normal.shape[1]
-    return (inverse @ scatter @ inverse)[:planes, :planes]
+    covariance: Tensor = (inverse @ scatter @ inverse)[:planes, :planes]
+    return covariance

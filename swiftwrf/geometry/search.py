@@ -9,7 +9,7 @@ all single and double reflections, until none is better.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from dataclasses import field as of
 
@@ -23,10 +23,12 @@ SIDES = torch.tensor(
     [[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], dtype=torch.float64
 )  # outward normals
 FEW = 36  # positions that moves of all sides are scored with first
+PERFECT = 2e-4  # a score that needs no further moves
 STARTS = 4  # of a search
 HOPELESS = 1.4  # a start with so many times the best score is given up
+Alternatives = list[list[tuple[float, float]]]  # offset [m] and gain, for each side
 CHUNK = 256  # candidates at a time
-MOVES = {2: 99, 3: 7, 4: 4, 6: 5}  # so many sides move at once, each to so many alternatives
+MOVES = {2: 99, 3: 7, 4: 4}  # so many sides move at once, each to so many alternatives
 
 
 @dataclass
@@ -142,7 +144,7 @@ class Search:
             rooms = list(distinct.values())[:width]
         return rooms
 
-    def alternatives(self, room: Room, top: int) -> list[list[tuple[float, float]]]:
+    def alternatives(self, room: Room, top: int) -> Alternatives:
         """For each side (offset, gain): where it is, nothing (gain 0), and the minima of scans with and without
         second-order images."""
         found = []
@@ -157,9 +159,7 @@ class Search:
             found.append(own + [(o, gain) for o in far])
         return found
 
-    def table(
-        self, alternatives: list[list[tuple[float, float]]]
-    ) -> tuple[list[Tensor], dict[tuple[int, int], Tensor]]:
+    def table(self, alternatives: Alternatives) -> tuple[list[Tensor], dict[tuple[int, int], Tensor]]:
         """Waves of single reflections, (A, n, K) a side, and of double ones, (A, B, n, K) a pair of sides."""
         offset = [torch.tensor([o for o, _ in a], dtype=torch.float64) for a in alternatives]
         gain = [torch.tensor([g for _, g in a]) for a in alternatives]
@@ -174,16 +174,21 @@ class Search:
             double[i, j] = waves.reshape(len(offset[i]), len(offset[j]), *waves.shape[1:])
         return single, double
 
-    def moves(self, room: Room, top: int, k: int, keep: int) -> list[Room]:
+    def moves(self, alternatives: Alternatives, k: int, keep: int) -> list[Room]:
         """The best rooms in which k sides take other alternatives, of which the more are tried the fewer sides move."""
-        if k == 6 and len(self.scene) > FEW:
-            few = self.scene.subset(torch.linspace(0, len(self.scene) - 1, FEW).long())
-            return Search(few, self.reach, self.sign, self.order).moves(room, top, k, keep)
-        alternatives = self.alternatives(room, top) if k < 6 else self.wraps(room)
-        single, double = self.table(alternatives)
+        return self._moved(alternatives, *self.table(alternatives), k, keep)
+
+    def _moved(
+        self,
+        alternatives: Alternatives,
+        single: list[Tensor],
+        double: dict[tuple[int, int], Tensor],
+        k: int,
+        keep: int,
+    ) -> list[Room]:
         pool: list[tuple[float, tuple[int, ...]]] = []
         for which in itertools.combinations(range(6), k):
-            tried = [list(range(len(alternatives[i])))[: MOVES[k]] for i in which]
+            tried = [list(range(len(alternatives[i])))[: MOVES.get(k)] for i in which]
             rest = [i for i in range(6) if i not in which]
             total = self.direct + sum(single[i][0] for i in rest)
             for i, j in itertools.combinations(rest, 2):
@@ -207,7 +212,7 @@ class Search:
             rooms.append(Room(value_, {i: p[0] for i, p in picked.items()}, {i: p[1] for i, p in picked.items()}))
         return rooms
 
-    def wraps(self, room: Room) -> list[list[tuple[float, float]]]:
+    def wraps(self, room: Room) -> Alternatives:
         """For each side (offset, gain): where it is and where its wave has the same phase up to one or two turns."""
         found = []
         for side in range(6):
@@ -228,15 +233,25 @@ class Search:
         """Moves several planes at a time, with second-order images, until nothing is better."""
         best = self.refined([room], self.order)[0]
         for _ in range(sweeps):
-            before = best.score
-            for k in MOVES:
-                tried = self.refined(self.moves(best, top, k, keep), self.order)
-                if tried[0].score < best.score - 1e-4:
-                    best = tried[0]
+            for tried in self._trials(best, top, keep):
+                if tried.score < best.score - 1e-4:
+                    best = tried
                     break
-            if best.score == before:
+            else:
                 break
         return best
+
+    def _trials(self, room: Room, top: int, keep: int) -> Iterator[Room]:
+        """The best of each kind of move, the cheap ones first."""
+        if room.score < PERFECT:
+            return
+        alternatives = self.alternatives(room, top)
+        single, double = self.table(alternatives)
+        for k in MOVES:
+            yield self.refined(self._moved(alternatives, single, double, k, keep), self.order)[0]
+        rows = torch.linspace(0, len(self.scene) - 1, min(FEW, len(self.scene))).long()
+        few = Search(self.scene.subset(rows), self.reach, self.sign, self.order)
+        yield self.refined(few.moves(self.wraps(room), 6, keep), self.order)[0]
 
 
 def _placed(waves: Tensor, axes: list[int], k: int) -> Tensor:
@@ -260,12 +275,15 @@ def find_room(
         tick: called after each of the STARTS starts.
     """
     starts = []
+    nothing = Room(float(scene.score(scene.wave(scene.transmitter))))
+    if nothing.score < PERFECT:
+        return 1.0, nothing
     for sign in (-1.0, 1.0):
         search = Search(scene, reach, sign, order)
         starts += [(search.beam(width, first)[0], search) for first in (order, 1)]
     best: tuple[float, Room] | None = None
     for start, search in sorted(starts, key=lambda s: s[0].score):
-        if best is None or start.score < max(HOPELESS * best[1].score, best[1].score + 0.02):
+        if best is None or PERFECT < start.score < HOPELESS * best[1].score:
             room = search.improve(start)
             if best is None or room.score < best[1].score:
                 best = search.sign, room
