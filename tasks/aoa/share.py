@@ -67,7 +67,7 @@ def fits(run: AoaRecords) -> tuple[DataFrame, DataFrame]:
     """History of the fits of SwiftWRF for the first share and repeat: the last evaluation of each of the search, and the
     final fit."""
     history = first_history(run)
-    if "stage" not in history:
+    if "n_primitives" not in history:
         return history.iloc[:0], history.iloc[:0]
     own = history[history["synthesizer"] == "swiftwrf"]
     search = own[own["stage"] == "search"].groupby(["n_primitives", "steps"], as_index=False).last()

@@ -1,0 +1,32 @@
+"""The room, and the smooth part of what it leaves."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from augment.synthesizers.base import ARRAY, FIXED_END, SYNTHESIZERS, Synthesizer
+from augment.synthesizers.geometry import find_room
+from swiftwrf import Spectra
+from swiftwrf.geometry import HybridModel, fit_hybrid
+
+
+@SYNTHESIZERS.register(
+    "hybrid",
+    meaning="geometry, and a Gaussian process on what it leaves",
+    needs=(ARRAY, FIXED_END),
+    colour="#332288",
+)
+class Hybrid(Synthesizer):
+    """A share of the geometry's spectra and a smooth remainder; the share is chosen on held-out training spectra."""
+
+    def fit(self, train: Spectra) -> None:
+        own = self.settings
+        self._model = fit_hybrid(train, find_room(train, own), validation=own.validation, seed=own.seed)
+
+    def synthesize(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        return self._model.synthesize(position)
+
+    @property
+    def model(self) -> HybridModel:
+        return self._model
