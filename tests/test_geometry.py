@@ -136,7 +136,7 @@ def test_mirroring_twice_returns():
     ids=["one", "two", "six"],
 )
 def test_rooms_without_noise_are_found_to_a_millimetre(planes, gain, moving):
-    model = fit(spectra(planes, gain, moving))
+    model = fit(spectra(planes, gain, moving, n=40))
     assert len(model.planes) == len(planes)
     assert max(e for e, _ in errors(model, planes)) < 1
     assert all(abs(p.gain - gain) < 0.02 and p.certain for p in model.planes)

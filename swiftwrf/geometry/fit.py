@@ -17,7 +17,7 @@ from swiftwrf.geometry.images import Scene
 from swiftwrf.geometry.model import GeometryModel
 from swiftwrf.geometry.observe import correlations, element_phases
 from swiftwrf.geometry.orient import GAIN, candidates
-from swiftwrf.geometry.planes import Planes, advantage, correlation_score, flipped
+from swiftwrf.geometry.planes import Planes, advantage, clearly, correlation_score, flipped
 from swiftwrf.geometry.search import PERFECT, STARTS, Search, find_room
 from swiftwrf.geometry.verdict import judged
 from swiftwrf.progress import progress_bar
@@ -133,7 +133,7 @@ def _pruned(room: Planes, scene: Scene, splits: list[tuple[Scene, Scene]]) -> Pl
     while room.normal.shape[1]:
         full = _held_out(room, splits)
         rest = [room.without(i).refined(scene, 4) for i in range(room.normal.shape[1])]
-        needed = [advantage(full, _held_out(r, splits)) for r in rest]
+        needed = [clearly(full, _held_out(r, splits)) for r in rest]
         least = min(range(len(rest)), key=needed.__getitem__)
         if needed[least] > NEEDED:
             break

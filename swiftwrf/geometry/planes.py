@@ -13,6 +13,8 @@ from swiftwrf.geometry.observe import autocorrelation
 from swiftwrf.geometry.refine import refine
 from swiftwrf.geometry.search import Room
 
+FLOOR = 1e-6  # of what is missing: rounding
+
 
 @dataclass(frozen=True)
 class Planes:
@@ -53,6 +55,17 @@ def advantage(a: Tensor, b: Tensor) -> float:
     """By how many standard errors the coherences a (n,) are higher than b."""
     difference = a - b
     return float(difference.mean() / (difference.std() / math.sqrt(len(difference))).clamp_min(1e-9))
+
+
+def explained(coherence: Tensor) -> Tensor:
+    """How well each spectrum is explained: minus the logarithm of what is missing, (n,)."""
+    return -(1 - coherence + FLOOR).log()
+
+
+def clearly(a: Tensor, b: Tensor) -> float:
+    """The larger `advantage` of coherences a over b, as they are or by what is missing: differences of the former are
+    skewed where spectra are few, and those of the latter hide what helps badly explained ones."""
+    return max(advantage(a, b), advantage(explained(a), explained(b)))
 
 
 def turn_of(scene: Scene, room: Planes, plane: int) -> float:

@@ -6,16 +6,14 @@ import math
 from dataclasses import replace
 
 import torch
-from torch import Tensor
 
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.geometry.images import Scene, field
 from swiftwrf.geometry.model import GeometryModel, Plane
-from swiftwrf.geometry.planes import Planes, advantage, correlation_score, flipped, turn_of
+from swiftwrf.geometry.planes import Planes, advantage, correlation_score, explained, flipped, turn_of
 from swiftwrf.geometry.refine import deviations
 from swiftwrf.geometry.sample import Residual, residual_statistics
 
-FLOOR = 1e-6  # of what is missing: rounding
 CERTAIN = 3.0  # the same against a rival place, for a plane to be certain
 VAGUE = 0.5  # deviation [rad of phase] beyond which a plane is not certain
 FLAT = 0.8  # spread of the positions in any direction [rad of phase] up to which they count as flat
@@ -71,12 +69,6 @@ def judged(train: Spectra, scene: Scene, room: Planes, score: float, reach: floa
     )
 
 
-def _fit(scene: Scene, room: Planes) -> Tensor:
-    """How well each position's spectrum is explained, (n,): minus the logarithm of what is missing, of which single
-    positions with much missing do not make all."""
-    return -(1 - scene.coherence(room.field(scene)) + FLOOR).log()
-
-
 def _rival(scene: Scene, room: Planes, plane: int) -> tuple[float, float]:
     """By how many standard errors the plane's place is better than the best rival's, and how far that is away [m].
 
@@ -94,13 +86,13 @@ def _rival(scene: Scene, room: Planes, plane: int) -> tuple[float, float]:
     value = torch.stack([scene.score(base + field(scene, room.normal, o[None], room.gain, own)[0]) for o in offset])
     moved = room.offset.clone()
     moved[:, plane] += beside[value.argmin()]
-    here = _fit(scene, room)
+    here = explained(scene.coherence(room.field(scene)))
     nearest = math.inf, 0.0
     for rival in (replace(room, offset=moved), *flipped(scene, room, plane)):
         other = rival.refined(scene, 5)
         distance = abs(float(other.offset[0, plane] - room.offset[0, plane]))
         if distance > turn / 4:
-            nearest = min(nearest, (advantage(here, _fit(scene, other)), distance))
+            nearest = min(nearest, (advantage(here, explained(scene.coherence(other.field(scene)))), distance))
     return nearest
 
 
