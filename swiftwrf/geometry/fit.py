@@ -18,7 +18,7 @@ from swiftwrf.geometry.model import GeometryModel
 from swiftwrf.geometry.observe import correlations, element_phases
 from swiftwrf.geometry.orient import GAIN, candidates
 from swiftwrf.geometry.planes import Planes, advantage, clearly, correlation_score, flipped
-from swiftwrf.geometry.search import PERFECT, STARTS, Search, find_room
+from swiftwrf.geometry.search import BETTER, PERFECT, STARTS, Search, find_room
 from swiftwrf.geometry.verdict import judged
 from swiftwrf.progress import progress_bar
 
@@ -82,7 +82,8 @@ def fit_geometry(
     found = Search(_some(scene, config.positions, seed), config.reach, sign).improve(found)
     room = Planes.of(found).refined(scene)
     splits = _splits(scene, fold)
-    room = _extended(_pruned(room, scene, splits), scene, splits, config)
+    room = _settled(_pruned(room, scene, splits), scene)
+    room = _extended(room, scene, splits, config)
     room = _with_order(room, splits, config.max_order)
     return judged(train, scene, room.refined(scene), score, config.reach)
 
@@ -138,6 +139,19 @@ def _pruned(room: Planes, scene: Scene, splits: list[tuple[Scene, Scene]]) -> Pl
         if needed[least] > NEEDED:
             break
         room = rest[least]
+    return room
+
+
+def _settled(room: Planes, scene: Scene) -> Planes:
+    """With the other sign of a plane's gain, its wave in step again, where that explains the spectra better: a few planes
+    are explained nearly as well by the wrong sign, and the search takes one sign for all."""
+    score = float(scene.score(room.field(scene)))
+    for plane in range(room.normal.shape[1]):
+        for other in flipped(scene, room, plane):
+            other = other.refined(scene, 12)
+            value = float(scene.score(other.field(scene)))
+            if value < BETTER * score:
+                room, score = other, value
     return room
 
 
