@@ -32,7 +32,9 @@ def small(monkeypatch):
     monkeypatch.setattr(experiment, "simulated_room", lambda **_: room)
     monkeypatch.setattr("augment.synthesizers.swiftwrf.FitConfig", lambda: TINY_FIT)
     for place in (experiment, choose):  # finding a room has tests of its own
-        monkeypatch.setattr(place, "candidates", lambda data: [n for n in ("idw", "gp", "coarray") if not lacks(n, data)])
+        monkeypatch.setattr(
+            place, "candidates", lambda data: [n for n in ("idw", "gp", "coarray") if not lacks(n, data)]
+        )
     monkeypatch.setattr(aann, "AANNConfig", lambda: AANNConfig(steps=2, batch=4))
     return room
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,13 +10,13 @@ from torch import Tensor
 from swiftwrf.data.spectra import Spectra, check_training
 from swiftwrf.data.splits import MIN_TRAINING, Validation, folds
 from swiftwrf.errors import InputError
-from swiftwrf.geometry.images import Scene, Sequence, field, images, sequences
-from swiftwrf.geometry.model import GeometryModel, Plane
-from swiftwrf.geometry.observe import autocorrelation, correlations, element_phases
+from swiftwrf.geometry.images import Scene
+from swiftwrf.geometry.model import GeometryModel
+from swiftwrf.geometry.observe import correlations, element_phases
 from swiftwrf.geometry.orient import GAIN, candidates
-from swiftwrf.geometry.refine import deviations, refine
-from swiftwrf.geometry.sample import Residual, residual_statistics
-from swiftwrf.geometry.search import PERFECT, STARTS, Room, Search, find_room
+from swiftwrf.geometry.planes import Planes, advantage, clearly, correlation_score, flipped
+from swiftwrf.geometry.search import BETTER, PERFECT, STARTS, Search, find_room
+from swiftwrf.geometry.verdict import judged
 from swiftwrf.progress import progress_bar
 
 SOLVED = 0.1  # relative error of a spectrum's autocorrelation up to which its phases are used
@@ -25,11 +24,6 @@ NEEDED = 2.5  # standard errors by which held-out spectra must be better for a p
 FURTHER = 4.0  # the same for a plane of any orientation, of which far more are tried
 TRIED = 8  # candidates of any orientation that are refined
 MANY = 300  # positions from which one held-out part decides, not all in turn
-MISFIT = 0.02  # wavelengths that planes are off where nothing is explained: what is not modelled is no random noise
-CERTAIN = 3.0  # the same against a rival place, for a plane to be certain
-VAGUE = 0.5  # deviation [rad of phase] beyond which a plane is not certain
-FLAT = 0.8  # spread of the positions in any direction [rad of phase] up to which they count as flat
-SCALES = (0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05)  # of the carrier that rivals the given one
 
 
 @dataclass(frozen=True)
@@ -49,41 +43,6 @@ class GeometryConfig:
     width: int = 8
     max_order: int = 3
     further: int = 3
-
-
-@dataclass(frozen=True)
-class _Room:
-    """Planes (1, P, 3), (1, P) [m] with gains (1, P), and the order of their images."""
-
-    normal: Tensor
-    offset: Tensor
-    gain: Tensor
-    order: int
-
-    @classmethod
-    def of(cls, found: Room) -> _Room:
-        normal, offset, gain = found.tensors()
-        return cls(normal, offset, gain, 2)
-
-    @property
-    def sequence(self) -> list[Sequence]:
-        return sequences(self.normal[0], self.order) if self.normal.shape[1] else []
-
-    def field(self, scene: Scene) -> Tensor:
-        """(n, K)."""
-        return scene.wave(scene.transmitter) + field(scene, self.normal, self.offset, self.gain, self.sequence)[0]
-
-    def without(self, plane: int) -> _Room:
-        keep = [i for i in range(self.normal.shape[1]) if i != plane]
-        return replace(self, normal=self.normal[:, keep], offset=self.offset[:, keep], gain=self.gain[:, keep])
-
-    def refined(self, scene: Scene, steps: int = 10, tilt: bool = False) -> _Room:
-        if not self.sequence:
-            return self
-        _, normal, offset, gain = refine(
-            scene, self.normal, self.offset, self.gain, self.sequence, steps=steps, tilt=tilt
-        )
-        return replace(self, normal=normal, offset=offset, gain=gain)
 
 
 def fit_geometry(
@@ -109,19 +68,21 @@ def fit_geometry(
     """
     config = config or GeometryConfig()
     scene, fold = _observe(train, validation, seed)
+    assert train.array is not None
     kept, held = scene.subset((fold != 0).nonzero()[:, 0]), scene.subset((fold == 0).nonzero()[:, 0])
     with progress_bar(progress) as bar:
         task = bar.add_task("finding the room", total=STARTS)
         sign, found = find_room(
             _some(kept, config.positions, seed), config.reach, width=config.width, tick=lambda: bar.advance(task)
         )
-    score = _correlation_score(held, _Room.of(found).refined(kept), train)
+    score = correlation_score(held, Planes.of(found).refined(kept), train.array)
     found = Search(_some(scene, config.positions, seed), config.reach, sign).improve(found)
-    room = _Room.of(found).refined(scene)
+    room = Planes.of(found).refined(scene)
     splits = _splits(scene, fold)
-    room = _extended(_pruned(room, scene, splits), scene, splits, config)
+    room = _settled(_pruned(room, scene, splits), scene)
+    room = _extended(room, scene, splits, config)
     room = _with_order(room, splits, config.max_order)
-    return _model(train, scene, room.refined(scene), score, config.reach)
+    return judged(train, scene, room.refined(scene), score, config.reach)
 
 
 def _some(scene: Scene, most: int, seed: int) -> Scene:
@@ -160,23 +121,17 @@ def _observe(train: Spectra, validation: Validation, seed: int) -> tuple[Scene, 
     return scene, folds(train.position[solved], validation, seed)
 
 
-def _advantage(a: Tensor, b: Tensor) -> float:
-    """By how many standard errors the coherences a (n,) are higher than b."""
-    difference = a - b
-    return float(difference.mean() / (difference.std() / math.sqrt(len(difference))).clamp_min(1e-9))
-
-
-def _held_out(room: _Room, splits: list[tuple[Scene, Scene]], steps: int = 4) -> Tensor:
+def _held_out(room: Planes, splits: list[tuple[Scene, Scene]], steps: int = 4) -> Tensor:
     """Coherence at held-out positions (n,), planes and gains refined on the others."""
     return torch.cat([held.coherence(room.refined(kept, steps).field(held)) for kept, held in splits])
 
 
-def _pruned(room: _Room, scene: Scene, splits: list[tuple[Scene, Scene]]) -> _Room:
+def _pruned(room: Planes, scene: Scene, splits: list[tuple[Scene, Scene]]) -> Planes:
     """Without the planes that held-out spectra do not need, the least needed first."""
     while room.normal.shape[1]:
         full = _held_out(room, splits)
         rest = [room.without(i).refined(scene, 4) for i in range(room.normal.shape[1])]
-        needed = [_advantage(full, _held_out(r, splits)) for r in rest]
+        needed = [clearly(full, _held_out(r, splits)) for r in rest]
         least = min(range(len(rest)), key=needed.__getitem__)
         if needed[least] > NEEDED:
             break
@@ -184,26 +139,20 @@ def _pruned(room: _Room, scene: Scene, splits: list[tuple[Scene, Scene]]) -> _Ro
     return room
 
 
-def _turn(scene: Scene, room: _Room, plane: int) -> float:
-    """By how much a plane moves to turn the phase of its reflection by a full turn, on average [m]."""
-    ray = images(scene, room.normal, room.offset, [(plane,)])[0, 0] - scene.receiver
-    cosine = float((ray @ room.normal[0, plane] / ray.norm(dim=-1)).abs().mean().clamp_min(0.3))
-    return math.pi / (scene.wavenumber * cosine)
+def _settled(room: Planes, scene: Scene) -> Planes:
+    """With the other sign of a plane's gain, its wave in step again, where that explains the spectra better: a few planes
+    are explained nearly as well by the wrong sign, and the search takes one sign for all."""
+    score = float(scene.score(room.field(scene)))
+    for plane in range(room.normal.shape[1]):
+        for other in flipped(scene, room, plane):
+            other = other.refined(scene, 12)
+            value = float(scene.score(other.field(scene)))
+            if value < BETTER * score:
+                room, score = other, value
+    return room
 
 
-def _flipped(scene: Scene, room: _Room, plane: int = -1) -> list[_Room]:
-    """The rooms in which a plane reflects with the other sign, and its wave is in step again to either side."""
-    plane %= room.normal.shape[1]
-    turn, rooms = _turn(scene, room, plane), []
-    for step in (-turn / 2, turn / 2):
-        offset, gain = room.offset.clone(), room.gain.clone()
-        offset[:, plane] += step
-        gain[:, plane] *= -1
-        rooms.append(replace(room, offset=offset, gain=gain))
-    return rooms
-
-
-def _extended(room: _Room, scene: Scene, splits: list[tuple[Scene, Scene]], config: GeometryConfig) -> _Room:
+def _extended(room: Planes, scene: Scene, splits: list[tuple[Scene, Scene]], config: GeometryConfig) -> Planes:
     """With further planes of any orientation, as long as held-out spectra need them."""
     some = _some(scene, config.positions, 0)
     for _ in range(config.further):
@@ -214,20 +163,20 @@ def _extended(room: _Room, scene: Scene, splits: list[tuple[Scene, Scene]], conf
             normals = torch.cat([room.normal, normal[None, None]], dim=1)
             offsets = torch.cat([room.offset, torch.full((1, 1), offset, dtype=torch.float64)], dim=1)
             gains = torch.cat([room.gain, torch.full((1, 1), GAIN * sign)], dim=1)
-            wider.append(_Room(normals, offsets, gains, room.order).refined(some, 8, tilt=True))
+            wider.append(Planes(normals, offsets, gains, room.order).refined(some, 8, tilt=True))
         wider.sort(key=lambda r: float(some.score(r.field(some))))
-        wider = [r.refined(some, 20, tilt=True) for other in wider[:2] for r in (other, *_flipped(scene, other))]
+        wider = [r.refined(some, 20, tilt=True) for other in wider[:2] for r in (other, *flipped(scene, other))]
         best = min(wider, key=lambda r: float(some.score(r.field(some)))).refined(scene, 15, tilt=True)
-        if _advantage(scene.coherence(best.field(scene)), scene.coherence(room.field(scene))) < FURTHER:
+        if advantage(scene.coherence(best.field(scene)), scene.coherence(room.field(scene))) < FURTHER:
             break
         best = _pruned(best, scene, splits)
-        if _advantage(_held_out(best, splits), _held_out(room, splits)) < FURTHER:
+        if advantage(_held_out(best, splits), _held_out(room, splits)) < FURTHER:
             break
         room = best
     return room
 
 
-def _with_order(room: _Room, splits: list[tuple[Scene, Scene]], most: int) -> _Room:
+def _with_order(room: Planes, splits: list[tuple[Scene, Scene]], most: int) -> Planes:
     """With images up to the order that explains held-out spectra best; a higher one must be clearly better."""
     if not room.normal.shape[1]:
         return replace(room, order=1)
@@ -235,111 +184,6 @@ def _with_order(room: _Room, splits: list[tuple[Scene, Scene]], most: int) -> _R
     for order in range(1, most + 1):
         tried = replace(room, order=order)
         held = _held_out(tried, splits, 8)
-        if not len(score) or _advantage(held, score) > NEEDED:
+        if not len(score) or advantage(held, score) > NEEDED:
             best, score = tried, held
     return best
-
-
-def _correlation_score(scene: Scene, room: _Room, train: Spectra) -> float:
-    """1 - correlation of predicted and observed co-array numbers, both scaled freely."""
-    assert train.array is not None
-    h = room.field(scene)
-    predicted = autocorrelation(h / h.abs().clamp_min(1e-12), train.array)
-    seen = autocorrelation(scene.channel[:, 0], train.array)
-    power = float(predicted.abs().square().sum() * seen.abs().square().sum())
-    return 1 - float((predicted * seen.conj()).real.sum()) / math.sqrt(power)
-
-
-def _model(train: Spectra, scene: Scene, room: _Room, score: float, reach: float) -> GeometryModel:
-    """The model with its verdicts."""
-    assert train.array is not None
-    assert train.rotation is not None
-    assert train.fixed_position is not None
-    planes: list[Plane] = []
-    covariance = torch.zeros(0, 0, dtype=torch.float64)
-    residual = Residual()
-    doubt = ""
-    unexplained = 1 - (1 - _correlation_score(scene, room, train)) ** 2
-    if room.normal.shape[1]:
-        covariance = deviations(scene, room.normal, room.offset, room.gain, room.sequence)
-        systematic = MISFIT * train.array.wavelength * math.sqrt(max(unexplained, 0))
-        covariance = covariance + systematic**2 * torch.eye(len(covariance), dtype=torch.float64)
-        direct = float(train.line_of_sight.double().mean())
-        residual = residual_statistics(scene, room.normal, room.offset, room.gain, room.sequence, direct)
-        doubt = _flat(scene) or _other_carrier(scene, room)
-        std = covariance.diagonal().clamp_min(0).sqrt().tolist()
-        rivals = [_rival(scene, room, i) for i in range(len(std))]
-        lost = [rival <= CERTAIN or s * scene.wavenumber > VAGUE for s, (rival, _) in zip(std, rivals, strict=True)]
-        # rooms most of whose planes could stand elsewhere may be wrong as a whole, each plane holding the others
-        all_lost = bool(doubt) or sum(lost) > len(lost) / 2
-        for i, (rival, distance) in enumerate(rivals):
-            away = reach if all_lost else distance if rival <= CERTAIN else 0.0
-            x, y, z = room.normal[0, i].tolist()
-            offset, gain = float(room.offset[0, i]), float(room.gain[0, i])
-            deviation = 1000 * max(std[i], away)
-            planes.append(Plane((x, y, z), offset, gain, deviation, not (lost[i] or all_lost)))
-    certain_planes = sum(p.certain for p in planes)
-    verdict = (
-        f"{len(planes)} planes, {certain_planes} of them certain{doubt}" if planes else "no plane explains the spectra"
-    )
-    return GeometryModel(
-        array=train.array,
-        grid=train.grid,
-        rotation=train.rotation,
-        fixed_position=train.fixed_position,
-        moving=train.moving,
-        planes=planes,
-        order=room.order,
-        score_held_out=score,
-        unexplained=unexplained,
-        verdict=verdict,
-        covariance=covariance,
-        residual=residual,
-    )
-
-
-def _rival(scene: Scene, room: _Room, plane: int) -> tuple[float, float]:
-    """By how many standard errors the plane's place is better than the best rival's, and how far that is away [m].
-
-    Rivals are the best place of a scan around the plane, and the places where a wave of the other sign is in step; each is
-    refined together with all other planes.
-    """
-    turn = _turn(scene, room, plane)
-    step = torch.arange(turn / 2, 3.5 * turn, 0.4 / scene.wavenumber, dtype=torch.float64)
-    beside = torch.cat([-step.flip(0), step])
-    offset = room.offset.repeat(len(beside), 1)
-    offset[:, plane] += beside
-    rest = [s for s in room.sequence if plane not in s]
-    own = [s for s in room.sequence if plane in s]
-    base = scene.wave(scene.transmitter) + field(scene, room.normal, room.offset, room.gain, rest)[0]
-    value = torch.stack([scene.score(base + field(scene, room.normal, o[None], room.gain, own)[0]) for o in offset])
-    moved = room.offset.clone()
-    moved[:, plane] += beside[value.argmin()]
-    here = scene.coherence(room.field(scene))
-    nearest = math.inf, 0.0
-    for rival in (replace(room, offset=moved), *_flipped(scene, room, plane)):
-        other = rival.refined(scene, 5)
-        distance = abs(float(other.offset[0, plane] - room.offset[0, plane]))
-        if distance > turn / 4:
-            nearest = min(nearest, (_advantage(here, scene.coherence(other.field(scene))), distance))
-    return nearest
-
-
-def _flat(scene: Scene) -> str:
-    """A doubt where the positions lie on a line or in a plane, from where many rooms look alike."""
-    moving = scene.transmitter if len(scene.transmitter) > 1 else scene.receiver
-    extent = torch.linalg.svdvals(moving - moving.mean(0)) / math.sqrt(len(moving))
-    if float(extent[2]) * scene.wavenumber > FLAT:
-        return ""
-    shape = "a line" if float(extent[1]) * scene.wavenumber <= FLAT else "a plane"
-    return f"; the positions lie on {shape}, from where many rooms look alike"
-
-
-def _other_carrier(scene: Scene, room: _Room) -> str:
-    """A doubt where another carrier explains the spectra clearly better, else nothing."""
-    for scale in SCALES:
-        other = replace(scene, wavenumber=scale * scene.wavenumber)
-        rival = other.coherence(room.refined(other, 6).field(other))
-        if _advantage(rival, scene.coherence(room.field(scene))) > CERTAIN:
-            return f"; a carrier {100 * (scale - 1):+.0f} % from the given one explains the spectra better"
-    return ""

@@ -41,6 +41,8 @@ class HybridModel(Saved):
 
     kind: ClassVar[str] = "hybrid model"
 
+    kind: ClassVar[str] = "hybrid model"
+
     geometry: GeometryModel
     share: float
     kernel: Kernel
@@ -98,8 +100,11 @@ def fit_hybrid(
     stride = max(1, seen.shape[1] // PIXELS) | 1
     some, some_known = seen[:, ::stride], known[:, ::stride]
     kernel = choose_kernel(train.position, (some - FIRST * some_known)[:, None], fold)
-    share = _share(train.position, some, some_known, fold, kernel)
+    share, gains = _share(train.position, some, some_known, fold, kernel)
     left = seen - share * known
+    if not gains:
+        nothing = torch.zeros(1, seen.shape[1])
+        return HybridModel(geometry, 1.0, kernel, train.position, torch.zeros(len(train), 0), nothing)
     mean = left.mean(0)
     value, vector = torch.linalg.eigh(((left - mean) @ (left - mean).T).double())
     vector = vector[:, value > 1e-6 * value.sum()][:, -COMPONENTS:]
@@ -109,11 +114,15 @@ def fit_hybrid(
     return HybridModel(geometry, share, kernel, train.position, readout, component)
 
 
-def _share(position: Tensor, seen: Tensor, known: Tensor, fold: Tensor, kernel: Kernel) -> float:
-    """The share of `known` (n, pixels) that leaves least of `seen` where it is held out from the process, in [0, 1]."""
-    product = power = 0.0
+def _share(position: Tensor, seen: Tensor, known: Tensor, fold: Tensor, kernel: Kernel) -> tuple[float, bool]:
+    """The share of `known` (n, pixels) that leaves least of `seen` where it is held out from the process, in [0, 1], and
+    whether that, with the process, leaves less than `known` alone, by the mean logarithm of the squared error."""
+    missed, sharp = torch.empty_like(seen), torch.empty_like(known)
     for out, kept, weight in held_out_weights(kernel, position, fold):
-        missed, sharp = (x[out] - x[kept].mean(0) - weight.float() @ (x[kept] - x[kept].mean(0)) for x in (seen, known))
-        product += float((missed * sharp).sum())
-        power += float(sharp.square().sum())
-    return min(1.0, max(0.0, product / power)) if power > 0 else 0.0
+        for x, left in ((seen, missed), (known, sharp)):
+            mean = x[kept].mean(0)
+            left[out] = x[out] - mean - weight.float() @ (x[kept] - mean)
+    power = float(sharp.square().sum())
+    share = min(1.0, max(0.0, float((missed * sharp).sum()) / power)) if power > 0 else 0.0
+    both, alone = ((x.square().mean(1) + 1e-9).log().mean() for x in (missed - share * sharp, seen - known))
+    return share, bool(both < alone)

@@ -57,6 +57,8 @@ class GeometryModel(Saved):
 
     kind: ClassVar[str] = "geometry model"
 
+    kind: ClassVar[str] = "geometry model"
+
     array: PlanarArray
     grid: AngularGrid
     rotation: Tensor

@@ -20,7 +20,7 @@ from swiftwrf.data.spectra import Spectra
 
 PIXELS = 6000  # of a spectrum that are enough for its few dozen coefficients
 STEPS = 40
-STARTS = 8
+STARTS = 20
 SOLVED = 5e-3  # relative error of the autocorrelation below which a start counts as the solution
 
 
@@ -77,7 +77,7 @@ def element_phases(observed: Tensor, array: PlanarArray, seed: int = 0) -> tuple
         rows = (error > SOLVED).nonzero()[:, 0]
         if not len(rows):
             break
-        x = phase[rows] + (0.7 * start) * torch.randn(len(rows), k, dtype=torch.float64, generator=generator)
+        x = phase[rows] + min(0.7 * start, 2.1) * torch.randn(len(rows), k, dtype=torch.float64, generator=generator)
         x, miss = _descend(x, observed[rows], a, b, lag)
         better = miss / scale[rows] < error[rows]
         best[rows[better]], error[rows[better]] = x[better], (miss / scale[rows])[better]

@@ -23,7 +23,8 @@ SIDES = torch.tensor(
     [[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], dtype=torch.float64
 )  # outward normals
 FEW = 36  # positions that moves of all sides are scored with first
-PERFECT = 2e-4  # a score that needs no further moves
+BETTER = 0.997  # of the score, for a move to count
+PERFECT = 2e-6  # a score that needs no further moves
 STARTS = 4  # of a search
 HOPELESS = 1.4  # a start with so many times the best score is given up
 Alternatives = list[list[tuple[float, float]]]  # offset [m] and gain, for each side
@@ -234,7 +235,7 @@ class Search:
         best = self.refined([room], self.order)[0]
         for _ in range(sweeps):
             for tried in self._trials(best, top, keep):
-                if tried.score < best.score - 1e-4:
+                if tried.score < BETTER * best.score:
                     best = tried
                     break
             else:

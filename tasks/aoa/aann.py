@@ -28,13 +28,13 @@ from tasks.aoa.estimators import ESTIMATORS, Estimator, Settings
 class AANNConfig:
     """How the network is trained."""
 
-    steps: int = 400
+    steps: int = 200
     """optimisation steps, the same for every training set"""
-    batch: int = 16
+    batch: int = 32
     """spectra a step"""
     rate: float = 1e-3
     """peak learning rate of AdamW, one cycle"""
-    max_azimuths: int = 120
+    max_azimuths: int = 60
     """larger spectra are averaged down for the network; 0 keeps all pixels"""
     circular: bool = False
     """pad the azimuth circularly, as the physics has it, instead of with zeros"""
