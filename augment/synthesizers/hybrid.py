@@ -20,12 +20,14 @@ from swiftwrf.geometry import HybridModel, fit_hybrid
 class Hybrid(Synthesizer):
     """A share of the geometry's spectra and a smooth remainder; the share is chosen on held-out training spectra."""
 
+    samples = True
+
     def fit(self, train: Spectra) -> None:
         own = self.settings
         self._model = fit_hybrid(train, find_room(train, own), validation=own.validation, seed=own.seed)
 
     def synthesize(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        return self._model.synthesize(position)
+        return self._model.synthesize(position, generator)
 
     @property
     def model(self) -> HybridModel:

@@ -41,8 +41,6 @@ class HybridModel(Saved):
 
     kind: ClassVar[str] = "hybrid model"
 
-    kind: ClassVar[str] = "hybrid model"
-
     geometry: GeometryModel
     share: float
     kernel: Kernel
@@ -51,8 +49,9 @@ class HybridModel(Saved):
     component: Tensor
 
     @torch.no_grad()
-    def synthesize(self, position: Tensor, batch: int = 256) -> Tensor:
-        """Spectra at positions (n, 3) [m] of the moving end, float32 (n, n_elevation, n_azimuth) in [0, 1].
+    def synthesize(self, position: Tensor, generator: torch.Generator | None = None, batch: int = 256) -> Tensor:
+        """Spectra at positions (n, 3) [m] of the moving end, float32 (n, n_elevation, n_azimuth) in [0, 1]; with a generator
+        the room's part is drawn.
 
         Raises:
             InputError: positions of another shape, or not finite.
@@ -63,7 +62,7 @@ class HybridModel(Saved):
             rows = slice(start, start + batch)
             score = self.kernel(position[rows], self.anchor).float() @ self.readout
             smooth = (self.component[0] + score @ self.component[1:]).reshape(-1, *self.geometry.grid.shape)
-            sharp = self.share * self.geometry.synthesize(position[rows]) if self.share else 0.0
+            sharp = self.share * self.geometry.synthesize(position[rows], generator) if self.share else 0.0
             spectrum[rows] = (smooth + sharp).clamp(0, 1)
         return spectrum
 

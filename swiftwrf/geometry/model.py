@@ -57,8 +57,6 @@ class GeometryModel(Saved):
 
     kind: ClassVar[str] = "geometry model"
 
-    kind: ClassVar[str] = "geometry model"
-
     array: PlanarArray
     grid: AngularGrid
     rotation: Tensor
