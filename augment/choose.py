@@ -13,7 +13,6 @@ from swiftwrf import FitError, InputError, Spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.metrics import psnr
 
-ENOUGH = 60  # spectra from which one held-out fold decides, not all in turn
 SLOW = ("swiftwrf",)  # compared only where they are asked for by name
 
 
@@ -54,7 +53,9 @@ def candidates(data: Spectra) -> list[str]:
 
 
 def choose_synthesizer(measured: Spectra, settings: Settings, names: Iterable[str] | None = None) -> Choice:
-    """The synthesizer whose spectra come closest to measured ones that were held out from it.
+    """The synthesizer whose spectra come closest to measured ones that were held out from it, a fifth at a time.
+
+    Those that search (for a room, say) do so once; in the other folds they go on from what was found there.
 
     Args:
         measured: the only spectra it sees.
@@ -65,18 +66,20 @@ def choose_synthesizer(measured: Spectra, settings: Settings, names: Iterable[st
         InputError: fewer than 10 spectra, or no candidate that can be fitted.
     """
     fold = folds(measured.position, settings.validation, settings.seed)
-    tried = range(1) if len(measured) >= ENOUGH else range(int(fold.max()) + 1)
     quiet = replace(settings, checkpoint=None, on_record=None)
     score: dict[str, float] = {}
     trials: dict[str, list[Trial]] = {}
     seconds: dict[str, float] = {}
     for name in names or candidates(measured):
         began, found, trials[name] = time.perf_counter(), [], []
-        for number in tried:
+        for number in range(int(fold.max()) + 1):
             kept, out = (measured.subset(rows.nonzero()[:, 0]) for rows in (fold != number, fold == number))
             synthesizer = make_synthesizer(name, quiet)
             try:
-                synthesizer.fit(kept)
+                if trials[name]:
+                    synthesizer.fit_like(trials[name][0].synthesizer, kept)
+                else:
+                    synthesizer.fit(kept)
             except (InputError, FitError):  # one that cannot be fitted here is no candidate
                 break
             trials[name].append(Trial(synthesizer, kept, out))

@@ -40,6 +40,8 @@ def small(monkeypatch):
 
 
 def run(*arguments):
+    if arguments[:1] == ("--mix",) and "--extra" not in arguments:
+        arguments = (*arguments, "--extra", 0)
     return command_line("tasks.aoa", AoaConfig, experiment.run, [str(a) for a in arguments], arms.meaning)
 
 
@@ -104,7 +106,7 @@ def test_aann_is_seeded_and_leaves_the_global_generator_alone(room):
 
 def test_whole_run(small, tmp_path):
     out = tmp_path / "run"
-    assert run("--mix", 0.5, 1.0, "--synthesizer", "swiftwrf", "idw", "--repeats", 2, "--out", out) == 0
+    assert run("--mix", 0.5, 1.0, "--synthesizer", "swiftwrf", "idw", "--repeats", 2, "--extra", 20, "--out", out) == 0
     metrics = json.loads((out / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(name))
     assert (metrics["task"], metrics["data"], metrics["split"], metrics["seed"]) == (
         "aoa",

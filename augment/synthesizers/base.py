@@ -54,6 +54,10 @@ class Synthesizer(ABC):
     def fit(self, train: Spectra) -> None:
         """Learns; `train` is all it ever sees."""
 
+    def fit_like(self, other: Synthesizer, train: Spectra) -> None:
+        """Learns as another one of its kind did from other spectra of the scene, whose search it need not repeat."""
+        self.fit(train)
+
     @abstractmethod
     def synthesize(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Magnitudes in [0, 1], float32 (n, H, W), at positions (n, 3) [m].

@@ -10,6 +10,7 @@ from torch import Tensor
 from augment.synthesizers.base import ARRAY, FIXED_END, SYNTHESIZERS, Settings, Synthesizer
 from swiftwrf import GeometryModel, Spectra, fit_geometry
 from swiftwrf.data.spectra import fingerprint
+from swiftwrf.geometry import refit_geometry
 
 _ROOMS: OrderedDict[str, GeometryModel] = OrderedDict()  # the last ones found: synthesizers that need the same share it
 _KEPT = 4
@@ -40,6 +41,10 @@ class Geometry(Synthesizer):
 
     def fit(self, train: Spectra) -> None:
         self._model = find_room(train, self.settings)
+
+    def fit_like(self, other: Synthesizer, train: Spectra) -> None:
+        assert isinstance(other, Geometry)
+        self._model = refit_geometry(other.model, train, seed=self.settings.seed)
 
     def synthesize(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
         return self._model.synthesize(position, generator)

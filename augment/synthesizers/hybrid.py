@@ -7,8 +7,8 @@ from torch import Tensor
 
 from augment.synthesizers.base import ARRAY, FIXED_END, SYNTHESIZERS, Synthesizer
 from augment.synthesizers.geometry import find_room
-from swiftwrf import Spectra
-from swiftwrf.geometry import HybridModel, fit_hybrid
+from swiftwrf import GeometryModel, Spectra
+from swiftwrf.geometry import HybridModel, fit_hybrid, refit_geometry
 
 
 @SYNTHESIZERS.register(
@@ -23,8 +23,14 @@ class Hybrid(Synthesizer):
     samples = True
 
     def fit(self, train: Spectra) -> None:
-        own = self.settings
-        self._model = fit_hybrid(train, find_room(train, own), validation=own.validation, seed=own.seed)
+        self._fit(train, find_room(train, self.settings))
+
+    def fit_like(self, other: Synthesizer, train: Spectra) -> None:
+        assert isinstance(other, Hybrid)
+        self._fit(train, refit_geometry(other.model.geometry, train, seed=self.settings.seed))
+
+    def _fit(self, train: Spectra, room: GeometryModel) -> None:
+        self._model = fit_hybrid(train, room, validation=self.settings.validation, seed=self.settings.seed)
 
     def synthesize(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
         return self._model.synthesize(position, generator)

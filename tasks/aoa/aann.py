@@ -23,6 +23,8 @@ from swiftwrf.data.spectra import coarsening
 from swiftwrf.progress import progress
 from tasks.aoa.estimators import ESTIMATORS, Estimator, Settings
 
+STATISTICS = 512  # spectra that the batch norms' statistics are taken from
+
 
 @dataclass(frozen=True)
 class AANNConfig:
@@ -125,8 +127,9 @@ class AANN(Estimator):
                 self.history.append({"step": step, "loss": loss.item(), "seconds": time.perf_counter() - began})
 
         # a short training leaves the batch norms' running statistics behind the weights, so they are taken anew
+        some = torch.randperm(len(train), generator=self._generator)[:STATISTICS]
         with self._autocast:
-            update_bn(spectrum.split(64), network)
+            update_bn(spectrum[some].split(64), network)
         network.eval()
 
     def _point(self, prepared: Tensor) -> Tensor:

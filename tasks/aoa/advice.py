@@ -19,7 +19,7 @@ from tasks.aoa.estimators import ESTIMATORS, Settings
 from tasks.metrics import AdviceMetrics, ChangeMetrics, GainMetrics
 
 STAND_IN = "kernel_ridge"
-NUMBERS = (0, 100, 300, 1000, 3000)  # of further positions that are compared
+NUMBERS = (300, 1000, 3000)  # of further positions that are compared
 DRAWS = 2000  # of the bootstrap
 
 
@@ -34,7 +34,7 @@ def advise(trials: Sequence[Trial], settings: Settings, extra: int) -> AdviceMet
     alone = np.concatenate([_errors(trial, 0, False, settings) for trial in trials])
     gains: list[GainMetrics] = []
     for sampled in (False, True) if trials[0].synthesizer.samples else (False,):
-        for number in sorted({*(n for n in NUMBERS if 0 < n < extra), extra} - {0}):
+        for number in sorted({*(n for n in NUMBERS if n < extra), extra} - {0}):
             with_extra = np.concatenate([_errors(trial, number, sampled, settings) for trial in trials])
             gains.append({"extra": number, "sampled": sampled, **_paired(alone, with_extra)})
     best = min(gains, key=lambda gain: gain["median_deg"], default=None)
