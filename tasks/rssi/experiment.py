@@ -35,8 +35,8 @@ class RssiTaskConfig:
     """folder with gateway_position.yml, tx_pos.csv and gateway_rssi.csv (NeRF2 layout)"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
-    preset: Literal["default", "paper"] = "default"
-    """of SwiftWRF: default corrects a log-distance law; paper is the plain head"""
+    preset: Literal["quick", "paper"] = "quick"
+    """of SwiftWRF: quick corrects a log-distance law; paper is the plain head"""
     floor_plan: str | None = None
     """an image to draw behind the maps"""
     floor_extent: tuple[float, float, float, float] | None = None
@@ -65,7 +65,6 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     validation: Validation = "random" if config.split == "random" else "block"
     parallel = on_cluster(config.scheduler) if config.scheduler else map
     settings = Settings(validation, config.seed, config.preset, device, parallel, pool)
-    train.receivers(["all"])  # refuses receivers heard too rarely to learn from
     if not bool((~test.rssi_dbm.isnan()).any()):
         raise InputError(f"split {config.split!r} of {data.name} has no heard test rows for these receivers")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
