@@ -109,6 +109,8 @@ class Kernel:
         r = torch.cdist(
             a, b, compute_mode="donot_use_mm_for_euclid_dist"
         )  # the fast mode loses close pairs to rounding
+        if self.share == 1:
+            return torch.exp(-r / self.long)
         near = math.sqrt(3) * r / self.short
         return self.share * torch.exp(-r / self.long) + (1 - self.share) * (1 + near) * torch.exp(-near)
 
