@@ -118,7 +118,9 @@ class _PerReceiver(ABC):
             heard = ~np.isnan(values)
             if heard.sum() < MIN_TRAINING:  # too few to choose anything: their mean, or that of all
                 level = float(values[heard].mean()) if heard.any() else typical
-                self._regressors.append(DummyRegressor(strategy="constant", constant=level).fit(position, values))
+                self._regressors.append(
+                    DummyRegressor(strategy="constant", constant=level).fit(position, 0 * position[:, 0])
+                )
                 continue
             own = fold[heard]
             if np.bincount(own).max() == len(own):  # heard in one region alone: no region is left to learn from
