@@ -56,7 +56,8 @@ class _Left:
     def errors(self, precision: Tensor) -> list[Tensor]:
         """By fold [dB], with the precision (n, n) of all sites: see `solve._Receiver.held_out`."""
         dual = precision @ self.filled
-        return [torch.linalg.solve(precision[out][:, out], dual[out])[:n] for n, out in self.parts]
+        blocks = (precision.index_select(0, out).index_select(1, out) for _, out in self.parts)
+        return [torch.linalg.solve(b, dual[out])[:n] for b, (n, out) in zip(blocks, self.parts, strict=True)]
 
 
 def mixing_weights(held_out: Tensor, measured: Tensor) -> Tensor:
