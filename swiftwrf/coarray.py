@@ -29,6 +29,7 @@ from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel
 from swiftwrf.positions import check_positions
 from swiftwrf.progress import progress_bar
+from swiftwrf.threads import single_thread
 
 COMPONENTS = 64  # principal components of the training magnitudes that the model keeps at most
 SAME = 1e-6  # differences closer than this share of a wavelength are one
@@ -239,6 +240,7 @@ def fit_coarray(
     return model
 
 
+@single_thread()
 def _solve(train: Spectra, array: PlanarArray, fold: Tensor) -> CoarrayModel:
     functions, flat = basis(array, train.grid, torch.float32), train.spectrum.flatten(1)
     inverse = _inverse(array, train.grid).float()

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from swiftwrf.positions import distance
+from swiftwrf.threads import single_thread
 
 NOISES = (1e-3, 1e-2, 1e-1)  # of spectra: little of a measured one is not a function of position
 MIN_RANK, MAX_RANK = 24, 64
@@ -124,6 +125,7 @@ class SmoothField(nn.Module):
         return self.coefficient.square().sum()
 
 
+@single_thread()
 def choose_kernel(position: Tensor, spectrum: Tensor, fold: Tensor) -> Kernel:
     """The candidate with the highest mean logarithm of 1 / MSE over held-out spectra.
 
@@ -146,6 +148,7 @@ def choose_kernel(position: Tensor, spectrum: Tensor, fold: Tensor) -> Kernel:
     return max(candidates(position, NOISES), key=score)
 
 
+@single_thread()
 def choose_rank(position: Tensor, spectrum: Tensor, fold: Tensor, kernel: Kernel) -> int:
     """How many principal components of the spectra are predicted better than by their mean where they are held out.
 

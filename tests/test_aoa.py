@@ -14,10 +14,11 @@ import torch
 from augment import SYNTHESIZERS, Mixed, choose, lacks
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, load, simulated_room
 from swiftwrf.metrics import angle_errors
-from tasks.aoa import aann, arms, experiment
-from tasks.aoa.aann import AANN, AANNConfig
+from tasks.aoa import arms, experiment
 from tasks.aoa.config import AoaConfig
-from tasks.aoa.estimators import ESTIMATORS, Constant, NearestSpectrum, Peak, Settings
+from tasks.aoa.estimators import ESTIMATORS, Settings, aann
+from tasks.aoa.estimators.aann import AANN, AANNConfig
+from tasks.aoa.estimators.baselines import Constant, NearestSpectrum, Peak
 from tasks.page.palette import Palette
 from tasks.report import merge
 from tasks.run import command_line
@@ -86,7 +87,7 @@ def test_aann_learns_a_toy(circular):
 
 
 def test_circular_padding_makes_rolled_spectra_alike():
-    from tasks.aoa.aann import _CircularConv
+    from tasks.aoa.estimators.aann import _CircularConv
 
     convolution = _CircularConv(torch.nn.Conv2d(1, 3, 5, padding=2))
     x = torch.rand(1, 1, 9, 12)

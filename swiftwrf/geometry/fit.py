@@ -18,6 +18,7 @@ from swiftwrf.geometry.planes import Planes, advantage, clearly, correlation_sco
 from swiftwrf.geometry.search import BETTER, PERFECT, STARTS, Search, find_room
 from swiftwrf.geometry.verdict import judged
 from swiftwrf.progress import progress_bar
+from swiftwrf.threads import single_thread
 
 SOLVED = 0.1  # relative error of a spectrum's autocorrelation up to which its phases are used
 NEEDED = 2.5  # standard errors by which held-out spectra must be better for a plane or an order
@@ -45,6 +46,7 @@ class GeometryConfig:
     further: int = 3
 
 
+@single_thread()
 def fit_geometry(
     train: Spectra,
     config: GeometryConfig | None = None,
@@ -85,6 +87,7 @@ def fit_geometry(
     return judged(train, scene, room.refined(scene), score, config.reach)
 
 
+@single_thread()
 def refit_geometry(model: GeometryModel, train: Spectra, *, seed: int = 0) -> GeometryModel:
     """The same planes with offsets and gains refined on other spectra of the scene: no search, hence under a second.
 

@@ -20,6 +20,7 @@ from swiftwrf.data.splits import Validation, folds
 from swiftwrf.geometry.model import GeometryModel
 from swiftwrf.gp import Kernel, choose_kernel, held_out_weights
 from swiftwrf.positions import check_positions
+from swiftwrf.threads import single_thread
 
 COMPONENTS = 64  # principal components of the difference that are kept at most
 PIXELS = 4000  # of a spectrum that are enough to choose kernel and share
@@ -79,6 +80,7 @@ class HybridModel(Saved):
         return cls(GeometryModel.from_state(tensors, header), header["share"], Kernel(**header["kernel"]), **own)
 
 
+@single_thread()
 def fit_hybrid(
     train: Spectra, geometry: GeometryModel, *, validation: Validation = "random", seed: int = 0
 ) -> HybridModel:

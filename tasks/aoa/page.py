@@ -183,7 +183,8 @@ def _training(runs: list[AoaRecords]) -> Section:
     for run in runs:
         _, final = fits(run)
         figure, axes = figures.new_figure(1, 2, 9, 3)
-        by_arm = first_history(run).groupby("method", sort=False)
+        history = first_history(run)
+        by_arm = history.groupby("method", sort=False) if "method" in history else ()
         networks = {str(name): (part["step"], part["loss"]) for name, part in by_arm}
         figures.curves(axes[0], arms.palette(), networks, "step", "loss of the network")
         swiftwrf = {"swiftwrf": (final["step"], final["loss"])}

@@ -60,6 +60,8 @@ def scene(run: AoaRecords) -> str:
 def first_history(run: AoaRecords) -> DataFrame:
     """History of everything trained for the first share and repeat."""
     history = run.table("history")
+    if not len(history):
+        return history
     return history[(history["repeat"] == 0) & (history["mix"] == history["mix"].iloc[0])]
 
 

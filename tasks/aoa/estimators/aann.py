@@ -21,7 +21,7 @@ from augment import Mixed
 from swiftwrf.angles import to_angles, to_direction
 from swiftwrf.data.spectra import coarsening
 from swiftwrf.progress import progress
-from tasks.aoa.estimators import ESTIMATORS, Estimator, Settings
+from tasks.aoa.estimators.base import ESTIMATORS, Estimator, Settings
 
 STATISTICS = 512  # spectra that the batch norms' statistics are taken from
 

@@ -1,0 +1,50 @@
+"""Estimators that any network must beat."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from augment import Mixed
+from swiftwrf.angles import to_angles, to_direction
+from tasks.aoa.estimators.base import ESTIMATORS, Estimator
+
+
+@ESTIMATORS.register("peak", meaning="the strongest direction", colour="#bbbbbb")
+class Peak(Estimator):
+    """The strongest direction: what one has without learning. Multipath is often stronger than the line of sight."""
+
+    learns = False
+
+    def fit(self, train: Mixed) -> None:
+        """Nothing to learn."""
+
+    def estimate(self, spectrum: Tensor) -> Tensor:
+        grid, pixel = self.settings.grid, spectrum.flatten(1).argmax(dim=1)
+        row, column = pixel // grid.n_azimuth, pixel % grid.n_azimuth
+        return torch.stack([grid.azimuth[column], grid.elevation[row]], dim=-1)
+
+
+@ESTIMATORS.register("constant", meaning="the mean direction of the measured labels", colour="#999999")
+class Constant(Estimator):
+    """The mean direction of the training labels, whatever the spectrum: what an estimator must beat to have learnt."""
+
+    learns = False
+
+    def fit(self, train: Mixed) -> None:
+        mean = to_direction(*train.label.unbind(-1)).mean(dim=0)
+        self._angles = torch.stack(to_angles(mean), dim=-1)
+
+    def estimate(self, spectrum: Tensor) -> Tensor:
+        return self._angles.expand(len(spectrum), 2)
+
+
+@ESTIMATORS.register("nearest_spectrum", meaning="the label of the most similar measured spectrum", colour="#666666")
+class NearestSpectrum(Estimator):
+    """The label of the training spectrum with the least squared difference: look-up, hard to beat on a dense path."""
+
+    def fit(self, train: Mixed) -> None:
+        self._spectrum, self._label = train.spectrum.flatten(1), train.label
+
+    def estimate(self, spectrum: Tensor) -> Tensor:
+        return self._label[torch.cdist(spectrum.flatten(1), self._spectrum).argmin(dim=1)]
