@@ -6,15 +6,15 @@ Every fitted model is saved and opened the same way: it derives from `Saved`, an
 from __future__ import annotations
 
 import json
-import os
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any, ClassVar
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
+from swiftwrf.durable import write_bytes
 from swiftwrf.errors import InputError
 
 FORMAT = 1
@@ -22,7 +22,7 @@ Header = dict[str, Any]  # values that JSON can carry
 
 
 def write(path: str | Path, kind: str, tensors: dict[str, Tensor], header: Header) -> None:
-    """Writes under a temporary name and renames, so that an interrupted write leaves the old file.
+    """Writes the file, or leaves the old one where the write is interrupted.
 
     Args:
         path: of the file.
@@ -30,14 +30,9 @@ def write(path: str | Path, kind: str, tensors: dict[str, Tensor], header: Heade
         tensors: by name.
         header: values that JSON can carry.
     """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     metadata = {"kind": kind, "format": str(FORMAT), "header": json.dumps(header)}
-    try:
-        save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, temporary, metadata)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    content = save({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, metadata)
+    write_bytes(Path(path), content)
 
 
 def read(path: str | Path, *kinds: str) -> tuple[str, dict[str, Tensor], Header]:

@@ -8,7 +8,9 @@ from typing import Annotated, Literal
 from augment import SYNTHESIZERS
 from swiftwrf import InputError, Spectra
 from swiftwrf.arrays import PlanarArray
-from tasks.run import Preset, choice
+from tasks.run import SEEDS, Preset, choice
+
+MOST_ELEMENTS = 32  # a side of an array: its spectra have 7,938 numbers
 
 
 @dataclass(frozen=True)
@@ -55,12 +57,16 @@ def check(config: AoaConfig) -> None:
         )
     if len(set(config.mix)) < len(config.mix):
         raise InputError(f"--mix names a share twice: {' '.join(f'{s:g}' for s in config.mix)}")
-    if config.array is not None and not (config.array[0] >= 2 and min(config.array[1:]) > 0):
+    if not config.synthesizer:
+        raise InputError(f"--synthesizer takes at least one of {', '.join(SYNTHESIZERS)}")
+    if config.array is not None and not (2 <= config.array[0] <= MOST_ELEMENTS and min(config.array[1:]) > 0):
         raise InputError(
-            f"--array takes at least 2 elements a side, a spacing [m] and a carrier [Hz], got {config.array}"
+            f"--array takes 2 to {MOST_ELEMENTS} elements a side, a spacing [m] and a carrier [Hz], got {config.array}"
         )
     if config.repeats < 1:
         raise InputError(f"--repeats must be at least 1, got {config.repeats}")
+    if config.seed + config.repeats > SEEDS:
+        raise InputError(f"--seed {config.seed} leaves no seeds for {config.repeats} repeats; choose a smaller one")
 
 
 def with_array(data: Spectra, config: AoaConfig) -> Spectra:

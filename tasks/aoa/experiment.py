@@ -16,7 +16,10 @@ from augment import Settings as SynthesizerSettings
 from swiftwrf import InputError, Spectra, load_spectra, simulated_room
 from swiftwrf.checkpoint import read, write
 from swiftwrf.metrics import angle_errors, l1, psnr, ssim
-from tasks.aoa import arms
+from tasks.aoa import (
+    aann,  # noqa: F401 (registers the network)
+    arms,
+)
 from tasks.aoa.config import AoaConfig, can_draw, check, with_array
 from tasks.aoa.estimators import ESTIMATORS, Settings
 from tasks.aoa.page import page
@@ -172,13 +175,13 @@ class _Experiment:
         """Measured and synthetic spectra at test positions for the report, chosen by rule."""
         order = score.argsort()
         chosen = order[[round(q * (len(order) - 1)) for q in EXAMPLE_QUANTILES]]
-        np.savez_compressed(
-            self.directory.path(f"examples-mix{share:g}.npz"),
-            measured=_as_bytes(self.test.spectrum[chosen]),
-            synthetic=_as_bytes(synthetic[chosen]),
-            index=self.test.index[chosen].numpy(),
-            psnr_db=score[chosen].numpy(),
-        )
+        examples = {
+            "measured": _as_bytes(self.test.spectrum[chosen]),
+            "synthetic": _as_bytes(synthetic[chosen]),
+            "index": self.test.index[chosen].numpy(),
+            "psnr_db": score[chosen].numpy(),
+        }
+        self.directory.write_npz(f"examples-mix{share:g}.npz", examples)
 
     def summary(self, share: float) -> MixMetrics:
         """What metrics.json says of one share."""
