@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from augment import SYNTHESIZERS
 from swiftwrf import InputError, Spectra
 from swiftwrf.arrays import PlanarArray
+from swiftwrf.metrics import WINDOW
 from tasks.run import SEEDS, Preset, choice
 
 MOST_ELEMENTS = 32  # a side of an array: its spectra have 7,938 numbers
@@ -73,8 +74,14 @@ def with_array(data: Spectra, config: AoaConfig) -> Spectra:
     """The data, with the array of the command line.
 
     Raises:
-        InputError: a synthesizer needs the array, and neither data nor command line describe it.
+        InputError: spectra too small to be compared; a synthesizer needs the array, and neither data nor command line
+            describe it.
     """
+    if min(data.grid.shape) < WINDOW:
+        raise InputError(
+            f"spectra of {data.name} have {data.grid.shape[0]} x {data.grid.shape[1]} pixels; SSIM, by which they are "
+            f"learnt and judged, needs at least {WINDOW} x {WINDOW}"
+        )
     if config.array is not None:
         side, spacing, frequency = config.array
         data = replace(data, array=PlanarArray.square(side, frequency, spacing))

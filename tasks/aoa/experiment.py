@@ -136,30 +136,29 @@ class _Experiment:
         name = arm["synthesizer"]
 
         def compute() -> Row:
-            history: list[Row] = []
+            fit = _FitHistory()
             settings = SynthesizerSettings(
                 validation="random",  # the withheld places lie among the measured ones, whatever the split of the test
                 seed=self.config.seed + arm["repeat"],
                 preset=self.config.preset,
                 device=self.device,
                 checkpoint=self.directory.path(f"steps/{step}-fit.safetensors"),
-                on_record=history.append,
+                on_record=fit.add,
             )
             synthesizer = make_synthesizer(name, settings)
-            began = time.perf_counter()
             synthesizer.fit(measured)
             fitted = time.perf_counter()
             synthetic = {
                 "withheld": synthesizer.synthesize(withheld.position),
                 "test": synthesizer.synthesize(self.test.position),
             }
-            seconds = {"fit": fitted - began, "synthesize": time.perf_counter() - fitted}
+            seconds = {"fit": fitted - fit.began + fit.earlier, "synthesize": time.perf_counter() - fitted}
             write(file, "synthetic spectra", synthetic, {})
             model = synthesizer.model
             if model is not None and name in self.config.synthesizer and arm["repeat"] == 0:
                 prefix = "model" if name == "swiftwrf" else name
                 model.save(self.directory.path(f"{prefix}-mix{arm['mix']:g}.safetensors"))
-            return {"history": history, "seconds": seconds}
+            return {"history": fit.records, "seconds": seconds}
 
         value = self.directory.step(step, compute)["value"]
         _, synthetic, _ = read(file, "synthetic spectra")
@@ -198,6 +197,19 @@ class _Experiment:
                 "train": float(networks["train"].sum()),
             },
         }
+
+
+class _FitHistory:
+    """The records of a fit, and the seconds that it took in sessions before this one."""
+
+    def __init__(self) -> None:
+        self.records: list[Row] = []
+        self.began, self.earlier = time.perf_counter(), 0.0
+
+    def add(self, record: Row) -> None:
+        """One record; those of earlier sessions come first."""
+        self.records.append(record)
+        self.earlier = max(self.earlier, record.get("elapsed", 0.0) - (time.perf_counter() - self.began))
 
 
 def _of(share: float, rows: list[Row]) -> DataFrame:
