@@ -116,6 +116,9 @@ class Run:
             raise InputError(f"{self.final} exists already and a run is never overwritten; choose another --out")
 
     def _begin(self, task: str, config: Any, device: torch.device, source: dict[str, str]) -> None:
+        # the same call as in a run that goes on: it also keeps MKL from choosing a number by itself, which shows in the
+        # last bits
+        torch.set_num_threads(torch.get_num_threads())
         values = asdict(config)
         self._environment = environment(device, source) | {"config_sha256": _digest(values)}
         self.write_json(ENVIRONMENT, self._environment)
