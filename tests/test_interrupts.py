@@ -1,6 +1,6 @@
 """Runs that are killed, run into a full disk or into each other: nothing finished is lost, and the numbers are the same.
 
-As a program it does the same many times and writes what came out: `python tests/test_interrupts.py KILLS DISKS`.
+`benchmarks/reliability.py` does the same many times.
 """
 
 from __future__ import annotations
@@ -133,21 +133,3 @@ def race(folder, asked, count):
 
 def test_of_two_runs_in_one_directory_one_is_refused(tmp_path):
     race(tmp_path / "a", RSSI, 2)
-
-
-if __name__ == "__main__":
-    import tempfile
-
-    wanted, disks = int(sys.argv[1]), int(sys.argv[2])
-    draw, kills, runs, root = random.Random(0), 0, 0, Path(tempfile.mkdtemp())
-    wholes = {asked: whole_run(root / asked[0], asked) for asked in (RSSI, AOA)}
-    while kills < wanted:
-        for asked in (RSSI, AOA):
-            folder = root / f"kill{runs}"
-            folder.mkdir()
-            kills += kill_until_done(folder, asked, wholes[asked], draw, min(5, wanted - kills))
-            runs += 1
-            print(f"{kills} kills in {runs} runs", flush=True)
-    for number in range(disks):
-        fill_disk(root / f"disk{number}", RSSI, wholes[RSSI], draw.randint(100, 12_000))
-        print(f"{number + 1} full disks", flush=True)
