@@ -13,6 +13,7 @@ from dataclasses import replace
 from unittest import mock
 
 from swiftwrf import AngularGrid, FitConfig, ModelConfig, RssiConfig, rssi_room, simulated_room
+from swiftwrf.errors import LONGEST
 from tasks.aoa import experiment as aoa
 from tasks.aoa.arms import NETWORK
 from tasks.aoa.config import AoaConfig
@@ -65,6 +66,15 @@ def run(task: str, *arguments: object) -> int:
     }[task]
     with quick():
         return command_line(f"tasks.{task}", config, function, [str(a) for a in arguments])
+
+
+def said(capsys) -> str:
+    """The one sentence on stderr after `error:`, for tests of refusals."""
+    sentences = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert len(sentences) == 1
+    sentence = sentences[0].removeprefix("error: ")
+    assert len(sentence) <= LONGEST
+    return sentence
 
 
 if __name__ == "__main__":
