@@ -7,23 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from augment.places import FURTHER, Places
 from swiftwrf import InputError, Spectra
 from swiftwrf.data.splits import MIN_TRAINING
-
-
-@dataclass(frozen=True, eq=False)
-class Places:
-    """Where spectra are withheld: what one knows of a place without measuring there. It has no spectrum to leak.
-
-    Args:
-        position: of the moving end (n, 3) [m].
-        label: direction of the transmitter (n, 2) [rad], from the positions of both ends.
-        index: (n,) in the data set.
-    """
-
-    position: Tensor
-    label: Tensor
-    index: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +19,7 @@ class Mixed:
     Args:
         spectrum: (n, H, W).
         label: azimuth and elevation [rad], (n, 2).
-        index: number of each sample's place in the data set, (n,).
+        index: number of each sample's place in the data set, -1 for further places, (n,).
         synthetic: origin of each spectrum: False measured, True synthesized, (n,).
     """
 
@@ -50,6 +36,28 @@ class Mixed:
         """Measured spectra alone."""
         synthetic = torch.zeros(len(spectra), dtype=torch.bool)
         return cls(spectra.spectrum, spectra.label, spectra.index, synthetic)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many spectra are measured, synthesized at withheld places, and synthesized at further ones."""
+        further = int((self.index == FURTHER).sum())
+        synthetic = int(self.synthetic.sum())
+        return {"measured": len(self) - synthetic, "withheld": synthetic - further, "further": further}
+
+    def add(self, places: Places, synthetic: Tensor) -> Mixed:
+        """With synthetic spectra (n, H, W) at these places, after those there are.
+
+        Raises:
+            InputError: another number of spectra than places.
+        """
+        if len(synthetic) != len(places):
+            raise InputError(f"expected one synthetic spectrum for each of {len(places)} places, got {len(synthetic)}")
+        return Mixed(
+            torch.cat([self.spectrum, synthetic]),
+            torch.cat([self.label, places.label]),
+            torch.cat([self.index, places.index]),
+            torch.cat([self.synthetic, torch.ones(len(synthetic), dtype=torch.bool)]),
+        )
 
 
 def withhold(train: Spectra, share: float, seed: int) -> tuple[Spectra, Places]:
@@ -75,14 +83,8 @@ def mix(measured: Spectra, withheld: Places, synthetic: Tensor) -> Mixed:
     """Measured spectra, and synthetic ones (n, H, W) at the withheld places, in this order.
 
     The synthesizer that drew them was fitted on `measured` alone, which is all that `withhold` hands out.
+
+    Raises:
+        InputError: another number of spectra than places.
     """
-    if len(synthetic) != len(withheld.index):
-        raise InputError(
-            f"expected one synthetic spectrum for each of {len(withheld.index)} places, got {len(synthetic)}"
-        )
-    return Mixed(
-        torch.cat([measured.spectrum, synthetic]),
-        torch.cat([measured.label, withheld.label]),
-        torch.cat([measured.index, withheld.index]),
-        torch.cat([torch.zeros(len(measured), dtype=torch.bool), torch.ones(len(synthetic), dtype=torch.bool)]),
-    )
+    return Mixed.measured(measured).add(withheld, synthetic)

@@ -4,6 +4,9 @@ data = swiftwrf.load_spectra(folder)
 train, test = data.split("block")
 model = swiftwrf.fit(train)
 spectrum = model.synthesize(test.position)
+
+"The paper" in all docstrings is M. Liu, C. Zhang, Q. Yang, Y. Cao, Y. Xu, Y. Xu, S. Sun, M. Dai and Y. Guan, "Deformable 2D
+Gaussian Splatting for Efficient Wireless Radiance Field Rendering", 2025.
 """
 
 from swiftwrf.angles import AngularGrid, ArrayPose
@@ -13,6 +16,7 @@ from swiftwrf.data import Rssi, Spectra, load_rssi, load_spectra
 from swiftwrf.data.simulated import rssi_room, simulated_room
 from swiftwrf.errors import FitError, InputError
 from swiftwrf.fitting import FitConfig, fit
+from swiftwrf.geometry import GeometryModel, fit_geometry
 from swiftwrf.model import ModelConfig, SwiftWRF
 from swiftwrf.rasterize import rasterize, rasterize_magnitude
 from swiftwrf.rssi import RssiConfig, RssiModel, fit_rssi
@@ -23,6 +27,7 @@ __all__ = [
     "CoarrayModel",
     "FitConfig",
     "FitError",
+    "GeometryModel",
     "InputError",
     "ModelConfig",
     "Rssi",
@@ -32,6 +37,7 @@ __all__ = [
     "SwiftWRF",
     "fit",
     "fit_coarray",
+    "fit_geometry",
     "fit_rssi",
     "load",
     "load_rssi",

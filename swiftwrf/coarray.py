@@ -13,7 +13,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
@@ -26,7 +26,7 @@ from swiftwrf.checkpoint import Header, Saved, expect, refusing, restore
 from swiftwrf.data.spectra import Spectra, check_training, fingerprint
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
-from swiftwrf.gp import Kernel, choose_kernel
+from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel
 from swiftwrf.positions import check_batch, check_drawn, check_positions
 from swiftwrf.progress import progress_bar
 
@@ -137,20 +137,38 @@ class CoarrayModel(Saved):
         """Numbers that were fitted."""
         return self.readout.numel() + self.form.numel()
 
-    def coefficients(self, position: Tensor) -> tuple[Tensor, Tensor]:
-        """Of the squared spectrum, (n, 1 + 2 P), and the offset to take off its root, (n, 1)."""
+    @cached_property
+    @torch.inference_mode(False)
+    def process(self) -> GaussianProcess:
+        """That of the component scores."""
+        return GaussianProcess(self.kernel, self.anchor)
+
+    def coefficients(self, position: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        """Of the squared spectrum, (n, 1 + 2 P), and the offset to take off its root, (n, 1); drawn from the posterior at
+        each position where there is a generator."""
         predicted = (self.kernel(position, self.anchor) @ self.readout).float()
+        if generator is not None:  # a score's variance over the training spectra is 1 / n
+            unknown = (self.process.variance(position) / len(self.anchor)).sqrt().float()
+            noise = torch.randn(len(position), predicted.shape[1] - 1, generator=generator)
+            predicted[:, :-1] += unknown[:, None] * noise
         score = torch.cat([torch.ones_like(predicted[:, :1]), predicted[:, :-1]], dim=1)
         return torch.einsum("nk,ckl,nl->nc", score, self.form, score), self.offset + predicted[:, -1:]
 
     @torch.no_grad()
-    def synthesize(self, position: Tensor, grid: AngularGrid | None = None, batch: int = 32) -> Tensor:
+    def synthesize(
+        self,
+        position: Tensor,
+        grid: AngularGrid | None = None,
+        batch: int = 32,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
         """Spectra at any positions: one matrix product and a root a pixel.
 
         Args:
             position: of the moving end [m], (n, 3).
             grid: directions to draw; the training spectra's unless given.
             batch: spectra at a time, so many that they stay in the processor's cache.
+            generator: draws from the process' posterior at each position instead of taking its mean.
 
         Returns:
             Magnitudes in [0, 1], float32 (n, n_elevation, n_azimuth).
@@ -166,7 +184,7 @@ class CoarrayModel(Saved):
         stretched = bool(self.offset > 0)
         for start in range(0, len(position), batch):
             rows = slice(start, start + batch)
-            coefficient, offset = self.coefficients(position[rows])
+            coefficient, offset = self.coefficients(position[rows], generator)
             drawn = torch.mm(coefficient, functions, out=spectrum[rows])
             drawn.clamp_(min=0).sqrt_()
             if stretched:

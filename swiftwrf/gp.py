@@ -62,6 +62,8 @@ class Kernel:
     def __call__(self, a: Tensor, b: Tensor) -> Tensor:
         """k between positions (n, 3) and (m, 3), (n, m)."""
         r = distance(a, b)
+        if self.share == 1:
+            return torch.exp(-r / self.long)
         near = math.sqrt(3) * r / self.short
         value: Tensor = self.share * torch.exp(-r / self.long) + (1 - self.share) * (1 + near) * torch.exp(-near)
         return value

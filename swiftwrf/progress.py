@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TypeVar
 
+from rich import get_console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
@@ -17,7 +18,9 @@ class _Rate(ProgressColumn):
 def progress_bar(shown: bool = True) -> Progress:
     """A bar with steps, rate and time left; it disappears when it is done."""
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"))
-    return Progress(*columns, _Rate(), TimeRemainingColumn(), transient=True, disable=not shown)
+    return Progress(
+        *columns, _Rate(), TimeRemainingColumn(), transient=True, disable=not shown or not get_console().is_terminal
+    )
 
 
 Item = TypeVar("Item")

@@ -76,10 +76,49 @@ class MixSeconds(TypedDict):
     train: float
 
 
+class ChoiceMetrics(TypedDict):
+    """Which synthesizer was taken: median PSNR [dB] on held-out measured spectra, and seconds, of each candidate."""
+
+    name: str
+    psnr_db: dict[str, float]
+    seconds: dict[str, float]
+
+
+class ChangeMetrics(TypedDict):
+    """Median error with synthetic spectra, its relative change (-0.3 is 30 % lower), and the change's 95 % interval."""
+
+    median_deg: float
+    change: float
+    low: float
+    high: float
+
+
+class GainMetrics(ChangeMetrics):
+    """The same with so many further positions, drawn or predicted."""
+
+    extra: int
+    sampled: bool
+
+
+class AdviceMetrics(TypedDict):
+    """What turbo learning gains on measured spectra that were held out: `helps` where the interval excludes no gain."""
+
+    stand_in: str
+    n_held_out: int
+    measured_only_deg: float
+    gains: list[GainMetrics]
+    sampled: bool
+    recommended_extra: int
+    helps: bool
+
+
 class MixMetrics(TypedDict):
-    """One measured share."""
+    """One measured share; `choice` and `advice` of the first repeat, `counts` of spectra by origin in each training set."""
 
     n_measured: int
+    counts: dict[str, dict[str, int]]
+    choice: ChoiceMetrics | None
+    advice: AdviceMetrics | None
     synthesis: dict[str, SynthesisMetrics]
     methods: dict[str, ArmMetrics]
     seconds: MixSeconds
@@ -90,6 +129,7 @@ class AoaMetrics(RunMetrics):
 
     repeats: int
     moving: str
+    extra: int
     grid: tuple[int, int]
     line_of_sight_share: float
     mixes: dict[str, MixMetrics]

@@ -31,6 +31,8 @@ PREDICTORS_KEPT = ("swiftwrf", "mean", "mri_pooled", "mri_receiver")
 class QuickNetwork(Constant):
     """Stands in for the network; leaves a history as it does."""
 
+    learns = True
+
     def fit(self, train):
         super().fit(train)
         time.sleep(0.05)

@@ -11,8 +11,8 @@ import pandas as pd
 import pytest
 import torch
 
-from augment import SYNTHESIZERS, Mixed
-from swiftwrf import AngularGrid, CoarrayModel, FitConfig, InputError, ModelConfig, load, simulated_room
+from augment import SYNTHESIZERS, Mixed, choose, lacks
+from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, load, simulated_room
 from swiftwrf.metrics import angle_errors
 from tasks.aoa import aann, arms, experiment
 from tasks.aoa.aann import AANN, AANNConfig
@@ -29,13 +29,19 @@ TINY_FIT = FitConfig(model=ModelConfig(n_primitives=8), steps=20, check_every=10
 def small(monkeypatch):
     """The task on a toy: few spectra, few steps."""
     room = simulated_room(n=50, grid=AngularGrid.hemisphere(10, 40))
-    monkeypatch.setattr(experiment, "simulated_room", lambda seed: room)
+    monkeypatch.setattr(experiment, "simulated_room", lambda **_: room)
     monkeypatch.setattr("augment.synthesizers.swiftwrf.FitConfig", lambda: TINY_FIT)
+    for place in (experiment, choose):  # finding a room has tests of its own
+        monkeypatch.setattr(
+            place, "candidates", lambda data: [n for n in ("idw", "gp", "coarray") if not lacks(n, data)]
+        )
     monkeypatch.setattr(aann, "AANNConfig", lambda: AANNConfig(steps=2, batch=4))
     return room
 
 
 def run(*arguments):
+    if arguments[:1] == ("--mix",) and "--extra" not in arguments:
+        arguments = (*arguments, "--extra", 0)
     return command_line("tasks.aoa", AoaConfig, experiment.run, [str(a) for a in arguments], arms.meaning)
 
 
@@ -71,7 +77,7 @@ def test_aann_learns_a_toy(circular):
         spectrum[i, 4:10, 16 * (i % 4) : 16 * (i % 4) + 8] = 1
     train = Mixed(spectrum, label, torch.arange(16), torch.zeros(16).bool())
     settings = Settings(AngularGrid.hemisphere(16, 64))
-    network = AANN(settings, AANNConfig(steps=30, batch=8, circular=circular))
+    network = AANN(settings, AANNConfig(steps=30, batch=8, max_azimuths=0, circular=circular))
     network.fit(train)
     constant = Constant(settings)
     constant.fit(train)
@@ -100,7 +106,7 @@ def test_aann_is_seeded_and_leaves_the_global_generator_alone(room):
 
 def test_whole_run(small, tmp_path):
     out = tmp_path / "run"
-    assert run("--mix", 0.5, 1.0, "--synthesizer", "swiftwrf", "idw", "--repeats", 2, "--out", out) == 0
+    assert run("--mix", 0.5, 1.0, "--synthesizer", "swiftwrf", "idw", "--repeats", 2, "--extra", 20, "--out", out) == 0
     metrics = json.loads((out / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(name))
     assert (metrics["task"], metrics["data"], metrics["split"], metrics["seed"]) == (
         "aoa",
@@ -226,14 +232,14 @@ def test_wrong_input_is_one_sentence_and_code_2(small, tmp_path, capsys, argumen
 
 
 def test_coarray_needs_the_array_and_takes_it_from_the_command_line(small, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(experiment, "simulated_room", lambda seed: replace(small, array=None))
+    monkeypatch.setattr(experiment, "simulated_room", lambda **_: replace(small, array=None))
     turbo = ("--mix", 0.5, "--synthesizer", "coarray", "--out", tmp_path / "run")
     assert run(*turbo) == 2
     assert "give it with --array" in capsys.readouterr().err
     assert run(*turbo, "--array", 1, 0.16, 915e6) == 2
     assert "at least 2 elements a side" in capsys.readouterr().err
     assert run(*turbo, "--array", 4, 0.164, 915e6) == 0
-    model = CoarrayModel.load(tmp_path / "run" / "coarray-mix0.5.safetensors")
+    model = load(tmp_path / "run" / "coarray-mix0.5.safetensors")
     assert model.synthesize(small.position[:2]).shape == (2, 10, 40)
 
 

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from augment import SYNTHESIZERS, Settings, Synthesizer, make_synthesizer, mix, withhold
+from augment import (
+    SYNTHESIZERS,
+    Settings,
+    Synthesizer,
+    choose_synthesizer,
+    draw_places,
+    make_synthesizer,
+    mix,
+    withhold,
+)
+from augment.choose import candidates
 from augment.synthesizers.idw import weights
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, simulated_room
 from swiftwrf.metrics import psnr
@@ -92,5 +104,64 @@ def test_idw_of_two_neighbours_is_their_weighted_mean():
 
 
 def test_unknown_synthesizer():
-    with pytest.raises(InputError, match="choose from coarray, gp"):
+    with pytest.raises(InputError, match="choose from coarray, geometry, gp"):
         make_synthesizer("vae")
+
+
+@pytest.mark.parametrize("flat", [0, 1, 2])
+def test_drawn_places_lie_in_the_region_with_the_right_directions(flat):
+    """In the hull, also of positions in a plane or on a line, and near measured positions."""
+    data = simulated_room(n=40, seed=1, grid=AngularGrid.hemisphere(15, 60))
+    position = data.position.clone()
+    position[:, :flat] = 3.0
+    data = replace(data, position=position, label=data.direction_at(position))
+    places = draw_places(data, 200, seed=0)
+    assert len(places) == 200
+    assert (places.index == -1).all()
+    low, high = position.min(dim=0).values, position.max(dim=0).values
+    assert ((places.position >= low - 1e-9) & (places.position <= high + 1e-9)).all()
+    torch.testing.assert_close(places.label, data.direction_at(places.position))
+    assert torch.equal(places.position, draw_places(data, 200, seed=0).position)
+
+
+def test_places_are_not_drawn_inside_a_ring():
+    angle = torch.linspace(0, 2 * torch.pi, 61, dtype=torch.float64)[:-1]
+    ring = torch.stack([3 + angle.cos(), 2.5 + angle.sin(), torch.full_like(angle, 1.0)], dim=1)
+    data = replace(simulated_room(n=60, grid=AngularGrid.hemisphere(15, 60)), position=ring)
+    places = draw_places(data, 100, seed=0)
+    assert (places.position[:, :2] - torch.tensor([3.0, 2.5])).norm(dim=1).min() > 0.4
+
+
+def test_direction_needs_to_know_the_fixed_end():
+    with pytest.raises(InputError, match="where the fixed end stands"):
+        draw_places(replace(ROOM, fixed_position=None), 10, seed=0)
+
+
+@pytest.mark.parametrize("name", ["gp", "coarray"])
+def test_samples_scatter_about_the_mean_and_are_as_varied_as_measured_spectra(name):
+    synthesizer = make_synthesizer(name)
+    synthesizer.fit(TRAIN)
+    assert synthesizer.samples
+    mean = synthesizer.synthesize(TEST.position)
+    draws = torch.stack(
+        [synthesizer.synthesize(TEST.position, torch.Generator().manual_seed(seed)) for seed in range(40)]
+    )
+    assert not torch.equal(draws[0], draws[1])
+    assert (draws.mean(dim=0) - mean).abs().mean() < 0.3 * draws.std(dim=0).mean()
+    spread = [spectra.std(dim=0).mean() for spectra in (TEST.spectrum, mean, draws[0])]
+    assert spread[1] < spread[2] < 1.3 * spread[0]
+
+
+def test_counts_say_where_spectra_come_from():
+    measured, withheld = withhold(TRAIN, 0.5, 0)
+    further = draw_places(measured, 7, seed=0)
+    mixed = mix(measured, withheld, torch.zeros(len(withheld), 15, 60)).add(further, torch.zeros(7, 15, 60))
+    assert mixed.counts == {"measured": len(measured), "withheld": len(withheld), "further": 7}
+
+
+def test_choice_takes_the_best_on_held_out_spectra_and_sees_nothing_else():
+    chosen = choose_synthesizer(TRAIN, Settings(), ("nearest", "idw", "gp"))
+    assert set(chosen.psnr_db) == {"nearest", "idw", "gp"}
+    assert chosen.psnr_db[chosen.name] == max(chosen.psnr_db.values())
+    assert "geometry" in candidates(TRAIN)
+    assert not {"geometry", "hybrid", "coarray"} & set(candidates(replace(TRAIN, array=None)))

@@ -1,7 +1,7 @@
 """Synthesizers: spectra at any position from measured ones. Each method is one file of this folder."""
 
-from augment.synthesizers.base import SYNTHESIZERS, Settings, Synthesizer, make_synthesizer
+from augment.synthesizers.base import SYNTHESIZERS, Settings, Synthesizer, lacks, make_synthesizer
 
 SYNTHESIZERS.discover(__name__, __path__)
 
-__all__ = ["SYNTHESIZERS", "Settings", "Synthesizer", "make_synthesizer"]
+__all__ = ["SYNTHESIZERS", "Settings", "Synthesizer", "lacks", "make_synthesizer"]

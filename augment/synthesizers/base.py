@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -44,6 +44,9 @@ class Settings:
 class Synthesizer(ABC):
     """Learns from spectra, then draws one at any position."""
 
+    samples: ClassVar[bool] = False
+    """whether `synthesize` can draw instead of predicting the mean"""
+
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
 
@@ -51,9 +54,17 @@ class Synthesizer(ABC):
     def fit(self, train: Spectra) -> None:
         """Learns; `train` is all it ever sees."""
 
+    def fit_like(self, other: Synthesizer, train: Spectra) -> None:
+        """Learns as another one of its kind did from other spectra of the scene, whose search it need not repeat."""
+        self.fit(train)
+
     @abstractmethod
-    def synthesize(self, position: Tensor) -> Tensor:
-        """Magnitudes in [0, 1], float32 (n, H, W), at positions (n, 3) [m]."""
+    def synthesize(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Magnitudes in [0, 1], float32 (n, H, W), at positions (n, 3) [m].
+
+        Without a generator the most plausible spectra, and with one, for those that can, spectra as plausible as any: a
+        network that learns from means sees less of the world than there is.
+        """
 
     @property
     def model(self) -> Saved | None:
@@ -62,6 +73,7 @@ class Synthesizer(ABC):
 
 
 SYNTHESIZERS: Registry[Synthesizer] = Registry("synthesizer")
+ARRAY, FIXED_END = "array", "fixed end"  # what a synthesizer may need of the data
 
 
 def make_synthesizer(name: str, settings: Settings | None = None) -> Synthesizer:
@@ -71,3 +83,9 @@ def make_synthesizer(name: str, settings: Settings | None = None) -> Synthesizer
         InputError: an unknown name.
     """
     return SYNTHESIZERS[name].make(settings or Settings())
+
+
+def lacks(name: str, data: Spectra) -> list[str]:
+    """What the synthesizer of that name needs and the data do not tell."""
+    known = {ARRAY: data.array is not None, FIXED_END: data.fixed_position is not None and data.rotation is not None}
+    return [need for need in SYNTHESIZERS[name].needs if not known[need]]

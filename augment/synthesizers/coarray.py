@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
-from augment.synthesizers.base import SYNTHESIZERS, Synthesizer
+from augment.synthesizers.base import ARRAY, SYNTHESIZERS, Synthesizer
 from swiftwrf import CoarrayModel, Spectra, fit_coarray
 
 
 @SYNTHESIZERS.register(
     "coarray",
     meaning="a Gaussian process in the space that the array's spectra can lie in",
-    needs=("array",),
+    needs=(ARRAY,),
     colour="#aa3377",
 )
 class Coarray(Synthesizer):
     """49 numbers a position for a 4 x 4 array, known in a second."""
+
+    samples = True
 
     def fit(self, train: Spectra) -> None:
         own = self.settings
@@ -28,8 +31,8 @@ class Coarray(Synthesizer):
             progress=own.progress,
         )
 
-    def synthesize(self, position: Tensor) -> Tensor:
-        return self._model.synthesize(position)
+    def synthesize(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        return self._model.synthesize(position, generator=generator)
 
     @property
     def model(self) -> CoarrayModel:

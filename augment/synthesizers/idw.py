@@ -32,7 +32,7 @@ class InverseDistance(Synthesizer):
             loss += float((predicted - flat[out]).square().sum())
         return loss
 
-    def synthesize(self, position: Tensor) -> Tensor:
+    def synthesize(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
         weight = weights(position, self._train.position, self.k)
         return (weight @ self._train.spectrum.flatten(1)).reshape(-1, *self._train.grid.shape)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from augment.synthesizers.base import SYNTHESIZERS, Synthesizer
@@ -16,5 +17,5 @@ class Nearest(Synthesizer):
     def fit(self, train: Spectra) -> None:
         self._train = train
 
-    def synthesize(self, position: Tensor) -> Tensor:
+    def synthesize(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
         return self._train.spectrum[distance(position.double(), self._train.position).argmin(dim=1)]

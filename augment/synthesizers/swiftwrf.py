@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import torch
 from torch import Tensor
 
 from augment.synthesizers.base import SYNTHESIZERS, Synthesizer
@@ -26,7 +27,7 @@ class SwiftWRFSynthesizer(Synthesizer):
             progress=own.progress,
         )
 
-    def synthesize(self, position: Tensor) -> Tensor:
+    def synthesize(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
         return self._model.synthesize(position)
 
     @property

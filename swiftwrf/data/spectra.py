@@ -9,10 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+import torch
 from torch import Tensor
 from torch.nn import functional
 
-from swiftwrf.angles import AngularGrid
+from swiftwrf.angles import AngularGrid, to_angles
 from swiftwrf.arrays import PlanarArray
 from swiftwrf.data.splits import MIN_TRAINING, choose_split
 from swiftwrf.errors import InputError
@@ -36,6 +37,9 @@ class Spectra:
         named_splits: training and test rows of the splits that came with the data.
         array: the antenna array, where it is known.
         source: sha256 of each file that says what the data are, by file name.
+        fixed_position: of the end that does not move, float64 (3,) [m]; None where it is unknown or both ends move.
+        rotation: turns array into world coordinates, float64 (3, 3); the array stands at the fixed end when the
+            transmitter moves, and else moves with constant orientation. None where it is unknown.
     """
 
     name: str
@@ -49,6 +53,8 @@ class Spectra:
     named_splits: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
     array: PlanarArray | None = None
     source: dict[str, str] = field(default_factory=dict)
+    fixed_position: Tensor | None = None
+    rotation: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.position)
@@ -73,6 +79,21 @@ class Spectra:
         """
         train, test = choose_split(name, seed, self.position, self.named_splits, self.name)
         return self.subset(train), self.subset(test)
+
+    def direction_at(self, position: Tensor) -> Tensor:
+        """Azimuth and elevation (n, 2) [rad] of the line of sight with the moving end at positions (n, 3) [m].
+
+        Raises:
+            InputError: the fixed end or the array's orientation is unknown.
+        """
+        if self.fixed_position is None or self.rotation is None:
+            raise InputError(
+                f"{self.name} does not say where the fixed end stands and how the array is turned, so the direction at "
+                "further positions is unknown"
+            )
+        away = position.double() - self.fixed_position
+        towards = away if self.moving == "transmitter" else -away
+        return torch.stack(to_angles(towards @ self.rotation), dim=-1)
 
     def coarsen(self, factor: int) -> Spectra:
         """The same spectra averaged over squares of factor x factor pixels.

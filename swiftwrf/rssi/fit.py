@@ -1,131 +1,149 @@
-"""From measured RSSI to a model."""
+"""From measured RSSI to a model: what all receivers share, each receiver's fit, and how far to trust it."""
 
 from __future__ import annotations
 
 import functools
-import math
+import time
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import MIN_TRAINING, folds
-from swiftwrf.errors import FitError, InputError
-from swiftwrf.gp import Kernel, candidates, held_out_weights, thinned
-from swiftwrf.progress import progress
+from swiftwrf.progress import progress_bar
+from swiftwrf.rssi.choose import mixing_weights
 from swiftwrf.rssi.config import RssiConfig
-from swiftwrf.rssi.law import Law, fit_law, log_distance
-from swiftwrf.rssi.model import ReceiverGroup, RssiModel
+from swiftwrf.rssi.head import pooled
+from swiftwrf.rssi.learn import learn
+from swiftwrf.rssi.model import RssiModel
+from swiftwrf.rssi.prepare import Setting, check, prepare
+from swiftwrf.rssi.solve import Fitted, Group, solve
+from swiftwrf.rssi.state import State, fingerprint
+from swiftwrf.rssi.uncertainty import known
 
-MAX_ANCHORS = 1500
-GROUP = 16  # receivers fitted as one program: bounds the memory of hundreds
-NOISES = (0.3, 1.0, 2.0, 3.0)  # variance of a packet relative to that of the field: fading is as large as shadowing
+GROUP = 4  # receivers a task: a state is kept after each, and a cluster's workers take one each
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
 def fit_rssi(
-    train: Rssi, config: RssiConfig | None = None, *, device: torch.device | str = "cpu", parallel: Map = map
+    train: Rssi,
+    config: RssiConfig | None = None,
+    *,
+    pool: Rssi | None = None,
+    device: torch.device | str = "cpu",
+    parallel: Map = map,
+    checkpoint: Path | None = None,
+    on_record: Callable[[dict[str, Any]], None] | None = None,
+    progress: bool = True,
 ) -> RssiModel:
-    """Fits all receivers at once; same data, configuration and machine give the same model.
+    """Fits all receivers; same data, configuration and machine give the same model.
 
-    The kernel, and whether there are primitives at all, are chosen by cross-validation on what the log-distance law leaves;
-    the width of the interval on one held-out fold of the training rows.
+    Whatever has to be chosen is chosen on five held-out folds of the training rows: the kernel and whether there are
+    primitives at all, the weights of the field beside simpler predictors (the receiver's law, the law of all receivers, the
+    receiver's mean), and the width of the interval.
 
     Args:
-        train: the only rows it sees; a receiver's missing values do not count.
+        train: the only rows it sees; a receiver's missing values do not count. A receiver heard in fewer than 10 rows falls
+            back to the law of all receivers.
         config: how; `RssiConfig()` unless given.
-        device: where to optimise; the model that comes back is on the CPU.
+        pool: the same rows at every receiver of the data, of which `train` has some: the kernel and the law of all
+            receivers are learnt from them.
+        device: where to compute; the model that comes back is on the CPU.
         parallel: maps the fit over groups of receivers; give one that spreads work over processes or machines.
+        checkpoint: a file that keeps the groups that are fitted; where it exists, the fit goes on from it.
+        on_record: called when the kernel is chosen and after each group of receivers with stage (search, final), group,
+            n_primitives, validation loss (mean absolute error of held-out sites [dB]; not in the search) and seconds.
+        progress: show a progress bar on a terminal.
 
     Raises:
-        InputError: a receiver heard in too few rows.
-        FitError: a loss that is not finite.
+        InputError: fewer than 10 measurements in all, something not finite, a pool of other rows, or a checkpoint of
+            another fit.
+        FitError: a fit that broke.
     """
-    config = config or RssiConfig()
-    for name, count in zip(train.receiver_names, (~train.rssi_dbm.isnan()).sum(dim=0).tolist(), strict=True):
-        if count < MIN_TRAINING:
-            raise InputError(f"receiver {name!r} is heard in {count} training rows; at least {MIN_TRAINING} are needed")
-    fold = folds(train.transmitter_position, config.validation, config.seed)
-    kernel, helps = _choose_field(train.transmitter_position, _law(train)[1], fold)
-    rest, held_out = train.subset((fold != 0).nonzero()[:, 0]), train.subset((fold == 0).nonzero()[:, 0])
+    config, pool, began = config or RssiConfig(), pool or train, time.perf_counter()
+    check(train, pool)
+    told = on_record or (lambda record: None)
+    state = State(checkpoint, fingerprint(config, train, pool))
+    setting = prepare(train, pool, config)
+    told({"stage": "search", "n_primitives": setting.n_primitives, "seconds": time.perf_counter() - began})
+    groups = [setting.columns(slice(start, start + GROUP)) for start in range(0, len(train.receiver_names), GROUP)]
+    pending = [number for number in range(len(groups)) if number not in state.fitted]
     task = functools.partial(
-        _optimise,
-        n_primitives=config.n_primitives if helps or not config.law else 0,
-        kernel=kernel,
+        learn if config.plain else solve,
+        kernel=setting.kernel,
         config=config,
+        n_primitives=setting.n_primitives,
         device=torch.device(device),
     )
-    searched, model = (RssiModel(list(parallel(task, _groups(rows)))) for rows in (rest, train))
-    with torch.no_grad():
-        predicted, deviation = searched(held_out.transmitter_position)
-    standardised = (predicted - held_out.rssi_dbm).abs() / deviation
-    model.widening.fill_(standardised[standardised.isfinite()].quantile(config.coverage))
-    return model.eval()
+    with progress_bar(progress) as bar:
+        results = parallel(task, [groups[number] for number in pending])
+        done = bar.track(zip(pending, results, strict=True), total=len(pending), description="groups of receivers")
+        for number, fitted in done:
+            state.add(number, fitted)
+            told(_record(number, fitted, groups[number], setting, time.perf_counter() - began))
+    parts = zip(*(state.fitted[number] for number in range(len(groups))), strict=True)
+    along = (0, 0, 0, 1, 0, 1)  # the dimension of the receivers in each field of `Fitted`
+    return _assemble(train, setting, Fitted(*(torch.cat(p, dim=d) for p, d in zip(parts, along, strict=True))), config)
 
 
-def _groups(rows: Rssi) -> list[Rssi]:
-    """The receivers in groups of a fixed size, so that the numbers do not depend on who fits which group."""
-    columns = list(range(len(rows.receiver_names)))
-    return [rows.columns(columns[start : start + GROUP]) for start in range(0, len(columns), GROUP)]
+def _record(number: int, fitted: Fitted, group: Group, setting: Setting, seconds: float) -> dict[str, Any]:
+    return {
+        "stage": "final",
+        "group": number,
+        "n_primitives": setting.n_primitives,
+        "validation": float((fitted.held_out - group.rssi).abs().nanmean()),
+        "seconds": seconds,
+    }
 
 
-def _choose_field(position: Tensor, residual: Tensor, fold: Tensor) -> tuple[Kernel, bool]:
-    """The kernel that best predicts what the log-distance law leaves (n, R) where it is held out, by mean absolute error
-    [dB], and whether that is better than leaving it. Missing values count as 0 when they predict; they are not scored."""
-    position, residual, fold = thinned(position, residual, fold)
-    filled = residual.nan_to_num()
+def _assemble(train: Rssi, setting: Setting, fitted: Fitted, config: RssiConfig) -> RssiModel:
+    """The model: the mixture worked into its tensors, and the interval's width."""
+    predictions = torch.cat([fitted.held_out[None], setting.held_out])
+    row, group, kernel = setting.sites.of_row, setting.whole, setting.kernel
+    weight = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
+    if not config.plain:
+        weight = mixing_weights(predictions[:, row], train.rssi_dbm)
+    level, slope = (
+        torch.einsum("p,pr->r", weight, torch.stack(values))
+        for values in zip((fitted.level, fitted.slope), *setting.simple, strict=True)
+    )
+    still = pooled(fitted.drawn, torch.zeros(1, len(level)))[0]
+    somewhere = known(group.local, kernel)
+    predicted = torch.einsum("p,pnr->nr", weight, predictions.where(weight[:, None, None] > 0, 0.0))
+    score = ((train.rssi_dbm - predicted[row]) / _held_out_deviation(setting)[row]).abs()
+    return RssiModel(
+        receiver_names=tuple(map(str, train.receiver_names)),
+        n_primitives=setting.n_primitives,
+        kernel=kernel,
+        weight=weight,
+        receiver=train.receiver_position.double(),
+        centre=setting.centre,
+        level=level,
+        slope=slope,
+        directivity=(weight[0] * fitted.directivity).float(),
+        anchor=group.local.float(),
+        coefficient=fitted.coefficient.float(),
+        drawn=fitted.drawn,
+        offset=torch.zeros_like(still) if config.plain else still,
+        share=weight[:1].float(),
+        known_position=somewhere.position.float(),
+        known_root=somewhere.root.float(),
+        field_db=group.field_db.float(),
+        noise_db=group.noise_db.float(),
+        widening=score[score.isfinite()].quantile(config.coverage).float()[None],
+    )
 
-    def missed(kernel: Kernel) -> float:
-        parts = held_out_weights(kernel, position, fold)
-        return float(torch.cat([(gain @ filled[kept] - residual[out]).abs() for out, kept, gain in parts]).nanmean())
 
-    best = min(candidates(position, NOISES), key=missed)
-    return best, missed(best) < float(residual.abs().nanmean())
+def _held_out_deviation(setting: Setting) -> Tensor:
+    """Of a measurement about what all other folds say of its site, (n, R) [dB]: as `RssiModel` has it, without the fold.
 
-
-def _law(train: Rssi) -> tuple[Law, Tensor]:
-    """The law of each receiver, and what it leaves (n, R), nan where not heard."""
-    distance = log_distance(train.transmitter_position, train.receiver_position)
-    law = fit_law(distance, train.rssi_dbm)
-    return law, train.rssi_dbm - law(distance)
-
-
-def _optimise(
-    train: Rssi, n_primitives: int, kernel: Kernel, config: RssiConfig, device: torch.device
-) -> ReceiverGroup:
-    """Maximum a posteriori: Huber's loss in units of the noise, and the prior of the functions of position."""
-    generator = torch.Generator().manual_seed(config.seed)
-    position, rssi = train.transmitter_position, train.rssi_dbm.float()
-    rows = torch.randperm(len(train), generator=generator)[:MAX_ANCHORS].sort().values
-    model = ReceiverGroup(train.receiver_position, position[rows], kernel, n_primitives, config)
-    law, residual = _law(train)
-    variance = residual.square().nanmean(dim=0).float().clamp_min(1e-6)
-    with torch.no_grad():
-        if config.law:
-            model.level.copy_(law.level)
-            model.slope.copy_(law.slope)
-        share = kernel.noise / (1 + kernel.noise) if n_primitives else 1.0
-        model.noise_db.copy_((share * variance).sqrt())
-        model.field_db.copy_(((1 - share) * variance).sqrt())
-    model, position, rssi = model.to(device), position.to(device), rssi.to(device)
-    optimiser = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], lr=config.rate)
-    heard = int((~rssi.isnan()).sum())
-    described = f"{len(train.receiver_names)} receivers, {n_primitives} primitives"
-    for step in progress(range(config.steps), described):
-        batch = torch.randint(len(train), (min(config.batch, len(train)),), generator=generator)
-        measured = rssi[batch]
-        missed = ((model(position[batch]) - measured) / model.noise_db)[~measured.isnan()]
-        loss = functional.huber_loss(missed, torch.zeros_like(missed), delta=config.huber)
-        loss = loss + model.prior() / heard
-        if not math.isfinite(loss.item()):
-            raise FitError(
-                f"the RSSI fit broke at step {step}: loss {loss.item():.3g}; try a rate below {config.rate:g}"
-            )
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.param_groups[0]["lr"] = config.rate * 0.5 * (1 + math.cos(math.pi * step / config.steps))
-        optimiser.step()
-    return model.requires_grad_(False).cpu()
+    So the interval is cross-conformal (V. Vovk, Annals of Mathematics and Artificial Intelligence 74, 2015): each row's
+    error is taken in units of what a model without it would have said.
+    """
+    group, unknown = setting.whole, torch.empty(len(setting.whole.local), dtype=torch.float64)
+    for number in group.fold.unique():
+        out = group.fold == number
+        unknown[out] = known(group.local[~out], setting.kernel).unknown(group.local[out], setting.kernel)
+    return (group.noise_db.square() + group.field_db.square() * unknown[:, None]).sqrt()

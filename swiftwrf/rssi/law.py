@@ -1,19 +1,32 @@
-"""The log-distance law: received power falls by 10 gamma dB for each decade of distance."""
+"""What is known of received power before any field: it falls with distance, and depends on the direction."""
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
+from torch.nn import functional
 
 from swiftwrf.positions import distance
 
 NEAREST = 0.3  # [m] distances below it count as it: the law ends somewhere
+HARMONICS = 8  # real spherical harmonics of degree 1 and 2
 
 
 def log_distance(position: Tensor, receiver: Tensor) -> Tensor:
     """log10 of the distances [m] from positions (n, 3) to receivers (R, 3), float64 (n, R)."""
     return distance(position.double(), receiver.double()).clamp_min(NEAREST).log10()
+
+
+def harmonics(position: Tensor, receiver: Tensor) -> Tensor:
+    """Harmonics of degree 1 and 2 of the direction from receivers (R, 3) to positions (n, 3), (n, R, 8), each of unit mean
+    square over all directions."""
+    x, y, z = functional.normalize(position[:, None] - receiver, dim=-1).unbind(-1)
+    first = [math.sqrt(3) * c for c in (x, y, z)]
+    second = [math.sqrt(15) * c for c in (x * y, y * z, z * x, (x * x - y * y) / 2)]
+    return torch.stack([*first, *second, math.sqrt(5) / 2 * (3 * z * z - 1)], dim=-1)
 
 
 class Law(NamedTuple):
@@ -25,6 +38,10 @@ class Law(NamedTuple):
     def __call__(self, distance: Tensor) -> Tensor:
         """RSSI [dBm] at log10 distances (n, R)."""
         return self.level + self.slope * distance
+
+    def where(self, usable: Tensor, other: Law) -> Law:
+        """This law for usable (R,) receivers, another for the rest."""
+        return Law(self.level.where(usable, other.level), self.slope.where(usable, other.slope))
 
 
 def fit_law(distance: Tensor, rssi: Tensor, *, pooled: bool = False) -> Law:

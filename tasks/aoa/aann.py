@@ -24,19 +24,20 @@ from swiftwrf.progress import progress
 from tasks.aoa.estimators import ESTIMATORS, Estimator, Settings
 
 LEAST_ROWS = 8  # a prime number of rows can only be averaged to one, which leaves nothing to learn from
+STATISTICS = 512  # spectra that the batch norms' statistics are taken from
 
 
 @dataclass(frozen=True)
 class AANNConfig:
     """How the network is trained."""
 
-    steps: int = 400
+    steps: int = 200
     """optimisation steps, the same for every training set"""
-    batch: int = 16
+    batch: int = 32
     """spectra a step"""
     rate: float = 1e-3
     """peak learning rate of AdamW, one cycle"""
-    max_azimuths: int = 120
+    max_azimuths: int = 60
     """larger spectra are averaged down for the network; 0 keeps all pixels"""
     circular: bool = False
     """pad the azimuth circularly, as the physics has it, instead of with zeros"""
@@ -127,8 +128,9 @@ class AANN(Estimator):
                 self.history.append({"step": step, "loss": loss.item(), "seconds": time.perf_counter() - began})
 
         # a short training leaves the batch norms' running statistics behind the weights, so they are taken anew
+        some = torch.randperm(len(train), generator=self._generator)[:STATISTICS]
         with self._autocast:
-            update_bn(spectrum.split(64), network)
+            update_bn(spectrum[some].split(64), network)
         network.eval()
 
     def _point(self, prepared: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
-"""The arms of the experiment: the baselines, and one network trained on measured and on synthetic spectra.
+"""The arms of the experiment: every estimator that learns, on each of the training sets.
 
-Names, meanings and colours come from the registries of estimators and synthesizers.
+Names, meanings and colours come from the registries of estimators and synthesizers. The network's arms are named after
+their training set, the other estimators' by both.
 """
 
 from __future__ import annotations
@@ -9,43 +10,75 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from augment import SYNTHESIZERS
-from tasks.aoa.estimators import ESTIMATORS
+from tasks.aoa.estimators import ESTIMATORS, learners
 from tasks.page.palette import Palette
 
-NETWORK = "aann"  # of the estimators: the one that is trained in the arms that are no baselines
+NETWORK = "aann"  # of the estimators: the one that the paper trains
 TURBO = "turbo_"  # before the name of the synthesizer
+EXTRA = "_extra"  # after it, where further positions are added to the withheld ones
 
 
 @dataclass(frozen=True)
 class Bound:
-    """What turbo learning is compared with: the network without synthetic spectra."""
+    """What turbo learning is compared with: training sets without synthetic spectra."""
 
     name: str
     meaning: str
     colour: str
 
 
-LOWER = Bound("measured_only", "lower bound: the network trained on the measured share alone", "#ee6677")
-UPPER = Bound("measured_all", "upper bound: the network trained on all training spectra, measured", "#228833")
+LOWER = Bound("measured_only", "lower bound: trained on the measured share alone", "#ee6677")
+UPPER = Bound("measured_all", "upper bound: trained on all training spectra, measured", "#228833")
+
+
+def turbo(synthesizer: str, extra: bool = False) -> str:
+    """Name of the training set with spectra of this synthesizer, and with those at further positions."""
+    return f"{TURBO}{synthesizer}{EXTRA if extra else ''}"
+
+
+def arm(estimator: str, training: str) -> str:
+    """Name of an estimator on a training set."""
+    if estimator == NETWORK:
+        return training
+    return estimator if training == LOWER.name else f"{estimator}_{training}"
+
+
+def training_of(name: str) -> str:
+    """The training set of an arm of that name."""
+    own = [estimator for estimator in ESTIMATORS if name == estimator or name.startswith(f"{estimator}_")]
+    if not own:
+        return name
+    rest = name.removeprefix(max(own, key=len)).removeprefix("_")
+    return rest or LOWER.name
+
+
+def estimator_of(name: str) -> str:
+    """The estimator of an arm of that name."""
+    own = [estimator for estimator in ESTIMATORS if name == estimator or name.startswith(f"{estimator}_")]
+    return max(own, key=len) if own else NETWORK
+
+
+def is_turbo(name: str) -> bool:
+    """Whether synthetic spectra train this arm."""
+    return training_of(name).startswith(TURBO)
 
 
 def baselines() -> list[str]:
-    """Names of the estimators that the network must beat."""
+    """Names of the estimators on the measured share that the network must beat."""
     return [name for name in ESTIMATORS if name != NETWORK]
-
-
-def turbo(synthesizer: str) -> str:
-    """Name of the arm with spectra of this synthesizer."""
-    return TURBO + synthesizer
 
 
 def meaning() -> str:
     """All arms in words."""
     texts = [f"{bound.name}: {bound.meaning}" for bound in (LOWER, UPPER)]
-    texts += [f"{name}: {ESTIMATORS[name].meaning}" for name in baselines()]
+    texts += [
+        f"{TURBO}NAME: trained on the measured share and on spectra that NAME synthesized at the withheld positions",
+        f"{TURBO}NAME{EXTRA}: the same, and at as many further positions as --extra says",
+    ]
+    texts += [f"{entry.name}: {entry.meaning}" for entry in ESTIMATORS.entries()]
     return (
-        "; ".join(texts)
-        + f". {TURBO}NAME: the network trained on the measured share and on spectra that NAME synthesized at the others."
+        "; ".join(texts) + f". An arm without the name of an estimator is the network ({NETWORK}); an estimator's name "
+        "alone is that estimator on the measured share."
     )
 
 
@@ -55,10 +88,22 @@ def synthesizers(names: Iterable[str]) -> str:
 
 
 def palette() -> Palette:
-    """Of synthesizers and arms; a turbo arm looks like its synthesizer."""
+    """Of synthesizers and arms; a turbo arm looks like its synthesizer, lighter without the further positions."""
     drawn = Palette.of(SYNTHESIZERS.entries()).colours
     colours = {bound.name: bound.colour for bound in (LOWER, UPPER)}
     colours |= Palette.of(ESTIMATORS.entries()).colours
     colours |= drawn
-    colours |= {turbo(name): colour for name, colour in drawn.items()}
-    return Palette(colours, frozenset(baselines()))
+    for name, colour in drawn.items():
+        colours |= {turbo(name): colour, turbo(name, extra=True): _darker(colour)}
+    dashed = set(baselines())
+    for estimator in learners():
+        if estimator != NETWORK:
+            for name, colour in list(colours.items()):
+                if name in (LOWER.name, UPPER.name) or name.startswith(TURBO):
+                    colours[arm(estimator, name)] = colour if name != LOWER.name else colours[estimator]
+                    dashed.add(arm(estimator, name))
+    return Palette(colours, frozenset(dashed))
+
+
+def _darker(colour: str) -> str:
+    return "#" + "".join(f"{int(int(colour[i : i + 2], 16) * 0.7):02x}" for i in (1, 3, 5))

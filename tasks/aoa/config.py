@@ -5,13 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
-from augment import SYNTHESIZERS
+from augment import SYNTHESIZERS, lacks
 from swiftwrf import InputError, Spectra
 from swiftwrf.arrays import PlanarArray
+from swiftwrf.data.spectra import Moving
 from swiftwrf.metrics import WINDOW
 from tasks.run import SEEDS, Preset, choice
 
 MOST_ELEMENTS = 32  # a side of an array: its spectra have 7,938 numbers
+
+AUTO = "auto"  # the synthesizer that suits the scene
+EXTRA = 3000  # further positions unless told otherwise
 
 
 @dataclass(frozen=True)
@@ -27,11 +31,20 @@ class AoaConfig:
     """folder of spectra (NeRF2 layout) or of ray paths (paths.npz)"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
-    synthesizer: Annotated[tuple[str, ...], choice("methods that draw the synthetic spectra", SYNTHESIZERS)] = (
-        "swiftwrf",
-    )
+    synthesizer: Annotated[
+        tuple[str, ...],
+        choice(
+            f"methods that draw the synthetic spectra; {AUTO} takes the one that predicts held-out measured spectra best",
+            SYNTHESIZERS,
+        ),
+    ] = (AUTO,)
+    extra: int | None = None
+    """further positions in the region of the measured ones at which spectra are synthesized, too (default: 3000 where the
+    data say where the fixed end stands, else 0)"""
     array: tuple[int, float, float] | None = None
     """square array that took the spectra, where the data do not say: elements a side, spacing [m], carrier [Hz]"""
+    moving: Moving | None = None
+    """which end moves in the built-in room (default: transmitter)"""
     preset: Preset = "quick"
     """quick: sized for a CPU; paper: the paper's model and a long training, for a GPU"""
     repeats: int = 1
@@ -50,8 +63,17 @@ def check(config: AoaConfig) -> None:
     Raises:
         InputError: such an option.
     """
+    if not config.synthesizer:
+        raise InputError("--synthesizer takes at least one name")
+    if AUTO in config.synthesizer and len(config.synthesizer) > 1:
+        raise InputError(f"--synthesizer takes {AUTO} or names, not both: {' '.join(config.synthesizer)}")
     for name in config.synthesizer:
-        SYNTHESIZERS[name]  # refuses an unknown one
+        if name != AUTO:
+            SYNTHESIZERS[name]  # refuses an unknown one
+    if config.extra is not None and config.extra < 0:
+        raise InputError(f"--extra takes a number of positions, got {config.extra}")
+    if config.moving is not None and config.data is not None:
+        raise InputError("--moving is for the built-in room; with --data the data say which end moves")
     if not config.mix or not all(0 < share <= 1 for share in config.mix):
         raise InputError(
             f"--mix takes measured shares in (0, 1], got {' '.join(f'{s:g}' for s in config.mix) or 'none'}"
@@ -86,13 +108,20 @@ def with_array(data: Spectra, config: AoaConfig) -> Spectra:
         side, spacing, frequency = config.array
         data = replace(data, array=PlanarArray.square(side, frequency, spacing))
     for name in config.synthesizer:
-        if not can_draw(name, data):
-            raise InputError(
-                f"synthesizer {name} needs the array, which {data.name} does not describe; give it with --array"
-            )
+        missing = [] if name == AUTO else lacks(name, data)
+        if missing:
+            hint = "give it with --array" if "array" in missing else "the data must say where it stands"
+            raise InputError(f"synthesizer {name} needs the {missing[0]}, which {data.name} does not describe; {hint}")
     return data
 
 
-def can_draw(synthesizer: str, data: Spectra) -> bool:
-    """Whether the data have what the synthesizer needs."""
-    return data.array is not None or "array" not in SYNTHESIZERS[synthesizer].needs
+def further_positions(data: Spectra, config: AoaConfig) -> int:
+    """How many further positions are synthesized at.
+
+    Raises:
+        InputError: some were asked for, but the directions there are unknown.
+    """
+    if config.extra:
+        data.direction_at(data.position[:1])  # refuses
+    known = data.fixed_position is not None and data.rotation is not None
+    return config.extra if config.extra is not None else EXTRA if known else 0

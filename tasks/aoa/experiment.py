@@ -3,25 +3,35 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 from pandas import DataFrame
 from torch import Tensor
 
-from augment import Mixed, Places, make_synthesizer, mix, withhold
+from augment import (
+    Mixed,
+    Places,
+    choose_synthesizer,
+    draw_places,
+    make_synthesizer,
+    mix,
+    withhold,
+)
 from augment import Settings as SynthesizerSettings
-from swiftwrf import InputError, Spectra, load_spectra, simulated_room
-from swiftwrf.checkpoint import read, write
+from augment.choose import SLOW, candidates
+from swiftwrf import GeometryModel, InputError, Spectra, load_spectra, simulated_room
+from swiftwrf.checkpoint import Saved, read, write
+from swiftwrf.geometry import HybridModel
 from swiftwrf.metrics import angle_errors, l1, psnr, ssim
 from tasks.aoa import (
     aann,  # noqa: F401 (registers the network)
     arms,
 )
-from tasks.aoa.config import AoaConfig, can_draw, check, with_array
-from tasks.aoa.estimators import ESTIMATORS, Settings
+from tasks.aoa.advice import advise
+from tasks.aoa.config import AUTO, AoaConfig, check, further_positions, with_array
+from tasks.aoa.estimators import ESTIMATORS, Settings, learners
 from tasks.aoa.page import page
 from tasks.metrics import ANGLES, SCORES, AoaMetrics, ArmMetrics, MixMetrics, SynthesisMetrics
 from tasks.page.page import reporting
@@ -29,7 +39,7 @@ from tasks.run import Row, Run, choose_device, console
 from tasks.summarise import averaged, repeats_averaged
 
 SCORE = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
-COMPARED = ("nearest", "idw", "gp", "coarray")  # synthesizers that are always measured beside those asked for
+SAMPLE = " sample"  # after the name of a synthesizer whose draws are scored instead of its means
 EXAMPLE_QUANTILES = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)  # of the PSNR at the test positions: the best to the worst spectrum
 
 
@@ -41,15 +51,20 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
     """
     device = choose_device(config.device)
     check(config)
-    data = with_array(load_spectra(config.data) if config.data else simulated_room(seed=config.seed), config)
+    if config.data is None:
+        data = simulated_room(seed=config.seed, moving=config.moving or "transmitter")
+    else:
+        data = load_spectra(config.data)
+    data = with_array(data, config)
     train, test = data.split(config.split, config.seed)
     if len(test) == 0:
         raise InputError(f"split {config.split!r} of {data.name} has no test spectra")
     for share in config.mix:
         withhold(train, share, config.seed)  # refuses before anything is written
+    extra = further_positions(data, config)
     label = f"mix{'_'.join(f'{share:g}' for share in config.mix)}-s{config.seed}"
     with Run("aoa", config.out, label, config, device, data.source, resume) as directory:
-        experiment = _Experiment(config, train, test, device, directory)
+        experiment = _Experiment(config, train, test, extra, device, directory)
         for repeat in range(config.repeats):
             for share in config.mix:
                 experiment.turbo(share, repeat)
@@ -64,6 +79,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
             "seed": config.seed,
             "repeats": config.repeats,
             "moving": data.moving,
+            "extra": extra,
             "n_train": len(train),
             "n_test": len(test),
             "grid": data.grid.shape,
@@ -77,37 +93,83 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
 class _Experiment:
     """Trains and tests every arm, each a step of the run's directory, and gathers the tables of the run."""
 
-    def __init__(self, config: AoaConfig, train: Spectra, test: Spectra, device: torch.device, directory: Run) -> None:
-        self.config, self.train, self.test, self.device, self.directory = config, train, test, device, directory
+    def __init__(
+        self, config: AoaConfig, train: Spectra, test: Spectra, extra: int, device: torch.device, directory: Run
+    ) -> None:
+        self.config, self.train, self.test, self.extra = config, train, test, extra
+        self.device, self.directory = device, directory
         self.errors: list[Row] = []
         self.synthesis: list[Row] = []
         self.history: list[Row] = []
         self.training_seconds: list[Row] = []
         self.synthesis_seconds: list[Row] = []
+        self.chosen: dict[float, Row] = {}  # by share, of the first repeat
+        self.counts: dict[float, dict[str, dict[str, int]]] = {}
+        self._kept_examples: set[float] = set()
 
     def turbo(self, share: float, repeat: int) -> None:
         """All arms at one measured share."""
         measured, withheld = withhold(self.train, share, self.config.seed + repeat)
-        few = Mixed.measured(measured)
+        further = draw_places(measured, self.extra, self.config.seed + repeat) if self.extra else None
         at = {"mix": share, "repeat": repeat}
         suffix = f"mix{share:g}-r{repeat}"
-        for name in arms.baselines():
-            self._arm(at | {"method": name}, f"{name}-{suffix}", few, name)
-        self._arm(at | {"method": arms.LOWER.name}, f"{arms.LOWER.name}-{suffix}", few)
-        asked_for = self.config.synthesizer
-        for name in dict.fromkeys((*asked_for, *(name for name in COMPARED if can_draw(name, self.train)))):
-            mixed = self._synthesize(at | {"synthesizer": name}, f"synthesis_{name}-{suffix}", measured, withheld)
+        self._train_on(at, arms.LOWER.name, suffix, Mixed.measured(measured), list(ESTIMATORS))
+        asked_for, sampled = self._choose(at, suffix, measured)
+        for name in dict.fromkeys((*asked_for, *candidates(self.train))):
+            places = (withheld, further) if name in asked_for else (None, None)
+            drawn = self._synthesize(at | {"synthesizer": name}, suffix, measured, places, sampled)
             if name in asked_for:
-                self._arm(at | {"method": arms.turbo(name)}, f"{arms.turbo(name)}-{suffix}", mixed)
-        # the same whatever the share, so its step is shared by all of them
-        self._arm(at | {"method": arms.UPPER.name}, f"{arms.UPPER.name}-r{repeat}", Mixed.measured(self.train))
+                mixed = mix(measured, withheld, drawn["withheld"])
+                self._train_on(at, arms.turbo(name), suffix, mixed, learners())
+                if further is not None:
+                    more = mixed.add(further, drawn["further"])
+                    self._train_on(at, arms.turbo(name, extra=True), suffix, more, learners())
+        # the same whatever the share, so its steps are shared by all of them
+        self._train_on(at, arms.UPPER.name, f"r{repeat}", Mixed.measured(self.train), learners())
 
-    def _arm(self, arm: Row, step: str, train: Mixed, name: str = arms.NETWORK) -> None:
+    def _choose(self, at: Row, suffix: str, measured: Spectra) -> tuple[list[str], bool]:
+        """Synthesizers whose spectra train, and whether they draw instead of predicting means."""
+        named = [name for name in self.config.synthesizer if name != AUTO]
+        compared = [name for name in named if name not in SLOW] or None
+        if named and compared is None:
+            return named, False
+
+        def compute() -> Row:
+            choice = choose_synthesizer(measured, self._settings(at["repeat"]), compared)
+            advice = advise(choice.trials, self._estimator_settings(at["repeat"]), self.extra)
+            return {
+                "choice": {"name": choice.name, "psnr_db": choice.psnr_db, "seconds": choice.seconds},
+                "advice": advice,
+            }
+
+        value = self.directory.step(f"choice-{suffix}", compute)["value"]
+        self.chosen.setdefault(at["mix"], value)
+        return named or [value["choice"]["name"]], value["advice"]["sampled"]
+
+    def _settings(self, repeat: int) -> SynthesizerSettings:
+        return SynthesizerSettings(
+            validation="random",  # the withheld places lie among the measured ones, whatever the split of the test
+            seed=self.config.seed + repeat,
+            preset=self.config.preset,
+            device=self.device,
+        )
+
+    def _estimator_settings(self, repeat: int) -> Settings:
+        return Settings(self.train.grid, self.config.seed + repeat, self.device, self.config.preset)
+
+    def _train_on(self, at: Row, training: str, suffix: str, train: Mixed, estimators: list[str]) -> None:
+        """Trains and tests estimators on one training set."""
+        self.counts.setdefault(at["mix"], {})[training] = train.counts
+        for estimator in estimators:
+            name = arms.arm(estimator, training)
+            self._arm(at | {"method": name}, f"{name}-{suffix}", train, estimator)
+
+    def _arm(self, arm: Row, step: str, train: Mixed, name: str) -> None:
         """Trains one estimator and tests it."""
 
         def compute() -> Row:
-            settings = Settings(self.train.grid, self.config.seed + arm["repeat"], self.device, self.config.preset)
-            estimator, began = ESTIMATORS[name].make(settings), time.perf_counter()
+            estimator = ESTIMATORS[name].make(self._estimator_settings(arm["repeat"]))
+            began = time.perf_counter()
             estimator.fit(train)
             fitted = time.perf_counter()
             estimate = estimator.estimate(self.test.spectrum)
@@ -130,53 +192,76 @@ class _Experiment:
         self.history += [arm | row for row in done["value"]["history"]]
         self.training_seconds.append(arm | done["value"]["seconds"])
 
-    def _synthesize(self, arm: Row, step: str, measured: Spectra, withheld: Places) -> Mixed:
-        """The mixed training set of one synthesizer, and its quality at the test positions."""
-        file = self.directory.path(f"steps/{step}.safetensors")
+    def _synthesize(
+        self, arm: Row, suffix: str, measured: Spectra, places: tuple[Places | None, Places | None], sampled: bool
+    ) -> dict[str, Tensor]:
+        """Spectra of one synthesizer at withheld and further places, and its quality at the test positions."""
         name = arm["synthesizer"]
+        step = f"synthesis_{name}-{suffix}"
+        file = self.directory.path(f"steps/{step}.safetensors")
 
         def compute() -> Row:
             fit = _FitHistory()
-            settings = SynthesizerSettings(
-                validation="random",  # the withheld places lie among the measured ones, whatever the split of the test
-                seed=self.config.seed + arm["repeat"],
-                preset=self.config.preset,
-                device=self.device,
-                checkpoint=self.directory.path(f"steps/{step}-fit.safetensors"),
-                on_record=fit.add,
-            )
+            checkpoint = self.directory.path(f"steps/{step}-fit.safetensors")
+            settings = replace(self._settings(arm["repeat"]), checkpoint=checkpoint, on_record=fit.add)
             synthesizer = make_synthesizer(name, settings)
             synthesizer.fit(measured)
             fitted = time.perf_counter()
-            synthetic = {
-                "withheld": synthesizer.synthesize(withheld.position),
-                "test": synthesizer.synthesize(self.test.position),
-            }
+            generator = torch.Generator().manual_seed(settings.seed)
+            drawn = {"test": synthesizer.synthesize(self.test.position)}
+            if synthesizer.samples:
+                drawn["test sample"] = synthesizer.synthesize(self.test.position, generator)
+            for key, asked in zip(("withheld", "further"), places, strict=True):
+                if asked is not None:
+                    own = generator if sampled and synthesizer.samples else None
+                    drawn[key] = synthesizer.synthesize(asked.position, own)
             seconds = {"fit": fitted - fit.began + fit.earlier, "synthesize": time.perf_counter() - fitted}
-            write(file, "synthetic spectra", synthetic, {})
-            model = synthesizer.model
-            if model is not None and name in self.config.synthesizer and arm["repeat"] == 0:
-                prefix = "model" if name == "swiftwrf" else name
-                model.save(self.directory.path(f"{prefix}-mix{arm['mix']:g}.safetensors"))
+            write(file, "synthetic spectra", {key: _as_bytes(spectrum) for key, spectrum in drawn.items()}, {})
+            if places[0] is not None and arm["repeat"] == 0:
+                self._keep_model(synthesizer.model, name, arm["mix"], measured)
             return {"history": fit.records, "seconds": seconds}
 
         value = self.directory.step(step, compute)["value"]
-        _, synthetic, _ = read(file, "synthetic spectra")
-        scores = {key: score(synthetic["test"], self.test.spectrum) for key, score in SCORE.items()}
-        self.synthesis += _rows(arm, {"index": self.test.index} | scores)
+        drawn = {key: spectrum.float() / 255 for key, spectrum in read(file, "synthetic spectra")[1].items()}
+        for key, called in (("test", name), ("test sample", name + SAMPLE)):
+            if key in drawn:
+                scores = {score: function(drawn[key], self.test.spectrum) for score, function in SCORE.items()}
+                self.synthesis += _rows(arm | {"synthesizer": called}, {"index": self.test.index} | scores)
+                self.synthesis_seconds.append(arm | {"synthesizer": called} | value["seconds"])
         self.history += [arm | row for row in value["history"]]
-        self.synthesis_seconds.append(arm | value["seconds"])
-        if arm["repeat"] == 0 and name == self.config.synthesizer[0]:
-            self._keep_examples(arm["mix"], synthetic["test"], scores["psnr_db"])
-        return mix(measured, withheld, synthetic["withheld"])
+        if arm["repeat"] == 0 and places[0] is not None and arm["mix"] not in self._kept_examples:
+            self._kept_examples.add(arm["mix"])
+            self._keep_examples(arm["mix"], name, drawn["test"], psnr(drawn["test"], self.test.spectrum))
+        return drawn
 
-    def _keep_examples(self, share: float, synthetic: Tensor, score: Tensor) -> None:
+    def _keep_model(self, model: Saved | None, name: str, share: float, measured: Spectra) -> None:
+        """The fitted model, and the room where one was found."""
+        if model is None:
+            return
+        prefix = "model" if name == "swiftwrf" else name
+        model.save(self.directory.path(f"{prefix}-mix{share:g}.safetensors"))
+        room = model.geometry if isinstance(model, HybridModel) else model
+        if isinstance(room, GeometryModel):
+            self.directory.write_json(f"geometry-mix{share:g}.json", room.to_json())
+            at, gain, order = room.image_sources()
+            places = {
+                "measured": measured.position.numpy(),
+                "test": self.test.position.numpy(),
+                "fixed": room.fixed_position.numpy(),
+                "image": at.numpy(),
+                "gain": gain.numpy(),
+                "order": order.numpy(),
+            }
+            self.directory.write_npz(f"room-mix{share:g}.npz", places)
+
+    def _keep_examples(self, share: float, name: str, synthetic: Tensor, score: Tensor) -> None:
         """Measured and synthetic spectra at test positions for the report, chosen by rule."""
         order = score.argsort()
         chosen = order[[round(q * (len(order) - 1)) for q in EXAMPLE_QUANTILES]]
         examples = {
-            "measured": _as_bytes(self.test.spectrum[chosen]),
-            "synthetic": _as_bytes(synthetic[chosen]),
+            "measured": _as_bytes(self.test.spectrum[chosen]).numpy(),
+            "synthetic": _as_bytes(synthetic[chosen]).numpy(),
+            "synthesizer": name,
             "index": self.test.index[chosen].numpy(),
             "psnr_db": score[chosen].numpy(),
         }
@@ -185,10 +270,15 @@ class _Experiment:
     def summary(self, share: float) -> MixMetrics:
         """What metrics.json says of one share."""
         training, fits = (_of(share, rows) for rows in (self.training_seconds, self.synthesis_seconds))
-        asked_for = fits[fits["synthesizer"].isin(self.config.synthesizer)]
-        networks = training[~training["method"].isin(arms.baselines())]
+        trained = [name for name in training["method"].unique() if arms.is_turbo(name)]
+        asked_for = fits[[any(arms.training_of(t) == arms.turbo(s) for t in trained) for s in fits["synthesizer"]]]
+        networks = training[[arms.estimator_of(name) == arms.NETWORK for name in training["method"]]]
+        chosen = self.chosen.get(share, {})
         return {
             "n_measured": round(share * len(self.train)),
+            "counts": self.counts[share],
+            "choice": chosen.get("choice"),
+            "advice": chosen.get("advice"),
             "synthesis": _synthesis_metrics(_of(share, self.synthesis), fits),
             "methods": _arm_metrics(_of(share, self.errors), training),
             "seconds": {
@@ -247,5 +337,6 @@ def _rows(arm: Row, columns: dict[str, Tensor]) -> list[Row]:
     return [arm | dict(zip(lists, values, strict=True)) for values in zip(*lists.values(), strict=True)]
 
 
-def _as_bytes(spectrum: Tensor) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    return (spectrum.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+def _as_bytes(spectrum: Tensor) -> Tensor:
+    """In 256 steps, as measured spectra come in images."""
+    return (spectrum.clamp(0, 1) * 255).round().to(torch.uint8)

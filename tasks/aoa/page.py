@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tasks.aoa import arms
+from tasks.aoa.page_room import advice_sentence, choice_section, room_section
 from tasks.aoa.share import AoaRecords, Share, first_history, fits, place, scene
 from tasks.metrics import Angle, ErrorSummary
 from tasks.page import figures
@@ -29,6 +30,8 @@ def page(runs: list[AoaRecords]) -> Page:
     sections = [_results(share, several) for share in shares]
     if len(shares) > 1:
         sections.insert(0, _over_shares(shares))
+    for share in shares:
+        sections += [section for section in (choice_section(share), room_section(share)) if section]
     sections += [_synthesis(shares, several), *(_examples(share) for share in shares), _size(runs)]
     sections += [*(_speed(share) for share in shares), _training(runs)]
     sections += [_time(shares, several), _limits(runs[0]), provenance(runs)]
@@ -39,18 +42,21 @@ def page(runs: list[AoaRecords]) -> Page:
 def _lead(share: Share) -> str:
     metrics, mix = share.run.metrics, share.mix
     median = {name: arm["great_circle_deg"]["median"] for name, arm in mix["methods"].items()}
-    turbo = min((name for name in median if name.startswith(arms.TURBO)), key=lambda name: median[name])
+    turbo = min((name for name in median if arms.is_turbo(name) and _is_network(name)), key=lambda name: median[name])
     lower, upper = median[arms.LOWER.name], median[arms.UPPER.name]
-    gain = "lowers" if median[turbo] < lower else "does not lower"
-    best = min((name for name in arms.baselines() if name in median), key=lambda name: median[name])
-    return (
-        f"On {share.scene}, with {mix['n_measured']} of {metrics['n_train']} training spectra measured "
-        f"({share.percent}), turbo learning with {turbo.removeprefix(arms.TURBO)} {gain} the network's median "
-        f"great-circle error: "
-        f"{median[turbo]:.2f} degrees against {lower:.2f} without synthetic spectra and "
-        f"{upper:.2f} with all of them measured. The best baseline without a network, {best}, "
-        f"reaches {median[best]:.2f}. {metrics['n_test']} test spectra."
-    )
+    best = min(median, key=lambda name: median[name])
+    sentences = [
+        f"On {share.scene}, with {mix['n_measured']} of {metrics['n_train']} training spectra measured ({share.percent}), "
+        f"turbo learning ({turbo}) changes the network's median great-circle error by {median[turbo] / lower - 1:+.0%}: "
+        f"{median[turbo]:.2f} degrees against {lower:.2f} on the measured share alone and {upper:.2f} with everything "
+        "measured.",
+        f"The best of all arms is {best} with {median[best]:.2f}. {metrics['n_test']} test spectra.",
+    ]
+    return " ".join([*sentences, *filter(None, [advice_sentence(share)])])
+
+
+def _is_network(name: str) -> bool:
+    return arms.estimator_of(name) == arms.NETWORK
 
 
 def _results(share: Share, several: bool) -> Section:
@@ -60,7 +66,7 @@ def _results(share: Share, several: bool) -> Section:
         for name, arm in share.mix["methods"].items()
     ]
     columns = ["method", *(f"{name} [deg]" for name in ERRORS.values()), "great circle, 90 %"]
-    strong = frozenset(name for name in share.mix["methods"] if name.startswith(arms.TURBO))
+    strong = frozenset(name for name in share.mix["methods"] if arms.is_turbo(name))
     paragraphs = [arms.meaning()]
     if share.key in PAPER:
         elevation, azimuth = PAPER[share.key]
@@ -69,7 +75,9 @@ def _results(share: Share, several: bool) -> Section:
             "share, on its own 6,123 spectra and an unnamed split; the numbers are not comparable with these."
         )
     table = Table(columns, rows, "Median error with its 95 % interval over the test spectra.", strong)
-    return Section(title, paragraphs, [table], [_cdf(share)])
+    parts = [[name, *(str(n) for n in counts.values())] for name, counts in share.mix["counts"].items()]
+    origin = Table(["training set", "measured", "withheld positions", "further positions"], parts, "Spectra by origin.")
+    return Section(title, paragraphs, [table, origin], [_cdf(share)])
 
 
 def _with_interval(summary: ErrorSummary) -> str:
@@ -79,6 +87,7 @@ def _with_interval(summary: ErrorSummary) -> str:
 def _cdf(share: Share) -> Plot:
     table = share.run.table("errors")
     own = table[table["mix"] == float(share.key)]
+    own = own[[_is_network(name) or name in arms.baselines() for name in own["method"]]]  # more would hide each other
     figure, axes = figures.new_figure(1, 3, 10, 3.3)
     for ax, (column, name) in zip(axes, ERRORS.items(), strict=True):
         groups = {str(method): part[column] for method, part in own.groupby("method", sort=False)}
@@ -92,7 +101,10 @@ def _cdf(share: Share) -> Plot:
 
 
 def _over_shares(shares: list[Share]) -> Section:
-    names = dict.fromkeys(name for share in shares for name in share.mix["methods"] if name != OFF_SCALE)
+    every = (name for share in shares for name in share.mix["methods"])
+    names = dict.fromkeys(
+        name for name in every if name != OFF_SCALE and (_is_network(name) or name in arms.baselines())
+    )
     labels = [share.percent for share in shares]
     if len({place(share.run) for share in shares}) > 1:
         labels = [figures.plain(f"{s.percent}\n{s.run.metrics['data']}\n{s.run.metrics['split']}") for s in shares]
@@ -135,7 +147,7 @@ def _examples(share: Share) -> Section:
     figure = figures.spectra(example["measured"] / 255.0, example["synthetic"] / 255.0, captions)
     text = "From the best to the worst of the test spectra by PSNR (quantiles 1, 0.8, ..., 0); angles in degrees."
     return Section(
-        f"Six spectra at positions nobody measured ({share.title})",
+        f"Six spectra at positions nobody measured ({share.title}, {example.get('synthesizer', 'swiftwrf')})",
         plots=[Plot(f"spectra-{share.file_name}", figure, text)],
     )
 

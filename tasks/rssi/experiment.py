@@ -70,7 +70,6 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     train, test = data.split(config.split, config.seed)
     parallel = on_cluster(config.scheduler) if config.scheduler else map
     settings = Settings(validation_for(config.split), config.seed, config.preset, device, parallel, pool)
-    train.receivers(["all"])  # refuses receivers heard too rarely to learn from
     if not bool((~test.rssi_dbm.isnan()).any()):
         raise InputError(f"split {config.split!r} of {data.name} has no heard test rows for these receivers")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"

@@ -9,6 +9,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from sklearn.dummy import DummyRegressor
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 from sklearn.model_selection import GridSearchCV, PredefinedSplit
@@ -16,7 +17,7 @@ from sklearn.neighbors import KNeighborsRegressor
 from torch import Tensor
 
 from swiftwrf import Rssi, RssiConfig, RssiModel, fit_rssi
-from swiftwrf.data.splits import Validation, folds
+from swiftwrf.data.splits import MIN_TRAINING, Validation, folds
 from swiftwrf.registry import Registry
 from swiftwrf.rssi import Map, fit_law, log_distance
 
@@ -44,7 +45,7 @@ class Settings:
         preset: of SwiftWRF: `quick`, or `paper` for the plain head.
         device: where SwiftWRF computes.
         parallel: how SwiftWRF's groups of receivers are mapped.
-        pool: the training rows of every receiver of the data; those asked for unless given.
+        pool: the training rows at every receiver of the data; those asked for unless given.
     """
 
     validation: Validation = "random"
@@ -62,7 +63,8 @@ class Mean:
     """The mean of each receiver's training values, wherever the transmitter is."""
 
     def fit(self, train: Rssi) -> None:
-        self._mean = train.rssi_dbm.nanmean(dim=0)
+        # a receiver never heard in the training part has the mean of the others
+        self._mean = train.rssi_dbm.nanmean(dim=0).nan_to_num(float(train.rssi_dbm.nanmean()))
 
     def predict(self, position: Tensor) -> Tensor:
         return self._mean.expand(len(position), -1)
@@ -74,7 +76,8 @@ class LogDistance:
 
     Args:
         pooled: one law for all receivers.
-        pool: the rows it is fitted to; None: those that `fit` is given.
+        pool: the rows that the law of all is fitted to; None: those that `fit` is given. It also stands for the law of a
+            receiver never heard.
     """
 
     def __init__(self, pooled: bool, pool: Rssi | None = None) -> None:
@@ -83,8 +86,10 @@ class LogDistance:
     def fit(self, train: Rssi) -> None:
         self._receiver = train.receiver_position
         rows = self._pool or train
-        distance = log_distance(rows.transmitter_position, rows.receiver_position)
-        self._law = fit_law(distance, rows.rssi_dbm, pooled=self._pooled)
+        self._law = fit_law(log_distance(rows.transmitter_position, rows.receiver_position), rows.rssi_dbm, pooled=True)
+        if not self._pooled:
+            own = fit_law(log_distance(train.transmitter_position, self._receiver), train.rssi_dbm)
+            self._law = own.where((~train.rssi_dbm.isnan()).any(dim=0), self._law)
 
     def predict(self, position: Tensor) -> Tensor:
         return self._law(log_distance(position, self._receiver))
@@ -106,9 +111,19 @@ class _PerReceiver(ABC):
         fold = folds(train.transmitter_position, self._validation, self._seed).numpy()
         position = train.transmitter_position.numpy()
         self._regressors = []
+        typical = float(residual.nanmean())
         for values in residual.numpy().T:
             heard = ~np.isnan(values)
-            self._regressors.append(self._regressor(position[heard], values[heard], fold[heard]))
+            if heard.sum() < MIN_TRAINING:  # too few to choose anything: their mean, or that of all
+                level = float(values[heard].mean()) if heard.any() else typical
+                self._regressors.append(
+                    DummyRegressor(strategy="constant", constant=level).fit(position, 0 * position[:, 0])
+                )
+                continue
+            own = fold[heard]
+            if np.bincount(own).max() == len(own):  # heard in one region alone: no region is left to learn from
+                own = np.arange(len(own)) % (fold.max() + 1)
+            self._regressors.append(self._regressor(position[heard], values[heard], own))
 
     @abstractmethod
     def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
@@ -148,11 +163,19 @@ class GaussianProcess(_PerReceiver):
 class SwiftWRFPredictor:
     """The model of this package; all receivers at once."""
 
-    def __init__(self, config: RssiConfig, **options: Any) -> None:
-        self._config, self._options = config, options
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
 
     def fit(self, train: Rssi) -> None:
-        self.model: RssiModel = fit_rssi(train, self._config, **self._options)
+        given = self._settings
+        config = RssiConfig.paper if given.preset == "paper" else RssiConfig
+        self.model: RssiModel = fit_rssi(
+            train,
+            config(validation=given.validation, seed=given.seed),
+            pool=given.pool,
+            device=given.device,
+            parallel=given.parallel,
+        )
 
     def predict(self, position: Tensor) -> Tensor:
         return self.model.predict(position)[0]
@@ -160,15 +183,13 @@ class SwiftWRFPredictor:
 
 @PREDICTORS.register(
     "swiftwrf",
-    meaning="50 primitives a receiver on a 16 x 16 grid, averaged, on a log-distance law",
+    meaning="50 primitives a receiver on a 16 x 16 grid, averaged, on a log-distance law; "
+    "mixed with the laws and the mean as held-out rows say",
     needs=("positions of the receivers",),
     colour="#4477aa",
 )
 def _swiftwrf(settings: Settings) -> Predictor:
-    config = RssiConfig.paper if settings.preset == "paper" else RssiConfig
-    return SwiftWRFPredictor(
-        config(validation=settings.validation, seed=settings.seed), device=settings.device, parallel=settings.parallel
-    )
+    return SwiftWRFPredictor(settings)
 
 
 @PREDICTORS.register("mean", meaning="the mean of the receiver's training values", colour="#bbbbbb")

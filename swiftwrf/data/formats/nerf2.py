@@ -82,6 +82,8 @@ def _read(folder: Path) -> Spectra:
         index=torch.arange(len(position)),
         named_splits=splits,
         source={file.name: sha256(file) for file in described} | {"spectrum/*.png": digest},
+        fixed_position=fixed,
+        rotation=pose.rotation,
     )
 
 

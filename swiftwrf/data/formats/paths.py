@@ -89,6 +89,7 @@ def load_paths(folder: Path, grid: AngularGrid = GRID) -> Spectra:
     direction = offset / offset.norm(dim=1, keepdim=True)
     array = PlanarArray.square(ARRAY_SIDE, float(arrays["frequency_hz"]))
     moving: Moving = "receiver" if len(receiver.unique(dim=0)) >= len(transmitter.unique(dim=0)) else "transmitter"
+    fixed = transmitter if moving == "receiver" else receiver
     return Spectra(
         name=folder.resolve().name,
         position=receiver if moving == "receiver" else transmitter,
@@ -101,6 +102,8 @@ def load_paths(folder: Path, grid: AngularGrid = GRID) -> Spectra:
         named_splits={name: read_split(folder, name, len(count), first=1) for name in split_names(folder)},
         array=array,
         source={f.name: sha256(f) for f in [file, *sorted(folder.glob("*_index*.txt"))]},
+        fixed_position=fixed[0].double() if len(fixed.unique(dim=0)) == 1 else None,
+        rotation=torch.eye(3, dtype=torch.float64),
     )
 
 

@@ -60,4 +60,6 @@ def simulated_room(
         moving=moving,
         index=torch.arange(n),
         array=array,
+        fixed_position=fixed,
+        rotation=pose.rotation,
     )

@@ -1,0 +1,92 @@
+"""Walls found from spectra, how far they are off, and the spectra that follow from them at unseen positions.
+
+python benchmarks/geometry.py DATA   DATA holds newrf-bedroom and newrf-office
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from record import write_result
+
+from swiftwrf import Spectra, load_spectra, simulated_room
+from swiftwrf.geometry import GeometryModel, fit_geometry
+from swiftwrf.geometry.hybrid import fit_hybrid
+from swiftwrf.metrics import psnr, summary
+
+WALLS = {
+    "newrf-bedroom": [(0, -2.28), (0, 2.28), (1, -2.28), (1, 2.28), (2, 0.0), (2, 3.0)],
+    "newrf-office": [(0, 0.010), (0, 5.010), (1, 0.016), (1, 8.016), (2, 0.0), (2, 3.2)],
+    "simulated-room": [(0, 0.0), (0, 6.0), (1, 0.0), (1, 5.0), (2, 0.0), (2, 3.0)],
+}
+CASES = [
+    ("newrf-bedroom", "receiver", 1.0, 0),
+    *(("newrf-bedroom", "receiver", 0.1, draw) for draw in range(3)),
+    ("simulated-room", "transmitter", 0.3, 0),
+    ("simulated-room", "receiver", 0.3, 0),
+    ("newrf-office", "receiver", 1.0, 0),
+    *(("simulated-room", moving, 0.3, draw) for draw in (1, 2) for moving in ("transmitter", "receiver")),
+]
+
+
+def nearest(model: GeometryModel, axis: int, offset: float) -> dict[str, Any] | None:
+    """The plane found on the side of a true wall that is closest to it."""
+    side = [
+        (abs(p.offset_m * p.normal[axis] - offset), p)
+        for p in model.planes
+        if abs(p.normal[axis]) > 0.9 and p.normal[axis] * (offset - float(model.fixed_position[axis])) > 0
+    ]
+    if not side:
+        return None
+    error, plane = min(side, key=lambda s: s[0])
+    found = plane.offset_m * plane.normal[axis]
+    return {"found_m": found, "error_mm": 1000 * error, "std_mm": plane.std_mm, "certain": plane.certain}
+
+
+def measure(data: Spectra, share: float, draw: int) -> dict[str, Any]:
+    """Fits geometry and hybrid on a share of the training spectra."""
+    train, test = data.split("random")
+    order = torch.randperm(len(train), generator=torch.Generator().manual_seed(draw))
+    train = train.subset(order[: round(share * len(train))].sort().values)
+    began, cpu = time.perf_counter(), time.process_time()
+    model = fit_geometry(train, progress=False)
+    seconds, cpu_seconds = time.perf_counter() - began, time.process_time() - cpu
+    hybrid = fit_hybrid(train, model)
+    axes = "xyz"
+    walls = {f"{axes[a]} = {o}": nearest(model, a, o) for a, o in WALLS[data.name]}
+    return {
+        "positions": len(train),
+        "seconds": seconds,
+        "cpu_seconds": cpu_seconds,
+        "walls": walls,
+        "planes": len(model.planes),
+        "order": model.order,
+        "score_held_out": model.score_held_out,
+        "verdict": model.verdict,
+        "psnr_db": {
+            "geometry": summary(psnr(model.synthesize(test.position), test.spectrum)),
+            "sample": summary(psnr(model.synthesize(test.position, torch.Generator().manual_seed(0)), test.spectrum)),
+            "hybrid": summary(psnr(hybrid.synthesize(test.position), test.spectrum)),
+        },
+    }
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    folder, results = Path(sys.argv[1]), {}
+    for name, moving, share, draw in CASES:
+        data = simulated_room(moving=moving) if name == "simulated-room" else load_spectra(folder / name)
+        key = f"{name}, moving {moving}, {round(100 * share)} %, draw {draw}"
+        results[key] = measure(data, share, draw)
+        off = [None if w is None else round(w["error_mm"], 1) for w in results[key]["walls"].values()]
+        decibels = {k: round(v["median"], 2) for k, v in results[key]["psnr_db"].items()}
+        print(key, off, decibels, round(results[key]["cpu_seconds"], 1), "s", flush=True)
+        write_result("geometry", {"cases": results})  # after each, for the last ones take long
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,127 @@
+"""Geometry plus the smooth part of what it leaves: a Gaussian process on the difference of the spectra.
+
+    spectrum(s) = a geometry(s) + mean + k(s, training positions) w
+
+Where the planes explain only a part, their fringes are worth their share a: the least-squares share at training spectra
+that are held out from the process, hence never worse there than the better of the two parts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from swiftwrf.checkpoint import Header, Saved
+from swiftwrf.data.spectra import Spectra, check_training
+from swiftwrf.data.splits import Validation, folds
+from swiftwrf.geometry.model import GeometryModel
+from swiftwrf.gp import Kernel, choose_kernel, held_out_weights
+from swiftwrf.positions import check_positions
+
+COMPONENTS = 64  # principal components of the difference that are kept at most
+PIXELS = 4000  # of a spectrum that are enough to choose kernel and share
+FIRST = 0.7  # share with which the kernel is chosen
+
+
+@dataclass(frozen=True, eq=False)
+class HybridModel(Saved):
+    """What `fit_hybrid` returns.
+
+    Args:
+        geometry: the room.
+        share: of its spectra in the prediction, 0 to 1.
+        kernel: of the process, lengths in [m].
+        anchor: training positions, float64 (n, 3) [m].
+        readout: kernel weights to component scores, float32 (n, k).
+        component: the mean difference, then the components, float32 (1 + k, pixels).
+    """
+
+    kind: ClassVar[str] = "hybrid model"
+
+    geometry: GeometryModel
+    share: float
+    kernel: Kernel
+    anchor: Tensor
+    readout: Tensor
+    component: Tensor
+
+    @torch.no_grad()
+    def synthesize(self, position: Tensor, generator: torch.Generator | None = None, batch: int = 256) -> Tensor:
+        """Spectra at positions (n, 3) [m] of the moving end, float32 (n, n_elevation, n_azimuth) in [0, 1]; with a generator
+        the room's part is drawn.
+
+        Raises:
+            InputError: positions of another shape, or not finite.
+        """
+        position = check_positions(position)
+        spectrum = torch.empty(len(position), *self.geometry.grid.shape)
+        for start in range(0, len(position), batch):
+            rows = slice(start, start + batch)
+            score = self.kernel(position[rows], self.anchor).float() @ self.readout
+            smooth = (self.component[0] + score @ self.component[1:]).reshape(-1, *self.geometry.grid.shape)
+            sharp = self.share * self.geometry.synthesize(position[rows], generator) if self.share else 0.0
+            spectrum[rows] = (smooth + sharp).clamp(0, 1)
+        return spectrum
+
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        """All there is to save: tensors and plain values."""
+        tensors, values = self.geometry.state()
+        own = {"anchor": self.anchor, "readout": self.readout, "component": self.component}
+        return tensors | own, values | {"share": self.share, "kernel": asdict(self.kernel)}
+
+    @classmethod
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> HybridModel:
+        """The model that `state` described."""
+        own = {name: tensors[name] for name in ("anchor", "readout", "component")}
+        return cls(GeometryModel.from_state(tensors, header), header["share"], Kernel(**header["kernel"]), **own)
+
+
+def fit_hybrid(
+    train: Spectra, geometry: GeometryModel, *, validation: Validation = "random", seed: int = 0
+) -> HybridModel:
+    """Fits the process to what the room leaves of its own training spectra.
+
+    Args:
+        train: the only spectra it sees.
+        geometry: found from the same spectra.
+        validation: how they are held out to choose kernel and share.
+        seed: of what is held out.
+
+    Raises:
+        InputError: fewer than 10 spectra, or something not finite.
+    """
+    check_training(train)
+    seen, known = train.spectrum.flatten(1), geometry.synthesize(train.position).flatten(1)
+    fold = folds(train.position, validation, seed)
+    stride = max(1, seen.shape[1] // PIXELS) | 1
+    some, some_known = seen[:, ::stride], known[:, ::stride]
+    kernel = choose_kernel(train.position, (some - FIRST * some_known)[:, None], fold)
+    share, gains = _share(train.position, some, some_known, fold, kernel)
+    left = seen - share * known
+    if not gains:
+        nothing = torch.zeros(1, seen.shape[1])
+        return HybridModel(geometry, 1.0, kernel, train.position, torch.zeros(len(train), 0), nothing)
+    mean = left.mean(0)
+    value, vector = torch.linalg.eigh(((left - mean) @ (left - mean).T).double())
+    vector = vector[:, value > 1e-6 * value.sum()][:, -COMPONENTS:]
+    gram = kernel(train.position, train.position) + kernel.noise * torch.eye(len(train), dtype=torch.float64)
+    readout = torch.linalg.solve(gram, vector).float()
+    component = torch.cat([mean[None], vector.T.float() @ (left - mean)])
+    return HybridModel(geometry, share, kernel, train.position, readout, component)
+
+
+def _share(position: Tensor, seen: Tensor, known: Tensor, fold: Tensor, kernel: Kernel) -> tuple[float, bool]:
+    """The share of `known` (n, pixels) that leaves least of `seen` where it is held out from the process, in [0, 1], and
+    whether that, with the process, leaves less than `known` alone, by the mean logarithm of the squared error."""
+    missed, sharp = torch.empty_like(seen), torch.empty_like(known)
+    for out, kept, weight in held_out_weights(kernel, position, fold):
+        for x, left in ((seen, missed), (known, sharp)):
+            mean = x[kept].mean(0)
+            left[out] = x[out] - mean - weight.float() @ (x[kept] - mean)
+    power = float(sharp.square().sum())
+    share = min(1.0, max(0.0, float((missed * sharp).sum()) / power)) if power > 0 else 0.0
+    both, alone = ((x.square().mean(1) + 1e-9).log().mean() for x in (missed - share * sharp, seen - known))
+    return share, bool(both < alone)

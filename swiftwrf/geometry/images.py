@@ -1,0 +1,151 @@
+"""Image sources: where paths that mirror planes reflect seem to come from, and the waves they bring to the array.
+
+A path reflected by planes one after another arrives as if from the transmitter mirrored in them one after another, along a
+straight line (J. B. Allen and D. A. Berkley, J. Acoust. Soc. Am. 65, 1979). Everything is batched over rooms that have
+equally many planes; B rooms, P planes, S images, n positions, K elements.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from swiftwrf.arrays import PlanarArray
+
+RIGHT = 0.02  # |cosine| below which two planes count as perpendicular, above 1 - RIGHT**2 as parallel
+
+Sequence = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the waves depend on besides the planes, and what was observed.
+
+    Args:
+        transmitter, receiver: positions, float64 (n, 3) or, of the fixed end, (1, 3) [m].
+        element: phase that a wave from unit vector u gains at each element is element @ u, float32 (K, 3) [rad].
+        wavenumber: [rad / m].
+        channel: observed phases, complex64 (n, 2, K): of unit modulus, and the same seen by an array turned by half a turn.
+    """
+
+    transmitter: Tensor
+    receiver: Tensor
+    element: Tensor
+    wavenumber: float
+    channel: Tensor
+
+    @classmethod
+    def of(
+        cls, position: Tensor, fixed: Tensor, moving: str, array: PlanarArray, rotation: Tensor, channel: Tensor
+    ) -> Scene:
+        """The scene of a moving end at `position` (n, 3) [m] and a fixed one (3,) [m]; `channel` (n, K) of modulus 1."""
+        transmitter, receiver = (position, fixed[None]) if moving == "transmitter" else (fixed[None], position)
+        wavenumber = 2 * math.pi / array.wavelength
+        element = wavenumber * array.element.double() @ rotation[:, :2].T.double()
+        both = torch.stack([channel, channel.conj().flip(1)], dim=1)
+        return cls(transmitter, receiver, element.float(), wavenumber, both.to(torch.complex64))
+
+    def __len__(self) -> int:
+        return max(len(self.transmitter), len(self.receiver))
+
+    def subset(self, rows: Tensor) -> Scene:
+        """The given positions only."""
+        pick = [p[rows] if len(p) > 1 else p for p in (self.transmitter, self.receiver)]
+        return replace(self, transmitter=pick[0], receiver=pick[1], channel=self.channel[rows])
+
+    def wave(self, source: Tensor) -> Tensor:
+        """What each element hears from sources (..., n or 1, 3) [m]: exp(-j k d) / d, complex64 (..., n, K)."""
+        ray = (source - self.receiver).float()
+        length = ray.norm(dim=-1, keepdim=True)
+        phase = (ray / length) @ self.element.T - self.wavenumber * length
+        return torch.polar((1 / length).expand_as(phase), phase)
+
+    def coherence(self, field: Tensor) -> Tensor:
+        """|x^H h|^2 / K^2 of the observed and the given phases, (..., n, K) to (..., n), in [0, 1]; the better of the two
+        channels that the spectrum cannot tell apart counts."""
+        unit = field / field.abs().clamp_min(1e-12)
+        match = unit[..., None, :] @ self.channel.conj().transpose(-1, -2)
+        return match[..., 0, :].abs().square().amax(-1) / field.shape[-1] ** 2
+
+    def score(self, field: Tensor) -> Tensor:
+        """1 - the mean coherence: 0 where all phases agree, (..., n, K) to (...)."""
+        return 1 - self.coherence(field).mean(-1)
+
+
+def sequences(normal: Tensor, order: int) -> list[Sequence]:
+    """Which planes, one after another, make the images up to `order`, of planes with outward normals (P, 3).
+
+    Planes that face alike cannot reflect each other's images, and of perpendicular ones both orders give one image.
+    """
+    cosine = (normal @ normal.T).tolist()
+    planes = range(len(normal))
+    found: list[Sequence] = [(i,) for i in planes]
+    last = found
+    for _ in range(order - 1):
+        last = [
+            (*s, i)
+            for s, i in itertools.product(last, planes)
+            if cosine[s[-1]][i] < 1 - RIGHT**2 and i != s[-1] and not (abs(cosine[s[-1]][i]) < RIGHT and i < s[-1])
+        ]
+        found = found + last
+    return found
+
+
+def mirror(source: Tensor, normal: Tensor, offset: Tensor) -> Tensor:
+    """Sources (..., 3) [m] mirrored in planes normal . x = offset; the shapes (..., 3) and (...) broadcast."""
+    distance = (source * normal).sum(-1, keepdim=True) - offset[..., None]
+    return source - 2 * distance * normal
+
+
+def images(scene: Scene, normal: Tensor, offset: Tensor, sequence: list[Sequence]) -> Tensor:
+    """Where the images are, float64 (B, S, n or 1, 3) [m], in planes (B, P, 3) and (B, P) [m]."""
+    found: dict[Sequence, Tensor] = {(): scene.transmitter.expand(len(normal), -1, -1)}
+    for s in sequence:
+        for end in range(1, len(s) + 1):
+            if s[:end] not in found:
+                i = s[end - 1]
+                found[s[:end]] = mirror(found[s[: end - 1]], normal[:, i, None], offset[:, i, None])
+    return torch.stack([found[s] for s in sequence], dim=1)
+
+
+def field(scene: Scene, normal: Tensor, offset: Tensor, gain: Tensor, sequence: list[Sequence]) -> Tensor:
+    """Sum of the waves of the given images, complex64 (B, n, K); gains (B, P), real or complex."""
+    if not sequence:
+        shape = (len(normal), len(scene), len(scene.element))
+        return torch.zeros(shape, dtype=torch.complex64)
+    source = images(scene, normal, offset, sequence)
+    strength = image_gain(gain, sequence)[..., None] * visibility(scene, normal, offset, sequence, source)
+    wave = scene.wave(source)
+    return torch.einsum("bsnk,bsn->bnk", wave, strength.to(wave.dtype).expand(wave.shape[:3]))
+
+
+def image_gain(gain: Tensor, sequence: list[Sequence]) -> Tensor:
+    """Product of the gains (B, P) along each sequence, (B, S)."""
+    return torch.stack([gain[:, list(s)].prod(dim=1) for s in sequence], dim=1)
+
+
+def visibility(scene: Scene, normal: Tensor, offset: Tensor, sequence: list[Sequence], source: Tensor) -> Tensor:
+    """Whether the path of each image (B, S, n or 1, 3) exists, float32 (B, S, n or 1).
+
+    Between planes that are parallel or perpendicular all do, since the region is inside of all planes. Elsewhere the path
+    is followed back from the receiver: it must meet its last plane coming from the inside, and so on.
+    """
+    cosine = (normal @ normal.mT).abs()
+    if not bool(((cosine > RIGHT) & (cosine < 1 - RIGHT**2)).any()):
+        return torch.ones(source.shape[:2])[..., None]
+    row = {s: number for number, s in enumerate(sequence)}
+    there = torch.ones(*source.shape[:2], len(scene))
+    for number, s in enumerate(sequence):
+        point = scene.receiver.expand(len(normal), -1, -1)
+        for end in range(len(s), 0, -1):
+            n, o = normal[:, s[end - 1], None], offset[:, s[end - 1], None]
+            towards = source[:, row[s[:end]]] - point
+            before, slope = o - (point * n).sum(-1), (towards * n).sum(-1)
+            share = before / slope
+            there[:, number] *= ((share > 0) & (share < 1)).float()
+            point = point + share[..., None] * towards
+    return there

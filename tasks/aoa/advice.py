@@ -1,0 +1,72 @@
+"""Does turbo learning help here? Cross-validation inside the measured share, before anybody measures more.
+
+The stand-in for the network is kernel ridge regression, which trains in a second; what it gains from synthetic spectra is
+what there is to gain. Nothing withheld and no test spectrum is seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from augment import Mixed, Trial, draw_places
+from swiftwrf.metrics import angle_errors
+from tasks.aoa.estimators import ESTIMATORS, Settings
+from tasks.metrics import AdviceMetrics, ChangeMetrics, GainMetrics
+
+STAND_IN = "kernel_ridge"
+NUMBERS = (300, 1000, 3000)  # of further positions that are compared
+DRAWS = 2000  # of the bootstrap
+
+
+def advise(trials: Sequence[Trial], settings: Settings, extra: int) -> AdviceMetrics:
+    """What turbo learning gains on held-out measured spectra.
+
+    Args:
+        trials: synthesizers with the measured spectra that they saw and those held out from them.
+        settings: of the stand-in.
+        extra: number of further positions that the run adds; larger numbers are not compared.
+    """
+    alone = np.concatenate([_errors(trial, 0, False, settings) for trial in trials])
+    gains: list[GainMetrics] = []
+    for sampled in (False, True) if trials[0].synthesizer.samples else (False,):
+        for number in sorted({*(n for n in NUMBERS if n < extra), extra} - {0}):
+            with_extra = np.concatenate([_errors(trial, number, sampled, settings) for trial in trials])
+            gains.append({"extra": number, "sampled": sampled, **_paired(alone, with_extra)})
+    best = min(gains, key=lambda gain: gain["median_deg"], default=None)
+    return {
+        "stand_in": STAND_IN,
+        "n_held_out": len(alone),
+        "measured_only_deg": float(np.median(alone)),
+        "gains": gains,
+        "sampled": bool(best and best["sampled"]),
+        "recommended_extra": best["extra"] if best and best["change"] < 0 else 0,
+        "helps": bool(best and best["high"] < 0),
+    }
+
+
+def _errors(trial: Trial, extra: int, sampled: bool, settings: Settings) -> NDArray[np.float64]:
+    """Great-circle errors of the stand-in on the held-out spectra [deg], trained with so many synthetic ones."""
+    mixed = Mixed.measured(trial.kept)
+    if extra:
+        places = draw_places(trial.kept, extra, settings.seed)
+        generator = torch.Generator().manual_seed(settings.seed) if sampled else None
+        mixed = mixed.add(places, trial.synthesizer.synthesize(places.position, generator))
+    stand_in = ESTIMATORS[STAND_IN].make(settings)
+    stand_in.fit(mixed)
+    errors = angle_errors(stand_in.estimate(trial.out.spectrum), trial.out.label)["great_circle"].rad2deg()
+    return cast(NDArray[np.float64], errors.double().numpy())
+
+
+def _paired(alone: NDArray[np.float64], turbo: NDArray[np.float64]) -> ChangeMetrics:
+    """Median with synthetic spectra, its relative change against the median without, and the 95 % bootstrap interval of
+    that change over held-out spectra."""
+    rows = np.random.default_rng(0).integers(len(alone), size=(DRAWS, len(alone)))
+    medians = np.median(turbo[rows], axis=1), np.median(alone[rows], axis=1)
+    low, high = np.percentile(medians[0] / np.maximum(medians[1], 1e-9) - 1, (2.5, 97.5))
+    change = float(np.median(turbo) / max(float(np.median(alone)), 1e-9) - 1)
+    return {"median_deg": float(np.median(turbo)), "change": change, "low": float(low), "high": float(high)}

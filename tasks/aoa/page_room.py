@@ -1,0 +1,206 @@
+"""The report's sections on the synthesizer: why it was chosen, what it gains, the room it found."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from augment import SYNTHESIZERS
+from tasks.aoa import arms
+from tasks.aoa.share import Share
+from tasks.metrics import AdviceMetrics, GainMetrics
+from tasks.page import figures
+from tasks.page.page import Plot, Section, Table
+from tasks.page.provenance import number
+
+MARGIN = 0.5  # [m] that a plan shows beyond the room
+FIXED, MEASURED, IMAGE = "#cc3311", "#4477aa", "#ee8866"
+
+
+def advice_sentence(share: Share) -> str | None:
+    """Whether turbo learning helps, in a sentence; None where nothing was compared."""
+    advice = share.mix["advice"]
+    if advice is None or not advice["gains"]:
+        return None
+    best = min(advice["gains"], key=lambda gain: gain["median_deg"])
+    change = f"{best['change']:+.0%} [{best['low']:+.0%}, {best['high']:+.0%}]"
+    found = (
+        f"Cross-validation inside the measured share ({advice['n_held_out']} spectra held out, {advice['stand_in']} as "
+        f"stand-in for the network): {best['extra']} synthetic spectra {'drawn' if best['sampled'] else 'predicted'} at "
+        f"further positions change the median error by {change}, from {advice['measured_only_deg']:.2f} to "
+        f"{best['median_deg']:.2f} degrees."
+    )
+    if advice["helps"]:
+        return f"{found} Turbo learning helps here: use --extra {advice['recommended_extra']} with this share."
+    if best["low"] > 0:
+        return f"{found} Turbo learning harms here: measure more instead, or use another synthesizer."
+    return f"{found} The interval includes no gain: more measured positions are the safer way."
+
+
+def choice_section(share: Share) -> Section | None:
+    """Which synthesizer was taken, and what it gains over the number of further positions."""
+    choice, advice = share.mix["choice"], share.mix["advice"]
+    if choice is None or advice is None:
+        return None
+    rows = [
+        [name, number(db, 1), number(choice["seconds"].get(name), 1)]
+        for name, db in sorted(choice["psnr_db"].items(), key=lambda item: -item[1])
+    ]
+    table = Table(
+        ["synthesizer", "held-out PSNR [dB]", "seconds"],
+        rows,
+        "Median over measured spectra that were held out from each candidate.",
+        frozenset({choice["name"]}),
+    )
+    text = f"{choice['name']} predicts held-out measured spectra best: {SYNTHESIZERS[choice['name']].meaning}."
+    sentence = advice_sentence(share)
+    plots = [_gain(share, advice)] if advice["gains"] else []
+    paragraphs = [text, *([sentence] if sentence else [])]
+    return Section(f"Which synthesizer, and does it help? ({share.percent} measured)", paragraphs, [table], plots)
+
+
+def _gain(share: Share, advice: AdviceMetrics) -> Plot:
+    figure, axes = figures.new_figure(1, 1, 7, 3.2)
+    ax = axes[0]
+    name = share.mix["choice"]["name"] if share.mix["choice"] else ""
+    colour = arms.palette().colour(name)
+    for sampled, line, label in ((False, "-", "most plausible spectra"), (True, "--", "drawn spectra")):
+        gains = [gain for gain in advice["gains"] if gain["sampled"] == sampled]
+        if gains:
+            at = [0, *(gain["extra"] for gain in gains)]
+            ax.plot(
+                at, [0, *(100 * g["change"] for g in gains)], line, marker="o", markersize=4, color=colour, label=label
+            )
+            ax.fill_between(at, *_band(gains), color=colour, alpha=0.12, linewidth=0)
+    ax.axhline(0, color="#aeb7c6", linewidth=1)
+    ax.set_xscale("symlog", linthresh=100)
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.set(xlabel="further positions with synthetic spectra", ylabel="change of the median error [%]")
+    figures.legend_below(figure, ax)
+    caption = (
+        f"Measured spectra held out, {advice['stand_in']} trained on the others and on synthetic ones; bands: 95 % "
+        "bootstrap intervals of the change. Below zero turbo learning helps."
+    )
+    return Plot(f"gain-{share.file_name}", figure, caption)
+
+
+def _band(gains: list[GainMetrics]) -> tuple[list[float], list[float]]:
+    return [0, *(100 * gain["low"] for gain in gains)], [0, *(100 * gain["high"] for gain in gains)]
+
+
+def room_section(share: Share) -> Section | None:
+    """The planes that the spectra show, in plan and in space; None where none were sought."""
+    file = share.run.folder / f"geometry-mix{share.key}.json"
+    if not file.is_file():
+        return None
+    room = json.loads(file.read_text())
+    title = f"The room that the spectra show ({share.percent} measured)"
+    if not room["planes"]:
+        return Section(title, ["No plane predicts held-out spectra: the direct path is all that was found."])
+    rows = [
+        [
+            _described(plane),
+            f"{plane['gain']:+.2f}",
+            number(plane["std_mm"], 1),
+            "certain" if plane["certain"] else "uncertain",
+        ]
+        for plane in room["planes"]
+    ]
+    table = Table(
+        ["plane", "gain", "deviation [mm]", ""],
+        rows,
+        f"Mirror planes; images up to order {room['order']}. Uncertain: another place explains the spectra nearly as "
+        "well, or held-out spectra hardly need the plane.",
+    )
+    text = (
+        f"1 - correlation with held-out spectra: {room['score_held_out']:.3f}; share of the spectra's power that the room "
+        f"leaves unexplained: {room['unexplained']:.0%}. The planes stand in geometry-mix{share.key}.json."
+    )
+    with np.load(share.run.folder / f"room-mix{share.key}.npz") as stored:
+        points = dict(stored)
+    plot = Plot(
+        f"room-{share.file_name}",
+        _room_figure(room["planes"], points),
+        "In plan and in space: the planes (dashed: uncertain), measured positions, the fixed end and its images of first "
+        "order. The images of a moving transmitter are those of the array that sees it.",
+    )
+    return Section(title, [text], [table], [plot])
+
+
+def _described(plane: dict[str, Any]) -> str:
+    normal = np.array(plane["normal"])
+    axis = int(np.abs(normal).argmax())
+    if abs(normal[axis]) > 1 - 1e-6:
+        return f"{'xyz'[axis]} = {plane['offset_m'] * normal[axis]:.3f} m"
+    return f"({', '.join(f'{x:.3f}' for x in normal)}) . x = {plane['offset_m']:.3f} m"
+
+
+def _room_figure(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> Figure:
+    figure, axes = figures.new_figure(1, 2, 11, 5)
+    low, high = _extent(planes, points)
+    plan = axes[0]
+    for plane in planes:
+        _draw_in_plan(plan, plane, low, high)
+    first = points["order"] == 1
+    plan.plot(*points["measured"][:, :2].T, ".", color=MEASURED, markersize=2.5, label="measured positions")
+    plan.plot(*points["fixed"][:2], "*", color=FIXED, markersize=11, label="fixed end")
+    plan.plot(*points["image"][first][:, :2].T, "o", color=IMAGE, markersize=4, label="its images, first order")
+    plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    figures.legend_below(figure, plan)
+    axes[1].remove()
+    space: Any = figure.add_subplot(1, 2, 2, projection="3d")
+    for plane in planes:
+        _draw_in_space(space, plane, low, high)
+    space.scatter(*points["measured"].T, s=2, color=MEASURED)
+    space.scatter(*points["fixed"], s=60, marker="*", color=FIXED)
+    space.scatter(*points["image"][first].T, s=12, color=IMAGE)
+    space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    space.set_box_aspect(np.ptp(np.concatenate([points["image"][first], [low, high]]), axis=0) + 0.5)
+    return figure
+
+
+def _extent(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Opposite corners of the room as far as it is known [m]."""
+    inside = np.concatenate([points["measured"], points["fixed"][None]])
+    low, high = inside.min(axis=0) - MARGIN, inside.max(axis=0) + MARGIN
+    for plane in planes:
+        normal = np.array(plane["normal"])
+        axis = int(np.abs(normal).argmax())
+        at = plane["offset_m"] / normal[axis]
+        if abs(normal[axis]) > 0.99:
+            low[axis], high[axis] = min(low[axis], at), max(high[axis], at)
+    return low, high
+
+
+def _draw_in_plan(ax: Axes, plane: dict[str, Any], low: NDArray[Any], high: NDArray[Any]) -> None:
+    nx, ny, nz = plane["normal"]
+    if abs(nz) > 0.7:  # floors and ceilings are no lines in a plan
+        return
+    line = "-" if plane["certain"] else "--"
+    ends = [low - MARGIN, high + MARGIN]
+    height = (low[2] + high[2]) / 2
+    if abs(nx) >= abs(ny):
+        y = np.array([e[1] for e in ends])
+        x = (plane["offset_m"] - ny * y - nz * height) / nx
+    else:
+        x = np.array([e[0] for e in ends])
+        y = (plane["offset_m"] - nx * x - nz * height) / ny
+    ax.plot(x, y, line, color="#333333", linewidth=1.3)
+
+
+def _draw_in_space(ax: Any, plane: dict[str, Any], low: NDArray[Any], high: NDArray[Any]) -> None:
+    normal = np.array(plane["normal"])
+    axis = int(np.abs(normal).argmax())
+    others = [i for i in range(3) if i != axis]
+    corner = np.zeros((2, 2, 3))
+    corner[..., others[0]], corner[..., others[1]] = np.meshgrid(
+        [low[others[0]], high[others[0]]], [low[others[1]], high[others[1]]], indexing="ij"
+    )
+    corner[..., axis] = (plane["offset_m"] - corner[..., others] @ normal[others]) / normal[axis]
+    alpha = 0.12 if plane["certain"] else 0.05
+    ax.plot_surface(*np.moveaxis(corner, -1, 0), color="#333333", alpha=alpha, shade=False, edgecolor="#999999")

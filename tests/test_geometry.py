@@ -1,0 +1,238 @@
+"""Rooms in closed form found again, verdicts on what cannot be known, draws, state."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from swiftwrf import AngularGrid, InputError, Spectra, simulated_room
+from swiftwrf.arrays import PlanarArray
+from swiftwrf.geometry import GeometryConfig, GeometryModel, fit_geometry
+from swiftwrf.geometry.hybrid import HybridModel, fit_hybrid
+from swiftwrf.geometry.images import Scene, field, mirror, sequences
+from swiftwrf.geometry.observe import autocorrelation, correlations, element_phases
+from swiftwrf.geometry.refine import derivatives
+from swiftwrf.metrics import psnr
+
+GRID = AngularGrid.hemisphere(10, 40)
+ARRAY = PlanarArray.square(4, 915e6)
+QUICK = GeometryConfig(reach=2.0, width=2)
+SIX = {
+    (-1, 0, 0): 0.0,
+    (1, 0, 0): 5.0,
+    (0, -1, 0): 0.0,
+    (0, 1, 0): 4.0,
+    (0, 0, -1): 0.0,
+    (0, 0, 1): 2.8,
+}
+
+
+def spectra(
+    planes, gain=-0.6, moving="receiver", n=30, noise=0.0, low=(1.5, 1.2, 0.9), high=(3.5, 3.2, 1.6), array=ARRAY
+):
+    """Spectra in a room of the given planes (normal to offset), with images up to the second order and phase noise."""
+    generator = torch.Generator().manual_seed(0)
+    low, high = torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64)
+    position = low + (high - low) * torch.rand(n, 3, dtype=torch.float64, generator=generator)
+    fixed = torch.tensor([2.6, 2.2, 2.4 if moving == "receiver" else 0.3], dtype=torch.float64)
+    rotation = torch.eye(3, dtype=torch.float64)
+    scene = Scene.of(position, fixed, moving, array, rotation, torch.ones(n, len(array.element)))
+    normal = torch.nn.functional.normalize(torch.tensor(list(planes), dtype=torch.float64).reshape(-1, 3), dim=1)[None]
+    offset = torch.tensor([list(planes.values())], dtype=torch.float64)
+    chain = sequences(normal[0], 2) if planes else []
+    channel = scene.wave(scene.transmitter) + field(scene, normal, offset, torch.full(offset.shape, gain), chain)[0]
+    turn = noise * torch.randn(channel.shape, generator=generator)
+    return Spectra(
+        name="closed form",
+        position=position,
+        spectrum=array.spectrum(channel * torch.polar(torch.ones_like(turn), turn), GRID),
+        grid=GRID,
+        label=torch.zeros(n, 2, dtype=torch.float64),
+        line_of_sight=torch.ones(n, dtype=torch.bool),
+        moving=moving,
+        index=torch.arange(n),
+        array=array,
+        fixed_position=fixed,
+        rotation=rotation,
+    )
+
+
+def fit(data, **changes):
+    return fit_geometry(data, replace(QUICK, **changes), progress=False)
+
+
+def errors(model, planes):
+    """Distance of each true plane from the found one with that normal [mm], and that one's deviation [mm]."""
+    found = []
+    for normal, offset in planes.items():
+        unit = torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
+        near = max(model.planes, key=lambda p: float(torch.tensor(p.normal, dtype=torch.float64) @ unit))
+        found.append((1000 * abs(near.offset_m - offset), near.std_mm))
+    return found
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    return spectra(SIX, noise=0.1)
+
+
+@pytest.fixture(scope="module")
+def room(noisy):
+    return fit(noisy)
+
+
+def test_phases_of_the_elements_follow_from_the_spectra():
+    generator = torch.Generator().manual_seed(0)
+    angle = 3 * torch.randn(30, 16, dtype=torch.float64, generator=generator)
+    channel = torch.polar(torch.ones_like(angle), angle)
+    data = replace(spectra({}, n=30), spectrum=ARRAY.spectrum(channel, GRID))
+    torch.testing.assert_close(correlations(data), autocorrelation(channel, ARRAY), atol=1e-5, rtol=0)
+    found, error = element_phases(correlations(data), ARRAY)
+    match = torch.stack([(channel.conj() * f).mean(1).abs() for f in (found, found.conj().flip(1))]).amax(0)
+    assert float(error.max()) < 1e-3
+    assert float(match.min()) > 0.999
+
+
+def test_derivatives_of_the_field_are_its_differences():
+    data = spectra(SIX, n=5)
+    scene = Scene.of(data.position, data.fixed_position, "receiver", ARRAY, data.rotation, torch.ones(5, 16))
+    normal = torch.tensor([list(SIX)], dtype=torch.float64)
+    offset, gain = torch.tensor([list(SIX.values())], dtype=torch.float64), torch.full((1, 6), -0.6)
+    chain, step = sequences(normal[0], 2), 1e-3
+    _, change = derivatives(scene, normal, offset, gain, chain, tilt=True)
+    across = torch.linalg.svd(normal[:, :, None]).Vh[:, :, 1:]
+    for plane in (0, 3):
+        for q in range(4):
+            moved = []
+            for side in (-step, step):
+                n, o, g = normal.clone(), offset.clone(), gain.clone()
+                if q == 0:
+                    o[0, plane] += side
+                elif q == 1:
+                    g[0, plane] += side
+                else:
+                    n[0, plane] += side * across[0, plane, q - 2]
+                moved.append(derivatives(scene, n, o, g, chain, tilt=False)[0])
+            difference = (moved[1] - moved[0]) / (2 * step)
+            assert float((change[:, q, plane] - difference).norm() / difference.norm()) < 0.02
+
+
+def test_mirroring_twice_returns():
+    point = torch.randn(4, 3, dtype=torch.float64)
+    normal = torch.nn.functional.normalize(torch.randn(4, 3, dtype=torch.float64), dim=1)
+    offset = torch.randn(4, dtype=torch.float64)
+    torch.testing.assert_close(mirror(mirror(point, normal, offset), normal, offset), point)
+
+
+@pytest.mark.parametrize(
+    ("planes", "gain", "moving"),
+    [
+        ({(1, 0, 0): 4.6}, -0.7, "receiver"),
+        ({(1, 0, 0): 4.6, (0, 0, -1): 0.0}, 0.8, "transmitter"),
+        (SIX, -0.6, "transmitter"),
+    ],
+    ids=["one", "two", "six"],
+)
+def test_rooms_without_noise_are_found_to_a_millimetre(planes, gain, moving):
+    model = fit(spectra(planes, gain, moving, n=40))
+    assert len(model.planes) == len(planes)
+    assert max(e for e, _ in errors(model, planes)) < 1
+    assert all(abs(p.gain - gain) < 0.02 and p.certain for p in model.planes)
+    assert model.order == (1 if len(planes) == 1 else 2)
+
+
+def test_a_tilted_plane_is_found_to_a_millimetre():
+    model = fit(spectra({(0.8, 0.5, 0.1): 5.0}, -0.7, n=60), width=1)
+    assert len(model.planes) == 1
+    assert errors(model, {(0.8, 0.5, 0.1): 5.0})[0][0] < 1
+    torch.testing.assert_close(
+        torch.tensor(model.planes[0].normal), torch.tensor([0.8433, 0.5270, 0.1054]), atol=1e-3, rtol=0
+    )
+
+
+def test_nothing_to_find_is_no_plane():
+    model = fit(spectra({}))
+    assert model.planes == []
+    assert "no plane" in model.verdict
+    assert len(model.image_sources()[0]) == 1
+
+
+def test_noise_stays_within_the_deviations(room):
+    assert len(room.planes) == 6
+    assert all(error < 4 * std and error < 20 for error, std in errors(room, SIX))
+
+
+def test_positions_in_a_plane_leave_no_plane_certain():
+    model = fit(spectra(SIX, noise=0.1, n=24, low=(1.5, 1.2, 1.2), high=(3.5, 3.2, 1.2)), further=0, width=1)
+    assert not any(p.certain for p in model.planes)
+    assert all(error < 3 * std for error, std in errors(model, SIX) if model.planes)
+
+
+def test_pure_noise_has_no_certain_plane():
+    generator = torch.Generator().manual_seed(0)
+    data = spectra({}, n=30)
+    channel = torch.randn(30, 16, dtype=torch.complex128, generator=generator)
+    model = fit(replace(data, spectrum=ARRAY.spectrum(channel, GRID)), further=0, width=1)
+    assert not any(p.certain for p in model.planes)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"array": None}, "which array"),
+        ({"rotation": None}, "how the array is turned"),
+        ({"fixed_position": None}, "fixed end"),
+        ({"array": PlanarArray.square(4, 915e6, spacing=0.11)}, "check its geometry and carrier"),
+    ],
+)
+def test_refusals_say_what_is_missing(change, message):
+    with pytest.raises(InputError, match=message):
+        fit(replace(spectra(SIX, n=12), **change))
+
+
+def test_few_spectra_are_refused():
+    with pytest.raises(InputError, match="at least 10"):
+        fit(spectra(SIX, n=9))
+
+
+def test_the_same_seed_finds_the_same_room_and_draws_the_same_spectra(noisy, room):
+    few = noisy.subset(torch.arange(12))
+    assert fit(few, width=1, further=0).to_json() == fit(few, width=1, further=0).to_json()
+    drawn = [room.synthesize(noisy.position[:5], torch.Generator().manual_seed(s)) for s in (1, 1, 2)]
+    assert torch.equal(drawn[0], drawn[1])
+    assert not torch.equal(drawn[0], drawn[2])
+
+
+def test_draws_differ_from_the_mean_as_much_as_measurements_do(noisy, room):
+    mean = room.synthesize(noisy.position)
+    drawn = room.synthesize(noisy.position, torch.Generator().manual_seed(0))
+    assert mean.shape == drawn.shape == noisy.spectrum.shape
+    assert abs(float(psnr(drawn, mean).median() - psnr(noisy.spectrum, mean).median())) < 4
+
+
+def test_state_returns_the_same_model(noisy, room):
+    again = GeometryModel.from_state(*room.state())
+    assert again.to_json() == room.to_json()
+    assert torch.equal(again.synthesize(noisy.position), room.synthesize(noisy.position))
+
+
+def test_json_and_images_describe_the_room(room):
+    content = room.to_json()
+    assert set(content) == {"planes", "order", "score_held_out", "unexplained"}
+    assert set(content["planes"][0]) == {"normal", "offset_m", "gain", "std_mm", "certain"}
+    position, gain, order = room.image_sources()
+    assert len(position) == len(gain) == len(order) == 25
+    assert torch.equal(position[0], room.fixed_position)
+
+
+def test_hybrid_is_not_worse_than_geometry():
+    data = simulated_room(n=60, grid=GRID)
+    train, test = data.split("random")
+    room = fit(train, further=0, width=1)
+    hybrid = fit_hybrid(train, room)
+    gained = psnr(hybrid.synthesize(test.position), test.spectrum) - psnr(room.synthesize(test.position), test.spectrum)
+    assert float(gained.mean()) > -0.5
+    again = HybridModel.from_state(*hybrid.state())
+    assert torch.equal(again.synthesize(test.position), hybrid.synthesize(test.position))
