@@ -18,14 +18,18 @@ from swiftwrf import (
     FitConfig,
     ModelConfig,
     Rssi,
+    RssiModel,
     Spectra,
     fit,
     fit_coarray,
+    fit_rssi,
     load,
     load_rssi,
     load_spectra,
+    rssi_room,
     simulated_room,
 )
+from swiftwrf.geometry import fit_geometry, fit_hybrid
 from swiftwrf.model import SwiftWRF
 
 N = 12
@@ -76,6 +80,18 @@ def model_coarray(folder: Path) -> None:
     fit_coarray(_room(), progress=False).save(folder / "model")
 
 
+def model_geometry(folder: Path) -> None:
+    fit_geometry(_room(), progress=False).save(folder / "model")
+
+
+def model_hybrid(folder: Path) -> None:
+    fit_hybrid(_room(), fit_geometry(_room(), progress=False)).save(folder / "model")
+
+
+def model_rssi(folder: Path) -> None:
+    fit_rssi(rssi_room(n=40).receivers(["1", "2"])).save(folder / "model")
+
+
 def state_of_a_fit(folder: Path) -> None:
     fit(_room(), TINY, progress=False, checkpoint=folder / "state")
 
@@ -96,7 +112,8 @@ def read_rssi(folder: Path) -> Rssi:
 
 
 def read_model(folder: Path) -> object:
-    drawn = load(folder / "model").synthesize(torch.tensor([[3.0, 2.5, 1.2]]))  # type: ignore[attr-defined]
+    model, position = load(folder / "model"), torch.tensor([[3.0, 2.5, 1.2]])
+    drawn = torch.cat(model.predict(position)) if isinstance(model, RssiModel) else model.synthesize(position)
     assert drawn.isfinite().all()
     return drawn
 
@@ -111,5 +128,8 @@ KINDS: dict[str, tuple[Callable[[Path], None], Reader]] = {
     "format of RSSI nerf2": (rssi_nerf2, read_rssi),
     "swiftwrf model": (model_swiftwrf, read_model),
     "co-array model": (model_coarray, read_model),
+    "geometry model": (model_geometry, read_model),
+    "hybrid model": (model_hybrid, read_model),
+    "rssi model": (model_rssi, read_model),
     "fit state": (state_of_a_fit, go_on),
 }
