@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from tasks.run import environment
+from tasks.environment import environment
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -18,13 +18,17 @@ from torch import Tensor
 from swiftwrf.errors import InputError
 
 TURN = 2 * math.pi
+MOST_PIXELS = 2**24  # of a spectrum
 
 
 @dataclass(frozen=True)
 class AngularGrid:
     """The directions of a spectrum's pixels: evenly spaced elevations, azimuths evenly spaced over the whole circle.
 
-    Rows are elevations, lowest first; columns are azimuths and periodic. All four numbers are in radians.
+    Rows are elevations, lowest first; columns are azimuths and periodic. All angles are in radians.
+
+    Raises:
+        InputError: no pixels or too many of them, or an angle that is not finite.
     """
 
     elevation_start: float
@@ -32,6 +36,18 @@ class AngularGrid:
     n_elevation: int
     azimuth_start: float
     n_azimuth: int
+
+    def __post_init__(self) -> None:
+        sizes, angles = (
+            (self.n_elevation, self.n_azimuth),
+            (self.elevation_start, self.elevation_step, self.azimuth_start),
+        )
+        if not all(isinstance(size, int) and size >= 1 for size in sizes) or math.prod(sizes) > MOST_PIXELS:
+            raise InputError(
+                f"a grid has whole numbers of rows and columns and at most {MOST_PIXELS} pixels, got {sizes}"
+            )
+        if not all(map(math.isfinite, angles)) or self.elevation_step <= 0:
+            raise InputError(f"a grid needs finite angles and a step above 0, got {angles} [rad]")
 
     @classmethod
     def degrees(cls, elevation: Iterable[float], azimuth: Iterable[float]) -> AngularGrid:
@@ -102,7 +118,7 @@ def _even_step(values: list[float], name: str) -> float:
     if len(values) < 2:
         raise InputError(f"a grid needs at least 2 {name}s, got {len(values)}")
     step = (values[-1] - values[0]) / (len(values) - 1)
-    if step <= 0 or any(abs(b - a - step) > 1e-6 * step for a, b in itertools.pairwise(values)):
+    if not step > 0 or not all(abs(b - a - step) <= 1e-6 * step for a, b in itertools.pairwise(values)):
         raise InputError(f"{name}s must ascend in even steps, got {values[:3]} ... {values[-1]} [degrees]")
     return step
 

@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from swiftwrf.angles import AngularGrid
+from swiftwrf.errors import InputError
 
 LIGHT_SPEED = 299_792_458.0  # [m / s]
+MOST_ELEMENTS = 4096  # of an array: what follows grows with their square
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,10 +23,23 @@ class PlanarArray:
     Args:
         element: positions (K, 2) [m], float64.
         wavelength: of the carrier [m].
+
+    Raises:
+        InputError: elements of another shape, no or too many of them, or something that is not finite.
     """
 
     element: Tensor
     wavelength: float
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.element.shape)
+        if len(shape) != 2 or shape[1] != 2 or not 1 <= shape[0] <= MOST_ELEMENTS:
+            raise InputError(f"an array has 1 to {MOST_ELEMENTS} elements at positions (K, 2), got shape {shape}")
+        if not bool(self.element.isfinite().all()) or not 0 < self.wavelength < math.inf:
+            raise InputError(
+                "an array's elements need finite positions [m] and its carrier a wavelength above 0 m, got "
+                f"{self.wavelength}"
+            )
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, PlanarArray) and self._content == other._content

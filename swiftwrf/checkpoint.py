@@ -6,15 +6,18 @@ Every fitted model is saved and opened the same way: it derives from `Saved`, an
 from __future__ import annotations
 
 import json
-import os
 from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
 
+import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
+from swiftwrf.durable import write_bytes
 from swiftwrf.errors import InputError
 
 FORMAT = 1
@@ -22,7 +25,7 @@ Header = dict[str, Any]  # values that JSON can carry
 
 
 def write(path: str | Path, kind: str, tensors: dict[str, Tensor], header: Header) -> None:
-    """Writes under a temporary name and renames, so that an interrupted write leaves the old file.
+    """Writes the file, or leaves the old one where the write is interrupted.
 
     Args:
         path: of the file.
@@ -30,35 +33,55 @@ def write(path: str | Path, kind: str, tensors: dict[str, Tensor], header: Heade
         tensors: by name.
         header: values that JSON can carry.
     """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     metadata = {"kind": kind, "format": str(FORMAT), "header": json.dumps(header)}
-    try:
-        save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, temporary, metadata)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    content = save({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, metadata)
+    write_bytes(Path(path), content)
 
 
 def read(path: str | Path, *kinds: str) -> tuple[str, dict[str, Tensor], Header]:
     """Kind, tensors and header of a file of one of the given kinds.
 
     Raises:
-        InputError: no such file, not a safetensors file, another kind or a newer format.
+        InputError: no such file, not a safetensors file, another kind or a newer format, or a number that is not finite.
     """
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
+            kind = metadata.get("kind", "something else")
+            if kind not in kinds or metadata.get("format") != str(FORMAT):
+                raise InputError(
+                    f"{path} holds {kind!r} in format {metadata.get('format')}; expected "
+                    f"{' or '.join(map(repr, kinds))} in format {FORMAT}"
+                )
+            header = json.loads(metadata.get("header", ""))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-    except (OSError, SafetensorError) as error:
-        raise InputError(f"{path} is not a readable safetensors file ({error})") from None
-    kind = metadata.get("kind", "something else")
-    if kind not in kinds or metadata.get("format") != str(FORMAT):
-        raise InputError(
-            f"{path} holds {kind!r} in format {metadata.get('format')}; expected {' or '.join(map(repr, kinds))} in "
-            f"format {FORMAT}"
-        )
-    return kind, tensors, json.loads(metadata["header"])
+            for name, tensor in tensors.items():
+                if not bool(torch.isfinite(tensor).all()):
+                    raise InputError(
+                        f"{path}: {name} holds a value that is not finite, so nothing it gives can be trusted; make it anew"
+                    )
+    except InputError:
+        raise
+    except (OSError, SafetensorError, ValueError, RecursionError, RuntimeError, TypeError) as error:
+        raise InputError(f"{path} is not a readable safetensors file of this package ({error})") from None
+    if not isinstance(header, dict):
+        raise InputError(f"{path} has no header of names and values; it was changed or written by something else")
+    return kind, tensors, header
+
+
+def expect(tensors: dict[str, Tensor], shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Refuses tensors that are not there or of another shape than the header calls for.
+
+    What a header says is believed only after this: it may ask for gigabytes, the tensors lie in the file.
+
+    Raises:
+        InputError: the first such tensor.
+    """
+    for name, shape in shapes.items():
+        if name not in tensors:
+            raise InputError(f"{name} is missing")
+        if tuple(tensors[name].shape) != shape:
+            raise InputError(f"{name} has shape {tuple(tensors[name].shape)}, but the configuration calls for {shape}")
 
 
 class Saved(ABC):
@@ -79,7 +102,11 @@ class Saved(ABC):
     @classmethod
     @abstractmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Saved:
-        """The model of which `state` gave these."""
+        """The model of which `state` gave these.
+
+        Raises:
+            InputError: they do not fit together; found before memory is taken for what the header claims.
+        """
 
     def save(self, path: str | Path, provenance: dict[str, str] | None = None) -> None:
         """Writes the model to one safetensors file, its configuration and `provenance` in the header."""
@@ -91,7 +118,27 @@ def load(path: str | Path) -> Saved:
     """The model that was saved there, of whatever kind.
 
     Raises:
-        InputError: not such a file.
+        InputError: not such a file, or one whose parts do not fit together.
     """
-    kind, tensors, header = read(path, *Saved.kinds)
-    return Saved.kinds[kind].from_state(tensors, header)
+    return restore(path, *Saved.kinds)[0]
+
+
+def restore(path: str | Path, *kinds: str) -> tuple[Saved, Header]:
+    """The model that was saved there, of one of these kinds, and its header: the one way in for all of them.
+
+    Raises:
+        InputError: not such a file, or one whose parts do not fit together.
+    """
+    kind, tensors, header = read(path, *kinds)
+    with refusing(f"{path} is no {kind} that can be used"):
+        return Saved.kinds[kind].from_state(tensors, header), header
+
+
+@contextmanager
+def refusing(what: str) -> Iterator[None]:
+    """Says that what was kept on disk does not fit together, whatever part of it shows it first."""
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+        raise InputError(f"{what}: {reason}; it was changed or written by another version, make it anew") from None

@@ -15,23 +15,25 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor
 
 from swiftwrf.angles import AngularGrid
 from swiftwrf.arrays import PlanarArray
-from swiftwrf.checkpoint import Header, Saved, read
+from swiftwrf.checkpoint import Header, Saved, expect, refusing, restore
 from swiftwrf.data.spectra import Spectra, check_training, fingerprint
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel
-from swiftwrf.positions import check_positions
+from swiftwrf.positions import check_batch, check_drawn, check_positions
 from swiftwrf.progress import progress_bar
 from swiftwrf.threads import single_thread
 
 COMPONENTS = 64  # principal components of the training magnitudes that the model keeps at most
+DTYPES = {torch.float64: ("anchor", "readout"), torch.float32: ("offset", "form")}
+MOST = 2**28  # values of the functions on a grid: 2 GiB
 SAME = 1e-6  # differences closer than this share of a wavelength are one
 
 
@@ -48,7 +50,13 @@ def differences(array: PlanarArray) -> Tensor:
 @torch.inference_mode(False)  # what is kept must also serve calls that await gradients
 def basis(array: PlanarArray, grid: AngularGrid, dtype: torch.dtype = torch.float64) -> Tensor:
     """The functions that squared spectra consist of: 1, P cosines, P sines, (1 + 2 P, pixels); kept for the next call."""
-    phase = 2 * math.pi * differences(array) @ grid.direction[..., :2].reshape(-1, 2).T
+    between = differences(array)
+    if (values := (1 + 2 * len(between)) * math.prod(grid.shape)) > MOST:
+        raise InputError(
+            f"the {1 + 2 * len(between)} functions of this array take {values:.2g} values on a grid of {grid.shape}, more "
+            f"than {MOST:.2g}; take a coarser grid or an array of fewer elements"
+        )
+    phase = 2 * math.pi * between @ grid.direction[..., :2].reshape(-1, 2).T
     return torch.cat([torch.ones_like(phase[:1]), phase.cos(), phase.sin()]).to(dtype)
 
 
@@ -167,9 +175,10 @@ class CoarrayModel(Saved):
             Magnitudes in [0, 1], float32 (n, n_elevation, n_azimuth).
 
         Raises:
-            InputError: positions of another shape, or not finite.
+            InputError: positions of another shape, or not finite; a batch below 1.
         """
         position = check_positions(position)
+        check_batch(batch)
         grid = grid or self.grid
         functions = basis(self.array, grid, torch.float32)
         spectrum = torch.empty(len(position), functions.shape[1])
@@ -182,7 +191,7 @@ class CoarrayModel(Saved):
             if stretched:
                 drawn.sub_(offset)
             drawn.clamp_(0, 1)
-        return spectrum.reshape(-1, *grid.shape)
+        return check_drawn(spectrum).reshape(-1, *grid.shape)
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         names = ("anchor", "readout", "offset", "form")
@@ -191,9 +200,18 @@ class CoarrayModel(Saved):
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> CoarrayModel:
-        own = {name: tensors[name] for name in ("anchor", "readout", "offset", "form")}
         array = PlanarArray(tensors["element"], header["wavelength"])
-        return cls(array, AngularGrid(**header["grid"]), Kernel(**header["kernel"]), **own)
+        n, scores = len(tensors["anchor"]), tensors["readout"].shape[-1]
+        coefficients = 1 + 2 * len(differences(array))
+        shapes = {
+            "anchor": (n, 3),
+            "readout": (n, scores),
+            "offset": (1,),
+            "form": (coefficients, scores, scores),
+        }
+        expect(tensors, shapes)
+        double, single = ({name: tensors[name].to(dtype) for name in names} for dtype, names in DTYPES.items())
+        return cls(array, AngularGrid(**header["grid"]), Kernel(**header["kernel"]), **double, **single)
 
 
 def fit_coarray(
@@ -212,7 +230,7 @@ def fit_coarray(
         validation: how training spectra are held out to choose the kernel.
         seed: of what is held out.
         checkpoint: a file that keeps the fitted model; where it exists and is of these spectra, it is opened instead.
-        on_record: called once, with stage (final) and seconds.
+        on_record: called once, with stage (final), seconds and elapsed, those of the fit also where it is opened.
         progress: show a progress bar on a terminal.
 
     Raises:
@@ -223,20 +241,26 @@ def fit_coarray(
         raise InputError(f"{train.name} does not say which array took the spectra; give its geometry and carrier")
     owner = fingerprint(train, validation, seed)
     if checkpoint is not None and checkpoint.exists():
-        _, tensors, header = read(checkpoint, CoarrayModel.kind)
-        if header["provenance"] != {"fit": owner}:
+        kept, header = restore(checkpoint, CoarrayModel.kind)
+        provenance = header.get("provenance")
+        if not isinstance(provenance, dict) or provenance.get("fit") != owner:
             raise InputError(
                 f"{checkpoint} is of another fit (other spectra or settings); remove it or give another path"
             )
-        return CoarrayModel.from_state(tensors, header)
+        if on_record is not None:
+            with refusing(f"{checkpoint} is no co-array model that was kept by a fit"):
+                seconds = float(provenance["seconds"])
+            on_record({"stage": "final", "seconds": seconds, "elapsed": seconds})
+        return cast(CoarrayModel, kept)
     began = time.perf_counter()
     with progress_bar(progress) as bar:
         bar.add_task("co-array model", total=1)
         model = _solve(train, train.array, folds(train.position, validation, seed))
+    seconds = time.perf_counter() - began
     if checkpoint is not None:
-        model.save(checkpoint, {"fit": owner})
+        model.save(checkpoint, {"fit": owner, "seconds": repr(seconds)})
     if on_record is not None:
-        on_record({"stage": "final", "seconds": time.perf_counter() - began})
+        on_record({"stage": "final", "seconds": seconds, "elapsed": seconds})
     return model
 
 

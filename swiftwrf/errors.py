@@ -1,5 +1,17 @@
 """The two ways this package says no."""
 
+LONGEST = 300  # characters of a message: what came may be a megabyte long
+
+
+def one_line(message: str) -> str:
+    """The message without line breaks, its middle left out where it is too long: what is wrong stands at the beginning,
+    what to do at the end."""
+    line = " ".join(message.split())
+    if len(line) <= LONGEST:
+        return line
+    kept = LONGEST - len(" ... ")
+    return f"{line[: kept // 2]} ... {line[-(kept - kept // 2) :]}"
+
 
 class InputError(ValueError):
     """Wrong input: one sentence saying what was expected, what came and what to do.
@@ -7,6 +19,12 @@ class InputError(ValueError):
     Commands print the sentence and exit with code 2.
     """
 
+    def __init__(self, message: object) -> None:
+        super().__init__(one_line(str(message)))
+
 
 class FitError(RuntimeError):
     """A fit that cannot go on; the last good state is kept on disk where a checkpoint path was given."""
+
+    def __init__(self, message: object) -> None:
+        super().__init__(one_line(str(message)))

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
+from swiftwrf.errors import InputError
 from swiftwrf.positions import distance
 from swiftwrf.threads import single_thread
 
@@ -40,12 +41,20 @@ class Kernel:
         long, short: correlation lengths, in the unit of the positions.
         share: of the long part, in [0, 1].
         noise: variance of what is not a function of position, relative to k(0) = 1.
+
+    Raises:
+        InputError: a length, share or noise that makes no kernel.
     """
 
     long: float = 0.5
     short: float = 0.1
     share: float = 0.6
     noise: float = 1e-2
+
+    def __post_init__(self) -> None:
+        finite = all(map(math.isfinite, (self.long, self.short, self.share, self.noise)))
+        if not (finite and self.long > 0 and self.short > 0 and 0 <= self.share <= 1 and self.noise >= 0):
+            raise InputError(f"a kernel needs lengths above 0, a share in [0, 1] and a noise from 0, got {self}")
 
     def scaled(self, factor: float) -> Kernel:
         """The same kernel on positions multiplied by `factor`."""

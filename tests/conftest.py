@@ -11,9 +11,11 @@ import torch
 from swiftwrf import AngularGrid, Spectra, simulated_room
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skips what this machine cannot run, with the reason."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Skips what this machine cannot run and what is long, with the reason."""
     for item in items:
+        if item.get_closest_marker("fuzz") and "fuzz" not in config.option.markexpr:
+            item.add_marker(pytest.mark.skip(reason="long: run it with -m fuzz"))
         if "cuda" in item.keywords and not torch.cuda.is_available():
             item.add_marker(pytest.mark.skip(reason="needs an NVIDIA GPU"))
         if "data" in item.keywords and "SWIFTWRF_DATA" not in os.environ:

@@ -263,9 +263,9 @@ def test_report_refuses_unfinished_runs(tmp_path):
 
 
 def test_metrics_are_strict_json(tmp_path):
-    from tasks.run import _strict
+    from tasks.records import strict
 
-    assert _strict({"a": math.nan, "b": [math.inf, 1.0], "c": (1, 2)}) == {"a": None, "b": [None, 1.0], "c": [1, 2]}
+    assert strict({"a": math.nan, "b": [math.inf, 1.0], "c": (1, 2)}) == {"a": None, "b": [None, 1.0], "c": [1, 2]}
 
 
 def test_paper_preset_keeps_all_pixels():

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import io
+import math
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,50 +17,127 @@ from torch import Tensor
 
 from swiftwrf.errors import InputError
 
+MOST_BYTES = 2**28  # of a text file: a million rows of positions take a tenth of it
+FARTHEST = 1e9  # [m] from the origin: beyond, float64 no longer keeps a wavelength apart
+MOST_PIXELS = 2**29  # of all spectra of a data set: 2 GiB
+PLAIN_TAGS = {
+    f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "timestamp", "seq", "map")
+}
+
 
 def sha256(file: Path) -> str:
     """Hex digest of a file's bytes."""
-    return hashlib.sha256(file.read_bytes()).hexdigest()
+    return hashlib.sha256(read_bytes(file)).hexdigest()
 
 
-def read_yaml(file: Path) -> dict[str, object]:
-    """A YAML mapping, read without running code.
+def sha256_of_all(digests: Iterable[tuple[str, str]]) -> str:
+    """One digest for many files, of their names and digests."""
+    return hashlib.sha256("".join(f"{digest}  {name}\n" for name, digest in digests).encode()).hexdigest()
+
+
+def read_bytes(file: Path) -> bytes:
+    """The content of a file.
 
     Raises:
-        InputError: no such file, not YAML, not a mapping, or a name twice.
+        InputError: it is not there or may not be read.
     """
     if not file.is_file():
         raise InputError(f"{file} is missing")
     try:
-        text = file.read_text()
-        content, tree = yaml.safe_load(text), yaml.compose(text, Loader=yaml.SafeLoader)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{file} is not valid YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(content, dict) or not isinstance(tree, yaml.MappingNode):
+        return file.read_bytes()
+    except OSError as error:
+        reason = "no permission to read it" if isinstance(error, PermissionError) else error.strerror
+        raise InputError(f"{file} cannot be read ({reason})") from None
+
+
+def read_text(file: Path) -> str:
+    """A text in UTF-8, with or without a byte-order mark.
+
+    Raises:
+        InputError: no such file, one too large, or another encoding.
+    """
+    if file.is_file() and file.stat().st_size > MOST_BYTES:
+        raise InputError(f"{file} has {file.stat().st_size} bytes; a table or list has at most {MOST_BYTES}")
+    try:
+        text = read_bytes(file).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file} is no text in UTF-8 (byte {error.start + 1}); save it in that encoding") from None
+    if "\0" in text:
+        raise InputError(f"{file} is no text in UTF-8: it holds zero bytes; save it in that encoding")
+    return text
+
+
+def number(text: object) -> float:
+    """The number that a text says, nan where it says none: Python also takes 1_0 for 10."""
+    try:
+        return float(text) if isinstance(text, str) and "_" not in text else math.nan
+    except ValueError:
+        return math.nan
+
+
+def read_yaml(file: Path) -> dict[str, Any]:
+    """A YAML mapping; all that is no list or mapping is text, so that names are names whatever they look like and nothing
+    is read as a date.
+
+    Raises:
+        InputError: no such file, not YAML, not a mapping, a name twice, or a tag (YAML's way to make objects).
+    """
+    text = read_text(file)
+    try:
+        content = _plain(yaml.compose(text, Loader=yaml.SafeLoader), {})
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise InputError(f"{file} is not valid YAML: {error or 'nested too deeply'}") from None
+    if not isinstance(content, dict):
         raise InputError(f"{file} must hold names and values, got {type(content).__name__}")
-    names = [str(key.value) for key, _ in tree.value]
-    if len(set(names)) < len(names):  # YAML would silently keep the last
-        twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{file} names {twice!r} twice; each needs a name of its own")
     return content
+
+
+def _plain(node: yaml.Node | None, done: dict[int, Any]) -> Any:
+    """The text, list or mapping that a node describes; what is referred to twice is built once, or lists of references to
+    lists of references would grow without bound."""
+    if node is None or id(node) in done:
+        return done.get(id(node))
+    if node.tag not in PLAIN_TAGS:
+        raise ValueError(f"the tag {node.tag} is not allowed")
+    value: Any
+    if isinstance(node, yaml.MappingNode):
+        value = {}
+        for key, item in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise ValueError("a name must be text")
+            if key.value in value:  # YAML would silently keep the last
+                raise ValueError(f"it names {key.value!r} twice; each needs a name of its own")
+            value[key.value] = _plain(item, done)
+    else:
+        value = [_plain(item, done) for item in node.value] if isinstance(node, yaml.SequenceNode) else node.value
+    done[id(node)] = value
+    return value
+
+
+def numbers(value: Any, count: int) -> tuple[float, ...] | None:
+    """So many finite numbers from a list of `read_yaml`; None where it is something else."""
+    found = tuple(number(item) for item in value) if isinstance(value, list) and len(value) == count else (math.nan,)
+    return found if all(map(math.isfinite, found)) else None
 
 
 def read_table(file: Path, columns: list[str] | None = None) -> tuple[list[str], Tensor]:
     """Header and numbers of a comma-separated file, float64 (rows, columns); numbers may be nan.
 
     Raises:
-        InputError: no such file, another header than `columns`, a name twice, rows of unequal length, text in a
-            number's place, no rows.
+        InputError: no such file, another header than `columns`, a column without name or a name twice, rows of unequal
+            length, text in a number's place, no rows.
     """
-    if not file.is_file():
-        raise InputError(f"{file} is missing")
-    with file.open(newline="") as stream:
-        lines = [line for line in csv.reader(stream) if line]
+    try:
+        lines = [line for line in csv.reader(io.StringIO(read_text(file), newline="")) if line]
+    except csv.Error as error:
+        raise InputError(f"{file} is not a comma-separated table ({error})") from None
     if not lines:
         raise InputError(f"{file} is empty; expected a header and one row a measurement")
     header = [name.strip() for name in lines[0]]
     if columns is not None and header != columns:
         raise InputError(f"{file} must start with the header {','.join(columns)}, got {','.join(header)}")
+    if "" in header:
+        raise InputError(f"{file} has no name for column {header.index('') + 1}; give it one in the header")
     if len(set(header)) < len(header):
         twice = next(name for name in header if header.count(name) > 1)
         raise InputError(f"{file} names column {twice!r} twice; each needs a name of its own")
@@ -70,6 +151,8 @@ def read_table(file: Path, columns: list[str] | None = None) -> tuple[list[str],
             values[row - 1] = [float(text) for text in line]
         except ValueError:
             raise InputError(f"{file} row {row} holds text where a number is expected: {','.join(line)}") from None
+        if any("_" in text for text in line):  # Python takes 1_0 for 10
+            raise InputError(f"{file} row {row} holds text where a number is expected: {','.join(line)}")
     return header, torch.from_numpy(values)
 
 
@@ -77,11 +160,13 @@ def read_positions(file: Path) -> Tensor:
     """Positions, float64 (n, 3) [m], of a file with the header x,y,z.
 
     Raises:
-        InputError: as `read_table`, or a position that is not finite.
+        InputError: as `read_table`, or a position that is not finite or too far away.
     """
     _, position = read_table(file, ["x", "y", "z"])
-    bad = (~position.isfinite()).any(dim=1).nonzero()
+    bad = (~(position.abs() <= FARTHEST)).any(dim=1).nonzero()  # nan compares false, so it is bad too
     if len(bad):
         row = int(bad[0])
-        raise InputError(f"{file} row {row + 1} is {position[row].tolist()}; positions must be finite numbers [m]")
+        raise InputError(
+            f"{file} row {row + 1} is {position[row].tolist()}; positions must be finite numbers [m], at most {FARTHEST:g}"
+        )
     return position

@@ -8,10 +8,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from swiftwrf.data.files import read_text
 from swiftwrf.errors import InputError
 
 TEST_SHARE = 0.2
 MIN_TRAINING = 10
+MOST_DIGITS = 18  # of an index
 FOLDS = 5  # parts of the training rows that are held out in turn to choose settings
 
 Validation = Literal["random", "block"]
@@ -53,11 +55,11 @@ def _read_indices(file: Path, n: int, first: int) -> list[int]:
         raise InputError(f"split file {file} is missing; a split needs both its train_index and its test_index file")
     rows: list[int] = []
     seen: set[int] = set()
-    for line, text in enumerate(file.read_text().split(), start=1):
-        try:
-            row = int(text) - first
-        except ValueError:
-            raise InputError(f"{file} entry {line} is {text!r}; expected a whole number") from None
+    for line, text in enumerate(read_text(file).split(), start=1):
+        digits = text.lstrip("0") or "0"
+        if not (text.isascii() and text.isdecimal() and len(digits) <= MOST_DIGITS):
+            raise InputError(f"{file} entry {line} is {text!r}; expected a whole number, {first} to {n - 1 + first}")
+        row = int(digits) - first
         if not 0 <= row < n:
             raise InputError(
                 f"{file} entry {line} is {text}; expected {first} to {n - 1 + first}, the measurements there are"

@@ -45,7 +45,8 @@ def fit(
         device: where to compute.
         checkpoint: a file that keeps the state of the fit; where it exists, the fit goes on from it.
         on_record: called at each evaluation with stage (search, final), n_primitives, steps, step, loss, validation loss
-            (final stage: none) and seconds.
+            (final stage: none), seconds of that run and elapsed ones of the fit; a fit that goes on begins with the records
+            of its earlier sessions.
         progress: show a progress bar on a terminal.
 
     Raises:

@@ -11,15 +11,17 @@ import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from swiftwrf.checkpoint import refusing
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import FitError, InputError
 from swiftwrf.fitting.config import FitConfig
 from swiftwrf.fitting.loss import spectrum_loss
-from swiftwrf.fitting.state import Session, Size, State
+from swiftwrf.fitting.state import Record, Session, Size, State
 from swiftwrf.gp import Kernel, thinned
 from swiftwrf.model import SwiftWRF
 
 AVERAGING = 0.98  # a step's weight decays by this much a step: averaged parameters predict better than the last ones
+KEPT = {"step": int, "seconds": float, "first_loss": float}  # what is saved beside the tensors
 MAX_ANCHORS = 1000  # of the motion: a step costs their square
 
 
@@ -150,8 +152,9 @@ class Optimisation:
         Raises:
             FitError: it ended worse than it began.
         """
-        if session.saved is not None and session.saved.header["run"] == self.size.key:
-            self._restore(session.saved)
+        if session.saved is not None and session.saved.header.get("run") == self.size.key:
+            with refusing(f"{session.path} is no state that a fit can go on from"):
+                self._restore(session.saved)
         task = session.bar.add_task(str(self.size), total=self.steps, completed=self.step)
         began = time.perf_counter() - self.seconds
         while self.step < self.steps:
@@ -161,8 +164,7 @@ class Optimisation:
             session.bar.update(task, completed=self.step)
             if self._evaluates_after(self.step):
                 self.seconds = time.perf_counter() - began
-                self._keep(session)
-                self._record(session, loss)
+                session.evaluated(self._record(loss), *self._state())
                 if self.step == self.steps and float(loss) > self.first_loss:
                     raise FitError(
                         f"the fit ended with a loss of {float(loss):.3g}, worse than the {self.first_loss:.3g} it began "
@@ -171,31 +173,30 @@ class Optimisation:
         session.bar.remove_task(task)
         return self
 
-    def _record(self, session: Session, loss: Tensor) -> None:
-        if session.on_record is not None:
-            session.on_record(
-                {
-                    "stage": "final" if self.size.final else "search",
-                    "n_primitives": self.size.n_primitives,
-                    "steps": self.steps,
-                    "step": self.step,
-                    "loss": float(loss),
-                    "validation": self.held_out_loss() if self.held_out else None,
-                    "seconds": self.seconds,
-                }
-            )
+    def _record(self, loss: Tensor) -> Record:
+        return {
+            "stage": "final" if self.size.final else "search",
+            "n_primitives": self.size.n_primitives,
+            "steps": self.steps,
+            "step": self.step,
+            "loss": float(loss),
+            "validation": self.held_out_loss() if self.held_out else None,
+            "seconds": self.seconds,
+        }
 
-    def _keep(self, session: Session) -> None:
+    def _state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
         tensors |= {f"average.{name}": value for name, value in self.average.state_dict().items()}
         for number, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{number}.{name}": torch.as_tensor(value) for name, value in moments.items()}
-        header = {name: getattr(self, name) for name in ("step", "seconds", "first_loss")}
-        session.keep(tensors, header | {"run": self.size.key})
+        header = {name: getattr(self, name) for name in KEPT}
+        return tensors, header | {"run": self.size.key}
 
     def _restore(self, saved: State) -> None:
         header, tensors = saved.header, saved.tensors
-        self.step, self.seconds, self.first_loss = header["step"], header["seconds"], header["first_loss"]
+        self.step, self.seconds, self.first_loss = (kind(header[name]) for name, kind in KEPT.items())
+        if not 0 <= self.step <= self.steps:
+            raise InputError(f"its step {self.step} is none of {self.steps}")
         for prefix, module in (("model.", self.model), ("average.", self.average)):
             module.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
         state: dict[str, Any] = copy.deepcopy(self.optimiser.state_dict())

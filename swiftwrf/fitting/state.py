@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -58,6 +59,11 @@ class Session:
         on_record: is called at each evaluation.
         saved: the state of an earlier session of the same fit.
         losses: on held-out spectra, of runs that are done, by their key.
+        records: of all evaluations of the fit, those of earlier sessions first.
+        earlier: seconds that earlier sessions took, as far as their work was kept.
+
+    Raises:
+        InputError: a saved state that is damaged or of another fit.
     """
 
     path: Path | None
@@ -66,18 +72,43 @@ class Session:
     on_record: Callable[[Record], None] | None
     saved: State | None = None
     losses: dict[str, float] = field(default_factory=dict)
+    records: list[Record] = field(default_factory=list)
+    earlier: float = 0.0
+    began: float = field(default_factory=time.perf_counter)
 
     def __post_init__(self) -> None:
         if self.path is not None and self.path.exists():
             _, tensors, header = checkpoint.read(self.path, KIND)
-            if header["fingerprint"] != self.owner:
+            if header.get("fingerprint") != self.owner:
                 raise InputError(
                     f"{self.path} is the state of another fit (other spectra or settings); remove it or give another path"
                 )
-            self.saved, self.losses = State(header, tensors), header["losses"]
+            with checkpoint.refusing(f"{self.path} is no state that a fit can go on from"):
+                self.saved, self.losses = State(header, tensors), dict(header["losses"])
+                self.records, self.earlier = list(header["records"]), float(header["elapsed"])
+            for record in self.records:
+                self._inform(record)
 
-    def keep(self, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
-        """Writes the state of the run under way."""
+    @property
+    def elapsed(self) -> float:
+        """Seconds that the fit took so far, over all its sessions."""
+        return self.earlier + time.perf_counter() - self.began
+
+    def evaluated(self, record: Record, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
+        """Keeps the record of an evaluation with the state of the run under way, then informs: a history that is read
+        after an interruption has it once."""
+        record = record | {"elapsed": self.elapsed}
+        self.records.append(record)
         if self.path is not None:
-            shared = {"losses": self.losses, "fingerprint": self.owner}
+            shared = {
+                "losses": self.losses,
+                "fingerprint": self.owner,
+                "records": self.records,
+                "elapsed": self.elapsed,
+            }
             checkpoint.write(self.path, KIND, tensors, header | shared)
+        self._inform(record)
+
+    def _inform(self, record: Record) -> None:
+        if self.on_record is not None:
+            self.on_record(record)

@@ -10,11 +10,14 @@ from torch import Tensor
 
 from swiftwrf.angles import AngularGrid
 from swiftwrf.arrays import PlanarArray
-from swiftwrf.checkpoint import Header, Saved
+from swiftwrf.checkpoint import Header, Saved, expect
 from swiftwrf.data.spectra import Moving
+from swiftwrf.errors import InputError
 from swiftwrf.geometry.images import Scene, field, image_gain, images, sequences
 from swiftwrf.geometry.sample import Residual, draw
 from swiftwrf.positions import check_positions
+
+MOST_PLANES, MOST_ORDER = 64, 4  # of a room in a file
 
 
 @dataclass(frozen=True)
@@ -157,7 +160,18 @@ class GeometryModel(Saved):
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> GeometryModel:
-        """The model that `state` described."""
+        """The model that `state` described.
+
+        Raises:
+            InputError: tensors or an order that no room has; image sources grow with the planes to the power of the order.
+        """
+        n_planes, order = len(header["planes"]), header["order"]
+        expect(tensors, {"rotation": (3, 3), "fixed_position": (3,)})
+        if type(order) is not int or not 0 <= order <= MOST_ORDER or n_planes > MOST_PLANES:
+            raise InputError(
+                f"a room has at most {MOST_PLANES} planes and paths of 0 to {MOST_ORDER} reflections, got {n_planes} and "
+                f"{order}"
+            )
         return cls(
             array=PlanarArray(tensors["element"], header["wavelength"]),
             grid=AngularGrid(**header["grid"]),

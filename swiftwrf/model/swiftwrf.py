@@ -9,13 +9,15 @@ import torch
 from torch import Tensor, nn
 
 from swiftwrf.angles import AngularGrid
-from swiftwrf.checkpoint import Header, Saved
+from swiftwrf.checkpoint import Header, Saved, expect
 from swiftwrf.errors import InputError
 from swiftwrf.gp import Kernel
-from swiftwrf.model.deformation import Deformation, Offsets, Setting, deformation_type
+from swiftwrf.model.deformation import COMPONENTS, Deformation, Offsets, Setting, deformation_type
 from swiftwrf.model.primitives import Gaussians, Primitives
-from swiftwrf.positions import check_positions
+from swiftwrf.positions import check_batch, check_drawn, check_positions
 from swiftwrf.rasterize import rasterize_magnitude
+
+FARTHEST = 1e6  # normalised: beyond, all is equally far, and float32 must not overflow
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,20 @@ class ModelConfig:
                 "a model needs numbers for n_primitives and rank; swiftwrf.fit finds those that are 'auto'"
             )
         return self.n_primitives, self.rank
+
+    def check(self) -> None:
+        """Refuses what no model can have, wherever the configuration comes from.
+
+        Raises:
+            InputError: such a setting.
+        """
+        deformation_type(self.deformation)
+        unknown = set(self.components) - set(COMPONENTS)
+        if unknown or len(set(self.components)) < len(self.components):
+            raise InputError(f"components must be some of {', '.join(COMPONENTS)}, each once, got {self.components}")
+        whole = all(type(value) is int and value >= 0 for value in self.size)
+        if not whole or not 0 < self.cutoff < 1 or not all(type(x) is bool for x in (self.bounded, self.axis_aligned)):
+            raise InputError(f"this makes no model: {self}")
 
     def make_primitives(self, grid: AngularGrid, generator: torch.Generator) -> Primitives:
         """Canonical primitives at their start."""
@@ -166,15 +182,16 @@ class SwiftWRF(nn.Module, Saved):
             Magnitudes clipped to [0, 1], float32 (n, n_elevation, n_azimuth), on the CPU.
 
         Raises:
-            InputError: positions of another shape, or not finite.
+            InputError: positions of another shape, or not finite; a batch below 1.
         """
         position = check_positions(position)
+        check_batch(batch)
         grid = grid or self.grid
         spectrum = torch.empty(len(position), *grid.shape)
         for start in range(0, len(position), batch):
             x = self.normalise(position[start : start + batch].to(self.centre.device))
             spectrum[start : start + batch] = self.draw(self.gaussians(x), len(x), grid).clamp(0, 1)
-        return spectrum
+        return check_drawn(spectrum)
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         header = {"config": asdict(self.config), "grid": asdict(self.grid)}
@@ -184,6 +201,12 @@ class SwiftWRF(nn.Module, Saved):
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> SwiftWRF:
         config = ModelConfig(**{**header["config"], "components": tuple(header["config"]["components"])})
         grid = AngularGrid(**header["grid"])
+        config.check()
+        n, _ = config.size
+        own_shapes = {"mean": (n, 2), "cholesky": (n, 3), "attenuation": (n,), "response": (n, 2), "floor": (2,)}
+        expect(tensors, {"centre": (3,), "scale": ()} | {f"primitives.{name}": s for name, s in own_shapes.items()})
+        if not float(tensors["scale"]) > 0:
+            raise InputError(f"scale is {float(tensors['scale'])}, expected metres above 0")
         primitives = config.make_primitives(grid, torch.Generator())
         own = {name.removeprefix("deformation."): t for name, t in tensors.items() if name.startswith("deformation.")}
         deformation = deformation_type(config.deformation).restore(config.components, header, own)
@@ -193,4 +216,4 @@ class SwiftWRF(nn.Module, Saved):
 
 
 def _normalise(position: Tensor, centre: Tensor, scale: Tensor) -> Tensor:
-    return ((position.double() - centre) / scale).float()
+    return ((position.double() - centre) / scale).clamp(-FARTHEST, FARTHEST).float()

@@ -25,8 +25,16 @@ from swiftwrf.angles import AngularGrid
 ANCHOR = 16  # columns between two exact exponentials: 16^2 / 2 roundings stay under 1e-5 of the kernel
 
 _FAST = {"contract", "nsz", "arcp"}  # not reassoc or nnan: sums keep their order, and what is not finite stays visible
-_jit = njit(parallel=True, fastmath=_FAST, cache=True)
 _inline = njit(inline="always", fastmath=_FAST)
+
+
+def _jit(function):
+    """Compiled at first use, and kept for the next process where there is a place to keep it: neither an installation that
+    may not be written nor a user without a home is one."""
+    try:
+        return njit(parallel=True, fastmath=_FAST, cache=True)(function)
+    except RuntimeError:
+        return njit(parallel=True, fastmath=_FAST)(function)
 
 
 @_inline

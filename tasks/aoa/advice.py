@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from augment import Mixed, Trial, draw_places
 from swiftwrf.metrics import angle_errors
+from swiftwrf.threads import single_thread
 from tasks.aoa.estimators import ESTIMATORS, Settings
 from tasks.metrics import AdviceMetrics, ChangeMetrics, GainMetrics
 
@@ -23,6 +24,7 @@ NUMBERS = (300, 1000, 3000)  # of further positions that are compared
 DRAWS = 2000  # of the bootstrap
 
 
+@single_thread()
 def advise(trials: Sequence[Trial], settings: Settings, extra: int) -> AdviceMetrics:
     """What turbo learning gains on held-out measured spectra.
 

@@ -9,7 +9,10 @@ from augment import SYNTHESIZERS, lacks
 from swiftwrf import InputError, Spectra
 from swiftwrf.arrays import PlanarArray
 from swiftwrf.data.spectra import Moving
-from tasks.run import Preset, choice
+from swiftwrf.metrics import WINDOW
+from tasks.run import SEEDS, Preset, choice
+
+MOST_ELEMENTS = 32  # a side of an array: its spectra have 7,938 numbers
 
 AUTO = "auto"  # the synthesizer that suits the scene
 EXTRA = 3000  # further positions unless told otherwise
@@ -77,20 +80,30 @@ def check(config: AoaConfig) -> None:
         )
     if len(set(config.mix)) < len(config.mix):
         raise InputError(f"--mix names a share twice: {' '.join(f'{s:g}' for s in config.mix)}")
-    if config.array is not None and not (config.array[0] >= 2 and min(config.array[1:]) > 0):
+    if not config.synthesizer:
+        raise InputError(f"--synthesizer takes at least one of {', '.join(SYNTHESIZERS)}")
+    if config.array is not None and not (2 <= config.array[0] <= MOST_ELEMENTS and min(config.array[1:]) > 0):
         raise InputError(
-            f"--array takes at least 2 elements a side, a spacing [m] and a carrier [Hz], got {config.array}"
+            f"--array takes 2 to {MOST_ELEMENTS} elements a side, a spacing [m] and a carrier [Hz], got {config.array}"
         )
     if config.repeats < 1:
         raise InputError(f"--repeats must be at least 1, got {config.repeats}")
+    if config.seed + config.repeats > SEEDS:
+        raise InputError(f"--seed {config.seed} leaves no seeds for {config.repeats} repeats; choose a smaller one")
 
 
 def with_array(data: Spectra, config: AoaConfig) -> Spectra:
     """The data, with the array of the command line.
 
     Raises:
-        InputError: a synthesizer needs the array, and neither data nor command line describe it.
+        InputError: spectra too small to be compared; a synthesizer needs the array, and neither data nor command line
+            describe it.
     """
+    if min(data.grid.shape) < WINDOW:
+        raise InputError(
+            f"spectra of {data.name} have {data.grid.shape[0]} x {data.grid.shape[1]} pixels; SSIM, by which they are "
+            f"learnt and judged, needs at least {WINDOW} x {WINDOW}"
+        )
     if config.array is not None:
         side, spacing, frequency = config.array
         data = replace(data, array=PlanarArray.square(side, frequency, spacing))

@@ -6,7 +6,6 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from pandas import DataFrame
 from torch import Tensor
@@ -26,7 +25,10 @@ from swiftwrf import GeometryModel, InputError, Spectra, load_spectra, simulated
 from swiftwrf.checkpoint import Saved, read, write
 from swiftwrf.geometry import HybridModel
 from swiftwrf.metrics import angle_errors, l1, psnr, ssim
-from tasks.aoa import arms
+from tasks.aoa import (
+    aann,  # noqa: F401 (registers the network)
+    arms,
+)
 from tasks.aoa.advice import advise
 from tasks.aoa.config import AUTO, AoaConfig, check, further_positions, with_array
 from tasks.aoa.estimators import ESTIMATORS, Settings, learners
@@ -199,11 +201,10 @@ class _Experiment:
         file = self.directory.path(f"steps/{step}.safetensors")
 
         def compute() -> Row:
-            history: list[Row] = []
+            fit = _FitHistory()
             checkpoint = self.directory.path(f"steps/{step}-fit.safetensors")
-            settings = replace(self._settings(arm["repeat"]), checkpoint=checkpoint, on_record=history.append)
+            settings = replace(self._settings(arm["repeat"]), checkpoint=checkpoint, on_record=fit.add)
             synthesizer = make_synthesizer(name, settings)
-            began = time.perf_counter()
             synthesizer.fit(measured)
             fitted = time.perf_counter()
             generator = torch.Generator().manual_seed(settings.seed)
@@ -214,11 +215,11 @@ class _Experiment:
                 if asked is not None:
                     own = generator if sampled and synthesizer.samples else None
                     drawn[key] = synthesizer.synthesize(asked.position, own)
-            seconds = {"fit": fitted - began, "synthesize": time.perf_counter() - fitted}
+            seconds = {"fit": fitted - fit.began + fit.earlier, "synthesize": time.perf_counter() - fitted}
             write(file, "synthetic spectra", {key: _as_bytes(spectrum) for key, spectrum in drawn.items()}, {})
             if places[0] is not None and arm["repeat"] == 0:
                 self._keep_model(synthesizer.model, name, arm["mix"], measured)
-            return {"history": history, "seconds": seconds}
+            return {"history": fit.records, "seconds": seconds}
 
         value = self.directory.step(step, compute)["value"]
         drawn = {key: spectrum.float() / 255 for key, spectrum in read(file, "synthetic spectra")[1].items()}
@@ -243,28 +244,28 @@ class _Experiment:
         if isinstance(room, GeometryModel):
             self.directory.write_json(f"geometry-mix{share:g}.json", room.to_json())
             at, gain, order = room.image_sources()
-            np.savez_compressed(
-                self.directory.path(f"room-mix{share:g}.npz"),
-                measured=measured.position.numpy(),
-                test=self.test.position.numpy(),
-                fixed=room.fixed_position.numpy(),
-                image=at.numpy(),
-                gain=gain.numpy(),
-                order=order.numpy(),
-            )
+            places = {
+                "measured": measured.position.numpy(),
+                "test": self.test.position.numpy(),
+                "fixed": room.fixed_position.numpy(),
+                "image": at.numpy(),
+                "gain": gain.numpy(),
+                "order": order.numpy(),
+            }
+            self.directory.write_npz(f"room-mix{share:g}.npz", places)
 
     def _keep_examples(self, share: float, name: str, synthetic: Tensor, score: Tensor) -> None:
         """Measured and synthetic spectra at test positions for the report, chosen by rule."""
         order = score.argsort()
         chosen = order[[round(q * (len(order) - 1)) for q in EXAMPLE_QUANTILES]]
-        np.savez_compressed(
-            self.directory.path(f"examples-mix{share:g}.npz"),
-            measured=_as_bytes(self.test.spectrum[chosen]).numpy(),
-            synthetic=_as_bytes(synthetic[chosen]).numpy(),
-            synthesizer=name,
-            index=self.test.index[chosen].numpy(),
-            psnr_db=score[chosen].numpy(),
-        )
+        examples = {
+            "measured": _as_bytes(self.test.spectrum[chosen]).numpy(),
+            "synthetic": _as_bytes(synthetic[chosen]).numpy(),
+            "synthesizer": name,
+            "index": self.test.index[chosen].numpy(),
+            "psnr_db": score[chosen].numpy(),
+        }
+        self.directory.write_npz(f"examples-mix{share:g}.npz", examples)
 
     def summary(self, share: float) -> MixMetrics:
         """What metrics.json says of one share."""
@@ -286,6 +287,19 @@ class _Experiment:
                 "train": float(networks["train"].sum()),
             },
         }
+
+
+class _FitHistory:
+    """The records of a fit, and the seconds that it took in sessions before this one."""
+
+    def __init__(self) -> None:
+        self.records: list[Row] = []
+        self.began, self.earlier = time.perf_counter(), 0.0
+
+    def add(self, record: Row) -> None:
+        """One record; those of earlier sessions come first."""
+        self.records.append(record)
+        self.earlier = max(self.earlier, record.get("elapsed", 0.0) - (time.perf_counter() - self.began))
 
 
 def _of(share: float, rows: list[Row]) -> DataFrame:

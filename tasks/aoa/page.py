@@ -6,7 +6,7 @@ import numpy as np
 
 from tasks.aoa import arms
 from tasks.aoa.page_room import advice_sentence, choice_section, room_section
-from tasks.aoa.share import AoaRecords, Share, first_history, fits, scene
+from tasks.aoa.share import AoaRecords, Share, first_history, fits, place, scene
 from tasks.metrics import Angle, ErrorSummary
 from tasks.page import figures
 from tasks.page.page import Page, Plot, Section, Table
@@ -35,7 +35,7 @@ def page(runs: list[AoaRecords]) -> Page:
     sections += [_synthesis(shares, several), *(_examples(share) for share in shares), _size(runs)]
     sections += [*(_speed(share) for share in shares), _training(runs)]
     sections += [_time(shares, several), _limits(runs[0]), provenance(runs)]
-    names = ", ".join(dict.fromkeys(scene(run) for run in runs))
+    names = ", ".join(dict.fromkeys(place(run) for run in runs))
     return Page(f"Angle of arrival: {names}", _lead(shares[0]), sections)
 
 
@@ -106,8 +106,8 @@ def _over_shares(shares: list[Share]) -> Section:
         name for name in every if name != OFF_SCALE and (_is_network(name) or name in arms.baselines())
     )
     labels = [share.percent for share in shares]
-    if len({share.scene for share in shares}) > 1:
-        labels = [f"{s.percent}\n{s.run.metrics['data']}\n{s.run.metrics['split']}" for s in shares]
+    if len({place(share.run) for share in shares}) > 1:
+        labels = [figures.plain(f"{s.percent}\n{s.run.metrics['data']}\n{s.run.metrics['split']}") for s in shares]
     heights = {name: [_median_and_interval(share, name) for share in shares] for name in names}
     figure, axes = figures.new_figure(1, 1, 8, 3.4)
     figures.bars(axes[0], arms.palette(), labels, heights, "median great-circle error [deg]")
@@ -147,7 +147,7 @@ def _examples(share: Share) -> Section:
     figure = figures.spectra(example["measured"] / 255.0, example["synthetic"] / 255.0, captions)
     text = "From the best to the worst of the test spectra by PSNR (quantiles 1, 0.8, ..., 0); angles in degrees."
     return Section(
-        f"Six spectra at positions nobody measured ({share.percent} measured, {example.get('synthesizer', 'swiftwrf')})",
+        f"Six spectra at positions nobody measured ({share.title}, {example.get('synthesizer', 'swiftwrf')})",
         plots=[Plot(f"spectra-{share.file_name}", figure, text)],
     )
 
@@ -215,9 +215,7 @@ def _speed(share: Share) -> Section:
         "the synthesizer's time not counted. The line is the Pareto front: what is not on it is beaten in both."
     )
     figures.legend_of(figure, palette, [*synthesis, *methods])
-    return Section(
-        f"Speed against error ({share.percent} measured)", plots=[Plot(f"speed-{share.file_name}", figure, caption)]
-    )
+    return Section(f"Speed against error ({share.title})", plots=[Plot(f"speed-{share.file_name}", figure, caption)])
 
 
 def _time(shares: list[Share], several: bool) -> Section:

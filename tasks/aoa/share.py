@@ -47,11 +47,20 @@ class Share:
     @property
     def file_name(self) -> str:
         """What its figures are called after."""
-        metrics = self.run.metrics
-        return f"{metrics['data']}-{metrics['split']}-mix{self.key}-s{metrics['seed']}"
+        return f"mix{self.key}-{self.run.file_name}"
+
+    @property
+    def title(self) -> str:
+        """The share, and which run it is of where there are several."""
+        return f"{self.percent} measured{self.run.label}"
 
 
 def scene(run: AoaRecords) -> str:
+    """The data and the split of a run in words, and which run it is where there are several."""
+    return place(run) + run.label
+
+
+def place(run: AoaRecords) -> str:
     """The data and the split of a run in words."""
     name = "the simulated room" if run.metrics["data"] == "simulated-room" else run.metrics["data"]
     return f"{name}, {run.metrics['split']} split"

@@ -36,6 +36,11 @@ def new_figure(rows: int, columns: int, width: float, height: float) -> tuple[Fi
     return figure, list(axes.flat)
 
 
+def plain(name: str) -> str:
+    """A name as text of a figure: dollars in it begin no formula."""
+    return name.replace("$", r"\$")
+
+
 def as_svg(figure: Figure) -> str:
     """The figure as SVG without date or random names."""
     stream = io.StringIO()

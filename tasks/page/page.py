@@ -11,6 +11,7 @@ from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from swiftwrf.durable import write_text
 from tasks.page.figures import as_svg
 from tasks.page.records import Metrics, Records
 
@@ -58,14 +59,16 @@ def write_page(folder: Path, page: Page) -> None:
     inlined: dict[str, Markup] = {}
     for section in page.sections:
         for plot in section.plots:
+            if plot.name in inlined:
+                raise ValueError(f"two figures are called {plot.name}; one would be shown in the other's place")
             svg = as_svg(plot.figure)
-            (figures / f"{plot.name}.svg").write_text(svg)
+            write_text(figures / f"{plot.name}.svg", svg)
             inlined[plot.name] = Markup(svg[svg.index("<svg") :])  # our own drawing; its texts are escaped in it
     environment = Environment(
         loader=PackageLoader("tasks.page", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
     html = environment.get_template("template.html").render(page=page, svg=inlined)
-    (folder / "report.html").write_text(html)
+    write_text(folder / "report.html", html)
 
 
 def reporting(page: Callable[[list[Records[Metrics]]], Page]) -> Callable[[Path, dict[str, Any]], None]:

@@ -20,12 +20,21 @@ def provenance(runs: Sequence[Records[Any]]) -> Section:
     for run in runs:
         environment = run.environment
         packages = ", ".join(f"{name} {version}" for name, version in environment["packages"].items())
+        resumed = ", ".join(
+            f"{session['start']} (commit {session['commit']})" for session in environment.get("resumed", [])
+        )
         rows = [
+            *([["run", f"{run.number}: {run.folder.name}"]] if run.number else []),
             ["command", run.config["command"]],
             ["code", f"version {environment['version']}, commit {environment['commit'] or 'unknown'}"],
             ["packages", f"Python {environment['python']}, {packages}"],
-            ["machine", f"{environment['device']}, {environment['threads']} threads"],
+            ["machine", f"{environment['device']}"],
+            [
+                "threads",
+                f"{environment['threads']}; like the seed, another number changes the networks, by up to degrees",
+            ],
             ["time", f"{environment['start']} to {environment.get('end', '-')}"],
+            *([["resumed", resumed]] if resumed else []),
             *([f"sha256 of {name}", digest] for name, digest in environment["input_sha256"].items()),
         ]
         tables.append(Table(["", ""], rows))

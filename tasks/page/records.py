@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import json
+import re
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
-import pandas as pd
+from pandas import DataFrame
 
 from swiftwrf import InputError
 from tasks.metrics import RunMetrics
+from tasks.records import read_json, read_table
 
 Metrics = TypeVar("Metrics", bound=RunMetrics)
 
@@ -21,34 +22,42 @@ class Records(Generic[Metrics]):
     Args:
         folder: its directory.
         metrics: the content of metrics.json, read from the directory unless given.
+        number: of the run in a report over several, counted from 1; 0 where it is alone.
 
     Raises:
         InputError: not the directory of a finished run.
     """
 
-    def __init__(self, folder: Path, metrics: dict[str, Any] | None = None) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, metrics: dict[str, Any] | None = None, number: int = 0) -> None:
+        self.folder, self.number = folder, number
         if metrics is None:
             file = folder / "metrics.json"
             if not file.is_file():
                 raise InputError(f"{folder} is no finished run: it has no metrics.json")
-            metrics = json.loads(file.read_text())
+            metrics = read_json(file)
         self.metrics = cast(Metrics, metrics)
+
+    @property
+    def label(self) -> str:
+        """What tells the run from the others of a report, to be put behind a title; nothing where it is alone."""
+        return f", run {self.number}" if self.number else ""
+
+    @property
+    def file_name(self) -> str:
+        """What the figures of the run are called after: no figure of one run takes the place of another's."""
+        names = [re.sub(r"[^\w.=-]+", "_", self.metrics[key], flags=re.ASCII)[:40] for key in ("data", "split")]
+        return "-".join([*names, f"s{self.metrics['seed']}", *([f"run{self.number}"] if self.number else [])])
 
     @cached_property
     def config(self) -> dict[str, Any]:
         """Command and configuration."""
-        return self._json("config.json")
+        return read_json(self.folder / "config.json")
 
     @cached_property
     def environment(self) -> dict[str, Any]:
         """Where it ran."""
-        return self._json("environment.json")
+        return read_json(self.folder / "environment.json")
 
-    def table(self, name: str) -> pd.DataFrame:
+    def table(self, name: str) -> DataFrame:
         """One of the run's tables, e.g. `errors`."""
-        return pd.read_csv(self.folder / f"{name}.csv")
-
-    def _json(self, name: str) -> dict[str, Any]:
-        content: dict[str, Any] = json.loads((self.folder / name).read_text())
-        return content
+        return read_table(self.folder / f"{name}.csv")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import secrets
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from swiftwrf import InputError
+from swiftwrf.durable import rename
 from tasks.aoa import page as aoa
 from tasks.page.page import Page, write_page
 from tasks.page.records import Records
@@ -20,16 +23,39 @@ def merge(folders: list[Path], out: Path) -> None:
     """Writes one report over several finished runs of one task.
 
     Raises:
-        InputError: no runs, an unfinished one, runs of several tasks, or `out` exists.
+        InputError: no runs, an unfinished one, runs of several tasks, records that are not a run's, or `out` exists.
     """
-    runs: list[Records[Any]] = [Records(folder) for folder in folders]
-    tasks = sorted({run.metrics["task"] for run in runs})
-    if len(tasks) != 1:
-        raise InputError(f"a report takes runs of one task, got {', '.join(tasks) or 'no runs'}")
-    if out.exists():
+    several = len(folders) > 1
+    runs: list[Records[Any]] = [Records(f, number=n if several else 0) for n, f in enumerate(folders, start=1)]
+    tasks = sorted({str(run.metrics.get("task")) for run in runs})
+    if len(tasks) != 1 or tasks[0] not in PAGES:
+        raise InputError(
+            f"a report takes finished runs of one task ({' or '.join(PAGES)}), got {', '.join(tasks) or 'no runs'}"
+        )
+    if out.exists() or not out.name:
         raise InputError(f"{out} exists already and a report is never overwritten; choose another --out")
-    partial = out.with_name(out.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    write_page(partial, PAGES[tasks[0]](runs))
-    partial.rename(out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = out.with_name(f".{out.name}.{secrets.token_hex(4)}")  # a name that nothing else has
+    unfinished.mkdir()
+    try:
+        _write(unfinished, tasks[0], runs)
+        if out.exists():
+            raise InputError(f"{out} was made by somebody else in the meantime; choose another --out")
+        rename(unfinished, out)
+    finally:
+        if unfinished.exists():
+            shutil.rmtree(unfinished)
+
+
+def _write(folder: Path, task: str, runs: list[Records[Any]]) -> None:
+    try:
+        write_page(folder, PAGES[task](runs))
+    except InputError:
+        raise
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        # the records are files, which anybody may have changed, and everything in them is used somewhere on the page
+        names = ", ".join(os.fspath(run.folder) for run in runs)
+        raise InputError(
+            f"the records in {names} do not hold what a report shows ({type(error).__name__}: {error}); they were changed "
+            "or written by another version"
+        ) from error

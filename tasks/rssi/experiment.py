@@ -13,6 +13,7 @@ from pandas import DataFrame
 from PIL import Image, UnidentifiedImageError
 
 from swiftwrf import InputError, Rssi, load_rssi, rssi_room
+from swiftwrf.data.files import sha256
 from swiftwrf.data.splits import validation_for
 from swiftwrf.positions import distance
 from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
@@ -24,6 +25,7 @@ from tasks.run import Preset, Row, Run, choose_device, console
 from tasks.summarise import error_summary, grouped
 
 MAP_CELLS = 80  # along the longer side of the floor
+MOST_PLAN_PIXELS = 2**24
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class RssiTaskConfig:
     preset: Preset = "quick"
     """of SwiftWRF: quick corrects a log-distance law; paper is the plain head"""
     floor_plan: str | None = None
-    """an image to draw behind the maps"""
+    """an image to draw behind the maps, PNG or JPEG"""
     floor_extent: tuple[float, float, float, float] | None = None
     """x0 x1 y0 y1 of that image [m]"""
     scheduler: str | None = None
@@ -62,7 +64,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         InputError: what the configuration asks for is not there or makes no sense.
     """
     device = choose_device("cpu" if config.device == "auto" else config.device)
-    _check_floor_plan(config)
+    plan = _read_floor_plan(config)
     whole = load_rssi(config.data) if config.data else rssi_room(seed=config.seed)
     data, (pool, _) = whole.receivers(config.rx), whole.split(config.split, config.seed)
     train, test = data.split(config.split, config.seed)
@@ -71,8 +73,9 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     if not bool((~test.rssi_dbm.isnan()).any()):
         raise InputError(f"split {config.split!r} of {data.name} has no heard test rows for these receivers")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
-    with Run("rssi", config.out, label, config, device, data.source, resume) as directory:
-        tables = _Tables(data, train, test, config, directory, settings)
+    source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
+    with Run("rssi", config.out, label, config, device, source, resume) as directory:
+        tables = _Tables(data, train, test, plan, directory, settings)
         for name in PREDICTORS:
             tables.add(name)
         directory.write_csv("errors.csv", tables.errors)
@@ -95,28 +98,37 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     console.print(f"report: [bold]{final / 'report.html'}[/]")
 
 
-def _check_floor_plan(config: RssiTaskConfig) -> None:
+def _read_floor_plan(config: RssiTaskConfig) -> dict[str, Any]:
+    """The floor plan and where it lies, as maps.npz keeps them; nothing where there is none."""
     if (config.floor_plan is None) != (config.floor_extent is None):
         raise InputError("--floor-plan needs --floor-extent x0 x1 y0 y1 [m], and the other way round")
     if config.floor_plan is None or config.floor_extent is None:
-        return
+        return {}
     x0, x1, y0, y1 = config.floor_extent
     if not (x0 < x1 and y0 < y1):
         raise InputError(f"--floor-extent must be x0 x1 y0 y1 with x0 < x1 and y0 < y1, got {config.floor_extent}")
     try:
-        with Image.open(config.floor_plan) as image:
-            image.verify()
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
-        raise InputError(f"--floor-plan {config.floor_plan} is not a readable image ({error})") from None
+        # few formats, for Pillow starts other programs for some; the pixels now, for a file may end before they do
+        with Image.open(config.floor_plan, formats=("PNG", "JPEG")) as image:
+            if image.width * image.height > MOST_PLAN_PIXELS:
+                raise InputError(
+                    f"--floor-plan {config.floor_plan} has {image.width} x {image.height} pixels; give one of at most "
+                    f"{MOST_PLAN_PIXELS}"
+                )
+            return {"plan": np.asarray(image.convert("RGB")), "plan_extent": np.array(config.floor_extent)}
+    except InputError:
+        raise
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
+        raise InputError(f"--floor-plan {config.floor_plan} is not a readable image, PNG or JPEG ({error})") from None
 
 
 class _Tables:
     """Fits and tests every predictor, each a step of the run's directory, and gathers the tables of the run."""
 
     def __init__(
-        self, data: Rssi, train: Rssi, test: Rssi, config: RssiTaskConfig, directory: Run, settings: Settings
+        self, data: Rssi, train: Rssi, test: Rssi, plan: dict[str, Any], directory: Run, settings: Settings
     ) -> None:
-        self.train, self.test, self.config, self.directory, self.settings = train, test, config, directory, settings
+        self.train, self.test, self.plan, self.directory, self.settings = train, test, plan, directory, settings
         self.errors: list[Row] = []
         self.predictions: list[Row] = []
         self.seconds: dict[str, PredictorSeconds] = {}
@@ -190,22 +202,17 @@ class _Tables:
         grid = torch.stack([*torch.meshgrid(xs, ys, indexing="xy")], dim=-1).reshape(-1, 2)
         places = torch.cat([grid, position[:, 2].median().expand(len(grid), 1)], dim=1)
         middle, lower, upper = (p.T.reshape(-1, len(ys), len(xs)).numpy() for p in predictor.model.predict(places))
-        plan: dict[str, Any] = {}
-        if self.config.floor_plan is not None:
-            with Image.open(self.config.floor_plan) as image:
-                plan = {"plan": np.asarray(image.convert("RGB")), "plan_extent": np.array(self.config.floor_extent)}
-        np.savez_compressed(
-            self.directory.path("maps.npz"),
-            x=xs.numpy(),
-            y=ys.numpy(),
-            predicted=middle.astype(np.float32),
-            width=(upper - lower).astype(np.float32),
-            measured_position=self.train.transmitter_position.numpy(),
-            measured=self.train.rssi_dbm.numpy(),
-            receiver=self.train.receiver_position.numpy(),
-            receiver_names=np.array(self.train.receiver_names),
-            **plan,
-        )
+        maps = {
+            "x": xs.numpy(),
+            "y": ys.numpy(),
+            "predicted": middle.astype(np.float32),
+            "width": (upper - lower).astype(np.float32),
+            "measured_position": self.train.transmitter_position.numpy(),
+            "measured": self.train.rssi_dbm.numpy(),
+            "receiver": self.train.receiver_position.numpy(),
+            "receiver_names": np.array(self.train.receiver_names),
+        }
+        self.directory.write_npz("maps.npz", maps | self.plan)
 
     def overall(self) -> dict[str, PredictorMetrics]:
         """What metrics.json says of each method."""

@@ -27,11 +27,15 @@ def palette() -> Palette:
 def page(runs: list[RssiRecords]) -> Page:
     """The page of these runs."""
     sections = [section for run in runs for section in _run(run, several=len(runs) > 1)]
-    names = ", ".join(dict.fromkeys(_scene(run) for run in runs))
+    names = ", ".join(dict.fromkeys(_place(run) for run in runs))
     return Page(f"RSSI: {names}", _lead(runs[0]), [*sections, _limits(runs[0]), provenance(runs)])
 
 
 def _scene(run: RssiRecords) -> str:
+    return _place(run) + run.label
+
+
+def _place(run: RssiRecords) -> str:
     name = "the simulated floor" if run.metrics["data"] == "simulated-room" else run.metrics["data"]
     return f"{name}, {run.metrics['split']} split"
 
@@ -54,7 +58,7 @@ def _lead(run: RssiRecords) -> str:
 
 def _run(run: RssiRecords, several: bool) -> list[Section]:
     suffix = f" - {_scene(run)}" if several else ""
-    name = f"{run.metrics['data']}-{run.metrics['split']}-s{run.metrics['seed']}"
+    name = run.file_name
     plots = [Plot(f"bars-{name}", _bars(run), "Median absolute error; whiskers: its 95 % interval.")]
     plots.append(Plot(f"cdf-{name}", _cdf(run), "Distribution of the absolute errors over all receivers."))
     return [
@@ -128,7 +132,7 @@ def _bars(run: RssiRecords) -> Figure:
         errors = [methods[name]["abs_error_db"] for methods in receivers.values()]
         heights[name] = [(error["median"], error["low"], error["high"]) for error in errors]
     figure, axes = figures.new_figure(1, 1, max(5, 1.1 * len(receivers)), 3.6)
-    figures.bars(axes[0], palette(), list(receivers), heights, "median absolute error [dB]")
+    figures.bars(axes[0], palette(), [figures.plain(name) for name in receivers], heights, "median absolute error [dB]")
     axes[0].tick_params(axis="x", labelrotation=30 if len(receivers) > 6 else 0)
     figures.legend_below(figure, axes[0])
     return figure
@@ -183,7 +187,7 @@ def _maps(run: RssiRecords, field: str, label: str) -> Figure:
             }
             ax.scatter(x, y, s=9, c=maps["measured"][heard, i], zorder=2, **dots)
         ax.plot(*maps["receiver"][i, :2], "x", color="#ee6677", markersize=9, markeredgewidth=2, zorder=3)
-        ax.set_title(str(maps["receiver_names"][i]), fontsize=9)
+        ax.set_title(figures.plain(str(maps["receiver_names"][i])), fontsize=9)
         ax.grid(visible=False)
     axes[0].set(xlabel="x [m]", ylabel="y [m]")
     figure.colorbar(drawn, ax=axes[:n], label=label, fraction=0.03, pad=0.02)

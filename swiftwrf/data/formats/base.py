@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -42,10 +43,14 @@ def read(path: str | Path, formats: Registry[Format[Data]]) -> Data:
     """
     folder = Path(path)
     known = "; ".join(f"{entry.name}: {entry.meaning}" for entry in formats.entries())
-    if not folder.is_dir():
+    if not os.path.isdir(folder):  # Path.is_dir raises where a name is too long
         raise InputError(f"{folder} is not a folder; expected one of measurements ({known})")
-    for entry in formats.entries():
-        reader = entry.make()
-        if reader.recognises(folder):
-            return reader.read(folder)
+    try:
+        for entry in formats.entries():
+            reader = entry.make()
+            if reader.recognises(folder):
+                return reader.read(folder)
+    except OSError as error:
+        reason = "no permission to read it" if isinstance(error, PermissionError) else error.strerror
+        raise InputError(f"{error.filename or folder} cannot be read ({reason})") from None
     raise InputError(f"{folder} holds no {formats.kind} that is known ({known})")

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
+import struct
+import warnings
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +15,35 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from swiftwrf.angles import AngularGrid, ArrayPose
-from swiftwrf.data.files import read_positions, read_yaml, sha256
+from swiftwrf.data.files import (
+    FARTHEST,
+    MOST_PIXELS,
+    numbers,
+    read_bytes,
+    read_positions,
+    read_yaml,
+    sha256,
+    sha256_of_all,
+)
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format
 from swiftwrf.data.spectra import Moving, Spectra
 from swiftwrf.data.splits import read_split, split_names
 from swiftwrf.errors import InputError
+
+# what Pillow raises on broken files
+BROKEN = (
+    UnidentifiedImageError,
+    Image.DecompressionBombError,
+    OSError,
+    SyntaxError,
+    ValueError,
+    ArithmeticError,
+    LookupError,
+    TypeError,
+    EOFError,
+    struct.error,
+    zlib.error,
+)
 
 
 @SPECTRA_FORMATS.register("nerf2", meaning="gateway_info.yml, tx_pos.csv or rx_pos.csv, spectrum/00001.png, ...")
@@ -35,7 +64,7 @@ def _read(folder: Path) -> Spectra:
         raise InputError(f"{folder} must hold one of tx_pos.csv (moving transmitter) and rx_pos.csv (moving receiver)")
     moving: Moving = "transmitter" if tables[0].name == "tx_pos.csv" else "receiver"
     position = read_positions(tables[0])
-    spectrum = _read_images(folder / "spectrum", len(position))
+    spectrum, digest = _read_images(folder / "spectrum", len(position))
     fixed = torch.tensor(pose.position, dtype=torch.float64)
     ends = (position, fixed) if moving == "transmitter" else (fixed, position)
     if bool((position == fixed).all(dim=1).any()):
@@ -52,7 +81,7 @@ def _read(folder: Path) -> Spectra:
         moving=moving,
         index=torch.arange(len(position)),
         named_splits=splits,
-        source={file.name: sha256(file) for file in described},
+        source={file.name: sha256(file) for file in described} | {"spectrum/*.png": digest},
         fixed_position=fixed,
         rotation=pose.rotation,
     )
@@ -63,55 +92,76 @@ def _read_pose(file: Path) -> ArrayPose:
     gateways = [value for value in content.values() if isinstance(value, dict)]
     if len(gateways) != 1:
         raise InputError(f"{file} must describe one gateway with its position and orientation, got {len(gateways)}")
-    try:
-        position = tuple(float(x) for x in gateways[0]["position"])
-        orientation = tuple(float(x) for x in gateways[0]["orientation"])
-    except (KeyError, TypeError, ValueError):
-        raise InputError(f"{file}: the gateway needs a position of 3 and an orientation of 4 numbers") from None
-    if len(position) != 3 or len(orientation) != 4:
+    position, orientation = numbers(gateways[0].get("position"), 3), numbers(gateways[0].get("orientation"), 4)
+    if position is None or orientation is None or max(map(abs, position)) > FARTHEST:
         raise InputError(
-            f"{file}: the gateway's position must have 3 numbers and its orientation (x, y, z, w) 4, "
-            f"got {len(position)} and {len(orientation)}"
+            f"{file}: the gateway needs a position of 3 numbers [m], at most {FARTHEST:g}, and an orientation (x, y, z, w) "
+            f"of 4, got {gateways[0].get('position')} and {gateways[0].get('orientation')}"
         )
     try:
-        return ArrayPose(position, orientation)
+        return ArrayPose(position, orientation)  # type: ignore[arg-type]  # the lengths are checked
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
 
 
-def _read_images(folder: Path, n: int) -> Tensor:
-    """`00001.png` to `n`.png as float32 (n, H, W) in [0, 1], all grey and of one shape."""
+def _read_images(folder: Path, n: int) -> tuple[Tensor, str]:
+    """`00001.png` to `n`.png as float32 (n, H, W) in [0, 1], all grey and of one shape, and the digest of all files."""
     if not folder.is_dir():
         raise InputError(f"{folder} is missing; expected one grey image a position, 00001.png to {n:05d}.png")
     found = len(list(folder.glob("*.png")))
     if found != n:
         raise InputError(f"{folder} holds {found} images, but there are {n} positions; each position needs its image")
-    images = [_read_image(folder / f"{number:05d}.png") for number in range(1, n + 1)]
-    for number, image in enumerate(images, start=1):
-        if image.shape != images[0].shape:
-            raise InputError(
-                f"{folder / f'{number:05d}.png'} has {image.shape[0]} x {image.shape[1]} pixels, the first image "
-                f"{images[0].shape[0]} x {images[0].shape[1]}; all spectra must have one shape"
-            )
-    return torch.from_numpy(np.stack(images)).float() / 255
+    files = [folder / f"{number:05d}.png" for number in range(1, n + 1)]
+    shape: tuple[int, int] | None = None
+    images, digests = [], []
+    for file in files:
+        if not file.is_file():
+            raise InputError(f"{file} is missing; images are numbered from 00001.png without gaps")
+        content = read_bytes(file)
+        digests.append((file.name, hashlib.sha256(content).hexdigest()))
+        shape = _check_size(file, content, n, shape)
+        images.append(_decode(file, content))
+    return torch.from_numpy(np.stack(images)).float() / 255, sha256_of_all(digests)
 
 
-def _read_image(file: Path) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
-    if not file.is_file():
-        raise InputError(f"{file} is missing; images are numbered from 00001.png without gaps")
+def _opened(file: Path, content: bytes) -> Image.Image:
+    """Of its header alone is read. No other format than PNG: Pillow starts other programs for some."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is checked below
+        return Image.open(io.BytesIO(content), formats=["PNG"])
+
+
+def _check_size(file: Path, content: bytes, n: int, shape: tuple[int, int] | None) -> tuple[int, int]:
+    """Rows and columns, known before anything is decoded: a few kilobytes may claim gigabytes."""
     try:
-        with Image.open(file) as image:
+        with _opened(file, content) as image:
+            rows, columns, mode = image.height, image.width, image.mode
+    except BROKEN as error:
+        raise InputError(f"{file} is not a complete PNG image ({error})") from None
+    if mode != "L":
+        raise InputError(f"{file} has mode {mode}; a spectrum is an 8-bit grey image")
+    if not (rows >= 2 and columns == 4 * rows):
+        raise InputError(
+            f"{file} has {rows} x {columns} pixels; a spectrum has 4 columns a row "
+            "(elevations to 90, azimuths to 360 degrees), e.g. 90 x 360"
+        )
+    if n * rows * columns > MOST_PIXELS:
+        raise InputError(
+            f"{file} has {rows} x {columns} pixels, with {n} images {n * rows * columns:.3g}; average them down to at most "
+            f"{MOST_PIXELS:.3g} in all"
+        )
+    if shape is not None and (rows, columns) != shape:
+        raise InputError(
+            f"{file} has {rows} x {columns} pixels, the first image {shape[0]} x {shape[1]}; all spectra must have one shape"
+        )
+    return rows, columns
+
+
+def _decode(file: Path, content: bytes) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
+    try:
+        with _opened(file, content) as image:
             image.verify()  # the checksums; loading alone forgives a missing end
-        with Image.open(file) as image:
-            image.load()
-            if image.mode != "L":
-                raise InputError(f"{file} has mode {image.mode}; a spectrum is an 8-bit grey image")
-            rows, columns = image.height, image.width
-            if not (rows >= 2 and columns == 4 * rows):
-                raise InputError(
-                    f"{file} has {rows} x {columns} pixels; a spectrum has 4 columns a row "
-                    "(elevations to 90, azimuths to 360 degrees), e.g. 90 x 360"
-                )
+        with _opened(file, content) as image:
             return np.asarray(image)
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+    except BROKEN as error:
         raise InputError(f"{file} is not a complete PNG image ({error})") from None

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from swiftwrf.data.files import read_positions, read_table, read_yaml, sha256
+from swiftwrf.data.files import FARTHEST, numbers, read_positions, read_table, read_yaml, sha256
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import read_split, split_names
@@ -66,10 +66,11 @@ def _read_receivers(file: Path, names: list[str]) -> Tensor:
     missing = [name for name in names if name not in content]
     if missing:
         raise InputError(f"{file} has no position of receiver {missing[0]!r}, which gateway_rssi.csv names")
-    try:
-        position = torch.tensor([content[name] for name in names], dtype=torch.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{file}: each receiver needs a position of 3 numbers [m]") from None
-    if position.shape != (len(names), 3) or not position.isfinite().all():
-        raise InputError(f"{file}: each receiver needs a position of 3 finite numbers [m]")
-    return position
+    positions = [numbers(content[name], 3) for name in names]
+    for name, position in zip(names, positions, strict=True):
+        if position is None or max(map(abs, position)) > FARTHEST:
+            raise InputError(
+                f"{file}: receiver {name!r} needs a position of 3 finite numbers [m], at most {FARTHEST:g}, got "
+                f"{content[name]}"
+            )
+    return torch.tensor(positions, dtype=torch.float64)

@@ -4,8 +4,8 @@ Each is one file of this folder. It owns its forward pass, prior, learning rates
 open, and saved state.
 """
 
-from swiftwrf.model.deformation.base import DEFORMATIONS, Deformation, Offsets, Setting, deformation_type
+from swiftwrf.model.deformation.base import COMPONENTS, DEFORMATIONS, Deformation, Offsets, Setting, deformation_type
 
 DEFORMATIONS.discover(__name__, __path__)
 
-__all__ = ["DEFORMATIONS", "Deformation", "Offsets", "Setting", "deformation_type"]
+__all__ = ["COMPONENTS", "DEFORMATIONS", "Deformation", "Offsets", "Setting", "deformation_type"]

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from swiftwrf import gp
-from swiftwrf.checkpoint import Header
+from swiftwrf.checkpoint import Header, expect
 from swiftwrf.model.deformation.base import COMPONENTS, DEFORMATIONS, Deformation, Offsets, Setting
 
 
@@ -41,6 +41,10 @@ class MotionBasis(Deformation):
 
     @classmethod
     def restore(cls, components: tuple[str, ...], header: Header, tensors: Mapping[str, Tensor]) -> MotionBasis:
+        rank, n, m = header["config"]["rank"], header["config"]["n_primitives"], len(tensors["field.anchor"])
+        shapes = {"anchor": (m, 3), "whiten": (m, m), "coefficient": (m, rank)}
+        basis_shape = (rank, n, sum(COMPONENTS[c] for c in components))
+        expect(dict(tensors), {f"field.{name}": shape for name, shape in shapes.items()} | {"basis": basis_shape})
         anchor, whiten, basis = (tensors[name] for name in ("field.anchor", "field.whiten", "basis"))
         field = gp.SmoothField(anchor, gp.Kernel(**header["kernel"]), len(basis), whiten)
         return cls(field, basis.clone(), components)

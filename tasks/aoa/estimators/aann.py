@@ -23,6 +23,7 @@ from swiftwrf.data.spectra import coarsening
 from swiftwrf.progress import progress
 from tasks.aoa.estimators.base import ESTIMATORS, Estimator, Settings
 
+LEAST_ROWS = 8  # a prime number of rows can only be averaged to one, which leaves nothing to learn from
 STATISTICS = 512  # spectra that the batch norms' statistics are taken from
 
 
@@ -98,7 +99,7 @@ class AANN(Estimator):
         self._autocast = torch.autocast(device.type, torch.bfloat16, enabled=_gains_from_bfloat16(device))
 
     def _prepare(self, spectrum: Tensor) -> Tensor:
-        factor = coarsening(spectrum.shape[1:], self._config.max_azimuths)
+        factor = coarsening(spectrum.shape[1:], self._config.max_azimuths, LEAST_ROWS)
         small = functional.avg_pool2d(spectrum[:, None], factor)
         return (2 * small - 1).to(self._device, memory_format=torch.channels_last)
 

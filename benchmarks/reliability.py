@@ -1,0 +1,127 @@
+"""How readers, commands and runs end when everything goes wrong: the long version of tests/fuzz and tests/test_interrupts.
+
+python benchmarks/reliability.py [--mutations 10000 --commands 200 --kills 50 --disks 10 --races 5]
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import os
+import random
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+
+import test_interrupts as interrupts
+from fuzz.commands import command_lines
+from fuzz.kinds import KINDS
+from fuzz.test_fuzz import SHORT, attack
+from quick import run
+from record import write_result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    for name, number in (("mutations", 10_000), ("commands", 200), ("kills", 50), ("disks", 10), ("races", 5)):
+        parser.add_argument(f"--{name}", type=int, default=number)
+    asked = parser.parse_args()
+    root, done = Path(tempfile.mkdtemp()), {}
+    parts: dict[str, Callable[[], dict[str, Any]]] = {
+        "mutations": lambda: mutations(root, asked.mutations),
+        "commands": lambda: commands(root, asked.commands),
+        "kills": lambda: kills(root, asked.kills),
+        "disks": lambda: disks(root, asked.disks),
+        "races": lambda: races(root, asked.races),
+    }
+    for name, part in parts.items():
+        done[name] = part()
+        print(name, done[name], flush=True)
+        write_result("reliability", done)
+
+
+def mutations(root: Path, count: int) -> dict[str, Any]:
+    """Of every reader and model file; seeds that the tests do not use."""
+    ends: dict[str, Any] = {}
+    for kind in KINDS:
+        seeds = range(SHORT, SHORT + -(-count // len(KINDS)))
+        try:
+            ends[kind] = attack(kind, root / kind.replace(" ", "-"), seeds) | {"wrong": 0}
+        except AssertionError as error:
+            ends[kind] = {"wrong": 1, "what": str(error)}
+    return ends
+
+
+def commands(root: Path, count: int) -> dict[str, int]:
+    """Command lines in this process; exit codes, and tracebacks as wrong."""
+    ends = {"exit 0": 0, "exit 1": 0, "exit 2": 0, "wrong": 0}
+    folder = root / "commands"
+    folder.mkdir()
+    with contextlib.chdir(folder):
+        for task, arguments in command_lines(random.Random(2), folder, count):
+            said = io.StringIO()
+            try:
+                with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+                    code = run(task, *arguments)
+            except SystemExit as end:
+                code = int(end.code or 0)
+            except BaseException as error:
+                print(task, arguments, repr(error))
+                code = -1
+            ends[f"exit {code}" if f"exit {code}" in ends else "wrong"] += 1
+    return ends
+
+
+def kills(root: Path, count: int) -> dict[str, int]:
+    """SIGKILL at random moments, then --resume, until the tables can be compared with those of whole runs."""
+    draw, ends = random.Random(3), {"kills": 0, "runs": 0, "wrong": 0}
+    wholes = {asked: interrupts.whole_run(root / asked[0], asked) for asked in (interrupts.RSSI, interrupts.AOA)}
+    while ends["kills"] < count:
+        asked = (interrupts.AOA, interrupts.RSSI)[ends["runs"] % 2]
+        folder = root / f"kill{ends['runs']}"
+        folder.mkdir()
+        try:
+            ends["kills"] += interrupts.kill_until_done(
+                folder, asked, wholes[asked], draw, min(10, count - ends["kills"])
+            )
+        except AssertionError as error:
+            print(error)
+            ends["wrong"] += 1
+        ends["runs"] += 1
+        print(ends, flush=True)
+    return ends
+
+
+def disks(root: Path, count: int) -> dict[str, int]:
+    """No file may grow beyond a random size; then it may, and the run goes on."""
+    draw, wrong = random.Random(4), 0
+    for number in range(count):
+        try:
+            whole = root / "rssi" / "whole"
+            interrupts.fill_disk(root / f"disk{number}", interrupts.RSSI, whole, draw.randint(100, 12_000))
+        except AssertionError as error:
+            print(error)
+            wrong += 1
+    return {"full disks": count, "wrong": wrong}
+
+
+def races(root: Path, count: int) -> dict[str, int]:
+    """Two processes with one --out."""
+    wrong = 0
+    for number in range(count):
+        try:
+            interrupts.race(root / f"race{number}", interrupts.RSSI, 2)
+        except AssertionError as error:
+            print(error)
+            wrong += 1
+    return {"races": count, "wrong": wrong}
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    main()

@@ -1,0 +1,52 @@
+"""Files that are whole or not there, whatever happens while they are written: an error, a kill, a full disk, a power cut.
+
+A file is written under a temporary name, brought to the disk (fsync) and renamed; then its directory is brought to the
+disk, for a rename lives there. Without the first fsync a power cut may leave the new name with no content; without the
+second the old file.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+
+def sync(path: Path) -> None:
+    """Brings a file, or the names in a directory, to the disk."""
+    with suppress(PermissionError):  # a directory that may be written but not read, and directories on Windows
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary file beside `path` to be written in the block; it takes the place of `path` if nothing was raised."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        yield temporary
+        sync(temporary)
+        rename(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Writes a file, or leaves the old one."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def write_text(path: Path, content: str) -> None:
+    """Writes a file in UTF-8, or leaves the old one."""
+    write_bytes(path, content.encode())
+
+
+def rename(source: Path, target: Path) -> None:
+    """Gives a file or directory another name in the same directory, for good."""
+    os.replace(source, target)
+    sync(target.parent)

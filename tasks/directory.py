@@ -1,0 +1,204 @@
+"""The directory of a run: configuration, environment, records and results; resumable, and whole or not there."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shlex
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+
+from swiftwrf import InputError
+from swiftwrf.durable import rename, replacing
+from tasks.claim import CONFIG, ENVIRONMENT, LOCK, STEPS, Claim
+from tasks.environment import environment, now
+from tasks.records import Row, read_json, strict, write_json, write_table
+
+PARTIAL = ".partial"  # suffix of a run that is not finished
+MOST_LABEL = 60  # characters of what is added to the time in a directory's name
+console = Console(stderr=True, highlight=False)
+
+
+def saved_config(folder: Path, task: str) -> Row:
+    """The configuration of an interrupted run of this task, as it was when the run began.
+
+    Raises:
+        InputError: no such run, one of another task, or a configuration that has changed since.
+    """
+    if not folder.name.endswith(PARTIAL) or not folder.is_dir():
+        raise InputError(f"{folder} is no interrupted run; expected a directory *{PARTIAL} with a {CONFIG}")
+    if not (folder / CONFIG).exists():
+        raise InputError(
+            f"{folder} was stopped before its {CONFIG} was written, so it holds nothing to go on with; start the run again"
+        )
+    content = read_json(folder / CONFIG)
+    if content.get("task") != task:
+        raise InputError(
+            f"{folder} is a run of tasks.{content.get('task')}; resume it with that task, not tasks.{task}"
+        )
+    if _digest(content.get("config")) != read_json(folder / ENVIRONMENT).get("config_sha256"):
+        raise InputError(
+            f"{folder / CONFIG} is not what the run began with, and its steps would mix two configurations; restore it or "
+            "start a new run"
+        )
+    config: Row = content["config"]
+    return config
+
+
+def _digest(config: Any) -> str:
+    return hashlib.sha256(json.dumps(strict(config), sort_keys=True).encode()).hexdigest()
+
+
+class Run:
+    """The directory of a run while it is being filled.
+
+    It is made as `NAME.partial` and renamed to `NAME` by `finish`. What a step has computed is kept there, so that a
+    resumed run goes on after it. A directory is deleted only by the process that made it, and only before a step has left
+    anything in it.
+
+    Args:
+        task: its name, the parent directory of runs without `--out`.
+        out: where the run will lie, or None for a new directory under `runs/`.
+        label: what to add to the time in the name of such a directory.
+        config: a dataclass of plain values.
+        device: where it computes.
+        source: sha256 of all that the run reads, by name; a resumed run must find what it began with.
+        resume: the directory of an interrupted run to go on with. It gets the number of threads that it began with.
+
+    Raises:
+        InputError: `out` exists already, another process is at work in it, or the input has changed since the run began.
+    """
+
+    def __init__(
+        self,
+        task: str,
+        out: str | None,
+        label: str,
+        config: Any,
+        device: torch.device,
+        source: dict[str, str],
+        resume: Path | None = None,
+    ) -> None:
+        if resume is not None:
+            self.final = resume.with_name(resume.name.removesuffix(PARTIAL))
+        else:
+            label = re.sub(r"[^\w.,=-]+", "_", label, flags=re.ASCII)[:MOST_LABEL]
+            self.final = Path(out) if out else Path("runs") / task / f"{datetime.now():%Y%m%d-%H%M%S}-{label}"
+        if not self.final.name:
+            raise InputError(f"--out {out} has no name of its own; give a new directory, e.g. runs/{task}/first")
+        self.folder = self.final.with_name(self.final.name + PARTIAL)
+        self._refuse_existing()
+        self._claim = Claim(self.folder, new=resume is None)
+        try:
+            self._refuse_existing()  # the one before us may have finished before the directory was ours
+            (self.folder / STEPS).mkdir(exist_ok=True)
+            if resume is None:
+                self._begin(task, config, device, source)
+            else:
+                self._go_on(device, source)
+        except BaseException:
+            self._claim.discard_if_nothing_is_lost()
+            raise
+
+    def _refuse_existing(self) -> None:
+        if self.final.exists():
+            raise InputError(f"{self.final} exists already and a run is never overwritten; choose another --out")
+
+    def _begin(self, task: str, config: Any, device: torch.device, source: dict[str, str]) -> None:
+        # the same call as in a run that goes on: it also keeps MKL from choosing a number by itself, which shows in the
+        # last bits
+        torch.set_num_threads(torch.get_num_threads())
+        values = asdict(config)
+        self._environment = environment(device, source) | {"config_sha256": _digest(values)}
+        self.write_json(ENVIRONMENT, self._environment)
+        command = shlex.join(["python", "-m", f"tasks.{task}", *sys.argv[1:]])
+        self.write_json(CONFIG, {"task": task, "command": command, "config": values})
+
+    def _go_on(self, device: torch.device, source: dict[str, str]) -> None:
+        self._environment = read_json(self.path(ENVIRONMENT))
+        before = self._environment.get("input_sha256")
+        if before != source:
+            before = before if isinstance(before, dict) else {}
+            changed = sorted(name for name in {*before, *source} if before.get(name) != source.get(name))
+            raise InputError(
+                f"the input has changed since {self.folder} began ({', '.join(changed)}); restore it or start a new run"
+            )
+        threads = self._environment.get("threads")
+        if isinstance(threads, int) and 1 <= threads <= 1024:  # they are part of the seed
+            torch.set_num_threads(threads)
+        session = {name: value for name, value in environment(device, source).items() if name in ("commit", "start")}
+        self._environment["resumed"] = [*self._environment.get("resumed", []), session]
+        self.write_json(ENVIRONMENT, self._environment)
+
+    def write_json(self, name: str, content: Any) -> None:
+        """Strict JSON: nan and infinity become null."""
+        write_json(self.path(name), content)
+
+    def write_csv(self, name: str, rows: Iterable[Row]) -> None:
+        """A table with the keys of the rows as columns."""
+        write_table(self.path(name), rows)
+
+    def write_npz(self, name: str, arrays: Mapping[str, Any]) -> None:
+        """Arrays by name."""
+        with replacing(self.path(name)) as file, file.open("wb") as stream:
+            np.savez_compressed(stream, **arrays)
+
+    def step(self, name: str, compute: Callable[[], Row]) -> Row:
+        """What `compute` returns (plain values) under `value`; computed once, also over a resumed run. Seconds are kept
+        with it.
+
+        Raises:
+            InputError: what an earlier session kept is damaged.
+        """
+        file = f"{STEPS}/{name}.json"
+        if not self.path(file).exists():
+            console.print(f"[bold]{name}[/] ...", end=" " if not console.is_terminal else "\n")
+            began = time.perf_counter()
+            value = strict(compute())
+            self.write_json(file, {"value": value, "seconds": time.perf_counter() - began})
+            console.print(f"{time.perf_counter() - began:.1f} s")
+        kept = read_json(self.path(file))
+        if not isinstance(kept.get("value"), dict):
+            raise InputError(f"{self.path(file)} does not hold what the step computed; remove it and resume again")
+        return kept
+
+    def path(self, name: str) -> Path:
+        """A file in the run's directory."""
+        return self.folder / name
+
+    def finish(self, metrics: Mapping[str, Any], report: Callable[[Path, Row], None]) -> Path:
+        """Writes environment, report and, last, metrics; gives the run its name; then removes what only a resumed run
+        needs, so that a run stopped in between can still be resumed."""
+        self._environment["end"] = now()
+        self.write_json(ENVIRONMENT, self._environment)
+        plain: Row = strict(metrics)
+        report(self.folder, plain)
+        self.write_json("metrics.json", plain)
+        rename(self.folder, self.final)
+        self._claim.release()
+        shutil.rmtree(self.final / STEPS, ignore_errors=True)
+        (self.final / LOCK).unlink(missing_ok=True)
+        return self.final
+
+    def __enter__(self) -> Run:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if kind is None or not self.folder.exists():
+            self._claim.release()
+        elif issubclass(kind, InputError) and self._claim.discard_if_nothing_is_lost():
+            pass
+        else:
+            self._claim.release()
+            console.print(f"stopped; go on with [bold]--resume {self.folder}[/]")

@@ -1,0 +1,57 @@
+"""Where a run computes: code, versions, machine, input."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from contextlib import suppress
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+
+def now() -> str:
+    """The time in UTC, to the second."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def environment(device: torch.device, source: dict[str, str]) -> dict[str, Any]:
+    """Code, versions, machine and input of a run.
+
+    The number of threads belongs to the seed: sums over threads are added up in another order, and a training turns the
+    last bit of a sum into degrees.
+    """
+    packages = ("torch", "torchvision", "numpy", "scipy", "scikit-learn", "numba")
+    return {
+        "commit": _commit(),
+        "version": version("swiftwrf-tasks"),
+        "python": platform.python_version(),
+        "packages": {name: version(name) for name in packages},
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _processor(),
+        "threads": torch.get_num_threads(),
+        "input_sha256": source,
+        "start": now(),
+    }
+
+
+def _commit() -> str | None:
+    """Of the repository the code runs from, marked where files differ from it; None outside a repository."""
+    with suppress(OSError, subprocess.CalledProcessError):
+        described = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
+            cwd=Path(__file__).parent, capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        return described.stdout.strip()
+    return None
+
+
+def _processor() -> str:
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return f"{line.split(':', 1)[1].strip()}, {os.cpu_count()} cores"
+    return f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores"

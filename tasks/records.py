@@ -1,0 +1,105 @@
+"""Tables and values on disk: written whole or not at all, read back as they were, refused where they are damaged.
+
+A cell that begins with = + - @ is a formula to spreadsheet programs, which run it. Names come from the files of others, so
+such a name is written behind an apostrophe, which those programs take for "this is text", and read back without.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import torch
+
+from swiftwrf import InputError
+from swiftwrf.durable import write_text
+
+Row = dict[str, Any]
+NAMES = (
+    "method",
+    "receiver",
+    "synthesizer",
+    "stage",
+    "origin",
+)  # columns of text, whatever it looks like (NA, 1, 12:34)
+FORMULA = re.compile(r"^'*[=+\-@\t\r]")
+
+
+def strict(value: Any) -> Any:
+    """The value as strict JSON carries it: nan and infinity become null."""
+    if isinstance(value, dict):
+        return {str(key): strict(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [strict(item) for item in value]
+    if isinstance(value, torch.Tensor):
+        return strict(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def write_json(file: Path, content: Any) -> None:
+    """Strict JSON."""
+    write_text(file, json.dumps(strict(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def read_json(file: Path) -> Row:
+    """The JSON object in a file.
+
+    Raises:
+        InputError: no such file, or something else in it.
+    """
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{file} cannot be read ({error.strerror}); is this the directory of a run?") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{file} is not the JSON that a run writes ({error}); restore it") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{file} must hold a JSON object, got a {type(content).__name__}; restore it")
+    return content
+
+
+def write_table(file: Path, rows: Iterable[Row]) -> None:
+    """A comma-separated table with the keys of the rows as columns."""
+    rows = list(rows)
+    stream = io.StringIO(newline="")
+    writer = csv.DictWriter(stream, list(dict.fromkeys(key for row in rows for key in row)))
+    writer.writeheader()
+    writer.writerows({key: _escaped(value) for key, value in row.items()} for row in rows)
+    write_text(file, stream.getvalue())
+
+
+def _escaped(value: Any) -> Any:
+    return f"'{value}" if isinstance(value, str) and FORMULA.match(value) else value
+
+
+def read_table(file: Path) -> pd.DataFrame:
+    """What `write_table` wrote; columns of names are text.
+
+    Raises:
+        InputError: no such file, or no table in it.
+    """
+    try:
+        columns = list(pd.read_csv(file, nrows=0))
+        names = [name for name in NAMES if name in columns]
+        missing = {name: [""] if name in names else ["", "nan"] for name in columns}
+        table = pd.read_csv(file, dtype=dict.fromkeys(names, str), keep_default_na=False, na_values=missing)
+    except OSError as error:
+        raise InputError(f"{file} cannot be read ({error.strerror}); is this the directory of a run?") from None
+    except ValueError as error:  # pandas' own errors and those of decoding are such
+        raise InputError(f"{file} is not the table that a run writes ({error}); restore it") from None
+    for name in names:
+        table[name] = table[name].map(_unescaped, na_action="ignore")
+    return table
+
+
+def _unescaped(text: str) -> str:
+    return text[1:] if text.startswith("'") and FORMULA.match(text) else text

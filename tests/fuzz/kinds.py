@@ -1,0 +1,146 @@
+"""What is fuzzed: one function a kind writes a well-formed sample and gives the way in that reads it.
+
+A format or a kind of model joins by a sample here (a test refuses those without one), a task by its options in
+`commands.py`.
+"""
+
+from __future__ import annotations
+
+import functools
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import torch
+from PIL import Image
+
+from swiftwrf import (
+    AngularGrid,
+    FitConfig,
+    ModelConfig,
+    Rssi,
+    RssiModel,
+    Spectra,
+    fit,
+    fit_coarray,
+    fit_rssi,
+    load,
+    load_rssi,
+    load_spectra,
+    rssi_room,
+    simulated_room,
+)
+from swiftwrf.geometry import fit_geometry, fit_hybrid
+from swiftwrf.gp import Kernel
+from swiftwrf.model import SwiftWRF
+
+N = 12
+TINY = FitConfig(model=ModelConfig(n_primitives=3, rank=2), steps=12, check_every=6)
+Reader = Callable[[Path], object]
+
+
+def spectra_nerf2(folder: Path) -> None:
+    (folder / "spectrum").mkdir()
+    (folder / "gateway_info.yml").write_text("name: a\ng:\n  position: [0, 0, 0]\n  orientation: [0, 0, 0, 1]\n")
+    (folder / "tx_pos.csv").write_text("x,y,z\n" + "".join(f"{i},1,1\n" for i in range(N)))
+    (folder / "train_index.txt").write_text("".join(f"{i:05d}\n" for i in range(1, 11)))
+    (folder / "test_index.txt").write_text("00011\n00012\n")
+    for i in range(N):
+        Image.fromarray(np.arange(8 * 32, dtype=np.uint8).reshape(8, 32)).save(folder / "spectrum" / f"{i + 1:05d}.png")
+
+
+def spectra_paths(folder: Path) -> None:
+    arrays = {
+        "transmitter_position": np.tile([0.0, 0.0, 2.0], (N, 1)),
+        "receiver_position": np.stack([np.arange(1.0, N + 1), np.zeros(N), np.ones(N)], axis=1),
+        "path_count": np.ones(N, dtype=np.int32),
+        "last_point": np.tile([0.0, 0.0, 2.0], (N, 1)),
+        "gain": np.ones(N, dtype=np.complex64),
+        "line_of_sight": np.ones(N, dtype=bool),
+        "frequency_hz": np.float64(2.4e9),
+    }
+    np.savez(folder / "paths.npz", **arrays)
+
+
+def rssi_nerf2(folder: Path) -> None:
+    (folder / "gateway_position.yml").write_text("a: [0, 0, 1]\nb: [5, 0, 1]\n")
+    (folder / "tx_pos.csv").write_text("x,y,z\n" + "".join(f"{i},1,1\n" for i in range(N)))
+    (folder / "gateway_rssi.csv").write_text("a,b\n" + "-50,-100\n" * N)
+    (folder / "train_index.txt").write_text("".join(f"{i}\n" for i in range(10)))
+    (folder / "test_index.txt").write_text("10\n11\n")
+
+
+def _room() -> Spectra:
+    return simulated_room(n=12, grid=AngularGrid.hemisphere(8, 32))
+
+
+def model_swiftwrf(folder: Path) -> None:
+    fit(_room(), TINY, progress=False).save(folder / "model")
+
+
+def model_coarray(folder: Path) -> None:
+    fit_coarray(_room(), progress=False).save(folder / "model")
+
+
+def model_geometry(folder: Path) -> None:
+    fit_geometry(_room(), progress=False).save(folder / "model")
+
+
+def model_hybrid(folder: Path) -> None:
+    fit_hybrid(_room(), fit_geometry(_room(), progress=False)).save(folder / "model")
+
+
+def model_rssi(folder: Path) -> None:
+    fit_rssi(rssi_room(n=40).receivers(["1", "2"])).save(folder / "model")
+
+
+def state_of_a_fit(folder: Path) -> None:
+    go_on(folder)
+
+
+def read_spectra(folder: Path) -> Spectra:
+    data = load_spectra(folder)
+    assert all(t.isfinite().all() for t in (data.position, data.spectrum, data.label))
+    assert 0 <= float(data.spectrum.min()) <= float(data.spectrum.max()) <= 1 + 1e-6
+    return data
+
+
+def read_rssi(folder: Path) -> Rssi:
+    data = load_rssi(folder)
+    assert data.transmitter_position.isfinite().all()
+    assert data.receiver_position.isfinite().all()
+    assert all(isinstance(name, str) and name for name in data.receiver_names)
+    return data
+
+
+def read_model(folder: Path) -> object:
+    model, position = load(folder / "model"), torch.tensor([[3.0, 2.5, 1.2]])
+    drawn = torch.cat(model.predict(position)) if isinstance(model, RssiModel) else model.synthesize(position)
+    assert drawn.isfinite().all()
+    return drawn
+
+
+def go_on(folder: Path) -> SwiftWRF:
+    """A fit from its state; the choice of the kernel, which takes longest, is left out."""
+    with mock.patch.object(sys.modules["swiftwrf.fitting.fit"], "choose_kernel", return_value=Kernel()):
+        return fit(_few(), TINY, progress=False, checkpoint=folder / "state")
+
+
+@functools.cache
+def _few() -> Spectra:
+    return _room()
+
+
+KINDS: dict[str, tuple[Callable[[Path], None], Reader]] = {
+    "format of spectra nerf2": (spectra_nerf2, read_spectra),
+    "format of spectra paths": (spectra_paths, read_spectra),
+    "format of RSSI nerf2": (rssi_nerf2, read_rssi),
+    "swiftwrf model": (model_swiftwrf, read_model),
+    "co-array model": (model_coarray, read_model),
+    "geometry model": (model_geometry, read_model),
+    "hybrid model": (model_hybrid, read_model),
+    "rssi model": (model_rssi, read_model),
+    "fit state": (state_of_a_fit, go_on),
+}

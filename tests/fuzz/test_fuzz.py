@@ -1,0 +1,120 @@
+"""Whatever is done to files and command lines, there is a result that is finite, or one sentence; never a traceback.
+
+200 mutations a kind with every test run; `pytest -m fuzz` makes 10,000 more, and 200 command lines.
+"""
+
+from __future__ import annotations
+
+import random
+import shutil
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from quick import run
+
+from fuzz.commands import command_lines
+from fuzz.kinds import KINDS
+from fuzz.mutate import spoil
+from swiftwrf import FitError, InputError
+from swiftwrf.checkpoint import Saved
+from swiftwrf.data.files import read_table, read_yaml
+from swiftwrf.data.formats import RSSI_FORMATS, SPECTRA_FORMATS
+from swiftwrf.errors import LONGEST
+
+SHORT = 200  # mutations a kind
+LONG = -(-10_000 // len(KINDS))
+
+
+def attack(kind: str, folder: Path, seeds: range) -> dict[str, int]:
+    """How many mutated samples were read and how many refused.
+
+    Raises:
+        AssertionError: one ended otherwise.
+    """
+    write, read = KINDS[kind]
+    sound, spoilt = folder / "sound", folder / "spoilt"
+    sound.mkdir(parents=True)
+    write(sound)
+    read(sound)
+    ends = {"read": 0, "refused": 0}
+    for seed in seeds:
+        shutil.rmtree(spoilt, ignore_errors=True)
+        shutil.copytree(sound, spoilt)
+        spoil(spoilt, random.Random(seed))
+        try:
+            read(spoilt)
+        except (InputError, FitError) as refusal:
+            if len(str(refusal)) > LONGEST or "\n" in str(refusal):
+                raise AssertionError(f"{kind}, seed {seed}: {refusal}") from refusal
+            ends["refused"] += 1
+        except BaseException as error:
+            raise AssertionError(f"{kind}, seed {seed}: {type(error).__name__}: {error}") from error
+        else:
+            ends["read"] += 1
+    return ends
+
+
+def test_every_format_and_model_is_fuzzed():
+    for formats in (SPECTRA_FORMATS, RSSI_FORMATS):
+        for name in formats:
+            assert f"{formats.kind} {name}" in KINDS, f"add a sample of {name} to fuzz/kinds.py"
+    own = {kind for kind, model in Saved.kinds.items() if model.__module__.startswith("swiftwrf.")}
+    assert own <= set(KINDS), "add a sample of the model to fuzz/kinds.py"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_mutations(kind, tmp_path):
+    ends = attack(kind, tmp_path, range(SHORT))
+    assert ends["refused"] > 0
+
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize("kind", KINDS)
+def test_many_mutations(kind, tmp_path):
+    attack(kind, tmp_path, range(SHORT, SHORT + LONG))
+
+
+def _end(task, arguments, capsys):
+    """Runs a command line; its exit code, and what it said where that was a refusal of ours."""
+    try:
+        code = run(task, *arguments)
+    except SystemExit as end:  # help, or options that the parser does not know
+        code = end.code
+    lines = capsys.readouterr().err.strip().splitlines()
+    said = [line for line in lines if line.startswith("error: ")]
+    assert code in (0, 1, 2, None), (task, arguments)
+    if said:
+        assert code in (1, 2)
+        assert len(said) == 1
+        assert len(said[0]) <= LONGEST + len("error: ")
+    return code
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_command_lines(seed, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for task, arguments in command_lines(random.Random(seed), tmp_path, 10):
+        _end(task, arguments, capsys)
+
+
+@pytest.mark.fuzz
+def test_many_command_lines(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for task, arguments in command_lines(random.Random(99), tmp_path, 200):
+        _end(task, arguments, capsys)
+
+
+text = st.text(alphabet=st.characters(codec="utf-8"), max_size=200)
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(text)
+def test_any_text_as_yaml_or_table(tmp_path, content):
+    file = tmp_path / "file"
+    file.write_text(content, encoding="utf-8", newline="")
+    for read in (read_yaml, read_table):
+        with suppress(InputError):
+            read(file)

@@ -1,0 +1,83 @@
+"""The tasks on toys, with cheap stand-ins for what takes long: a whole run takes seconds, and is a real one.
+
+As a program it is the command line of a task, for tests that kill it: `python tests/quick.py aoa --mix 0.5 --out DIR`.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from unittest import mock
+
+from swiftwrf import AngularGrid, FitConfig, ModelConfig, RssiConfig, rssi_room, simulated_room
+from swiftwrf.errors import LONGEST
+from tasks.aoa import experiment as aoa
+from tasks.aoa.arms import NETWORK
+from tasks.aoa.config import AoaConfig
+from tasks.aoa.estimators import ESTIMATORS, Constant
+from tasks.report.__main__ import ReportConfig
+from tasks.report.__main__ import run as report
+from tasks.rssi import experiment as rssi
+from tasks.rssi.predictors import PREDICTORS
+from tasks.run import command_line
+
+FIT = FitConfig(model=ModelConfig(n_primitives=4, rank=2), steps=30, check_every=5)
+PREDICTORS_KEPT = ("swiftwrf", "mean", "mri_pooled", "mri_receiver")
+
+
+class QuickNetwork(Constant):
+    """Stands in for the network; leaves a history as it does."""
+
+    learns = True
+
+    def fit(self, train):
+        super().fit(train)
+        time.sleep(0.05)
+        self.history = [{"step": step, "loss": 1 / step, "seconds": 0.01} for step in (1, 2)]
+
+
+@contextmanager
+def quick() -> Iterator[None]:
+    """Few spectra, few steps, few methods."""
+    spectra = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
+    floor = rssi_room(n=40)
+    network = replace(ESTIMATORS[NETWORK], make=QuickNetwork)
+    with (
+        mock.patch.object(aoa, "simulated_room", return_value=spectra),
+        mock.patch.object(rssi, "rssi_room", return_value=floor),
+        mock.patch("augment.synthesizers.swiftwrf.FitConfig", return_value=FIT),
+        mock.patch("tasks.rssi.predictors.RssiConfig", lambda **given: RssiConfig(**given, steps=2, n_primitives=0)),
+        mock.patch("tasks.rssi.experiment.MAP_CELLS", 8),
+        mock.patch.dict(ESTIMATORS._entries, {NETWORK: network}),
+        mock.patch.object(
+            PREDICTORS, "_entries", {name: PREDICTORS[name] for name in PREDICTORS if name in PREDICTORS_KEPT}
+        ),
+    ):
+        yield
+
+
+def run(task: str, *arguments: object) -> int:
+    """A task's command line on the toy; its exit code."""
+    config, function = {
+        "aoa": (AoaConfig, aoa.run),
+        "rssi": (rssi.RssiTaskConfig, rssi.run),
+        "report": (ReportConfig, report),
+    }[task]
+    with quick():
+        return command_line(f"tasks.{task}", config, function, [str(a) for a in arguments])
+
+
+def said(capsys) -> str:
+    """The one sentence on stderr after `error:`, for tests of refusals."""
+    sentences = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert len(sentences) == 1
+    sentence = sentences[0].removeprefix("error: ")
+    assert len(sentence) <= LONGEST
+    return sentence
+
+
+if __name__ == "__main__":
+    sys.exit(run(*sys.argv[1:]))

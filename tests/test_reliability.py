@@ -1,0 +1,279 @@
+"""Nothing lost, nothing silently wrong: runs that are interrupted, resumed, started twice, or whose input changes."""
+
+from __future__ import annotations
+
+import json
+import os
+from contextlib import suppress
+
+import pandas as pd
+import pytest
+import quick
+import torch
+from quick import run, said
+
+from swiftwrf import InputError, durable
+from tasks.claim import Claim
+from tasks.page.page import Page, Plot, Section, write_page
+from tasks.page.records import Records
+from tasks.records import read_table, write_table
+from tasks.report import merge
+from tasks.rssi import experiment as rssi
+
+TABLES = ("errors.csv", "predictions.csv")
+
+
+@pytest.fixture
+def stopped(tmp_path, monkeypatch):
+    """An RSSI run that was interrupted after its first step, and what it was asked for."""
+    with monkeypatch.context() as patch:
+        patch.setattr(rssi._Tables, "overall", _interrupt)
+        assert run("rssi", "--rx", "1", "--out", tmp_path / "run") == 130
+    return tmp_path / "run.partial"
+
+
+def _interrupt(*_):
+    raise KeyboardInterrupt
+
+
+def _files(folder):
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+@pytest.mark.parametrize("damage", ["", "{", "[1]", '{"value": null}'])
+def test_a_damaged_step_does_not_cost_the_others(stopped, capsys, damage):
+    (stopped / "steps" / "mean.json").write_text(damage)
+    before = _files(stopped)
+    assert run("rssi", "--resume", stopped) == 2
+    assert "mean.json" in said(capsys)
+    after = _files(stopped)
+    assert {name: after[name] for name in before if name != "environment.json"} == {
+        name: before[name] for name in before if name != "environment.json"
+    }
+
+
+def test_a_run_stopped_while_it_finishes_can_be_finished(tmp_path, monkeypatch):
+    assert run("rssi", "--rx", "1", "--out", tmp_path / "whole") == 0
+    with monkeypatch.context() as patch:
+        patch.setattr("tasks.directory.rename", _interrupt)
+        assert run("rssi", "--rx", "1", "--out", tmp_path / "cut") == 130
+    assert (tmp_path / "cut.partial" / "metrics.json").exists()
+    assert run("rssi", "--resume", tmp_path / "cut.partial") == 0
+    assert sorted(p.name for p in (tmp_path / "cut").iterdir()) == sorted(
+        p.name for p in (tmp_path / "whole").iterdir()
+    )
+    for name in TABLES:
+        assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_a_failed_start_leaves_nothing(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise InputError("no")
+
+    monkeypatch.setattr(rssi._Tables, "add", refuse)
+    assert run("rssi", "--rx", "1", "--out", tmp_path / "run") == 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_resume_refuses_another_configuration(stopped, capsys):
+    file = stopped / "config.json"
+    content = json.loads(file.read_text())
+    content["config"]["seed"] = 1
+    file.write_text(json.dumps(content))
+    assert run("rssi", "--resume", stopped) == 2
+    assert "not what the run began with" in said(capsys)
+    assert (stopped / "steps" / "mean.json").exists()
+
+
+def test_resume_refuses_another_task(stopped, capsys):
+    assert run("aoa", "--resume", stopped) == 2
+    assert "run of tasks.rssi" in said(capsys)
+
+
+def test_resume_refuses_changed_data(tmp_path, monkeypatch, capsys):
+    """Every file that is read counts: here a floor plan."""
+    from PIL import Image
+
+    plan = tmp_path / "plan.png"
+    Image.new("RGB", (4, 4)).save(plan)
+    with monkeypatch.context() as patch:
+        patch.setattr(rssi._Tables, "overall", _interrupt)
+        floor = ("--floor-plan", plan, "--floor-extent", 0, 1, 0, 1)
+        assert run("rssi", "--rx", "1", *floor, "--out", tmp_path / "run") == 130
+    Image.new("RGB", (5, 4)).save(plan)
+    assert run("rssi", "--resume", tmp_path / "run.partial") == 2
+    assert "changed since" in said(capsys)
+    assert (tmp_path / "run.partial" / "steps" / "mean.json").exists()
+
+
+def test_resumed_run_keeps_its_number_of_threads(stopped):
+    file = stopped / "environment.json"
+    content, before = json.loads(file.read_text()), torch.get_num_threads()
+    file.write_text(json.dumps(content | {"threads": before + 1}))
+    try:
+        assert run("rssi", "--resume", stopped) == 0
+        assert torch.get_num_threads() == before + 1
+    finally:
+        torch.set_num_threads(before)
+    report = (stopped.with_name("run") / "report.html").read_text()
+    assert "like the seed" in report
+    assert "resumed" in report
+
+
+@pytest.mark.parametrize("left", [[], ["environment.json"], ["steps/"]])
+def test_a_directory_left_before_the_run_began_is_taken_over(tmp_path, capsys, left):
+    partial = tmp_path / "run.partial"
+    partial.mkdir()
+    for name in left:
+        (partial / name).mkdir() if name.endswith("/") else (partial / name).write_text("{}")
+    assert run("rssi", "--resume", partial) == 2
+    assert "start the run again" in said(capsys)
+    assert run("rssi", "--rx", "1", "--out", tmp_path / "run") == 0
+
+
+def test_foreign_files_are_never_taken_over(tmp_path, capsys):
+    (tmp_path / "run.partial").mkdir()
+    (tmp_path / "run.partial" / "thesis.txt").write_text("years of work")
+    assert run("rssi", "--rx", "1", "--out", tmp_path / "run") == 2
+    assert "exists already" in said(capsys)
+    assert [file.name for file in (tmp_path / "run.partial").iterdir()] == ["thesis.txt"]
+
+
+def test_one_process_at_a_time(stopped, tmp_path, capsys):
+    claim = Claim(stopped, new=False)
+    assert run("rssi", "--resume", stopped) == 2
+    assert "another process" in said(capsys)
+    claim.release()
+    new = Claim(tmp_path / "new.partial", new=True)
+    with pytest.raises(InputError, match="another process"):
+        Claim(tmp_path / "new.partial", new=True)
+    new.release()
+
+
+def test_report_leaves_the_interrupted_work_of_others(tmp_path):
+    assert run("rssi", "--rx", "1", "--out", tmp_path / "one") == 0
+    (tmp_path / "long.partial").mkdir()
+    (tmp_path / "long.partial" / "config.json").write_text("{}")
+    merge([tmp_path / "one"], tmp_path / "long")
+    assert (tmp_path / "long.partial" / "config.json").exists()
+    assert {file.name for file in tmp_path.iterdir()} == {"one", "long", "long.partial"}
+
+
+@pytest.mark.parametrize(
+    ("task", "first", "second", "figures"),
+    [("rssi", ("--rx", "1"), ("--rx", "2"), 6), ("aoa", ("--mix", 0.5), ("--mix", 0.5, "--repeats", 2), 4)],
+)
+def test_merged_reports_show_every_run(tmp_path, task, first, second, figures):
+    method = ("--synthesizer", "nearest") if task == "aoa" else ()
+    for name, arguments in (("one", first), ("two", second)):
+        assert run(task, *arguments, *method, "--out", tmp_path / name) == 0
+    merge([tmp_path / "one", tmp_path / "two"], tmp_path / "both")
+    drawn = _files(tmp_path / "both" / "figures")
+    assert len({name for name in drawn if "run1" in name}) == len({name for name in drawn if "run2" in name}) >= figures
+    for name in (name for name in drawn if "run1" in name and name.startswith(("cdf", "map", "bars"))):
+        assert drawn[name] != drawn[name.replace("run1", "run2")]
+
+
+def test_two_figures_of_one_name_are_refused(tmp_path):
+    from matplotlib.figure import Figure
+
+    plots = [Plot("same", Figure(), ""), Plot("same", Figure(), "")]
+    with pytest.raises(ValueError, match="same"):
+        write_page(tmp_path, Page("", "", [Section("", plots=plots)]))
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("metrics.json", "{"),
+        ("metrics.json", "[]"),
+        ("metrics.json", '{"task": "rssi"}'),
+        ("metrics.json", '{"task": "other"}'),
+        ("metrics.json", "\udcff"),
+        ("config.json", "{}"),
+        ("environment.json", '{"packages": 3}'),
+        ("errors.csv", ""),
+        ("errors.csv", "method\nswiftwrf\n"),
+        ("errors.csv", None),
+        ("maps.npz", "PK"),
+    ],
+)
+def test_report_refuses_damaged_records(tmp_path, capsys, name, content):
+    assert run("rssi", "--rx", "1", "--out", tmp_path / "run") == 0
+    file = tmp_path / "run" / name
+    file.unlink()
+    if content is not None:
+        file.write_bytes(content.encode(errors="surrogateescape"))
+    capsys.readouterr()
+    assert run("report", tmp_path / "run", "--out", tmp_path / "report") == 2
+    said(capsys)
+    assert [file.name for file in tmp_path.iterdir()] == ["run"]
+
+
+def test_names_are_text_and_no_formulas(tmp_path):
+    names = ["NA", "nan", "1", "12:34:56", "", "=1+1", "+a", "-b", "@c", "'=d", "'e", "true"]
+    write_table(tmp_path / "t.csv", [{"receiver": name, "value": float("nan"), "n": 1} for name in names])
+    table = read_table(tmp_path / "t.csv")
+    assert table["receiver"].fillna("").tolist() == names
+    assert table["value"].isna().all()
+    assert (table["n"] == 1).all()
+    lines = (tmp_path / "t.csv").read_text().splitlines()
+    assert not [line for line in lines if line[0] in "=+-@"]
+
+
+@pytest.mark.parametrize("name", ["NA", "$x^{$", "=cmd()", "12:34:56", "7", "<b>", "x" * 300])
+def test_a_receiver_may_have_any_name(tmp_path, monkeypatch, name):
+    from dataclasses import replace
+
+    from swiftwrf import rssi_room
+
+    floor = rssi_room(n=40)
+    with quick.quick():
+        monkeypatch.setattr(
+            rssi, "rssi_room", lambda seed: replace(floor, receiver_names=(name, *floor.receiver_names[1:]))
+        )
+        config = rssi.RssiTaskConfig(rx=("1",), out=str(tmp_path / "run"))
+        rssi.run(config)
+    assert set(pd.read_csv(tmp_path / "run" / "errors.csv", dtype=str, keep_default_na=False)["receiver"]) in (
+        {name},
+        {f"'{name}"},
+    )
+    assert set(Records(tmp_path / "run").table("errors")["receiver"]) == {name}
+
+
+def test_files_reach_the_disk_before_they_get_their_name(tmp_path, monkeypatch):
+    done: list[tuple[str, str]] = []
+    fsync, replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda fd: (done.append(("sync", os.readlink(f"/proc/self/fd/{fd}"))), fsync(fd)))
+    monkeypatch.setattr(os, "replace", lambda a, b: (done.append(("rename", str(b))), replace(a, b)))
+    durable.write_text(tmp_path / "a", "text")
+    assert [kind for kind, _ in done] == ["sync", "rename", "sync"]
+    assert done[0][1] != str(tmp_path / "a")
+    assert done[2][1] == str(tmp_path)
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    durable.write_text(tmp_path / "a", "old")
+    with pytest.raises(UnicodeEncodeError):
+        durable.write_text(tmp_path / "a", "\udcff")
+    with suppress(OSError), durable.replacing(tmp_path / "a") as file:
+        file.write_text("half")
+        raise OSError("disk full")
+    assert _files(tmp_path) == {"a": b"old"}
+
+
+def test_a_full_disk_ends_in_a_sentence_and_can_be_resumed(tmp_path, capsys, monkeypatch):
+    write, calls = durable.os.fsync, []
+
+    def full(descriptor):
+        calls.append(1)
+        if len(calls) > 12:
+            raise OSError(28, "No space left on device", "file")
+        write(descriptor)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(durable.os, "fsync", full)
+        assert run("rssi", "--rx", "1", "--out", tmp_path / "run") == 2
+    assert "no space left" in said(capsys)
+    assert run("rssi", "--resume", tmp_path / "run.partial") == 0
+    assert not list((tmp_path / "run").rglob(".*"))
