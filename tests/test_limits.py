@@ -78,7 +78,7 @@ def test_grids_arrays_and_kernels_refuse_what_they_cannot_be():
 
 
 def test_prime_numbers_of_rows_leave_the_network_something():
-    from tasks.aoa.aann import LEAST_ROWS
+    from tasks.aoa.estimators.aann import LEAST_ROWS
 
     assert coarsening((89, 356), 120, LEAST_ROWS) == 1
     assert coarsening((90, 360), 120, LEAST_ROWS) == 3

@@ -25,10 +25,7 @@ from swiftwrf import GeometryModel, InputError, Spectra, load_spectra, simulated
 from swiftwrf.checkpoint import Saved, read, write
 from swiftwrf.geometry import HybridModel
 from swiftwrf.metrics import angle_errors, l1, psnr, ssim
-from tasks.aoa import (
-    aann,  # noqa: F401 (registers the network)
-    arms,
-)
+from tasks.aoa import arms
 from tasks.aoa.advice import advise
 from tasks.aoa.config import AUTO, AoaConfig, check, further_positions, with_array
 from tasks.aoa.estimators import ESTIMATORS, Settings, learners

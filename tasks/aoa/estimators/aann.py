@@ -31,7 +31,7 @@ STATISTICS = 512  # spectra that the batch norms' statistics are taken from
 class AANNConfig:
     """How the network is trained."""
 
-    steps: int = 200
+    steps: int = 150
     """optimisation steps, the same for every training set"""
     batch: int = 32
     """spectra a step"""
