@@ -20,7 +20,7 @@ from tasks.aoa.estimators import ESTIMATORS, Settings
 from tasks.metrics import AdviceMetrics, ChangeMetrics, GainMetrics
 
 STAND_IN = "kernel_ridge"
-NUMBERS = (300, 1000, 3000)  # of further positions that are compared
+NUMBERS, MIDDLE = (300, 1000, 3000), 1000  # of further positions that are compared
 DRAWS = 2000  # of the bootstrap
 
 
@@ -34,11 +34,18 @@ def advise(trials: Sequence[Trial], settings: Settings, extra: int) -> AdviceMet
         extra: number of further positions that the run adds; larger numbers are not compared.
     """
     alone = np.concatenate([_errors(trial, 0, False, settings) for trial in trials])
+
+    def gain(number: int, sampled: bool) -> GainMetrics:
+        turbo = np.concatenate([_errors(trial, number, sampled, settings) for trial in trials])
+        return {"extra": number, "sampled": sampled, **_paired(alone, turbo)}
+
     gains: list[GainMetrics] = []
-    for sampled in (False, True) if trials[0].synthesizer.samples else (False,):
-        for number in sorted({*(n for n in NUMBERS if n < extra), extra} - {0}):
-            with_extra = np.concatenate([_errors(trial, number, sampled, settings) for trial in trials])
-            gains.append({"extra": number, "sampled": sampled, **_paired(alone, with_extra)})
+    if extra:
+        middle = min(MIDDLE, extra)  # where means and draws are compared
+        gains = [gain(middle, sampled) for sampled in ((False, True) if trials[0].synthesizer.samples else (False,))]
+        better = min(gains, key=lambda found: found["median_deg"])["sampled"]
+        others = sorted({*(n for n in NUMBERS if n < extra), extra} - {middle})
+        gains += [gain(number, better) for number in others]
     best = min(gains, key=lambda gain: gain["median_deg"], default=None)
     return {
         "stand_in": STAND_IN,

@@ -70,7 +70,8 @@ def _gain(share: Share, advice: AdviceMetrics) -> Plot:
     name = share.mix["choice"]["name"] if share.mix["choice"] else ""
     colour = arms.palette().colour(name)
     for sampled, line, label in ((False, "-", "most plausible spectra"), (True, "--", "drawn spectra")):
-        gains = [gain for gain in advice["gains"] if gain["sampled"] == sampled]
+        own = [gain for gain in advice["gains"] if gain["sampled"] == sampled]
+        gains = sorted(own, key=lambda gain: gain["extra"])
         if gains:
             at = [0, *(gain["extra"] for gain in gains)]
             ax.plot(
