@@ -19,7 +19,7 @@ from swiftwrf.data.spectra import Spectra, check_training
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.geometry.model import GeometryModel
 from swiftwrf.gp import Kernel, choose_kernel, held_out_weights
-from swiftwrf.positions import check_positions
+from swiftwrf.positions import check_batch, check_drawn, check_positions
 
 COMPONENTS = 64  # principal components of the difference that are kept at most
 PIXELS = 4000  # of a spectrum that are enough to choose kernel and share
@@ -57,6 +57,7 @@ class HybridModel(Saved):
             InputError: positions of another shape, or not finite.
         """
         position = check_positions(position)
+        check_batch(batch)
         spectrum = torch.empty(len(position), *self.geometry.grid.shape)
         for start in range(0, len(position), batch):
             rows = slice(start, start + batch)
@@ -64,7 +65,7 @@ class HybridModel(Saved):
             smooth = (self.component[0] + score @ self.component[1:]).reshape(-1, *self.geometry.grid.shape)
             sharp = self.share * self.geometry.synthesize(position[rows], generator) if self.share else 0.0
             spectrum[rows] = (smooth + sharp).clamp(0, 1)
-        return spectrum
+        return check_drawn(spectrum)
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """All there is to save: tensors and plain values."""
