@@ -62,9 +62,9 @@ def same_results(task, whole, cut):
     assert not (cut / "steps").exists()
 
 
-def wait_for(process, sign):
-    """Until the run is under way, or over."""
-    while process.poll() is None and not sign.exists():
+def wait_for(process, environment, since):
+    """Until this start of the run is under way (it has written its environment since then), or over."""
+    while process.poll() is None and not (environment.exists() and environment.stat().st_mtime > since):
         time.sleep(0.01)
 
 
@@ -74,8 +74,9 @@ def kill_until_done(folder, asked, whole, draw, kills):
     arguments = (*asked, "--out", out)
     partial = out.with_name("cut.partial")
     while hit < kills and not out.exists():
+        since = time.time()
         process = start(folder, *arguments)
-        wait_for(process, partial)
+        wait_for(process, partial / "environment.json", since)
         time.sleep(draw.uniform(0, 3))
         process.send_signal(signal.SIGKILL)
         process.communicate()

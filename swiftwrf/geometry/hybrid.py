@@ -19,7 +19,7 @@ from swiftwrf.data.spectra import Spectra, check_training
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.geometry.model import GeometryModel
 from swiftwrf.gp import Kernel, choose_kernel, held_out_weights
-from swiftwrf.positions import check_positions
+from swiftwrf.positions import check_batch, check_drawn, check_positions
 from swiftwrf.threads import single_thread
 
 COMPONENTS = 64  # principal components of the difference that are kept at most
@@ -58,6 +58,7 @@ class HybridModel(Saved):
             InputError: positions of another shape, or not finite.
         """
         position = check_positions(position)
+        check_batch(batch)
         spectrum = torch.empty(len(position), *self.geometry.grid.shape)
         for start in range(0, len(position), batch):
             rows = slice(start, start + batch)
@@ -65,7 +66,7 @@ class HybridModel(Saved):
             smooth = (self.component[0] + score @ self.component[1:]).reshape(-1, *self.geometry.grid.shape)
             sharp = self.share * self.geometry.synthesize(position[rows], generator) if self.share else 0.0
             spectrum[rows] = (smooth + sharp).clamp(0, 1)
-        return spectrum
+        return check_drawn(spectrum)
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """All there is to save: tensors and plain values."""

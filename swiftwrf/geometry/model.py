@@ -15,7 +15,7 @@ from swiftwrf.data.spectra import Moving
 from swiftwrf.errors import InputError
 from swiftwrf.geometry.images import Scene, field, image_gain, images, sequences
 from swiftwrf.geometry.sample import Residual, draw
-from swiftwrf.positions import check_positions
+from swiftwrf.positions import check_batch, check_drawn, check_positions
 
 MOST_PLANES, MOST_ORDER = 64, 4  # of a room in a file
 
@@ -90,11 +90,12 @@ class GeometryModel(Saved):
             InputError: positions of another shape, or not finite.
         """
         position = check_positions(position)
+        check_batch(batch)
         spectrum = torch.empty(len(position), *self.grid.shape)
         for start in range(0, len(position), batch):
             rows = slice(start, start + batch)
             spectrum[rows] = self.array.spectrum(self.channel(position[rows], generator), self.grid)
-        return spectrum
+        return check_drawn(spectrum)
 
     def channel(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """What each element hears at positions (n, 3) [m], complex64 (n, K), drawn where there is a generator."""
