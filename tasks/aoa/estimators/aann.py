@@ -31,11 +31,11 @@ STATISTICS = 512  # spectra that the batch norms' statistics are taken from
 class AANNConfig:
     """How the network is trained."""
 
-    steps: int = 150
+    steps: int = 250
     """optimisation steps, the same for every training set"""
     batch: int = 32
     """spectra a step"""
-    rate: float = 1e-3
+    rate: float = 2e-3
     """peak learning rate of AdamW, one cycle"""
     max_azimuths: int = 60
     """larger spectra are averaged down for the network; 0 keeps all pixels"""
