@@ -5,15 +5,22 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 from tasks.metrics import RunMetrics
 from tasks.page.records import Records
 
 
 def collect(folder: Path, name: str) -> None:
-    """Writes the run's command, environment and metrics to `results/NAME.json`."""
+    """Writes the run's command, environment, metrics and the rooms it found to `results/NAME.json`."""
     run: Records[RunMetrics] = Records(folder)
-    content = {"command": run.config["command"], "environment": run.environment, "metrics": run.metrics}
+    content: dict[str, Any] = {"command": run.config["command"], "environment": run.environment, "metrics": run.metrics}
+    rooms = {
+        file.stem.removeprefix("geometry-mix"): json.loads(file.read_text())
+        for file in sorted(folder.glob("geometry-mix*.json"))
+    }
+    if rooms:
+        content["geometry"] = rooms
     file = Path(__file__).parent / "results" / f"{name}.json"
     file.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
     print(f"wrote {file}")

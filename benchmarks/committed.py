@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tasks.metrics import AoaMetrics, RssiMetrics
+from tasks.metrics import AoaMetrics, ErrorSummary, MixMetrics, RssiMetrics
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
@@ -32,3 +32,14 @@ def markdown(columns: list[str], rows: list[list[str]]) -> str:
     """The table in Markdown."""
     lines = [columns, ["---"] * len(columns), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def turbo_arm(mix: MixMetrics) -> str:
+    """The network's arm with synthetic spectra, that with further positions if there is one."""
+    names = [name for name in mix["methods"] if name.startswith("turbo_")]
+    return max(names, key=lambda name: name.endswith("_extra"))
+
+
+def interval(error: ErrorSummary) -> str:
+    """Median with its 95 % interval."""
+    return f"{error['median']:.2f} [{error['low']:.2f}, {error['high']:.2f}]"

@@ -6,7 +6,8 @@ import json
 import re
 from typing import Any
 
-from committed import RESULTS, ROOT, aoa_runs, load, markdown, rssi_runs
+from committed import RESULTS, ROOT, aoa_runs, interval, load, markdown, rssi_runs, turbo_arm
+from geometry import WALLS
 from targets import aoa_targets, rssi_targets, synthesis_targets
 
 from tasks.summarise import pareto
@@ -23,15 +24,55 @@ def synthesis() -> str:
 
 
 def aoa() -> str:
-    """Median great-circle errors of the arms of each run."""
-    methods = ("constant", "nearest_spectrum", "measured_only", "turbo_swiftwrf", "measured_all")
+    """Median great-circle errors of the arms of each run; turbo: with further positions where there are any."""
+    fixed = ("nearest_spectrum", "kernel_ridge", "measured_only")
+    columns = [
+        "scene, split, moving end",
+        "measured",
+        *fixed,
+        "turbo",
+        "turbo, kernel_ridge",
+        "measured_all",
+        "synthesizer",
+    ]
     rows = []
     for metrics in aoa_runs():
+        scene = f"{metrics['data']}, {metrics['split']}, {metrics['moving']}"
         for share, mix in metrics["mixes"].items():
-            errors = [mix["methods"][name]["great_circle_deg"] for name in methods]
-            cells = [f"{e['median']:.2f} [{e['low']:.2f}, {e['high']:.2f}]" for e in errors]
-            rows.append([f"{metrics['data']}, {metrics['split']}", f"{float(share):.0%}", *cells])
-    return markdown(["scene, split", "measured", *methods], rows)
+            arms, turbo = mix["methods"], turbo_arm(mix)
+            names = (*fixed, turbo, f"kernel_ridge_{turbo}", "measured_all")
+            cells = [interval(arms[name]["great_circle_deg"]) if name in arms else "" for name in names]
+            rows.append([scene, f"{float(share):.0%}", *cells, turbo.removeprefix("turbo_").replace("_", ", ")])
+    return markdown(columns, rows)
+
+
+def room() -> str:
+    """The planes that each run found, whose true places are known."""
+    rows = []
+    for name in sorted(file.stem for file in RESULTS.glob("aoa_*.json")):
+        content = load(name)
+        for share, found in content.get("geometry", {}).items():
+            walls = WALLS.get(content["metrics"]["data"])
+            if walls is None:
+                continue
+            errors = [_wall_error(found["planes"], *wall) for wall in walls]
+            cells = ["not found" if error is None else f"{1000 * error:.1f}" for error in errors]
+            certain = sum(plane["certain"] for plane in found["planes"])
+            scene = f"{content['metrics']['data']}, {content['metrics']['moving']}"
+            n = content["metrics"]["mixes"][share]["n_measured"]
+            psnr = content["metrics"]["mixes"][share]["synthesis"]
+            quality = [f"{psnr[s]['psnr_db']['median']:.1f}" for s in ("geometry", "hybrid", "coarray", "gp")]
+            rows.append([scene, str(n), *cells, f"{certain} of {len(found['planes'])}", *quality])
+    sides = ("x-", "x+", "y-", "y+", "z-", "z+")
+    methods = ("geometry", "hybrid", "coarray", "gp")
+    return markdown(["scene, moving end", "spectra", *(f"{s} [mm]" for s in sides), "certain", *methods], rows)
+
+
+def _wall_error(planes: list[dict[str, Any]], axis: int, offset: float) -> float | None:
+    """Distance [m] of the nearest plane found along an axis, None beyond half a metre."""
+    own = [p["offset_m"] * p["normal"][axis] for p in planes if abs(p["normal"][axis]) > 0.99]
+    error = min((abs(at - offset) for at in own), default=1.0)
+    return error if error < 0.5 else None
 
 
 def rssi() -> str:
@@ -181,6 +222,7 @@ def ablation() -> str:
 TABLES = {
     "synthesis": synthesis,
     "aoa": aoa,
+    "room": room,
     "rssi": rssi,
     "size": size,
     "hard_cases": hard_cases,

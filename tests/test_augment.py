@@ -23,6 +23,7 @@ from augment.choose import candidates
 from augment.synthesizers.idw import weights
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, simulated_room
 from swiftwrf.metrics import psnr
+from swiftwrf.registry import Entry
 
 ROOM = simulated_room(n=60, seed=3, grid=AngularGrid.hemisphere(15, 60))
 TRAIN, TEST = ROOM.split("random", 0)
@@ -165,3 +166,33 @@ def test_choice_takes_the_best_on_held_out_spectra_and_sees_nothing_else():
     assert chosen.psnr_db[chosen.name] == max(chosen.psnr_db.values())
     assert "geometry" in candidates(TRAIN)
     assert not {"geometry", "hybrid", "coarray"} & set(candidates(replace(TRAIN, array=None)))
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(0.3, 0.9), st.integers(0, 2**31))
+def test_choice_advice_and_further_places_see_the_measured_share_alone(share, seed):
+    """Every spectrum that any fit is shown is measured; places are drawn from measured positions alone."""
+    measured, withheld = withhold(TRAIN, share, seed)
+    shown = []
+
+    class Spy(Recorder):
+        def fit(self, train):
+            super().fit(train)
+            shown.append(train)
+
+    entries = dict(SYNTHESIZERS._entries)
+    SYNTHESIZERS._entries = {"spy": Entry("spy", Spy, "watches")}
+    try:
+        choice = choose_synthesizer(measured, Settings(seed=seed % 1000), ("spy",))
+    finally:
+        SYNTHESIZERS._entries = entries
+    own = set(measured.index.tolist())
+    assert len(shown) == len(choice.trials) == 5
+    for trial, train in zip(choice.trials, shown, strict=True):
+        kept, out = (set(part.index.tolist()) for part in (train, trial.out))
+        assert not kept & out
+        assert kept | out == own
+        assert torch.equal(train.spectrum, ROOM.spectrum[train.index])
+    assert not own & (set(withheld.index.tolist()) | set(TEST.index.tolist()))
+    blank = replace(measured, spectrum=torch.full_like(measured.spectrum, torch.nan))
+    assert torch.equal(draw_places(blank, 9, 0).position, draw_places(measured, 9, 0).position)
