@@ -17,7 +17,8 @@ from swiftwrf.errors import LONGEST
 from tasks.aoa import experiment as aoa
 from tasks.aoa.arms import NETWORK
 from tasks.aoa.config import AoaConfig
-from tasks.aoa.estimators import ESTIMATORS, Constant
+from tasks.aoa.estimators import ESTIMATORS
+from tasks.aoa.estimators.baselines import Constant
 from tasks.report.__main__ import ReportConfig
 from tasks.report.__main__ import run as report
 from tasks.rssi import experiment as rssi

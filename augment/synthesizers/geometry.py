@@ -32,7 +32,7 @@ def find_room(train: Spectra, settings: Settings) -> GeometryModel:
     "geometry",
     meaning="paths by way of the room's walls, which it finds from the spectra",
     needs=(ARRAY, FIXED_END),
-    colour="#117733",
+    colour="#0077bb",
 )
 class Geometry(Synthesizer):
     """Image sources of the known fixed end in mirror planes found from the training spectra."""

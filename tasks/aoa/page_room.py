@@ -80,6 +80,7 @@ def _gain(share: Share, advice: AdviceMetrics) -> Plot:
             ax.fill_between(at, *_band(gains), color=colour, alpha=0.12, linewidth=0)
     ax.axhline(0, color="#aeb7c6", linewidth=1)
     ax.set_xscale("symlog", linthresh=100)
+    ax.set_xlim(left=0)
     ax.xaxis.set_major_formatter("{x:g}")
     ax.set(xlabel="further positions with synthetic spectra", ylabel="change of the median error [%]")
     figures.legend_below(figure, ax)

@@ -51,16 +51,20 @@ def as_svg(figure: Figure) -> str:
 
 def legend_below(figure: Figure, axes: Axes) -> None:
     """One legend for all axes, from the entries of one of them."""
-    columns = max(1, int(figure.get_figwidth() / 1.6))
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=columns, frameon=False)
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=_columns(figure, labels), frameon=False)
 
 
 def legend_of(figure: Figure, palette: Palette, names: Sequence[str]) -> None:
     """A legend of dots in the colours of methods."""
     dots = [Line2D([], [], marker="o", linestyle="", color=palette.colour(name), label=name) for name in names]
-    figure.legend(
-        handles=dots, loc="outside lower center", ncols=max(1, int(figure.get_figwidth() / 1.8)), frameon=False
-    )
+    figure.legend(handles=dots, loc="outside lower center", ncols=_columns(figure, names), frameon=False)
+
+
+def _columns(figure: Figure, labels: Sequence[str]) -> int:
+    """Of a legend that is no wider than its figure: a line, and 0.08 inches a letter."""
+    widest = max((len(label) for label in labels), default=0)
+    return max(1, int(figure.get_figwidth() / (0.6 + 0.08 * widest)))
 
 
 def cdf(axes: Axes, palette: Palette, errors: Mapping[str, ArrayLike], label: str, limit: float | None = None) -> None:
