@@ -86,7 +86,8 @@ def choose_synthesizer(measured: Spectra, settings: Settings, names: Iterable[st
             found.append(psnr(synthesizer.synthesize(out.position), out.spectrum))
         else:
             score[name] = float(torch.cat(found).median())
-        seconds[name] = time.perf_counter() - began
+        shared = sum(trial.synthesizer.shared_seconds for trial in trials[name])
+        seconds[name] = time.perf_counter() - began + shared
     if not score:
         raise InputError(f"no synthesizer can be fitted to {len(measured)} measured spectra of {measured.name}")
     best = max(score, key=lambda name: score[name])

@@ -46,6 +46,8 @@ class Synthesizer(ABC):
 
     samples: ClassVar[bool] = False
     """whether `synthesize` can draw instead of predicting the mean"""
+    shared_seconds: float = 0.0
+    """of its fit, spent by another synthesizer that needed the same"""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings

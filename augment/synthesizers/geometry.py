@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import OrderedDict
 
 import torch
@@ -12,20 +13,22 @@ from swiftwrf import GeometryModel, Spectra, fit_geometry
 from swiftwrf.data.spectra import fingerprint
 from swiftwrf.geometry import refit_geometry
 
-_ROOMS: OrderedDict[str, GeometryModel] = OrderedDict()  # the last ones found: synthesizers that need the same share it
+_ROOMS: OrderedDict[str, tuple[GeometryModel, float]] = OrderedDict()  # the last ones found, with the seconds that took
 _KEPT = 4
 
 
-def find_room(train: Spectra, settings: Settings) -> GeometryModel:
-    """The room in which these spectra were measured; found once for all synthesizers that build on it."""
+def find_room(train: Spectra, settings: Settings) -> tuple[GeometryModel, float]:
+    """The room in which these spectra were measured, found once for all synthesizers that build on it, and the seconds
+    that another one spent on it."""
     key = fingerprint(train, settings.validation, settings.seed)
-    if key not in _ROOMS:
-        _ROOMS[key] = fit_geometry(
-            train, validation=settings.validation, seed=settings.seed, progress=settings.progress
-        )
-        if len(_ROOMS) > _KEPT:
-            _ROOMS.popitem(last=False)
-    return _ROOMS[key]
+    if key in _ROOMS:
+        return _ROOMS[key]
+    began = time.perf_counter()
+    room = fit_geometry(train, validation=settings.validation, seed=settings.seed, progress=settings.progress)
+    _ROOMS[key] = room, time.perf_counter() - began
+    if len(_ROOMS) > _KEPT:
+        _ROOMS.popitem(last=False)
+    return room, 0.0
 
 
 @SYNTHESIZERS.register(
@@ -40,7 +43,7 @@ class Geometry(Synthesizer):
     samples = True
 
     def fit(self, train: Spectra) -> None:
-        self._model = find_room(train, self.settings)
+        self._model, self.shared_seconds = find_room(train, self.settings)
 
     def fit_like(self, other: Synthesizer, train: Spectra) -> None:
         assert isinstance(other, Geometry)

@@ -23,7 +23,8 @@ class Hybrid(Synthesizer):
     samples = True
 
     def fit(self, train: Spectra) -> None:
-        self._fit(train, find_room(train, self.settings))
+        room, self.shared_seconds = find_room(train, self.settings)
+        self._fit(train, room)
 
     def fit_like(self, other: Synthesizer, train: Spectra) -> None:
         assert isinstance(other, Hybrid)

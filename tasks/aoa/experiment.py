@@ -212,7 +212,10 @@ class _Experiment:
                 if asked is not None:
                     own = generator if sampled and synthesizer.samples else None
                     drawn[key] = synthesizer.synthesize(asked.position, own)
-            seconds = {"fit": fitted - fit.began + fit.earlier, "synthesize": time.perf_counter() - fitted}
+            seconds = {
+                "fit": fitted - fit.began + fit.earlier + synthesizer.shared_seconds,
+                "synthesize": time.perf_counter() - fitted,
+            }
             write(file, "synthetic spectra", {key: _as_bytes(spectrum) for key, spectrum in drawn.items()}, {})
             if places[0] is not None and arm["repeat"] == 0:
                 self._keep_model(synthesizer.model, name, arm["mix"], measured)

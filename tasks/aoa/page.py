@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from augment import SYNTHESIZERS
 from tasks.aoa import arms
+from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.page_room import advice_sentence, choice_section, room_section
 from tasks.aoa.share import AoaRecords, Share, first_history, fits, place, scene
 from tasks.metrics import Angle, ErrorSummary
@@ -32,7 +34,7 @@ def page(runs: list[AoaRecords]) -> Page:
         sections.insert(0, _over_shares(shares))
     for share in shares:
         sections += [section for section in (choice_section(share), room_section(share)) if section]
-    sections += [_synthesis(shares, several), *(_examples(share) for share in shares), _size(runs)]
+    sections += [_synthesis(shares, several), *(_examples(share) for share in shares), *_size(runs)]
     sections += [*(_speed(share) for share in shares), _training(runs)]
     sections += [_time(shares, several), _limits(runs[0]), provenance(runs)]
     names = ", ".join(dict.fromkeys(place(run) for run in runs))
@@ -152,7 +154,7 @@ def _examples(share: Share) -> Section:
     )
 
 
-def _size(runs: list[AoaRecords]) -> Section:
+def _size(runs: list[AoaRecords]) -> list[Section]:
     """Quality against size: what the fit of SwiftWRF tried, and what it took."""
     plots = []
     for run in runs:
@@ -175,7 +177,7 @@ def _size(runs: list[AoaRecords]) -> Section:
             "steps."
         )
         plots.append(Plot(f"size-{Share.of(run)[0].file_name}", figure, caption))
-    return Section("How large a model the scene needs", plots=plots)
+    return [Section("How large a model the scene needs", plots=plots)] if plots else []
 
 
 def _training(runs: list[AoaRecords]) -> Section:
@@ -196,7 +198,8 @@ def _training(runs: list[AoaRecords]) -> Section:
 
 
 def _speed(share: Share) -> Section:
-    synthesis, methods = share.mix["synthesis"], share.mix["methods"]
+    synthesis = {name: scores for name, scores in share.mix["synthesis"].items() if name in SYNTHESIZERS}
+    methods = {n: a for n, a in share.mix["methods"].items() if _is_network(n) or n in ESTIMATORS}
     error = {name: rms_of_psnr(scores["psnr_db"]["median"]) for name, scores in synthesis.items()}
     fit = {name: max(scores["seconds"]["fit"], SHORTEST) for name, scores in synthesis.items()}
     draw = {name: max(scores["seconds"]["synthesize"], SHORTEST) for name, scores in synthesis.items()}
@@ -205,7 +208,7 @@ def _speed(share: Share) -> Section:
         for name, arm in methods.items()
     }
     palette = arms.palette()
-    figure, axes = figures.new_figure(1, 3, 10.5, 3.4)
+    figure, axes = figures.new_figure(1, 3, 10.5, 4.2)
     for ax, stage, seconds in zip(axes, ("fit", "synthesize"), (fit, draw), strict=False):
         points = {name: (seconds[name], error[name]) for name in synthesis}
         figures.speed(ax, palette, points, f"seconds to {stage}", "RMS error of a spectrum")
