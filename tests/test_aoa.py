@@ -116,13 +116,19 @@ def test_whole_run(small, tmp_path):
         0,
     )
     methods = metrics["mixes"]["0.5"]["methods"]
-    expected = {"measured_only", "turbo_swiftwrf", "turbo_idw", "measured_all", "constant", "nearest_spectrum", "peak"}
+    trainings = ["measured_all", *(f"turbo_{name}{more}" for name in ("swiftwrf", "idw") for more in ("", "_extra"))]
+    others = ("nearest_spectrum", "kernel_ridge")
+    expected = {"measured_only", "constant", "peak", *others, *trainings}
+    expected |= {f"{estimator}_{training}" for estimator in others for training in trainings}
     assert set(methods) == expected
-    assert set(metrics["mixes"]["0.5"]["synthesis"]) == {"swiftwrf", "nearest", "idw", "gp", "coarray"}
+    drawn = {"swiftwrf", "idw", "gp", "gp sample", "coarray", "coarray sample"}
+    assert set(metrics["mixes"]["0.5"]["synthesis"]) == drawn
+    assert metrics["mixes"]["0.5"]["counts"]["turbo_idw_extra"] == {"measured": 20, "withheld": 20, "further": 20}
+    assert metrics["mixes"]["0.5"]["advice"]["n_held_out"] == 20
     assert set(metrics["mixes"]["1"]["seconds"]) == {"fit", "synthesize", "train"}
 
     errors = pd.read_csv(out / "errors.csv")
-    assert len(errors) == 2 * 2 * 7 * 10  # shares, repeats, methods, test spectra
+    assert len(errors) == 2 * 2 * 20 * 10  # shares, repeats, methods, test spectra
     own = errors[(errors.mix == 0.5) & (errors.method == "turbo_swiftwrf")]
     median = own.groupby("index").great_circle_deg.mean().median()
     assert methods["turbo_swiftwrf"]["great_circle_deg"]["median"] == pytest.approx(median)
@@ -238,7 +244,7 @@ def test_coarray_needs_the_array_and_takes_it_from_the_command_line(small, tmp_p
     assert run(*turbo) == 2
     assert "give it with --array" in capsys.readouterr().err
     assert run(*turbo, "--array", 1, 0.16, 915e6) == 2
-    assert "at least 2 elements a side" in capsys.readouterr().err
+    assert "2 to 32 elements a side" in capsys.readouterr().err
     assert run(*turbo, "--array", 4, 0.164, 915e6) == 0
     model = load(tmp_path / "run" / "coarray-mix0.5.safetensors")
     assert model.synthesize(small.position[:2]).shape == (2, 10, 40)
@@ -270,4 +276,4 @@ def test_metrics_are_strict_json(tmp_path):
 
 def test_paper_preset_keeps_all_pixels():
     assert AANNConfig.paper().max_azimuths == 0
-    assert replace(AANNConfig(), steps=1).batch == 16
+    assert AANNConfig.paper().steps > AANNConfig().steps

@@ -45,7 +45,7 @@ class AANNConfig:
     @classmethod
     def paper(cls) -> AANNConfig:
         """Full resolution and a long training."""
-        return cls(steps=6000, max_azimuths=0)
+        return cls(steps=6000, batch=16, rate=1e-3, max_azimuths=0)
 
 
 class _CircularConv(nn.Module):
