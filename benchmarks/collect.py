@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,8 @@ from tasks.page.records import Records
 def collect(folder: Path, name: str) -> None:
     """Writes the run's command, environment, metrics and the rooms it found to `results/NAME.json`."""
     run: Records[RunMetrics] = Records(folder)
-    content: dict[str, Any] = {"command": run.config["command"], "environment": run.environment, "metrics": run.metrics}
+    command = shlex.join(Path(word).name if "/" in word else word for word in shlex.split(run.config["command"]))
+    content: dict[str, Any] = {"command": command, "environment": run.environment, "metrics": run.metrics}
     rooms = {
         file.stem.removeprefix("geometry-mix"): json.loads(file.read_text())
         for file in sorted(folder.glob("geometry-mix*.json"))

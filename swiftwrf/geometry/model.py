@@ -20,6 +20,9 @@ from swiftwrf.positions import check_batch, check_drawn, check_positions
 MOST_PLANES, MOST_ORDER = 64, 4  # of a room in a file
 
 
+FARTHEST = 1e7  # [m] from the fixed end: beyond, phases are lost to rounding
+
+
 @dataclass(frozen=True)
 class Plane:
     """A mirror plane normal . x = offset in world coordinates.
@@ -107,7 +110,10 @@ class GeometryModel(Saved):
         return scene.wave(scene.transmitter) + field(scene, normal, offset, gain, chain)[0]
 
     def scene(self, position: Tensor) -> Scene:
-        """The scene at positions (n, 3) [m], nothing observed."""
+        """The scene at positions (n, 3) [m], nothing observed; from `FARTHEST` on only the direction counts."""
+        away = position - self.fixed_position
+        size = away.abs().amax(dim=1, keepdim=True)
+        position = torch.where(size > FARTHEST, self.fixed_position + FARTHEST * (away / size), position)
         nothing = torch.ones(len(position), len(self.array.element), dtype=torch.complex64)
         return Scene.of(position, self.fixed_position, self.moving, self.array, self.rotation, nothing)
 

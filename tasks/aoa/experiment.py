@@ -21,7 +21,7 @@ from augment import (
 )
 from augment import Settings as SynthesizerSettings
 from augment.choose import SLOW, candidates
-from swiftwrf import GeometryModel, InputError, Spectra, load_spectra, simulated_room
+from swiftwrf import FitError, GeometryModel, InputError, Spectra, load_spectra, simulated_room
 from swiftwrf.checkpoint import Saved, read, write
 from swiftwrf.geometry import HybridModel
 from swiftwrf.metrics import angle_errors, l1, psnr, ssim
@@ -114,7 +114,13 @@ class _Experiment:
         asked_for, sampled = self._choose(at, suffix, measured)
         for name in dict.fromkeys((*asked_for, *candidates(self.train))):
             places = (withheld, further) if name in asked_for else (None, None)
-            drawn = self._synthesize(at | {"synthesizer": name}, suffix, measured, places, sampled)
+            try:
+                drawn = self._synthesize(at | {"synthesizer": name}, suffix, measured, places, sampled)
+            except (InputError, FitError) as error:
+                if name in asked_for:
+                    raise
+                console.print(f"{name} is left out of the comparison: {error}")
+                continue
             if name in asked_for:
                 mixed = mix(measured, withheld, drawn["withheld"])
                 self._train_on(at, arms.turbo(name), suffix, mixed, learners())
