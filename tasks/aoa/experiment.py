@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from pandas import DataFrame
 from torch import Tensor
 
 from augment import (
@@ -30,10 +29,10 @@ from tasks.aoa.advice import advise
 from tasks.aoa.config import AUTO, AoaConfig, check, further_positions, with_array
 from tasks.aoa.estimators import ESTIMATORS, Settings, learners
 from tasks.aoa.page import page
-from tasks.metrics import ANGLES, SCORES, AoaMetrics, ArmMetrics, MixMetrics, SynthesisMetrics
+from tasks.aoa.results import mix_metrics
+from tasks.metrics import AoaMetrics, MixMetrics
 from tasks.page.page import reporting
 from tasks.run import Row, Run, choose_device, console
-from tasks.summarise import averaged, repeats_averaged
 
 SCORE = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
 SAMPLE = " sample"  # after the name of a synthesizer whose draws are scored instead of its means
@@ -275,24 +274,15 @@ class _Experiment:
 
     def summary(self, share: float) -> MixMetrics:
         """What metrics.json says of one share."""
-        training, fits = (_of(share, rows) for rows in (self.training_seconds, self.synthesis_seconds))
-        trained = [name for name in training["method"].unique() if arms.is_turbo(name)]
-        asked_for = fits[[any(arms.training_of(t) == arms.turbo(s) for t in trained) for s in fits["synthesizer"]]]
-        networks = training[[arms.estimator_of(name) == arms.NETWORK for name in training["method"]]]
         chosen = self.chosen.get(share, {})
-        return {
-            "n_measured": round(share * len(self.train)),
-            "counts": self.counts[share],
-            "choice": chosen.get("choice"),
-            "advice": chosen.get("advice"),
-            "synthesis": _synthesis_metrics(_of(share, self.synthesis), fits),
-            "methods": _arm_metrics(_of(share, self.errors), training),
-            "seconds": {
-                "fit": float(asked_for["fit"].sum()),
-                "synthesize": float(asked_for["synthesize"].sum()),
-                "train": float(networks["train"].sum()),
-            },
+        rows = {
+            "errors": self.errors,
+            "training_seconds": self.training_seconds,
+            "synthesis": self.synthesis,
+            "synthesis_seconds": self.synthesis_seconds,
         }
+        n_measured = round(share * len(self.train))
+        return mix_metrics(share, n_measured, self.counts[share], chosen.get("choice"), chosen.get("advice"), rows)
 
 
 class _FitHistory:
@@ -306,36 +296,6 @@ class _FitHistory:
         """One record; those of earlier sessions come first."""
         self.records.append(record)
         self.earlier = max(self.earlier, record.get("elapsed", 0.0) - (time.perf_counter() - self.began))
-
-
-def _of(share: float, rows: list[Row]) -> DataFrame:
-    return DataFrame([row for row in rows if row["mix"] == share])
-
-
-def _synthesis_metrics(scores: DataFrame, seconds: DataFrame) -> dict[str, SynthesisMetrics]:
-    spent = averaged(seconds, "synthesizer", ("fit", "synthesize"))
-    return {
-        name: {
-            "psnr_db": of["psnr_db"],
-            "ssim": of["ssim"],
-            "l1": of["l1"],
-            "seconds": {"fit": spent[name]["fit"], "synthesize": spent[name]["synthesize"]},
-        }
-        for name, of in repeats_averaged(scores, "synthesizer", SCORES).items()
-    }
-
-
-def _arm_metrics(errors: DataFrame, seconds: DataFrame) -> dict[str, ArmMetrics]:
-    spent = averaged(seconds, "method", ("train", "estimate"))
-    return {
-        name: {
-            "azimuth_deg": of["azimuth_deg"],
-            "elevation_deg": of["elevation_deg"],
-            "great_circle_deg": of["great_circle_deg"],
-            "seconds": {"train": spent[name]["train"], "estimate": spent[name]["estimate"]},
-        }
-        for name, of in repeats_averaged(errors, "method", ANGLES).items()
-    }
 
 
 def _rows(arm: Row, columns: dict[str, Tensor]) -> list[Row]:
