@@ -39,8 +39,8 @@ class AoaConfig:
         ),
     ] = (AUTO,)
     extra: int | None = None
-    """further positions in the region of the measured ones at which spectra are synthesized, too (default: 3000 where the
-    data say where the fixed end stands, else 0)"""
+    """further positions in the region of the measured ones at which spectra are synthesized, too (default: 3000 where
+    held-out measured spectra gain from them, else none)"""
     array: tuple[int, float, float] | None = None
     """square array that took the spectra, where the data do not say: elements a side, spacing [m], carrier [Hz]"""
     moving: Moving | None = None

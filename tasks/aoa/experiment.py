@@ -30,7 +30,7 @@ from tasks.aoa.config import AUTO, AoaConfig, check, further_positions, with_arr
 from tasks.aoa.estimators import ESTIMATORS, Settings, learners
 from tasks.aoa.page import page
 from tasks.aoa.results import mix_metrics
-from tasks.metrics import AoaMetrics, MixMetrics
+from tasks.metrics import AdviceMetrics, AoaMetrics, MixMetrics
 from tasks.page.page import reporting
 from tasks.run import Row, Run, choose_device, console
 
@@ -106,11 +106,14 @@ class _Experiment:
     def turbo(self, share: float, repeat: int) -> None:
         """All arms at one measured share."""
         measured, withheld = withhold(self.train, share, self.config.seed + repeat)
-        further = draw_places(measured, self.extra, self.config.seed + repeat) if self.extra else None
         at = {"mix": share, "repeat": repeat}
         suffix = f"mix{share:g}-r{repeat}"
         self._train_on(at, arms.LOWER.name, suffix, Mixed.measured(measured), list(ESTIMATORS))
-        asked_for, sampled = self._choose(at, suffix, measured)
+        asked_for, advice = self._choose(at, suffix, measured)
+        sampled = bool(advice and advice["sampled"])
+        # unless told how many, only where held-out measured spectra gain from them
+        wanted = self.config.extra is not None or bool(advice and advice["recommended_extra"])
+        further = draw_places(measured, self.extra, self.config.seed + repeat) if self.extra and wanted else None
         for name in dict.fromkeys((*asked_for, *candidates(self.train))):
             places = (withheld, further) if name in asked_for else (None, None)
             try:
@@ -129,12 +132,12 @@ class _Experiment:
         # the same whatever the share, so its steps are shared by all of them
         self._train_on(at, arms.UPPER.name, f"r{repeat}", Mixed.measured(self.train), learners())
 
-    def _choose(self, at: Row, suffix: str, measured: Spectra) -> tuple[list[str], bool]:
-        """Synthesizers whose spectra train, and whether they draw instead of predicting means."""
+    def _choose(self, at: Row, suffix: str, measured: Spectra) -> tuple[list[str], AdviceMetrics | None]:
+        """Synthesizers whose spectra train, and what cross-validation says of them, where they were compared."""
         named = [name for name in self.config.synthesizer if name != AUTO]
         compared = [name for name in named if name not in SLOW] or None
         if named and compared is None:
-            return named, False
+            return named, None
 
         def compute() -> Row:
             choice = choose_synthesizer(measured, self._settings(at["repeat"]), compared)
@@ -146,7 +149,7 @@ class _Experiment:
 
         value = self.directory.step(f"choice-{suffix}", compute)["value"]
         self.chosen.setdefault(at["mix"], value)
-        return named or [value["choice"]["name"]], value["advice"]["sampled"]
+        return named or [value["choice"]["name"]], value["advice"]
 
     def _settings(self, repeat: int) -> SynthesizerSettings:
         return SynthesizerSettings(
