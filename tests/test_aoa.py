@@ -78,7 +78,7 @@ def test_aann_learns_a_toy(circular):
         spectrum[i, 4:10, 16 * (i % 4) : 16 * (i % 4) + 8] = 1
     train = Mixed(spectrum, label, torch.arange(16), torch.zeros(16).bool())
     settings = Settings(AngularGrid.hemisphere(16, 64))
-    network = AANN(settings, AANNConfig(steps=30, batch=8, max_azimuths=0, circular=circular))
+    network = AANN(settings, AANNConfig(steps=60, batch=8, rate=1e-3, max_azimuths=0, circular=circular))
     network.fit(train)
     constant = Constant(settings)
     constant.fit(train)
