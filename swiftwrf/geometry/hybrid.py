@@ -110,8 +110,7 @@ def fit_hybrid(
     mean = left.mean(0)
     value, vector = torch.linalg.eigh(((left - mean) @ (left - mean).T).double())
     vector = vector[:, value > 1e-6 * value.sum()][:, -COMPONENTS:]
-    gram = kernel(train.position, train.position) + kernel.noise * torch.eye(len(train), dtype=torch.float64)
-    readout = torch.linalg.solve(gram, vector).float()
+    readout = torch.linalg.solve(kernel.noisy_gram(train.position), vector).float()
     component = torch.cat([mean[None], vector.T.float() @ (left - mean)])
     return HybridModel(geometry, share, kernel, train.position, readout, component)
 
