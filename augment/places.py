@@ -39,9 +39,6 @@ class Places:
 def draw_places(measured: Spectra, n: int, seed: int) -> Places:
     """Places drawn evenly in the region of the measured positions, their directions from the known geometry.
 
-    The region is the positions' convex hull, in as many dimensions as they extend in, without what lies farther from all of
-    them than they do from each other: a hull alone would fill the inside of a path round a room.
-
     Args:
         measured: spectra whose positions say where the region is; the spectra themselves play no part.
         n: number of places.
@@ -50,11 +47,17 @@ def draw_places(measured: Spectra, n: int, seed: int) -> Places:
     Raises:
         InputError: the fixed end or the array's orientation is unknown.
     """
-    position = _draw(measured.position, n, np.random.default_rng(seed))
+    position = draw_positions(measured.position, n, seed)
     return Places(position, measured.direction_at(position), torch.full((n,), FURTHER))
 
 
-def _draw(known: Tensor, n: int, generator: np.random.Generator) -> Tensor:
+def draw_positions(known: Tensor, n: int, seed: int) -> Tensor:
+    """Positions (n, 3) drawn evenly in the region of known ones (m, 3) [m].
+
+    The region is the positions' convex hull, in as many dimensions as they extend in, without what lies farther from all of
+    them than they do from each other: a hull alone would fill the inside of a path round a room.
+    """
+    generator = np.random.default_rng(seed)
     centre = known.mean(dim=0)
     _, extent, axes = torch.linalg.svd(known - centre, full_matrices=False)
     axes = axes[extent > FLAT * extent[0].clamp_min(1e-12)]  # the directions in which the positions extend

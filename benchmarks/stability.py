@@ -86,7 +86,8 @@ def precision(device: torch.device) -> list[dict[str, Any]]:
     generator = torch.Generator().manual_seed(0)
     grid = AngularGrid.hemisphere(90, 360)
     anchor = torch.rand(100, 3, generator=generator)
-    model = SwiftWRF.make(ModelConfig(n_primitives=200, rank=32), grid, anchor, Kernel(), generator=generator)
+    config = ModelConfig(n_primitives=200, rank=32, components=("mean", "response", "attenuation", "cholesky"))
+    model = SwiftWRF.make(config, grid, anchor, Kernel(), generator=generator)
     for parameter in model.parameters():
         parameter.data += 0.3 * torch.randn(parameter.shape, generator=generator)
     model = model.to(device).requires_grad_(False)
@@ -188,7 +189,8 @@ def fit_case(name: str, many: int, config: FitConfig | None = None) -> dict[str,
     """How well the training spectra are drawn, beside what their mean would reach; or the refusal."""
     train, config = FITS[name](many), config or FitConfig()
     if name.startswith("learning rate"):
-        config = replace(config, rate=10 * config.rate)
+        gradient = replace(config.model, n_primitives=24, components=("mean", "response", "attenuation", "cholesky"))
+        config = replace(config, model=gradient, steps=300, rate=10 * config.rate)
     result: dict[str, Any] = {"case": name, "n": len(train), "psnr_db": None, "mean_psnr_db": None, "refusal": None}
     began = time.perf_counter()
     try:

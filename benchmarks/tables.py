@@ -97,16 +97,16 @@ def size() -> str:
         rows.append(
             [
                 scene,
-                f"{auto['n_primitives']}, {auto['rank']}, {auto['steps']}",
+                f"{auto['n_primitives']}, {auto['rank']}",
                 f"{auto['psnr_db']['median']:.2f}",
                 f"{min(quality.values()):.2f} to {quality[best]:.2f} ({best})",
                 str(enough["n_primitives"]),
                 f"{auto['parameters'] / enough['parameters']:.1f}",
-                f"{auto['seconds']:.0f} s",
+                f"{auto['seconds']:.1f} s",
                 f"{auto['seconds'] / _at(fixed, auto['n_primitives'])['seconds']:.1f}",
             ]
         )
-    columns = ["scene, split", "N, K, steps", "PSNR [dB]", "of N = 16 ... 2048 (best)", "smallest within 0.1 dB"]
+    columns = ["scene, split", "N, K", "PSNR [dB]", "of N = 16 ... 1024 (best)", "smallest within 0.1 dB"]
     return markdown([*columns, "parameters over its", "time", "time over that of a fit of fixed N"], rows)
 
 

@@ -21,10 +21,9 @@ from swiftwrf.positions import distance
 from swiftwrf.threads import single_thread
 
 NOISES = (1e-3, 1e-2, 1e-1)  # of spectra: little of a measured one is not a function of position
-MIN_RANK, MAX_RANK = 24, 64
-EXPLAINED = (
-    0.05  # least share of a component's variance that counts as predicted: half of pure noise exceeds 0 by chance
-)
+NEGLIGIBLE = 5e-4  # share of the error at held-out positions that components may add which are left out
+JITTER = 1e-6  # relative variance that keeps neighbouring anchors apart
+ROWS = 4096  # positions regressed at a time
 MAX_ROWS = 400  # more do not change the choice, and a candidate costs their number cubed
 
 
@@ -125,6 +124,40 @@ class SmoothField(nn.Module):
     anchor: Tensor
     whiten: Tensor
 
+    @classmethod
+    @single_thread()
+    def regress(cls, position: Tensor, kernel: Kernel, value: Tensor, anchors: int) -> SmoothField:
+        """The functions that a Gaussian process tells from values (n, K) at normalised positions (n, 3).
+
+        Where there are more positions than `anchors`, evenly chosen ones carry what all tell (subset of regressors;
+        Rasmussen and Williams 2006, section 8.3.1), so that time grows with n and not its cube.
+        """
+        value = value.double()
+        if len(position) <= anchors:
+            field = cls(position, kernel, value.shape[1])
+            field.coefficient.data = torch.linalg.solve_triangular(
+                torch.linalg.cholesky(kernel.noisy_gram(position)), value, upper=False
+            ).to(position)
+            return field
+        (anchor,) = thinned(position, rows=anchors)
+        among = kernel(anchor.double(), anchor.double()) + JITTER * torch.eye(anchors, dtype=torch.float64)
+        normal, right = kernel.noise * among, torch.zeros(anchors, value.shape[1], dtype=torch.float64)
+        for rows in torch.arange(len(position)).split(ROWS):
+            cross = kernel(anchor.double(), position[rows].double())
+            normal += cross @ cross.T
+            right += cross @ value[rows]
+        # what the posterior covariance takes off the prior one is k W W^T k
+        certain, direction = torch.linalg.eigh(torch.linalg.inv(among) - kernel.noise * torch.linalg.inv(normal))
+        root = certain.clamp_min(1e-12 * float(certain.max())).sqrt()
+        field = cls(anchor, kernel, value.shape[1], (direction * root).to(position))
+        field.coefficient.data = ((direction / root).T @ torch.linalg.solve(normal, right)).to(position)
+        return field
+
+    def variance(self, position: Tensor) -> Tensor:
+        """Of the functions at positions (B, 3) once the measured spectra are known, relative to k(0) = 1, (B,)."""
+        known: Tensor = self.kernel(position, self.anchor) @ self.whiten
+        return (1 - known.square().sum(dim=1)).clamp(0, 1)
+
     def forward(self, position: Tensor) -> Tensor:
         """c(s) at positions (B, 3), (B, K)."""
         return self.kernel(position, self.anchor) @ (self.whiten @ self.coefficient)
@@ -159,23 +192,75 @@ def choose_kernel(position: Tensor, spectrum: Tensor, fold: Tensor) -> Kernel:
 
 @single_thread()
 def choose_rank(position: Tensor, spectrum: Tensor, fold: Tensor, kernel: Kernel) -> int:
-    """How many principal components of the spectra are predicted better than by their mean where they are held out.
-
-    What varies from spectrum to spectrum in other components cannot be known at a position without measuring there, so
-    a motion that could draw it would only learn noise.
+    """How many principal components of the spectra it takes until the variance of the others no longer counts beside the
+    error at positions that are held out.
 
     Args:
         position, spectrum, fold: as for `choose_kernel`.
         kernel: what it chose.
     """
     position, spectrum, fold = thinned(position, spectrum, fold)
-    eigenvalue, eigenvector = torch.linalg.eigh(_inner_products(spectrum))
-    component = eigenvector * eigenvalue.clamp_min(0).sqrt()  # (n, n), one column a component
-    missed = torch.zeros_like(component)
-    for out, kept, gain in held_out_weights(kernel, position, fold):
-        missed[out] = component[out] - gain @ component[kept]
-    predicted = missed.square().sum(dim=0) < (1 - EXPLAINED) * component.square().sum(dim=0)
-    return int(predicted.sum().clamp(MIN_RANK, MAX_RANK))
+    variance, vector = torch.linalg.eigh(_inner_products(spectrum))
+    variance = variance.flip(0).clamp_min(0)
+    component = vector.flip(1) * variance.sqrt()  # (n, n), one column a component
+    predicted, _ = held_out(kernel, position, fold, component)
+    left_out = variance.flip(0).cumsum(0).flip(0)  # by 0, 1, ... components
+    enough = left_out <= NEGLIGIBLE * (component - predicted).square().sum()
+    return int((~enough).sum())
+
+
+def held_out(kernel: Kernel, position: Tensor, fold: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+    """What regression with mean 0 predicts of values whose fold is left out, all folds from one inverse (Rasmussen and
+    Williams 2006, section 5.4.2; Golub, Heath and Wahba 1979).
+
+    Args:
+        position: (n, 3).
+        fold: number of the part that each is held out with, (n,).
+        value: (n, K).
+
+    Returns:
+        Predictions (n, K), and variances of the noisy values about them, relative to k(0) = 1, (n,); float64.
+    """
+    inverse = torch.linalg.inv(kernel.noisy_gram(position))
+    weighted = inverse @ value.double()
+    predicted, variance = torch.empty_like(weighted), torch.empty(len(value), dtype=torch.float64)
+    for number in fold.unique():
+        out = (fold == number).nonzero()[:, 0]
+        covariance = torch.linalg.inv(inverse[out][:, out])
+        predicted[out] = value[out].double() - covariance @ weighted[out]
+        variance[out] = covariance.diagonal()
+    return predicted, variance
+
+
+@single_thread()
+def most_informative(kernel: Kernel, known: Tensor, candidate: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Where measuring lowers the mean variance over the candidates most, one after the other (greedy variance reduction;
+    Krause, Singh and Guestrin 2008 on its near-optimality).
+
+    Args:
+        kernel: of the field, with its noise.
+        known: positions (n, 3) that are measured already.
+        candidate: positions (m, 3) to choose from, evenly over the region.
+        count: how many, at most m.
+
+    Returns:
+        Numbers of the chosen candidates in order, (count,), and the mean variance before any and after each of them,
+        relative to k(0) = 1, float64 (1 + count,).
+    """
+    candidate = candidate.double()
+    cross = kernel(candidate, known.double())
+    covariance = kernel(candidate, candidate) - cross @ torch.linalg.solve(kernel.noisy_gram(known), cross.T)
+    chosen: list[int] = []
+    left = [covariance.diagonal().mean()]
+    for _ in range(count):
+        noisy = covariance.diagonal().clamp_min(0) + kernel.noise + JITTER
+        lowered = covariance.square().sum(dim=0) / noisy
+        lowered[chosen] = -1
+        best = int(lowered.argmax())
+        covariance -= covariance[:, best, None] * covariance[best] / noisy[best]
+        chosen.append(best)
+        left.append(covariance.diagonal().mean())
+    return torch.tensor(chosen, dtype=torch.int64), torch.stack(left).clamp_min(0)
 
 
 def thinned(*tensors: Tensor, rows: int = MAX_ROWS) -> list[Tensor]:

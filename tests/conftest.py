@@ -29,6 +29,12 @@ def room() -> Spectra:
 
 
 @pytest.fixture(scope="session")
+def built_in_room() -> tuple[Spectra, Spectra]:
+    """Training and test spectra of the simulated room as the tasks use it, but on a smaller grid."""
+    return simulated_room(grid=AngularGrid.hemisphere(15, 60)).split()
+
+
+@pytest.fixture(scope="session")
 def measured_data() -> Path:
     """The folder of the measured data sets."""
     return Path(os.environ["SWIFTWRF_DATA"])

@@ -27,7 +27,7 @@ from swiftwrf.registry import Entry
 
 ROOM = simulated_room(n=60, seed=3, grid=AngularGrid.hemisphere(15, 60))
 TRAIN, TEST = ROOM.split("random", 0)
-SHORT = FitConfig(model=ModelConfig(n_primitives=32), steps=300)  # the search for a size has its own tests
+SHORT = FitConfig(model=ModelConfig(n_primitives=32))  # the search for a size has its own tests
 MARGIN_DB = {"nearest": -1.0}  # so few positions are too far apart for a copy
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import Matern
 
-from swiftwrf.gp import MIN_RANK, GaussianProcess, Kernel, SmoothField, choose_kernel, choose_rank
+from swiftwrf.gp import GaussianProcess, Kernel, SmoothField, choose_kernel, choose_rank, held_out, most_informative
 
 KERNEL = Kernel(long=1.0, short=0.3, share=0.6, noise=1e-2)
 
@@ -52,12 +53,55 @@ def test_kernel_choice_finds_smooth_and_rough_fields(generator):
     assert choose_kernel(position, smooth, fold).noise < choose_kernel(position, noise, fold).noise
 
 
-def test_rank_counts_what_can_be_predicted(generator):
-    """Thirty smooth fields over three directions: their rank is found; noise has none."""
+def test_rank_counts_what_matters(generator):
+    """Thirty directions in which smooth fields vary are all it takes, with or without a little noise."""
     position = torch.rand(200, 3, generator=generator, dtype=torch.float64)
-    fold = torch.arange(200) % 5
-    fields = torch.sin(position @ torch.randn(3, 40, generator=generator, dtype=torch.float64) * 4)
-    smooth = (fields @ torch.randn(40, 64, generator=generator, dtype=torch.float64)).reshape(200, 8, 8)
-    noise = torch.rand(200, 8, 8, generator=generator)
-    assert 28 <= choose_rank(position, smooth, fold, choose_kernel(position, smooth, fold)) <= 40
-    assert choose_rank(position, noise, fold, choose_kernel(position, noise, fold)) == MIN_RANK
+    fold = torch.arange(200)
+    fields = torch.sin(position @ torch.randn(3, 30, generator=generator, dtype=torch.float64) * 20)
+    smooth = (fields @ torch.randn(30, 64, generator=generator, dtype=torch.float64)).reshape(200, 8, 8)
+    noisy = smooth + 1e-3 * torch.randn(smooth.shape, generator=generator)
+    for spectrum in (smooth, noisy):
+        kernel = choose_kernel(position, spectrum, fold % 5)
+        assert 25 <= choose_rank(position, spectrum, fold, kernel) <= 30
+
+
+@pytest.mark.parametrize("n_folds", [5, 40], ids=["a fifth", "one"])
+def test_held_out_predictions_are_those_of_a_process_without_the_fold(generator, n_folds):
+    position = torch.rand(40, 3, generator=generator, dtype=torch.float64)
+    value = torch.randn(40, 2, generator=generator, dtype=torch.float64)
+    fold = torch.arange(40) % n_folds
+    predicted, variance = held_out(KERNEL, position, fold, value)
+    for number in range(n_folds):
+        out, kept = fold == number, fold != number
+        process = GaussianProcess(KERNEL, position[kept])
+        torch.testing.assert_close(predicted[out], process.weights(position[out]) @ value[kept])
+        torch.testing.assert_close(variance[out], process.variance(position[out]) + KERNEL.noise)
+
+
+def test_regression_on_fewer_anchors_tells_nearly_the_same(generator):
+    """Mean and variance of the exact process, from a third of the positions as anchors of a smooth field."""
+    position = 2 * torch.rand(300, 3, generator=generator) - 1
+    value = torch.sin(position @ torch.randn(3, 2, generator=generator))
+    kernel = Kernel(long=8.0, short=2.0, share=0.05, noise=1e-2)
+    new = 1.6 * torch.rand(50, 3, generator=generator) - 0.8
+    exact, sparse = (SmoothField.regress(position, kernel, value, anchors) for anchors in (300, 100))
+    process = GaussianProcess(kernel, position)
+    torch.testing.assert_close(exact(new), (process.weights(new) @ value.double()).float(), atol=1e-4, rtol=0)
+    torch.testing.assert_close(exact.variance(new), process.variance(new).float(), atol=1e-4, rtol=0)
+    assert (sparse(new) - exact(new)).abs().max() < 0.05
+    assert (sparse.variance(new) - exact.variance(new)).abs().max() < 0.05  # at the corners, where anchors are rare
+
+
+def test_suggested_positions_beat_random_ones(generator):
+    """The variance that is left is what a process with them measured has, and less than with as many at random."""
+    known, candidate = (torch.rand(n, 3, generator=generator, dtype=torch.float64) for n in (20, 200))
+    chosen, left = most_informative(KERNEL, known, candidate, 8)
+    assert len(set(chosen.tolist())) == 8
+    assert (left.diff() < 0).all()
+
+    def remaining(rows):
+        return GaussianProcess(KERNEL, torch.cat([known, candidate[rows]])).variance(candidate).mean()
+
+    torch.testing.assert_close(left[-1], remaining(chosen), atol=1e-5, rtol=1e-4)
+    random = [remaining(torch.randperm(200, generator=generator)[:8]) for _ in range(20)]
+    assert left[-1] < min(random)

@@ -20,7 +20,7 @@ REFUSED = {
     "a pixel that is not a number": "spectrum of training spectrum 3 is not finite; mend or leave it out",
     "learning rate ten times too large": "try a learning rate below 0.3",
 }
-SMALL_FIT = FitConfig(model=ModelConfig(n_primitives=24), steps=300)
+SMALL_FIT = FitConfig(model=ModelConfig(n_primitives=24))
 
 
 @pytest.mark.parametrize("cutoff", [None, 1e-4])

@@ -13,11 +13,19 @@ from swiftwrf import FitConfig, Spectra, SwiftWRF, fit
 
 @SYNTHESIZERS.register("swiftwrf", meaning="2D Gaussians that move with the position", colour="#4477aa")
 class SwiftWRFSynthesizer(Synthesizer):
-    """2D Gaussians that move with the position, as many as the scene needs."""
+    """2D Gaussians that change with the position, as many as the scene needs."""
 
     def fit(self, train: Spectra) -> None:
+        self._fit(train, FitConfig.paper() if self.settings.preset == "paper" else FitConfig())
+
+    def fit_like(self, other: Synthesizer, train: Spectra) -> None:
+        assert isinstance(other, SwiftWRFSynthesizer)
+        n = other.model.config.n_primitives
+        config = FitConfig()
+        self._fit(train, replace(config, model=replace(config.model, n_primitives=n)))
+
+    def _fit(self, train: Spectra, config: FitConfig) -> None:
         own = self.settings
-        config = FitConfig.paper() if own.preset == "paper" else FitConfig()
         self._model = fit(
             train,
             replace(config, validation=own.validation, seed=own.seed),

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from swiftwrf.data.splits import Validation
+from swiftwrf.errors import InputError
 from swiftwrf.model import ModelConfig
 
 
@@ -14,8 +15,9 @@ class FitConfig:
     """How a model is fitted. The defaults are what measured best; `FitConfig.paper()` is the paper."""
 
     model: ModelConfig = field(default_factory=ModelConfig)
-    steps: int | Literal["auto"] = "auto"
-    """optimisation steps, coarse ones included; auto finds how many held-out spectra call for"""
+    steps: int = 0
+    """0: by regression; otherwise steps by gradient from a random start, coarse ones included; what follows on steps,
+    rates, batch, prior and smoothing is theirs"""
     coarse_share: float = 0.0
     """share of them on shared primitives, without deformation (the paper's coarse stage)"""
     batch: int = 16
@@ -29,7 +31,7 @@ class FitConfig:
     final_rate: float = 0.02
     """share of the rates left after cosine decay"""
     ssim_weight: float = 0.3
-    """weight of 1 - SSIM in the loss; the pixels' error has the rest"""
+    """weight of 1 - SSIM in the loss, by which a size is chosen, too; the pixels' error has the rest"""
     pixel_loss: Literal["l1", "l2"] = "l1"
     """absolute or squared error"""
     prior_weight: float = 1e-4
@@ -47,6 +49,22 @@ class FitConfig:
     check_every: int = 50
     """steps between two evaluations, at which progress is recorded and the state kept"""
     seed: int = 0
+
+    def check(self) -> None:
+        """Refuses settings that do not fit together.
+
+        Raises:
+            InputError: what goes only by gradient without steps, or steps of a model whose size is to be found.
+        """
+        model = self.model
+        still = model.deformation == "none" or (model.deformation == "motion_basis" and "response" in model.components)
+        if not self.steps and not still:
+            raise InputError(
+                f"deformation {model.deformation} of {', '.join(model.components)} is not found by regression; give a "
+                "number of steps to fit it by gradient"
+            )
+        if self.steps and model.n_primitives == "auto":
+            raise InputError("a fit by gradient needs a number of primitives; only regression finds it")
 
     @classmethod
     def paper(cls, **changes: Any) -> FitConfig:

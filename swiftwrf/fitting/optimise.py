@@ -30,45 +30,31 @@ class Optimisation:
 
     Args:
         config: with numbers for everything that may be `auto`.
-        steps: their number.
         train: spectra to fit.
         kernel: of the motion's prior, lengths in [m].
-        held_out: spectra to evaluate on.
     """
 
-    def __init__(
-        self,
-        config: FitConfig,
-        steps: int,
-        train: Spectra,
-        kernel: Kernel,
-        device: torch.device | str,
-        held_out: Spectra | None = None,
-    ) -> None:
+    def __init__(self, config: FitConfig, train: Spectra, kernel: Kernel, device: torch.device | str) -> None:
         n, _ = config.model.size
-        self.size, self.steps, self.config = Size(held_out is None, n, steps), steps, config
+        self.steps, self.config = (steps := config.steps), config
+        self.size = Size(True, n, steps)
         self.coarse_steps = round(config.coarse_share * steps)
         generator = torch.Generator().manual_seed(config.seed)
         (anchor,) = thinned(train.position, rows=MAX_ANCHORS)
         model = SwiftWRF.make(config.model, train.grid, anchor, kernel, generator=generator)
         self.model = model.to(device)
-        self.position, self.spectrum = self._tensors(train)
+        self.position, self.spectrum = self.model.normalise(train.position.to(device)), train.spectrum.to(device)
         # everything random is drawn now: nothing is copied to the device between two evaluations
         batch = min(config.batch, len(train))
         self.rows = torch.randint(len(train), (steps, batch), generator=generator).to(device)
         noisy = steps if config.smoothing else 0
         self.noise = torch.randn(noisy, batch, 3, generator=generator).to(device)
-        self.held_out = None if held_out is None else self._tensors(held_out)
         groups = [{"params": list(self.model.primitives.parameters()), "peak": config.rate}]
         groups += self.model.deformation.parameter_groups(config.rate, config.deformation_rate)
         self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99))
         self.average = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(AVERAGING))
         self.step, self.seconds, self.first_loss = 0, 0.0, math.inf
         self.broken_at = torch.tensor(steps, device=device)  # the first step whose loss was not finite
-
-    def _tensors(self, spectra: Spectra) -> tuple[Tensor, Tensor]:
-        device = self.model.centre.device
-        return self.model.normalise(spectra.position.to(device)), spectra.spectrum.to(device)
 
     def _rate(self, step: int) -> float:
         """Share of the peak rate: warm-up, then cosine decay."""
@@ -134,17 +120,6 @@ class Optimisation:
         """The model with averaged parameters."""
         return cast(SwiftWRF, self.average.module)
 
-    @torch.no_grad()
-    def held_out_loss(self) -> float:
-        """Mean over the held-out spectra; nan where there are none."""
-        if self.held_out is None:
-            return math.nan
-        position, measured = self.held_out
-        parts = zip(position.split(64), measured.split(64), strict=True)
-        deform = self.step > self.coarse_steps
-        losses = [float(self.loss(self.result(p, deform=deform), m)) * len(p) for p, m in parts]
-        return sum(losses) / len(position)
-
     def run(self, session: Session) -> Optimisation:
         """Takes all steps, from where the session's saved state stands if that is of this run; keeps the state at each
         evaluation.
@@ -175,12 +150,12 @@ class Optimisation:
 
     def _record(self, loss: Tensor) -> Record:
         return {
-            "stage": "final" if self.size.final else "search",
+            "stage": "final",
             "n_primitives": self.size.n_primitives,
             "steps": self.steps,
             "step": self.step,
             "loss": float(loss),
-            "validation": self.held_out_loss() if self.held_out else None,
+            "validation": None,
             "seconds": self.seconds,
         }
 

@@ -37,7 +37,8 @@ class Size:
         return f"{'final' if self.final else 'search'} {self.n_primitives} {self.steps}"
 
     def __str__(self) -> str:
-        return f"{'final' if self.final else 'search'}, {self.n_primitives} primitives, {self.steps} steps"
+        steps = f", {self.steps} steps" if self.steps else ""
+        return f"{'final' if self.final else 'search'}, {self.n_primitives} primitives{steps}"
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,11 @@ from swiftwrf.angles import AngularGrid, wrap
 
 def rasterize(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None) -> Tensor:
     """See `swiftwrf.rasterize`; costs N * n_elevation * n_azimuth exponentials and as much memory per position."""
+    return torch.einsum("...nc,...nhw->...chw", weight, kernels(mean, cholesky, grid, cutoff))
+
+
+def kernels(mean: Tensor, cholesky: Tensor, grid: AngularGrid, cutoff: float | None) -> Tensor:
+    """What each primitive draws with a weight of 1, (..., N, n_elevation, n_azimuth)."""
     azimuth = grid.azimuth.to(mean)
     elevation = grid.elevation.to(mean)
     l1, l2, l3 = (c[..., None, None] for c in cholesky.unbind(-1))  # (..., N, 1, 1)
@@ -24,4 +29,4 @@ def rasterize(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid,
     kernel = torch.exp(-0.5 * (u * u + v * v))
     if cutoff is not None:
         kernel = torch.where(kernel >= cutoff, kernel, torch.zeros_like(kernel))
-    return torch.einsum("...nc,...nhw->...chw", weight, kernel)
+    return kernel

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 from augment import SYNTHESIZERS, lacks
+from augment.suggest import MOST as MOST_SUGGESTED
 from swiftwrf import InputError, Spectra
 from swiftwrf.arrays import PlanarArray
 from swiftwrf.data.spectra import Moving
@@ -41,6 +42,8 @@ class AoaConfig:
     extra: int | None = None
     """further positions in the region of the measured ones at which spectra are synthesized, too (default: 3000 where
     held-out measured spectra gain from them, else none)"""
+    suggest: int = 0
+    """also say where to measure next: so many positions that lower the uncertainty over the region most"""
     array: tuple[int, float, float] | None = None
     """square array that took the spectra, where the data do not say: elements a side, spacing [m], carrier [Hz]"""
     moving: Moving | None = None
@@ -72,6 +75,8 @@ def check(config: AoaConfig) -> None:
             SYNTHESIZERS[name]  # refuses an unknown one
     if config.extra is not None and config.extra < 0:
         raise InputError(f"--extra takes a number of positions, got {config.extra}")
+    if not 0 <= config.suggest <= MOST_SUGGESTED:
+        raise InputError(f"--suggest takes 0 to {MOST_SUGGESTED} positions, got {config.suggest}")
     if config.moving is not None and config.data is not None:
         raise InputError("--moving is for the built-in room; with --data the data say which end moves")
     if not config.mix or not all(0 < share <= 1 for share in config.mix):

@@ -20,6 +20,7 @@ from augment import (
 )
 from augment import Settings as SynthesizerSettings
 from augment.choose import SLOW, candidates
+from augment.suggest import suggest
 from swiftwrf import FitError, GeometryModel, InputError, Spectra, load_spectra, simulated_room
 from swiftwrf.checkpoint import Saved, read, write
 from swiftwrf.geometry import HybridModel
@@ -64,6 +65,9 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         for repeat in range(config.repeats):
             for share in config.mix:
                 experiment.turbo(share, repeat)
+        if config.suggest:
+            for share in config.mix:
+                experiment.suggest(share)
         directory.write_csv("errors.csv", experiment.errors)
         directory.write_csv("synthesis.csv", experiment.synthesis)
         directory.write_csv("history.csv", experiment.history)
@@ -131,6 +135,21 @@ class _Experiment:
                     self._train_on(at, arms.turbo(name, extra=True), suffix, more, learners())
         # the same whatever the share, so its steps are shared by all of them
         self._train_on(at, arms.UPPER.name, f"r{repeat}", Mixed.measured(self.train), learners())
+
+    def suggest(self, share: float) -> None:
+        """Where to measure next, as a table for those who go there."""
+        measured, _ = withhold(self.train, share, self.config.seed)
+
+        def compute() -> Row:
+            found = suggest(measured, self.config.suggest, self.config.seed)
+            return {"position": found.position, "left": found.left}
+
+        value = self.directory.step(f"suggestion-mix{share:g}", compute)["value"]
+        position, left = torch.tensor(value["position"]), torch.tensor(value["left"])
+        columns = {"x_m": position[:, 0], "y_m": position[:, 1], "z_m": position[:, 2], "variance_left": left[1:]}
+        self.directory.write_csv(f"suggested-mix{share:g}.csv", _rows({}, columns))
+        places = {"measured": measured.position.numpy(), "suggested": position.numpy(), "left": left.numpy()}
+        self.directory.write_npz(f"suggested-mix{share:g}.npz", places)
 
     def _choose(self, at: Row, suffix: str, measured: Spectra) -> tuple[list[str], AdviceMetrics | None]:
         """Synthesizers whose spectra train, and what cross-validation says of them, where they were compared."""

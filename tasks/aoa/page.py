@@ -8,6 +8,7 @@ from augment import SYNTHESIZERS
 from tasks.aoa import arms
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.page_room import advice_sentence, choice_section, room_section
+from tasks.aoa.page_suggest import suggestion_section
 from tasks.aoa.share import AoaRecords, Share, first_history, fits, place, scene
 from tasks.metrics import Angle, ErrorSummary
 from tasks.page import figures
@@ -33,7 +34,9 @@ def page(runs: list[AoaRecords]) -> Page:
     if len(shares) > 1:
         sections.insert(0, _over_shares(shares))
     for share in shares:
-        sections += [section for section in (choice_section(share), room_section(share)) if section]
+        sections += [
+            section for section in (choice_section(share), room_section(share), suggestion_section(share)) if section
+        ]
     sections += [_synthesis(shares, several), *(_examples(share) for share in shares), *_size(runs)]
     sections += [*(_speed(share) for share in shares), _training(runs)]
     sections += [_time(shares, several), _limits(runs[0]), provenance(runs)]
@@ -162,19 +165,16 @@ def _size(runs: list[AoaRecords]) -> list[Section]:
         if not len(search):
             continue
         figure, axes = figures.new_figure(1, 1, 6, 3)
-        for steps, part in search.groupby("steps"):
-            by_size = part.sort_values("n_primitives")
-            axes[0].plot(by_size["n_primitives"], by_size["validation"], "o-", markersize=4, label=f"{steps:.0f} steps")
-        n, steps = int(final["n_primitives"].iloc[0]), int(final["steps"].iloc[0])
+        by_size = search.sort_values("n_primitives")
+        axes[0].plot(by_size["n_primitives"], by_size["validation"], "o-", markersize=4)
+        n = int(final["n_primitives"].iloc[0])
         axes[0].axvline(n, color="#aeb7c6", linewidth=1)
         axes[0].set_xscale("log", base=2)
         axes[0].xaxis.set_major_formatter("{x:g}")
         axes[0].set(xlabel="primitives", ylabel="loss on held-out spectra")
-        figures.legend_below(figure, axes[0])
         caption = (
-            f"{scene(run)}, first share. Loss of short fits on a fifth of the measured spectra that they did not see, at "
-            f"coarse resolution; the model took the smallest size within 1 % of the best: {n} primitives (line), {steps} "
-            "steps."
+            f"{scene(run)}, first share. Loss on measured spectra that each size did not see, at coarse resolution; the "
+            f"model took the smallest within 0.2 % of the best: {n} primitives (line)."
         )
         plots.append(Plot(f"size-{Share.of(run)[0].file_name}", figure, caption))
     return [Section("How large a model the scene needs", plots=plots)] if plots else []
@@ -183,16 +183,15 @@ def _size(runs: list[AoaRecords]) -> list[Section]:
 def _training(runs: list[AoaRecords]) -> Section:
     plots = []
     for run in runs:
-        _, final = fits(run)
-        figure, axes = figures.new_figure(1, 2, 9, 3)
         history = first_history(run)
         by_arm = history.groupby("method", sort=False) if "method" in history else ()
         networks = {str(name): (part["step"], part["loss"]) for name, part in by_arm}
-        figures.curves(axes[0], arms.palette(), networks, "step", "loss of the network")
-        swiftwrf = {"swiftwrf": (final["step"], final["loss"])}
-        figures.curves(axes[1], arms.palette(), swiftwrf, "step", "loss of SwiftWRF")
-        axes[1].set_visible(bool(len(final)))
-        caption = f"{scene(run)}, first share and repeat: the networks, and the final fit of SwiftWRF."
+        _, final = fits(run)
+        optimised = final[final["steps"] > 0]
+        lines = networks | ({"swiftwrf": (optimised["step"], optimised["loss"])} if len(optimised) else {})
+        figure, axes = figures.new_figure(1, 1, 8, 3)
+        figures.curves(axes[0], arms.palette(), lines, "step", "loss")
+        caption = f"{scene(run)}, first share and repeat: the networks, and SwiftWRF where it is fitted by gradient."
         plots.append(Plot(f"training-{Share.of(run)[0].file_name}", figure, caption))
     return Section("Training", plots=plots)
 

@@ -75,11 +75,9 @@ def first_history(run: AoaRecords) -> DataFrame:
 
 
 def fits(run: AoaRecords) -> tuple[DataFrame, DataFrame]:
-    """History of the fits of SwiftWRF for the first share and repeat: the last evaluation of each of the search, and the
-    final fit."""
+    """History of the fits of SwiftWRF for the first share and repeat: of each size that was tried, and of the final one."""
     history = first_history(run)
     if "n_primitives" not in history:
-        return history.iloc[:0], history.iloc[:0]
+        return history.iloc[:0].assign(steps=0), history.iloc[:0].assign(steps=0)
     own = history[history["synthesizer"] == "swiftwrf"]
-    search = own[own["stage"] == "search"].groupby(["n_primitives", "steps"], as_index=False).last()
-    return search, own[own["stage"] == "final"]
+    return own[own["stage"] == "search"], own[own["stage"] == "final"]

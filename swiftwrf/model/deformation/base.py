@@ -82,6 +82,11 @@ class Deformation(nn.Module, ABC):
     def forward(self, position: Tensor, mean: Tensor) -> Offsets:
         """Offsets at normalised positions (B, 3) of primitives with canonical means (N, 2) [rad]."""
 
+    def doubt(self, position: Tensor) -> Tensor | None:
+        """Standard deviation of a measured spectrum about the drawn one at normalised positions (B, 3), in units of that of
+        all spectra, (B,); None where it is unknown."""
+        return None
+
     def prior(self) -> Tensor | None:
         """Negative log prior up to a factor 1/2; None without one."""
         return None

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from swiftwrf import gp
 from swiftwrf.checkpoint import Header, expect
+from swiftwrf.errors import InputError
 from swiftwrf.model.deformation.base import COMPONENTS, DEFORMATIONS, Deformation, Offsets, Setting
 
 
@@ -26,11 +27,18 @@ class MotionBasis(Deformation):
         field: the smooth functions.
         basis: motions of the primitives, (rank, N, numbers that deform).
         components: that deform.
+        deviation: of measured spectra about the drawn ones, relative to what the prior of the motion says; 0 where it
+            is unknown.
     """
 
-    def __init__(self, field: gp.SmoothField, basis: Tensor, components: tuple[str, ...]) -> None:
+    def __init__(
+        self, field: gp.SmoothField, basis: Tensor, components: tuple[str, ...], deviation: float = 0.0
+    ) -> None:
         super().__init__()
         self.components, self.field, self.basis = components, field, nn.Parameter(basis)
+        self.register_buffer("deviation", torch.tensor(deviation))
+
+    deviation: Tensor
 
     @classmethod
     def initial(cls, setting: Setting, *, generator: torch.Generator) -> MotionBasis:
@@ -44,7 +52,10 @@ class MotionBasis(Deformation):
         rank, n, m = header["config"]["rank"], header["config"]["n_primitives"], len(tensors["field.anchor"])
         shapes = {"anchor": (m, 3), "whiten": (m, m), "coefficient": (m, rank)}
         basis_shape = (rank, n, sum(COMPONENTS[c] for c in components))
-        expect(dict(tensors), {f"field.{name}": shape for name, shape in shapes.items()} | {"basis": basis_shape})
+        field_shapes = {f"field.{name}": shape for name, shape in shapes.items()}
+        expect(dict(tensors), field_shapes | {"basis": basis_shape, "deviation": ()})
+        if not float(tensors["deviation"]) >= 0:
+            raise InputError(f"deviation is {float(tensors['deviation'])}, expected 0 or more")
         anchor, whiten, basis = (tensors[name] for name in ("field.anchor", "field.whiten", "basis"))
         field = gp.SmoothField(anchor, gp.Kernel(**header["kernel"]), len(basis), whiten)
         return cls(field, basis.clone(), components)
@@ -59,6 +70,11 @@ class MotionBasis(Deformation):
     def forward(self, position: Tensor, mean: Tensor) -> Offsets:
         """Offsets at positions (B, 3); the canonical means play no part."""
         return Offsets.of(torch.einsum("bk,kns->bns", self.field(position), self.basis), self.components)
+
+    def doubt(self, position: Tensor) -> Tensor | None:
+        if not self.deviation > 0:
+            return None
+        return self.deviation * (self.field.variance(position) + self.field.kernel.noise).sqrt()
 
     def prior(self) -> Tensor:
         return self.field.prior()
