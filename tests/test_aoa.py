@@ -107,7 +107,8 @@ def test_aann_is_seeded_and_leaves_the_global_generator_alone(room):
 
 def test_whole_run(small, tmp_path):
     out = tmp_path / "run"
-    assert run("--mix", 0.5, 1.0, "--synthesizer", "swiftwrf", "idw", "--repeats", 2, "--extra", 20, "--out", out) == 0
+    more = ("--repeats", 2, "--extra", 20, "--suggest", 4)
+    assert run("--mix", 0.5, 1.0, "--synthesizer", "swiftwrf", "idw", *more, "--out", out) == 0
     metrics = json.loads((out / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(name))
     assert (metrics["task"], metrics["data"], metrics["split"], metrics["seed"]) == (
         "aoa",
@@ -136,7 +137,13 @@ def test_whole_run(small, tmp_path):
     truth = np.degrees(small.label[own["index"].tolist()].numpy())
     np.testing.assert_allclose(own[["truth_azimuth_deg", "truth_elevation_deg"]], truth, rtol=1e-9)
 
+    suggested = pd.read_csv(out / "suggested-mix0.5.csv")
+    assert suggested.columns.tolist() == ["x_m", "y_m", "z_m", "variance_left"]
+    assert len(suggested) == 4
+    assert suggested["variance_left"].is_monotonic_decreasing
+
     html = (out / "report.html").read_text()
+    assert "Where to measure next" in html
     assert "What this does not show" in html
     assert "<svg" in html
     assert not [line for line in html.splitlines() if 'src="http' in line or 'href="http' in line]
@@ -225,6 +232,7 @@ def test_interrupted_run_goes_on_to_the_same_numbers(small, tmp_path, monkeypatc
         (("--mix", 0.5, "--split", "nowhere"), "choose one of block, random"),
         (("--mix", 0.5, "--synthesizer", "vae"), "unknown synthesizer"),
         (("--mix", 0.5, "--repeats", 0), "--repeats"),
+        (("--mix", 0.5, "--suggest", -1), "--suggest"),
         (("--mix", 0.5, "--data", "/nowhere"), "is not a folder"),
         (("--resume", "nowhere"), "no interrupted run"),
     ],

@@ -173,7 +173,7 @@ def test_deviations_hold_what_they_say(built_in_room):
 
 def test_a_fit_by_gradient_knows_no_deviation(room):
     model = fit(room, replace(QUICK, steps=20), progress=False)
-    with pytest.raises(InputError, match="no uncertainty"):
+    with pytest.raises(InputError, match="knows no standard deviations"):
         model.synthesize(room.position, return_std=True)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from swiftwrf import AngularGrid, InputError, ModelConfig, SwiftWRF, load
+from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, SwiftWRF, fit, load
 from swiftwrf.gp import Kernel
 from swiftwrf.model.deformation.base import COMPONENTS
 from swiftwrf.model.deformation.per_primitive_mlp import PerPrimitiveMLP, encode
@@ -132,3 +132,13 @@ def test_positions_in_kilometres_keep_their_millimetres():
         ModelConfig(n_primitives=3, rank=4), GRID, near + 5e5, KERNEL, generator=torch.Generator().manual_seed(0)
     )
     torch.testing.assert_close(a.normalise(near), b.normalise(near + 5e5), atol=1e-6, rtol=0)
+
+
+def test_many_spectra_of_fixed_primitives_are_those_drawn_one_by_one(room):
+    model = fit(room, FitConfig(model=ModelConfig(n_primitives=32)), progress=False)
+    with torch.no_grad():
+        model.primitives.response[:, 1] = 0.1  # an imaginary part, too
+    for grid in (room.grid, AngularGrid.hemisphere(30, 120)):
+        together = model.synthesize(room.position, grid)
+        apart = torch.cat([model.synthesize(position[None], grid) for position in room.position])
+        torch.testing.assert_close(together, apart, atol=2e-5, rtol=0)

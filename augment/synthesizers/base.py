@@ -68,6 +68,11 @@ class Synthesizer(ABC):
         network that learns from means sees less of the world than there is.
         """
 
+    def deviation(self, position: Tensor) -> Tensor | None:
+        """By how much a measured spectrum is expected to differ from the synthesized one: standard deviations, float32
+        (n, H, W); None where that is unknown."""
+        return None
+
     @property
     def model(self) -> Saved | None:
         """What was fitted, where it can be saved."""

@@ -38,6 +38,9 @@ class SwiftWRFSynthesizer(Synthesizer):
     def synthesize(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
         return self._model.synthesize(position)
 
+    def deviation(self, position: Tensor) -> Tensor | None:
+        return self._model.synthesize(position, return_std=True)[1] if self._model.knows_deviation else None
+
     @property
     def model(self) -> SwiftWRF:
         return self._model

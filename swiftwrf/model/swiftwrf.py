@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import ClassVar, Literal, overload
 
@@ -16,7 +17,10 @@ from swiftwrf.model.deformation import COMPONENTS, Deformation, Offsets, Setting
 from swiftwrf.model.primitives import Gaussians, Primitives
 from swiftwrf.positions import check_batch, check_drawn, check_positions
 from swiftwrf.rasterize import rasterize, rasterize_magnitude
+from swiftwrf.rasterize.reference import kernels
 
+MANY = 16  # spectra from which on a product of matrices is faster than drawing each
+MOST_VALUES = 2**26  # of the kernels on a grid: 256 MiB
 FARTHEST = 1e6  # normalised: beyond, all is equally far, and float32 must not overflow
 
 
@@ -197,23 +201,42 @@ class SwiftWRF(nn.Module, Saved):
         grid = grid or self.grid
         spectrum = torch.empty(len(position), *grid.shape)
         std = torch.empty_like(spectrum) if return_std else None
+        kernel = self._fixed_kernels(grid) if len(position) >= MANY else None
         variation = self._variation(grid) if return_std else None
         for start in range(0, len(position), batch):
             x = self.normalise(position[start : start + batch].to(self.centre.device))
-            spectrum[start : start + batch] = self.draw(self.gaussians(x), len(x), grid).clamp(0, 1)
-            if std is not None and variation is not None:
-                std[start : start + batch] = _known(self.deformation.doubt(x))[:, None, None] * variation
+            gaussians = self.gaussians(x)
+            drawn = self.draw(gaussians, len(x), grid) if kernel is None else _product(gaussians.weight, kernel)
+            spectrum[start : start + batch] = drawn.clamp(0, 1)
+            if std is not None and variation is not None and (doubt := self.deformation.doubt(x)) is not None:
+                std[start : start + batch] = doubt[:, None, None] * variation
         spectrum = check_drawn(spectrum)
         return spectrum if std is None else (spectrum, check_drawn(std))
 
+    def _fixed_kernels(self, grid: AngularGrid) -> Tensor | None:
+        """Kernels (N, H, W) of primitives that stay where they are, so that many spectra are one matrix product; None where
+        some move or there are too many."""
+        moving = {"mean", "cholesky"} & set(self.config.components) and self.config.deformation != "none"
+        if moving or len(self.primitives) * math.prod(grid.shape) > MOST_VALUES:
+            return None
+        canonical = self.primitives()
+        return kernels(canonical.mean, canonical.cholesky, grid, self.config.cutoff)
+
+    @property
+    def knows_deviation(self) -> bool:
+        """Whether `synthesize` can tell standard deviations."""
+        return self.deformation.doubt(self.centre.new_zeros(1, 3).float()) is not None
+
     def _variation(self, grid: AngularGrid) -> Tensor:
         """Standard deviation of all spectra, as far as motions of the responses draw it, (H, W)."""
-        _known(self.deformation.doubt(self.centre.new_zeros(1, 3).float()))
+        if not self.knows_deviation:
+            raise InputError("this model knows no standard deviations; only one that was fitted by regression does")
         canonical = self.primitives()
         basis = torch.as_tensor(self.deformation.basis)  # only motions have doubt
         moved = Offsets.of(basis, self.config.components).response
         variance = torch.zeros(grid.shape, device=self.centre.device)
-        for motion in (canonical.attenuation[..., None] * _known(moved)).split(64):
+        assert moved is not None
+        for motion in (canonical.attenuation[..., None] * moved).split(64):
             mean = canonical.mean.expand(len(motion), -1, -1)
             part = rasterize(mean, canonical.cholesky, motion, grid, cutoff=self.config.cutoff)
             variance += part[:, 0].square().sum(dim=0)
@@ -241,10 +264,13 @@ class SwiftWRF(nn.Module, Saved):
         return model.eval()
 
 
-def _known(value: Tensor | None) -> Tensor:
-    if value is None:
-        raise InputError("this model knows no uncertainty; only one that was fitted by regression does")
-    return value
+def _product(weight: Tensor, kernel: Tensor) -> Tensor:
+    """|A| (B, H, W) from weights (B, N, 2), or (N, 2) for all."""
+    real, imaginary = weight.unbind(-1)
+    field: Tensor = torch.tensordot(real, kernel, dims=1)
+    if imaginary.any():
+        field = torch.hypot(field, torch.tensordot(imaginary, kernel, dims=1))
+    return field.abs()
 
 
 def frame(position: Tensor) -> tuple[Tensor, Tensor]:

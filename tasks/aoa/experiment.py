@@ -37,6 +37,7 @@ from tasks.run import Row, Run, choose_device, console
 
 SCORE = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
 SAMPLE = " sample"  # after the name of a synthesizer whose draws are scored instead of its means
+NORMAL_80 = 1.2816  # standard deviations about the mean that hold 80 % of a normal variable
 EXAMPLE_QUANTILES = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)  # of the PSNR at the test positions: the best to the worst spectrum
 
 
@@ -233,6 +234,9 @@ class _Experiment:
             fitted = time.perf_counter()
             generator = torch.Generator().manual_seed(settings.seed)
             drawn = {"test": synthesizer.synthesize(self.test.position)}
+            deviation = synthesizer.deviation(self.test.position)
+            if deviation is not None:
+                drawn["test deviation"] = deviation
             if synthesizer.samples:
                 drawn["test sample"] = synthesizer.synthesize(self.test.position, generator)
             for key, asked in zip(("withheld", "further"), places, strict=True):
@@ -258,7 +262,7 @@ class _Experiment:
         self.history += [arm | row for row in value["history"]]
         if arm["repeat"] == 0 and places[0] is not None and arm["mix"] not in self._kept_examples:
             self._kept_examples.add(arm["mix"])
-            self._keep_examples(arm["mix"], name, drawn["test"], psnr(drawn["test"], self.test.spectrum))
+            self._keep_examples(arm["mix"], name, drawn)
         return drawn
 
     def _keep_model(self, model: Saved | None, name: str, share: float, measured: Spectra) -> None:
@@ -281,17 +285,23 @@ class _Experiment:
             }
             self.directory.write_npz(f"room-mix{share:g}.npz", places)
 
-    def _keep_examples(self, share: float, name: str, synthetic: Tensor, score: Tensor) -> None:
+    def _keep_examples(self, share: float, name: str, drawn: dict[str, Tensor]) -> None:
         """Measured and synthetic spectra at test positions for the report, chosen by rule."""
+        measured, synthetic = self.test.spectrum, drawn["test"]
+        score = psnr(synthetic, measured)
         order = score.argsort()
         chosen = order[[round(q * (len(order) - 1)) for q in EXAMPLE_QUANTILES]]
         examples = {
-            "measured": _as_bytes(self.test.spectrum[chosen]).numpy(),
+            "measured": _as_bytes(measured[chosen]).numpy(),
             "synthetic": _as_bytes(synthetic[chosen]).numpy(),
             "synthesizer": name,
             "index": self.test.index[chosen].numpy(),
             "psnr_db": score[chosen].numpy(),
         }
+        if "test deviation" in drawn:
+            deviation = drawn["test deviation"]
+            examples["deviation"] = _as_bytes(deviation[chosen]).numpy()
+            examples["coverage"] = float(((synthetic - measured).abs() <= NORMAL_80 * deviation).float().mean())
         self.directory.write_npz(f"examples-mix{share:g}.npz", examples)
 
     def summary(self, share: float) -> MixMetrics:

@@ -149,8 +149,14 @@ def _examples(share: Share) -> Section:
     with np.load(share.run.folder / f"examples-mix{share.key}.npz") as file:
         example = dict(file)
     captions = [f"no. {i + 1}\n{db:.1f} dB" for i, db in zip(example["index"], example["psnr_db"], strict=True)]
-    figure = figures.spectra(example["measured"] / 255.0, example["synthetic"] / 255.0, captions)
+    deviation = example["deviation"] / 255.0 if "deviation" in example else None
+    figure = figures.spectra(example["measured"] / 255.0, example["synthetic"] / 255.0, captions, deviation)
     text = "From the best to the worst of the test spectra by PSNR (quantiles 1, 0.8, ..., 0); angles in degrees."
+    if deviation is not None:
+        text += (
+            " Expected deviation: the standard deviation by which the model expects to be wrong; intervals of 80 % cover "
+            f"{float(example['coverage']):.0%} of the pixels of all test spectra."
+        )
     return Section(
         f"Six spectra at positions nobody measured ({share.title}, {example.get('synthesizer', 'swiftwrf')})",
         plots=[Plot(f"spectra-{share.file_name}", figure, text)],

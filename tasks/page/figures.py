@@ -95,31 +95,44 @@ def bars(
     axes.grid(axis="x", visible=False)
 
 
-def spectra(measured: NDArray[Any], synthetic: NDArray[Any], captions: Sequence[str]) -> Figure:
-    """Measured, synthesized and their difference, one row a spectrum; azimuth to the right, elevation upwards [deg]."""
-    figure, axes = new_figure(len(measured), 3, 9, 0.95 * len(measured) + 0.6)
-    for row, caption in enumerate(captions):
-        pair = (measured[row], synthetic[row], synthetic[row] - measured[row])
-        for column, image in enumerate(pair):
-            ax = axes[3 * row + column]
+def spectra(
+    measured: NDArray[Any],
+    synthetic: NDArray[Any],
+    captions: Sequence[str],
+    deviation: NDArray[Any] | None = None,
+) -> Figure:
+    """Measured, synthesized, their difference and, where it is known, the deviation that was expected, one row a spectrum;
+    azimuth to the right, elevation upwards [deg]."""
+    columns = [
+        ("measured", measured, "viridis", 0),
+        ("synthesized", synthetic, "viridis", 0),
+        ("synthesized - measured", synthetic - measured, "RdBu_r", -1),
+        *([("expected deviation", deviation, "magma", 0)] if deviation is not None else []),
+    ]
+    n = len(columns)
+    figure, axes = new_figure(len(measured), n, 3 * n, 0.95 * len(measured) + 0.6)
+    for column, (title, images, colours, low) in enumerate(columns):
+        high = float(deviation.max()) if deviation is not None and images is deviation else 1
+        for row, image in enumerate(images):
+            ax = axes[n * row + column]
             drawn = ax.imshow(
                 image,
                 origin="lower",
                 extent=(0, 360, 0, 90),
                 aspect="auto",
                 interpolation="nearest",
-                cmap="viridis" if column < 2 else "RdBu_r",
-                vmin=0 if column < 2 else -1,
-                vmax=1,
+                cmap=colours,
+                vmin=low,
+                vmax=high,
             )
             ax.set(yticks=(0, 90), xticks=(0, 180, 360) if row == len(captions) - 1 else ())
             ax.grid(visible=False)
-            if row == 0:
-                ax.set_title(("measured", "synthesized", "synthesized - measured")[column], fontsize=9)
-            if row == 0 and column:
-                figure.colorbar(drawn, ax=axes[column::3], fraction=0.04, pad=0.02)
-        axes[3 * row].set_ylabel(caption, rotation=0, ha="right", va="center")
-    axes[-2].set_xlabel("azimuth [deg]")
+        axes[column].set_title(title, fontsize=9)
+        if column:
+            figure.colorbar(drawn, ax=axes[column::n], fraction=0.04, pad=0.02)
+    for row, caption in enumerate(captions):
+        axes[n * row].set_ylabel(caption, rotation=0, ha="right", va="center")
+    axes[n * (len(captions) - 1) + 1].set_xlabel("azimuth [deg]")
     return figure
 
 
