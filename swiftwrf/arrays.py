@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.angles import AngularGrid
+from swiftwrf.beamforming import BEAMFORMERS, PHASE
 from swiftwrf.errors import InputError
 
 LIGHT_SPEED = 299_792_458.0  # [m / s]
@@ -58,27 +59,36 @@ class PlanarArray:
         steps = torch.arange(side, dtype=torch.float64) * (spacing or wavelength / 2)
         return cls(torch.cartesian_prod(steps, steps), wavelength)
 
+    @classmethod
+    def grid(cls, rows: int, columns: int, spacing: float, frequency_hz: float) -> PlanarArray:
+        """rows x columns elements, `spacing` [m] apart and centred on the origin; the element of row r and column c is
+        number r * columns + c, columns ascend along x and rows along y."""
+        y, x = (spacing * (torch.arange(n, dtype=torch.float64) - (n - 1) / 2) for n in (rows, columns))
+        return cls(torch.cartesian_prod(y, x).flip(1), LIGHT_SPEED / frequency_hz)
+
     def phase(self, direction: Tensor) -> Tensor:
         """By how much each element leads the origin for a wave from unit vectors (..., 3), (..., K) [rad] (paper, the
         phase difference Delta alpha)."""
         return 2 * math.pi / self.wavelength * (direction[..., :2].to(self.element) @ self.element.T)
 
-    def spectrum(self, channel: Tensor, grid: AngularGrid) -> Tensor:
-        """The magnitude |sum_m w_m exp(j angle(h_m))| / K at each direction, in [0, 1] (paper, equation of the spectrum).
+    def spectrum(self, channel: Tensor, grid: AngularGrid, beamformer: str = PHASE) -> Tensor:
+        """The magnitude at each direction, in [0, 1], float32 (n, n_elevation, n_azimuth).
 
-        Only the phases of the channel count: what the array reports is where the wave comes from, not its power.
+        With `phase`, the default, only the phases of the channel count: what the array reports is where the wave comes
+        from, not its power.
 
         Args:
-            channel: complex channel of each element, (n, K).
+            channel: complex channel of each element, (n, K), or (n, S, K) of several snapshots (subcarriers or packets).
             grid: the directions to scan.
+            beamformer: of `swiftwrf.beamforming`: phase, bartlett or capon.
 
-        Returns:
-            float32 (n, n_elevation, n_azimuth).
+        Raises:
+            InputError: an unknown beamformer, or too few snapshots for it.
         """
-        steering = torch.polar(torch.ones((), dtype=torch.float64), -self.phase(grid.direction)).flatten(0, 1)
-        heard = torch.polar(torch.ones((), dtype=torch.float64), channel.angle().double())
-        beam = heard.to(torch.complex64) @ steering.to(torch.complex64).T
-        return (beam.abs() / len(self.element)).reshape(-1, *grid.shape).float()
+        steering = torch.polar(torch.ones((), dtype=torch.float64), self.phase(grid.direction)).flatten(0, 1)
+        snapshots = channel[:, None] if channel.dim() == 2 else channel
+        squared = BEAMFORMERS[beamformer].make(snapshots, steering)
+        return squared.clamp(0, 1).sqrt().reshape(-1, *grid.shape)
 
     def channel(self, direction: Tensor, gain: Tensor, owner: Tensor, n: int) -> Tensor:
         """Sum of paths at each element: gain exp(j phase), complex128 (n, K).

@@ -17,7 +17,6 @@ from torch import Tensor
 from swiftwrf.angles import AngularGrid, ArrayPose
 from swiftwrf.data.files import (
     FARTHEST,
-    MOST_PIXELS,
     numbers,
     read_bytes,
     read_positions,
@@ -26,7 +25,8 @@ from swiftwrf.data.files import (
     sha256_of_all,
 )
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format
-from swiftwrf.data.spectra import Moving, Spectra
+from swiftwrf.data.reading import Reading
+from swiftwrf.data.spectra import MOST_PIXELS, Moving, Spectra
 from swiftwrf.data.splits import read_split, split_names
 from swiftwrf.errors import InputError
 
@@ -53,7 +53,7 @@ class Nerf2(Format[Spectra]):
     def recognises(self, path: Path) -> bool:
         return (path / "gateway_info.yml").is_file() or (path / "spectrum").is_dir()
 
-    def read(self, path: Path) -> Spectra:
+    def read(self, path: Path, how: Reading) -> Spectra:
         return _read(path)
 
 
