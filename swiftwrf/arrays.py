@@ -52,6 +52,11 @@ class PlanarArray:
     def _content(self) -> tuple[float, ...]:
         return (self.wavelength, *self.element.flatten().tolist())
 
+    @property
+    def frequency_hz(self) -> float:
+        """Of the carrier."""
+        return LIGHT_SPEED / self.wavelength
+
     @classmethod
     def square(cls, side: int, frequency_hz: float, spacing: float | None = None) -> PlanarArray:
         """side x side elements, `spacing` [m] or else half a wavelength apart, the first at the origin."""

@@ -38,8 +38,17 @@ def load_spectra(
     Raises:
         InputError: what is missing, does not fit together or is not what the layout says; an argument that does not apply.
     """
-    data = read(path, Reading(array, beamformer, grid, every, station), SPECTRA_FORMATS, SNAPSHOT_FORMATS)
-    return data.spectra(grid, beamformer or PHASE) if isinstance(data, Snapshots) else data
+    return read_spectra(path, Reading(array, beamformer, grid, every, station))
+
+
+def read_spectra(path: str | Path, how: Reading) -> Spectra:
+    """`load_spectra` with its arguments in one.
+
+    Raises:
+        InputError: as `load_spectra`.
+    """
+    data = read(path, how, SPECTRA_FORMATS, SNAPSHOT_FORMATS)
+    return data.spectra(how.grid, how.beamformer or PHASE) if isinstance(data, Snapshots) else data
 
 
 def load_snapshots(path: str | Path, *, every: int | None = None, station: int | None = None) -> Snapshots:
@@ -65,4 +74,4 @@ def load_rssi(path: str | Path, *, columns: Mapping[str, str] | None = None) -> 
     return read(path, Reading(columns=columns), RSSI_FORMATS)
 
 
-__all__ = ["Reading", "Rssi", "Snapshots", "Spectra", "load_rssi", "load_snapshots", "load_spectra"]
+__all__ = ["Reading", "Rssi", "Snapshots", "Spectra", "load_rssi", "load_snapshots", "load_spectra", "read_spectra"]

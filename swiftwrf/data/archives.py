@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from swiftwrf.errors import InputError
 
-MOST_BYTES = 2**30  # unpacked
+MOST_BYTES, MOST_STORED = 2**30, 2**33  # unpacked, and as they lie in the file
 NUMPY, HDF5 = (".npz",), (".h5", ".hdf5")
 ARCHIVES = (*NUMPY, *HDF5)  # suffixes of files that hold arrays by name
 Arrays = dict[str, NDArray[Any]]
@@ -63,7 +63,7 @@ def read_arrays(file: Path, needed: Sequence[str], optional: Sequence[str] = ())
 
     Raises:
         InputError: no such file, one that is broken, an array that is missing or holds something else than numbers, or
-            more than a gigabyte.
+            more than a gigabyte that the file itself does not have.
     """
     if not file.is_file():
         raise InputError(f"{file} is missing")
@@ -71,12 +71,12 @@ def read_arrays(file: Path, needed: Sequence[str], optional: Sequence[str] = ())
         if file.suffix in HDF5:
             with _hdf5(file) as content:
                 names = _choose(file, set(content), needed, optional)
-                return _read_hdf5(content, names)
+                return _read_hdf5(content, names, file)
         with zipfile.ZipFile(file) as archive:
             stored = {name.removesuffix(".npy") for name in archive.namelist()}
             names = _choose(file, stored, needed, optional)
             members = {name: archive.getinfo(f"{name}.npy") for name in names}
-            _check_total(sum(member.file_size for member in members.values()))
+            _check_total(sum(member.file_size for member in members.values()), file)
             return {name: _read_member(archive, member) for name, member in members.items()}
 
 
@@ -84,12 +84,12 @@ def read_array(file: Path) -> NDArray[Any]:
     """The array of numbers in an npy file.
 
     Raises:
-        InputError: no such file, one that is broken or holds something else than numbers, or more than a gigabyte.
+        InputError: no such file, one that is broken or holds something else than numbers, or more than 8 gigabytes.
     """
     if not file.is_file():
         raise InputError(f"{file} is missing")
     with refusing_broken(file, "npy file"), file.open("rb") as stream:
-        _check_total(file.stat().st_size)
+        _check_total(file.stat().st_size, file)
         return _read_stream(stream, file.name, file.stat().st_size)
 
 
@@ -111,9 +111,11 @@ def _choose(file: Path, stored: set[str], needed: Sequence[str], optional: Seque
     return [*needed, *(name for name in optional if name in stored)]
 
 
-def _check_total(total: int) -> None:
-    if total > MOST_BYTES:
-        raise InputError(f"it unpacks to {total} bytes; at most {MOST_BYTES} are read, so split the data")
+def _check_total(total: int, file: Path) -> None:
+    """Refuses what unpacks to far more than the file has, and what fills any memory."""
+    most = max(MOST_BYTES, min(file.stat().st_size, MOST_STORED))
+    if total > most:
+        raise InputError(f"it unpacks to {total} bytes; at most {most} are read, so split the data")
 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
@@ -142,7 +144,7 @@ def _hdf5(file: Path) -> Any:
     return h5py.File(file, "r")
 
 
-def _read_hdf5(content: Any, names: Sequence[str]) -> Arrays:
+def _read_hdf5(content: Any, names: Sequence[str], file: Path) -> Arrays:
     """Datasets of an HDF5 file; none may lie in another file, which HDF5 would open without a word."""
     import h5py
 
@@ -150,5 +152,5 @@ def _read_hdf5(content: Any, names: Sequence[str]) -> Arrays:
         own = isinstance(content.get(name, getlink=True), h5py.HardLink) and isinstance(content[name], h5py.Dataset)
         if not own or content[name].is_virtual or content[name].external or content[name].dtype.kind not in "biufc":
             raise ValueError(f"{name} is no array of numbers in this file")
-    _check_total(sum(math.prod(content[name].shape) * content[name].dtype.itemsize for name in names))
+    _check_total(sum(math.prod(content[name].shape) * content[name].dtype.itemsize for name in names), file)
     return {name: np.asarray(content[name][()]) for name in names}

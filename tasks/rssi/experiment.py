@@ -22,7 +22,7 @@ from tasks.rssi.cluster import on_cluster
 from tasks.rssi.page import page
 from tasks.rssi.predictors import PREDICTORS, Settings, SwiftWRFPredictor, lacks
 from tasks.run import Preset, Row, Run, choose_device, console
-from tasks.source import named_columns
+from tasks.source import TableSource, reading
 from tasks.summarise import error_summary, grouped
 
 MAP_CELLS = 80  # along the longer side of the floor
@@ -30,7 +30,7 @@ MOST_PLAN_PIXELS = 2**24
 
 
 @dataclass(frozen=True)
-class RssiTaskConfig:
+class RssiTaskConfig(TableSource):
     """RSSI of a moving transmitter at fixed receivers, against baselines.
 
     Without --data the built-in simulated floor is used. An interrupted run goes on with --resume DIR.
@@ -40,8 +40,6 @@ class RssiTaskConfig:
     """receivers: names, numbers counted from 1, or all"""
     data: str | None = None
     """survey table (CSV or Parquet), or folder with tx_pos.csv, gateway_rssi.csv and gateway_position.yml (NeRF2 layout)"""
-    columns: tuple[str, ...] = ()
-    """of a survey table whose columns are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME ... (rssi='WAP*': several)"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
     preset: Preset = "quick"
@@ -113,7 +111,7 @@ def _load(config: RssiTaskConfig) -> Rssi:
         if config.columns:
             raise InputError("--columns is for a survey table; give it with --data")
         return rssi_room(seed=config.seed)
-    return load_rssi(config.data, columns=named_columns(config.columns))
+    return load_rssi(config.data, columns=reading(config).columns)
 
 
 def _read_floor_plan(config: RssiTaskConfig) -> dict[str, Any]:
