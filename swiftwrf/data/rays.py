@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +15,6 @@ from swiftwrf.arrays import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.files import sha256
 from swiftwrf.data.reading import Reading
 from swiftwrf.data.spectra import GRID, Moving, Spectra, check_pixels
-from swiftwrf.data.splits import read_split, split_names
 from swiftwrf.errors import InputError
 
 ARRAY_SIDE = 4
@@ -29,6 +30,7 @@ class Rays:
         direction: unit vectors from the receiver to where the path comes from, in world coordinates, (sum, 3).
         gain: complex amplitude of each path at the receiver with the phase of its whole length, (sum,).
         line_of_sight: whether the direct path is free, bool (n,).
+        index: number of each pair in the data set, counted from 0, int64 (n,).
         frequency_hz: of the carrier.
     """
 
@@ -38,29 +40,30 @@ class Rays:
     direction: Tensor
     gain: Tensor
     line_of_sight: Tensor
+    index: Tensor
     frequency_hz: float
 
-    def spectra(self, file: Path, folder: Path, how: Reading, notes: tuple[str, ...] = ()) -> Spectra:
+    def spectra(self, folder: Path, how: Reading, files: Iterable[Path], **more: Any) -> Spectra:
         """Spectra of an array that lies level at each receiver (array axes are world axes); it sees the upper half space
         and folds what comes from below.
 
         Args:
-            file: that the paths come from, and whose digest is kept.
-            folder: where splits lie.
+            folder: that the paths come from.
             how: array and grid.
-            notes: what the reader has to say.
+            files: whose digests are kept.
+            more: of the spectra's fields.
 
         Raises:
             InputError: an array for another carrier; spectra of too many pixels.
         """
         grid = how.grid or GRID
         n = len(self.count)
-        check_pixels(str(file), n, grid)
+        check_pixels(str(folder), n, grid)
         array = how.array or PlanarArray.square(ARRAY_SIDE, self.frequency_hz)
         own = LIGHT_SPEED / self.frequency_hz
         if abs(array.wavelength - own) > 1e-3 * own:
             raise InputError(
-                f"{file} has a carrier of {self.frequency_hz:.6g} Hz, but the array was given with a wavelength of "
+                f"{folder} has a carrier of {self.frequency_hz:.6g} Hz, but the array was given with a wavelength of "
                 f"{array.wavelength:.4g} m, not {own:.4g} m"
             )
         owner = torch.arange(n).repeat_interleave(self.count)
@@ -75,11 +78,10 @@ class Rays:
             label=torch.stack(to_angles(self.transmitter - self.receiver), dim=-1),
             line_of_sight=self.line_of_sight,
             moving=moving,
-            index=torch.arange(n),
-            named_splits={name: read_split(folder, name, n, first=1) for name in split_names(folder)},
+            index=self.index,
             array=array,
-            source={f.name: sha256(f) for f in [file, *sorted(folder.glob("*_index*.txt"))]},
+            source={file.name: sha256(file) for file in files},
             fixed_position=fixed[0].double() if min(transmitters, receivers) == 1 else None,
             rotation=torch.eye(3, dtype=torch.float64),
-            notes=notes,
+            **more,
         )

@@ -14,6 +14,7 @@ from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format
 from swiftwrf.data.rays import Rays
 from swiftwrf.data.reading import Reading
 from swiftwrf.data.spectra import GRID, Spectra, check_pixels
+from swiftwrf.data.splits import read_split, split_names
 from swiftwrf.errors import InputError
 
 NAMES = (
@@ -40,7 +41,10 @@ class Paths(Format[Spectra]):
 
     def read(self, path: Path, how: Reading) -> Spectra:
         file = path if path.is_file() else path / "paths.npz"
-        return _read(file, how).spectra(file, file.parent, how)
+        folder, rays = file.parent, _read(file, how)
+        files = [file, *sorted(folder.glob("*_index*.txt"))]
+        splits = {name: read_split(folder, name, len(rays.count), first=1) for name in split_names(folder)}
+        return rays.spectra(folder, how, files, named_splits=splits)
 
 
 def _read(file: Path, how: Reading) -> Rays:
@@ -60,6 +64,7 @@ def _read(file: Path, how: Reading) -> Rays:
         direction=offset / offset.norm(dim=1, keepdim=True),
         gain=arrays["gain"],
         line_of_sight=arrays["line_of_sight"],
+        index=torch.arange(len(count)),
         frequency_hz=float(arrays["frequency_hz"]),
     )
 
