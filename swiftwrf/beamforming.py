@@ -14,6 +14,7 @@ snapshots cancel each other.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -37,7 +38,7 @@ def covariance(channel: Tensor) -> Tensor:
 
 
 def _responses(roots: Tensor, steering: Tensor) -> Tensor:
-    """sum_r |a^H f_r|^2 over the rows f_r of roots (n, r, K) for steering vectors (directions, K), float32 (n, directions)."""
+    """sum_r |a^H f_r|^2 over rows f_r of roots (n, r, K) for steering vectors a (directions, K), float32 (n, directions)."""
     n, rank, _ = roots.shape
     adjoint = steering.conj().to(torch.complex64).T
     power = torch.empty(n, len(steering))
@@ -50,9 +51,10 @@ def _responses(roots: Tensor, steering: Tensor) -> Tensor:
 def _roots(channel: Tensor) -> Tensor:
     """Fewer rows (n, r, K) with the covariance that channels (n, S, K) have."""
     if channel.shape[1] <= channel.shape[2]:
-        return channel / channel.shape[1] ** 0.5
+        return channel / math.sqrt(channel.shape[1])
     value, vector = torch.linalg.eigh(covariance(channel))
-    return (value.clamp_min(0).sqrt()[:, None, :] * vector).mT
+    roots: Tensor = (value.clamp_min(0).sqrt()[:, None, :] * vector).mT
+    return roots
 
 
 @BEAMFORMERS.register(PHASE, meaning="sum of phases, as the paper has it; power is ignored")
@@ -69,7 +71,9 @@ def bartlett(channel: Tensor, steering: Tensor) -> Tensor:
     return _responses(_roots(unit), steering) / channel.shape[2] ** 2
 
 
-@BEAMFORMERS.register("capon", meaning="power of the beam that suppresses all else (minimum variance), relative to its maximum")
+@BEAMFORMERS.register(
+    "capon", meaning="power of the beam that suppresses all else (minimum variance), relative to its maximum"
+)
 def capon(channel: Tensor, steering: Tensor) -> Tensor:
     """Squared spectra (n, directions) of channels (n, S, K).
 

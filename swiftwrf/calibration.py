@@ -1,18 +1,20 @@
 """Phases of an array's elements and its orientation, estimated from positions with a clear line of sight.
 
 Cables and receivers add an unknown phase to each element, and arrays are mounted a few degrees off. Where the transmitter's
-position is known, so is what the direct path should look like: a_k = exp(j phi_k + j 2 pi e_k . d / wavelength) at element k,
-with d the direction turned into array coordinates. The phases phi and the turn that give the direct paths of all positions the
-most of what was heard,
+position is known, so is what the direct path should look like: a_k = exp(j phi_k + j 2 pi e_k . d / wavelength) at element
+k, with d the direction turned into array coordinates. The phases phi and the turn that give the direct paths of all
+positions the most of what was heard,
 
     J(phi, turn) = sum_i w_i a_i^H C_i a_i / K^2,    C_i: covariance of the phases at position i,
 
-are found by a scan over turns, for each of which phi is the principal eigenvector of the turned covariances, and least squares of
-the residual phases from the best. Positions without a clear direct path lose their weight. Deviations follow from the residual phases of whole
-neighbourhoods, for multipath errs alike at neighbouring positions (sandwich estimator; H. White, Econometrica 48, 1980).
+are found by a scan over turns, for each of which phi is the principal eigenvector of the turned covariances, and by least
+squares of the residual phases from the best. Positions without a clear direct path lose their weight. Deviations follow from
+the residuals of whole neighbourhoods, for multipath errs alike at neighbouring positions (sandwich estimator; H. White,
+Econometrica 48, 1980). They do not cover a reflection that is there at all positions, as from a floor: it shifts the
+estimate by about twice as much.
 
-What cannot be told is refused: an array on a line does not see a turn about it, and positions in a narrow cone make a turn look
-like phases.
+What cannot be told is refused: an array on a line does not see a turn about it, and positions in a narrow cone make a turn
+look like phases.
 """
 
 from __future__ import annotations
@@ -95,7 +97,8 @@ def calibrate(train: Snapshots) -> Calibration:
     seen = train.subset(train.line_of_sight.nonzero()[:, 0])
     if len(seen) < 2 * MIN_TRAINING:
         raise InputError(
-            f"{train.name} has {len(seen)} training positions with line of sight; a calibration needs at least {2 * MIN_TRAINING}"
+            f"{train.name} has {len(seen)} training positions with line of sight; a calibration needs at least "
+            f"{2 * MIN_TRAINING}"
         )
     problem = _Problem.of(seen)
     found = problem.descend(problem.scan())
@@ -109,8 +112,8 @@ def calibrate(train: Snapshots) -> Calibration:
     if float(turn_std.max()) > MOST_DEVIATION[0] or float(phase_std.max()) > MOST_DEVIATION[1]:
         raise InputError(
             f"the positions of {train.name} cannot tell the array's orientation from its elements' phases (deviations "
-            f"{math.degrees(float(turn_std.max())):.1f} and {math.degrees(float(phase_std.max())):.0f} degrees); measure positions "
-            "in more directions from the array"
+            f"{math.degrees(float(turn_std.max())):.1f} and {math.degrees(float(phase_std.max())):.0f} degrees); measure "
+            "positions in more directions from the array"
         )
     before, after = problem.held_out(found, slabs(seen.position, FOLDS))
     if not after > before:
@@ -159,7 +162,7 @@ class _Problem:
     def scan(self) -> _Found:
         """The best of turns all over the ball, with its phases."""
         few = self.subset(torch.linspace(0, len(self.direction) - 1, min(SCANNED, len(self.direction))).round().long())
-        _, phase, turn = max((few._phases(turn) + (turn,) for turn in _turns()), key=lambda found: found[0])
+        _, phase, turn = max(((*few._phases(turn), turn) for turn in _turns()), key=lambda found: found[0])
         return _Found(phase, turn)
 
     def _phases(self, turn: Tensor) -> tuple[float, Tensor]:

@@ -21,7 +21,9 @@ class SpectraSource:
     array: tuple[int, float, float] | None = None
     """square array that took the spectra, where the data do not say, or that ray paths are computed for: elements a side,
     spacing [m], carrier [Hz]"""
-    beamformer: Annotated[str | None, choice("what makes spectra of array snapshots (phase unless given)", BEAMFORMERS)] = None
+    beamformer: Annotated[
+        str | None, choice("what makes spectra of array snapshots (phase unless given)", BEAMFORMERS)
+    ] = None
     grid: tuple[int, int] | None = None
     """elevations and azimuths of spectra that are computed (90 360 unless given)"""
     every: int | None = None
@@ -35,7 +37,8 @@ class TableSource:
     """How survey tables are read."""
 
     columns: tuple[str, ...] = ()
-    """of a survey table whose columns are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME ... (rssi='WAP*': several)"""
+    """of a survey table whose columns are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME ... (several with
+    rssi='WAP*')"""
 
 
 def reading(config: SpectraSource | TableSource) -> Reading:

@@ -57,7 +57,8 @@ def load_snapshots(path: str | Path, *, every: int | None = None, station: int |
     Raises:
         InputError: as `load_spectra`.
     """
-    return read(path, Reading(every=every, station=station), SNAPSHOT_FORMATS)
+    data: Snapshots = read(path, Reading(every=every, station=station), SNAPSHOT_FORMATS)
+    return data
 
 
 def load_rssi(path: str | Path, *, columns: Mapping[str, str] | None = None) -> Rssi:
@@ -71,7 +72,8 @@ def load_rssi(path: str | Path, *, columns: Mapping[str, str] | None = None) -> 
     Raises:
         InputError: what is missing, does not fit together or is not what the layout says; an argument that does not apply.
     """
-    return read(path, Reading(columns=columns), RSSI_FORMATS)
+    data: Rssi = read(path, Reading(columns=columns), RSSI_FORMATS)
+    return data
 
 
 __all__ = ["Reading", "Rssi", "Snapshots", "Spectra", "load_rssi", "load_snapshots", "load_spectra", "read_spectra"]

@@ -67,7 +67,7 @@ def read_arrays(file: Path, needed: Sequence[str], optional: Sequence[str] = ())
     """
     if not file.is_file():
         raise InputError(f"{file} is missing")
-    with refusing_broken(file, "HDF5 file" if file.suffix in HDF5 else "npz archive"):
+    with refusing_broken(file, "an HDF5 file" if file.suffix in HDF5 else "an npz archive"):
         if file.suffix in HDF5:
             with _hdf5(file) as content:
                 names = _choose(file, set(content), needed, optional)
@@ -88,7 +88,7 @@ def read_array(file: Path) -> NDArray[Any]:
     """
     if not file.is_file():
         raise InputError(f"{file} is missing")
-    with refusing_broken(file, "npy file"), file.open("rb") as stream:
+    with refusing_broken(file, "an npy file"), file.open("rb") as stream:
         _check_total(file.stat().st_size, file)
         return _read_stream(stream, file.name, file.stat().st_size)
 
@@ -101,7 +101,7 @@ def refusing_broken(file: Path, kind: str) -> Iterator[None]:
     except InputError as error:
         raise InputError(f"{file}: {error}" if str(file) not in str(error) else str(error)) from None
     except BROKEN as error:
-        raise InputError(f"{file} is not an {kind} of plain numbers ({error})") from None
+        raise InputError(f"{file} is not {kind} of plain numbers ({error})") from None
 
 
 def _choose(file: Path, stored: set[str], needed: Sequence[str], optional: Sequence[str]) -> list[str]:

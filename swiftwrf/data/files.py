@@ -6,6 +6,7 @@ import csv
 import hashlib
 import io
 import math
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +22,7 @@ from swiftwrf.errors import InputError
 MOST_BYTES = 2**28  # of a text file: a million rows of positions take a tenth of it
 FARTHEST = 1e9  # [m] from the origin: beyond, float64 no longer keeps a wavelength apart
 CARRIERS_HZ = (1e6, 1e13)
+DECIMAL_COMMA = re.compile(r"^(\s*[+-]?\d+),(\d+\s*)$")
 PLAIN_TAGS = {
     f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "timestamp", "seq", "map")
 }
@@ -134,15 +136,16 @@ def read_cells(file: Path, separators: str = ",") -> tuple[list[str], list[list[
 
     Args:
         file: with one row a line and values between separators.
-        separators: of these, the one that the header has most of.
+        separators: of these, the one that the header has most of; numbers may have a decimal comma if it is another.
 
     Raises:
         InputError: no such file, a column without name or a name twice, rows of unequal length, no rows.
     """
     text = read_text(file)
     first = text.split("\n", 1)[0]
+    separator = max(separators, key=first.count)
     try:
-        stream = csv.reader(io.StringIO(text, newline=""), delimiter=max(separators, key=first.count))
+        stream = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
         lines = [line for line in stream if line]
     except csv.Error as error:
         raise InputError(f"{file} is not a comma-separated table ({error})") from None
@@ -159,7 +162,9 @@ def read_cells(file: Path, separators: str = ",") -> tuple[list[str], list[list[
     for row, line in enumerate(lines[1:], start=1):
         if len(line) != len(header):
             raise InputError(f"{file} row {row} has {len(line)} values, but the header has {len(header)}")
-    return header, lines[1:]
+    if separator == ",":
+        return header, lines[1:]
+    return header, [[DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in line] for line in lines[1:]]
 
 
 def read_table(file: Path, columns: list[str] | None = None) -> tuple[list[str], Tensor]:

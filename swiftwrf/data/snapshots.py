@@ -72,7 +72,8 @@ class Snapshots:
     def direction(self) -> Tensor:
         """Unit vectors of the line of sight in array coordinates, float64 (n, 3); z may be negative."""
         away = self.position - self.array_position
-        return away / away.norm(dim=1, keepdim=True) @ self.rotation
+        direction: Tensor = away / away.norm(dim=1, keepdim=True) @ self.rotation
+        return direction
 
     def spectra(self, grid: AngularGrid | None = None, beamformer: str = PHASE) -> Spectra:
         """The spectra of the array, all snapshots of a position together.

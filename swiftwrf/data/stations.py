@@ -113,7 +113,13 @@ def read_station(file: Path, number: int | None) -> tuple[int, Station, float]:
     assignments = antenna.get("assignments")
     return (
         index,
-        Station(names[index], location, _rotation(file, antenna), (spacing[0][0], spacing[1][0]), _checked(file, assignments)),
+        Station(
+            names[index],
+            location,
+            _rotation(file, antenna),
+            (spacing[0][0], spacing[1][0]),
+            _checked(file, assignments),
+        ),
         frequency[0],
     )
 
@@ -145,7 +151,9 @@ def _rotation(file: Path, antenna: dict[str, Any]) -> Tensor:
         up = np.cross(front, right)
         lengths = lengths[0], np.linalg.norm(up)
     if not min(lengths) > 1e-6 or abs(right @ up) > SKEW * math.prod(lengths):
-        raise InputError(f"{file}: rightvector and upvector of an array must be at right angles, or its direction not vertical")
+        raise InputError(
+            f"{file}: rightvector and upvector of an array must be at right angles, or its direction not vertical"
+        )
     front = np.cross(right, up)
     front, right = front / np.linalg.norm(front), right / lengths[0]
     return torch.from_numpy(np.stack([right, np.cross(front, right), front], axis=1))
@@ -154,13 +162,15 @@ def _rotation(file: Path, antenna: dict[str, Any]) -> Tensor:
 def _checked(file: Path, assignments: Any) -> list[list[int | None]] | None:
     if assignments is None:
         return None
-    rows = assignments if isinstance(assignments, list) and assignments else [None]
-    if not all(isinstance(row, list) and len(row) == len(rows[0] or []) for row in rows):
+    rows: list[list[int | None]] = assignments if isinstance(assignments, list) else []
+    if not rows or not all(isinstance(row, list) and len(row) == len(rows[0]) for row in rows):
         raise InputError(f"{file}: assignments must be rows of equal length, with null where an antenna is missing")
     cells = [cell for row in rows for cell in row]
     used = [cell for cell in cells if isinstance(cell, int) and not isinstance(cell, bool) and 0 <= cell < 4096]
     if len(used) + cells.count(None) != len(cells) or len(set(used)) != len(used) or len(used) < 2:
-        raise InputError(f"{file}: assignments must name at least 2 antennas by their numbers, each once, got {assignments}")
+        raise InputError(
+            f"{file}: assignments must name at least 2 antennas by their numbers, each once, got {assignments}"
+        )
     return rows
 
 
@@ -208,7 +218,9 @@ def read_snapshots(
             positions.append(record.position.astype(np.float64))
             index.append(number)
             if len(channels) * channel.nbytes > MOST_BYTES:
-                raise InputError(f"{path} holds more than {MOST_BYTES} bytes of channels; take one record of several: every")
+                raise InputError(
+                    f"{path} holds more than {MOST_BYTES} bytes of channels; take one record of several: every"
+                )
     if not channels:
         raise InputError(f"{path} holds no record with a position and a channel")
     if without:

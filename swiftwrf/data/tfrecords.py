@@ -11,6 +11,7 @@ Checksums are not compared: CRC-32C is not in Python's library.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,7 +23,14 @@ from numpy.typing import NDArray
 from swiftwrf.errors import InputError
 
 LONGEST = 2**28  # bytes of a record
-DTYPES = {1: np.dtype("<f4"), 2: np.dtype("<f8"), 3: np.dtype("<i4"), 8: np.dtype("<c8"), 9: np.dtype("<i8"), 18: np.dtype("<c16")}
+DTYPES: dict[int, np.dtype[Any]] = {
+    1: np.dtype("<f4"),
+    2: np.dtype("<f8"),
+    3: np.dtype("<i4"),
+    8: np.dtype("<c8"),
+    9: np.dtype("<i8"),
+    18: np.dtype("<c16"),
+}
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5  # wire types
 
 
@@ -52,7 +60,9 @@ def tensor(content: bytes) -> NDArray[Any]:
     Raises:
         ValueError: no tensor of numbers, or another number of them than its shape calls for.
     """
-    dtype, shape, numbers = None, [], b""
+    dtype: np.dtype[Any] | None = None
+    shape: list[int] = []
+    numbers = b""
     for field, value in _fields(content):
         if field == 1 and isinstance(value, int):
             dtype = DTYPES.get(value)
@@ -62,17 +72,10 @@ def tensor(content: bytes) -> NDArray[Any]:
             numbers = value
     if dtype is None:
         raise ValueError("a tensor of another type than numbers")
-    values = np.frombuffer(numbers, dtype)  # refuses parts of numbers
-    if len(values) != _product(shape):
+    values: NDArray[Any] = np.frombuffer(numbers, dtype)  # refuses parts of numbers
+    if len(values) != math.prod(shape):
         raise ValueError(f"a tensor of shape {tuple(shape)[:8]} with {len(values)} numbers")
     return values.reshape(shape)
-
-
-def _product(shape: list[int]) -> int:
-    product = 1
-    for size in shape:
-        product *= size
-    return product
 
 
 def _size(dimension: int | bytes) -> int:

@@ -31,7 +31,8 @@ def write_spectra(data: Spectra, folder: Path) -> None:
     """
     if data.fixed_position is None or data.rotation is None:
         raise InputError(
-            f"{data.name} has no end that stays at one place and one orientation, which the layout needs; it cannot be written"
+            f"{data.name} has no end that stays at one place with one orientation, which the layout needs; it cannot be "
+            "written"
         )
     if data.grid != AngularGrid.hemisphere(*data.grid.shape):
         raise InputError(f"{data.name} has another grid than elevations up to 90 degrees and azimuths from 0 on")

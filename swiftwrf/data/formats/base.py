@@ -55,7 +55,9 @@ def read(path: str | Path, how: Reading, *registries: Registry[Format[Any]]) -> 
         entry, reader = _find(source, known, registries)
         for name in how.given:
             if name not in reader.takes:
-                raise InputError(f"{source} is read as {entry.name} ({entry.meaning}), which takes no {name}; leave it out")
+                raise InputError(
+                    f"{source} is read as {entry.name} ({entry.meaning}), which takes no {name}; leave it out"
+                )
         return reader.read(source, how)
     except OSError as error:
         reason = "no permission to read it" if isinstance(error, PermissionError) else error.strerror

@@ -1,8 +1,8 @@
 """Reader of DeepMIMO v4 folders, the exchange format of ray tracers (Sionna RT, Wireless InSite, AODT): one array a file.
 
 `{key}_t{set}_tx{index}_r{set}.npz` holds `key`: power [dB], phase [deg], delay [s], aoa_az, aoa_el [deg] of up to 25 paths a
-receiver, nan where there are fewer, and rx_pos, tx_pos [m]; params.json the carrier and the ray tracer. aoa_el is the angle from
-the zenith. The angles point from the receiver to where the path comes from, in world coordinates.
+receiver, nan where there are fewer, and rx_pos, tx_pos [m]; params.json the carrier and the ray tracer. aoa_el is the angle
+from the zenith. The angles point from the receiver to where the path comes from, in world coordinates.
 
 Wireless InSite gives the phase of a path over its whole length; Sionna that of its passband coefficient, to which the phase
 -2 pi f delay of the propagation is to be added. Which it is shows at the direct paths, whose phase is the propagation's.
@@ -32,6 +32,7 @@ from swiftwrf.errors import InputError
 KEYS = ("power", "phase", "delay", "aoa_az", "aoa_el")
 FILE = re.compile(r"power_(t\d+_tx\d+_r\d+)\.npz")
 SIONNA = "sionna"  # in the name of the ray tracer
+SHORTEST, LONGEST = 0.9, 100.0  # that the shortest path may be, in distances: beyond, units are wrong
 DIRECT = 0.01  # relative: a path hardly longer than the distance is the direct one
 STEADY = 0.5  # mean resultant length of phases beyond which they are one phase
 OFF = 15.0  # [deg] that direct paths may come from beside the line of sight
@@ -51,7 +52,9 @@ class DeepMimo(Format[Spectra]):
         pairs = _pairs(path)
         if (how.station is None and len(pairs) > 1) or not 1 <= (how.station or 1) <= len(pairs):
             listed = ", ".join(f"{number} {pair}" for number, pair in enumerate(pairs[:8], start=1))
-            raise InputError(f"{path} holds {len(pairs)} pairs of transmitter and receivers; choose one by its number: station ({listed})")
+            raise InputError(
+                f"{path} holds {len(pairs)} pairs of transmitter and receivers; choose one by its number: station ({listed})"
+            )
         pair = pairs[(how.station or 1) - 1]
         frequency, tracer = _params(path / "params.json")
         rays, notes = _rays(path, pair, frequency, tracer, how)
@@ -70,7 +73,9 @@ def _params(file: Path) -> tuple[float, str]:
         given = json.loads(read_text(file))["rt_params"]
         frequency, tracer = float(given["frequency"]), str(given.get("raytracer_name", ""))
     except (LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise InputError(f"{file} must be JSON with rt_params, and in it frequency, the carrier in Hz ({error!r})") from None
+        raise InputError(
+            f"{file} must be JSON with rt_params, and in it frequency, the carrier in Hz ({error!r})"
+        ) from None
     check_carrier(file, frequency)
     return frequency, tracer
 
@@ -92,8 +97,17 @@ def _rays(folder: Path, pair: str, frequency: float, tracer: str, how: Reading) 
     away = transmitter - receiver
     distance = np.linalg.norm(away, axis=1)
     if not (distance > 0).all():
-        raise InputError(f"{folder}: receiver {int(rows[distance.argmin()])} of pair {pair} is at the transmitter; leave it out")
-    line, path = np.nonzero(known & (np.abs(table["delay"] * LIGHT_SPEED / distance[:, None] - 1) < DIRECT))
+        raise InputError(
+            f"{folder}: receiver {int(rows[distance.argmin()])} of pair {pair} is at the transmitter; leave it out"
+        )
+    detour = np.where(known, table["delay"] * LIGHT_SPEED / distance[:, None], math.inf)
+    shortest = float(np.median(detour.min(axis=1)))
+    if not SHORTEST <= shortest <= LONGEST:
+        raise InputError(
+            f"{folder}: shortest paths are {shortest:.3g} times as long as the distance (median), so positions are not in "
+            "metres or delays not in seconds"
+        )
+    line, path = np.nonzero(np.abs(detour - 1) < DIRECT)
     angles = table["aoa_az"], table["aoa_el"]
     if max(np.abs(angle[known]).max() for angle in angles) <= 2 * math.pi:
         raise InputError(f"{folder}: no angle is beyond 2 pi, so they look like radians; aoa_az and aoa_el are degrees")
@@ -142,7 +156,9 @@ def _tables(folder: Path, pair: str) -> tuple[dict[str, NDArray[np.float64]], ND
         shapes = ", ".join(f"{key} {values.shape}" for key, values in arrays.items())
         raise InputError(f"{folder}: the paths of pair {pair} must all have shape (receivers, paths), got {shapes}")
     if receiver.shape != (shape[0], 3) or transmitter.shape != (3,):
-        raise InputError(f"{folder}: expected rx_pos ({shape[0]}, 3) and tx_pos (3,), got {receiver.shape} and {transmitter.shape}")
+        raise InputError(
+            f"{folder}: expected rx_pos ({shape[0]}, 3) and tx_pos (3,), got {receiver.shape} and {transmitter.shape}"
+        )
     if not (np.abs(receiver) <= FARTHEST).all() or not (np.abs(transmitter) <= FARTHEST).all():
         raise InputError(f"{folder}: positions of pair {pair} must be finite numbers [m], at most {FARTHEST:g}")
     return arrays, receiver, transmitter
@@ -172,14 +188,20 @@ def _check_angles(folder: Path, azimuth: NDArray[Any], zenith: NDArray[Any], tow
     if declared <= OFF:
         return
     others = {
-        "aoa_el is the angle from the horizon; give that from the zenith, 90 - aoa_el": _direction(azimuth, 90 - zenith),
-        "the angles say where a path goes; give those from the receiver to where it comes from": -_direction(azimuth, zenith),
+        "aoa_el is the angle from the horizon; give that from the zenith, 90 - aoa_el": _direction(
+            azimuth, 90 - zenith
+        ),
+        "the angles say where a path goes; give those from the receiver to where it comes from": -_direction(
+            azimuth, zenith
+        ),
         "x and y are swapped in the angles or in the positions": _direction(90 - azimuth, zenith),
         "aoa_az turns clockwise; give it counter-clockwise from x": _direction(-azimuth, zenith),
     }
     meaning, best = min(((meaning, off(claimed)) for meaning, claimed in others.items()), key=lambda found: found[1])
     reason = f"it would fit if {meaning}" if best <= OFF else "positions and angles are in different frames or units"
-    raise InputError(f"{folder}: direct paths come from {declared:.0f} degrees beside the transmitter (median); {reason}")
+    raise InputError(
+        f"{folder}: direct paths come from {declared:.0f} degrees beside the transmitter (median); {reason}"
+    )
 
 
 def _convention(phase: NDArray[Any], turned: NDArray[Any], tracer: str) -> str:

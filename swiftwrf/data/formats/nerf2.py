@@ -57,7 +57,8 @@ BROKEN = (
 
 
 @SPECTRA_FORMATS.register(
-    "nerf2", meaning="gateway_info.yml, tx_pos.csv or rx_pos.csv, and spectrum/00001.png, ... or spectrum.npy, spectrum.npz"
+    "nerf2",
+    meaning="gateway_info.yml, tx_pos.csv or rx_pos.csv, and spectrum/00001.png, ... or spectrum.npy, spectrum.npz",
 )
 class Nerf2(Format[Spectra]):
     """Images; row i of the positions belongs to the image numbered i from 1, or to row i of the array."""
@@ -133,7 +134,9 @@ def _read_array(file: Path, gateway: dict[str, Any]) -> PlanarArray | None:
     frequency, elements = number(gateway.get("frequency_hz")), gateway.get("element_position")
     places = [numbers(place, 2) for place in elements] if isinstance(elements, list) else [None]
     if None in places:
-        raise InputError(f"{file}: frequency_hz [Hz] comes with element_position, a list of x and y [m] of each element")
+        raise InputError(
+            f"{file}: frequency_hz [Hz] comes with element_position, a list of x and y [m] of each element"
+        )
     check_carrier(file, frequency)
     return PlanarArray(torch.tensor(places, dtype=torch.float64), LIGHT_SPEED / frequency)
 
@@ -148,10 +151,8 @@ def _read_spectra(folder: Path, n: int) -> tuple[Tensor, Tensor, dict[str, str]]
         spectrum, digest = _read_images(folder / "spectrum", n)
         return spectrum, free, {"spectrum/*.png": digest}
     file = arrays[0]
-    if file.suffix == ".npy":
-        content = {"spectrum": read_array(file)}
-    else:
-        content = read_arrays(file, ["spectrum"], ["line_of_sight"])
+    single = file.suffix == ".npy"
+    content = {"spectrum": read_array(file)} if single else read_arrays(file, ["spectrum"], ["line_of_sight"])
     if (seen := content.get("line_of_sight")) is not None:
         if seen.shape != (n,) or seen.dtype.kind != "b":
             raise InputError(f"{file}: line_of_sight must be {n} truth values, got {seen.dtype} of shape {seen.shape}")
@@ -177,8 +178,8 @@ def _checked(file: Path, values: NDArray[Any], n: int) -> Tensor:
     low, high = float(values.min()), float(values.max())
     if not (low >= 0 and high <= 1 + 1e-6):  # nan compares false, so it is refused
         raise InputError(
-            f"{file}: spectra are magnitudes in [0, 1], got {low:.4g} to {high:.4g}; convert decibels to magnitudes and divide by "
-            "the largest"
+            f"{file}: spectra are magnitudes in [0, 1], got {low:.4g} to {high:.4g}; convert decibels to magnitudes and "
+            "divide by the largest"
         )
     return torch.from_numpy(values.astype(np.float32)).clamp(0, 1)
 

@@ -43,7 +43,9 @@ class SnapshotArrays(Format[Snapshots]):
 
 def _file(path: Path) -> Path | None:
     if path.is_dir():
-        return next((path / f"snapshots{suffix}" for suffix in ARCHIVES if (path / f"snapshots{suffix}").is_file()), None)
+        return next(
+            (path / f"snapshots{suffix}" for suffix in ARCHIVES if (path / f"snapshots{suffix}").is_file()), None
+        )
     return path if path.suffix in ARCHIVES and "csi" in array_names(path) else None
 
 
@@ -105,8 +107,8 @@ def _channel(file: Path, csi: NDArray[Any], n: int, elements: int) -> Tensor:
         raise InputError(f"{file}: csi must hold complex numbers, got {csi.dtype}{hint}")
     if csi.ndim == 3 and csi.shape[0] == n and csi.shape[2] != elements and csi.shape[1] == elements:
         raise InputError(
-            f"{file}: csi has shape {csi.shape} with its {elements} elements in the middle; the last axis must be the elements, "
-            "so give csi.transpose(0, 2, 1)"
+            f"{file}: csi has shape {csi.shape} with its {elements} elements in the middle; they must be the last axis, so "
+            "give csi.transpose(0, 2, 1)"
         )
     if csi.ndim not in (2, 3) or csi.shape[0] != n or csi.shape[-1] != elements or 0 in csi.shape:
         raise InputError(
@@ -155,7 +157,8 @@ def _array(file: Path, arrays: Arrays) -> PlanarArray:
         array = PlanarArray.grid(int(rows), int(columns), spacing, float(frequency))
     else:
         raise InputError(
-            f"{file} lacks the array: give element_position (elements, 3) in metres, or the numbers rows, columns and spacing_m"
+            f"{file} lacks the array: give element_position (elements, 3) in metres, or the numbers rows, columns and "
+            "spacing_m"
         )
     check_spacing(file, array)
     return array
@@ -185,6 +188,6 @@ def check_spacing(file: Path, array: PlanarArray) -> None:
     low, high = SPACING
     if not low <= float(apart) <= high:
         raise InputError(
-            f"{file}: neighbouring elements are {float(apart) * array.wavelength:.4g} m, {float(apart):.3g} wavelengths apart; "
-            f"expected {low:g} to {high:g} wavelengths, so is the spacing in metres and the carrier in Hz?"
+            f"{file}: neighbouring elements are {float(apart) * array.wavelength:.4g} m, {float(apart):.3g} wavelengths "
+            f"apart; expected {low:g} to {high:g} wavelengths, so is the spacing in metres and the carrier in Hz?"
         )

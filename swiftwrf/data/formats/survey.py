@@ -11,36 +11,33 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf.data.archives import MOST_BYTES, refusing_broken
-from swiftwrf.data.files import FARTHEST, read_cells, sha256
+from swiftwrf.data.files import FARTHEST, sha256
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format
 from swiftwrf.data.formats.nerf2_rssi import HIGHEST, LOWEST, NOT_HEARD
 from swiftwrf.data.reading import Reading
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import read_split, split_names
+from swiftwrf.data.tables import SUFFIXES, column_of_numbers, parsed, read_frame
 from swiftwrf.errors import InputError
 
-SUFFIXES = (".csv", ".parquet")
 RECEIVERS = "receivers.csv"  # beside the table: receiver,x,y,z
 SENTINELS = (NOT_HEARD, -200.0, 100.0)  # that tables write for a receiver that heard nothing
 STOREY = 4.0  # [m] that a number of a floor stands for, where there is no height
 MOST_VALUES = 2**27  # of all receivers
-SEPARATORS = ",;\t"
-ROLES = {
-    "x": {"x", "x_m", "pos_x", "position_x", "position_x_m", "x_pos", "x_position", "coord_x", "tx_x", "easting", "longitude", "lon"},
-    "y": {"y", "y_m", "pos_y", "position_y", "position_y_m", "y_pos", "y_position", "coord_y", "tx_y", "northing", "latitude", "lat"},
-    "z": {"z", "z_m", "pos_z", "position_z", "position_z_m", "z_pos", "z_position", "coord_z", "tx_z", "height", "height_m", "altitude"},
-    "floor": {"floor"},
-    "time": {"time", "time_s", "timestamp", "t", "datetime", "date", "date_time"},
-    "receiver": {"receiver", "receiver_name", "receiver_id", "rx", "gateway", "ap", "bssid", "mac", "sensor", "anchor"},
-    "rssi": {"rssi", "rssi_dbm", "rss", "rss_dbm", "dbm", "signal", "signal_dbm", "power_dbm", "rsrp", "rsrp_dbm"},
-}  # fmt: skip
+AXIS = "(?:(?:pos|position|coord|tx)_)?{0}(?:_(?:pos|position|coord))?(?:_m)?"
+ROLES = {  # names of columns, in small letters and underscores
+    "x": re.compile(AXIS.format("x") + "|easting|longitude|lon"),
+    "y": re.compile(AXIS.format("y") + "|northing|latitude|lat"),
+    "z": re.compile(AXIS.format("z") + "|(?:height|altitude)(?:_m)?"),
+    "floor": re.compile("floor"),
+    "time": re.compile("time(?:_s)?|timestamp|t|date(?:_?time)?"),
+    "receiver": re.compile("receiver(?:_(?:name|id))?|rx|gateway|ap|bssid|mac|sensor|anchor"),
+    "rssi": re.compile("(?:rssi?|rsrp|signal|power)(?:_dbm)?|rss_dbm|dbm"),
+}
 ASKED = tuple(role for role in ROLES if role != "floor")  # that --columns takes
 DEGREES = {"longitude", "lon", "latitude", "lat"}
-MISSING = {"", "nan", "na", "n/a", "null", "none", "-"}
 
 
 @RSSI_FORMATS.register("survey", meaning="a table of positions and RSSI, long or wide, in CSV or Parquet")
@@ -71,7 +68,7 @@ def _tables(path: Path) -> list[Path]:
 
 
 def _read(file: Path, asked: Mapping[str, str]) -> Rssi:
-    table = _parquet(file) if file.suffix.lower() == ".parquet" else _csv(file)
+    table = read_frame(file)
     roles = _roles(file, table, asked)
     notes: list[str] = []
     position = _positions(file, table, roles, notes)
@@ -89,36 +86,10 @@ def _read(file: Path, asked: Mapping[str, str]) -> Rssi:
         transmitter_position=position,
         rssi_dbm=rssi,
         index=torch.arange(len(position)),
-        named_splits={
-            name: read_split(file.parent, name, len(position), first=0) for name in split_names(file.parent)
-        },
+        named_splits={name: read_split(file.parent, name, len(position), first=0) for name in split_names(file.parent)},
         source={f.name: sha256(f) for f in described},
         notes=tuple(notes),
     )
-
-
-def _csv(file: Path) -> pd.DataFrame:
-    header, rows = read_cells(file, SEPARATORS)
-    return pd.DataFrame(rows, columns=header, dtype=object)
-
-
-def _parquet(file: Path) -> pd.DataFrame:
-    try:
-        from pyarrow import parquet
-    except ImportError:
-        raise InputError(
-            f"{file} is Parquet, which pyarrow reads; install it with pip install 'swiftwrf-tasks[formats]'"
-        ) from None
-    with refusing_broken(file, "Parquet file"):
-        content = parquet.ParquetFile(file)
-        groups = range(content.metadata.num_row_groups)
-        if (total := sum(content.metadata.row_group(i).total_byte_size for i in groups)) > MOST_BYTES:
-            raise InputError(f"it unpacks to {total} bytes; at most {MOST_BYTES} are read, so split the data")
-        table = content.read().to_pandas()
-    table.columns = [str(name).strip() for name in table.columns]
-    if not len(table) or not table.columns.is_unique:
-        raise InputError(f"{file} must have rows, and a name of its own for each column")
-    return table
 
 
 def _roles(file: Path, table: pd.DataFrame, asked: Mapping[str, str]) -> dict[str, str]:
@@ -134,15 +105,22 @@ def _roles(file: Path, table: pd.DataFrame, asked: Mapping[str, str]) -> dict[st
     for role, known in ROLES.items():
         if role in asked:
             continue
-        found = [name for name in table.columns if _plain(name) in known and name not in roles.values()]
+        found = [name for name in table.columns if known.fullmatch(_plain(name)) and name not in roles.values()]
         if len(found) > 1:
-            raise InputError(f"{file} has {len(found)} columns that may be {role} ({_listed(found)}); say which: columns {role}=NAME")
-        roles |= {role: name for name in found}
+            raise InputError(
+                f"{file} has {len(found)} columns that may be {role} ({_listed(found)}); say which: columns {role}=NAME"
+            )
+        if found:
+            roles[role] = found[0]
     for role in ("x", "y"):
         if role not in roles:
-            raise InputError(f"{file} has no column for {role}; there are {_listed(table.columns)}; say which: columns {role}=NAME")
+            raise InputError(
+                f"{file} has no column for {role}; there are {_listed(table.columns)}; say which: columns {role}=NAME"
+            )
     if "receiver" in roles and "rssi" not in roles:
-        raise InputError(f"{file} has receivers in column {roles['receiver']!r}, but no RSSI beside; say where: columns rssi=NAME")
+        raise InputError(
+            f"{file} has receivers in column {roles['receiver']!r}, but no RSSI beside; say where: columns rssi=NAME"
+        )
     return roles
 
 
@@ -156,42 +134,21 @@ def _listed(names: Any) -> str:
     return ", ".join(names[:12]) + (f" and {len(names) - 12} more" if len(names) > 12 else "")
 
 
-def _numbers(file: Path, table: pd.DataFrame, name: str) -> NDArray[np.float64]:
-    """A column as numbers, nan where a cell is empty.
-
-    Raises:
-        InputError: a cell of text.
-    """
-    values, text = _parsed(table[name])
-    if text.any():
-        row = int(text.argmax())
-        raise InputError(f"{file} row {row + 1}, column {name}: {table[name].iloc[row]!r} is not a number")
-    return values
-
-
-def _parsed(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Numbers, nan elsewhere, and where a cell holds text that is none."""
-    if column.dtype.kind in "biuf":
-        return column.to_numpy(np.float64), np.zeros(len(column), dtype=bool)
-    cells = column.astype(str).str.strip()
-    values = pd.to_numeric(cells, errors="coerce").to_numpy(np.float64)
-    if np.isnan(values).all():  # decimal commas, which semicolons between the columns allow
-        values = pd.to_numeric(cells.str.replace(",", ".", regex=False), errors="coerce").to_numpy(np.float64)
-    empty = column.isna().to_numpy() | cells.str.lower().isin(MISSING).to_numpy()
-    return np.where(empty, np.nan, values), np.isnan(values) & ~empty
-
-
 def _positions(file: Path, table: pd.DataFrame, roles: dict[str, str], notes: list[str]) -> Tensor:
     """Positions of the rows, float64 (n, 3) [m]."""
-    x, y = (_numbers(file, table, roles[role]) for role in ("x", "y"))
-    if {_plain(roles["x"]), _plain(roles["y"])} & DEGREES and np.nanmax(np.abs(x)) <= 180 and np.nanmax(np.abs(y)) <= 90:
+    x, y = (column_of_numbers(file, table, roles[role]) for role in ("x", "y"))
+    if (
+        {_plain(roles["x"]), _plain(roles["y"])} & DEGREES
+        and np.nanmax(np.abs(x)) <= 180
+        and np.nanmax(np.abs(y)) <= 90
+    ):
         raise InputError(
             f"{file}: columns {roles['x']} and {roles['y']} hold degrees; give positions in metres, projected to the plane"
         )
     if "z" in roles:
-        z = _numbers(file, table, roles["z"])
+        z = column_of_numbers(file, table, roles["z"])
     elif "floor" in roles:
-        z = STOREY * _numbers(file, table, roles["floor"])
+        z = STOREY * column_of_numbers(file, table, roles["floor"])
         notes.append(f"there is no height, so each floor of column {roles['floor']} counts as {STOREY:g} m")
     else:
         z = np.zeros(len(table))
@@ -201,8 +158,8 @@ def _positions(file: Path, table: pd.DataFrame, roles: dict[str, str], notes: li
     if len(bad):
         row, axis = bad[0]
         raise InputError(
-            f"{file} row {row + 1} has no usable {'xyz'[axis]} ({position[row, axis]:g}); positions must be finite numbers [m], at "
-            f"most {FARTHEST:g}"
+            f"{file} row {row + 1} has no usable {'xyz'[axis]} ({position[row, axis]:g}); positions must be finite numbers "
+            f"[m], at most {FARTHEST:g}"
         )
     return torch.from_numpy(position)
 
@@ -220,7 +177,7 @@ def _long(file: Path, table: pd.DataFrame, roles: dict[str, str], position: Tens
     n = int(row.max()) + 1
     _check_size(file, n, len(names))
     values = np.full((n, len(names)), np.nan)
-    values[row, column] = _numbers(file, table, roles["rssi"])
+    values[row, column] = column_of_numbers(file, table, roles["rssi"])
     where = np.empty(n, dtype=np.int64)
     where[row] = np.arange(len(row))
     return list(names), torch.from_numpy(values), position[torch.from_numpy(where)]
@@ -244,13 +201,13 @@ def _wide(
             "say which: columns rssi=NAME or rssi='PREFIX*'"
         )
     _check_size(file, len(table), len(names))
-    values = np.stack([_numbers(file, table, name) for name in names], axis=1)
+    values = np.stack([column_of_numbers(file, table, name) for name in names], axis=1)
     return names, torch.from_numpy(values)
 
 
 def _is_rssi(column: pd.Series) -> bool:
     """Whether most of its cells are received powers, or all say that nothing was heard."""
-    values, text = _parsed(column)
+    values, text = parsed(column)
     known = values[~np.isnan(values)]
     if text.sum() > len(known) or not len(known):
         return False
@@ -281,8 +238,8 @@ def _heard(file: Path, names: list[str], rssi: Tensor, notes: list[str]) -> tupl
     if len(bad):
         row, column = bad[0].tolist()
         raise InputError(
-            f"{file} row {row + 1}, receiver {names[column]}: {float(rssi[row, column]):g} dBm is no received power; expected "
-            f"{LOWEST:g} to {HIGHEST:g}, or {', '.join(f'{value:g}' for value in SENTINELS)} or nothing for not heard"
+            f"{file} row {row + 1}, receiver {names[column]}: {float(rssi[row, column]):g} dBm is no received power; "
+            f"expected {LOWEST:g} to {HIGHEST:g}, or {', '.join(f'{v:g}' for v in SENTINELS)} or nothing for not heard"
         )
     kept = (~rssi.isnan()).any(dim=0).nonzero()[:, 0].tolist()
     if not kept:
@@ -296,15 +253,16 @@ def _receivers(file: Path, names: list[str]) -> Tensor:
     """Positions of the receivers, float64 (R, 3) [m]; nan where no file tells them."""
     if not file.is_file():
         return torch.full((len(names), 3), torch.nan, dtype=torch.float64)
-    header, rows = read_cells(file, SEPARATORS)
-    if header != ["receiver", "x", "y", "z"]:
-        raise InputError(f"{file} must start with the header receiver,x,y,z, got {','.join(header)}")
-    table = pd.DataFrame(rows, columns=header, dtype=object)
-    table.index = pd.Index([name.strip() for name in table["receiver"]])
+    table = read_frame(file)
+    if list(table.columns) != ["receiver", "x", "y", "z"]:
+        raise InputError(f"{file} must start with the header receiver,x,y,z, got {','.join(table.columns)}")
+    table.index = pd.Index(table["receiver"].str.strip())
     missing = [name for name in names if name not in table.index]
     if missing or not table.index.is_unique:
-        raise InputError(f"{file} must have each receiver once; {', '.join(missing[:5]) or 'one name'} is missing or comes twice")
-    position = np.stack([_numbers(file, table.loc[names], axis) for axis in "xyz"], axis=1)
+        raise InputError(
+            f"{file} must have each receiver once; {', '.join(missing[:5]) or 'one name'} is missing or comes twice"
+        )
+    position = np.stack([column_of_numbers(file, table.loc[names], axis) for axis in "xyz"], axis=1)
     if not (np.abs(position) <= FARTHEST).all():
         raise InputError(f"{file} needs 3 finite numbers [m], at most {FARTHEST:g}, for each receiver")
     return torch.from_numpy(position)
