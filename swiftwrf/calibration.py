@@ -8,10 +8,10 @@ positions the most of what was heard,
     J(phi, turn) = sum_i w_i a_i^H C_i a_i / K^2,    C_i: covariance of the phases at position i,
 
 are found by a scan over turns, for each of which phi is the principal eigenvector of the turned covariances, and by least
-squares of the residual phases from the best. Positions without a clear direct path lose their weight. Deviations follow from
-the residuals of whole neighbourhoods, for multipath errs alike at neighbouring positions (sandwich estimator; H. White,
-Econometrica 48, 1980). They do not cover a reflection that is there at all positions, as from a floor: it shifts the
-estimate by about twice as much.
+squares of the residual phases from the best. Positions without a clear direct path lose their weight. Deviations are those of
+the jackknife that leaves out a neighbourhood at a time, for multipath errs alike at neighbouring positions (J. W. Tukey, Ann.
+Math. Statist. 29, 1958). They do not cover a reflection that is there at all positions, as from a floor, which shifts the
+estimate by as much again or twice as much.
 
 What cannot be told is refused: an array on a line does not see a turn about it, and positions in a narrow cone make a turn
 look like phases.
@@ -41,7 +41,8 @@ STEPS, SETTLED = 40, 1e-6  # of the descent, the last one [rad]
 SINGULAR = 1e-9  # relative: smaller eigenvalues are nothing
 CLEAR = 0.5  # of what is heard from the direct path counts as a clear line of sight
 NEIGHBOURHOODS = 20
-MOST_DEVIATION = math.radians(2), math.radians(20)  # of the turn and of a phase: beyond, the data cannot tell
+WORSE = 0.02  # in the share at positions held out, that is no chance
+MOST_DEVIATION = math.radians(3), math.radians(30)  # of the turn and of a phase: beyond, the data cannot tell
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,10 +117,10 @@ def calibrate(train: Snapshots) -> Calibration:
             "positions in more directions from the array"
         )
     before, after = problem.held_out(found, slabs(seen.position, FOLDS))
-    if not after > before:
+    if after < before - WORSE:
         raise InputError(
-            f"a calibration of {train.name} does not help at positions held out: {before:.0%} of what is heard comes along "
-            f"the line of sight without, {after:.0%} with it"
+            f"a calibration of {train.name} does harm at positions held out: {before:.0%} of what is heard comes along the line "
+            f"of sight without, {after:.0%} with it"
         )
     return Calibration(wrap(found.phase - found.phase[0]), phase_std, found.turn, turn_std, before, after, clear)
 
@@ -134,8 +135,7 @@ class _System(NamedTuple):
     """Weighted least squares of the residual phases for a small change of the phases but the first, and of the turn."""
 
     normal: Tensor  # (p, p)
-    score: Tensor  # (n, p), of each position
-    noise: float  # variance of a residual phase
+    score: Tensor  # (p,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +176,7 @@ class _Problem:
         """Gauss-Newton steps on the residual phases, their weights renewed in each."""
         for _ in range(STEPS):
             system = self._system(found)
-            step = torch.linalg.pinv(system.normal, rtol=SINGULAR, hermitian=True) @ system.score.sum(0)
+            step = torch.linalg.pinv(system.normal, rtol=SINGULAR, hermitian=True) @ system.score
             turned = Rotation.from_rotvec(found.turn.numpy()) * Rotation.from_rotvec(step[-3:].numpy())
             phase = found.phase + torch.cat([torch.zeros(1, dtype=torch.float64), step[:-3]])
             found = _Found(phase, torch.from_numpy(turned.as_rotvec()))
@@ -201,8 +201,7 @@ class _Problem:
         weighted = weight[:, None, None] * jacobian
         return _System(
             normal=torch.einsum("nkp,nkq->pq", weighted, jacobian),
-            score=torch.einsum("nkp,nk->np", weighted, residual),
-            noise=float((weight[:, None] * residual.square()).sum() / (weight.sum() * (k - 1))),
+            score=torch.einsum("nkp,nk->p", weighted, residual),
         )
 
     def shares(self, found: _Found) -> Tensor:
@@ -218,17 +217,21 @@ class _Problem:
         return _unit(self.array.phase(self.direction @ _matrix(turn)))
 
     def deviations(self, found: _Found) -> tuple[Tensor, Tensor]:
-        """Of the phases (K,) beyond that of the first element, and of the turn (3,); infinite where nothing tells them."""
-        system = self._system(found)
-        if torch.linalg.matrix_rank(system.normal, rtol=SINGULAR, hermitian=True) < len(system.normal):
+        """Of the phases (K,) beyond that of the first element, and of the turn (3,), by leaving out one neighbourhood after
+        the other; infinite where nothing tells them."""
+        normal = self._system(found).normal
+        if torch.linalg.matrix_rank(normal, rtol=SINGULAR, hermitian=True) < len(normal):
             return torch.full_like(found.phase, math.inf), torch.full_like(found.turn, math.inf)
-        inverse = torch.linalg.inv(system.normal)
-        groups = slabs(self.position, min(NEIGHBOURHOODS, len(self.position)))
-        together = torch.zeros(int(groups.max()) + 1, len(inverse), dtype=torch.float64)
-        sandwich = (together.index_add(0, groups, system.score) @ inverse).square().sum(0)
-        # neighbourhoods may happen to agree where little is known; independent noise is then the larger
-        deviation = torch.maximum(sandwich, system.noise * inverse.diagonal()).sqrt()
-        return torch.cat([torch.zeros(1, dtype=torch.float64), deviation[:-3]]), deviation[-3:]
+        group = slabs(self.position, min(NEIGHBOURHOODS, len(self.position)))
+        count = int(group.max()) + 1
+        away = []
+        for number in range(count):
+            other = self.subset(group != number).descend(found)
+            turn = Rotation.from_rotvec(found.turn.numpy()).inv() * Rotation.from_rotvec(other.turn.numpy())
+            away.append(torch.cat([wrap(other.phase - found.phase), torch.from_numpy(turn.as_rotvec())]))
+        spread = torch.stack(away)
+        deviation = ((count - 1) / count * (spread - spread.mean(dim=0)).square().sum(dim=0)).sqrt()
+        return deviation[:-3], deviation[-3:]
 
     def held_out(self, found: _Found, fold: Tensor) -> tuple[float, float]:
         """Mean share along the line of sight at positions left out of the descent, without and with a calibration."""

@@ -68,12 +68,14 @@ def _parse(features: dict[str, bytes], file: Path, offsets: dict[Path, NDArray[A
     parts, position = tensor(features["csi"]), tensor(features["pos-tachy"])
     if parts.ndim != 3 or parts.shape[2] != 2 or parts.dtype.kind != "f" or 0 in parts.shape or position.shape != (3,):
         raise ValueError(f"csi of shape {parts.shape} and pos-tachy of shape {position.shape}")
-    csi = np.fft.fftshift(parts[..., 0] + 1j * parts[..., 1], axes=1)  # from the order of the FFT to that of frequency
+    joined = parts.view(np.result_type(parts.dtype, np.complex64))[..., 0]
+    csi = np.fft.fftshift(joined, axes=1)  # from the order of the FFT to that of frequency
     if (known := offsets[file]) is not None:
         if len(known) != len(csi):
             raise ValueError(f"{len(csi)} antennas, but offsets of {len(known)}")
         turns = np.arange(csi.shape[1]) / csi.shape[1]
-        csi = csi * np.exp(1j * (known[:, :1] + known[:, 1:] * 2 * np.pi * turns))
+        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is left out later
+            csi = csi * np.exp(1j * (known[:, :1] + known[:, 1:] * 2 * np.pi * turns))
     return Record(csi, position)
 
 
