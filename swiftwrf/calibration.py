@@ -8,10 +8,10 @@ positions the most of what was heard,
     J(phi, turn) = sum_i w_i a_i^H C_i a_i / K^2,    C_i: covariance of the phases at position i,
 
 are found by a scan over turns, for each of which phi is the principal eigenvector of the turned covariances, and by least
-squares of the residual phases from the best. Positions without a clear direct path lose their weight. Deviations are those of
-the jackknife that leaves out a neighbourhood at a time, for multipath errs alike at neighbouring positions (J. W. Tukey, Ann.
-Math. Statist. 29, 1958). They do not cover a reflection that is there at all positions, as from a floor, which shifts the
-estimate by as much again or twice as much.
+squares of the residual phases from the best. Positions without a clear direct path lose their weight. Deviations are those
+of the jackknife that leaves out a neighbourhood at a time, for multipath errs alike at neighbouring positions (J. W. Tukey,
+Ann. Math. Statist. 29, 1958). They do not cover a reflection that is there at all positions, as from a floor, which shifts
+the estimate by as much again or twice as much.
 
 What cannot be told is refused: an array on a line does not see a turn about it, and positions in a narrow cone make a turn
 look like phases.
@@ -119,8 +119,8 @@ def calibrate(train: Snapshots) -> Calibration:
     before, after = problem.held_out(found, slabs(seen.position, FOLDS))
     if after < before - WORSE:
         raise InputError(
-            f"a calibration of {train.name} does harm at positions held out: {before:.0%} of what is heard comes along the line "
-            f"of sight without, {after:.0%} with it"
+            f"a calibration of {train.name} does harm at positions held out: {before:.0%} of what is heard comes along the "
+            f"line of sight without, {after:.0%} with it"
         )
     return Calibration(wrap(found.phase - found.phase[0]), phase_std, found.turn, turn_std, before, after, clear)
 

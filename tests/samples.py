@@ -37,9 +37,8 @@ def snapshots(
         turn = 2 * math.pi / WAVELENGTH * away.norm(dim=1)
         channel += (amplitude * torch.polar(torch.ones_like(phase), phase - turn[:, None]))[:, None]
     channel += noise * torch.randn(channel.shape, dtype=torch.complex128, generator=generator)
-    return Snapshots(
-        "made", channel.to(torch.complex64), position, array, POSITION, rotation, torch.ones(n, dtype=torch.bool), torch.arange(n)
-    )  # fmt: skip
+    free = torch.ones(n, dtype=torch.bool)
+    return Snapshots("made", channel.to(torch.complex64), position, array, POSITION, rotation, free, torch.arange(n))
 
 
 def snapshot_arrays(data: Snapshots) -> dict[str, object]:
@@ -54,7 +53,9 @@ def snapshot_arrays(data: Snapshots) -> dict[str, object]:
     }
 
 
-def write_snapshots(folder: Path, name: str = "snapshots.npz", data: Snapshots | None = None, **changes: object) -> Path:
+def write_snapshots(
+    folder: Path, name: str = "snapshots.npz", data: Snapshots | None = None, **changes: object
+) -> Path:
     """snapshots.npz or snapshots.h5; None leaves an array out."""
     arrays = {k: v for k, v in {**snapshot_arrays(data or snapshots()), **changes}.items() if v is not None}
     folder.mkdir(exist_ok=True)
@@ -142,7 +143,9 @@ def record_source(shape: tuple[int, int], n: int = 24, count: int = 3) -> Snapsh
     away = data.position - data.array_position
     phase = array.phase(away / away.norm(dim=1, keepdim=True) @ data.rotation)[:, None].expand(-1, count, -1)
     channel = torch.polar(torch.ones_like(phase), phase).to(torch.complex64)
-    return Snapshots("made", channel, data.position, array, data.array_position, data.rotation, data.line_of_sight, data.index)
+    return Snapshots(
+        "made", channel, data.position, array, data.array_position, data.rotation, data.line_of_sight, data.index
+    )
 
 
 def write_espargos(folder: Path, arrays: int = 1, **changes: object) -> Path:
@@ -175,7 +178,10 @@ def write_dichasus(folder: Path, offsets: bool = False, **changes: object) -> Pa
     stored = np.fft.ifftshift(csi, axes=2)
     folder.mkdir(exist_ok=True)
     examples = [
-        {"csi": np.stack([stored[i].real, stored[i].imag], axis=-1).astype(np.float32), "pos-tachy": data.position[i].numpy()}
+        {
+            "csi": np.stack([stored[i].real, stored[i].imag], axis=-1).astype(np.float32),
+            "pos-tachy": data.position[i].numpy(),
+        }
         for i in range(len(data))
     ]
     write_records(folder / "walk.tfrecords", examples)

@@ -78,7 +78,7 @@ def test_one_of_several_pairs(tmp_path):
     folder = write_deepmimo(tmp_path / "a")
     for file in list(folder.glob("*_t000_tx000_r001.npz")):
         (folder / file.name.replace("tx000", "tx001")).write_bytes(file.read_bytes())
-    with pytest.raises(InputError, match="2 pairs.*station"):
+    with pytest.raises(InputError, match=r"2 pairs.*station"):
         load_spectra(folder)
     assert len(load_spectra(folder, station=2, grid=GRID)) == 30
 
@@ -97,7 +97,10 @@ def _params(text):
         (lambda f: np.savez(f / "phase_t000_tx000_r001.npz", phase=np.zeros((3, 25))), "all have shape"),
         (lambda f: np.savez(f / "rx_pos_t000_tx000_r001.npz", rx_pos=np.zeros((3, 3))), "expected rx_pos"),
         (lambda f: np.savez(f / "rx_pos_t000_tx000_r001.npz", rx_pos=np.full((30, 3), np.nan)), "finite numbers"),
-        (lambda f: np.savez(f / "power_t000_tx000_r001.npz", power=np.full((30, 25), np.nan)), "no receiver with a path"),
+        (
+            lambda f: np.savez(f / "power_t000_tx000_r001.npz", power=np.full((30, 25), np.nan)),
+            "no receiver with a path",
+        ),
     ],
 )
 def test_refuses(tmp_path, spoil, says):

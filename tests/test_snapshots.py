@@ -88,7 +88,10 @@ REFUSED = {
     "at the array": ({"position": np.tile([0.2, 2.4, 1.2], (120, 1))}, "equal to array_position"),
     "no array": ({"element_position": None}, "lacks the array"),
     "half rows": ({"element_position": None, "rows": 4.5, "columns": 4, "spacing_m": 0.06}, "whole numbers"),
-    "elements in millimetres": ({"element_position": 1000 * snapshot_arrays(snapshots())["element_position"]}, "wavelengths"),
+    "elements in millimetres": (
+        {"element_position": 1000 * snapshot_arrays(snapshots())["element_position"]},
+        "wavelengths",
+    ),
     "elements upright": (
         {"element_position": snapshot_arrays(snapshots())["element_position"][:, [2, 0, 1]]},
         "along z",

@@ -71,8 +71,22 @@ def test_semicolons_and_decimal_commas(tmp_path):
 
 
 def test_uji_indoor_loc(tmp_path):
-    header = ["WAP001", "WAP002", "WAP003", "LONGITUDE", "LATITUDE", "FLOOR", "BUILDINGID", "SPACEID", "USERID", "TIMESTAMP"]
-    rows = [[-80 + i, 100, 100 if i % 2 else -90, -7541.2 + i, 4864921.0 + i, i % 3, 1, 106, 2, 1371713733] for i in range(12)]
+    header = [
+        "WAP001",
+        "WAP002",
+        "WAP003",
+        "LONGITUDE",
+        "LATITUDE",
+        "FLOOR",
+        "BUILDINGID",
+        "SPACEID",
+        "USERID",
+        "TIMESTAMP",
+    ]
+    rows = [
+        [-80 + i, 100, 100 if i % 2 else -90, -7541.2 + i, 4864921.0 + i, i % 3, 1, 106, 2, 1371713733]
+        for i in range(12)
+    ]
     data = load_rssi(write_survey(tmp_path, "trainingData.csv", header, rows))
     assert data.receiver_names == ("WAP001", "WAP003")
     assert data.transmitter_position[2].tolist() == [-7539.2, 4864923.0, 8.0]
@@ -87,7 +101,7 @@ def test_columns_named_by_the_user(tmp_path):
     header = ["easting_of_robot", "y", "z", "speed", "ap one", "ap two"]
     rows = [[i, i, 1, -0.5, -50 - i, -60] for i in range(12)]
     file = write_survey(tmp_path, header=header, rows=rows)
-    with pytest.raises(InputError, match="no column for x.*x=NAME"):
+    with pytest.raises(InputError, match=r"no column for x.*x=NAME"):
         load_rssi(file)
     data = load_rssi(file, columns={"x": "easting_of_robot", "rssi": "ap *"})
     assert data.receiver_names == ("ap one", "ap two")
@@ -142,8 +156,8 @@ REFUSED = {
     "far position": (_table("x,y,a", "1e12,2,-50"), "at most 1e"),
     "too strong": (_table("x,y,a", "1,2,-50", "1,2,-50", "1,2,31"), "row 3, receiver a: 31 dBm"),
     "never heard": (_table("x,y,a", "1,2,-100"), "no heard value"),
-    "ragged": (lambda f: (write_survey(f) and (f / "walk.csv").write_text("x,y,a\n1,2\n")), "has 2 values"),
-    "no rows": (lambda f: (write_survey(f) and (f / "walk.csv").write_text("x,y,a\n")), "no rows"),
+    "ragged": (lambda f: write_survey(f) and (f / "walk.csv").write_text("x,y,a\n1,2\n"), "has 2 values"),
+    "no rows": (lambda f: write_survey(f) and (f / "walk.csv").write_text("x,y,a\n"), "no rows"),
     "two tables": (lambda f: (write_survey(f), write_survey(f, "b.csv")), "2 tables"),
     "a name twice": (_table("x,y,a,a", "1,2,-50,-60"), "'a' twice"),
     "no Parquet": (lambda f: (f / "walk.parquet").write_bytes(b"PAR1"), "not a Parquet file"),
