@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import quick
 import torch
 from quick import said
 from samples import (
@@ -20,16 +22,15 @@ from samples import (
 from test_calibration import spoilt
 
 from swiftwrf import AngularGrid, load_rssi, load_spectra, simulated_room
+from swiftwrf.data import Reading
+from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.data.writing import write_rssi, write_spectra
-from tasks.convert import ConvertConfig
-from tasks.convert import run as convert
-from tasks.run import command_line
 
 GRID = ("--grid", 24, 96)
 
 
 def run(*arguments):
-    return command_line("tasks.convert", ConvertConfig, convert, [str(a) for a in arguments])
+    return quick.run("convert", *arguments)
 
 
 SPECTRA = {
@@ -165,3 +166,12 @@ def test_refusals_leave_nothing(tmp_path, capsys, arguments, says):
     assert run(*(str(a).format(**places) for a in arguments)) == 2
     assert says in said(capsys)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["source", "taken", "walk"]
+
+
+def test_every_format_is_described():
+    text = (Path(__file__).parent.parent / "docs" / "formats.md").read_text()
+    for formats in (SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS):
+        for name in formats:
+            assert f"[{name}](#" in text, f"describe {name} in docs/formats.md"
+    for option in Reading.__dataclass_fields__:
+        assert f"`--{option} " in text, f"describe --{option} in docs/formats.md"

@@ -5,18 +5,16 @@ from __future__ import annotations
 import json
 
 import pytest
+import quick
 import torch
 from quick import said
 from samples import WAVELENGTH, write_snapshots, write_survey
 
-from tasks.inspect import InspectConfig
-from tasks.inspect import run as inspect
 from tasks.inspect.findings import nearest
-from tasks.run import command_line
 
 
 def run(*arguments):
-    return command_line("tasks.inspect", InspectConfig, inspect, [str(a) for a in arguments])
+    return quick.run("inspect", *arguments)
 
 
 def test_snapshots(tmp_path, capsys):

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 from samples import write_survey
 
-from swiftwrf import InputError, Rssi, RssiModel, fit_rssi, rssi_room
+from swiftwrf import InputError, Rssi, fit_rssi, load, rssi_room
 from tasks.report import merge
 from tasks.rssi import experiment
 from tasks.rssi.predictors import PREDICTORS, Settings, lacks
@@ -182,7 +182,7 @@ def test_model_without_positions_of_the_receivers_is_saved(tmp_path):
     assert not model.directivity.any()
     model.save(tmp_path / "model")
     place = data.transmitter_position[:5]
-    torch.testing.assert_close(RssiModel.load(tmp_path / "model").predict(place)[0], model.predict(place)[0])
+    torch.testing.assert_close(load(tmp_path / "model").predict(place)[0], model.predict(place)[0])
 
 
 def test_a_survey_table_is_one_command_to_a_map(tmp_path, capsys):

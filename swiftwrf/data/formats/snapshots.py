@@ -56,7 +56,7 @@ def _read(file: Path, every: int) -> Snapshots:
             raise InputError(f"{file}: {name} holds complex numbers, expected real ones")
         if not np.isfinite(values).all():
             raise InputError(f"{file}: {name} holds a value that is not finite; leave that row out")
-    position = _vectors(file, arrays, "position", (None, 3))
+    position = _points(file, arrays, "position", 3)
     array = _array(file, arrays)
     channel = _channel(file, arrays["csi"], len(position), len(array.element))
     pose = _pose(file, arrays)
@@ -81,11 +81,11 @@ def _read(file: Path, every: int) -> Snapshots:
     return whole if every == 1 else whole.subset(torch.arange(0, n, every))
 
 
-def _vectors(file: Path, arrays: Arrays, name: str, shape: tuple[int | None, int]) -> Tensor:
-    """Points of float64 [m]."""
+def _points(file: Path, arrays: Arrays, name: str, columns: int) -> Tensor:
+    """Points, float64 (n, columns) [m]."""
     values = arrays[name]
-    if values.ndim != 2 or values.shape[1] != shape[1] or len(values) == 0:
-        raise InputError(f"{file}: {name} must have shape (n, {shape[1]}) in metres, got {values.shape}")
+    if values.ndim != 2 or values.shape[1] != columns or len(values) == 0:
+        raise InputError(f"{file}: {name} must have shape (n, {columns}) in metres, got {values.shape}")
     if float(np.abs(values).max()) > FARTHEST:
         raise InputError(f"{file}: {name} holds a coordinate beyond {FARTHEST:g} m; give metres from a nearer origin")
     return torch.from_numpy(values.astype(np.float64))
@@ -167,7 +167,7 @@ def _array(file: Path, arrays: Arrays) -> PlanarArray:
 def _plane(file: Path, arrays: Arrays, wavelength: float) -> Tensor:
     """Positions of the elements in their plane, (K, 2) [m]."""
     columns = 2 if arrays["element_position"].shape[1:] == (2,) else 3
-    element = _vectors(file, arrays, "element_position", (None, columns))
+    element = _points(file, arrays, "element_position", columns)
     if columns == 3 and float((height := element[:, 2]).max() - height.min()) > FLAT * wavelength:
         raise InputError(
             f"{file}: element_position spreads {float(height.max() - height.min()):.3g} m along z; give the elements in "
