@@ -18,7 +18,6 @@ import tyro
 from record import write_result
 
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, Spectra, fit, load_spectra, simulated_room
-from swiftwrf.data.formats.paths import load_paths
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import l1, psnr, ssim, summary
 
@@ -62,7 +61,7 @@ def study(name: str, data: Spectra, split: str, config: Config) -> dict[str, Any
         kept = torch.randperm(len(train), generator=torch.Generator().manual_seed(0))[: round(share * len(train))]
         cases[f"{share:.0%} of the training spectra"] = (train.subset(kept.sort().values), test, default)
     if data.array is not None and config.data is not None:  # ray paths can be seen at any resolution
-        fine = load_paths(config.data / data.name, AngularGrid.hemisphere(180, 720))
+        fine = load_spectra(config.data / data.name, grid=AngularGrid.hemisphere(180, 720))
         cases["seen at 0.5 degrees"] = (*fine.split(split), default)
     results = {}
     for variant, (kept_spectra, unseen, changed) in cases.items():

@@ -10,9 +10,10 @@ Gaussian Splatting for Efficient Wireless Radiance Field Rendering", 2025.
 """
 
 from swiftwrf.angles import AngularGrid, ArrayPose
+from swiftwrf.calibration import Calibration, calibrate
 from swiftwrf.checkpoint import load
 from swiftwrf.coarray import CoarrayModel, fit_coarray, project
-from swiftwrf.data import Rssi, Spectra, load_rssi, load_spectra
+from swiftwrf.data import Rssi, Snapshots, Spectra, load_rssi, load_snapshots, load_spectra
 from swiftwrf.data.simulated import rssi_room, simulated_room
 from swiftwrf.errors import FitError, InputError
 from swiftwrf.fitting import FitConfig, fit
@@ -24,6 +25,7 @@ from swiftwrf.rssi import RssiConfig, RssiModel, fit_rssi
 __all__ = [
     "AngularGrid",
     "ArrayPose",
+    "Calibration",
     "CoarrayModel",
     "FitConfig",
     "FitError",
@@ -33,14 +35,17 @@ __all__ = [
     "Rssi",
     "RssiConfig",
     "RssiModel",
+    "Snapshots",
     "Spectra",
     "SwiftWRF",
+    "calibrate",
     "fit",
     "fit_coarray",
     "fit_geometry",
     "fit_rssi",
     "load",
     "load_rssi",
+    "load_snapshots",
     "load_spectra",
     "project",
     "rasterize",

@@ -9,7 +9,6 @@ l, -l, a cosine and a sine. Gaussians need neither the array's geometry nor its 
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -21,7 +20,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.angles import AngularGrid
-from swiftwrf.arrays import PlanarArray
+from swiftwrf.arrays import PlanarArray, basis, differences
 from swiftwrf.checkpoint import Header, Saved, expect, refusing, restore
 from swiftwrf.data.spectra import Spectra, check_training, fingerprint
 from swiftwrf.data.splits import Validation, folds
@@ -33,31 +32,6 @@ from swiftwrf.threads import single_thread
 
 COMPONENTS = 64  # principal components of the training magnitudes that the model keeps at most
 DTYPES = {torch.float64: ("anchor", "readout"), torch.float32: ("offset", "form")}
-MOST = 2**28  # values of the functions on a grid: 2 GiB
-SAME = 1e-6  # differences closer than this share of a wavelength are one
-
-
-def differences(array: PlanarArray) -> Tensor:
-    """The co-array without 0, one of each pair l, -l, float64 (P, 2) [wavelengths]."""
-    element = array.element.double() / array.wavelength
-    difference = torch.round((element[:, None] - element).reshape(-1, 2) / SAME).unique(dim=0)
-    first = (difference[:, 0] > 0) | ((difference[:, 0] == 0) & (difference[:, 1] > 0))
-    kept: Tensor = difference[first] * SAME
-    return kept
-
-
-@lru_cache(maxsize=8)
-@torch.inference_mode(False)  # what is kept must also serve calls that await gradients
-def basis(array: PlanarArray, grid: AngularGrid, dtype: torch.dtype = torch.float64) -> Tensor:
-    """The functions that squared spectra consist of: 1, P cosines, P sines, (1 + 2 P, pixels); kept for the next call."""
-    between = differences(array)
-    if (values := (1 + 2 * len(between)) * math.prod(grid.shape)) > MOST:
-        raise InputError(
-            f"the {1 + 2 * len(between)} functions of this array take {values:.2g} values on a grid of {grid.shape}, more "
-            f"than {MOST:.2g}; take a coarser grid or an array of fewer elements"
-        )
-    phase = 2 * math.pi * between @ grid.direction[..., :2].reshape(-1, 2).T
-    return torch.cat([torch.ones_like(phase[:1]), phase.cos(), phase.sin()]).to(dtype)
 
 
 @lru_cache(maxsize=4)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import secrets
 import shlex
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
@@ -58,6 +60,28 @@ def saved_config(folder: Path, task: str) -> Row:
 
 def _digest(config: Any) -> str:
     return hashlib.sha256(json.dumps(strict(config), sort_keys=True).encode()).hexdigest()
+
+
+@contextmanager
+def new_directory(out: Path, what: str) -> Iterator[Path]:
+    """A directory to be filled in the block, under a name that nothing else has; it becomes `out` if nothing was raised.
+
+    Raises:
+        InputError: `out` exists already, or was made by somebody else in the meantime.
+    """
+    if out.exists() or not out.name:
+        raise InputError(f"{out} exists already and {what} is never overwritten; choose another --out")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = out.with_name(f".{out.name}.{secrets.token_hex(4)}")
+    unfinished.mkdir()
+    try:
+        yield unfinished
+        if out.exists():
+            raise InputError(f"{out} was made by somebody else in the meantime; choose another --out")
+        rename(unfinished, out)
+    finally:
+        if unfinished.exists():
+            shutil.rmtree(unfinished)
 
 
 class Run:

@@ -168,9 +168,10 @@ class ChosenMetrics(TypedDict):
 
 
 class RssiMetrics(RunMetrics):
-    """Of a run of tasks.rssi; `receivers` by receiver and method."""
+    """Of a run of tasks.rssi; `receivers` by receiver and method; `left_out` says why a method is not there."""
 
     overall: dict[str, PredictorMetrics]
+    left_out: dict[str, str]
     receivers: dict[str, dict[str, ReceiverMetrics]]
     seconds: PredictorSeconds
     interval: IntervalMetrics

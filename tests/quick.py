@@ -19,6 +19,10 @@ from tasks.aoa.arms import NETWORK
 from tasks.aoa.config import AoaConfig
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.estimators.baselines import Constant
+from tasks.convert import ConvertConfig
+from tasks.convert import run as convert
+from tasks.inspect import InspectConfig
+from tasks.inspect import run as inspect
 from tasks.report.__main__ import ReportConfig
 from tasks.report.__main__ import run as report
 from tasks.rssi import experiment as rssi
@@ -66,6 +70,8 @@ def run(task: str, *arguments: object) -> int:
         "aoa": (AoaConfig, aoa.run),
         "rssi": (rssi.RssiTaskConfig, rssi.run),
         "report": (ReportConfig, report),
+        "convert": (ConvertConfig, convert),
+        "inspect": (InspectConfig, inspect),
     }[task]
     with quick():
         return command_line(f"tasks.{task}", config, function, [str(a) for a in arguments])

@@ -13,6 +13,7 @@ import torch
 
 from augment import SYNTHESIZERS, Mixed, choose, lacks
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, load, simulated_room
+from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
 from tasks.aoa import arms, experiment
 from tasks.aoa.config import AoaConfig
@@ -246,9 +247,12 @@ def test_wrong_input_is_one_sentence_and_code_2(small, tmp_path, capsys, argumen
     assert not list(tmp_path.iterdir())
 
 
-def test_coarray_needs_the_array_and_takes_it_from_the_command_line(small, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(experiment, "simulated_room", lambda **_: replace(small, array=None))
-    turbo = ("--mix", 0.5, "--synthesizer", "coarray", "--out", tmp_path / "run")
+def test_coarray_needs_the_array_and_takes_it_from_the_command_line(small, tmp_path, capsys):
+    (tmp_path / "data").mkdir()
+    write_spectra(replace(small, array=None), tmp_path / "data")
+    assert run("--mix", 0.5, "--array", 4, 0.164, 915e6, "--out", tmp_path / "run") == 2
+    assert "give it with --data" in capsys.readouterr().err
+    turbo = ("--mix", 0.5, "--synthesizer", "coarray", "--data", tmp_path / "data", "--out", tmp_path / "run")
     assert run(*turbo) == 2
     assert "give it with --array" in capsys.readouterr().err
     assert run(*turbo, "--array", 1, 0.16, 915e6) == 2

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
 from PIL import Image
+from samples import write_survey
 
-from swiftwrf import InputError, Rssi, rssi_room
+from swiftwrf import InputError, Rssi, fit_rssi, load, rssi_room
+from tasks.report import merge
 from tasks.rssi import experiment
-from tasks.rssi.predictors import PREDICTORS, Settings
+from tasks.rssi.predictors import PREDICTORS, Settings, lacks
 from tasks.run import command_line
 
 
@@ -149,3 +152,52 @@ def test_wrong_input_is_one_sentence_and_code_2(small, tmp_path, capsys, argumen
     assert says in error
     assert error.count("\n") == 0
     assert not list(tmp_path.iterdir())
+
+
+def unlocated(n=60):
+    """The simulated floor, had nobody noted where the receivers hang."""
+    data = rssi_room(n=n).columns([0, 1, 2])
+    return replace(data, receiver_position=torch.full_like(data.receiver_position, torch.nan))
+
+
+@pytest.mark.parametrize("name", list(PREDICTORS))
+def test_predictors_without_positions_of_the_receivers(name):
+    data, predictor = unlocated(), PREDICTORS[name].make(Settings())
+    if name.startswith("mri"):
+        assert "needs the positions of the receivers" in lacks(name, data)
+        with pytest.raises(
+            InputError, match="needs the positions of the receivers, which simulated-room does not tell"
+        ):
+            predictor.fit(data)
+    else:
+        assert lacks(name, data) == ""
+        predictor.fit(data)
+        assert predictor.predict(data.transmitter_position).isfinite().all()
+
+
+def test_model_without_positions_of_the_receivers_is_saved(tmp_path):
+    data = unlocated()
+    model = fit_rssi(data)
+    assert not model.slope.any()
+    assert not model.directivity.any()
+    model.save(tmp_path / "model")
+    place = data.transmitter_position[:5]
+    torch.testing.assert_close(load(tmp_path / "model").predict(place)[0], model.predict(place)[0])
+
+
+def test_a_survey_table_is_one_command_to_a_map(tmp_path, capsys):
+    file = write_survey(tmp_path / "walk")
+    assert run("--data", file, "--rx", "all", "--out", tmp_path / "run") == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(name))
+    assert set(metrics["overall"]) == {"swiftwrf", "mean", "knn", "gp"}
+    assert set(metrics["left_out"]) == {"mri_pooled", "mri_receiver", "mri_residual"}
+    report = (tmp_path / "run" / "report.html").read_text()
+    assert "Left out: mri_pooled needs the positions of the receivers" in report
+    with np.load(tmp_path / "run" / "maps.npz") as maps:
+        assert np.isfinite(maps["predicted"]).all()
+    merge([tmp_path / "run"], tmp_path / "merged")
+
+
+def test_columns_are_for_tables(small, tmp_path, capsys):
+    assert run("--rx", "1", "--columns", "x=a", "--out", tmp_path / "run") == 2
+    assert "give it with --data" in capsys.readouterr().err

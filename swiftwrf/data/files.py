@@ -6,7 +6,9 @@ import csv
 import hashlib
 import io
 import math
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +21,34 @@ from swiftwrf.errors import InputError
 
 MOST_BYTES = 2**28  # of a text file: a million rows of positions take a tenth of it
 FARTHEST = 1e9  # [m] from the origin: beyond, float64 no longer keeps a wavelength apart
-MOST_PIXELS = 2**29  # of all spectra of a data set: 2 GiB
+CARRIERS_HZ = (1e6, 1e13)
+DECIMAL_COMMA = re.compile(r"^(\s*[+-]?\d+),(\d+\s*)$")
 PLAIN_TAGS = {
     f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "timestamp", "seq", "map")
 }
 
 
 def sha256(file: Path) -> str:
-    """Hex digest of a file's bytes."""
-    return hashlib.sha256(read_bytes(file)).hexdigest()
+    """Hex digest of a file's bytes, which may be more than fit into memory."""
+    with _refusing_unreadable(file), file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def sha256_of_all(digests: Iterable[tuple[str, str]]) -> str:
     """One digest for many files, of their names and digests."""
     return hashlib.sha256("".join(f"{digest}  {name}\n" for name, digest in digests).encode()).hexdigest()
+
+
+@contextmanager
+def _refusing_unreadable(file: Path) -> Iterator[None]:
+    """Says in a sentence that a file is not there or may not be read."""
+    if not file.is_file():
+        raise InputError(f"{file} is missing")
+    try:
+        yield
+    except OSError as error:
+        reason = "no permission to read it" if isinstance(error, PermissionError) else error.strerror
+        raise InputError(f"{file} cannot be read ({reason})") from None
 
 
 def read_bytes(file: Path) -> bytes:
@@ -41,13 +57,8 @@ def read_bytes(file: Path) -> bytes:
     Raises:
         InputError: it is not there or may not be read.
     """
-    if not file.is_file():
-        raise InputError(f"{file} is missing")
-    try:
+    with _refusing_unreadable(file):
         return file.read_bytes()
-    except OSError as error:
-        reason = "no permission to read it" if isinstance(error, PermissionError) else error.strerror
-        raise InputError(f"{file} cannot be read ({reason})") from None
 
 
 def read_text(file: Path) -> str:
@@ -120,22 +131,27 @@ def numbers(value: Any, count: int) -> tuple[float, ...] | None:
     return found if all(map(math.isfinite, found)) else None
 
 
-def read_table(file: Path, columns: list[str] | None = None) -> tuple[list[str], Tensor]:
-    """Header and numbers of a comma-separated file, float64 (rows, columns); numbers may be nan.
+def read_cells(file: Path, separators: str = ",") -> tuple[list[str], list[list[str]]]:
+    """Header and rows of a table, as text.
+
+    Args:
+        file: with one row a line and values between separators.
+        separators: of these, the one that the header has most of; numbers may have a decimal comma if it is another.
 
     Raises:
-        InputError: no such file, another header than `columns`, a column without name or a name twice, rows of unequal
-            length, text in a number's place, no rows.
+        InputError: no such file, a column without name or a name twice, rows of unequal length, no rows.
     """
+    text = read_text(file)
+    first = text.split("\n", 1)[0]
+    separator = max(separators, key=first.count)
     try:
-        lines = [line for line in csv.reader(io.StringIO(read_text(file), newline="")) if line]
+        stream = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
+        lines = [line for line in stream if line]
     except csv.Error as error:
         raise InputError(f"{file} is not a comma-separated table ({error})") from None
     if not lines:
         raise InputError(f"{file} is empty; expected a header and one row a measurement")
     header = [name.strip() for name in lines[0]]
-    if columns is not None and header != columns:
-        raise InputError(f"{file} must start with the header {','.join(columns)}, got {','.join(header)}")
     if "" in header:
         raise InputError(f"{file} has no name for column {header.index('') + 1}; give it one in the header")
     if len(set(header)) < len(header):
@@ -143,10 +159,25 @@ def read_table(file: Path, columns: list[str] | None = None) -> tuple[list[str],
         raise InputError(f"{file} names column {twice!r} twice; each needs a name of its own")
     if len(lines) == 1:
         raise InputError(f"{file} has a header but no rows")
-    values = np.empty((len(lines) - 1, len(header)))
     for row, line in enumerate(lines[1:], start=1):
         if len(line) != len(header):
             raise InputError(f"{file} row {row} has {len(line)} values, but the header has {len(header)}")
+    if separator == ",":
+        return header, lines[1:]
+    return header, [[DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in line] for line in lines[1:]]
+
+
+def read_table(file: Path, columns: list[str] | None = None) -> tuple[list[str], Tensor]:
+    """Header and numbers of a comma-separated file, float64 (rows, columns); numbers may be nan.
+
+    Raises:
+        InputError: as `read_cells`, another header than `columns`, text in a number's place.
+    """
+    header, rows = read_cells(file)
+    if columns is not None and header != columns:
+        raise InputError(f"{file} must start with the header {','.join(columns)}, got {','.join(header)}")
+    values = np.empty((len(rows), len(header)))
+    for row, line in enumerate(rows, start=1):
         try:
             values[row - 1] = [float(text) for text in line]
         except ValueError:
@@ -170,3 +201,14 @@ def read_positions(file: Path) -> Tensor:
             f"{file} row {row + 1} is {position[row].tolist()}; positions must be finite numbers [m], at most {FARTHEST:g}"
         )
     return position
+
+
+def check_carrier(file: Path, frequency_hz: float) -> None:
+    """Refuses what is no carrier in Hz.
+
+    Raises:
+        InputError: below 1 MHz, above 10 THz, or not finite.
+    """
+    low, high = CARRIERS_HZ
+    if not low <= frequency_hz <= high:
+        raise InputError(f"{file}: frequency_hz is {frequency_hz}; expected the carrier in Hz, {low:g} to {high:g}")

@@ -18,12 +18,13 @@ class Rssi:
     Args:
         name: of the data set.
         receiver_names: R names, in file order.
-        receiver_position: float64 (R, 3) [m].
+        receiver_position: float64 (R, 3) [m]; nan where it is unknown, for all receivers or none.
         transmitter_position: float64 (n, 3) [m].
         rssi_dbm: float64 (n, R) [dBm], nan where the receiver did not hear the transmitter.
         index: number of each row in the data set, counted from 0, int64 (n,).
         named_splits: training and test rows of the splits that came with the data.
         source: sha256 of each file that says what the data are, by file name.
+        notes: what the reader found or did that a user should know, a sentence each.
     """
 
     name: str
@@ -34,9 +35,15 @@ class Rssi:
     index: Tensor
     named_splits: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
     source: dict[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.transmitter_position)
+
+    @property
+    def located(self) -> bool:
+        """Whether the positions of the receivers are known."""
+        return bool(self.receiver_position.isfinite().all())
 
     def subset(self, rows: Tensor) -> Rssi:
         """The given rows, in the given order; splits named for the whole set are dropped."""

@@ -19,6 +19,8 @@ from swiftwrf.data.splits import MIN_TRAINING, choose_split
 from swiftwrf.errors import InputError
 
 Moving = Literal["transmitter", "receiver"]
+GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
+MOST_PIXELS = 2**29  # of all spectra of a data set: 2 GiB
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,7 @@ class Spectra:
         fixed_position: of the end that does not move, float64 (3,) [m]; None where it is unknown or both ends move.
         rotation: turns array into world coordinates, float64 (3, 3); the array stands at the fixed end when the
             transmitter moves, and else moves with constant orientation. None where it is unknown.
+        notes: what the reader found or did that a user should know, a sentence each.
     """
 
     name: str
@@ -55,6 +58,7 @@ class Spectra:
     source: dict[str, str] = field(default_factory=dict)
     fixed_position: Tensor | None = None
     rotation: Tensor | None = None
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.position)
@@ -107,6 +111,19 @@ class Spectra:
             raise InputError(f"spectra of {self.grid.shape} pixels cannot be averaged over {factor} x {factor} of them")
         small = functional.avg_pool2d(self.spectrum[:, None], factor)[:, 0]
         return replace(self, spectrum=small, grid=self.grid.coarsen(factor))
+
+
+def check_pixels(name: str, n: int, grid: AngularGrid) -> None:
+    """Refuses more spectra than fit into memory.
+
+    Raises:
+        InputError: so many.
+    """
+    if n * math.prod(grid.shape) > MOST_PIXELS:
+        raise InputError(
+            f"{name} has {n} positions, whose spectra would have more than {MOST_PIXELS:.3g} pixels; take one measurement "
+            "of several (every) or a coarser grid"
+        )
 
 
 def coarsening(shape: Sequence[int], max_azimuths: int, least_rows: int = 1) -> int:

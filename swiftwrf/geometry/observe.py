@@ -14,23 +14,13 @@ import math
 import torch
 from torch import Tensor
 
-from swiftwrf.arrays import PlanarArray
-from swiftwrf.coarray import SAME, basis, differences
+from swiftwrf.arrays import PlanarArray, basis, pairs
 from swiftwrf.data.spectra import Spectra
 
 PIXELS = 6000  # of a spectrum that are enough for its few dozen coefficients
 STEPS = 40
 STARTS = 20
 SOLVED = 5e-3  # relative error of the autocorrelation below which a start counts as the solution
-
-
-def pairs(array: PlanarArray) -> tuple[Tensor, Tensor, Tensor]:
-    """Of all pairs of elements (a, b) with a difference in the half co-array: a, b and the number of the difference."""
-    element = array.element.double() / array.wavelength
-    difference = torch.round((element[:, None] - element) / SAME)
-    match = (difference[:, :, None] == torch.round(differences(array) / SAME)).all(-1)
-    a, b, lag = match.nonzero().unbind(1)
-    return a, b, lag
 
 
 def autocorrelation(channel: Tensor, array: PlanarArray) -> Tensor:

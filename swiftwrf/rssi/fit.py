@@ -46,7 +46,7 @@ def fit_rssi(
 
     Args:
         train: the only rows it sees; a receiver's missing values do not count. A receiver heard in fewer than 10 rows falls
-            back to the law of all receivers.
+            back to the law of all receivers. Where the receivers' positions are unknown, each law is a level.
         config: how; `RssiConfig()` unless given.
         pool: the same rows at every receiver of the data, of which `train` has some: the kernel and the law of all
             receivers are learnt from them.
@@ -118,7 +118,8 @@ def _assemble(train: Rssi, setting: Setting, fitted: Fitted, config: RssiConfig)
         n_primitives=setting.n_primitives,
         kernel=kernel,
         weight=weight,
-        receiver=train.receiver_position.double(),
+        # where it is unknown, any will do: the law has no slope and the directivity is 0
+        receiver=train.receiver_position.double().nan_to_num(0.0),
         centre=setting.centre,
         level=level,
         slope=slope,

@@ -16,17 +16,20 @@ HARMONICS = 8  # real spherical harmonics of degree 1 and 2
 
 
 def log_distance(position: Tensor, receiver: Tensor) -> Tensor:
-    """log10 of the distances [m] from positions (n, 3) to receivers (R, 3), float64 (n, R)."""
-    return distance(position.double(), receiver.double()).clamp_min(NEAREST).log10()
+    """log10 of the distances [m] from positions (n, 3) to receivers (R, 3), float64 (n, R).
+
+    0 for a receiver whose position is unknown (nan): there a law has a level and no slope.
+    """
+    return distance(position.double(), receiver.double()).clamp_min(NEAREST).log10().nan_to_num(0.0)
 
 
 def harmonics(position: Tensor, receiver: Tensor) -> Tensor:
     """Harmonics of degree 1 and 2 of the direction from receivers (R, 3) to positions (n, 3), (n, R, 8), each of unit mean
-    square over all directions."""
+    square over all directions; 0 for a receiver whose position is unknown (nan)."""
     x, y, z = functional.normalize(position[:, None] - receiver, dim=-1).unbind(-1)
     first = [math.sqrt(3) * c for c in (x, y, z)]
     second = [math.sqrt(15) * c for c in (x * y, y * z, z * x, (x * x - y * y) / 2)]
-    return torch.stack([*first, *second, math.sqrt(5) / 2 * (3 * z * z - 1)], dim=-1)
+    return torch.stack([*first, *second, math.sqrt(5) / 2 * (3 * z * z - 1)], dim=-1).nan_to_num(0.0)
 
 
 class Law(NamedTuple):

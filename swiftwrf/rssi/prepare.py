@@ -62,8 +62,8 @@ def check(train: Rssi, pool: Rssi) -> None:
     if heard < MIN_TRAINING:
         names = ", ".join(train.receiver_names)
         raise InputError(f"{names}: heard in {heard} training rows in all; at least {MIN_TRAINING} are needed")
-    if not train.transmitter_position.isfinite().all() or not train.receiver_position.isfinite().all():
-        raise InputError("positions of transmitters and receivers must be finite numbers [m]")
+    if not train.transmitter_position.isfinite().all() or not (train.located or train.receiver_position.isnan().all()):
+        raise InputError("positions of transmitters and receivers must be finite numbers [m], or nan for all receivers")
     if train.rssi_dbm.isinf().any():
         raise InputError("RSSI must be finite numbers [dBm], or nan where not heard")
     if not torch.equal(pool.transmitter_position, train.transmitter_position):

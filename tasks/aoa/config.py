@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from augment import SYNTHESIZERS, lacks
 from augment.suggest import MOST as MOST_SUGGESTED
 from swiftwrf import InputError, Spectra
-from swiftwrf.arrays import PlanarArray
 from swiftwrf.data.spectra import Moving
 from swiftwrf.metrics import WINDOW
 from tasks.run import SEEDS, Preset, choice
-
-MOST_ELEMENTS = 32  # a side of an array: its spectra have 7,938 numbers
+from tasks.source import SpectraSource, reading
 
 AUTO = "auto"  # the synthesizer that suits the scene
 EXTRA = 3000  # further positions unless told otherwise
 
 
 @dataclass(frozen=True)
-class AoaConfig:
+class AoaConfig(SpectraSource):
     """Angle of arrival with few measured spectra: turbo learning against its bounds and baselines.
 
     Without --data the built-in simulated room is used. An interrupted run goes on with --resume DIR.
@@ -29,7 +27,7 @@ class AoaConfig:
     mix: tuple[float, ...]
     """measured shares, each in (0, 1]: 0.3 keeps 30 % of the training spectra and synthesizes the others"""
     data: str | None = None
-    """folder of spectra (NeRF2 layout) or of ray paths (paths.npz)"""
+    """folder or file of spectra, ray paths or array snapshots, see docs/formats.md"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
     synthesizer: Annotated[
@@ -44,8 +42,6 @@ class AoaConfig:
     held-out measured spectra gain from them, else none)"""
     suggest: int = 0
     """also say where to measure next: so many positions that lower the uncertainty over the region most"""
-    array: tuple[int, float, float] | None = None
-    """square array that took the spectra, where the data do not say: elements a side, spacing [m], carrier [Hz]"""
     moving: Moving | None = None
     """which end moves in the built-in room (default: transmitter)"""
     preset: Preset = "quick"
@@ -87,18 +83,16 @@ def check(config: AoaConfig) -> None:
         raise InputError(f"--mix names a share twice: {' '.join(f'{s:g}' for s in config.mix)}")
     if not config.synthesizer:
         raise InputError(f"--synthesizer takes at least one of {', '.join(SYNTHESIZERS)}")
-    if config.array is not None and not (2 <= config.array[0] <= MOST_ELEMENTS and min(config.array[1:]) > 0):
-        raise InputError(
-            f"--array takes 2 to {MOST_ELEMENTS} elements a side, a spacing [m] and a carrier [Hz], got {config.array}"
-        )
+    if reading(config).given and config.data is None:
+        raise InputError(f"--{reading(config).given[0]} says how --data is read; give it with --data")
     if config.repeats < 1:
         raise InputError(f"--repeats must be at least 1, got {config.repeats}")
     if config.seed + config.repeats > SEEDS:
         raise InputError(f"--seed {config.seed} leaves no seeds for {config.repeats} repeats; choose a smaller one")
 
 
-def with_array(data: Spectra, config: AoaConfig) -> Spectra:
-    """The data, with the array of the command line.
+def check_data(data: Spectra, config: AoaConfig) -> None:
+    """Refuses data that what is asked for cannot work with.
 
     Raises:
         InputError: spectra too small to be compared; a synthesizer needs the array, and neither data nor command line
@@ -109,15 +103,11 @@ def with_array(data: Spectra, config: AoaConfig) -> Spectra:
             f"spectra of {data.name} have {data.grid.shape[0]} x {data.grid.shape[1]} pixels; SSIM, by which they are "
             f"learnt and judged, needs at least {WINDOW} x {WINDOW}"
         )
-    if config.array is not None:
-        side, spacing, frequency = config.array
-        data = replace(data, array=PlanarArray.square(side, frequency, spacing))
     for name in config.synthesizer:
         missing = [] if name == AUTO else lacks(name, data)
         if missing:
             hint = "give it with --array" if "array" in missing else "the data must say where it stands"
             raise InputError(f"synthesizer {name} needs the {missing[0]}, which {data.name} does not describe; {hint}")
-    return data
 
 
 def further_positions(data: Spectra, config: AoaConfig) -> int:

@@ -21,19 +21,21 @@ from augment import (
 from augment import Settings as SynthesizerSettings
 from augment.choose import SLOW, candidates
 from augment.suggest import suggest
-from swiftwrf import FitError, GeometryModel, InputError, Spectra, load_spectra, simulated_room
+from swiftwrf import FitError, GeometryModel, InputError, Spectra, simulated_room
 from swiftwrf.checkpoint import Saved, read, write
+from swiftwrf.data import read_spectra
 from swiftwrf.geometry import HybridModel
 from swiftwrf.metrics import angle_errors, l1, psnr, ssim
 from tasks.aoa import arms
 from tasks.aoa.advice import advise
-from tasks.aoa.config import AUTO, AoaConfig, check, further_positions, with_array
+from tasks.aoa.config import AUTO, AoaConfig, check, check_data, further_positions
 from tasks.aoa.estimators import ESTIMATORS, Settings, learners
 from tasks.aoa.page import page
 from tasks.aoa.results import mix_metrics
 from tasks.metrics import AdviceMetrics, AoaMetrics, MixMetrics
 from tasks.page.page import reporting
 from tasks.run import Row, Run, choose_device, console
+from tasks.source import reading
 
 SCORE = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
 SAMPLE = " sample"  # after the name of a synthesizer whose draws are scored instead of its means
@@ -52,8 +54,10 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
     if config.data is None:
         data = simulated_room(seed=config.seed, moving=config.moving or "transmitter")
     else:
-        data = load_spectra(config.data)
-    data = with_array(data, config)
+        data = read_spectra(config.data, reading(config))
+    for note in data.notes:
+        console.print(f"{data.name}: {note}")
+    check_data(data, config)
     train, test = data.split(config.split, config.seed)
     if len(test) == 0:
         raise InputError(f"split {config.split!r} of {data.name} has no test spectra")

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import os
-import secrets
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from swiftwrf import InputError
-from swiftwrf.durable import rename
 from tasks.aoa import page as aoa
+from tasks.directory import new_directory
 from tasks.page.page import Page, write_page
 from tasks.page.records import Records
 from tasks.rssi import page as rssi
@@ -32,19 +30,8 @@ def merge(folders: list[Path], out: Path) -> None:
         raise InputError(
             f"a report takes finished runs of one task ({' or '.join(PAGES)}), got {', '.join(tasks) or 'no runs'}"
         )
-    if out.exists() or not out.name:
-        raise InputError(f"{out} exists already and a report is never overwritten; choose another --out")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = out.with_name(f".{out.name}.{secrets.token_hex(4)}")  # a name that nothing else has
-    unfinished.mkdir()
-    try:
+    with new_directory(out, "a report") as unfinished:
         _write(unfinished, tasks[0], runs)
-        if out.exists():
-            raise InputError(f"{out} was made by somebody else in the meantime; choose another --out")
-        rename(unfinished, out)
-    finally:
-        if unfinished.exists():
-            shutil.rmtree(unfinished)
 
 
 def _write(folder: Path, task: str, runs: list[Records[Any]]) -> None:

@@ -20,8 +20,9 @@ from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, R
 from tasks.page.page import reporting
 from tasks.rssi.cluster import on_cluster
 from tasks.rssi.page import page
-from tasks.rssi.predictors import PREDICTORS, Settings, SwiftWRFPredictor
+from tasks.rssi.predictors import PREDICTORS, Settings, SwiftWRFPredictor, lacks
 from tasks.run import Preset, Row, Run, choose_device, console
+from tasks.source import TableSource, reading
 from tasks.summarise import error_summary, grouped
 
 MAP_CELLS = 80  # along the longer side of the floor
@@ -29,7 +30,7 @@ MOST_PLAN_PIXELS = 2**24
 
 
 @dataclass(frozen=True)
-class RssiTaskConfig:
+class RssiTaskConfig(TableSource):
     """RSSI of a moving transmitter at fixed receivers, against baselines.
 
     Without --data the built-in simulated floor is used. An interrupted run goes on with --resume DIR.
@@ -38,7 +39,7 @@ class RssiTaskConfig:
     rx: tuple[str, ...]
     """receivers: names, numbers counted from 1, or all"""
     data: str | None = None
-    """folder with gateway_position.yml, tx_pos.csv and gateway_rssi.csv (NeRF2 layout)"""
+    """survey table (CSV or Parquet), or folder with tx_pos.csv, gateway_rssi.csv and gateway_position.yml (NeRF2 layout)"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
     preset: Preset = "quick"
@@ -65,7 +66,9 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     """
     device = choose_device("cpu" if config.device == "auto" else config.device)
     plan = _read_floor_plan(config)
-    whole = load_rssi(config.data) if config.data else rssi_room(seed=config.seed)
+    whole = _load(config)
+    for note in whole.notes:
+        console.print(f"{whole.name}: {note}")
     data, (pool, _) = whole.receivers(config.rx), whole.split(config.split, config.seed)
     train, test = data.split(config.split, config.seed)
     parallel = on_cluster(config.scheduler) if config.scheduler else map
@@ -76,8 +79,12 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
     with Run("rssi", config.out, label, config, device, source, resume) as directory:
         tables = _Tables(data, train, test, plan, directory, settings)
+        left_out = {name: reason for name in PREDICTORS if (reason := lacks(name, data))}
         for name in PREDICTORS:
-            tables.add(name)
+            if name in left_out:
+                console.print(f"left out: {left_out[name]}")
+            else:
+                tables.add(name)
         directory.write_csv("errors.csv", tables.errors)
         directory.write_csv("predictions.csv", tables.predictions)
         metrics: RssiMetrics = {
@@ -89,6 +96,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             "n_train": len(train),
             "n_test": len(test),
             "overall": tables.overall(),
+            "left_out": left_out,
             "receivers": tables.receivers(),
             "seconds": tables.seconds["swiftwrf"],
             "interval": {"nominal": 0.8, "coverage": tables.coverage},
@@ -96,6 +104,14 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         }
         final = directory.finish(metrics, reporting(page))
     console.print(f"report: [bold]{final / 'report.html'}[/]")
+
+
+def _load(config: RssiTaskConfig) -> Rssi:
+    if config.data is None:
+        if config.columns:
+            raise InputError("--columns is for a survey table; give it with --data")
+        return rssi_room(seed=config.seed)
+    return load_rssi(config.data, columns=reading(config).columns)
 
 
 def _read_floor_plan(config: RssiTaskConfig) -> dict[str, Any]:
@@ -192,7 +208,9 @@ class _Tables:
     def _keep_maps(self, predictor: SwiftWRFPredictor) -> None:
         """Predicted field and width of the interval over the floor, at the median height of the measurements."""
         position = self.train.transmitter_position
-        shown = torch.cat([position, self.test.transmitter_position, self.train.receiver_position])
+        shown = torch.cat([position, self.test.transmitter_position])
+        if self.train.located:
+            shown = torch.cat([shown, self.train.receiver_position])
         low, high = shown.min(dim=0).values, shown.max(dim=0).values
         cell = float((high - low)[:2].max()) / MAP_CELLS or 1.0
         xs, ys = (
@@ -217,12 +235,12 @@ class _Tables:
     def overall(self) -> dict[str, PredictorMetrics]:
         """What metrics.json says of each method."""
         errors = grouped(DataFrame(self.errors), ["method"], "abs_error_db")
-        return {name: {"abs_error_db": errors[name,], "seconds": self.seconds[name]} for name in PREDICTORS}
+        return {name: {"abs_error_db": errors[name,], "seconds": self.seconds[name]} for name in self.seconds}
 
     def receivers(self) -> dict[str, dict[str, ReceiverMetrics]]:
         """What metrics.json says of each method at each receiver; one that no test row heard has no errors."""
         errors, none = grouped(DataFrame(self.errors), ["receiver", "method"], "abs_error_db"), error_summary([])
         return {
-            receiver: {name: {"abs_error_db": errors.get((receiver, name), none)} for name in PREDICTORS}
+            receiver: {name: {"abs_error_db": errors.get((receiver, name), none)} for name in self.seconds}
             for receiver in self.test.receiver_names
         }

@@ -48,10 +48,12 @@ def _lead(run: RssiRecords) -> str:
     def in_words(name: str) -> str:
         return f"{error[name]['median']:.2f} dB (90 %: {error[name]['p90']:.1f})"
 
+    law = f" and one log-distance law for all receivers {in_words('mri_pooled')}" if "mri_pooled" in error else ""
+
     return (
         f"On {_scene(run)}, SwiftWRF's median absolute error over {error['swiftwrf']['n']} heard pairs at "
         f"{len(run.metrics['receivers'])} receiver(s) is {in_words('swiftwrf')}; the best baseline, {best}, reaches "
-        f"{in_words(best)} and one log-distance law for all receivers {in_words('mri_pooled')}. "
+        f"{in_words(best)}{law}. "
         f"The {interval['nominal']:.0%} interval covers {interval['coverage']:.0%} of the test measurements."
     )
 
@@ -64,7 +66,10 @@ def _run(run: RssiRecords, several: bool) -> list[Section]:
     return [
         Section(
             f"Errors{suffix}",
-            ["; ".join(f"{entry.name}: {entry.meaning}" for entry in PREDICTORS.entries()) + "."],
+            [
+                "; ".join(f"{entry.name}: {entry.meaning}" for entry in PREDICTORS.entries()) + ".",
+                *(f"Left out: {reason}." for reason in run.metrics.get("left_out", {}).values()),
+            ],
             [_table(run), _paired(run)],
             plots,
         ),
@@ -198,15 +203,16 @@ def _where(run: RssiRecords) -> Figure:
     errors = run.table("errors")
     own = errors[errors["method"] == OWN]
     colour = palette().colour(OWN)
-    figure, axes = figures.new_figure(1, 3, 10, 3.3)
-    axes[0].plot(own["measured_dbm"], own["predicted_dbm"], ".", markersize=2, color=colour)
-    ends = [own["measured_dbm"].min(), own["measured_dbm"].max()]
-    axes[0].plot(ends, ends, color="#aeb7c6", linewidth=1)
-    axes[0].set(xlabel="measured [dBm]", ylabel="predicted [dBm]")
     columns = {
         "from_receiver_m": "distance from the receiver [m]",
         "from_training_m": "distance from training positions [m]",
     }
+    columns = {column: label for column, label in columns.items() if own[column].notna().any()}
+    figure, axes = figures.new_figure(1, 1 + len(columns), 3.4 * (1 + len(columns)), 3.3)
+    axes[0].plot(own["measured_dbm"], own["predicted_dbm"], ".", markersize=2, color=colour)
+    ends = [own["measured_dbm"].min(), own["measured_dbm"].max()]
+    axes[0].plot(ends, ends, color="#aeb7c6", linewidth=1)
+    axes[0].set(xlabel="measured [dBm]", ylabel="predicted [dBm]")
     for ax, (column, label) in zip(axes[1:], columns.items(), strict=True):
         ordered = own.sort_values(column)
         ax.plot(ordered[column], ordered["abs_error_db"], ".", markersize=2, color="#bbbbbb")

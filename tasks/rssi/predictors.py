@@ -16,7 +16,7 @@ from sklearn.model_selection import GridSearchCV, PredefinedSplit
 from sklearn.neighbors import KNeighborsRegressor
 from torch import Tensor
 
-from swiftwrf import Rssi, RssiConfig, RssiModel, fit_rssi
+from swiftwrf import InputError, Rssi, RssiConfig, RssiModel, fit_rssi
 from swiftwrf.data.splits import MIN_TRAINING, Validation, folds
 from swiftwrf.registry import Registry
 from swiftwrf.rssi import Map, fit_law, log_distance
@@ -59,6 +59,16 @@ class Settings:
 PREDICTORS = Registry[Predictor]("predictor")
 
 
+RECEIVERS = "positions of the receivers"  # what predictors of the log-distance law need of the data
+
+
+def lacks(name: str, data: Rssi) -> str:
+    """Why a predictor cannot be had of these data, in a sentence; nothing where it can."""
+    if RECEIVERS in PREDICTORS[name].needs and not data.located:
+        return f"{name} needs the {RECEIVERS}, which {data.name} does not tell"
+    return ""
+
+
 class Mean:
     """The mean of each receiver's training values, wherever the transmitter is."""
 
@@ -84,6 +94,8 @@ class LogDistance:
         self._pooled, self._pool = pooled, pool
 
     def fit(self, train: Rssi) -> None:
+        if not train.located:
+            raise InputError(f"the log-distance law needs the {RECEIVERS}, which {train.name} does not tell")
         self._receiver = train.receiver_position
         rows = self._pool or train
         self._law = fit_law(log_distance(rows.transmitter_position, rows.receiver_position), rows.rssi_dbm, pooled=True)
@@ -96,18 +108,21 @@ class LogDistance:
 
 
 class _PerReceiver(ABC):
-    """One scikit-learn regressor on the position for each receiver, on what a log-distance law leaves or on RSSI itself."""
+    """One scikit-learn regressor on the position for each receiver, on RSSI itself or on what a simpler predictor leaves."""
 
-    def __init__(self, validation: Validation, seed: int, on_law: bool) -> None:
-        self._validation: Validation = validation
-        self._seed = seed
-        self._law: Predictor | None = LogDistance(pooled=False) if on_law else None
+    def __init__(self, settings: Settings) -> None:
+        self._validation, self._seed = settings.validation, settings.seed
+
+    def _simpler(self, train: Rssi) -> Predictor | None:
+        """The predictor whose residuals are learnt."""
+        return None
 
     def fit(self, train: Rssi) -> None:
         residual = train.rssi_dbm
-        if self._law is not None:
-            self._law.fit(train)
-            residual = residual - self._law.predict(train.transmitter_position)
+        self._base = self._simpler(train)
+        if self._base is not None:
+            self._base.fit(train)
+            residual = residual - self._base.predict(train.transmitter_position)
         fold = folds(train.transmitter_position, self._validation, self._seed).numpy()
         position = train.transmitter_position.numpy()
         self._regressors = []
@@ -132,12 +147,11 @@ class _PerReceiver(ABC):
     def predict(self, position: Tensor) -> Tensor:
         x = position.double().numpy()
         predicted = torch.from_numpy(np.stack([regressor.predict(x) for regressor in self._regressors], axis=1))
-        return predicted if self._law is None else predicted + self._law.predict(position)
+        return predicted if self._base is None else predicted + self._base.predict(position)
 
 
 class NearestNeighbours(_PerReceiver):
-    """Inverse-distance mean of the k nearest measurements of RSSI, or of what the log-distance law of the receiver leaves
-    (near to the published MRI: Shin et al., IEEE TMC 14(6), 2015); k by cross-validation in the training rows."""
+    """Inverse-distance mean of the k nearest measurements of RSSI; k by cross-validation in the training rows."""
 
     def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
         fewest = len(y) - int(np.bincount(fold).max())
@@ -146,9 +160,21 @@ class NearestNeighbours(_PerReceiver):
         return search.fit(x, y)
 
 
+class NearestResiduals(NearestNeighbours):
+    """The same of what the log-distance law of the receiver leaves (near to the published MRI: Shin et al., IEEE TMC 14(6),
+    2015)."""
+
+    def _simpler(self, train: Rssi) -> Predictor:
+        return LogDistance(pooled=False)
+
+
 class GaussianProcess(_PerReceiver):
-    """A Gaussian process on what the log-distance law of the receiver leaves: Matern 3/2 and white noise, hyper-parameters
-    by marginal likelihood in the training rows (C. E. Rasmussen and C. K. I. Williams, 2006)."""
+    """A Gaussian process on what the log-distance law of the receiver leaves, or its mean where the receiver's position is
+    unknown: Matern 3/2 and white noise, hyper-parameters by marginal likelihood in the training rows (C. E. Rasmussen and
+    C. K. I. Williams, 2006)."""
+
+    def _simpler(self, train: Rssi) -> Predictor:
+        return LogDistance(pooled=False) if train.located else Mean()
 
     def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
         scale = max(float(np.var(y)), 1e-6)
@@ -185,7 +211,6 @@ class SwiftWRFPredictor:
     "swiftwrf",
     meaning="50 primitives a receiver on a 16 x 16 grid, averaged, on a log-distance law; "
     "mixed with the laws and the mean as held-out rows say",
-    needs=("positions of the receivers",),
     colour="#4477aa",
 )
 def _swiftwrf(settings: Settings) -> Predictor:
@@ -200,7 +225,7 @@ def _mean(settings: Settings) -> Predictor:
 @PREDICTORS.register(
     "mri_pooled",
     meaning="one log-distance law for all receivers of the data",
-    needs=("positions of the receivers",),
+    needs=(RECEIVERS,),
     colour="#ee6677",
 )
 def _mri_pooled(settings: Settings) -> Predictor:
@@ -210,7 +235,7 @@ def _mri_pooled(settings: Settings) -> Predictor:
 @PREDICTORS.register(
     "mri_receiver",
     meaning="a log-distance law for each receiver",
-    needs=("positions of the receivers",),
+    needs=(RECEIVERS,),
     colour="#ee8866",
 )
 def _mri_receiver(settings: Settings) -> Predictor:
@@ -220,23 +245,22 @@ def _mri_receiver(settings: Settings) -> Predictor:
 @PREDICTORS.register(
     "mri_residual",
     meaning="the same, and what it leaves interpolated from the nearest measurements",
-    needs=("positions of the receivers",),
+    needs=(RECEIVERS,),
     colour="#ccbb44",
 )
 def _mri_residual(settings: Settings) -> Predictor:
-    return NearestNeighbours(settings.validation, settings.seed, on_law=True)
+    return NearestResiduals(settings)
 
 
 @PREDICTORS.register("knn", meaning="inverse-distance mean of the nearest measurements", colour="#66ccee")
 def _knn(settings: Settings) -> Predictor:
-    return NearestNeighbours(settings.validation, settings.seed, on_law=False)
+    return NearestNeighbours(settings)
 
 
 @PREDICTORS.register(
     "gp",
-    meaning="a Gaussian process on what the log-distance law leaves",
-    needs=("positions of the receivers",),
+    meaning="a Gaussian process on what the log-distance law leaves (the mean, where receivers have no position)",
     colour="#228833",
 )
 def _gp(settings: Settings) -> Predictor:
-    return GaussianProcess(settings.validation, settings.seed, on_law=True)
+    return GaussianProcess(settings)

@@ -13,8 +13,11 @@ from pathlib import Path
 from unittest import mock
 
 import numpy as np
+import pandas as pd
 import torch
 from PIL import Image
+from samples import snapshots as made_snapshots
+from samples import survey_rows, write_deepmimo, write_dichasus, write_espargos, write_snapshots, write_survey
 
 from swiftwrf import (
     AngularGrid,
@@ -32,11 +35,13 @@ from swiftwrf import (
     rssi_room,
     simulated_room,
 )
+from swiftwrf.data.writing import write_spectra
 from swiftwrf.geometry import fit_geometry, fit_hybrid
 from swiftwrf.gp import Kernel
 from swiftwrf.model import SwiftWRF
 
 N = 12
+GRID = AngularGrid.hemisphere(8, 32)
 TINY = FitConfig(model=ModelConfig(n_primitives=3, rank=2), steps=12, check_every=6)
 Reader = Callable[[Path], object]
 
@@ -72,8 +77,30 @@ def rssi_nerf2(folder: Path) -> None:
     (folder / "test_index.txt").write_text("10\n11\n")
 
 
+def snapshot_arrays(folder: Path) -> None:
+    write_snapshots(folder, data=made_snapshots(n=N, count=2, side=2))
+
+
+def snapshots_hdf5(folder: Path) -> None:
+    write_snapshots(folder, "snapshots.h5", data=made_snapshots(n=N, count=2, side=2))
+
+
+def spectra_array(folder: Path) -> None:
+    write_spectra(_room(), folder)
+
+
+def survey_parquet(folder: Path) -> None:
+    header, rows = survey_rows()
+    pd.DataFrame(rows, columns=header).to_parquet(folder / "walk.parquet")
+
+
+def rssi_survey(folder: Path) -> None:
+    write_survey(folder)
+    (folder / "receivers.csv").write_text("receiver,x,y,z\n" + "".join(f"{r},1,1,2\n" for r in survey_rows()[0][3:]))
+
+
 def _room() -> Spectra:
-    return simulated_room(n=12, grid=AngularGrid.hemisphere(8, 32))
+    return simulated_room(n=12, grid=GRID)
 
 
 def model_swiftwrf(folder: Path) -> None:
@@ -102,6 +129,18 @@ def state_of_a_fit(folder: Path) -> None:
 
 def read_spectra(folder: Path) -> Spectra:
     data = load_spectra(folder)
+    return _checked(data)
+
+
+def read_snapshots(folder: Path) -> Spectra:
+    return _checked(load_spectra(folder, grid=GRID))
+
+
+def read_first_station(folder: Path) -> Spectra:
+    return _checked(load_spectra(folder, grid=GRID, station=1))
+
+
+def _checked(data: Spectra) -> Spectra:
     assert all(t.isfinite().all() for t in (data.position, data.spectrum, data.label))
     assert 0 <= float(data.spectrum.min()) <= float(data.spectrum.max()) <= 1 + 1e-6
     return data
@@ -110,7 +149,7 @@ def read_spectra(folder: Path) -> Spectra:
 def read_rssi(folder: Path) -> Rssi:
     data = load_rssi(folder)
     assert data.transmitter_position.isfinite().all()
-    assert data.receiver_position.isfinite().all()
+    assert data.located or data.receiver_position.isnan().all()
     assert all(isinstance(name, str) and name for name in data.receiver_names)
     return data
 
@@ -133,10 +172,18 @@ def _few() -> Spectra:
     return _room()
 
 
-KINDS: dict[str, tuple[Callable[[Path], None], Reader]] = {
+KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "format of spectra nerf2": (spectra_nerf2, read_spectra),
     "format of spectra paths": (spectra_paths, read_spectra),
+    "format of spectra deepmimo": (functools.partial(write_deepmimo, n=N), read_snapshots),
+    "format of array snapshots snapshots": (snapshot_arrays, read_snapshots),
+    "format of array snapshots espargos": (write_espargos, read_snapshots),
+    "format of array snapshots dichasus": (functools.partial(write_dichasus, offsets=True), read_first_station),
+    "spectra as an array": (spectra_array, read_spectra),
+    "snapshots in HDF5": (snapshots_hdf5, read_snapshots),
     "format of RSSI nerf2": (rssi_nerf2, read_rssi),
+    "survey in Parquet": (survey_parquet, read_rssi),
+    "format of RSSI survey": (rssi_survey, read_rssi),
     "swiftwrf model": (model_swiftwrf, read_model),
     "co-array model": (model_coarray, read_model),
     "geometry model": (model_geometry, read_model),

@@ -21,7 +21,7 @@ from fuzz.mutate import spoil
 from swiftwrf import FitError, InputError
 from swiftwrf.checkpoint import Saved
 from swiftwrf.data.files import read_table, read_yaml
-from swiftwrf.data.formats import RSSI_FORMATS, SPECTRA_FORMATS
+from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.errors import LONGEST
 
 SHORT = 200  # mutations a kind
@@ -58,7 +58,7 @@ def attack(kind: str, folder: Path, seeds: range) -> dict[str, int]:
 
 
 def test_every_format_and_model_is_fuzzed():
-    for formats in (SPECTRA_FORMATS, RSSI_FORMATS):
+    for formats in (SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS):
         for name in formats:
             assert f"{formats.kind} {name}" in KINDS, f"add a sample of {name} to fuzz/kinds.py"
     own = {kind for kind, model in Saved.kinds.items() if model.__module__.startswith("swiftwrf.")}

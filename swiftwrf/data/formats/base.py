@@ -5,25 +5,29 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
+from swiftwrf.data.reading import Reading
 from swiftwrf.data.rssi import Rssi
+from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
-from swiftwrf.registry import Registry
+from swiftwrf.registry import Entry, Registry
 
 Data = TypeVar("Data")
 
 
 class Format(ABC, Generic[Data]):
-    """A layout of files that measurements come in."""
+    """A layout of files that measurements come in; `takes` names what a user may say of them (`Reading`)."""
+
+    takes: ClassVar[frozenset[str]] = frozenset()
 
     @abstractmethod
     def recognises(self, path: Path) -> bool:
-        """Whether the folder holds files of this layout; `read` may still find them wanting."""
+        """Whether the folder or file is of this layout; `read` may still find it wanting."""
 
     @abstractmethod
-    def read(self, path: Path) -> Data:
+    def read(self, path: Path, how: Reading) -> Data:
         """The measurements.
 
         Raises:
@@ -32,25 +36,42 @@ class Format(ABC, Generic[Data]):
 
 
 SPECTRA_FORMATS: Registry[Format[Spectra]] = Registry("format of spectra")
+SNAPSHOT_FORMATS: Registry[Format[Snapshots]] = Registry("format of array snapshots")
 RSSI_FORMATS: Registry[Format[Rssi]] = Registry("format of RSSI")
 
 
-def read(path: str | Path, formats: Registry[Format[Data]]) -> Data:
-    """The measurements in a folder, by the first format that recognises it.
+def read(path: str | Path, how: Reading, *registries: Registry[Format[Any]]) -> Any:
+    """The measurements in a folder or file, by the format that recognises it.
 
     Raises:
-        InputError: no folder, no format that recognises it, or what the format refuses.
+        InputError: nothing there, no format that recognises it or more than one, what the format refuses, or something in
+            `how` that does not apply to it.
     """
-    folder = Path(path)
-    known = "; ".join(f"{entry.name}: {entry.meaning}" for entry in formats.entries())
-    if not os.path.isdir(folder):  # Path.is_dir raises where a name is too long
-        raise InputError(f"{folder} is not a folder; expected one of measurements ({known})")
+    source = Path(path)
+    known = ", ".join(name for registry in registries for name in registry)
+    if not os.path.isdir(source) and not os.path.isfile(source):  # Path.is_dir raises where a name is too long
+        raise InputError(f"{source} is not a folder or file; expected measurements (formats: {known})")
     try:
-        for entry in formats.entries():
-            reader = entry.make()
-            if reader.recognises(folder):
-                return reader.read(folder)
+        entry, reader = _find(source, known, registries)
+        for name in how.given:
+            if name not in reader.takes:
+                raise InputError(
+                    f"{source} is read as {entry.name} ({entry.meaning}), which takes no {name}; leave it out"
+                )
+        return reader.read(source, how)
     except OSError as error:
         reason = "no permission to read it" if isinstance(error, PermissionError) else error.strerror
-        raise InputError(f"{error.filename or folder} cannot be read ({reason})") from None
-    raise InputError(f"{folder} holds no {formats.kind} that is known ({known})")
+        raise InputError(f"{error.filename or source} cannot be read ({reason})") from None
+
+
+def _find(source: Path, known: str, registries: tuple[Registry[Any], ...]) -> tuple[Entry[Any], Format[Any]]:
+    """The one format that recognises the source: of two, either would be a guess."""
+    readers = [(entry, entry.make()) for registry in registries for entry in registry.entries()]
+    found = [(entry, reader) for entry, reader in readers if reader.recognises(source)]
+    if not found:
+        kinds = " or ".join(registry.kind for registry in registries)
+        raise InputError(f"{source} holds no {kinds} that is known ({known}); docs/formats.md describes them")
+    if len(found) > 1:
+        names = " and ".join(entry.name for entry, _ in found)
+        raise InputError(f"{source} holds several formats ({names}); keep one in the folder, or name the file itself")
+    return found[0]

@@ -1,4 +1,8 @@
-"""Reader of the NeRF2 layout for spectra: gateway_info.yml, tx_pos.csv or rx_pos.csv, spectrum/*.png."""
+"""Reader of the NeRF2 layout for spectra: gateway_info.yml, tx_pos.csv or rx_pos.csv, and spectrum/*.png or an array.
+
+An array in spectrum.npy or spectrum.npz keeps what eight bits lose; spectrum.npz may hold line_of_sight beside it, and the
+gateway its frequency_hz and element_position. This is also what `swiftwrf.data.writing` writes.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +12,21 @@ import struct
 import warnings
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from swiftwrf.angles import AngularGrid, ArrayPose
+from swiftwrf.arrays import LIGHT_SPEED, PlanarArray
+from swiftwrf.data.archives import read_array, read_arrays
 from swiftwrf.data.files import (
     FARTHEST,
-    MOST_PIXELS,
+    check_carrier,
+    number,
     numbers,
     read_bytes,
     read_positions,
@@ -26,7 +35,8 @@ from swiftwrf.data.files import (
     sha256_of_all,
 )
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format
-from swiftwrf.data.spectra import Moving, Spectra
+from swiftwrf.data.reading import Reading
+from swiftwrf.data.spectra import MOST_PIXELS, Moving, Spectra, check_pixels
 from swiftwrf.data.splits import read_split, split_names
 from swiftwrf.errors import InputError
 
@@ -46,25 +56,32 @@ BROKEN = (
 )
 
 
-@SPECTRA_FORMATS.register("nerf2", meaning="gateway_info.yml, tx_pos.csv or rx_pos.csv, spectrum/00001.png, ...")
+@SPECTRA_FORMATS.register(
+    "nerf2",
+    meaning="gateway_info.yml, tx_pos.csv or rx_pos.csv, and spectrum/00001.png, ... or spectrum.npy, spectrum.npz",
+)
 class Nerf2(Format[Spectra]):
-    """Images; row i of the positions belongs to the image numbered i from 1."""
+    """Images; row i of the positions belongs to the image numbered i from 1, or to row i of the array."""
+
+    takes = frozenset({"array"})
 
     def recognises(self, path: Path) -> bool:
         return (path / "gateway_info.yml").is_file() or (path / "spectrum").is_dir()
 
-    def read(self, path: Path) -> Spectra:
-        return _read(path)
+    def read(self, path: Path, how: Reading) -> Spectra:
+        return _read(path, how)
 
 
-def _read(folder: Path) -> Spectra:
-    pose = _read_pose(folder / "gateway_info.yml")
+def _read(folder: Path, how: Reading) -> Spectra:
+    gateway = _read_gateway(folder / "gateway_info.yml")
+    pose = _read_pose(folder / "gateway_info.yml", gateway)
+    array = how.array or _read_array(folder / "gateway_info.yml", gateway)
     tables = [file for file in (folder / "tx_pos.csv", folder / "rx_pos.csv") if file.is_file()]
     if len(tables) != 1:
         raise InputError(f"{folder} must hold one of tx_pos.csv (moving transmitter) and rx_pos.csv (moving receiver)")
     moving: Moving = "transmitter" if tables[0].name == "tx_pos.csv" else "receiver"
     position = read_positions(tables[0])
-    spectrum, digest = _read_images(folder / "spectrum", len(position))
+    spectrum, line_of_sight, digests = _read_spectra(folder, len(position))
     fixed = torch.tensor(pose.position, dtype=torch.float64)
     ends = (position, fixed) if moving == "transmitter" else (fixed, position)
     if bool((position == fixed).all(dim=1).any()):
@@ -77,31 +94,94 @@ def _read(folder: Path) -> Spectra:
         spectrum=spectrum,
         grid=AngularGrid.hemisphere(*spectrum.shape[1:]),
         label=pose.line_of_sight(*ends),
-        line_of_sight=torch.ones(len(position), dtype=torch.bool),
+        line_of_sight=line_of_sight,
         moving=moving,
         index=torch.arange(len(position)),
         named_splits=splits,
-        source={file.name: sha256(file) for file in described} | {"spectrum/*.png": digest},
+        array=array,
+        source={file.name: sha256(file) for file in described} | digests,
         fixed_position=fixed,
         rotation=pose.rotation,
     )
 
 
-def _read_pose(file: Path) -> ArrayPose:
+def _read_gateway(file: Path) -> dict[str, Any]:
     content = read_yaml(file)
     gateways = [value for value in content.values() if isinstance(value, dict)]
     if len(gateways) != 1:
         raise InputError(f"{file} must describe one gateway with its position and orientation, got {len(gateways)}")
-    position, orientation = numbers(gateways[0].get("position"), 3), numbers(gateways[0].get("orientation"), 4)
+    gateway: dict[str, Any] = gateways[0]
+    return gateway
+
+
+def _read_pose(file: Path, gateway: dict[str, Any]) -> ArrayPose:
+    position, orientation = numbers(gateway.get("position"), 3), numbers(gateway.get("orientation"), 4)
     if position is None or orientation is None or max(map(abs, position)) > FARTHEST:
         raise InputError(
             f"{file}: the gateway needs a position of 3 numbers [m], at most {FARTHEST:g}, and an orientation (x, y, z, w) "
-            f"of 4, got {gateways[0].get('position')} and {gateways[0].get('orientation')}"
+            f"of 4, got {gateway.get('position')} and {gateway.get('orientation')}"
         )
     try:
         return ArrayPose(position, orientation)  # type: ignore[arg-type]  # the lengths are checked
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
+
+
+def _read_array(file: Path, gateway: dict[str, Any]) -> PlanarArray | None:
+    """The antenna array, where the gateway tells it."""
+    if "frequency_hz" not in gateway and "element_position" not in gateway:
+        return None
+    frequency, elements = number(gateway.get("frequency_hz")), gateway.get("element_position")
+    places = [numbers(place, 2) for place in elements] if isinstance(elements, list) else [None]
+    if None in places:
+        raise InputError(
+            f"{file}: frequency_hz [Hz] comes with element_position, a list of x and y [m] of each element"
+        )
+    check_carrier(file, frequency)
+    return PlanarArray(torch.tensor(places, dtype=torch.float64), LIGHT_SPEED / frequency)
+
+
+def _read_spectra(folder: Path, n: int) -> tuple[Tensor, Tensor, dict[str, str]]:
+    """Spectra, float32 (n, H, W) in [0, 1], whether the line of sight is free, and digests of the files."""
+    free = torch.ones(n, dtype=torch.bool)
+    arrays = [file for file in (folder / "spectrum.npy", folder / "spectrum.npz") if file.is_file()]
+    if len(arrays) + (folder / "spectrum").is_dir() > 1:
+        raise InputError(f"{folder} holds spectra twice; keep one of spectrum/, spectrum.npy and spectrum.npz")
+    if not arrays:
+        spectrum, digest = _read_images(folder / "spectrum", n)
+        return spectrum, free, {"spectrum/*.png": digest}
+    file = arrays[0]
+    single = file.suffix == ".npy"
+    content = {"spectrum": read_array(file)} if single else read_arrays(file, ["spectrum"], ["line_of_sight"])
+    if (seen := content.get("line_of_sight")) is not None:
+        if seen.shape != (n,) or seen.dtype.kind != "b":
+            raise InputError(f"{file}: line_of_sight must be {n} truth values, got {seen.dtype} of shape {seen.shape}")
+        free = torch.from_numpy(seen.copy())
+    return _checked(file, content["spectrum"], n), free, {file.name: sha256(file)}
+
+
+def _checked(file: Path, values: NDArray[Any], n: int) -> Tensor:
+    """Spectra of an array: magnitudes in [0, 1], or bytes as images have them."""
+    if values.ndim != 3 or len(values) != n or min(values.shape) < 2 or values.dtype.kind not in "fu":
+        raise InputError(
+            f"{file}: expected spectra of shape ({n}, elevations, azimuths) for {n} positions, got {values.dtype} of shape "
+            f"{values.shape}"
+        )
+    if values.shape[1] > values.shape[2]:
+        raise InputError(
+            f"{file}: spectra have {values.shape[1]} elevations and {values.shape[2]} azimuths; these look swapped, so give "
+            "spectrum.transpose(0, 2, 1)"
+        )
+    check_pixels(str(file), n, AngularGrid.hemisphere(*values.shape[1:]))
+    if values.dtype.kind == "u":
+        values = values / np.float32(np.iinfo(values.dtype).max)
+    low, high = float(values.min()), float(values.max())
+    if not (low >= 0 and high <= 1 + 1e-6):  # nan compares false, so it is refused
+        raise InputError(
+            f"{file}: spectra are magnitudes in [0, 1], got {low:.4g} to {high:.4g}; convert decibels to magnitudes and "
+            "divide by the largest"
+        )
+    return torch.from_numpy(values.astype(np.float32)).clamp(0, 1)
 
 
 def _read_images(folder: Path, n: int) -> tuple[Tensor, str]:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from swiftwrf.data.files import FARTHEST, numbers, read_positions, read_table, read_yaml, sha256
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format
+from swiftwrf.data.reading import Reading
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import read_split, split_names
 from swiftwrf.errors import InputError
@@ -17,14 +18,17 @@ NOT_HEARD = -100.0  # what the files write for a receiver that did not hear the 
 LOWEST, HIGHEST = -150.0, 30.0  # [dBm] beyond which a value cannot be a received power
 
 
-@RSSI_FORMATS.register("nerf2", meaning="gateway_position.yml, tx_pos.csv, gateway_rssi.csv with -100 for not heard")
+@RSSI_FORMATS.register(
+    "nerf2",
+    meaning="tx_pos.csv, gateway_rssi.csv with -100 for not heard, gateway_position.yml where positions are known",
+)
 class Nerf2Rssi(Format[Rssi]):
     """One row a position of the transmitter, one column a receiver."""
 
     def recognises(self, path: Path) -> bool:
-        return (path / "gateway_position.yml").is_file() or (path / "gateway_rssi.csv").is_file()
+        return (path / "gateway_rssi.csv").is_file() or (path / "gateway_position.yml").is_file()
 
-    def read(self, path: Path) -> Rssi:
+    def read(self, path: Path, how: Reading) -> Rssi:
         return _read(path)
 
 
@@ -37,8 +41,8 @@ def _read(folder: Path) -> Rssi:
         )
     _check_values(folder / "gateway_rssi.csv", names, rssi)
     heard = torch.where(rssi == NOT_HEARD, torch.nan, rssi)
-    described = ["gateway_position.yml", "tx_pos.csv", "gateway_rssi.csv"]
-    files = [*(folder / name for name in described), *sorted(folder.glob("*_index*.txt"))]
+    described = ["tx_pos.csv", "gateway_rssi.csv", "gateway_position.yml"]
+    files = [*(folder / name for name in described if (folder / name).is_file()), *sorted(folder.glob("*_index*.txt"))]
     return Rssi(
         name=folder.resolve().name,
         receiver_names=tuple(names),
@@ -62,6 +66,9 @@ def _check_values(file: Path, names: list[str], rssi: Tensor) -> None:
 
 
 def _read_receivers(file: Path, names: list[str]) -> Tensor:
+    """Positions of the receivers, float64 (R, 3) [m]; nan where no file tells them."""
+    if not file.is_file():
+        return torch.full((len(names), 3), torch.nan, dtype=torch.float64)
     content = read_yaml(file)
     missing = [name for name in names if name not in content]
     if missing:

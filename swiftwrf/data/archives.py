@@ -1,0 +1,156 @@
+"""Arrays in files of others: npy files, npz archives and HDF5, never pickled, their sizes checked before memory is taken."""
+
+from __future__ import annotations
+
+import lzma
+import math
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib.format import read_array_header_1_0, read_array_header_2_0, read_magic
+from numpy.typing import NDArray
+
+from swiftwrf.errors import InputError
+
+MOST_BYTES, MOST_STORED = 2**30, 2**33  # unpacked, and as they lie in the file
+NUMPY, HDF5 = (".npz",), (".h5", ".hdf5")
+ARCHIVES = (*NUMPY, *HDF5)  # suffixes of files that hold arrays by name
+Arrays = dict[str, NDArray[Any]]
+
+# what zipfile, zlib, NumPy and h5py raise on broken files
+BROKEN = (
+    OSError,
+    EOFError,
+    zipfile.BadZipFile,
+    ValueError,
+    TypeError,
+    LookupError,
+    ArithmeticError,
+    SyntaxError,
+    RuntimeError,
+    RecursionError,
+    MemoryError,
+    struct.error,
+    tokenize.TokenError,
+    zlib.error,
+    lzma.LZMAError,
+)
+
+
+def array_names(file: Path) -> set[str]:
+    """Names of the arrays in an npz archive or HDF5 file; none where it is no such file."""
+    try:
+        if file.suffix in HDF5:
+            with _hdf5(file) as content:
+                return set(content)
+        with zipfile.ZipFile(file) as archive:
+            return {name.removesuffix(".npy") for name in archive.namelist()}
+    except InputError:
+        raise
+    except BROKEN:
+        return set()
+
+
+def read_arrays(file: Path, needed: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
+    """Arrays of numbers from an npz archive or HDF5 file.
+
+    Raises:
+        InputError: no such file, one that is broken, an array that is missing or holds something else than numbers, or
+            more than a gigabyte that the file itself does not have.
+    """
+    if not file.is_file():
+        raise InputError(f"{file} is missing")
+    with refusing_broken(file, "an HDF5 file" if file.suffix in HDF5 else "an npz archive"):
+        if file.suffix in HDF5:
+            with _hdf5(file) as content:
+                names = _choose(file, set(content), needed, optional)
+                return _read_hdf5(content, names, file)
+        with zipfile.ZipFile(file) as archive:
+            stored = {name.removesuffix(".npy") for name in archive.namelist()}
+            names = _choose(file, stored, needed, optional)
+            members = {name: archive.getinfo(f"{name}.npy") for name in names}
+            _check_total(sum(member.file_size for member in members.values()), file)
+            return {name: _read_member(archive, member) for name, member in members.items()}
+
+
+def read_array(file: Path) -> NDArray[Any]:
+    """The array of numbers in an npy file.
+
+    Raises:
+        InputError: no such file, one that is broken or holds something else than numbers, or more than 8 gigabytes.
+    """
+    if not file.is_file():
+        raise InputError(f"{file} is missing")
+    with refusing_broken(file, "an npy file"), file.open("rb") as stream:
+        _check_total(file.stat().st_size, file)
+        return _read_stream(stream, file.name, file.stat().st_size)
+
+
+@contextmanager
+def refusing_broken(file: Path, kind: str) -> Iterator[None]:
+    """Says in a sentence that a file is not what its name promises."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{file}: {error}" if str(file) not in str(error) else str(error)) from None
+    except BROKEN as error:
+        raise InputError(f"{file} is not {kind} of plain numbers ({error})") from None
+
+
+def _choose(file: Path, stored: set[str], needed: Sequence[str], optional: Sequence[str]) -> list[str]:
+    missing = [name for name in needed if name not in stored]
+    if missing:
+        raise InputError(f"{file} lacks {', '.join(missing)}; it must hold {', '.join(needed)}")
+    return [*needed, *(name for name in optional if name in stored)]
+
+
+def _check_total(total: int, file: Path) -> None:
+    """Refuses what unpacks to far more than the file has, and what fills any memory."""
+    most = max(MOST_BYTES, min(file.stat().st_size, MOST_STORED))
+    if total > most:
+        raise InputError(f"it unpacks to {total} bytes; at most {most} are read, so split the data")
+
+
+def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+    with archive.open(member) as stream:
+        return _read_stream(stream, member.filename, member.file_size)
+
+
+def _read_stream(stream: Any, name: str, size: int) -> NDArray[Any]:
+    """One array; what its header claims must be what lies behind it, before memory is taken for it."""
+    readers = {(1, 0): read_array_header_1_0, (2, 0): read_array_header_2_0}
+    shape, by_columns, dtype = readers[read_magic(stream)](stream)
+    if dtype.kind not in "biufc":
+        raise ValueError(f"{name} holds {dtype}, expected numbers")
+    if math.prod(shape) * dtype.itemsize != size - stream.tell():
+        raise ValueError(f"{name} does not hold the {shape} numbers that it claims")
+    return np.frombuffer(stream.read(), dtype).reshape(shape, order="F" if by_columns else "C")
+
+
+def _hdf5(file: Path) -> Any:
+    try:
+        import h5py
+    except ImportError:
+        raise InputError(
+            f"{file} is HDF5, which h5py reads; install it with pip install 'swiftwrf-tasks[formats]'"
+        ) from None
+    return h5py.File(file, "r")
+
+
+def _read_hdf5(content: Any, names: Sequence[str], file: Path) -> Arrays:
+    """Datasets of an HDF5 file; none may lie in another file, which HDF5 would open without a word."""
+    import h5py
+
+    for name in names:
+        own = isinstance(content.get(name, getlink=True), h5py.HardLink) and isinstance(content[name], h5py.Dataset)
+        if not own or content[name].is_virtual or content[name].external or content[name].dtype.kind not in "biufc":
+            raise ValueError(f"{name} is no array of numbers in this file")
+    _check_total(sum(math.prod(content[name].shape) * content[name].dtype.itemsize for name in names), file)
+    return {name: np.asarray(content[name][()]) for name in names}

@@ -1,0 +1,193 @@
+"""Reader of array snapshots: snapshots.npz or snapshots.h5 with the complex channel of each element."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from swiftwrf.angles import ArrayPose
+from swiftwrf.arrays import LIGHT_SPEED, PlanarArray
+from swiftwrf.data.archives import ARCHIVES, Arrays, array_names, read_arrays
+from swiftwrf.data.files import FARTHEST, check_carrier, sha256
+from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format
+from swiftwrf.data.reading import Reading
+from swiftwrf.data.snapshots import Snapshots
+from swiftwrf.data.splits import read_split, split_names
+from swiftwrf.errors import InputError
+
+NEEDED = ("csi", "position", "frequency_hz", "array_position", "array_orientation")
+OPTIONAL = ("element_position", "rows", "columns", "spacing_m", "line_of_sight", "time")
+FLAT = 1e-3  # [wavelengths] that elements may leave their plane
+SPACING = (0.01, 20.0)  # [wavelengths] between neighbours: beyond, positions are in another unit than metres
+
+
+@SNAPSHOT_FORMATS.register("snapshots", meaning="csi of each antenna element in snapshots.npz or snapshots.h5")
+class SnapshotArrays(Format[Snapshots]):
+    """Arrays by name, one row a position of the transmitter."""
+
+    takes = frozenset({"beamformer", "grid", "every"})
+
+    def recognises(self, path: Path) -> bool:
+        return _file(path) is not None
+
+    def read(self, path: Path, how: Reading) -> Snapshots:
+        file = _file(path)
+        assert file is not None
+        return _read(file, how.every or 1)
+
+
+def _file(path: Path) -> Path | None:
+    if path.is_dir():
+        return next(
+            (path / f"snapshots{suffix}" for suffix in ARCHIVES if (path / f"snapshots{suffix}").is_file()), None
+        )
+    return path if path.suffix in ARCHIVES and "csi" in array_names(path) else None
+
+
+def _read(file: Path, every: int) -> Snapshots:
+    arrays = read_arrays(file, NEEDED, OPTIONAL)
+    for name, values in arrays.items():
+        if name != "csi" and values.dtype.kind == "c":
+            raise InputError(f"{file}: {name} holds complex numbers, expected real ones")
+        if not np.isfinite(values).all():
+            raise InputError(f"{file}: {name} holds a value that is not finite; leave that row out")
+    position = _points(file, arrays, "position", 3)
+    array = _array(file, arrays)
+    channel = _channel(file, arrays["csi"], len(position), len(array.element))
+    pose = _pose(file, arrays)
+    fixed = torch.tensor(pose.position, dtype=torch.float64)
+    if bool((position == fixed).all(dim=1).any()):
+        raise InputError(f"{file} has a position equal to array_position, from which there is no direction")
+    n = len(position)
+    folder = file.parent
+    whole = Snapshots(
+        name=file.stem if file.stem != "snapshots" else folder.resolve().name,
+        channel=channel,
+        position=position,
+        array=array,
+        array_position=fixed,
+        rotation=pose.rotation,
+        line_of_sight=_rows(file, arrays, "line_of_sight", n, np.ones(n)).bool(),
+        index=torch.arange(n),
+        time=_rows(file, arrays, "time", n) if "time" in arrays else None,
+        named_splits={name: read_split(folder, name, n, first=1) for name in split_names(folder)} if every == 1 else {},
+        source={f.name: sha256(f) for f in [file, *sorted(folder.glob("*_index*.txt"))]},
+    )
+    return whole if every == 1 else whole.subset(torch.arange(0, n, every))
+
+
+def _points(file: Path, arrays: Arrays, name: str, columns: int) -> Tensor:
+    """Points, float64 (n, columns) [m]."""
+    values = arrays[name]
+    if values.ndim != 2 or values.shape[1] != columns or len(values) == 0:
+        raise InputError(f"{file}: {name} must have shape (n, {columns}) in metres, got {values.shape}")
+    if float(np.abs(values).max()) > FARTHEST:
+        raise InputError(f"{file}: {name} holds a coordinate beyond {FARTHEST:g} m; give metres from a nearer origin")
+    return torch.from_numpy(values.astype(np.float64))
+
+
+def _rows(file: Path, arrays: Arrays, name: str, n: int, default: NDArray[Any] | None = None) -> Tensor:
+    """One number a position."""
+    values = arrays.get(name, default)
+    assert values is not None
+    if values.shape != (n,):
+        raise InputError(f"{file}: {name} must have one value for each of the {n} positions, got shape {values.shape}")
+    return torch.from_numpy(values.astype(np.float64))
+
+
+def _channel(file: Path, csi: NDArray[Any], n: int, elements: int) -> Tensor:
+    """complex64 (n, S, K), each row scaled to unit mean power, for snapshots may be in any unit."""
+    if csi.dtype.kind != "c":
+        hint = "; join real and imaginary parts as csi[..., 0] + 1j * csi[..., 1]" if csi.shape[-1:] == (2,) else ""
+        raise InputError(f"{file}: csi must hold complex numbers, got {csi.dtype}{hint}")
+    if csi.ndim == 3 and csi.shape[0] == n and csi.shape[2] != elements and csi.shape[1] == elements:
+        raise InputError(
+            f"{file}: csi has shape {csi.shape} with its {elements} elements in the middle; they must be the last axis, so "
+            "give csi.transpose(0, 2, 1)"
+        )
+    if csi.ndim not in (2, 3) or csi.shape[0] != n or csi.shape[-1] != elements or 0 in csi.shape:
+        raise InputError(
+            f"{file}: csi must have shape ({n}, [subcarriers or packets,] {elements}) for {n} positions and {elements} "
+            f"elements, got {csi.shape}"
+        )
+    channel = torch.from_numpy(csi.reshape(n, -1, elements).astype(np.complex128))
+    power = torch.view_as_real(channel).square().sum(-1).mean(dim=(1, 2), keepdim=True)
+    silent = (~((power > 0) & power.isfinite())).flatten().nonzero()
+    if len(silent):
+        raise InputError(f"{file}: csi of row {int(silent[0])} has no power, or more than numbers hold; leave it out")
+    return (channel / power.sqrt()).to(torch.complex64)
+
+
+def _pose(file: Path, arrays: Arrays) -> ArrayPose:
+    position, orientation = arrays["array_position"], arrays["array_orientation"]
+    if orientation.shape == (3,):
+        raise InputError(
+            f"{file}: array_orientation has 3 numbers; Euler angles leave their order open, so give the unit quaternion "
+            "(x, y, z, w) that turns array into world coordinates"
+        )
+    if position.shape != (3,) or orientation.shape != (4,) or float(np.abs(position).max()) > FARTHEST:
+        raise InputError(
+            f"{file}: expected array_position of shape (3,) in metres, at most {FARTHEST:g}, and array_orientation of "
+            f"shape (4,), got {position.shape} and {orientation.shape}"
+        )
+    try:
+        return ArrayPose(tuple(map(float, position)), tuple(map(float, orientation)))  # type: ignore[arg-type]
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
+
+
+def _array(file: Path, arrays: Arrays) -> PlanarArray:
+    """The array, given by the positions of its elements or by rows, columns and their spacing."""
+    frequency = arrays["frequency_hz"]
+    if frequency.shape != ():
+        raise InputError(f"{file}: frequency_hz must be one number, the carrier, got shape {frequency.shape}")
+    check_carrier(file, float(frequency))
+    wavelength = LIGHT_SPEED / float(frequency)
+    if "element_position" in arrays:
+        array = PlanarArray(_plane(file, arrays, wavelength), wavelength)
+    elif all(name in arrays and arrays[name].shape == () for name in ("rows", "columns", "spacing_m")):
+        rows, columns, spacing = (float(arrays[name]) for name in ("rows", "columns", "spacing_m"))
+        if not (rows.is_integer() and columns.is_integer() and min(rows, columns) >= 1 and rows * columns < 1e6):
+            raise InputError(f"{file}: rows and columns must be whole numbers from 1, got {rows:g} and {columns:g}")
+        array = PlanarArray.grid(int(rows), int(columns), spacing, float(frequency))
+    else:
+        raise InputError(
+            f"{file} lacks the array: give element_position (elements, 3) in metres, or the numbers rows, columns and "
+            "spacing_m"
+        )
+    check_spacing(file, array)
+    return array
+
+
+def _plane(file: Path, arrays: Arrays, wavelength: float) -> Tensor:
+    """Positions of the elements in their plane, (K, 2) [m]."""
+    columns = 2 if arrays["element_position"].shape[1:] == (2,) else 3
+    element = _points(file, arrays, "element_position", columns)
+    if columns == 3 and float((height := element[:, 2]).max() - height.min()) > FLAT * wavelength:
+        raise InputError(
+            f"{file}: element_position spreads {float(height.max() - height.min()):.3g} m along z; give the elements in "
+            "array coordinates, x and y in the array's plane, and let array_orientation turn them into the world"
+        )
+    return element[:, :2]
+
+
+def check_spacing(file: Path, array: PlanarArray) -> None:
+    """Refuses elements at distances that no array has, as positions in millimetres give.
+
+    Raises:
+        InputError: such distances.
+    """
+    if len(array.element) < 2:
+        raise InputError(f"{file} describes an array of one element, which sees no directions; at least 2 are needed")
+    apart = torch.cdist(array.element, array.element).fill_diagonal_(torch.inf).amin(dim=1).median() / array.wavelength
+    low, high = SPACING
+    if not low <= float(apart) <= high:
+        raise InputError(
+            f"{file}: neighbouring elements are {float(apart) * array.wavelength:.4g} m, {float(apart):.3g} wavelengths "
+            f"apart; expected {low:g} to {high:g} wavelengths, so is the spacing in metres and the carrier in Hz?"
+        )

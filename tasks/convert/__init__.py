@@ -1,0 +1,91 @@
+"""Measurements of any known format, written in the toolkit's own layout."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+
+from swiftwrf import InputError
+from swiftwrf.beamforming import PHASE
+from swiftwrf.calibration import Calibration, calibrate
+from swiftwrf.data import Reading, Rssi, Snapshots, Spectra
+from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
+from swiftwrf.data.writing import write_rssi, write_spectra
+from tasks.directory import console, new_directory
+from tasks.records import write_json
+from tasks.source import SpectraSource, TableSource, reading
+
+
+@dataclass(frozen=True)
+class ConvertConfig(SpectraSource, TableSource):
+    """Measurements of any known format, written in the toolkit's own layout (see docs/formats.md)."""
+
+    source: Annotated[str, tyro.conf.Positional]
+    """folder or file of measurements"""
+    out: Annotated[str, tyro.conf.Positional]
+    """directory to write; must not exist"""
+    calibrate: bool = False
+    """estimate phases of the elements and the array's orientation from the training positions of array snapshots, and take
+    them out"""
+    split: str = "random"
+    """with --calibrate: the split whose training part it sees; it is written beside the spectra"""
+    seed: int = 0
+    """of that split"""
+
+
+def run(config: ConvertConfig, resume: Path | None = None) -> None:
+    """Reads, calibrates where asked, and writes.
+
+    Raises:
+        InputError: what cannot be read, calibrated or written in the layout.
+    """
+    if resume is not None:
+        raise InputError("a conversion cannot be resumed; start it again")
+    how = reading(config)
+    with new_directory(Path(config.out), "a directory") as folder:
+        data = read(config.source, how, SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
+        found = None
+        if config.calibrate:
+            data, found = _calibrated(data, config)
+        for note in data.notes:
+            console.print(f"{data.name}: {note}")
+        written = _write(data, how, folder)
+        record = {
+            "command": shlex.join(["python", "-m", "tasks.convert", *sys.argv[1:]]),
+            "options": asdict(config),
+            "source_sha256": data.source,
+            "notes": data.notes,
+            "calibration": found.to_json() if found else None,
+        }
+        write_json(folder / "conversion.json", record)
+    print(f"{written}: {config.out}")
+
+
+def _calibrated(data: Spectra | Snapshots | Rssi, config: ConvertConfig) -> tuple[Snapshots, Calibration]:
+    if not isinstance(data, Snapshots):
+        raise InputError("--calibrate takes array snapshots; spectra and RSSI do not hold the elements' phases")
+    train, test = data.split(config.split, config.seed)
+    found = calibrate(train)
+    phase, turn = float(found.phase_std.rad2deg().max()), float(found.turn.rad2deg().norm())
+    console.print(
+        f"calibrated on {found.clear} training positions: phases to {phase:.1f} deg, turned by {turn:.1f} deg (+- "
+        f"{float(found.turn_std.rad2deg().max()):.1f}); along the line of sight comes {found.after:.0%} of what is heard at "
+        f"positions held out, {found.before:.0%} before"
+    )
+    rows = torch.searchsorted(data.index, train.index), torch.searchsorted(data.index, test.index)
+    return replace(found.apply(data), named_splits={**data.named_splits, config.split: rows}), found
+
+
+def _write(data: Spectra | Snapshots | Rssi, how: Reading, folder: Path) -> str:
+    if isinstance(data, Rssi):
+        write_rssi(data, folder)
+        return f"{len(data)} rows of RSSI at {len(data.receiver_names)} receivers"
+    spectra = data.spectra(how.grid, how.beamformer or PHASE) if isinstance(data, Snapshots) else data
+    write_spectra(spectra, folder)
+    return f"{len(spectra)} spectra of {spectra.grid.shape[0]} x {spectra.grid.shape[1]} pixels"

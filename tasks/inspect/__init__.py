@@ -1,0 +1,58 @@
+"""What measurements hold, before anything is learnt from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from swiftwrf import InputError
+from swiftwrf.data import Rssi, Snapshots
+from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
+from tasks.directory import new_directory
+from tasks.inspect.findings import inspect
+from tasks.inspect.page import page
+from tasks.page.page import write_page
+from tasks.records import write_json
+from tasks.source import SpectraSource, TableSource, reading
+
+
+@dataclass(frozen=True)
+class InspectConfig(SpectraSource, TableSource):
+    """What measurements of any known format hold: counts, extents, neighbours, frames, calibration, suspicious columns."""
+
+    source: Annotated[str, tyro.conf.Positional]
+    """folder or file of measurements"""
+    out: str | None = None
+    """directory of the page; must not exist (default: a new one under runs/inspect)"""
+
+
+def run(config: InspectConfig, resume: Path | None = None) -> None:
+    """Says what it sees, and writes a page and inspect.json.
+
+    Raises:
+        InputError: what cannot be read.
+    """
+    if resume is not None:
+        raise InputError("an inspection is quick and cannot be resumed; start it again")
+    how = reading(config)
+    out = Path(config.out) if config.out else Path("runs") / "inspect" / f"{datetime.now():%Y%m%d-%H%M%S}"
+    with new_directory(out, "an inspection") as folder:
+        data = read(config.source, how, SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
+        kind = "RSSI" if isinstance(data, Rssi) else "array snapshots" if isinstance(data, Snapshots) else "spectra"
+        findings, shown = inspect(data, how)
+        content = {
+            "source": config.source,
+            "kind": kind,
+            "findings": [{"level": finding.level, "text": finding.text} for finding in findings.sentences],
+            "numbers": findings.numbers,
+        }
+        write_json(folder / "inspect.json", content)
+        write_page(folder, page(shown, kind, findings))
+    print(f"{config.source}: {kind}")
+    for finding in findings.sentences:
+        print(f"{'! ' if finding.level == 'warning' else '  '}{finding.text}")
+    print(f"page: {out / 'report.html'}")

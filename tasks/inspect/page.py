@@ -1,0 +1,152 @@
+"""The page of an inspection: findings, a plan with the array's axes or the receivers, what was heard against geometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from swiftwrf.angles import great_circle, to_direction
+from swiftwrf.data import Rssi, Spectra
+from swiftwrf.positions import distance
+from tasks.inspect.findings import Findings, nearest
+from tasks.page import figures
+from tasks.page.page import Page, Plot, Section, Table
+
+AXES = {"x": "#ee6677", "y": "#228833", "normal": "#4477aa"}
+DOTS, NONE = "#4477aa", "#bbbbbb"  # with line of sight, without
+MOST_DOTS = 2000
+MOST_RECEIVERS = 30  # in a figure
+PLAN = (
+    "From above and from the side: positions with (blue) and without line of sight (grey); arrows: the array's axes x "
+    "(red), y (green) and its normal (blue)."
+)
+DIRECTIONS = (
+    "Lines of sight (left) and peaks of the spectra (middle) as the array sees them, coloured by the azimuth of the line of "
+    "sight: one picture where frames and calibration are right."
+)
+
+
+def page(data: Spectra | Rssi, kind: str, findings: Findings) -> Page:
+    """What was found, and figures of it."""
+    rows = [[finding.level, finding.text] for finding in findings.sentences]
+    warnings = sum(finding.level == "warning" for finding in findings.sentences)
+    table = Table(["", ""], rows, strong=frozenset(["warning"]))
+    plots = _rssi(data) if isinstance(data, Rssi) else _spectra(data)
+    lead = f"Read as {kind}; {warnings} warning{'' if warnings == 1 else 's'}."
+    return Page(
+        f"Inspection: {data.name}", lead, [Section("Findings", tables=[table]), Section("Figures", plots=plots)]
+    )
+
+
+def _spectra(data: Spectra) -> list[Plot]:
+    return [
+        Plot("plan", _plan(data), PLAN),
+        Plot("directions", _directions(data), DIRECTIONS),
+        Plot("neighbours", _neighbours(data), "Distance to the nearest other position; the line is half a wavelength."),
+    ]
+
+
+def _rssi(data: Rssi) -> list[Plot]:
+    plots = [
+        Plot(
+            "plan", _floor(data), "Positions, coloured by the strongest RSSI; crosses: receivers, where they are known."
+        )
+    ]
+    if data.located:
+        plots.append(Plot("law", _against_distance(data), "RSSI against the distance from the receiver."))
+    return [*plots, Plot("heard", _heard(data), "Share of the rows in which each receiver was heard.")]
+
+
+def _plan(data: Spectra) -> Figure:
+    figure, axes = figures.new_figure(1, 2, 9, 4)
+    for ax, (a, b) in zip(axes, ((0, 1), (0, 2)), strict=True):
+        for free, colour in ((False, NONE), (True, DOTS)):
+            place = data.position[data.line_of_sight == free]
+            ax.plot(place[:, a], place[:, b], ".", markersize=3, color=colour)
+        ax.set(xlabel=f"{'xyz'[a]} [m]", ylabel=f"{'xyz'[b]} [m]", aspect="equal")
+        if data.fixed_position is not None:
+            ax.plot(*data.fixed_position[[a, b]].tolist(), "k^" if data.moving == "transmitter" else "k*", markersize=7)
+        _draw_axes(ax, data, a, b)
+    return figure
+
+
+def _draw_axes(ax: Axes, data: Spectra, a: int, b: int) -> None:
+    """Arrows from the array, or from the middle of the positions where it moves."""
+    if data.rotation is None:
+        return
+    still = data.moving == "transmitter" and data.fixed_position is not None
+    origin = data.fixed_position if still else data.position.mean(dim=0)
+    assert origin is not None
+    length = 0.25 * float((data.position.amax(dim=0) - data.position.amin(dim=0)).max() or 1.0)
+    for (name, colour), axis in zip(AXES.items(), data.rotation.T, strict=True):
+        dx, dy = (length * axis[[a, b]]).tolist()
+        ax.annotate(
+            name,
+            xy=(float(origin[a]), float(origin[b])),
+            xytext=(float(origin[a]) + dx, float(origin[b]) + dy),
+            color=colour,
+            fontsize=8,
+            arrowprops={"arrowstyle": "<-", "color": colour},
+        )
+
+
+def _directions(data: Spectra) -> Figure:
+    rows = data.line_of_sight.nonzero()[:MOST_DOTS, 0]
+    peak = data.grid.direction.flatten(0, 1)[data.spectrum[rows].flatten(1).argmax(dim=1)]
+    line = to_direction(*data.label[rows].unbind(-1))
+    figure, axes = figures.new_figure(1, 3, 11, 3.6)
+    for ax, (title, direction) in zip(axes, {"line of sight": line, "peak": peak}.items(), strict=False):
+        ax.scatter(direction[:, 0], direction[:, 1], s=6, c=data.label[rows, 0].rad2deg(), cmap="hsv", vmin=0, vmax=360)
+        ax.add_patch(Circle((0, 0), 1, fill=False, color="#aeb7c6"))  # the array's horizon
+        ax.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal", title=title, xlabel="array x", ylabel="array y")
+    axes[2].hist(great_circle(peak, line).rad2deg().numpy(), bins=45, range=(0, 90), color=DOTS)
+    axes[2].set(xlabel="peak to line of sight [deg]", ylabel="spectra")
+    return figure
+
+
+def _neighbours(data: Spectra) -> Figure:
+    figure, axes = figures.new_figure(1, 1, 6, 3)
+    axes[0].hist(nearest(data.position).numpy(), bins=40, color=DOTS)
+    if data.array is not None:
+        axes[0].axvline(data.array.wavelength / 2, color="#ee6677")
+    axes[0].set(xlabel="nearest other position [m]", ylabel="positions")
+    return figure
+
+
+def _floor(data: Rssi) -> Figure:
+    figure, axes = figures.new_figure(1, 1, 6, 4.5)
+    place = data.transmitter_position
+    strongest = data.rssi_dbm.nan_to_num(-torch.inf).amax(dim=1)
+    drawn = axes[0].scatter(
+        place[:, 0], place[:, 1], s=8, c=strongest.where(strongest.isfinite(), torch.nan), cmap="viridis"
+    )
+    figure.colorbar(drawn, ax=axes[0], label="strongest RSSI [dBm]")
+    for name, at in zip(data.receiver_names, data.receiver_position.tolist(), strict=True):
+        if data.located:
+            axes[0].plot(*at[:2], "x", color="#ee6677", markersize=8, markeredgewidth=2)
+            axes[0].annotate(figures.plain(name), at[:2], fontsize=7, xytext=(3, 3), textcoords="offset points")
+    axes[0].set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    return figure
+
+
+def _against_distance(data: Rssi) -> Figure:
+    figure, axes = figures.new_figure(1, 1, 6, 3.6)
+    apart = distance(data.transmitter_position, data.receiver_position)
+    for c, name in enumerate(data.receiver_names[:MOST_RECEIVERS]):
+        axes[0].plot(apart[:, c], data.rssi_dbm[:, c], ".", markersize=2, label=figures.plain(name))
+    axes[0].set(xlabel="distance from the receiver [m]", ylabel="RSSI [dBm]", xscale="log")
+    return figure
+
+
+def _heard(data: Rssi) -> Figure:
+    share = (~data.rssi_dbm.isnan()).double().mean(dim=0)
+    order = share.argsort(descending=True)[:MOST_RECEIVERS].tolist()
+    names = [figures.plain(data.receiver_names[i]) for i in order]
+    figure, axes = figures.new_figure(1, 1, max(4.0, 0.3 * len(order) + 2), 3)
+    axes[0].bar(np.arange(len(order)), share[order].numpy(), color=DOTS)
+    axes[0].set(xticks=range(len(order)), xticklabels=names, ylabel="share heard", ylim=(0, 1))
+    axes[0].tick_params(axis="x", labelrotation=60)
+    return figure

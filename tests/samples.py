@@ -1,0 +1,209 @@
+"""Small made files of the formats that others use, each with one thing changed where a test asks for it."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from swiftwrf import rssi_room
+from swiftwrf.arrays import LIGHT_SPEED, PlanarArray
+from swiftwrf.data import Snapshots
+from swiftwrf.data.simulated.room import Room
+
+FREQUENCY = 2.4e9
+WAVELENGTH = LIGHT_SPEED / FREQUENCY
+POSITION = torch.tensor([0.2, 2.4, 1.2], dtype=torch.float64)  # of the array, on a wall
+FACING_X = Rotation.from_euler("yx", [90, 25], degrees=True)  # its normal is +x, and it hangs askew
+
+
+def snapshots(
+    n: int = 120, count: int = 3, noise: float = 0.05, side: int = 4, seed: int = 0, echo: float = 0.0
+) -> Snapshots:
+    """Direct paths from all over a room, noise, and an echo from the floor of so much amplitude."""
+    generator = torch.Generator().manual_seed(seed)
+    place = torch.tensor([0.8, 0.4, 0.4]) + torch.tensor([4.5, 4.2, 2.3]) * torch.rand(n, 3, generator=generator)
+    position, rotation = place.double(), torch.from_numpy(FACING_X.as_matrix())
+    array = PlanarArray.grid(side, side, WAVELENGTH / 2, FREQUENCY)
+    channel = torch.zeros(n, count, side * side, dtype=torch.complex128)
+    for mirror, amplitude in ((1.0, 1.0), (-1.0, echo)):
+        away = position * torch.tensor([1.0, 1.0, mirror]) - POSITION
+        phase = array.phase(away / away.norm(dim=1, keepdim=True) @ rotation)
+        turn = 2 * math.pi / WAVELENGTH * away.norm(dim=1)
+        channel += (amplitude * torch.polar(torch.ones_like(phase), phase - turn[:, None]))[:, None]
+    channel += noise * torch.randn(channel.shape, dtype=torch.complex128, generator=generator)
+    free = torch.ones(n, dtype=torch.bool)
+    return Snapshots("made", channel.to(torch.complex64), position, array, POSITION, rotation, free, torch.arange(n))
+
+
+def snapshot_arrays(data: Snapshots) -> dict[str, object]:
+    """What snapshots.npz holds."""
+    return {
+        "csi": data.channel.numpy(),
+        "position": data.position.numpy(),
+        "element_position": np.pad(data.array.element.numpy(), ((0, 0), (0, 1))),
+        "frequency_hz": np.float64(FREQUENCY),
+        "array_position": data.array_position.numpy(),
+        "array_orientation": Rotation.from_matrix(data.rotation.numpy()).as_quat(),
+    }
+
+
+def write_snapshots(
+    folder: Path, name: str = "snapshots.npz", data: Snapshots | None = None, **changes: object
+) -> Path:
+    """snapshots.npz or snapshots.h5; None leaves an array out."""
+    arrays = {k: v for k, v in {**snapshot_arrays(data or snapshots()), **changes}.items() if v is not None}
+    folder.mkdir(exist_ok=True)
+    if name.endswith(".npz"):
+        np.savez(folder / name, **arrays)
+    else:
+        import h5py
+
+        with h5py.File(folder / name, "w") as file:
+            for key, value in arrays.items():
+                file[key] = value
+    return folder
+
+
+def write_deepmimo(folder: Path, n: int = 30, tracer: str = "Remcom Wireless Insite", **changes: object) -> Path:
+    """Paths of the simulated room from a transmitter on the ceiling; a change is a function of the arrays."""
+    generator = torch.Generator().manual_seed(0)
+    receiver = torch.tensor([0.5, 0.5, 0.6]) + torch.tensor([5.0, 4.0, 1.0]) * torch.rand(n, 3, generator=generator)
+    transmitter = torch.tensor([3.0, 2.5, 2.7])
+    paths = Room(frequency_hz=FREQUENCY).paths(transmitter, receiver)
+    direction, gain = paths.direction.numpy(), paths.gain.numpy()
+    arrays = {
+        "power": 20 * np.log10(abs(gain)),
+        "phase": np.rad2deg(np.angle(gain)),
+        "delay": paths.length.numpy() / LIGHT_SPEED,
+        "aoa_az": np.rad2deg(np.arctan2(direction[..., 1], direction[..., 0])),
+        "aoa_el": np.rad2deg(np.arccos(direction[..., 2])),
+        "rx_pos": receiver.double().numpy(),
+        "tx_pos": transmitter[None].double().numpy(),
+    }
+    arrays |= {key: change(arrays) for key, change in changes.items()}
+    folder.mkdir(exist_ok=True)
+    for key, value in arrays.items():
+        np.savez_compressed(folder / f"{key}_t000_tx000_r001.npz", **{key: value.astype(np.float32)})
+    params = {"rt_params": {"frequency": FREQUENCY, "raytracer_name": tracer}}
+    (folder / "params.json").write_text(json.dumps(params))
+    return folder
+
+
+def _varint(value: int) -> bytes:
+    low, high = value & 0x7F, value >> 7
+    return bytes([low | 0x80]) + _varint(high) if high else bytes([low])
+
+
+def _field(number: int, content: bytes) -> bytes:
+    return _varint(number << 3 | 2) + _varint(len(content)) + content
+
+
+def tensor_message(values: np.ndarray) -> bytes:
+    """A serialized tensor, as TensorFlow writes it."""
+    dtype = {"f4": 1, "f8": 2, "c8": 8}[values.dtype.str[1:]]
+    shape = b"".join(_field(2, _varint(1 << 3) + _varint(size)) for size in values.shape)
+    return _varint(1 << 3) + _varint(dtype) + _field(2, shape) + _field(4, values.tobytes())
+
+
+def write_records(file: Path, examples: list[dict[str, np.ndarray]]) -> None:
+    """A TFRecord file of examples of tensors."""
+    with file.open("wb") as stream:
+        for example in examples:
+            entries = b""
+            for name, values in example.items():
+                feature = _field(1, _field(1, tensor_message(values)))
+                entries += _field(1, _field(1, name.encode()) + _field(2, feature))
+            content = _field(1, entries)
+            stream.write(struct.pack("<Q", len(content)) + b"crc1" + content + b"crc2")
+
+
+def _seen_from_the_front(data: Snapshots, rows: int, columns: int) -> np.ndarray:
+    """Channels (n, rows, columns, S) of an array whose row 0 is the upper one."""
+    channel = data.channel.numpy().transpose(0, 2, 1).reshape(len(data), rows, columns, -1)
+    return channel[:, ::-1]
+
+
+def _antenna(data: Snapshots) -> dict[str, object]:
+    right, up, _ = data.rotation.T.tolist()
+    spacing = WAVELENGTH / 2
+    return {"name": "A", "location": data.array_position.tolist(), "rightvector": right, "upvector": up,
+            "spacingX": spacing, "spacingY": spacing}  # fmt: skip
+
+
+def record_source(shape: tuple[int, int], n: int = 24, count: int = 3) -> Snapshots:
+    """Snapshots of an array of this shape that data sets of records can hold."""
+    data = snapshots(n, count)
+    array = PlanarArray.grid(*shape, WAVELENGTH / 2, FREQUENCY)
+    away = data.position - data.array_position
+    phase = array.phase(away / away.norm(dim=1, keepdim=True) @ data.rotation)[:, None].expand(-1, count, -1)
+    channel = torch.polar(torch.ones_like(phase), phase).to(torch.complex64)
+    return Snapshots(
+        "made", channel, data.position, array, data.array_position, data.rotation, data.line_of_sight, data.index
+    )
+
+
+def write_espargos(folder: Path, arrays: int = 1, **changes: object) -> Path:
+    """As many arrays, the first of them real."""
+    data = record_source((2, 4))
+    csi = _seen_from_the_front(data, 2, 4)
+    csi = np.stack([csi, *([csi[::-1]] * (arrays - 1))], axis=1)
+    folder.mkdir(exist_ok=True)
+    examples = [
+        {"csi": np.ascontiguousarray(csi[i]), "pos": data.position[i].numpy(), "time": np.float64([i])}
+        for i in range(len(data))
+    ]
+    write_records(folder / "walk.tfrecords", examples)
+    content = {"frequency": FREQUENCY, "antennas": [_antenna(data)] * arrays} | changes
+    (folder / "metadata.json").write_text(json.dumps(content))
+    return folder
+
+
+def write_dichasus(folder: Path, offsets: bool = False, **changes: object) -> Path:
+    """Two arrays whose antennas are numbered crosswise; with `offsets`, phases that a file tells."""
+    data = record_source((2, 2), count=8)
+    first = _seen_from_the_front(data, 2, 2).reshape(len(data), 4, -1)
+    order = [6, 0, 3, 5]  # of the first array's antennas
+    csi = np.ones((len(data), 8, first.shape[2]), dtype=np.complex64)
+    csi[:, order] = first
+    cpo = np.linspace(0, 3, 8) if offsets else np.zeros(8)
+    sto = np.linspace(0, 2, 8) if offsets else np.zeros(8)
+    turns = np.arange(csi.shape[2]) / csi.shape[2]
+    csi = csi * np.exp(-1j * (cpo[:, None] + 2 * np.pi * sto[:, None] * turns))
+    stored = np.fft.ifftshift(csi, axes=2)
+    folder.mkdir(exist_ok=True)
+    examples = [
+        {
+            "csi": np.stack([stored[i].real, stored[i].imag], axis=-1).astype(np.float32),
+            "pos-tachy": data.position[i].numpy(),
+        }
+        for i in range(len(data))
+    ]
+    write_records(folder / "walk.tfrecords", examples)
+    if offsets:
+        (folder / "reftx-offsets-walk.json").write_text(json.dumps({"cpo": cpo.tolist(), "sto": sto.tolist()}))
+    antennas = [_antenna(data) | {"assignments": a} for a in ([[6, 0], [3, 5]], [[1, 2], [4, 7]])]
+    (folder / "spec.json").write_text(json.dumps({"frequency": FREQUENCY, "antennas": antennas} | changes))
+    return folder
+
+
+def survey_rows(n: int = 40) -> tuple[list[str], list[list[object]]]:
+    """Header and rows of a wide table: x, y, z and three receivers, -100 where nothing was heard."""
+    data = rssi_room(n=n).columns([0, 4, 8])
+    values = torch.cat([data.transmitter_position, data.rssi_dbm.nan_to_num(-100)], dim=1)
+    return ["x", "y", "z", *data.receiver_names], values.tolist()
+
+
+def write_survey(folder: Path, name: str = "walk.csv", header: list[str] | None = None, rows: object = None) -> Path:
+    """A table of comma-separated values."""
+    usual = survey_rows()
+    header, rows = header or usual[0], rows or usual[1]
+    folder.mkdir(exist_ok=True)
+    lines = [",".join(header), *(",".join(str(v) for v in row) for row in rows)]
+    (folder / name).write_text("\n".join(lines) + "\n")
+    return folder / name

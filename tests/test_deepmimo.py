@@ -1,0 +1,110 @@
+"""DeepMIMO v4 folders: conventions of angles and phases, and what is refused."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from samples import FREQUENCY, WAVELENGTH, write_deepmimo
+
+from swiftwrf import AngularGrid, InputError, load_spectra
+from swiftwrf.arrays import PlanarArray
+from swiftwrf.data.simulated.room import Room
+
+GRID = AngularGrid.hemisphere(24, 96)
+
+
+def load(folder, **changes):
+    return load_spectra(write_deepmimo(folder, **changes), grid=GRID)
+
+
+def passband(arrays):
+    """Phases without the propagation, as a ray tracer of passband coefficients gives them."""
+    return arrays["phase"] + 360 * FREQUENCY * arrays["delay"]
+
+
+def test_spectra_are_those_of_the_traced_paths(tmp_path):
+    data = load(tmp_path / "town")
+    paths = Room(frequency_hz=FREQUENCY).paths(data.fixed_position, data.position)
+    array = PlanarArray.square(4, FREQUENCY)
+    owner = torch.arange(30).repeat_interleave(25)
+    expected = array.spectrum(array.channel(paths.direction.flatten(0, 1), paths.gain.flatten(), owner, 30), GRID)
+    torch.testing.assert_close(data.spectrum, expected, atol=2e-3, rtol=0)
+    assert (data.moving, data.name, data.notes) == ("receiver", "town", ())
+    assert data.fixed_position.tolist() == pytest.approx([3, 2.5, 2.7], abs=1e-6)
+
+
+def test_phases_of_passband_coefficients_get_the_propagation(tmp_path):
+    usual, other = load(tmp_path / "a"), load(tmp_path / "b", phase=passband)
+    torch.testing.assert_close(other.spectrum, usual.spectrum, atol=2e-3, rtol=0)
+    assert "passband" in other.notes[0]
+
+
+@pytest.mark.parametrize(("tracer", "noted"), [("Sionna Ray Tracing", True), ("Remcom Wireless Insite", False)])
+def test_without_direct_paths_the_ray_tracer_tells(tmp_path, tracer, noted):
+    blocked = {key: lambda a, k=key: np.where(np.arange(25) == 0, np.nan, a[k]) for key in
+               ("power", "phase", "delay", "aoa_az", "aoa_el")}  # fmt: skip
+    data = load(tmp_path / "a", tracer=tracer, **blocked)
+    assert any("passband" in note for note in data.notes) == noted
+    assert not data.line_of_sight.any()
+
+
+def test_reversed_phases_are_turned_round(tmp_path):
+    usual, other = load(tmp_path / "a"), load(tmp_path / "b", phase=lambda a: -a["phase"])
+    torch.testing.assert_close(other.spectrum, usual.spectrum, atol=2e-3, rtol=0)
+    assert "reversed" in other.notes[0]
+
+
+def test_receivers_without_paths_are_left_out_and_counted(tmp_path):
+    def gap(key):
+        return lambda a: np.where(np.arange(30)[:, None] == 4, np.nan, a[key])
+
+    data = load(tmp_path / "a", **{key: gap(key) for key in ("power", "phase", "delay", "aoa_az", "aoa_el")})
+    assert data.index.tolist() == [i for i in range(30) if i != 4]
+    assert data.notes == ("receivers without a path are left out: 1",)
+
+
+def test_another_array_and_every_second_receiver(tmp_path):
+    folder = write_deepmimo(tmp_path / "a")
+    data = load_spectra(folder, array=PlanarArray.grid(2, 8, WAVELENGTH / 2, FREQUENCY), grid=GRID, every=2)
+    assert (len(data), len(data.array.element), data.index[1].item()) == (15, 16, 2)
+    with pytest.raises(InputError, match="carrier"):
+        load_spectra(folder, array=PlanarArray.square(4, 5e9))
+
+
+def test_one_of_several_pairs(tmp_path):
+    folder = write_deepmimo(tmp_path / "a")
+    for file in list(folder.glob("*_t000_tx000_r001.npz")):
+        (folder / file.name.replace("tx000", "tx001")).write_bytes(file.read_bytes())
+    with pytest.raises(InputError, match=r"2 pairs.*station"):
+        load_spectra(folder)
+    assert len(load_spectra(folder, station=2, grid=GRID)) == 30
+
+
+def _params(text):
+    return lambda folder: (folder / "params.json").write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda f: (f / "params.json").unlink(), "params.json"),
+        (_params("{}"), "rt_params"),
+        (_params(json.dumps({"rt_params": {"frequency": 2.4}})), "carrier in Hz"),
+        (lambda f: (f / "phase_t000_tx000_r001.npz").unlink(), "phase_t000_tx000_r001.npz is missing"),
+        (lambda f: np.savez(f / "phase_t000_tx000_r001.npz", phase=np.zeros((3, 25))), "all have shape"),
+        (lambda f: np.savez(f / "rx_pos_t000_tx000_r001.npz", rx_pos=np.zeros((3, 3))), "expected rx_pos"),
+        (lambda f: np.savez(f / "rx_pos_t000_tx000_r001.npz", rx_pos=np.full((30, 3), np.nan)), "finite numbers"),
+        (
+            lambda f: np.savez(f / "power_t000_tx000_r001.npz", power=np.full((30, 25), np.nan)),
+            "no receiver with a path",
+        ),
+    ],
+)
+def test_refuses(tmp_path, spoil, says):
+    folder = write_deepmimo(tmp_path / "a")
+    spoil(folder)
+    with pytest.raises(InputError, match=says):
+        load_spectra(folder)

@@ -1,0 +1,159 @@
+"""Array snapshots: what is read from npz and HDF5, and everything that is refused."""
+
+from __future__ import annotations
+
+import math
+import sys
+
+import numpy as np
+import pytest
+import torch
+from samples import FREQUENCY, WAVELENGTH, snapshot_arrays, snapshots, write_snapshots
+
+from swiftwrf import AngularGrid, InputError, load_snapshots, load_spectra
+from swiftwrf.angles import great_circle, to_direction
+from swiftwrf.data.archives import read_arrays
+
+GRID = AngularGrid.hemisphere(24, 96)
+
+
+@pytest.mark.parametrize("name", ["snapshots.npz", "snapshots.h5"])
+def test_reads_what_was_measured(tmp_path, name):
+    made = snapshots()
+    data = load_snapshots(write_snapshots(tmp_path / "walk", name, time=np.arange(120.0)))
+    assert (data.name, len(data), data.channel.shape) == ("walk", 120, (120, 3, 16))
+    torch.testing.assert_close(data.position, made.position)
+    torch.testing.assert_close(data.rotation, made.rotation)
+    assert data.array.wavelength == pytest.approx(WAVELENGTH)
+    ratio = data.channel / made.channel  # of one size everywhere
+    torch.testing.assert_close(ratio, ratio[:, :1, :1].expand_as(ratio), rtol=1e-4, atol=1e-4)
+    assert data.time[5] == 5
+    assert set(data.source) == {name}
+
+
+@pytest.mark.parametrize("beamformer", ["phase", "bartlett", "capon"])
+def test_spectra_peak_at_the_line_of_sight(tmp_path, beamformer):
+    folder = write_snapshots(tmp_path / "walk", data=snapshots(n=40, count=20))
+    data = load_spectra(folder, beamformer=beamformer, grid=GRID)
+    assert data.spectrum.shape == (40, 24, 96)
+    assert 0 <= float(data.spectrum.min()) <= float(data.spectrum.max()) <= 1
+    peak = data.grid.direction.flatten(0, 1)[data.spectrum.flatten(1).argmax(1)]
+    assert great_circle(peak, to_direction(*data.label.unbind(-1))).rad2deg().median() < 3
+    assert (data.moving, data.array, data.fixed_position.tolist()) == ("transmitter", data.array, [0.2, 2.4, 1.2])
+
+
+def test_one_snapshot_needs_no_axis_of_its_own(tmp_path):
+    made = snapshots()
+    folder = write_snapshots(tmp_path / "a", csi=made.channel[:, 0].numpy())
+    assert load_snapshots(folder).channel.shape == (120, 1, 16)
+
+
+def test_rows_columns_and_spacing_describe_an_array(tmp_path):
+    made = snapshots()
+    usual = load_spectra(write_snapshots(tmp_path / "a"), grid=GRID)
+    shape = {"rows": 4, "columns": 4, "spacing_m": WAVELENGTH / 2, "element_position": None}
+    other = load_spectra(write_snapshots(tmp_path / "b", **shape), grid=GRID)
+    torch.testing.assert_close(other.spectrum, usual.spectrum, rtol=1e-3, atol=1e-4)
+    x, y = made.array.element[1 * 4 + 2].tolist()  # row 1, column 2: columns along x, rows along y
+    assert (x, y) == pytest.approx((0.5 * WAVELENGTH / 2, -0.5 * WAVELENGTH / 2))
+
+
+def test_every_takes_one_of_so_many(tmp_path):
+    data = load_spectra(write_snapshots(tmp_path / "a"), every=50, grid=GRID)
+    assert data.index.tolist() == [0, 50, 100]
+
+
+def test_a_file_is_read_as_well_as_its_folder(tmp_path):
+    write_snapshots(tmp_path / "a", name="monday.npz")
+    assert load_snapshots(tmp_path / "a" / "monday.npz").name == "monday"
+
+
+def _csi(change):
+    return {"csi": change(snapshots().channel.numpy())}
+
+
+REFUSED = {
+    "real numbers": (_csi(np.abs), "must hold complex numbers"),
+    "parts apart": (_csi(lambda c: np.stack([c.real, c.imag], -1)), "join real and imaginary parts"),
+    "axes swapped": (_csi(lambda c: c.transpose(0, 2, 1)), r"give csi.transpose\(0, 2, 1\)"),
+    "other elements": (_csi(lambda c: c[..., :9]), "16 elements"),
+    "other rows": (_csi(lambda c: c[:50]), "for 120 positions"),
+    "silent": (_csi(lambda c: c * (np.arange(120) != 7)[:, None, None]), "row 7 has no power"),
+    "not finite": (_csi(lambda c: c + np.nan), "not finite"),
+    "no csi": ({"csi": None}, "lacks csi"),
+    "no pose": ({"array_orientation": None}, "lacks array_orientation"),
+    "Euler angles": ({"array_orientation": np.zeros(3)}, "Euler angles"),
+    "no unit quaternion": ({"array_orientation": np.ones(4)}, "unit quaternion"),
+    "flat positions": ({"position": np.zeros((120, 2))}, r"shape \(n, 3\)"),
+    "at the array": ({"position": np.tile([0.2, 2.4, 1.2], (120, 1))}, "equal to array_position"),
+    "no array": ({"element_position": None}, "lacks the array"),
+    "half rows": ({"element_position": None, "rows": 4.5, "columns": 4, "spacing_m": 0.06}, "whole numbers"),
+    "elements in millimetres": (
+        {"element_position": 1000 * snapshot_arrays(snapshots())["element_position"]},
+        "wavelengths",
+    ),
+    "elements upright": (
+        {"element_position": snapshot_arrays(snapshots())["element_position"][:, [2, 0, 1]]},
+        "along z",
+    ),
+    "carrier in GHz": ({"frequency_hz": 2.4}, "carrier in Hz"),
+    "carrier of a list": ({"frequency_hz": np.full(3, FREQUENCY)}, "one number"),
+    "times of others": ({"time": np.zeros(3)}, "time must have one value"),
+    "complex positions": ({"position": np.ones((120, 3), complex)}, "expected real"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_refuses(tmp_path, name):
+    changes, says = REFUSED[name]
+    with pytest.raises(InputError, match=says):
+        load_snapshots(write_snapshots(tmp_path / "a", **changes))
+
+
+def test_what_does_not_apply_is_refused(tmp_path):
+    folder = write_snapshots(tmp_path / "a")
+    with pytest.raises(InputError, match="takes no station"):
+        load_spectra(folder, station=1)
+    with pytest.raises(InputError, match="unknown beamformer"):
+        load_spectra(folder, beamformer="music")
+    with pytest.raises(InputError, match="coarser grid"):
+        load_spectra(folder, grid=AngularGrid.hemisphere(1100, 4400))
+
+
+def test_two_formats_in_a_folder_are_refused(tmp_path):
+    folder = write_snapshots(tmp_path / "a")
+    (folder / "gateway_info.yml").write_text("g:\n  position: [0, 0, 0]\n  orientation: [0, 0, 0, 1]\n")
+    with pytest.raises(InputError, match="several formats"):
+        load_spectra(folder)
+
+
+def test_hdf5_without_its_library(tmp_path, monkeypatch):
+    folder = write_snapshots(tmp_path / "a", "snapshots.h5")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(InputError, match=r"install it with pip install 'swiftwrf-tasks\[formats\]'"):
+        load_snapshots(folder)
+
+
+def test_hdf5_that_points_elsewhere_is_refused(tmp_path):
+    import h5py
+
+    write_snapshots(tmp_path / "secret", "snapshots.h5")
+    with h5py.File(tmp_path / "links.h5", "w") as file:
+        file["csi"] = h5py.ExternalLink(str(tmp_path / "secret" / "snapshots.h5"), "csi")
+    with pytest.raises(InputError, match="no array of numbers in this file"):
+        read_arrays(tmp_path / "links.h5", ["csi"])
+
+
+def test_hdf5_that_claims_much_is_refused_before_memory_is_taken(tmp_path):
+    import h5py
+
+    with h5py.File(tmp_path / "big.h5", "w") as file:
+        file.create_dataset("csi", shape=(2**20, 2**10), dtype="c16", chunks=(1, 1))
+    with pytest.raises(InputError, match="unpacks to"):
+        read_arrays(tmp_path / "big.h5", ["csi"])
+
+
+def test_label_is_that_of_the_pose(tmp_path):
+    data = load_spectra(write_snapshots(tmp_path / "a"), grid=GRID)
+    away = (data.position[0] - data.fixed_position) @ data.rotation
+    assert data.label[0, 1].item() == pytest.approx(abs(math.asin(float(away[2] / away.norm()))))
