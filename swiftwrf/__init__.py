@@ -9,6 +9,7 @@ spectrum = model.synthesize(test.position)
 Gaussian Splatting for Efficient Wireless Radiance Field Rendering", 2025.
 """
 
+from swiftwrf import comparison
 from swiftwrf.angles import AngularGrid, ArrayPose
 from swiftwrf.checkpoint import load
 from swiftwrf.coarray import CoarrayModel, fit_coarray, project
@@ -35,6 +36,7 @@ __all__ = [
     "RssiModel",
     "Spectra",
     "SwiftWRF",
+    "comparison",
     "fit",
     "fit_coarray",
     "fit_geometry",

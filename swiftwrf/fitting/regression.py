@@ -66,7 +66,7 @@ class Regression:
     def held_out_loss(self, n: int) -> float:
         """Of n primitives, on spectra that the regression has not seen."""
         drawn, _ = self._held_out(self.small, self._kernel(n, self.small.grid))
-        return float(spectrum_loss(drawn, self.small.spectrum, self.config))
+        return float(spectrum_loss(drawn, self.small.spectrum, self.config.ssim_weight, self.config.pixel_loss))
 
     @single_thread()
     def model(self, n: int) -> SwiftWRF:
