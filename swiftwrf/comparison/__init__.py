@@ -1,6 +1,25 @@
 """Methods that SwiftWRF is compared with, written anew from what is published about them."""
 
 from swiftwrf.comparison.base import Config, Drawing, fit
+from swiftwrf.comparison.dcgan import Dcgan, DcganConfig, DcganSize
 from swiftwrf.comparison.nerf2 import NeRF2, NeRF2Config, NeRF2Size
+from swiftwrf.comparison.vae import Vae, VaeConfig, VaeSize
+from swiftwrf.comparison.wrfgs import WrfGs, WrfGsConfig, WrfGsSize
 
-__all__ = ["Config", "Drawing", "NeRF2", "NeRF2Config", "NeRF2Size", "fit"]
+__all__ = [
+    "Config",
+    "Dcgan",
+    "DcganConfig",
+    "DcganSize",
+    "Drawing",
+    "NeRF2",
+    "NeRF2Config",
+    "NeRF2Size",
+    "Vae",
+    "VaeConfig",
+    "VaeSize",
+    "WrfGs",
+    "WrfGsConfig",
+    "WrfGsSize",
+    "fit",
+]

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Self, TypeVar
+from typing import Any, ClassVar, Generic, Self, TypeVar, get_args
 
 import numpy as np
 import torch
@@ -63,7 +63,7 @@ class Config(ABC, Generic[AnySize, Model]):
     final_rate: float = 0.02
     """share of the rates that is left when they have decayed"""
     decay_steps: int | None = None
-    """steps in which they decay; all steps unless given"""
+    """steps in which they decay, along a cosine that goes on afterwards; all steps unless given"""
     averaging: float = 0.98
     """by how much a step's weight in the averaged parameters decays a step; 0 keeps the last ones"""
     clip: float = 1.0
@@ -287,6 +287,29 @@ class Link(nn.Module):
     def to_world(self, direction: Tensor) -> Tensor:
         """Directions in array coordinates (..., 3) in those of the world, float32."""
         return (direction.to(self.rotation) @ self.rotation.T).float()
+
+
+class LinkDrawing(Drawing):
+    """One that knows where both ends stand.
+
+    Args:
+        size, grid: see `Drawing`.
+        moving: which end moves.
+    """
+
+    def __init__(self, size: Any, grid: AngularGrid, moving: Moving) -> None:
+        super().__init__(size, grid)
+        self.link = Link(moving)
+
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        tensors, header = super().state()
+        return tensors, header | {"moving": self.link.moving}
+
+    @classmethod
+    def arguments(cls, header: Header) -> dict[str, Any]:
+        if header["moving"] not in get_args(Moving):
+            raise InputError(f"moving must be one of {', '.join(get_args(Moving))}, got {header['moving']!r}")
+        return super().arguments(header) | {"moving": header["moving"]}
 
 
 def draw_parameters(model: nn.Module, generator: torch.Generator) -> None:

@@ -24,11 +24,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from swiftwrf.angles import AngularGrid
-from swiftwrf.checkpoint import Header
-from swiftwrf.comparison.base import Config, Drawing, Link, Size, Training, chunks, draw_parameters
+from swiftwrf.comparison.base import Config, Link, LinkDrawing, Size, Training, chunks, draw_parameters
+from swiftwrf.comparison.layers import Layers
 from swiftwrf.comparison.volume import Medium, integrate
 from swiftwrf.data.spectra import Moving, Spectra
-from swiftwrf.errors import InputError
 from swiftwrf.model.encoding import encode
 
 SAMPLES_AT_ONCE = 2**19  # samples of the field evaluated at a time, which bounds the memory
@@ -94,16 +93,11 @@ class Field(nn.Module):
     """Eight layers say how a point absorbs and turns the phase; three more, from what they know of the point, the direction
     and the transmitter, what it emits. Amplitudes are |leaky_relu|, phases 2 pi sigmoid."""
 
-    AGAIN = 5  # the layer that is given the position again
-
     def __init__(self, size: NeRF2Size) -> None:
         super().__init__()
         self.bands = size.bands
         inputs, width = 3 * (2 * size.bands + 1), size.width
-        self.layers = nn.ModuleList(
-            nn.Linear(inputs if i == 0 else width + (inputs if i == self.AGAIN else 0), width)
-            for i in range(size.depth)
-        )
+        self.layers = Layers(inputs, width, size.depth)
         self.attenuation = nn.Linear(width, 2)
         self.feature = nn.Linear(width, width)
         self.mixing = nn.Linear(width + 2 * inputs, width)
@@ -116,9 +110,7 @@ class Field(nn.Module):
         computed more often than it differs.
         """
         x = encode(point, self.bands, lowest=1.0)
-        h = x
-        for i, layer in enumerate(self.layers):
-            h = torch.relu(layer(torch.cat([h, x], dim=-1) if i == self.AGAIN else h))
+        h = self.layers(x)
         absorption, turning = _polar(self.attenuation(h))
         sizes = [h.shape[-1], x.shape[-1], x.shape[-1]]
         of_feature, of_direction, of_transmitter = self.mixing.weight.split(sizes, dim=1)
@@ -133,20 +125,19 @@ def _polar(raw: Tensor) -> tuple[Tensor, Tensor]:
     return functional.leaky_relu(raw[..., 0]).abs(), 2 * math.pi * torch.sigmoid(raw[..., 1])
 
 
-class NeRF2(Drawing):
+class NeRF2(LinkDrawing):
     """Magnitude of the sum along a ray from the receiver, in each direction.
 
     Args:
-        size, grid: see `Drawing`.
-        moving: which end moves.
+        size, grid, moving: see `LinkDrawing`.
     """
 
     kind: ClassVar[str] = "nerf2 model"
     size_type = NeRF2Size
 
     def __init__(self, size: NeRF2Size, grid: AngularGrid, moving: Moving) -> None:
-        super().__init__(size, grid)
-        self.link, self.field = Link(moving), Field(size)
+        super().__init__(size, grid, moving)
+        self.field = Field(size)
 
     @classmethod
     def make(cls, size: NeRF2Size, train: Spectra, generator: torch.Generator) -> NeRF2:
@@ -159,16 +150,6 @@ class NeRF2(Drawing):
         model.link = Link.of(train)
         draw_parameters(model, generator)
         return model
-
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        tensors, header = super().state()
-        return tensors, header | {"moving": self.link.moving}
-
-    @classmethod
-    def arguments(cls, header: Header) -> dict[str, Any]:
-        if header["moving"] not in ("transmitter", "receiver"):
-            raise InputError(f"moving must be transmitter or receiver, got {header['moving']!r}")
-        return super().arguments(header) | {"moving": header["moving"]}
 
     def forward(self, transmitter: Tensor, receiver: Tensor, direction: Tensor) -> Tensor:
         """Magnitudes (P, D) at P places of the moving end.

@@ -56,10 +56,14 @@ class Descent(ABC, Generic[Model]):
     def __init__(self, name: str, model: Model, groups: Iterable[dict[str, Any]], schedule: Schedule) -> None:
         self.name, self.model, self.schedule = name, model, schedule
         self.optimiser = torch.optim.Adam(groups, betas=schedule.betas, weight_decay=schedule.weight_decay)
-        self.average = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(schedule.averaging))
+        self.average = self.averaged()
         self.step, self.seconds, self.first_loss = 0, 0.0, math.inf
         device = next(model.parameters()).device
         self.broken_at = torch.tensor(schedule.steps, device=device)  # the first step whose loss was not finite
+
+    def averaged(self) -> AveragedModel:
+        """The running average, which begins with the parameters as they are."""
+        return AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(self.schedule.averaging))
 
     @property
     def label(self) -> str:

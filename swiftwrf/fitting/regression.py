@@ -16,11 +16,10 @@ import torch
 from torch import Tensor
 
 from swiftwrf.angles import AngularGrid
-from swiftwrf.data.spectra import Spectra, coarsening
+from swiftwrf.data.spectra import Spectra
 from swiftwrf.fitting.config import FitConfig
 from swiftwrf.fitting.loss import spectrum_loss
 from swiftwrf.gp import Kernel, SmoothField, held_out, thinned
-from swiftwrf.metrics import WINDOW
 from swiftwrf.model import ModelConfig, SwiftWRF
 from swiftwrf.model.deformation import COMPONENTS, Deformation
 from swiftwrf.model.deformation.motion_basis import MotionBasis
@@ -59,7 +58,7 @@ class Regression:
         (rows,) = thinned(torch.arange(len(train)), rows=MAX_ROWS)
         self.train, self.fold = train, fold[rows]
         self.some = train.subset(rows)
-        self.small = self.some.coarsen(coarsening(train.grid.shape, SHAPE_AZIMUTHS, least_rows=WINDOW))
+        self.small = self.some.at_most(SHAPE_AZIMUTHS)
         self.primitives: dict[int, Primitives] = {}
 
     @single_thread()
