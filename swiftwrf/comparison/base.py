@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Self, TypeVar, get_args
+from typing import Any, ClassVar, Generic, TypeVar, get_args
 
 import numpy as np
 import torch
@@ -74,7 +74,7 @@ class Config(ABC, Generic[AnySize, Model]):
 
     @classmethod
     @abstractmethod
-    def paper(cls, **changes: Any) -> Self:
+    def paper(cls, **changes: Any) -> Config[AnySize, Model]:
         """The size and the training of the publication."""
 
     @abstractmethod
@@ -192,7 +192,7 @@ class Drawing(nn.Module, Saved):
         return {"size": size, "grid": AngularGrid(**header["grid"])}
 
     @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Drawing:
         arguments = cls.arguments(header)
         with torch.device("meta"):  # takes no memory, whatever the header claims
             blank = cls(**arguments)

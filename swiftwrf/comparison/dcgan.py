@@ -4,12 +4,13 @@ A. Radford, L. Metz and S. Chintala, "Unsupervised Representation Learning with 
 Networks", 2016: its layers, batch normalisation and optimiser. How the papers of this field condition it on the position is
 not published; here the noise and the encoded position go through one more layer before the generator, the discriminator is
 given the encoded position, and the generator is also held to the measured spectrum by an L1 term, as is usual for paired
-data (P. Isola, J.-Y. Zhu, T. Zhou and A. A. Efros, "Image-to-Image Translation with Conditional Adversarial Networks", 2017).
+data (P. Isola, J.-Y. Zhu, T. Zhou and A. A. Efros, "Image-to-Image Translation with Conditional Adversarial Networks",
+2017).
 Generator and discriminator step at once, from torch's initial weights (from N(0, 0.02^2) the position is hardly heard).
 Without a generator of random numbers a spectrum is drawn from noise 0, its mean.
 
-The quick preset is sized for two cores; `DcganConfig.paper()` has the publication's 1,024 to 128 channels, 100 noise numbers,
-rate and batches of 128.
+The quick preset is sized for two cores; `DcganConfig.paper()` has the publication's 1,024 to 128 channels, 100 noise
+numbers, rate and batches of 128.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ class DcganConfig(Config[DcganSize, "Dcgan"]):
     size: DcganSize = DcganSize()
     steps: int = 1000
     batch: int = 8
-    rate: float = 2e-3
+    rate: float = 5e-3
     l1_weight: float = 100.0
     """of the mean absolute error beside the discriminator's verdict"""
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from swiftwrf.angles import to_angles
 from swiftwrf.model.primitives import WIDEST
 
-NEAREST = 1e-6  # of the distance: closer to the pole's axis, azimuth is as good as any
+NEAREST = 1e-6  # of the distance: closer to the axis, azimuth turns no faster
 
 
 def on_sphere(mean: Tensor, factor: Tensor, blur: Tensor) -> tuple[Tensor, Tensor]:
@@ -31,10 +31,12 @@ def on_sphere(mean: Tensor, factor: Tensor, blur: Tensor) -> tuple[Tensor, Tenso
             pixels, (2,).
     """
     x, y, z = mean.unbind(-1)
-    r = mean.norm(dim=-1)
-    rho = torch.maximum(torch.hypot(x, y), NEAREST * r)
-    turn = torch.stack([-y, x, torch.zeros_like(z)], dim=-1) / rho.square()[..., None]
-    rise = torch.stack([-x * z.abs(), -y * z.abs(), z.sign() * rho.square()], dim=-1) / (rho * r.square())[..., None]
+    r, flat = mean.norm(dim=-1), torch.hypot(x, y)
+    rho = torch.maximum(flat, NEAREST * r)
+    cosine = torch.where(flat > 0, x / rho, torch.ones_like(x))  # at the pole, any azimuth will do
+    sine, up = y / rho, torch.where(z < 0, -1.0, 1.0)
+    turn = torch.stack([-sine, cosine, torch.zeros_like(z)], dim=-1) / rho[..., None]
+    rise = torch.stack([-cosine * z.abs(), -sine * z.abs(), up * flat], dim=-1) / r.square()[..., None]
     image = torch.einsum("...nak,nkl->...nal", torch.stack([turn, rise], dim=-2), factor)
     variance = image.square().sum(dim=-1) + blur.square()
     shrink = torch.rsqrt(1 + variance / WIDEST**2)  # towards flat: wider would only overflow

@@ -241,7 +241,7 @@ class WrfGsTraining(Training[WrfGsConfig, WrfGs]):
             if self.step % GROW_EVERY == 0:
                 if self.step > GROW_FROM:
                     self._grow()
-                self.pull = torch.zeros(len(self.model.mean), device=self.pull.device)
+                self.pull.zero_()
             if self.step % RESET_EVERY == 0:
                 with torch.no_grad():
                     self.model.opacity.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
@@ -280,9 +280,10 @@ class WrfGsTraining(Training[WrfGsConfig, WrfGs]):
             group["params"] = [new]
             setattr(model, name, new)
         model.size = replace(model.size, n_gaussians=len(row))
+        self.pull = self.pull.new_zeros(len(row))
 
     def _restore(self, saved: State) -> None:
         n = len(saved.tensors["model.mean"])
         self._take(torch.zeros(n, dtype=torch.int64, device=self.pull.device), n_old=0)
-        self.average, self.pull = self.averaged(), self.pull.new_zeros(n)
+        self.average = self.averaged()
         super()._restore(saved)

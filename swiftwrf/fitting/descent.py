@@ -8,7 +8,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Generic, Self, TypeVar, cast
+from typing import Any, Generic, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -116,7 +116,7 @@ class Descent(ABC, Generic[Model]):
         """The model with averaged parameters."""
         return cast(Model, self.average.module)
 
-    def run(self, session: Session) -> Self:
+    def run(self, session: Session) -> None:
         """Takes all steps, from where the session's saved state stands if that is of this run; keeps the state at each
         evaluation.
 
@@ -143,7 +143,6 @@ class Descent(ABC, Generic[Model]):
                         f"with; {self._advice()}"
                     )
         session.bar.remove_task(task)
-        return self
 
     def record(self, loss: Tensor) -> Record:
         """What is told at an evaluation."""

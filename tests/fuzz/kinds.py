@@ -15,6 +15,7 @@ from unittest import mock
 import numpy as np
 import torch
 from PIL import Image
+from quick import PUBLISHED
 
 from swiftwrf import (
     AngularGrid,
@@ -23,6 +24,7 @@ from swiftwrf import (
     Rssi,
     RssiModel,
     Spectra,
+    comparison,
     fit,
     fit_coarray,
     fit_rssi,
@@ -92,6 +94,10 @@ def model_hybrid(folder: Path) -> None:
     fit_hybrid(_room(), fit_geometry(_room(), progress=False)).save(folder / "model")
 
 
+def model_published(name: str, folder: Path) -> None:
+    comparison.fit(_room(), PUBLISHED[name], progress=False).save(folder / "model")
+
+
 def model_rssi(folder: Path) -> None:
     fit_rssi(rssi_room(n=40).receivers(["1", "2"])).save(folder / "model")
 
@@ -142,5 +148,9 @@ KINDS: dict[str, tuple[Callable[[Path], None], Reader]] = {
     "geometry model": (model_geometry, read_model),
     "hybrid model": (model_hybrid, read_model),
     "rssi model": (model_rssi, read_model),
+    "nerf2 model": (functools.partial(model_published, "nerf2"), read_model),
+    "wrf-gs model": (functools.partial(model_published, "wrfgs"), read_model),
+    "vae model": (functools.partial(model_published, "vae"), read_model),
+    "dcgan model": (functools.partial(model_published, "dcgan"), read_model),
     "fit state": (state_of_a_fit, go_on),
 }
