@@ -19,6 +19,8 @@ from swiftwrf.comparison import (
     DcganConfig,
     DcganSize,
     NeRF2Config,
+    NeRF2RssiConfig,
+    NeRF2RssiSize,
     NeRF2Size,
     VaeConfig,
     VaeSize,
@@ -39,12 +41,14 @@ from tasks.run import command_line
 
 FIT = FitConfig(model=ModelConfig(n_primitives=4, rank=2), steps=30, check_every=5)
 SHORT = {"steps": 12, "check_every": 6, "batch": 8, "warm_up": 1}
+LONGER = {"steps": 60, "check_every": 30, "batch": 16, "rate": 1e-2}  # a batch of rays says little
 PUBLISHED: dict[str, Config] = {  # methods of comparison, as small as they can be
-    "nerf2": NeRF2Config(size=NeRF2Size(width=8, depth=6, bands=2, samples=6), rays=64, **SHORT),
+    "nerf2": NeRF2Config(size=NeRF2Size(width=8, depth=6, bands=2, samples=6), rays=64, **LONGER),
     "wrfgs": WrfGsConfig(size=WrfGsSize(n_gaussians=20, width=8, depth=6, bands=2), **SHORT),
     "vae": VaeConfig(size=VaeSize(latent=2, width=2, hidden=8, bands=2), **SHORT),
     "dcgan": DcganConfig(size=DcganSize(noise=2, width=2, hidden=8, bands=2), **SHORT),
 }
+PUBLISHED_RSSI = NeRF2RssiConfig(size=NeRF2RssiSize(width=8, bands=2, samples=4, azimuths=4, elevations=2), **LONGER)
 PREDICTORS_KEPT = ("swiftwrf", "mean", "mri_pooled", "mri_receiver")
 
 
@@ -66,6 +70,7 @@ def small_published() -> Iterator[None]:
         for name, config in PUBLISHED.items():
             made = staticmethod(lambda config=config: config)
             patches.enter_context(mock.patch.object(SYNTHESIZERS[name].make, "config", made))
+        patches.enter_context(mock.patch("tasks.rssi.predictors.NeRF2RssiConfig", return_value=PUBLISHED_RSSI))
         yield
 
 

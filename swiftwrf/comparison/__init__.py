@@ -3,6 +3,7 @@
 from swiftwrf.comparison.base import Config, Drawing, fit
 from swiftwrf.comparison.dcgan import Dcgan, DcganConfig, DcganSize
 from swiftwrf.comparison.nerf2 import NeRF2, NeRF2Config, NeRF2Size
+from swiftwrf.comparison.nerf2_rssi import NeRF2Rssi, NeRF2RssiConfig, NeRF2RssiSize, fit_rssi
 from swiftwrf.comparison.vae import Vae, VaeConfig, VaeSize
 from swiftwrf.comparison.wrfgs import WrfGs, WrfGsConfig, WrfGsSize
 
@@ -14,6 +15,9 @@ __all__ = [
     "Drawing",
     "NeRF2",
     "NeRF2Config",
+    "NeRF2Rssi",
+    "NeRF2RssiConfig",
+    "NeRF2RssiSize",
     "NeRF2Size",
     "Vae",
     "VaeConfig",
@@ -22,4 +26,5 @@ __all__ = [
     "WrfGsConfig",
     "WrfGsSize",
     "fit",
+    "fit_rssi",
 ]

@@ -167,6 +167,20 @@ def fit(
     return descend(config.training(train, torch.device(device)), owner, checkpoint, on_record, progress)
 
 
+def restored(make: Callable[[], Model], tensors: dict[str, Tensor]) -> Model:
+    """What `make` makes, with these tensors.
+
+    Raises:
+        InputError: tensors that are missing or of another shape; found before memory is taken for what is made.
+    """
+    with torch.device("meta"):  # takes no memory
+        blank = make()
+    expect(tensors, {name: tuple(tensor.shape) for name, tensor in blank.state_dict().items()})
+    model = make()
+    model.load_state_dict(tensors)
+    return model.eval()
+
+
 class Drawing(nn.Module, Saved):
     """A model that draws spectra.
 
@@ -194,12 +208,7 @@ class Drawing(nn.Module, Saved):
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Drawing:
         arguments = cls.arguments(header)
-        with torch.device("meta"):  # takes no memory, whatever the header claims
-            blank = cls(**arguments)
-        expect(tensors, {name: tuple(tensor.shape) for name, tensor in blank.state_dict().items()})
-        model = cls(**arguments)
-        model.load_state_dict(tensors)
-        return model.eval()
+        return restored(lambda: cls(**arguments), tensors)
 
     @torch.no_grad()
     def drawn(self, position: Tensor, grid: AngularGrid, batch: int, draw: Callable[[Tensor], Tensor]) -> Tensor:
