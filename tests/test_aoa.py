@@ -136,6 +136,7 @@ def test_whole_run(small, tmp_path):
     truth = np.degrees(small.label[own["index"].tolist()].numpy())
     np.testing.assert_allclose(own[["truth_azimuth_deg", "truth_elevation_deg"]], truth, rtol=1e-9)
 
+    assert list((out / "figures").glob("turbo-mix0.5*.svg"))
     html = (out / "report.html").read_text()
     assert "What this does not show" in html
     assert "<svg" in html
