@@ -28,9 +28,10 @@ from swiftwrf.comparison import (
     fit_rssi,
     wrfgs,
 )
-from swiftwrf.comparison.base import Training, draw_parameters
+from swiftwrf.comparison.base import Training
 from swiftwrf.comparison.convolution import Double, Halve, stages
 from swiftwrf.comparison.dcgan import Dcgan
+from swiftwrf.comparison.drawing import draw_parameters
 from swiftwrf.comparison.nerf2 import Field, received
 from swiftwrf.comparison.sphere import on_sphere
 from swiftwrf.comparison.vae import Normal

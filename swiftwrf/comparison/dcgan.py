@@ -25,8 +25,9 @@ from torch.func import functional_call
 from torch.nn import functional
 
 from swiftwrf.angles import AngularGrid
-from swiftwrf.comparison.base import Config, Drawing, Frame, Size, Training, draw_parameters
+from swiftwrf.comparison.base import Config, Size, Training
 from swiftwrf.comparison.convolution import decoder, encoder
+from swiftwrf.comparison.drawing import Drawing, Frame, draw_parameters
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.model.encoding import encode
 

@@ -24,7 +24,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from swiftwrf.angles import AngularGrid
-from swiftwrf.comparison.base import Config, Link, LinkDrawing, Size, Training, chunks, draw_parameters
+from swiftwrf.comparison.base import Config, Size, Training
+from swiftwrf.comparison.drawing import Link, LinkDrawing, chunks, draw_parameters
 from swiftwrf.comparison.layers import Layers
 from swiftwrf.comparison.volume import Medium, integrate
 from swiftwrf.data.spectra import Moving, Spectra

@@ -18,8 +18,9 @@ import torch
 from torch import Tensor, nn
 
 from swiftwrf.angles import AngularGrid
-from swiftwrf.comparison.base import Config, Drawing, Frame, Size, Training, draw_parameters
+from swiftwrf.comparison.base import Config, Size, Training
 from swiftwrf.comparison.convolution import decoder, encoder
+from swiftwrf.comparison.drawing import Drawing, Frame, draw_parameters
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.model.encoding import encode
 

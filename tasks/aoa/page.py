@@ -216,8 +216,8 @@ def _training(runs: list[AoaRecords]) -> Section:
         by_arm = history.groupby("method", sort=False) if "method" in history else ()
         networks = {str(name): (part["step"], part["loss"]) for name, part in by_arm}
         # fits by gradient; others have no steps
-        descents = history[(history["stage"] == "final") & (history["steps"] > 0)] if "steps" in history else ()
-        by_fit = descents.groupby("synthesizer", sort=False) if len(descents) else ()
+        descents = history[(history["stage"] == "final") & (history["steps"] > 0)] if "steps" in history else None
+        by_fit = () if descents is None else descents.groupby("synthesizer", sort=False)
         fitted = {str(name): (part["step"], part["loss"] / part["loss"].iloc[0]) for name, part in by_fit}
         figure, axes = figures.new_figure(1, 2, 9, 3)
         figures.curves(axes[0], arms.palette(), networks, "step", "loss of the network")
