@@ -41,12 +41,12 @@ from tasks.run import command_line
 
 FIT = FitConfig(model=ModelConfig(n_primitives=4, rank=2), steps=30, check_every=5)
 SHORT = {"steps": 12, "check_every": 6, "batch": 8, "warm_up": 1}
-LONGER = {"steps": 60, "check_every": 30, "batch": 16, "rate": 1e-2}  # a batch of rays says little
+LONGER = {"steps": 60, "check_every": 30, "batch": 16, "rate": 1e-2}  # a batch says little of so short a fit
 PUBLISHED: dict[str, Config] = {  # methods of comparison, as small as they can be
     "nerf2": NeRF2Config(size=NeRF2Size(width=8, depth=6, bands=2, samples=6), rays=64, **LONGER),
     "wrfgs": WrfGsConfig(size=WrfGsSize(n_gaussians=20, width=8, depth=6, bands=2), **SHORT),
-    "vae": VaeConfig(size=VaeSize(latent=2, width=2, hidden=8, bands=2), **SHORT),
-    "dcgan": DcganConfig(size=DcganSize(noise=2, width=2, hidden=8, bands=2), **SHORT),
+    "vae": VaeConfig(size=VaeSize(latent=2, width=2, hidden=8, bands=2), **LONGER),
+    "dcgan": DcganConfig(size=DcganSize(noise=2, width=2, hidden=8, bands=2), **LONGER),
 }
 PUBLISHED_RSSI = NeRF2RssiConfig(size=NeRF2RssiSize(width=8, bands=2, samples=4, azimuths=4, elevations=2), **LONGER)
 PREDICTORS_KEPT = ("swiftwrf", "mean", "mri_pooled", "mri_receiver")
