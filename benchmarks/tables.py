@@ -7,6 +7,7 @@ import re
 from typing import Any
 
 from committed import RESULTS, ROOT, aoa_runs, interval, load, markdown, rssi_runs, turbo_arm
+from comparison_tables import comparison, comparison_counts, comparison_turbo
 from geometry import WALLS
 from targets import aoa_targets, rssi_targets, synthesis_targets
 
@@ -232,11 +233,14 @@ TABLES = {
     "speed": speed,
     "drawing": drawing,
     "ablation": ablation,
+    "comparison": comparison,
+    "comparison_counts": comparison_counts,
+    "comparison_turbo": comparison_turbo,
     "synthesis_targets": synthesis_targets,
     "aoa_targets": aoa_targets,
     "rssi_targets": rssi_targets,
 }
-FILES = ("README.md", "docs/speed.md", "docs/stability.md", "docs/ablation.md", "docs/targets.md")
+FILES = ("README.md", "docs/speed.md", "docs/stability.md", "docs/ablation.md", "docs/comparison.md", "docs/targets.md")
 
 
 def rewrite(text: str) -> str:

@@ -9,6 +9,7 @@ spectrum = model.synthesize(test.position)
 Gaussian Splatting for Efficient Wireless Radiance Field Rendering", 2025.
 """
 
+from swiftwrf import comparison
 from swiftwrf.angles import AngularGrid, ArrayPose
 from swiftwrf.calibration import Calibration, calibrate
 from swiftwrf.checkpoint import load
@@ -39,6 +40,7 @@ __all__ = [
     "Spectra",
     "SwiftWRF",
     "calibrate",
+    "comparison",
     "fit",
     "fit_coarray",
     "fit_geometry",

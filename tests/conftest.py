@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import quick
 import torch
 
 from swiftwrf import AngularGrid, Spectra, simulated_room
@@ -38,6 +40,13 @@ def built_in_room() -> tuple[Spectra, Spectra]:
 def measured_data() -> Path:
     """The folder of the measured data sets."""
     return Path(os.environ["SWIFTWRF_DATA"])
+
+
+@pytest.fixture
+def small_published() -> Iterator[None]:
+    """The methods of comparison in their smallest size, for the time of a test."""
+    with quick.small_published():
+        yield
 
 
 @pytest.fixture

@@ -8,11 +8,25 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from unittest import mock
 
+from augment import SYNTHESIZERS
 from swiftwrf import AngularGrid, FitConfig, ModelConfig, RssiConfig, rssi_room, simulated_room
+from swiftwrf.comparison import (
+    Config,
+    DcganConfig,
+    DcganSize,
+    NeRF2Config,
+    NeRF2RssiConfig,
+    NeRF2RssiSize,
+    NeRF2Size,
+    VaeConfig,
+    VaeSize,
+    WrfGsConfig,
+    WrfGsSize,
+)
 from swiftwrf.errors import LONGEST
 from tasks.aoa import experiment as aoa
 from tasks.aoa.arms import NETWORK
@@ -30,6 +44,15 @@ from tasks.rssi.predictors import PREDICTORS
 from tasks.run import command_line
 
 FIT = FitConfig(model=ModelConfig(n_primitives=4, rank=2), steps=30, check_every=5)
+SHORT = {"steps": 12, "check_every": 6, "batch": 8, "warm_up": 1}
+LONGER = {"steps": 60, "check_every": 30, "batch": 16, "rate": 1e-2}  # a batch says little of so short a fit
+PUBLISHED: dict[str, Config] = {  # methods of comparison, as small as they can be
+    "nerf2": NeRF2Config(size=NeRF2Size(width=8, depth=6, bands=2, samples=6), rays=64, **LONGER),
+    "wrfgs": WrfGsConfig(size=WrfGsSize(n_gaussians=20, width=8, depth=6, bands=2), **SHORT),
+    "vae": VaeConfig(size=VaeSize(latent=2, width=2, hidden=8, bands=2), **LONGER),
+    "dcgan": DcganConfig(size=DcganSize(noise=2, width=2, hidden=8, bands=2), **LONGER),
+}
+PUBLISHED_RSSI = NeRF2RssiConfig(size=NeRF2RssiSize(width=8, bands=2, samples=4, azimuths=4, elevations=2), **LONGER)
 PREDICTORS_KEPT = ("swiftwrf", "mean", "mri_pooled", "mri_receiver")
 
 
@@ -45,12 +68,24 @@ class QuickNetwork(Constant):
 
 
 @contextmanager
+def small_published() -> Iterator[None]:
+    """The methods of comparison in their smallest size."""
+    with ExitStack() as patches:
+        for name, config in PUBLISHED.items():
+            made = staticmethod(lambda config=config: config)
+            patches.enter_context(mock.patch.object(SYNTHESIZERS[name].make, "config", made))
+        patches.enter_context(mock.patch("tasks.rssi.predictors.NeRF2RssiConfig", return_value=PUBLISHED_RSSI))
+        yield
+
+
+@contextmanager
 def quick() -> Iterator[None]:
     """Few spectra, few steps, few methods."""
     spectra = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
     floor = rssi_room(n=40)
     network = replace(ESTIMATORS[NETWORK], make=QuickNetwork)
     with (
+        small_published(),
         mock.patch.object(aoa, "simulated_room", return_value=spectra),
         mock.patch.object(rssi, "rssi_room", return_value=floor),
         mock.patch("augment.synthesizers.swiftwrf.FitConfig", return_value=FIT),

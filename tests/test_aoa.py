@@ -138,6 +138,7 @@ def test_whole_run(small, tmp_path):
     truth = np.degrees(small.label[own["index"].tolist()].numpy())
     np.testing.assert_allclose(own[["truth_azimuth_deg", "truth_elevation_deg"]], truth, rtol=1e-9)
 
+    assert list((out / "figures").glob("turbo-mix0.5*.svg"))
     suggested = pd.read_csv(out / "suggested-mix0.5.csv")
     assert suggested.columns.tolist() == ["x_m", "y_m", "z_m", "variance_left"]
     assert len(suggested) == 4

@@ -35,7 +35,7 @@ def moved(spectra, shift):
 
 
 @pytest.mark.parametrize("name", [name for name in SYNTHESIZERS if name != "swiftwrf"])
-def test_synthesizers_do_not_depend_on_the_origin(room, name):
+def test_synthesizers_do_not_depend_on_the_origin(room, small_published, name):
     """Map coordinates lie thousands of kilometres from theirs."""
     train, test = room.split("random")
     drawn = []
@@ -54,7 +54,7 @@ def test_swiftwrf_does_not_depend_on_the_origin(room):
 
 
 @pytest.mark.parametrize("name", [name for name in PREDICTORS if name != "swiftwrf"])
-def test_predictors_do_not_depend_on_the_origin(name):
+def test_predictors_do_not_depend_on_the_origin(small_published, name):
     data, predicted = rssi_room(n=40).receivers(["1", "2"]), []
     for shift in (0.0, 1e7):
         moved = replace(

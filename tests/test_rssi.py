@@ -13,8 +13,9 @@ from PIL import Image
 from samples import write_survey
 
 from swiftwrf import InputError, Rssi, fit_rssi, load, rssi_room
+from swiftwrf.comparison import NeRF2RssiConfig, NeRF2RssiSize
 from tasks.report import merge
-from tasks.rssi import experiment
+from tasks.rssi import experiment, predictors
 from tasks.rssi.predictors import PREDICTORS, Settings, lacks
 from tasks.run import command_line
 
@@ -66,6 +67,13 @@ def test_pooled_law_pools_over_all_receivers_of_the_data():
     )
 
 
+@pytest.fixture(autouse=True)
+def short_nerf2(monkeypatch):
+    """A field that is fitted in a second."""
+    size = NeRF2RssiSize(width=16, bands=2, samples=4, azimuths=4, elevations=2)
+    monkeypatch.setattr(predictors, "NeRF2RssiConfig", lambda: NeRF2RssiConfig(size=size, steps=300, rate=2e-2))
+
+
 @pytest.mark.parametrize("name", list(PREDICTORS))
 def test_predictors_ignore_what_was_not_heard(name):
     train, test = rssi_room(n=60).receivers(["1", "2"]).split("random")
@@ -95,7 +103,7 @@ def test_predictors_say_what_they_are():
     for entry in PREDICTORS.entries():
         assert entry.meaning
         assert entry.colour is not None
-    assert list(PREDICTORS) == ["swiftwrf", "mean", "mri_pooled", "mri_receiver", "mri_residual", "knn", "gp"]
+    assert list(PREDICTORS) == ["swiftwrf", "mean", "mri_pooled", "mri_receiver", "mri_residual", "knn", "gp", "nerf2"]
 
 
 def test_unknown_predictor():

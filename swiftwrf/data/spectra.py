@@ -17,6 +17,7 @@ from swiftwrf.angles import AngularGrid, to_angles
 from swiftwrf.arrays import PlanarArray
 from swiftwrf.data.splits import MIN_TRAINING, choose_split
 from swiftwrf.errors import InputError
+from swiftwrf.metrics import WINDOW
 
 Moving = Literal["transmitter", "receiver"]
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
@@ -111,6 +112,10 @@ class Spectra:
             raise InputError(f"spectra of {self.grid.shape} pixels cannot be averaged over {factor} x {factor} of them")
         small = functional.avg_pool2d(self.spectrum[:, None], factor)[:, 0]
         return replace(self, spectrum=small, grid=self.grid.coarsen(factor))
+
+    def at_most(self, azimuths: int) -> Spectra:
+        """The same spectra averaged down to at most so many columns, with rows enough for SSIM; 0 keeps all pixels."""
+        return self.coarsen(coarsening(self.grid.shape, azimuths, least_rows=WINDOW))
 
 
 def check_pixels(name: str, n: int, grid: AngularGrid) -> None:

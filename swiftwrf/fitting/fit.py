@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from swiftwrf.data.spectra import Spectra, check_training, coarsening, fingerprint
+from swiftwrf.data.spectra import Spectra, check_training, fingerprint
 from swiftwrf.data.splits import folds
 from swiftwrf.fitting.config import FitConfig
 from swiftwrf.fitting.optimise import Optimisation
@@ -17,7 +17,6 @@ from swiftwrf.fitting.regression import Regression
 from swiftwrf.fitting.search import doubling_search
 from swiftwrf.fitting.state import Record, Session, Size
 from swiftwrf.gp import choose_kernel
-from swiftwrf.metrics import WINDOW
 from swiftwrf.model import SwiftWRF
 from swiftwrf.model.deformation import deformation_type
 from swiftwrf.progress import progress_bar
@@ -59,7 +58,7 @@ def fit(
     check_training(train)
     config.check()
     fold = folds(train.position, config.validation, config.seed)
-    work = _at_most(config.max_azimuths, train)
+    work = train.at_most(config.max_azimuths)
     kernel = choose_kernel(work.position, work.spectrum, fold)
     if config.validation == "random":
         fold = torch.arange(len(train))  # regression leaves out one spectrum as easily as a fifth of them
@@ -70,7 +69,9 @@ def fit(
     with progress_bar(progress) as bar:
         session = Session(checkpoint, fingerprint(work, asdict(config)), bar, on_record)
         if config.steps:
-            model = Optimisation(config, work, kernel, device).run(session).result
+            optimisation = Optimisation(config, work, kernel, device)
+            optimisation.run(session)
+            model = optimisation.result
         else:
             model = _regress(Regression(work, config, kernel, fold), config, session).to(device)
     model.grid = train.grid
@@ -104,7 +105,3 @@ def _regress(regression: Regression, config: FitConfig, session: Session) -> Swi
     model = regression.model(n)
     record(size, began, regression.held_out_loss(n), None)
     return model
-
-
-def _at_most(azimuths: int, spectra: Spectra) -> Spectra:
-    return spectra.coarsen(coarsening(spectra.grid.shape, azimuths, least_rows=WINDOW))

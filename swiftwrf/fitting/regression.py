@@ -16,11 +16,10 @@ import torch
 from torch import Tensor
 
 from swiftwrf.angles import AngularGrid
-from swiftwrf.data.spectra import Spectra, coarsening
+from swiftwrf.data.spectra import Spectra
 from swiftwrf.fitting.config import FitConfig
 from swiftwrf.fitting.loss import spectrum_loss
 from swiftwrf.gp import Kernel, SmoothField, held_out, thinned
-from swiftwrf.metrics import WINDOW
 from swiftwrf.model import ModelConfig, SwiftWRF
 from swiftwrf.model.deformation import COMPONENTS, Deformation
 from swiftwrf.model.deformation.motion_basis import MotionBasis
@@ -59,14 +58,14 @@ class Regression:
         (rows,) = thinned(torch.arange(len(train)), rows=MAX_ROWS)
         self.train, self.fold = train, fold[rows]
         self.some = train.subset(rows)
-        self.small = self.some.coarsen(coarsening(train.grid.shape, SHAPE_AZIMUTHS, least_rows=WINDOW))
+        self.small = self.some.at_most(SHAPE_AZIMUTHS)
         self.primitives: dict[int, Primitives] = {}
 
     @single_thread()
     def held_out_loss(self, n: int) -> float:
         """Of n primitives, on spectra that the regression has not seen."""
         drawn, _ = self._held_out(self.small, self._kernel(n, self.small.grid))
-        return float(spectrum_loss(drawn, self.small.spectrum, self.config))
+        return float(spectrum_loss(drawn, self.small.spectrum, self.config.ssim_weight, self.config.pixel_loss))
 
     @single_thread()
     def model(self, n: int) -> SwiftWRF:

@@ -280,6 +280,6 @@ def frame(position: Tensor) -> tuple[Tensor, Tensor]:
     return (low + high) / 2, half if half > 0 else torch.ones_like(half)
 
 
-def normalise(position: Tensor, centre: Tensor, scale: Tensor) -> Tensor:
+def normalise(position: Tensor, centre: Tensor, scale: Tensor | float) -> Tensor:
     """Positions (n, 3) [m] in a frame, float32."""
     return ((position.double() - centre) / scale).clamp(-FARTHEST, FARTHEST).float()

@@ -6,11 +6,11 @@ import hashlib
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from swiftwrf import checkpoint as files
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import InputError
-from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.solve import Fitted
 
 KIND = "rssi fit state"
@@ -49,8 +49,8 @@ class State:
         files.write(self._path, KIND, tensors, {"fingerprint": self._owner, "groups": list(self.fitted)})
 
 
-def fingerprint(config: RssiConfig, train: Rssi, pool: Rssi) -> str:
-    """Says whether a saved state belongs to this configuration and these measurements."""
+def fingerprint(config: Any, train: Rssi, pool: Rssi) -> str:
+    """Says whether a saved state belongs to this configuration (a dataclass) and these measurements."""
     digest = hashlib.sha256(json.dumps([asdict(config), train.receiver_names]).encode())
     for tensor in (train.transmitter_position, train.receiver_position, train.rssi_dbm, pool.rssi_dbm):
         digest.update(tensor.contiguous().numpy().tobytes())

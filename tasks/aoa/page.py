@@ -82,7 +82,7 @@ def _results(share: Share, several: bool) -> Section:
     table = Table(columns, rows, "Median error with its 95 % interval over the test spectra.", strong)
     parts = [[name, *(str(n) for n in counts.values())] for name, counts in share.mix["counts"].items()]
     origin = Table(["training set", "measured", "withheld positions", "further positions"], parts, "Spectra by origin.")
-    return Section(title, paragraphs, [table, origin], [_cdf(share)])
+    return Section(title, paragraphs, [table, origin], [_cdf(share), *_turbo_cdf(share)])
 
 
 def _with_interval(summary: ErrorSummary) -> str:
@@ -103,6 +103,24 @@ def _cdf(share: Share) -> Plot:
     figures.legend_below(figure, axes[0])
     caption = "Distribution of the errors; full lines are networks, dashed ones baselines."
     return Plot(f"cdf-{share.file_name}", figure, caption)
+
+
+def _turbo_cdf(share: Share) -> list[Plot]:
+    """The paper's figure: the network between its bounds, one curve a synthesizer, where there are several."""
+    turbo = [name for name in share.mix["methods"] if name in map(arms.turbo, SYNTHESIZERS)]
+    if len(turbo) < 2:
+        return []
+    table = share.run.table("errors")
+    own = table[table["mix"] == float(share.key)]
+    figure, axes = figures.new_figure(1, 2, 8, 3.3)
+    for ax, (column, name) in zip(axes, ERRORS.items(), strict=False):  # azimuth and elevation
+        groups = {arm: own[own["method"] == arm][column] for arm in (arms.LOWER.name, *turbo, arms.UPPER.name)}
+        limit = max(*(float(part.quantile(0.95)) for part in groups.values()), 1e-3)
+        figures.cdf(ax, arms.palette(), groups, f"{name} error [deg]", limit=limit)
+    axes[1].set_ylabel("")
+    figures.legend_below(figure, axes[0])
+    caption = "The network with spectra of each synthesizer at the withheld positions, between its bounds."
+    return [Plot(f"turbo-{share.file_name}", figure, caption)]
 
 
 def _over_shares(shares: list[Share]) -> Section:
@@ -142,7 +160,18 @@ def _synthesis(shares: list[Share], several: bool) -> Section:
     )
     table = Table(["share and synthesizer", "SSIM", "PSNR [dB]", "L1"], rows, caption)
     names = dict.fromkeys(name for share in shares for name in share.mix["synthesis"])
-    return Section("How good are the synthetic spectra?", [arms.synthesizers(names)], [table])
+    plots = [_ssim_cdf(share) for share in shares]
+    return Section("How good are the synthetic spectra?", [arms.synthesizers(names)], [table], plots)
+
+
+def _ssim_cdf(share: Share) -> Plot:
+    table = share.run.table("synthesis")
+    own = table[(table["mix"] == float(share.key)) & table["synthesizer"].isin(list(SYNTHESIZERS))]
+    groups = {str(name): part["ssim"] for name, part in own.groupby("synthesizer", sort=False)}
+    figure, axes = figures.new_figure(1, 1, 6, 3.3)
+    figures.cdf(axes[0], arms.palette(), groups, "SSIM", limit=1)
+    figures.legend_below(figure, axes[0])
+    return Plot(f"ssim-{share.file_name}", figure, f"Distribution of the SSIM over the test spectra, {share.title}.")
 
 
 def _examples(share: Share) -> Section:
@@ -192,12 +221,15 @@ def _training(runs: list[AoaRecords]) -> Section:
         history = first_history(run)
         by_arm = history.groupby("method", sort=False) if "method" in history else ()
         networks = {str(name): (part["step"], part["loss"]) for name, part in by_arm}
-        _, final = fits(run)
-        optimised = final[final["steps"] > 0]
-        lines = networks | ({"swiftwrf": (optimised["step"], optimised["loss"])} if len(optimised) else {})
-        figure, axes = figures.new_figure(1, 1, 8, 3)
-        figures.curves(axes[0], arms.palette(), lines, "step", "loss")
-        caption = f"{scene(run)}, first share and repeat: the networks, and SwiftWRF where it is fitted by gradient."
+        # fits by gradient; others have no steps
+        descents = history[(history["stage"] == "final") & (history["steps"] > 0)] if "steps" in history else None
+        by_fit = () if descents is None else descents.groupby("synthesizer", sort=False)
+        fitted = {str(name): (part["step"], part["loss"] / part["loss"].iloc[0]) for name, part in by_fit}
+        figure, axes = figures.new_figure(1, 2, 9, 3)
+        figures.curves(axes[0], arms.palette(), networks, "step", "loss of the network")
+        figures.curves(axes[1], arms.palette(), fitted, "step", "loss of the synthesizer, over its first")
+        axes[1].set_visible(bool(fitted))
+        caption = f"{scene(run)}, first share and repeat: the networks, and synthesizers that are fitted by gradient."
         plots.append(Plot(f"training-{Share.of(run)[0].file_name}", figure, caption))
     return Section("Training", plots=plots)
 

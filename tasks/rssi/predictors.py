@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -16,7 +16,8 @@ from sklearn.model_selection import GridSearchCV, PredefinedSplit
 from sklearn.neighbors import KNeighborsRegressor
 from torch import Tensor
 
-from swiftwrf import InputError, Rssi, RssiConfig, RssiModel, fit_rssi
+from swiftwrf import InputError, Rssi, RssiConfig, RssiModel, comparison, fit_rssi
+from swiftwrf.comparison import NeRF2RssiConfig
 from swiftwrf.data.splits import MIN_TRAINING, Validation, folds
 from swiftwrf.registry import Registry
 from swiftwrf.rssi import Map, fit_law, log_distance
@@ -42,8 +43,8 @@ class Settings:
     Args:
         validation: how training rows are held out to choose its settings.
         seed: of what is random.
-        preset: of SwiftWRF: `quick`, or `paper` for the plain head.
-        device: where SwiftWRF computes.
+        preset: of SwiftWRF and NeRF2: `quick`, or `paper` for the plain head and the published field.
+        device: where these compute.
         parallel: how SwiftWRF's groups of receivers are mapped.
         pool: the training rows at every receiver of the data; those asked for unless given.
     """
@@ -207,6 +208,21 @@ class SwiftWRFPredictor:
         return self.model.predict(position)[0]
 
 
+class NeRF2Predictor:
+    """A neural field that all receivers share."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+
+    def fit(self, train: Rssi) -> None:
+        given = self._settings
+        config = NeRF2RssiConfig.paper() if given.preset == "paper" else NeRF2RssiConfig()
+        self._model = comparison.fit_rssi(train, replace(config, seed=given.seed), device=given.device)
+
+    def predict(self, position: Tensor) -> Tensor:
+        return self._model.predict(position)
+
+
 @PREDICTORS.register(
     "swiftwrf",
     meaning="50 primitives a receiver on a 16 x 16 grid, averaged, on a log-distance law; "
@@ -264,3 +280,13 @@ def _knn(settings: Settings) -> Predictor:
 )
 def _gp(settings: Settings) -> Predictor:
     return GaussianProcess(settings)
+
+
+@PREDICTORS.register(
+    "nerf2",
+    meaning="a neural field for all receivers, its rays averaged (NeRF2)",
+    needs=(RECEIVERS,),
+    colour="#44aa99",
+)
+def _nerf2(settings: Settings) -> Predictor:
+    return NeRF2Predictor(settings)

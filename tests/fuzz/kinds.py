@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 import torch
 from PIL import Image
+from quick import PUBLISHED, PUBLISHED_RSSI
 from samples import snapshots as made_snapshots
 from samples import survey_rows, write_deepmimo, write_dichasus, write_espargos, write_snapshots, write_survey
 
@@ -26,6 +27,7 @@ from swiftwrf import (
     Rssi,
     RssiModel,
     Spectra,
+    comparison,
     fit,
     fit_coarray,
     fit_rssi,
@@ -119,6 +121,15 @@ def model_hybrid(folder: Path) -> None:
     fit_hybrid(_room(), fit_geometry(_room(), progress=False)).save(folder / "model")
 
 
+def model_published(name: str, folder: Path) -> None:
+    comparison.fit(_room(), PUBLISHED[name], progress=False).save(folder / "model")
+
+
+def model_nerf2_rssi(folder: Path) -> None:
+    train = rssi_room(n=40).receivers(["1", "2"])
+    comparison.fit_rssi(train, PUBLISHED_RSSI, progress=False).save(folder / "model")
+
+
 def model_rssi(folder: Path) -> None:
     fit_rssi(rssi_room(n=40).receivers(["1", "2"])).save(folder / "model")
 
@@ -156,7 +167,8 @@ def read_rssi(folder: Path) -> Rssi:
 
 def read_model(folder: Path) -> object:
     model, position = load(folder / "model"), torch.tensor([[3.0, 2.5, 1.2]])
-    drawn = torch.cat(model.predict(position)) if isinstance(model, RssiModel) else model.synthesize(position)
+    drawn = model.synthesize(position) if hasattr(model, "synthesize") else model.predict(position)
+    drawn = torch.cat(drawn) if isinstance(model, RssiModel) else drawn
     assert drawn.isfinite().all()
     return drawn
 
@@ -189,5 +201,10 @@ KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "geometry model": (model_geometry, read_model),
     "hybrid model": (model_hybrid, read_model),
     "rssi model": (model_rssi, read_model),
+    "nerf2 model": (functools.partial(model_published, "nerf2"), read_model),
+    "wrf-gs model": (functools.partial(model_published, "wrfgs"), read_model),
+    "nerf2 rssi model": (model_nerf2_rssi, read_model),
+    "vae model": (functools.partial(model_published, "vae"), read_model),
+    "dcgan model": (functools.partial(model_published, "dcgan"), read_model),
     "fit state": (state_of_a_fit, go_on),
 }

@@ -11,15 +11,10 @@ from torch import Tensor, nn
 
 from swiftwrf.checkpoint import Header
 from swiftwrf.model.deformation.base import COMPONENTS, DEFORMATIONS, Deformation, Offsets, Setting
+from swiftwrf.model.encoding import encode
 
 MEAN_BANDS, POSITION_BANDS = 10, 6  # frequency bands of the paper's encodings
 WIDTH, DEPTH = 156, 8  # of the paper's network
-
-
-def encode(x: Tensor, bands: int) -> Tensor:
-    """[x, sin(2^k pi x), cos(2^k pi x)], k = 0 .. bands - 1 (paper): (..., d) to (..., d (2 bands + 1))."""
-    angle = x[..., None, :] * (math.pi * 2.0 ** torch.arange(bands, dtype=x.dtype, device=x.device))[:, None]
-    return torch.cat([x, torch.sin(angle).flatten(-2), torch.cos(angle).flatten(-2)], dim=-1)
 
 
 @DEFORMATIONS.register("per_primitive_mlp", meaning="the paper's network, evaluated for each primitive and position")

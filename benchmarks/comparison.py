@@ -1,0 +1,227 @@
+"""The paper's comparison on public data: every method on every scene, SSIM against the number of training spectra, and turbo
+learning with the spectra of several methods.
+
+Hours of work that can be stopped at any time: each row is kept in the folder `--work` once it is measured, unfinished fits
+and runs go on from their state, and the result holds all rows that are there.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import tyro
+from committed import ROOT
+from record import write_result
+from synthesis import load
+from torch import Tensor, nn
+
+from augment import SYNTHESIZERS, Settings, Synthesizer, lacks, make_synthesizer
+from augment.synthesizers.published import Published
+from swiftwrf import Spectra, simulated_room
+from swiftwrf.data.splits import validation_for
+from swiftwrf.durable import write_text
+from swiftwrf.metrics import l1, psnr, ssim, summary
+from tasks.aoa.config import AoaConfig
+from tasks.aoa.experiment import run
+from tasks.page import figures
+from tasks.page.palette import Palette
+
+MEASURED = (("s23-200", "random"), ("s23-200", "block"), ("newrf-bedroom", "random"), ("newrf-office", "random"))
+MEAN = "mean"  # the mean training spectrum
+BASELINES = (MEAN, "nearest", "gp", "coarray")
+LEARNT = ("swiftwrf", "nerf2", "wrfgs", "vae", "dcgan")
+COUNTS = (20, 40, 80)  # training spectra of s23-200 random; all of them are in the table of scenes
+SHARES = (0.1, 0.3, 0.5, 0.7)
+TURBO = ("swiftwrf", "nerf2", "wrfgs")
+QUICKER = 5  # by how much --quick shortens fits by gradient
+BATCH, REPEATS = 8, 3  # spectra a call, and calls, of which a rate is the median
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Config:
+    data: Path
+    """the folder that holds s23-200, newrf-bedroom and newrf-office"""
+    scenes: tuple[Path, ...] = ()
+    """folders of further scenes, ray-traced rooms say, split at random"""
+    only: tuple[str, ...] = ()
+    """of the scenes, those whose name begins so; all unless given"""
+    parts: tuple[Literal["scenes", "counts", "turbo"], ...] = ("scenes", "counts", "turbo")
+    """all methods on all scenes; with fewer training spectra; networks trained with their spectra"""
+    quick: bool = False
+    """under ten minutes: s23-200 at random and the simulated room, fits by gradient a fifth as long, one number of training
+    spectra, no networks"""
+    work: Path = Path("runs/comparison")
+    """folder of what is measured so far"""
+
+
+def main(config: Config) -> None:
+    """Measures what is not there yet and writes `results/comparison.json` (`comparison_quick.json`) and the figures."""
+    rows = config.work / ("quick" if config.quick else "rows")
+    rows.mkdir(parents=True, exist_ok=True)
+    for scene, data, split in scenes(config):
+        if config.only and not scene.startswith(config.only):
+            continue
+        train, test = data.split(split)
+        for n in numbers(scene, len(train), config):
+            some = train.subset(torch.randperm(len(train), generator=torch.Generator().manual_seed(0))[:n])
+            for method in (*BASELINES, *LEARNT):
+                if method == MEAN or not lacks(method, data):
+                    kept(rows / f"{scene} {n} {method}", partial(row, method, some, test, split, config.quick))
+    if "turbo" in config.parts and not config.quick:
+        train_networks(config)
+    result = {"scenes": gathered(rows), "turbo": None if config.quick else turbo(config.work)}
+    write_result("comparison_quick" if config.quick else "comparison", result)
+    if not config.quick:
+        draw(result["scenes"])
+
+
+def scenes(config: Config) -> Iterator[tuple[str, Spectra, str]]:
+    """Name, spectra and split of each scene."""
+    measured = MEASURED[:1] if config.quick else MEASURED
+    yield from ((f"{name} {split}", load(config.data / name), split) for name, split in measured)
+    yield "simulated-room random", simulated_room(), "random"
+    if not config.quick:
+        yield "simulated-room receiver random", simulated_room(moving="receiver"), "random"
+    yield from ((f"{folder.name} random", load(folder), "random") for folder in config.scenes)
+
+
+def numbers(scene: str, everything: int, config: Config) -> list[int]:
+    """Of training spectra to learn from."""
+    found = [everything] if "scenes" in config.parts else []
+    if scene == "s23-200 random" and "counts" in config.parts:
+        found += COUNTS[1:2] if config.quick else COUNTS
+    return found
+
+
+def kept(file: Path, measure: Callable[[Path], Row]) -> None:
+    """Measures a row unless it is there; `measure` is given a place for the state of its fit."""
+    done, state = Path(f"{file}.json"), Path(f"{file}.state")
+    if not done.exists():
+        found = measure(state)
+        print(file.name, f"{found['psnr_db']['median']:.2f} dB, {found['fit_seconds']:.0f} s", flush=True)
+        write_text(done, json.dumps(found))
+        state.unlink(missing_ok=True)
+
+
+def gathered(rows: Path) -> dict[str, dict[str, dict[str, Row]]]:
+    """All rows that are there, by scene, number of training spectra and method."""
+    found: dict[str, dict[str, dict[str, Row]]] = {}
+    order = [*BASELINES, *LEARNT]
+    files = [(*file.stem.rsplit(" ", 2), file) for file in rows.glob("*.json")]
+    for scene, n, method, file in sorted(files, key=lambda f: (f[0], -int(f[1]), order.index(f[2]))):
+        found.setdefault(scene, {}).setdefault(n, {})[method] = json.loads(file.read_text())
+    return found
+
+
+def row(method: str, train: Spectra, test: Spectra, split: str, quick: bool, state: Path) -> Row:
+    """Scores of a method at the test positions, the seconds of its fit and of a spectrum, and its size."""
+    began, earlier = time.perf_counter(), 0.0
+
+    def told(record: Row) -> None:
+        """A fit that goes on begins with the records of its earlier sessions."""
+        nonlocal earlier
+        earlier = max(earlier, record.get("elapsed", 0.0) - (time.perf_counter() - began))
+
+    if method == MEAN:
+        mean = train.spectrum.mean(dim=0)
+        size = {"parameters": mean.numel(), "megabytes": 4e-6 * mean.numel()}
+
+        def synthesize(position: Tensor) -> Tensor:
+            return mean.repeat(len(position), 1, 1)
+    else:
+        settings = Settings(validation=validation_for(split), checkpoint=state, on_record=told)
+        synthesizer = make_synthesizer(method, settings)
+        if quick and isinstance(synthesizer, Published):
+            full = synthesizer.config()
+            synthesizer.config = lambda: replace(full, steps=full.steps // QUICKER)
+        synthesizer.fit(train)
+        synthesize, size = synthesizer.synthesize, weight(synthesizer, train, state.with_suffix(".model"))
+    fit_seconds = time.perf_counter() - began + earlier
+    drawn = synthesize(test.position)
+    scores = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
+    found: Row = {name: summary(score(drawn, test.spectrum)) for name, score in scores.items()}
+    return (
+        found | {"fit_seconds": fit_seconds, "ms": milliseconds(synthesize, test.position), "n_test": len(test)} | size
+    )
+
+
+def weight(synthesizer: Synthesizer, train: Spectra, file: Path) -> Row:
+    """Numbers that were fitted and megabytes on disk; those that keep all training spectra weigh as much as these."""
+    model = synthesizer.model
+    if model is None:
+        return {"parameters": train.spectrum.numel(), "megabytes": 4e-6 * train.spectrum.numel()}
+    model.save(file)
+    megabytes = file.stat().st_size / 1e6
+    file.unlink()
+    fitted = model.parameters() if isinstance(model, nn.Module) else model.state()[0].values()
+    return {"parameters": sum(t.numel() for t in fitted), "megabytes": megabytes}
+
+
+def milliseconds(synthesize: Callable[[Tensor], Tensor], position: Tensor) -> dict[str, float]:
+    """A spectrum, from position to magnitudes: median, least and most of the repeats."""
+    position = position.repeat(-(-BATCH // len(position)), 1)[:BATCH]
+    taken = []
+    for _ in range(1 + REPEATS):  # the first one warms up
+        began = time.perf_counter()
+        synthesize(position)
+        taken.append(1e3 * (time.perf_counter() - began) / BATCH)
+    low, median, high = sorted(taken[1:])
+    return {"median": median, "low": low, "high": high}
+
+
+def train_networks(config: Config) -> None:
+    """Turbo learning with the spectra of several methods, unless that is done."""
+    out = config.work / "turbo"
+    stopped = out.with_name("turbo.partial")
+    if not out.exists():
+        task = AoaConfig(SHARES, str(config.data / "s23-200"), synthesizer=TURBO, extra=0, out=str(out))
+        run(task, stopped if stopped.exists() else None)
+
+
+def turbo(work: Path) -> Row | None:
+    """Errors of the network on each training set at each share, if that is done."""
+    file = work / "turbo" / "metrics.json"
+    if not file.exists():
+        return None
+    return {
+        share: {
+            name: {angle: arm[angle] for angle in ("elevation_deg", "azimuth_deg")}
+            for name, arm in mix["methods"].items()
+            if name.startswith("turbo_") or name.startswith("measured_")
+        }
+        for share, mix in json.loads(file.read_text())["mixes"].items()
+    }
+
+
+def draw(found: dict[str, dict[str, dict[str, Row]]]) -> None:
+    """Speed against error on each scene, and SSIM against the number of training spectra."""
+    folder, palette = ROOT / "docs" / "figures", Palette.of(SYNTHESIZERS.entries())
+    panels, axes = figures.new_figure(-(-len(found) // 2), min(2, len(found)), 10, 3.4 * -(-len(found) // 2))
+    for ax, (scene, by_count) in zip(axes, found.items(), strict=False):
+        rows = next(iter(by_count.values()))  # all training spectra
+        points = {name: (r["ms"]["median"], 10 ** (-r["psnr_db"]["median"] / 20)) for name, r in rows.items()}
+        figures.speed(ax, palette, points, f"milliseconds a spectrum, {scene}", "RMS error", list(points))
+    (folder / "comparison_speed.svg").write_text(figures.as_svg(panels))
+    curves = found.get("s23-200 random", {})
+    if len(curves) > 1:
+        numbers = sorted(map(int, curves))
+        panel, axes = figures.new_figure(1, 1, 6, 3.4)
+        for name in next(iter(curves.values())):
+            at = [curves[str(n)][name]["ssim"] for n in numbers if name in curves[str(n)]]
+            own = [n for n in numbers if name in curves[str(n)]]
+            axes[0].plot(own, [s["median"] for s in at], "o-", markersize=3, label=name, color=palette.colour(name))
+        axes[0].set(xscale="log", xlabel="training spectra", ylabel="median SSIM")
+        figures.legend_below(panel, axes[0])
+        (folder / "comparison_counts.svg").write_text(figures.as_svg(panel))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
