@@ -125,7 +125,7 @@ def test_whole_run(small, tmp_path):
     plan = tmp_path / "plan.png"
     Image.new("RGB", (40, 30), "white").save(plan)
     floor = ("--floor-plan", plan, "--floor-extent", 0, 20, 0, 16)
-    assert run("--rx", "1", "receiver06", *floor, "--out", tmp_path / "run") == 0
+    assert run("--rx", "1", "receiver06", *floor, "--also", "nerf2", "--out", tmp_path / "run") == 0
     out = tmp_path / "run"
     metrics = json.loads((out / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(name))
     assert (metrics["task"], metrics["data"], metrics["split"]) == ("rssi", "simulated-room", "random")

@@ -20,7 +20,7 @@ from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, R
 from tasks.page.page import reporting
 from tasks.rssi.cluster import on_cluster
 from tasks.rssi.page import page
-from tasks.rssi.predictors import PREDICTORS, Settings, SwiftWRFPredictor, lacks
+from tasks.rssi.predictors import PREDICTORS, SLOW, Settings, SwiftWRFPredictor, lacks
 from tasks.run import Preset, Row, Run, choose_device, console
 from tasks.source import TableSource, reading
 from tasks.summarise import error_summary, grouped
@@ -42,6 +42,8 @@ class RssiTaskConfig(TableSource):
     """survey table (CSV or Parquet), or folder with tx_pos.csv, gateway_rssi.csv and gateway_position.yml (NeRF2 layout)"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
+    also: tuple[str, ...] = ()
+    """predictors that take minutes and are compared only when named: nerf2"""
     preset: Preset = "quick"
     """of SwiftWRF: quick corrects a log-distance law; paper is the plain head"""
     floor_plan: str | None = None
@@ -65,6 +67,8 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         InputError: what the configuration asks for is not there or makes no sense.
     """
     device = choose_device("cpu" if config.device == "auto" else config.device)
+    for name in config.also:
+        PREDICTORS[name]  # refuses an unknown one
     plan = _read_floor_plan(config)
     whole = _load(config)
     for note in whole.notes:
@@ -79,8 +83,9 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
     with Run("rssi", config.out, label, config, device, source, resume) as directory:
         tables = _Tables(data, train, test, plan, directory, settings)
-        left_out = {name: reason for name in PREDICTORS if (reason := lacks(name, data))}
-        for name in PREDICTORS:
+        compared = [name for name in PREDICTORS if name not in SLOW or name in config.also]
+        left_out = {name: reason for name in compared if (reason := lacks(name, data))}
+        for name in compared:
             if name in left_out:
                 console.print(f"left out: {left_out[name]}")
             else:

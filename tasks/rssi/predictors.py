@@ -58,6 +58,7 @@ class Settings:
 
 
 PREDICTORS = Registry[Predictor]("predictor")
+SLOW = ("nerf2",)  # compared only where they are asked for
 
 
 RECEIVERS = "positions of the receivers"  # what predictors of the log-distance law need of the data
