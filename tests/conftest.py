@@ -12,6 +12,10 @@ import torch
 
 from swiftwrf import AngularGrid, Spectra, simulated_room
 
+if "PYTEST_XDIST_WORKER" in os.environ:  # one thread a process: more would wait for each other
+    torch.set_num_threads(1)
+    os.environ["OMP_NUM_THREADS"] = "1"
+
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Skips what this machine cannot run and what is long, with the reason."""
