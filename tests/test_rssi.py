@@ -11,12 +11,15 @@ import pytest
 import torch
 from PIL import Image
 from samples import write_survey
+from sklearn.model_selection import GridSearchCV, PredefinedSplit
+from sklearn.neighbors import KNeighborsRegressor
 
 from swiftwrf import InputError, Rssi, fit_rssi, load, rssi_room
 from swiftwrf.comparison import NeRF2RssiConfig, NeRF2RssiSize
+from swiftwrf.data.splits import folds
 from tasks.report import merge
 from tasks.rssi import experiment, predictors
-from tasks.rssi.predictors import PREDICTORS, Settings, lacks
+from tasks.rssi.predictors import NEIGHBOURS, PREDICTORS, Settings, lacks
 from tasks.run import command_line
 
 
@@ -209,3 +212,16 @@ def test_a_survey_table_is_one_command_to_a_map(tmp_path, capsys):
 def test_columns_are_for_tables(small, tmp_path, capsys):
     assert run("--rx", "1", "--columns", "x=a", "--out", tmp_path / "run") == 2
     assert "give it with --data" in capsys.readouterr().err
+
+
+def test_neighbours_are_those_that_a_grid_search_chooses():
+    data = rssi_room(n=150)
+    fold = folds(data.transmitter_position, "random", 0).numpy()
+    place, predictor = data.transmitter_position.numpy(), PREDICTORS["knn"].make(Settings())
+    for values in data.rssi_dbm.numpy().T[:3]:
+        heard = ~np.isnan(values)
+        x, y, own = place[heard], values[heard], fold[heard]
+        grid = {"n_neighbors": [k for k in NEIGHBOURS if k <= 100], "weights": ["uniform", "distance"]}
+        search = GridSearchCV(KNeighborsRegressor(), grid, scoring="neg_mean_absolute_error", cv=PredefinedSplit(own))
+        found = predictor._regressor(x, y, own)
+        assert {"n_neighbors": found.n_neighbors, "weights": found.weights} == search.fit(x, y).best_params_

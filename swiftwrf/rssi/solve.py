@@ -7,6 +7,7 @@ weighted least squares, solved again until weights and tangent stay (Gauss-Newto
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,6 +23,8 @@ from swiftwrf.rssi.law import Law, harmonics, log_distance
 LAW_DB = 30.0  # prior deviation of level and slope from their least squares: as good as none
 DIRECTIVITY_DB = 2.0  # prior deviation of each harmonic of a receiver's antenna and surroundings
 ITERATIONS, SETTLED = 30, 3e-3  # of the weights, each in (0, 1]
+SHRINKS = 0.9  # share of the last change of the motion beyond which steps go to and fro
+STILL_DB = 0.1  # mean change of the motion that is none
 
 
 @dataclass(frozen=True)
@@ -127,18 +130,23 @@ class _Receiver:
         """The dual variables (n,) - the inverse of the whole covariance times the data - and the tangent's slope (n,)."""
         zero = self.table(torch.zeros(1, 1, dtype=torch.float64, device=self.left.device))[0]
         weight, motion = torch.ones_like(self.left), torch.zeros_like(self.left)
+        step, last = 1.0, math.inf
         for _ in range(ITERATIONS):
             head, slope = (x[:, 0] for x in self.table(motion[:, None]))
             target = self.left - (head - zero[0, 0]) + slope * motion
             variance = self.noise_db.square() / weight
-            whole = slope[:, None] * self.covariance * slope + self.feature @ self.feature.T
+            whole = (slope[:, None] * self.covariance).mul_(slope).addmm_(self.feature, self.feature.T)
             whole.diagonal().add_(variance)
             self.factor = torch.linalg.cholesky(whole)
             dual = torch.cholesky_solve(target[:, None], self.factor)[:, 0]
-            motion = self.covariance @ (slope * dual)
+            change = self.covariance @ (slope * dual) - motion
+            moved = float(change.abs().mean())
+            if moved > SHRINKS * last:  # jumps to and fro where the head bends
+                step /= 2
+            motion, last = motion + step * change, moved
             before, error = weight, (variance * dual).abs()  # of the data about the tangent
             weight = (huber * self.noise_db / error.clamp_min(1e-12)).clamp_max(1)
-            if float((weight - before).abs().max()) < SETTLED:
+            if float((weight - before).abs().max()) < SETTLED and (step == 1 or moved < STILL_DB):
                 break
         return dual, slope
 

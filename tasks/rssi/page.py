@@ -16,7 +16,9 @@ from tasks.summarise import SHORTEST, paired_difference, running_median
 
 RssiRecords = Records[RssiMetrics]
 OWN = "swiftwrf"  # the predictor that all others are compared with
-MANY = 300  # dots, from which on white edges would hide their colours
+MANY = (
+    300  # dots, from which on white edges would hide their colours, and each drawn by itself makes a page of megabytes
+)
 
 
 def palette() -> Palette:
@@ -190,7 +192,7 @@ def _maps(run: RssiRecords, field: str, label: str) -> Figure:
                 "edgecolors": "white",
                 "linewidths": 0.3 if len(x) < MANY else 0,
             }
-            ax.scatter(x, y, s=9, c=maps["measured"][heard, i], zorder=2, **dots)
+            ax.scatter(x, y, s=9, c=maps["measured"][heard, i], zorder=2, rasterized=len(x) >= MANY, **dots)
         ax.plot(*maps["receiver"][i, :2], "x", color="#ee6677", markersize=9, markeredgewidth=2, zorder=3)
         ax.set_title(figures.plain(str(maps["receiver_names"][i])), fontsize=9)
         ax.grid(visible=False)
@@ -209,13 +211,14 @@ def _where(run: RssiRecords) -> Figure:
     }
     columns = {column: label for column, label in columns.items() if own[column].notna().any()}
     figure, axes = figures.new_figure(1, 1 + len(columns), 3.4 * (1 + len(columns)), 3.3)
-    axes[0].plot(own["measured_dbm"], own["predicted_dbm"], ".", markersize=2, color=colour)
+    many = len(own) >= MANY
+    axes[0].plot(own["measured_dbm"], own["predicted_dbm"], ".", markersize=2, color=colour, rasterized=many)
     ends = [own["measured_dbm"].min(), own["measured_dbm"].max()]
     axes[0].plot(ends, ends, color="#aeb7c6", linewidth=1)
     axes[0].set(xlabel="measured [dBm]", ylabel="predicted [dBm]")
     for ax, (column, label) in zip(axes[1:], columns.items(), strict=True):
         ordered = own.sort_values(column)
-        ax.plot(ordered[column], ordered["abs_error_db"], ".", markersize=2, color="#bbbbbb")
+        ax.plot(ordered[column], ordered["abs_error_db"], ".", markersize=2, color="#bbbbbb", rasterized=many)
         ax.plot(ordered[column], running_median(ordered["abs_error_db"]), color=colour, linewidth=1.6)
         ax.set(xlabel=label, ylabel="absolute error [dB]")
     return figure

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from sklearn.dummy import DummyRegressor
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
-from sklearn.model_selection import GridSearchCV, PredefinedSplit
-from sklearn.neighbors import KNeighborsRegressor
+from sklearn.neighbors import KNeighborsRegressor, NearestNeighbors
 from torch import Tensor
 
 from swiftwrf import InputError, Rssi, RssiConfig, RssiModel, comparison, fit_rssi
@@ -156,10 +155,22 @@ class NearestNeighbours(_PerReceiver):
     """Inverse-distance mean of the k nearest measurements of RSSI; k by cross-validation in the training rows."""
 
     def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
+        numbers = np.unique(fold)
         fewest = len(y) - int(np.bincount(fold).max())
-        grid = {"n_neighbors": [k for k in NEIGHBOURS if k <= fewest], "weights": ["uniform", "distance"]}
-        search = GridSearchCV(KNeighborsRegressor(), grid, scoring="neg_mean_absolute_error", cv=PredefinedSplit(fold))
-        return search.fit(x, y)
+        errors = {(k, weights): 0.0 for k in NEIGHBOURS if k <= fewest for weights in ("uniform", "distance")}
+        for number in numbers:  # one search for neighbours serves all settings, as GridSearchCV would not
+            out, kept = fold == number, fold != number
+            distance, row = NearestNeighbors(n_neighbors=max(errors)[0]).fit(x[kept]).kneighbors(x[out])
+            near = y[kept][row]
+            with np.errstate(divide="ignore"):
+                inverse = 1 / distance
+            inverse = np.where(np.isinf(inverse).any(axis=1, keepdims=True), np.isinf(inverse), inverse)
+            for k, weights in errors:
+                weight = inverse[:, :k] if weights == "distance" else np.ones_like(inverse[:, :k])
+                predicted = (weight * near[:, :k]).sum(axis=1) / weight.sum(axis=1)
+                errors[k, weights] += float(np.abs(predicted - y[out]).mean()) / len(numbers)
+        k, weights = min(errors, key=lambda setting: errors[setting])
+        return KNeighborsRegressor(k, weights=weights).fit(x, y)
 
 
 class NearestResiduals(NearestNeighbours):
