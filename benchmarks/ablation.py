@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ from record import write_result
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, Spectra, fit, load_spectra, simulated_room
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import l1, psnr, ssim, summary
+from swiftwrf.rssi import Map
+from tasks.cluster import connected
 
 SCENES = (("s23-200", "block"), ("newrf-bedroom", "random"), ("newrf-office", "random"))
 SIZES = (16, 64, 256)
@@ -35,6 +38,17 @@ class Config:
     """the folder that holds s23-200, newrf-bedroom and newrf-office; without it only the simulated room"""
     quick: bool = False
     """one seed, 150 steps a fit"""
+    scheduler: str | None = None
+    """address of a Dask scheduler whose workers compute the variants (extra: cluster)"""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One variant: how it is fitted, how often, and to which rows of the training spectra (None: all)."""
+
+    config: FitConfig
+    seeds: tuple[int, ...]
+    rows: torch.Tensor | None = None
 
 
 def main(config: Config) -> None:
@@ -44,30 +58,41 @@ def main(config: Config) -> None:
     else:
         scenes = {f"{name} {split}": (load_spectra(config.data / name), split) for name, split in SCENES}
     began = time.perf_counter()
-    results = {name: study(name, *scene, config) for name, scene in scenes.items()}
+    with connected(config.scheduler, torch.device("cpu")) as cluster:
+        parallel = cluster.map if cluster else map
+        results = {name: study(name, *scene, config, parallel) for name, scene in scenes.items()}
+        workers = {"workers": sorted(cluster.machines)} if cluster else {}
     seconds = time.perf_counter() - began
     name = "ablation_quick" if config.quick else "ablation"
-    write_result(name, {"seeds": SEEDS[:1] if config.quick else SEEDS, "seconds": seconds, "scenes": results})
+    seeds = SEEDS[:1] if config.quick else SEEDS
+    write_result(name, {"seeds": seeds, "seconds": seconds, **workers, "scenes": results})
 
 
-def study(name: str, data: Spectra, split: str, config: Config) -> dict[str, Any]:
+def study(name: str, data: Spectra, split: str, config: Config, parallel: Map) -> dict[str, Any]:
     """All variants on one scene."""
     train, test = data.split(split)
     default = FitConfig(validation=validation_for(split))
     steps = 150 if config.quick else STEPS
     gradient = replace(default, model=ModelConfig(n_primitives=SIZE, components=ALL), steps=steps)
-    cases = {variant: (train, test, changed) for variant, changed in variants(default, gradient).items()}
+
+    def case(changed: FitConfig, rows: torch.Tensor | None = None) -> Case:
+        return Case(changed, SEEDS if changed.steps and not config.quick else SEEDS[:1], rows)  # regression has no luck
+
+    def scores(train: Spectra, test: Spectra, cases: dict[str, Case]) -> dict[str, Any]:
+        found = {}
+        results = parallel(partial(measure, train, test), cases.values())
+        for variant, found[variant] in zip(cases, results, strict=True):
+            print(name, variant, in_words(found[variant]), flush=True)
+        return found
+
+    cases = {variant: case(changed) for variant, changed in variants(default, gradient).items()}
     for share in SHARES:
         kept = torch.randperm(len(train), generator=torch.Generator().manual_seed(0))[: round(share * len(train))]
-        cases[f"{share:.0%} of the training spectra"] = (train.subset(kept.sort().values), test, default)
+        cases[f"{share:.0%} of the training spectra"] = case(default, kept.sort().values)
+    results = scores(train, test, cases)
     if data.array is not None and config.data is not None:  # ray paths can be seen at any resolution
         fine = load_spectra(config.data / data.name, grid=AngularGrid.hemisphere(180, 720))
-        cases["seen at 0.5 degrees"] = (*fine.split(split), default)
-    results = {}
-    for variant, (kept_spectra, unseen, changed) in cases.items():
-        seeds = SEEDS if changed.steps and not config.quick else SEEDS[:1]  # regression has no luck
-        results[variant] = measure(kept_spectra, unseen, changed, seeds)
-        print(name, variant, in_words(results[variant]), flush=True)
+        results |= scores(*fine.split(split), {"seen at 0.5 degrees": case(default)})
     return {"n_train": len(train), "n_test": len(test), "steps": steps, "variants": results}
 
 
@@ -99,20 +124,21 @@ def variants(default: FitConfig, gradient: FitConfig) -> dict[str, FitConfig]:
     }
 
 
-def measure(train: Spectra, test: Spectra, config: FitConfig, seeds: tuple[int, ...]) -> dict[str, Any]:
+def measure(train: Spectra, test: Spectra, case: Case) -> dict[str, Any]:
     """Scores over the test spectra, averaged over seeds, with each seed's medians; or why there is no fit."""
+    kept = train if case.rows is None else train.subset(case.rows)
     scores: dict[str, list[torch.Tensor]] = {"ssim": [], "psnr_db": [], "l1": []}
     began = time.perf_counter()
     try:
-        for seed in seeds:
-            drawn = fit(train, replace(config, seed=seed), progress=False).synthesize(test.position)
+        for seed in case.seeds:
+            drawn = fit(kept, replace(case.config, seed=seed), progress=False).synthesize(test.position)
             for key, score in (("ssim", ssim), ("psnr_db", psnr), ("l1", l1)):
                 scores[key].append(score(drawn, test.spectrum))
     except InputError as error:
         return {"refusal": str(error)}
     result: dict[str, Any] = {key: summary(torch.stack(values).mean(dim=0)) for key, values in scores.items()}
     result["psnr_db"]["of_seeds"] = [float(values.median()) for values in scores["psnr_db"]]
-    return result | {"seconds": (time.perf_counter() - began) / len(seeds)}
+    return result | {"seconds": (time.perf_counter() - began) / len(case.seeds)}
 
 
 def in_words(result: dict[str, Any]) -> str:

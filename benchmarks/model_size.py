@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 import tyro
 from record import write_result
 from synthesis import SCENES
 
 from swiftwrf import FitConfig, ModelConfig, Spectra, fit, load_spectra, simulated_room
-from swiftwrf.data.splits import validation_for
+from swiftwrf.data.splits import Validation, validation_for
 from swiftwrf.metrics import psnr, ssim, summary
+from swiftwrf.rssi import Map
+from tasks.cluster import connected
 
 SIZES = (16, 32, 64, 128, 256, 512, 1024)
 
@@ -23,6 +27,8 @@ class Config:
     data: Path | None = None
     """the folder that holds s23-200, newrf-bedroom and newrf-office; without it only the simulated room"""
     seed: int = 0
+    scheduler: str | None = None
+    """address of a Dask scheduler whose workers compute the fits (extra: cluster)"""
 
 
 def main(config: Config) -> None:
@@ -30,38 +36,44 @@ def main(config: Config) -> None:
     scenes: dict[str, tuple[Spectra, str]] = {"simulated-room random": (simulated_room(), "random")}
     if config.data is not None:
         scenes |= {f"{name} {split}": (load_spectra(config.data / name), split) for name, split in SCENES}
-    results = {name: measure(name, *scene, config.seed) for name, scene in scenes.items()}
-    write_result("model_size", {"seed": config.seed, "scenes": results})
+    with connected(config.scheduler, torch.device("cpu")) as cluster:
+        parallel = cluster.map if cluster else map
+        results = {name: measure(name, *scene, config.seed, parallel) for name, scene in scenes.items()}
+        workers = {"workers": sorted(cluster.machines)} if cluster else {}
+    write_result("model_size", {"seed": config.seed, **workers, "scenes": results})
 
 
-def measure(name: str, data: Spectra, split: str, seed: int) -> dict[str, Any]:
+def measure(name: str, data: Spectra, split: str, seed: int, parallel: Map) -> dict[str, Any]:
     """The fit that chooses, and one of each size."""
     train, test = data.split(split, seed)
-    validation = validation_for(split)
+    sizes = (None, *SIZES)
+    results = []
+    for size, result in zip(
+        sizes, parallel(partial(fitted, train, test, validation_for(split), seed), sizes), strict=True
+    ):
+        found = f"{result['n_primitives']} {result['psnr_db']['median']:.2f} dB {result['seconds']:.0f} s"
+        print(name, "fixed" if size else "auto", found, flush=True)
+        results.append(result)
+    return {"auto": results[0], "fixed": results[1:]}
 
-    def fitted(n: int | None) -> dict[str, Any]:
-        model_config = ModelConfig() if n is None else ModelConfig(n_primitives=n)
-        began = time.perf_counter()
-        model = fit(
-            train,
-            FitConfig(model=model_config, validation=validation, seed=seed),
-            progress=False,
-        )
-        seconds = time.perf_counter() - began
-        drawn = model.synthesize(test.position)
-        result = {
-            "n_primitives": model.config.n_primitives,
-            "rank": model.config.rank,
-            "parameters": sum(p.numel() for p in model.parameters()),
-            "psnr_db": summary(psnr(drawn, test.spectrum)),
-            "ssim": summary(ssim(drawn, test.spectrum)),
-            "seconds": seconds,
-        }
-        label = "auto" if n is None else "fixed"
-        print(name, label, result["n_primitives"], f"{result['psnr_db']['median']:.2f} dB {seconds:.0f} s", flush=True)
-        return result
 
-    return {"auto": fitted(None), "fixed": [fitted(n) for n in SIZES]}
+def fitted(train: Spectra, test: Spectra, validation: Validation, seed: int, n: int | None) -> dict[str, Any]:
+    """How well a fit with so many primitives, or as many as it finds, draws the test spectra."""
+    config = FitConfig(
+        model=ModelConfig() if n is None else ModelConfig(n_primitives=n), validation=validation, seed=seed
+    )
+    began = time.perf_counter()
+    model = fit(train, config, progress=False)
+    seconds = time.perf_counter() - began
+    drawn = model.synthesize(test.position)
+    return {
+        "n_primitives": model.config.n_primitives,
+        "rank": model.config.rank,
+        "parameters": sum(p.numel() for p in model.parameters()),
+        "psnr_db": summary(psnr(drawn, test.spectrum)),
+        "ssim": summary(ssim(drawn, test.spectrum)),
+        "seconds": seconds,
+    }
 
 
 if __name__ == "__main__":

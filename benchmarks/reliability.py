@@ -1,6 +1,6 @@
 """How readers, commands and runs end when everything goes wrong: the long version of tests/fuzz and tests/test_interrupts.
 
-python benchmarks/reliability.py [--mutations 10000 --commands 200 --kills 50 --disks 10 --races 5]
+python benchmarks/reliability.py [--mutations 10000 --commands 200 --right 20 --kills 50 --disks 10 --races 5]
 """
 
 from __future__ import annotations
@@ -12,29 +12,33 @@ import os
 import random
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
 import test_interrupts as interrupts
-from fuzz.commands import command_lines
+from fuzz.commands import command_lines, right_command_lines
 from fuzz.kinds import KINDS
 from fuzz.test_fuzz import SHORT, attack
 from quick import run
 from record import write_result
 
+CommandLines = Callable[[random.Random, Path, int], Iterator[tuple[str, list[str]]]]
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    for name, number in (("mutations", 10_000), ("commands", 200), ("kills", 50), ("disks", 10), ("races", 5)):
+    numbers = {"mutations": 10_000, "commands": 200, "right": 20, "kills": 50, "disks": 10, "races": 5}
+    for name, number in numbers.items():
         parser.add_argument(f"--{name}", type=int, default=number)
     asked = parser.parse_args()
     root, done = Path(tempfile.mkdtemp()), {}
     parts: dict[str, Callable[[], dict[str, Any]]] = {
         "mutations": lambda: mutations(root, asked.mutations),
-        "commands": lambda: commands(root, asked.commands),
+        "commands": lambda: commands(root / "commands", command_lines, asked.commands),
+        "right": lambda: commands(root / "right", right_command_lines, asked.right),
         "kills": lambda: kills(root, asked.kills),
         "disks": lambda: disks(root, asked.disks),
         "races": lambda: races(root, asked.races),
@@ -57,13 +61,12 @@ def mutations(root: Path, count: int) -> dict[str, Any]:
     return ends
 
 
-def commands(root: Path, count: int) -> dict[str, int]:
+def commands(folder: Path, lines: CommandLines, count: int) -> dict[str, int]:
     """Command lines in this process; exit codes, and tracebacks as wrong."""
     ends = {"exit 0": 0, "exit 1": 0, "exit 2": 0, "wrong": 0}
-    folder = root / "commands"
     folder.mkdir()
     with contextlib.chdir(folder):
-        for task, arguments in command_lines(random.Random(2), folder, count):
+        for task, arguments in lines(random.Random(2), folder, count):
             said = io.StringIO()
             try:
                 with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):

@@ -17,15 +17,15 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from rich.console import Console
 
 from swiftwrf import InputError
-from swiftwrf.durable import rename, replacing
+from swiftwrf.durable import rename
+from swiftwrf.threads import set_threads
 from tasks.claim import CONFIG, ENVIRONMENT, LOCK, STEPS, Claim
 from tasks.environment import environment, now
-from tasks.records import Row, read_json, strict, write_json, write_table
+from tasks.records import Row, read_json, strict, write_json, write_npz, write_table
 
 PARTIAL = ".partial"  # suffix of a run that is not finished
 MOST_LABEL = 60  # characters of what is added to the time in a directory's name
@@ -140,9 +140,7 @@ class Run:
             raise InputError(f"{self.final} exists already and a run is never overwritten; choose another --out")
 
     def _begin(self, task: str, config: Any, device: torch.device, source: dict[str, str]) -> None:
-        # the same call as in a run that goes on: it also keeps MKL from choosing a number by itself, which shows in the
-        # last bits
-        torch.set_num_threads(torch.get_num_threads())
+        set_threads(torch.get_num_threads())  # the same call as in a run that goes on
         values = asdict(config)
         self._environment = environment(device, source) | {"config_sha256": _digest(values)}
         self.write_json(ENVIRONMENT, self._environment)
@@ -160,7 +158,7 @@ class Run:
             )
         threads = self._environment.get("threads")
         if isinstance(threads, int) and 1 <= threads <= 1024:  # they are part of the seed
-            torch.set_num_threads(threads)
+            set_threads(threads)
         session = {name: value for name, value in environment(device, source).items() if name in ("commit", "start")}
         self._environment["resumed"] = [*self._environment.get("resumed", []), session]
         self.write_json(ENVIRONMENT, self._environment)
@@ -175,27 +173,48 @@ class Run:
 
     def write_npz(self, name: str, arrays: Mapping[str, Any]) -> None:
         """Arrays by name."""
-        with replacing(self.path(name)) as file, file.open("wb") as stream:
-            np.savez_compressed(stream, **arrays)
+        write_npz(self.path(name), arrays)
 
     def step(self, name: str, compute: Callable[[], Row]) -> Row:
-        """What `compute` returns (plain values) under `value`; computed once, also over a resumed run. Seconds are kept
-        with it.
+        """What `compute` returns (plain values); computed once, also over a resumed run.
 
         Raises:
             InputError: what an earlier session kept is damaged.
         """
-        file = f"{STEPS}/{name}.json"
-        if not self.path(file).exists():
+        value = self.kept(name)
+        if value is None:
             console.print(f"[bold]{name}[/] ...", end=" " if not console.is_terminal else "\n")
             began = time.perf_counter()
-            value = strict(compute())
-            self.write_json(file, {"value": value, "seconds": time.perf_counter() - began})
+            value = self.keep(name, compute(), time.perf_counter() - began)
             console.print(f"{time.perf_counter() - began:.1f} s")
-        kept = read_json(self.path(file))
-        if not isinstance(kept.get("value"), dict):
-            raise InputError(f"{self.path(file)} does not hold what the step computed; remove it and resume again")
-        return kept
+        return value
+
+    def kept(self, name: str) -> Row | None:
+        """What a step of that name has computed; None where none has.
+
+        Raises:
+            InputError: what was kept is damaged.
+        """
+        file = self.path(f"{STEPS}/{name}.json")
+        if not file.exists():
+            return None
+        value = read_json(file).get("value")
+        if not isinstance(value, dict):
+            raise InputError(f"{file} does not hold what the step computed; remove it and resume again")
+        return value
+
+    def keep(self, name: str, value: Row, seconds: float) -> Row:
+        """Keeps what a step has computed, and the seconds that it took; the value as it is read back."""
+        plain: Row = strict(value)
+        self.write_json(f"{STEPS}/{name}.json", {"value": plain, "seconds": seconds})
+        return plain
+
+    def computed_on(self, machines: Iterable[str]) -> None:
+        """Says in the environment that these machines computed, too."""
+        known = self._environment.get("workers", [])
+        if not set(machines) <= set(known):
+            self._environment["workers"] = sorted({*known, *machines})
+            self.write_json(ENVIRONMENT, self._environment)
 
     def path(self, name: str) -> Path:
         """A file in the run's directory."""

@@ -25,17 +25,22 @@ def environment(device: torch.device, source: dict[str, str]) -> dict[str, Any]:
     The number of threads belongs to the seed: sums over threads are added up in another order, and a training turns the
     last bit of a sum into degrees.
     """
-    packages = ("torch", "torchvision", "numpy", "scipy", "scikit-learn", "numba")
     return {
         "commit": _commit(),
         "version": version("swiftwrf-tasks"),
         "python": platform.python_version(),
-        "packages": {name: version(name) for name in packages},
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _processor(),
+        "packages": packages(),
+        "device": machine(device),
         "threads": torch.get_num_threads(),
         "input_sha256": source,
         "start": now(),
     }
+
+
+def packages() -> dict[str, str]:
+    """Versions of the libraries that numbers come from."""
+    names = ("torch", "torchvision", "numpy", "scipy", "scikit-learn", "numba")
+    return {name: version(name) for name in names}
 
 
 def _commit() -> str | None:
@@ -49,7 +54,10 @@ def _commit() -> str | None:
     return None
 
 
-def _processor() -> str:
+def machine(device: torch.device) -> str:
+    """Name of the GPU, or model and number of cores of the processor."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
     with suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):

@@ -11,15 +11,16 @@ import io
 import json
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import torch
 
 from swiftwrf import InputError
-from swiftwrf.durable import write_text
+from swiftwrf.durable import replacing, write_text
 
 Row = dict[str, Any]
 NAMES = (
@@ -75,6 +76,12 @@ def write_table(file: Path, rows: Iterable[Row]) -> None:
     writer.writeheader()
     writer.writerows({key: _escaped(value) for key, value in row.items()} for row in rows)
     write_text(file, stream.getvalue())
+
+
+def write_npz(file: Path, arrays: Mapping[str, Any]) -> None:
+    """Arrays by name."""
+    with replacing(file) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, **arrays)
 
 
 def _escaped(value: Any) -> Any:

@@ -36,7 +36,8 @@ def command_line(
 ) -> int:
     """Parses the arguments into `config_type`, runs the task and turns its errors into sentences and exit codes.
 
-    `--resume DIR` takes the configuration from an interrupted run instead. The help says what the docstring of
+    `--resume DIR` takes the configuration from an interrupted run instead; where to compute on, here or on the cluster of
+    `--scheduler`, is said anew. The help says what the docstring of
     `config_type` does, and `more`.
 
     Returns:
@@ -76,13 +77,18 @@ def _parse(
     name: str, config_type: type[Config], arguments: Sequence[str], more: Callable[[], str] | None
 ) -> tuple[Config, Path | None]:
     """The configuration, and the directory to resume where that is asked for."""
-    if not arguments or arguments[0] != "--resume":
-        description = "\n\n".join([inspect.cleandoc(config_type.__doc__ or ""), *([more()] if more else [])])
-        return tyro.cli(config_type, prog=f"python -m {name}", description=description, args=arguments), None
-    if len(arguments) != 2:
-        raise InputError("--resume takes one directory and no other option; the run's own configuration is used")
-    folder = Path(arguments[1])
-    values = saved_config(folder, name.removeprefix("tasks."))
+    match arguments:
+        case ["--resume", resumed, *place] if not place or (place[0] == "--scheduler" and len(place) == 2):
+            folder = Path(resumed)
+            values = saved_config(folder, name.removeprefix("tasks."))
+            values["scheduler"] = place[1] if place else None
+        case ["--resume", *_]:
+            raise InputError(
+                "--resume takes one directory, and --scheduler to go on on a cluster; the rest is as the run began"
+            )
+        case _:
+            description = "\n\n".join([inspect.cleandoc(config_type.__doc__ or ""), *([more()] if more else [])])
+            return tyro.cli(config_type, prog=f"python -m {name}", description=description, args=arguments), None
     try:
         return config_type(**{key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}), folder
     except TypeError as error:

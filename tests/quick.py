@@ -53,6 +53,7 @@ PUBLISHED: dict[str, Config] = {  # methods of comparison, as small as they can 
     "dcgan": DcganConfig(size=DcganSize(noise=2, width=2, hidden=8, bands=2), **LONGER),
 }
 PUBLISHED_RSSI = NeRF2RssiConfig(size=NeRF2RssiSize(width=8, bands=2, samples=4, azimuths=4, elevations=2), **LONGER)
+FOR_LIFE = ExitStack()
 PREDICTORS_KEPT = ("swiftwrf", "mean", "mri_pooled", "mri_receiver")
 
 
@@ -110,6 +111,11 @@ def run(task: str, *arguments: object) -> int:
     }[task]
     with quick():
         return command_line(f"tasks.{task}", config, function, [str(a) for a in arguments])
+
+
+def dask_setup(worker: object) -> None:
+    """The stand-ins in a Dask worker with `--preload quick`, as long as it lives."""
+    FOR_LIFE.enter_context(quick())
 
 
 def said(capsys) -> str:

@@ -15,7 +15,7 @@ from augment import SYNTHESIZERS, Mixed, choose, lacks
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, load, simulated_room
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
-from tasks.aoa import arms, experiment
+from tasks.aoa import arms, experiment, steps
 from tasks.aoa.config import AoaConfig
 from tasks.aoa.estimators import ESTIMATORS, Settings, aann
 from tasks.aoa.estimators.aann import AANN, AANNConfig
@@ -33,7 +33,7 @@ def small(monkeypatch):
     room = simulated_room(n=50, grid=AngularGrid.hemisphere(10, 40))
     monkeypatch.setattr(experiment, "simulated_room", lambda **_: room)
     monkeypatch.setattr("augment.synthesizers.swiftwrf.FitConfig", lambda: TINY_FIT)
-    for place in (experiment, choose):  # finding a room has tests of its own
+    for place in (steps, choose):  # finding a room has tests of its own
         monkeypatch.setattr(
             place, "candidates", lambda data: [n for n in ("idw", "gp", "coarray") if not lacks(n, data)]
         )

@@ -10,6 +10,7 @@ import zlib
 import numpy as np
 import pytest
 import torch
+from fuzz.kinds import N, spectra_paths
 from PIL import Image
 
 from swiftwrf import (
@@ -18,22 +19,11 @@ from swiftwrf import (
     load_spectra,
 )
 
-N = 12
-
 
 def paths(folder, **changes):
-    """Paths of twelve receivers, some arrays replaced."""
-    arrays = {
-        "transmitter_position": np.tile([0.0, 0.0, 2.0], (N, 1)),
-        "receiver_position": np.stack([np.arange(1.0, N + 1), np.zeros(N), np.ones(N)], axis=1),
-        "path_count": np.ones(N, dtype=np.int32),
-        "last_point": np.tile([0.0, 0.0, 2.0], (N, 1)),
-        "gain": np.ones(N, dtype=np.complex64),
-        "line_of_sight": np.ones(N, dtype=bool),
-        "frequency_hz": np.float64(2.4e9),
-    } | changes
+    """A folder with ray paths, some of their arrays replaced."""
     folder.mkdir(exist_ok=True)
-    np.savez(folder / "paths.npz", **arrays)
+    spectra_paths(folder, **changes)
     return folder
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numba
 import pytest
 import torch
 from hypothesis import given, settings
@@ -41,6 +42,18 @@ def test_cpu_agrees_on_any_scene_and_grid(seed, shape, n):
     value, gradient = against_definition(random_scene(n=n, seed=seed, grid=grid), grid, None)
     assert value < VALUE_TOLERANCE[None]
     assert gradient < GRADIENT_TOLERANCE[None]
+
+
+def test_torch_keeps_its_threads():
+    """numba sets the number of OpenMP, which is that of torch, too."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(numba.config.NUMBA_NUM_THREADS + 1)
+    try:
+        inputs = random_scene(batch=3)
+        rasterize(*inputs, GRID, "cpu").sum().backward()
+        assert torch.get_num_threads() == numba.config.NUMBA_NUM_THREADS + 1
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_one_primitive_is_the_gaussian_of_the_formula():

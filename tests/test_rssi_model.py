@@ -16,7 +16,6 @@ from swiftwrf.rssi.head import Head, Table, pooled
 from swiftwrf.rssi.law import Law, fit_law, harmonics, log_distance
 from swiftwrf.rssi.sites import gather
 from swiftwrf.rssi.solve import DIRECTIVITY_DB, LAW_DB, Group, solve
-from tasks.rssi.cluster import on_cluster
 
 KERNEL = Kernel(long=4.0, short=1.0, share=0.6, noise=1.0)
 FIELD_DB, NOISE_DB = 3.0, 2.0
@@ -272,17 +271,6 @@ def test_interrupted_fit_goes_on(tmp_path, monkeypatch):
     assert torch.equal(resumed.predict(data.transmitter_position)[0], whole)
     with pytest.raises(InputError, match="another fit"):
         fit_rssi(data, RssiConfig(huber=2.0), checkpoint=state)
-
-
-def test_groups_of_receivers_may_be_fitted_anywhere(monkeypatch):
-    """Two groups fitted one after the other or by two processes of a cluster: the same bits."""
-    distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    monkeypatch.setattr(rssi_fit, "GROUP", 2)
-    data = with_field(n=40)
-    here = fit_rssi(data)
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        there = fit_rssi(data, parallel=on_cluster(cluster.scheduler_address))
-    assert torch.equal(there.predict(data.transmitter_position)[0], here.predict(data.transmitter_position)[0])
 
 
 # --- ordinary input that is awkward ----------------------------------------------------------------------------------

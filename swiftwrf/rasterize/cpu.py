@@ -21,6 +21,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from swiftwrf.angles import AngularGrid
+from swiftwrf.threads import threads_kept
 
 ANCHOR = 16  # columns between two exact exponentials: 16^2 / 2 roundings stay under 1e-5 of the kernel
 
@@ -184,7 +185,8 @@ def _rasterize(
     out = weight.new_empty(mean.shape[0], 2, n_elevation, n_azimuth)
     threads = numba.get_num_threads()
     n_bands = 1 if mean.shape[0] >= threads else min(threads, n_elevation)
-    _draw(*_arguments(mean, cholesky, weight, cutoff), n_bands, out.numpy())
+    with threads_kept():
+        _draw(*_arguments(mean, cholesky, weight, cutoff), n_bands, out.numpy())
     return out
 
 
@@ -197,7 +199,9 @@ def _rasterize_backward(
     threads = numba.get_num_threads()
     block = max(1, mean.shape[1] if mean.shape[0] >= threads else -(-mean.shape[1] // threads))
     arguments = _arguments(mean, cholesky, weight, cutoff)
-    _draw_backward(grad.contiguous().numpy(), *arguments, block, d_mean.numpy(), d_cholesky.numpy(), d_weight.numpy())
+    derivatives = (d_mean.numpy(), d_cholesky.numpy(), d_weight.numpy())
+    with threads_kept():
+        _draw_backward(grad.contiguous().numpy(), *arguments, block, *derivatives)
     return d_mean, d_cholesky if cholesky.dim() == 3 else d_cholesky.sum(0), d_weight
 
 

@@ -21,7 +21,8 @@ EXTRA = 3000  # further positions unless told otherwise
 class AoaConfig(SpectraSource):
     """Angle of arrival with few measured spectra: turbo learning against its bounds and baselines.
 
-    Without --data the built-in simulated room is used. An interrupted run goes on with --resume DIR.
+    Without --data the built-in simulated room is used. An interrupted run goes on with --resume DIR, here or where a
+    --scheduler beside it says.
     """
 
     mix: tuple[float, ...]
@@ -48,6 +49,8 @@ class AoaConfig(SpectraSource):
     """quick: sized for a CPU; paper: the paper's model and a long training, for a GPU"""
     repeats: int = 1
     """runs with different random shares and networks, pooled"""
+    scheduler: str | None = None
+    """address of a Dask scheduler whose workers compute the steps of the run (extra: cluster)"""
     seed: int = 0
     """of everything random"""
     out: str | None = None

@@ -29,6 +29,7 @@ def provenance(runs: Sequence[Records[Any]]) -> Section:
             ["code", f"version {environment['version']}, commit {environment['commit'] or 'unknown'}"],
             ["packages", f"Python {environment['python']}, {packages}"],
             ["machine", f"{environment['device']}"],
+            *([["workers", "; ".join(environment["workers"])]] if "workers" in environment else []),
             [
                 "threads",
                 f"{environment['threads']}; like the seed, another number changes the networks, by up to degrees",

@@ -16,9 +16,9 @@ from swiftwrf import InputError, Rssi, load_rssi, rssi_room
 from swiftwrf.data.files import sha256
 from swiftwrf.data.splits import validation_for
 from swiftwrf.positions import distance
+from tasks.cluster import connected
 from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
 from tasks.page.page import reporting
-from tasks.rssi.cluster import on_cluster
 from tasks.rssi.page import page
 from tasks.rssi.predictors import PREDICTORS, SLOW, Settings, SwiftWRFPredictor, lacks
 from tasks.run import Preset, Row, Run, choose_device, console
@@ -33,7 +33,8 @@ MOST_PLAN_PIXELS = 2**24
 class RssiTaskConfig(TableSource):
     """RSSI of a moving transmitter at fixed receivers, against baselines.
 
-    Without --data the built-in simulated floor is used. An interrupted run goes on with --resume DIR.
+    Without --data the built-in simulated floor is used. An interrupted run goes on with --resume DIR, here or where a
+    --scheduler beside it says.
     """
 
     rx: tuple[str, ...]
@@ -75,13 +76,16 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         console.print(f"{whole.name}: {note}")
     data, (pool, _) = whole.receivers(config.rx), whole.split(config.split, config.seed)
     train, test = data.split(config.split, config.seed)
-    parallel = on_cluster(config.scheduler) if config.scheduler else map
-    settings = Settings(validation_for(config.split), config.seed, config.preset, device, parallel, pool)
     if not bool((~test.rssi_dbm.isnan()).any()):
         raise InputError(f"split {config.split!r} of {data.name} has no heard test rows for these receivers")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
-    with Run("rssi", config.out, label, config, device, source, resume) as directory:
+    with (
+        connected(config.scheduler, device) as cluster,
+        Run("rssi", config.out, label, config, device, source, resume) as directory,
+    ):
+        parallel = cluster.map if cluster else map
+        settings = Settings(validation_for(config.split), config.seed, config.preset, device, parallel, pool)
         tables = _Tables(data, train, test, plan, directory, settings)
         compared = [name for name in PREDICTORS if name not in SLOW or name in config.also]
         left_out = {name: reason for name in compared if (reason := lacks(name, data))}
@@ -90,6 +94,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 console.print(f"left out: {left_out[name]}")
             else:
                 tables.add(name)
+        directory.computed_on(cluster.machines if cluster else ())
         directory.write_csv("errors.csv", tables.errors)
         directory.write_csv("predictions.csv", tables.predictions)
         metrics: RssiMetrics = {
@@ -175,7 +180,7 @@ class _Tables:
                 self._keep_maps(predictor)
             return result
 
-        value = self.directory.step(name, compute)["value"]
+        value = self.directory.step(name, compute)
         self.seconds[name] = {"fit": value["fit"], "predict": value["predict"]}
         predicted = torch.tensor(value["predicted"], dtype=torch.float64)
         measured = self.test.rssi_dbm

@@ -1,25 +1,48 @@
-"""Command lines as people mistype them and as hostile tools write them. None of them starts a long run: whatever is valid
-meets an `--out` that is taken, or fails its check."""
+"""Command lines as people mistype them and as hostile tools write them, and some that are right.
+
+Those that are mistyped start no long run: whatever is valid among them meets an `--out` that is taken, or fails its check.
+"""
 
 from __future__ import annotations
 
 import random
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
+
+from tasks.aoa.config import AoaConfig
+from tasks.report.__main__ import ReportConfig
+from tasks.rssi.experiment import RssiTaskConfig
 
 VALUES = [
     "", "0", "1", "-1", "0.5", "1.5", "nan", "inf", "-inf", "1e400", "1e-320", "4294967296", "99999999999999999999",
     "all", "x", "random", "block", "nowhere", "--", "-", "\u00e4", "\udcff", "a\nb", "$x^{$", "=1", "x" * 300, ".", "..",
     "/", "/dev/null", "/proc/1/mem", "tcp://127.0.0.1:1", "tls://127.0.0.1:1", "none", "auto", "cpu", "paper", "True",
-    "[1]", "{}", "nearest", "swiftwrf", "*",
+    "[1]", "{}", "nearest", "swiftwrf", "receiver", "*",
 ]  # fmt: skip
-BOTH = ("--data", "--split", "--preset", "--seed", "--device", "--resume")
+CONFIGS = {"aoa": AoaConfig, "rssi": RssiTaskConfig, "report": ReportConfig}
 OPTIONS = {
-    "aoa": ("--mix", "--synthesizer", "--array", "--repeats", *BOTH),
-    "rssi": ("--rx", "--floor-plan", "--floor-extent", "--scheduler", *BOTH),
-    "report": ("--out", "--resume"),
+    task: ("--resume", *(f"--{option.name.replace('_', '-')}" for option in fields(config)))
+    for task, config in CONFIGS.items()
 }
 NEEDED = {"aoa": ["--mix", "0.5"], "rssi": ["--rx", "1"], "report": ["run"]}
+RIGHT = {
+    "aoa": {
+        "--mix": ("0.5", "1", "0.45 0.9"),
+        "--synthesizer": ("nearest", "idw nearest"),
+        "--extra": ("0", "7"),
+        "--suggest": ("3",),
+        "--moving": ("transmitter", "receiver"),
+        "--split": ("random", "block"),
+        "--repeats": ("1", "2"),
+        "--seed": ("0", "4294967290"),
+    },
+    "rssi": {
+        "--rx": ("1", "receiver06 2", "all"),
+        "--split": ("random", "block"),
+        "--seed": ("0", "4294967295"),
+    },
+}
 
 
 def command_lines(draw: random.Random, folder: Path, count: int) -> Iterator[tuple[str, list[str]]]:
@@ -39,3 +62,14 @@ def command_lines(draw: random.Random, folder: Path, count: int) -> Iterator[tup
         if draw.random() < 0.1:
             arguments.append(draw.choice(values))
         yield task, [*arguments, "--out", str(taken)]
+
+
+def right_command_lines(draw: random.Random, folder: Path, count: int) -> Iterator[tuple[str, list[str]]]:
+    """So many that are right, each a short run into a directory of its own."""
+    for number in range(count):
+        task = draw.choice(list(RIGHT))
+        (needed, values), *others = RIGHT[task].items()
+        arguments = [needed, *draw.choice(values).split()]
+        for option, values in draw.sample(others, draw.randint(0, len(others))):
+            arguments += [option, *draw.choice(values).split()]
+        yield task, [*arguments, "--out", str(folder / f"run{number}")]

@@ -58,7 +58,8 @@ def spectra_nerf2(folder: Path) -> None:
         Image.fromarray(np.arange(8 * 32, dtype=np.uint8).reshape(8, 32)).save(folder / "spectrum" / f"{i + 1:05d}.png")
 
 
-def spectra_paths(folder: Path) -> None:
+def spectra_paths(folder: Path, **changes: object) -> None:
+    """Paths of twelve receivers, some arrays replaced."""
     arrays = {
         "transmitter_position": np.tile([0.0, 0.0, 2.0], (N, 1)),
         "receiver_position": np.stack([np.arange(1.0, N + 1), np.zeros(N), np.ones(N)], axis=1),
@@ -67,7 +68,7 @@ def spectra_paths(folder: Path) -> None:
         "gain": np.ones(N, dtype=np.complex64),
         "line_of_sight": np.ones(N, dtype=bool),
         "frequency_hz": np.float64(2.4e9),
-    }
+    } | changes
     np.savez(folder / "paths.npz", **arrays)
 
 

@@ -1,6 +1,6 @@
 """Whatever is done to files and command lines, there is a result that is finite, or one sentence; never a traceback.
 
-200 mutations a kind with every test run; `pytest -m fuzz` makes 10,000 more, and 200 command lines.
+200 mutations a kind with every test run; `pytest -m fuzz` makes 10,000 more, 200 command lines, and some whole runs.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from quick import run
 
-from fuzz.commands import command_lines
+from fuzz.commands import command_lines, right_command_lines
 from fuzz.kinds import KINDS
 from fuzz.mutate import spoil
 from swiftwrf import FitError, InputError
@@ -105,6 +105,14 @@ def test_many_command_lines(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for task, arguments in command_lines(random.Random(99), tmp_path, 200):
         _end(task, arguments, capsys)
+
+
+@pytest.mark.fuzz
+def test_right_command_lines(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for task, arguments in right_command_lines(random.Random(0), tmp_path, 5):
+        assert _end(task, arguments, capsys) == 0
+        assert (Path(arguments[-1]) / "metrics.json").exists()
 
 
 text = st.text(alphabet=st.characters(codec="utf-8"), max_size=200)
