@@ -112,22 +112,18 @@ def check_frames(spectra: Spectra) -> FrameReport | None:
     declared = scene.direction()
     agreement, chance = _agreement(declared, peak)
     found = {meaning: _agreement(direction, peak) for meaning, direction in _others(scene).items()}
-    best = max(found.values())
-    clear = best[0] - best[1] >= EVIDENCE and best[0] - agreement >= EVIDENCE
-    turn, turned = _constant_turn(scene, peak)
-    also = _agreement(_folded(_turned(scene, turn)), peak)
-    if clear and best[0] >= also[0] - GAIN:
-        also = (0.0, 0.0)  # named, so no rotation is needed
-    else:
-        clear = False
-    rotates = also[0] - also[1] >= EVIDENCE and turned >= LEAST_TURN and also[0] - agreement >= GAIN
+    named, by_chance = max(found.values())
+    turn, angle = _constant_turn(scene, peak)
+    turned, turned_by_chance = _agreement(_folded(_turned(scene, turn)), peak)
+    error = named - by_chance >= EVIDENCE and named - agreement >= EVIDENCE and named >= turned - GAIN
+    rotates = turned - turned_by_chance >= EVIDENCE and turned - agreement >= GAIN and angle >= LEAST_TURN
     return FrameReport(
         agreement=agreement,
         chance=chance,
         angle_deg=math.degrees(float(great_circle(declared, peak).median())),
-        explanations=tuple(name for name, value in found.items() if value[0] >= best[0] - TIED) if clear else (),
-        explained=best[0] if clear else also[0] if rotates else agreement,
-        turn_deg=tuple(np.degrees(turn).tolist()) if rotates else None,
+        explanations=tuple(name for name, (value, _) in found.items() if value >= named - TIED) if error else (),
+        explained=named if error else turned if rotates else agreement,
+        turn_deg=tuple(np.degrees(turn).tolist()) if rotates and not error else None,
         positions=len(rows),
     )
 

@@ -21,7 +21,8 @@ from samples import (
 )
 from test_calibration import spoilt
 
-from swiftwrf import AngularGrid, load_rssi, load_spectra, simulated_room
+from swiftwrf import AngularGrid, InputError, load_rssi, load_spectra, simulated_room
+from swiftwrf.arrays import PlanarArray
 from swiftwrf.data import Reading
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.data.writing import write_rssi, write_spectra
@@ -95,6 +96,13 @@ def test_moving_receivers_and_splits_come_back(tmp_path):
     assert back.moving == "receiver"
     assert torch.equal(back.named_splits["walk"][1], split["walk"][1])
     torch.testing.assert_close(back.label, room.label)
+
+
+def test_an_array_that_the_files_contradict_is_refused(tmp_path):
+    write_spectra(simulated_room(n=20, grid=AngularGrid.hemisphere(8, 32)), tmp_path)
+    with pytest.raises(InputError, match="another array"):
+        load_spectra(tmp_path, array=PlanarArray.square(2, 915e6))
+    assert load_spectra(tmp_path, array=PlanarArray.square(4, 915e6)).array == PlanarArray.square(4, 915e6)
 
 
 @pytest.mark.parametrize("name", ["spectrum.npy", "spectrum.npz"])

@@ -100,6 +100,7 @@ def _antennas(**changes):
         (_antennas() | {"frequency": None}, "lacks frequency"),
         (_antennas() | {"frequency": 2.4}, "carrier in Hz"),
         (_antennas(location=[0, 0]), "location"),
+        (_antennas(spacingX=60, spacingY=60), "is the spacing in metres"),
         (_antennas(spacingX=None), "spacingX"),
         (_antennas(direction=None), "direction"),
         (_antennas(direction=[0, 0, 1]), "not vertical"),
@@ -129,6 +130,13 @@ def test_refuses_records(tmp_path):
         load_snapshots(folder)
     write_records(file, [{"csi": np.ones((1, 2, 4, 3), np.complex64)}])
     with pytest.raises(InputError, match="'pos'"):
+        load_snapshots(folder)
+
+
+def test_refuses_records_without_a_description(tmp_path):
+    folder = write_espargos(tmp_path / "lab")
+    (folder / "metadata.json").unlink()
+    with pytest.raises(InputError, match="no JSON with antennas"):
         load_snapshots(folder)
 
 

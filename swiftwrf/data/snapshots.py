@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -12,6 +13,9 @@ from swiftwrf.arrays import PlanarArray
 from swiftwrf.beamforming import PHASE
 from swiftwrf.data.spectra import GRID, Spectra, check_pixels
 from swiftwrf.data.splits import choose_split
+from swiftwrf.errors import InputError
+
+SPACING = (0.01, 20.0)  # [wavelengths] between neighbours: beyond, positions are in another unit than metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,4 +106,21 @@ class Snapshots:
             fixed_position=self.array_position,
             rotation=self.rotation,
             notes=self.notes,
+        )
+
+
+def check_spacing(file: Path, array: PlanarArray) -> None:
+    """Refuses elements at distances that no array has, as positions in millimetres give.
+
+    Raises:
+        InputError: such distances.
+    """
+    if len(array.element) < 2:
+        raise InputError(f"{file} describes an array of one element, which sees no directions; at least 2 are needed")
+    apart = torch.cdist(array.element, array.element).fill_diagonal_(torch.inf).amin(dim=1).median() / array.wavelength
+    low, high = SPACING
+    if not low <= float(apart) <= high:
+        raise InputError(
+            f"{file}: neighbouring elements are {float(apart) * array.wavelength:.4g} m, {float(apart):.3g} wavelengths "
+            f"apart; expected {low:g} to {high:g} wavelengths, so is the spacing in metres and the carrier in Hz?"
         )

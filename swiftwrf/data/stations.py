@@ -22,7 +22,7 @@ from torch import Tensor
 from swiftwrf.arrays import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import MOST_BYTES
 from swiftwrf.data.files import FARTHEST, check_carrier, read_text, sha256
-from swiftwrf.data.snapshots import Snapshots
+from swiftwrf.data.snapshots import Snapshots, check_spacing
 from swiftwrf.data.tfrecords import records
 from swiftwrf.errors import InputError
 
@@ -144,18 +144,15 @@ def _rotation(file: Path, antenna: dict[str, Any]) -> Tensor:
     if "rightvector" in antenna:
         right, up = (np.array(_vector(file, antenna, name)) for name in ("rightvector", "upvector"))
     else:
-        front, up = np.array(_vector(file, antenna, "direction")), np.array([0.0, 0.0, 1.0])
-        right = np.cross(up, front)
-    lengths = np.linalg.norm(right), np.linalg.norm(up)
-    if "rightvector" not in antenna:
+        front = np.array(_vector(file, antenna, "direction"))
+        right = np.cross([0.0, 0.0, 1.0], front)
         up = np.cross(front, right)
-        lengths = lengths[0], np.linalg.norm(up)
-    if not min(lengths) > 1e-6 or abs(right @ up) > SKEW * math.prod(lengths):
+    size = np.linalg.norm(right) * np.linalg.norm(up)
+    if not size > 1e-12 or abs(right @ up) > SKEW * size:
         raise InputError(
             f"{file}: rightvector and upvector of an array must be at right angles, or its direction not vertical"
         )
-    front = np.cross(right, up)
-    front, right = front / np.linalg.norm(front), right / lengths[0]
+    right, front = (vector / np.linalg.norm(vector) for vector in (right, np.cross(right, up)))
     return torch.from_numpy(np.stack([right, np.cross(front, right), front], axis=1))
 
 
@@ -241,6 +238,12 @@ def read_snapshots(
     )
 
 
-def element_array(places: list[tuple[float, float]], frequency_hz: float) -> PlanarArray:
-    """Elements at these places of their plane."""
-    return PlanarArray(torch.tensor(places, dtype=torch.float64), LIGHT_SPEED / frequency_hz)
+def element_array(file: Path, places: list[tuple[float, float]], frequency_hz: float) -> PlanarArray:
+    """Elements at these places of their plane.
+
+    Raises:
+        InputError: distances that no array has.
+    """
+    array = PlanarArray(torch.tensor(places, dtype=torch.float64), LIGHT_SPEED / frequency_hz)
+    check_spacing(file, array)
+    return array

@@ -81,10 +81,10 @@ def _positions(position: Tensor, findings: Findings, wavelength: float | None = 
     findings.say(f"{len(position)} positions, {ranges} m.", n=len(position), extent_m=extent)
     if max(extent) > WIDE:
         findings.warn(f"Positions extend over {max(extent):.0f} m; are they millimetres? The toolkit takes metres.")
-    splits = [axis for axis, size in zip("xyz", extent, strict=True) if size < 1e-9]
-    if len(splits) > 1 or extent[0] < 1e-9 or extent[1] < 1e-9:
+    flat = [axis for axis, size in zip("xyz", extent, strict=True) if size < 1e-9]
+    if {"x", "y"} & set(flat):
         findings.warn(
-            f"All positions have one {' and one '.join(splits)}; directions and planes cannot be told from them."
+            f"All positions have one {' and one '.join(flat)}; directions and planes cannot be told from them."
         )
     near = nearest(position)
     same = int((near == 0).sum())

@@ -13,6 +13,7 @@ from sklearn.dummy import DummyRegressor
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 from sklearn.neighbors import KNeighborsRegressor, NearestNeighbors
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from swiftwrf import InputError, Rssi, RssiConfig, RssiModel, comparison, fit_rssi
@@ -195,8 +196,9 @@ class GaussianProcess(_PerReceiver):
         kernel = kernel + WhiteKernel(scale / 2, (scale * 1e-3, scale * 10))
         order = np.random.default_rng(self._seed).permutation(len(y))
         tuned, kept = order[:TUNED_ROWS], order[:KEPT_ROWS]
-        fitted = GaussianProcessRegressor(kernel, random_state=self._seed).fit(x[tuned], y[tuned])
-        return GaussianProcessRegressor(fitted.kernel_, optimizer=None).fit(x[kept], y[kept])
+        with threadpool_limits(1):  # many small systems, for which threads mostly wait for each other
+            fitted = GaussianProcessRegressor(kernel, random_state=self._seed).fit(x[tuned], y[tuned])
+            return GaussianProcessRegressor(fitted.kernel_, optimizer=None).fit(x[kept], y[kept])
 
 
 class SwiftWRFPredictor:

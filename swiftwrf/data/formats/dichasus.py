@@ -58,7 +58,7 @@ class Dichasus(Format[Snapshots]):
             how.every or 1,
             functools.partial(_parse, offsets=offsets),
             lambda csi: csi[antennas],
-            (station, element_array([station.element(r, c, shape) for r, c, _ in cells], frequency)),
+            (station, element_array(described, [station.element(r, c, shape) for r, c, _ in cells], frequency)),
             [described, *known],
             notes,
         )

@@ -17,6 +17,7 @@ from swiftwrf.data.stations import (
     record_files,
 )
 from swiftwrf.data.tfrecords import tensor
+from swiftwrf.errors import InputError
 
 SHAPE = (2, 4)  # rows and columns of an array
 
@@ -28,12 +29,17 @@ class Espargos(Format[Snapshots]):
     takes = frozenset({"beamformer", "grid", "every", "station"})
 
     def recognises(self, path: Path) -> bool:
-        described = description(path) if record_files(path) else None
-        return described is not None and not has_assignments(described)
+        if not record_files(path):
+            return False
+        described = description(path)
+        return described is None or not has_assignments(described)
 
     def read(self, path: Path, how: Reading) -> Snapshots:
         described = description(path)
-        assert described is not None
+        if described is None:
+            raise InputError(
+                f"{path} holds records, but no JSON with antennas, which describes their arrays, lies beside them"
+            )
         index, station, frequency = read_station(described, how.station)
         places = [station.element(row, column, SHAPE) for row in range(SHAPE[0]) for column in range(SHAPE[1])]
         return read_snapshots(
@@ -41,7 +47,7 @@ class Espargos(Format[Snapshots]):
             how.every or 1,
             _parse,
             lambda csi: csi[index].reshape(len(places), -1),
-            (station, element_array(places, frequency)),
+            (station, element_array(described, places, frequency)),
             [described],
             (),
         )

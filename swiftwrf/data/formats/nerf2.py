@@ -75,7 +75,9 @@ class Nerf2(Format[Spectra]):
 def _read(folder: Path, how: Reading) -> Spectra:
     gateway = _read_gateway(folder / "gateway_info.yml")
     pose = _read_pose(folder / "gateway_info.yml", gateway)
-    array = how.array or _read_array(folder / "gateway_info.yml", gateway)
+    array = _read_array(folder / "gateway_info.yml", gateway)
+    if how.array is not None and array is not None and array != how.array:
+        raise InputError(f"{folder / 'gateway_info.yml'} describes another array than was given; leave one of them out")
     tables = [file for file in (folder / "tx_pos.csv", folder / "rx_pos.csv") if file.is_file()]
     if len(tables) != 1:
         raise InputError(f"{folder} must hold one of tx_pos.csv (moving transmitter) and rx_pos.csv (moving receiver)")
@@ -98,7 +100,7 @@ def _read(folder: Path, how: Reading) -> Spectra:
         moving=moving,
         index=torch.arange(len(position)),
         named_splits=splits,
-        array=array,
+        array=array or how.array,
         source={file.name: sha256(file) for file in described} | digests,
         fixed_position=fixed,
         rotation=pose.rotation,

@@ -16,14 +16,13 @@ from swiftwrf.data.archives import ARCHIVES, Arrays, array_names, read_arrays
 from swiftwrf.data.files import FARTHEST, check_carrier, sha256
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format
 from swiftwrf.data.reading import Reading
-from swiftwrf.data.snapshots import Snapshots
+from swiftwrf.data.snapshots import Snapshots, check_spacing
 from swiftwrf.data.splits import read_split, split_names
 from swiftwrf.errors import InputError
 
 NEEDED = ("csi", "position", "frequency_hz", "array_position", "array_orientation")
 OPTIONAL = ("element_position", "rows", "columns", "spacing_m", "line_of_sight", "time")
 FLAT = 1e-3  # [wavelengths] that elements may leave their plane
-SPACING = (0.01, 20.0)  # [wavelengths] between neighbours: beyond, positions are in another unit than metres
 
 
 @SNAPSHOT_FORMATS.register("snapshots", meaning="csi of each antenna element in snapshots.npz or snapshots.h5")
@@ -174,20 +173,3 @@ def _plane(file: Path, arrays: Arrays, wavelength: float) -> Tensor:
             "array coordinates, x and y in the array's plane, and let array_orientation turn them into the world"
         )
     return element[:, :2]
-
-
-def check_spacing(file: Path, array: PlanarArray) -> None:
-    """Refuses elements at distances that no array has, as positions in millimetres give.
-
-    Raises:
-        InputError: such distances.
-    """
-    if len(array.element) < 2:
-        raise InputError(f"{file} describes an array of one element, which sees no directions; at least 2 are needed")
-    apart = torch.cdist(array.element, array.element).fill_diagonal_(torch.inf).amin(dim=1).median() / array.wavelength
-    low, high = SPACING
-    if not low <= float(apart) <= high:
-        raise InputError(
-            f"{file}: neighbouring elements are {float(apart) * array.wavelength:.4g} m, {float(apart):.3g} wavelengths "
-            f"apart; expected {low:g} to {high:g} wavelengths, so is the spacing in metres and the carrier in Hz?"
-        )
