@@ -232,7 +232,7 @@ def test_interrupted_run_goes_on_to_the_same_numbers(small, tmp_path, monkeypatc
         (("--mix", 0.3, 0.3), "twice"),
         (("--mix", 0.1), "leaves 4 of 40"),
         (("--mix", 0.5, "--split", "nowhere"), "choose one of block, random"),
-        (("--mix", 0.5, "--synthesizer", "vae"), "unknown synthesizer"),
+        (("--mix", 0.5, "--synthesizer", "oracle"), "unknown synthesizer"),
         (("--mix", 0.5, "--repeats", 0), "--repeats"),
         (("--mix", 0.5, "--suggest", -1), "--suggest"),
         (("--mix", 0.5, "--data", "/nowhere"), "is not a folder"),
