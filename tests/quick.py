@@ -53,6 +53,13 @@ PUBLISHED: dict[str, Config] = {  # methods of comparison, as small as they can 
     "dcgan": DcganConfig(size=DcganSize(noise=2, width=2, hidden=8, bands=2), **LONGER),
 }
 PUBLISHED_RSSI = NeRF2RssiConfig(size=NeRF2RssiSize(width=8, bands=2, samples=4, azimuths=4, elevations=2), **LONGER)
+TASKS = {
+    "aoa": (AoaConfig, aoa.run),
+    "rssi": (rssi.RssiTaskConfig, rssi.run),
+    "report": (ReportConfig, report),
+    "convert": (ConvertConfig, convert),
+    "inspect": (InspectConfig, inspect),
+}
 FOR_LIFE = ExitStack()
 PREDICTORS_KEPT = ("swiftwrf", "mean", "mri_pooled", "mri_receiver")
 
@@ -102,13 +109,7 @@ def quick() -> Iterator[None]:
 
 def run(task: str, *arguments: object) -> int:
     """A task's command line on the toy; its exit code."""
-    config, function = {
-        "aoa": (AoaConfig, aoa.run),
-        "rssi": (rssi.RssiTaskConfig, rssi.run),
-        "report": (ReportConfig, report),
-        "convert": (ConvertConfig, convert),
-        "inspect": (InspectConfig, inspect),
-    }[task]
+    config, function = TASKS[task]
     with quick():
         return command_line(f"tasks.{task}", config, function, [str(a) for a in arguments])
 

@@ -35,6 +35,12 @@ AOA = ("aoa", "--mix", 0.5, "--synthesizer", "swiftwrf", "idw", "--extra", 20)
 RSSI = ("rssi", "--rx", 1, 2, 3, 4, 5)  # two groups
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch):
+    """Processes start slowly where other tests run beside."""
+    monkeypatch.setattr(clusters, "PATIENCE", 120)
+
+
 @pytest.fixture(scope="module")
 def local():
     """Two processes that know the stand-ins of `quick`; one that is killed may take its time to start again."""
@@ -75,9 +81,14 @@ def during(monkeypatch, call, act):
     monkeypatch.setattr(owner, name, acting)
 
 
+def kill_a_worker(local):
+    """One that is up."""
+    up = [nanny for nanny in local.workers.values() if nanny.worker_address in local.scheduler.workers]
+    os.kill(up[0].pid, signal.SIGKILL)
+
+
 def test_aoa_has_the_same_numbers_when_a_worker_dies(local, whole, tmp_path, monkeypatch):
-    first = next(iter(local.workers.values()))
-    during(monkeypatch, (Run, "keep", 4), lambda: os.kill(first.pid, signal.SIGKILL))
+    during(monkeypatch, (Run, "keep", 4), lambda: kill_a_worker(local))
     assert run(*AOA, "--scheduler", local.scheduler_address, "--out", tmp_path / "run") == 0
     same_results("aoa", whole, tmp_path / "run")
     assert {file.name for file in (tmp_path / "run").iterdir()} == {file.name for file in whole.iterdir()}
@@ -88,8 +99,7 @@ def test_aoa_has_the_same_numbers_when_a_worker_dies(local, whole, tmp_path, mon
 
 def test_rssi_has_the_same_bits_when_a_worker_dies(local, cluster, monkeypatch):
     monkeypatch.setattr(rssi_fit, "GROUP", 1)
-    first = next(iter(local.workers.values()))
-    during(monkeypatch, (Cluster, "next", 2), lambda: os.kill(first.pid, signal.SIGKILL))
+    during(monkeypatch, (Cluster, "next", 2), lambda: kill_a_worker(local))
     data = with_field(n=40)
     here, there = fit_rssi(data), fit_rssi(data, parallel=cluster.map)
     assert torch.equal(there.predict(data.transmitter_position)[0], here.predict(data.transmitter_position)[0])
@@ -186,7 +196,6 @@ def scheduler(tmp_path):
 
 def test_aoa_survives_its_scheduler(scheduler, whole, tmp_path, monkeypatch, capsys):
     process, address = scheduler
-    monkeypatch.setattr(clusters, "PATIENCE", 120)  # the worker is starting
     with monkeypatch.context() as patch:
         during(patch, (Run, "keep", 3), process.kill)
         assert run(*AOA, "--scheduler", address, "--out", tmp_path / "cut") == 1
@@ -201,9 +210,10 @@ def test_aoa_survives_its_scheduler(scheduler, whole, tmp_path, monkeypatch, cap
 
 
 def test_a_worker_is_no_scheduler(local):
-    worker = next(iter(local.workers.values()))
+    while not local.scheduler.workers:
+        time.sleep(0.1)
     with pytest.raises(InputError, match="a Dask Worker answers"):
-        Cluster(worker.worker_address, CPU)
+        Cluster(next(iter(local.scheduler.workers)), CPU)
 
 
 def test_another_server_is_no_scheduler(monkeypatch):

@@ -10,9 +10,7 @@ from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 
-from tasks.aoa.config import AoaConfig
-from tasks.report.__main__ import ReportConfig
-from tasks.rssi.experiment import RssiTaskConfig
+from quick import TASKS
 
 VALUES = [
     "", "0", "1", "-1", "0.5", "1.5", "nan", "inf", "-inf", "1e400", "1e-320", "4294967296", "99999999999999999999",
@@ -20,12 +18,17 @@ VALUES = [
     "/", "/dev/null", "/proc/1/mem", "tcp://127.0.0.1:1", "tls://127.0.0.1:1", "none", "auto", "cpu", "paper", "True",
     "[1]", "{}", "nearest", "swiftwrf", "receiver", "*",
 ]  # fmt: skip
-CONFIGS = {"aoa": AoaConfig, "rssi": RssiTaskConfig, "report": ReportConfig}
 OPTIONS = {
     task: ("--resume", *(f"--{option.name.replace('_', '-')}" for option in fields(config)))
-    for task, config in CONFIGS.items()
+    for task, (config, _) in TASKS.items()
 }
-NEEDED = {"aoa": ["--mix", "0.5"], "rssi": ["--rx", "1"], "report": ["run"]}
+NEEDED = {
+    "aoa": ["--mix", "0.5"],
+    "rssi": ["--rx", "1"],
+    "report": ["run"],
+    "convert": ["data", "taken"],
+    "inspect": ["data"],
+}
 RIGHT = {
     "aoa": {
         "--mix": ("0.5", "1", "0.45 0.9"),
@@ -61,7 +64,7 @@ def command_lines(draw: random.Random, folder: Path, count: int) -> Iterator[tup
             arguments += [draw.choice(values) for _ in range(draw.choice([0, 1, 1, 1, 2, 3, 4]))]
         if draw.random() < 0.1:
             arguments.append(draw.choice(values))
-        yield task, [*arguments, "--out", str(taken)]
+        yield task, arguments if task == "convert" else [*arguments, "--out", str(taken)]
 
 
 def right_command_lines(draw: random.Random, folder: Path, count: int) -> Iterator[tuple[str, list[str]]]:
