@@ -77,13 +77,13 @@ def test_many_mutations(kind, tmp_path):
     attack(kind, tmp_path, range(SHORT, SHORT + LONG))
 
 
-def _end(task, arguments, capsys):
+def _end(task, arguments, capfd):
     """Runs a command line; its exit code, and what it said where that was a refusal of ours."""
     try:
         code = run(task, *arguments)
     except SystemExit as end:  # help, or options that the parser does not know
         code = end.code
-    lines = capsys.readouterr().err.strip().splitlines()
+    lines = capfd.readouterr().err.strip().splitlines()
     said = [line for line in lines if line.startswith("error: ")]
     assert code in (0, 1, 2, None), (task, arguments)
     if said:
@@ -94,24 +94,24 @@ def _end(task, arguments, capsys):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_command_lines(seed, tmp_path, monkeypatch, capsys):
+def test_command_lines(seed, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     for task, arguments in command_lines(random.Random(seed), tmp_path, 10):
-        _end(task, arguments, capsys)
+        _end(task, arguments, capfd)
 
 
 @pytest.mark.fuzz
-def test_many_command_lines(tmp_path, monkeypatch, capsys):
+def test_many_command_lines(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     for task, arguments in command_lines(random.Random(99), tmp_path, 200):
-        _end(task, arguments, capsys)
+        _end(task, arguments, capfd)
 
 
 @pytest.mark.fuzz
-def test_right_command_lines(tmp_path, monkeypatch, capsys):
+def test_right_command_lines(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     for task, arguments in right_command_lines(random.Random(0), tmp_path, 5):
-        assert _end(task, arguments, capsys) == 0
+        assert _end(task, arguments, capfd) == 0
         assert (Path(arguments[-1]) / "metrics.json").exists()
 
 
