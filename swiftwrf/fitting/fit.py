@@ -59,12 +59,12 @@ def fit(
     config.check()
     fold = folds(train.position, config.validation, config.seed)
     work = train.at_most(config.max_azimuths)
-    kernel = choose_kernel(work.position, work.spectrum, fold)
+    kernel = choose_kernel(work.position, work.store, fold)
     if config.validation == "random":
         fold = torch.arange(len(train))  # regression leaves out one spectrum as easily as a fifth of them
     if config.model.rank == "auto":
         deformation = deformation_type(config.model.deformation)
-        rank = deformation.choose_rank(work.position, work.spectrum, fold, kernel)
+        rank = deformation.choose_rank(work.position, work.store, fold, kernel)
         config = replace(config, model=replace(config.model, rank=rank))
     with progress_bar(progress) as bar:
         session = Session(checkpoint, fingerprint(work, asdict(config)), bar, on_record)

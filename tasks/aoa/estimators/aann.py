@@ -105,7 +105,7 @@ class AANN(Estimator):
 
     def fit(self, train: Mixed) -> None:
         config, network = self._config, self._network
-        spectrum = self._prepare(train.spectrum)
+        spectrum = torch.cat([self._prepare(part) for part in train.batches()])
         direction = to_direction(*train.label.unbind(-1)).float().to(self._device)
         self._mean = functional.normalize(direction.mean(dim=0), dim=0)
         self._spread = (direction - self._mean).square().sum(dim=1).mean().sqrt().clamp_min(1e-4)
