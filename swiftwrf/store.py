@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import IO
+from typing import Any
 
 import numpy as np
 import torch
@@ -179,19 +179,22 @@ def _write(file: Path, shape: tuple[int, int, int], dtype: torch.dtype, make: Ca
         )
     with replacing(file) as temporary, temporary.open("wb") as stream, progress_bar() as bar:
         task = bar.add_task("storing spectra", total=shape[0])
-        for batch in write_npy(stream, shape, dtype, make()):
-            bar.advance(task, len(batch))
+        write_npy(stream, shape, dtype, make(), lambda count: bar.advance(task, count))
 
 
 def write_npy(
-    stream: IO[bytes], shape: tuple[int, int, int], dtype: torch.dtype, batches: Iterable[Tensor]
-) -> Iterator[Tensor]:
-    """Writes an npy file of spectra (n, H, W) that come by the batch; gives each batch once it is written."""
+    stream: Any,
+    shape: tuple[int, int, int],
+    dtype: torch.dtype,
+    batches: Iterable[Tensor],
+    advance: Callable[[int], None] = lambda count: None,
+) -> None:
+    """An npy file of spectra (n, H, W) that come by the batch; `advance` hears how many were written."""
     header = {"shape": shape, "fortran_order": False, "descr": dtype_to_descr(np.dtype(TYPES[dtype]))}
     write_array_header_2_0(stream, header)
     for batch in batches:
         stream.write(batch.contiguous().numpy().data)
-        yield batch
+        advance(len(batch))
 
 
 def _prune(folder: Path) -> None:
