@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
-from committed import RESULTS
+from committed import RESULTS, ROOT
 from record import write_result
 
 from augment import Mixed, Settings, make_synthesizer
@@ -35,6 +35,7 @@ from swiftwrf.metrics import psnr
 from swiftwrf.store import stored
 from tasks.aoa.estimators import Settings as EstimatorSettings
 from tasks.aoa.estimators.aann import AANN, AANNConfig
+from tasks.page import figures
 
 GRID = AngularGrid.hemisphere(90, 360)
 SIZES = (300, 1_000, 10_000, 100_000)
@@ -46,6 +47,7 @@ DRAWN = 1_000  # positions between those of the walk that spectra are synthesize
 TRAINING_STEPS = 5
 SAMPLED = 0.02  # [s] between two looks at the memory
 GIB = 2**20  # in kibibytes
+MOST_GIB = 6  # that any stage may take
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,7 @@ def main(config: Config) -> None:
             rows[n] = {"n": n, "stages": {stage: run(stage, n, folder) for stage in STAGES}}
         ordered = [rows[n] for n in sorted(rows)]
         write_result("scaling", {"threads": torch.get_num_threads(), "rows": ordered, "slopes": slopes(ordered)})
+        draw(ordered)
 
 
 def run(stage: str, n: int, folder: str) -> dict[str, float]:
@@ -85,6 +88,22 @@ def slopes(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
                 growth = np.log(values[part] / small["stages"][stage][part]) / np.log(large["n"] / small["n"])
                 found.setdefault(f"{stage}, {part}", {})[f"{small['n']} to {large['n']}"] = round(float(growth), 2)
     return found
+
+
+def draw(rows: list[dict[str, Any]]) -> None:
+    """Seconds and peak memory of the stages against the number of spectra."""
+    panels, (time_axis, memory_axis) = figures.new_figure(1, 2, 9, 3.4)
+    for stage in STAGES:
+        for part in [key for key in rows[0]["stages"][stage] if key.endswith("seconds")]:
+            values = [row["stages"][stage][part] for row in rows]
+            time_axis.plot([row["n"] for row in rows], values, marker="o", label=f"{stage} {part[:-8]}".strip())
+        memory_axis.plot([row["n"] for row in rows], [row["stages"][stage]["rss_gib"] for row in rows], marker="o")
+    memory_axis.axhline(MOST_GIB, color=figures.RULE)
+    for axis, label in ((time_axis, "seconds of a processor"), (memory_axis, "peak resident memory [GiB]")):
+        axis.set(xscale="log", xlabel="spectra of 90 x 360 pixels", ylabel=label)
+    time_axis.set(yscale="log")
+    figures.legend_below(panels, time_axis)
+    (ROOT / "docs" / "figures" / "scaling.svg").write_text(figures.as_svg(panels))
 
 
 def walk(at: torch.Tensor) -> torch.Tensor:
