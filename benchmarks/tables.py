@@ -260,6 +260,22 @@ def scaling() -> str:
     return markdown([*columns, "not from files [GiB]"], rows)
 
 
+def scaling_rssi() -> str:
+    """Seconds of a processor of the RSSI model, and its peak memory."""
+    content = load("scaling_rssi")
+    rows = [
+        [
+            f"{row['rows']:,.0f}",
+            f"{row['receivers']:.0f}",
+            f"{row['fit seconds']:.1f} s",
+            f"{row['predict seconds']:.2f} s",
+            f"{row['rss_gib']:.1f}",
+        ]
+        for row in content["rows"]
+    ]
+    return markdown(["rows", "receivers", "fit", f"{content['predicted']:,} positions", "peak [GiB]"], rows)
+
+
 def scaling_quality() -> str:
     """Median PSNR between the positions of the walk."""
     content = load("scaling")
@@ -271,6 +287,7 @@ def scaling_quality() -> str:
 TABLES = {
     "scaling": scaling,
     "scaling_quality": scaling_quality,
+    "scaling_rssi": scaling_rssi,
     "headline": headline,
     "synthesis": synthesis,
     "aoa": aoa,
