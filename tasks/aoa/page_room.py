@@ -179,20 +179,24 @@ def _extent(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> tu
     return low, high
 
 
-def _draw_in_plan(ax: Axes, plane: dict[str, Any], low: NDArray[Any], high: NDArray[Any]) -> None:
+def in_plan(plane: dict[str, Any], low: NDArray[Any], high: NDArray[Any]) -> NDArray[Any] | None:
+    """Both ends (2, 2) [m] of a plane's line through the box from `low` to `high` (3,) at half its height, seen from
+    above; None for floors and ceilings."""
     nx, ny, nz = plane["normal"]
-    if abs(nz) > 0.7:  # floors and ceilings are no lines in a plan
-        return
-    line = "-" if plane["certain"] else "--"
-    ends = [low - MARGIN, high + MARGIN]
+    if abs(nz) > 0.7:
+        return None
     height = (low[2] + high[2]) / 2
     if abs(nx) >= abs(ny):
-        y = np.array([e[1] for e in ends])
-        x = (plane["offset_m"] - ny * y - nz * height) / nx
-    else:
-        x = np.array([e[0] for e in ends])
-        y = (plane["offset_m"] - nx * x - nz * height) / ny
-    ax.plot(x, y, line, color="#333333", linewidth=1.3)
+        y = np.array([low[1], high[1]])
+        return np.stack([(plane["offset_m"] - ny * y - nz * height) / nx, y], axis=1)
+    x = np.array([low[0], high[0]])
+    return np.stack([x, (plane["offset_m"] - nx * x - nz * height) / ny], axis=1)
+
+
+def _draw_in_plan(ax: Axes, plane: dict[str, Any], low: NDArray[Any], high: NDArray[Any]) -> None:
+    ends = in_plan(plane, low - MARGIN, high + MARGIN)
+    if ends is not None:
+        ax.plot(*ends.T, "-" if plane["certain"] else "--", color="#333333", linewidth=1.3)
 
 
 def _draw_in_space(ax: Any, plane: dict[str, Any], low: NDArray[Any], high: NDArray[Any]) -> None:

@@ -1,0 +1,283 @@
+"""Spectra anywhere: what is drawn where the moving end stands, without anything of how it is shown."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from swiftwrf import AngularGrid, CoarrayModel, GeometryModel, InputError, Spectra, SwiftWRF
+from swiftwrf.angles import great_circle, to_direction
+from swiftwrf.checkpoint import Saved
+from swiftwrf.comparison.dcgan import Dcgan
+from swiftwrf.comparison.drawing import LinkDrawing
+from swiftwrf.comparison.vae import Vae
+from swiftwrf.data.spectra import direction_of_link
+from swiftwrf.geometry import HybridModel
+from swiftwrf.positions import distance
+
+QUICK = 0.02  # [s] that a spectrum may take while the moving end is dragged
+Direction = tuple[float, float]  # azimuth, elevation [deg]
+Draw = Callable[[Tensor], tuple[Tensor, Tensor | None]]  # positions to spectra and their deviations
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A spectrum where the moving end stands.
+
+    Args:
+        position: of the moving end [m], (3,).
+        grid: of the spectrum; coarser than the model's where that would take too long.
+        spectrum: magnitudes, (n_elevation, n_azimuth).
+        deviation: expected of a measured spectrum; None where the model knows none.
+        strongest: direction of the largest magnitude.
+        line_of_sight: direction of the transmitter; None where it is unknown.
+        seconds: that it took.
+    """
+
+    position: NDArray[np.floating]
+    grid: AngularGrid
+    spectrum: NDArray[np.floating]
+    deviation: NDArray[np.floating] | None
+    strongest: Direction
+    line_of_sight: Direction | None
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The measured spectrum that is nearest to a position.
+
+    Args:
+        number: of its row, counted from 0.
+        away_m: distance from the position [m].
+        learnt: whether the model has learnt from it.
+        spectrum, strongest: see `Drawn`.
+    """
+
+    number: int
+    away_m: float
+    learnt: bool
+    spectrum: NDArray[np.floating]
+    strongest: Direction
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A fitted model.
+
+    Args:
+        title: what it is called.
+        model: what was saved.
+        planes: of the room, as in geometry-mix*.json.
+        learnt: which measured spectra it was fitted to, (n,); None where that is unknown.
+
+    Raises:
+        InputError: a model that draws no spectra.
+    """
+
+    title: str
+    model: Saved
+    planes: list[dict[str, Any]] = field(default_factory=list)
+    learnt: NDArray[np.bool_] | None = None
+
+    def __post_init__(self) -> None:
+        if not hasattr(self.model, "synthesize"):
+            raise InputError(f"a {self.model.kind} draws neither spectra nor maps that can be looked at")
+
+    @cached_property
+    def grid(self) -> AngularGrid:
+        """That of the spectra it was fitted to."""
+        model: Any = self.model.geometry if isinstance(self.model, HybridModel) else self.model
+        grid: AngularGrid = model.grid
+        return grid
+
+    @cached_property
+    def fine(self) -> Draw:
+        """Draws on the model's own grid."""
+        return self._on(self.grid)
+
+    @cached_property
+    def quick(self) -> tuple[AngularGrid, Draw]:
+        """A grid on which a spectrum takes at most `QUICK` seconds here and now, the coarsest there is where none does, and
+        what draws on it."""
+        at = self.region[:1]
+        found = self.grid, self.fine
+        for factor in range(1, min(self.grid.shape) + 1 if self._any_grid else 2):
+            if any(size % factor for size in self.grid.shape):
+                continue
+            grid = self.grid.coarsen(factor)
+            found = grid, self.fine if factor == 1 else self._on(grid)
+            if _seconds(found[1], at) <= QUICK:
+                break
+        return found
+
+    @property
+    def _any_grid(self) -> bool:
+        """Whether the model draws on other grids than its own."""
+        return isinstance(self.model, SwiftWRF | GeometryModel | CoarrayModel | LinkDrawing)
+
+    def _on(self, grid: AngularGrid) -> Draw:
+        model: Any = self.model
+        if isinstance(model, SwiftWRF):
+            canvas = model.canvas(grid)
+            if canvas.variation is not None:
+                return lambda position: model.synthesize(position, canvas, return_std=True)
+            return lambda position: (model.synthesize(position, canvas), None)
+        if isinstance(model, GeometryModel):
+            model = replace(model, grid=grid)
+        elif self._any_grid:
+            return lambda position: (model.synthesize(position, grid), None)
+        return lambda position: (model.synthesize(position), None)
+
+    @cached_property
+    def region(self) -> Tensor:
+        """Positions (n, 3) [m] around which the model knows spectra, as far as it says."""
+        match self.model:
+            case SwiftWRF() | Vae() | Dcgan():
+                frame: Any = self.model if isinstance(self.model, SwiftWRF) else self.model.frame
+                return frame.centre + frame.scale * torch.tensor([[0.0], [-1], [1]], dtype=torch.float64)
+            case CoarrayModel() | HybridModel():
+                return self.model.anchor
+            case LinkDrawing():
+                link = self.model.link
+                reach = (link.fixed - link.centre).abs().max()
+                return link.centre + reach * torch.tensor([[0.0], [-1], [1]], dtype=torch.float64)
+            case GeometryModel():
+                return self._inside(self.model)
+        raise AssertionError(type(self.model))
+
+    def _inside(self, room: GeometryModel) -> Tensor:
+        """The middle of a room and two of its corners, two metres away from the fixed end where no wall tells."""
+        low, high = room.fixed_position - 2, room.fixed_position + 2
+        for plane in room.planes:
+            axis = int(np.abs(plane.normal).argmax())
+            at = plane.offset_m / plane.normal[axis]
+            if plane.normal[axis] > 0:
+                high[axis] = at
+            else:
+                low[axis] = at
+        return torch.stack([(low + high) / 2, low, high])
+
+    def line_of_sight(self, position: Tensor) -> Tensor | None:
+        """Direction (n, 2) [rad] of the transmitter, as far as the model knows the link."""
+        match self.model:
+            case GeometryModel():
+                ends: Any = self.model
+            case HybridModel():
+                ends = self.model.geometry
+            case LinkDrawing():
+                link = self.model.link
+                return direction_of_link(position, link.fixed, link.rotation, link.moving)
+            case _:
+                return None
+        return direction_of_link(position, ends.fixed_position, ends.rotation, ends.moving)
+
+
+@dataclass(frozen=True, eq=False)
+class SpectraScene:
+    """What can be looked at: fitted models, and the spectra that were measured where they are known.
+
+    Args:
+        title: of the page.
+        fitted: the models, at least one.
+        data: what was measured; None where it is unknown.
+        notes: what to say of it, a sentence each.
+    """
+
+    title: str
+    fitted: list[Fitted]
+    data: Spectra | None = None
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def moving(self) -> str:
+        """What the moving end is called."""
+        return self.data.moving if self.data is not None else "moving end"
+
+    @cached_property
+    def places(self) -> NDArray[np.floating]:
+        """Positions (n, 3) [m] that the page shows: those measured, or around which the models know spectra."""
+        if self.data is not None:
+            return self.data.position.numpy()
+        return torch.cat([fitted.region for fitted in self.fitted]).numpy()
+
+    @property
+    def start(self) -> NDArray[np.floating]:
+        """Where the moving end stands at first: a measured position near the middle, or the middle."""
+        middle = (self.places.min(axis=0) + self.places.max(axis=0)) / 2
+        if self.data is None:
+            return middle
+        return self.places[np.linalg.norm(self.places - middle, axis=1).argmin()]
+
+    def draw(self, fitted: Fitted, position: NDArray[np.floating], quick: bool = False) -> Drawn:
+        """The spectrum of a model with the moving end at a position (3,) [m]; quickly, perhaps on a coarser grid."""
+        grid, draw = fitted.quick if quick else (fitted.grid, fitted.fine)
+        at = torch.as_tensor(position, dtype=torch.float64).reshape(1, 3)
+        began = time.perf_counter()
+        spectrum, deviation = draw(at)
+        seconds = time.perf_counter() - began
+        return Drawn(
+            np.asarray(position, dtype=float),
+            grid,
+            spectrum[0].numpy(),
+            None if deviation is None else deviation[0].numpy(),
+            strongest(spectrum[0], grid),
+            self._line_of_sight(fitted, at),
+            seconds,
+        )
+
+    def _line_of_sight(self, fitted: Fitted, at: Tensor) -> Direction | None:
+        if self.data is not None and self.data.fixed_position is not None and self.data.rotation is not None:
+            return _degrees(self.data.direction_at(at)[0])
+        seen = fitted.line_of_sight(at)
+        return None if seen is None else _degrees(seen[0])
+
+    def nearest(self, fitted: Fitted, position: NDArray[np.floating]) -> Measured | None:
+        """The measured spectrum nearest to a position (3,) [m]; None where none are known."""
+        if self.data is None:
+            return None
+        away = distance(torch.as_tensor(position, dtype=torch.float64).reshape(1, 3), self.data.position)[0]
+        row = int(away.argmin())
+        spectrum = self.data.spectrum[row]
+        learnt = fitted.learnt is not None and bool(fitted.learnt[row])
+        return Measured(row, float(away[row]), learnt, spectrum.numpy(), strongest(spectrum, self.data.grid))
+
+
+def planes_of(model: Saved) -> list[dict[str, Any]]:
+    """The room that a model found, as in geometry-mix*.json; none where it knows of none."""
+    room = model.geometry if isinstance(model, HybridModel) else model
+    planes: list[dict[str, Any]] = room.to_json()["planes"] if isinstance(room, GeometryModel) else []
+    return planes
+
+
+def strongest(spectrum: Tensor, grid: AngularGrid) -> Direction:
+    """Direction of the largest magnitude of a spectrum (n_elevation, n_azimuth)."""
+    row, column = divmod(int(spectrum.argmax()), grid.n_azimuth)
+    return _degrees(torch.stack([grid.azimuth[column], grid.elevation[row]]))
+
+
+def angle_between(a: Direction, b: Direction) -> float:
+    """Great-circle angle of two directions [deg]."""
+    first, second = (to_direction(*torch.tensor(direction, dtype=torch.float64).deg2rad()) for direction in (a, b))
+    return float(great_circle(first, second).rad2deg())
+
+
+def _degrees(direction: Tensor) -> Direction:
+    azimuth, elevation = direction.rad2deg().tolist()
+    return azimuth, elevation
+
+
+def _seconds(draw: Draw, at: Tensor) -> float:
+    """That one spectrum takes; the second one, for the first may compile or fill caches."""
+    draw(at)
+    began = time.perf_counter()
+    draw(at)
+    return time.perf_counter() - began
