@@ -32,7 +32,9 @@ def opened(source: Path) -> SpectraScene | RssiScene:
     if source.is_file():
         return _saved(source)
     if not source.is_dir():
-        raise InputError(f"{source} is not there; give the directory of a run of tasks.aoa or tasks.rssi, or a saved model")
+        raise InputError(
+            f"{source} is not there; give the directory of a run of tasks.aoa or tasks.rssi, or a saved model"
+        )
     if not (source / CONFIG).is_file():
         raise InputError(f"{source} is no run: it has no {CONFIG}; give the directory of a run, or a saved model")
     content = read_json(source / CONFIG)
@@ -42,7 +44,9 @@ def opened(source: Path) -> SpectraScene | RssiScene:
         case "rssi":
             return _rssi_run(source)
         case other:
-            raise InputError(f"{source} is a run of tasks.{other}; only runs of tasks.aoa and tasks.rssi can be looked at")
+            raise InputError(
+                f"{source} is a run of tasks.{other}; only runs of tasks.aoa and tasks.rssi can be looked at"
+            )
 
 
 def _saved(file: Path) -> SpectraScene | RssiScene:
@@ -102,7 +106,9 @@ def _measured(folder: Path, content: Row) -> tuple[Spectra | None, dict[str, Any
 def _rssi_run(folder: Path) -> RssiScene:
     file = folder / MODEL
     if not file.is_file():
-        raise InputError(f"{folder} holds no model: it has no {MODEL}; it was stopped early or is of an older version, run it anew")
+        raise InputError(
+            f"{folder} holds no model: it has no {MODEL}; it was stopped early or is of an older version, run it anew"
+        )
     model = load(file)
     if not isinstance(model, RssiModel):
         raise InputError(f"{file} holds a {model.kind}, expected a {RssiModel.kind}")

@@ -38,6 +38,13 @@ def png(values: Values, colours: str, low: float = 0.0, high: float = 1.0) -> by
     return stream.getvalue()
 
 
+def as_png(pixels: NDArray[np.uint8]) -> bytes:
+    """An image (rows, columns, 3)."""
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "PNG", compress_level=QUICK)
+    return stream.getvalue()
+
+
 def _palette(colours: str) -> bytes:
     rgb = colormaps[colours](np.linspace(0, 1, CLEAR), bytes=True)[:, :3]
     return bytes(rgb.tobytes()) + b"\0\0\0"
@@ -87,7 +94,8 @@ class View:
         """Azimuth and elevation [rad] of every pixel; elevations below 0 are outside."""
         x, y = np.arange(self.width) + 0.5, self.height - np.arange(self.height) - 0.5
         if not self.polar:
-            return np.broadcast_arrays(x / self.width * 2 * np.pi, y[:, None] / self.height * np.pi / 2)
+            azimuth, elevation = np.meshgrid(x / self.width * 2 * np.pi, y / self.height * np.pi / 2)
+            return azimuth, elevation
         right, up = np.meshgrid(2 * x / self.width - 1, 2 * y / self.height - 1)
         return np.arctan2(up, right) % (2 * np.pi), (1 - np.hypot(right, up)) * np.pi / 2
 

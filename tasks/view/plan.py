@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,6 @@ from markupsafe import escape
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
-SIZE = 640  # pixels of the longer side
 EDGE = 0.04  # of the extent, beyond what is shown
 NARROWEST = 0.4  # of a plan, over its longer side: a path along an axis, too, leaves room to drag
 
@@ -21,26 +20,25 @@ class Plan:
 
     Args:
         low, high: corners [m], (2,).
+        scale: pixels a metre.
     """
 
     low: NDArray[np.floating]
     high: NDArray[np.floating]
+    scale: float
 
     @classmethod
-    def around(cls, *places: ArrayLike) -> Plan:
-        """The plan that shows all these positions, each (..., 2 or 3) [m]; what is not finite is left out."""
+    def around(cls, *places: ArrayLike, most: tuple[int, int]) -> Plan:
+        """The plan that shows all these positions, each (..., 2 or 3) [m], in at most so many pixels to the right and
+        upwards; what is not finite is left out."""
         at = np.concatenate([np.asarray(place, dtype=float)[..., :2].reshape(-1, 2) for place in places])
         at = at[np.isfinite(at).all(axis=1)]
         low, high = at.min(axis=0), at.max(axis=0)
         longest = float((high - low).max()) or 1.0
         short = np.maximum(NARROWEST * longest - (high - low), 0) / 2
         edge = short + EDGE * longest
-        return cls(low - edge, high + edge)
-
-    @property
-    def scale(self) -> float:
-        """Pixels a metre."""
-        return SIZE / float((self.high - self.low).max())
+        low, high = low - edge, high + edge
+        return cls(low, high, float((np.array(most) / (high - low)).min()))
 
     @property
     def size(self) -> tuple[int, int]:
@@ -69,11 +67,11 @@ class Plan:
                 at = np.where(np.arange(2) == axis, tick, self.low)
                 x, y = self.place(at)
                 if axis == 0:
-                    parts += [_line(x, 0, x, height), text(x, height + 18, f"{tick:g}", "middle")]
+                    parts += [_line(x, 0, x, height), text(x, height + 16, f"{tick:g}", "middle")]
                 else:
-                    parts += [_line(0, y, width, y), text(-8, y + 5, f"{tick:g}", "end")]
-        parts.append(text(width, height + 36, "x [m]", "end"))
-        parts.append(text(-8, -10, "y [m]", "end"))
+                    parts += [_line(0, y, width, y), text(-6, y + 4, f"{tick:g}", "end")]
+        parts.append(text(width, height + 31, "x [m]", "end"))
+        parts.append(text(-6, -8, "y [m]", "end"))
         return "".join(parts)
 
     def dots(self, at: ArrayLike, colour: str, radius: float = 3.0) -> str:
@@ -104,20 +102,30 @@ def _line(x0: float, y0: float, x1: float, y1: float) -> str:
     return f'<path d="M{x0:.1f} {y0:.1f}L{x1:.1f} {y1:.1f}" stroke="currentColor" stroke-opacity="0.12"/>'
 
 
-def text(x: float, y: float, content: str, anchor: str = "start", size: float = 15, colour: str = "currentColor") -> str:
-    """A text at a pixel, whatever is in it."""
-    place = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-size="{size:g}"'
-    return f'<text {place} fill="{colour}">{escape(content)}</text>'
+def text(x: float, y: float, content: str, anchor: str = "start", size: float = 12, haloed: bool = False) -> str:
+    """A text at a pixel, whatever is in it; with a halo it can be read on any colour."""
+    place = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-size="{size:.4g}"'
+    look = 'fill="black" stroke="white" stroke-width="3" paint-order="stroke"' if haloed else 'fill="currentColor"'
+    return f"<text {place} {look}>{escape(content)}</text>"
 
 
 def ring(x: float, y: float, radius: float, colour: str) -> str:
     """A ring with a dark rim, to be seen on any colour."""
     circle = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.2f}" fill="none"'
-    return f'{circle} stroke="black" stroke-width="{radius / 1.6:.2f}"/>{circle} stroke="{colour}" stroke-width="{radius / 3.2:.2f}"/>'
+    return "".join(
+        f'{circle} stroke="{stroke}" stroke-width="{width:.2f}"/>' for stroke, width in _strokes(radius, colour)
+    )
 
 
 def cross(x: float, y: float, radius: float, colour: str) -> str:
     """A diagonal cross with a dark rim."""
     arms = "".join(f"M{x - radius:.1f} {y - s * radius:.1f}L{x + radius:.1f} {y + s * radius:.1f}" for s in (1, -1))
-    strokes: Iterable[tuple[str, float]] = (("black", radius / 1.6), (colour, radius / 3.2))
-    return "".join(f'<path d="{arms}" stroke="{c}" stroke-width="{w:.2f}" stroke-linecap="round"/>' for c, w in strokes)
+    path = f'<path d="{arms}" stroke-linecap="round"'
+    return "".join(
+        f'{path} stroke="{stroke}" stroke-width="{width:.2f}"/>' for stroke, width in _strokes(radius, colour)
+    )
+
+
+def _strokes(radius: float, colour: str) -> tuple[tuple[str, float], ...]:
+    """Colours and widths of a rim and of what is on it."""
+    return ("black", radius / 1.6), (colour, radius / 3.2)

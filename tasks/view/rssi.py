@@ -21,6 +21,7 @@ CELLS = 120  # of a map, along its longer side
 LEVEL = 0.8  # of the model's intervals
 DEVIATIONS = ndtri((1 + LEVEL) / 2)  # half of an interval, of a normal variable
 RECEIVER_COLOURS, MOST_COLOURS = "tab20", 20
+Corners = tuple[float, float, float, float]
 Kind = Literal["RSSI", "interval", "coverage", "best receiver"]
 
 
@@ -38,12 +39,15 @@ class Floor:
     measured: NDArray[np.floating]
     rssi_dbm: NDArray[np.floating]
     receiver: NDArray[np.floating]
-    plan: tuple[NDArray[np.uint8], tuple[float, ...]] | None = None
+    plan: tuple[NDArray[np.uint8], Corners] | None = None
 
     @classmethod
     def kept(cls, maps: Mapping[str, NDArray[Any]]) -> Floor:
         """Of a run's maps.npz."""
-        plan = (maps["plan"], tuple(maps["plan_extent"].tolist())) if "plan" in maps else None
+        plan = None
+        if "plan" in maps:
+            x0, x1, y0, y1 = maps["plan_extent"].tolist()
+            plan = maps["plan"], (x0, x1, y0, y1)
         return cls(maps["measured_position"], maps["measured"], maps["receiver"], plan)
 
     @classmethod
@@ -58,7 +62,7 @@ class Maps:
     """Predictions over the floor at one height.
 
     Args:
-        x, y: middles of the cells [m].
+        x, y: middles of the cells [m]; the cells are squares.
         height: [m].
         middle, low, high: prediction and its interval [dBm], (R, len(y), len(x)).
     """
@@ -71,7 +75,7 @@ class Maps:
     high: NDArray[np.floating]
 
     @property
-    def corners(self) -> tuple[float, float, float, float]:
+    def corners(self) -> Corners:
         """x0, x1, y0, y1 of the picture of all cells [m]."""
         half = (self.x[1] - self.x[0]) / 2
         return self.x[0] - half, self.x[-1] + half, self.y[0] - half, self.y[-1] + half
@@ -90,7 +94,8 @@ class Maps:
     @property
     def best(self) -> NDArray[np.integer]:
         """Number of the receiver with the highest prediction, (len(y), len(x))."""
-        return self.middle.argmax(axis=0)
+        best: NDArray[np.integer] = self.middle.argmax(axis=0)
+        return best
 
 
 @dataclass(frozen=True)
@@ -179,11 +184,10 @@ class RssiScene:
         low, middle, high = np.quantile(self.floor.measured[:, 2], (0, 0.5, 1)).tolist()
         return low, middle, high
 
-    @property
-    def plan(self) -> Plan:
-        """Of all that is known of the floor."""
+    def plan(self, most: tuple[int, int] = (CELLS, CELLS)) -> Plan:
+        """Of all that is known of the floor, in at most so many pixels."""
         corners = np.array(self.floor.plan[1]).reshape(2, 2).T if self.floor.plan else self.floor.measured
-        return Plan.around(self.floor.measured, self.floor.receiver, corners)
+        return Plan.around(self.floor.measured, self.floor.receiver, corners, most=most)
 
     def maps(self, height: float) -> Maps:
         """Predictions at a height [m]; those of one height are kept."""
@@ -193,11 +197,8 @@ class RssiScene:
         return self._kept[height]
 
     def _predicted(self, height: float) -> Maps:
-        plan = self.plan
-        width, depth = plan.high - plan.low
-        cell = max(width, depth) / CELLS
-        x = plan.low[0] + cell * (np.arange(max(2, round(width / cell))) + 0.5)
-        y = plan.low[1] + cell * (np.arange(max(2, round(depth / cell))) + 0.5)
+        plan = self.plan()
+        x, y = (plan.low[axis] + (np.arange(plan.size[axis]) + 0.5) / plan.scale for axis in (0, 1))
         at = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), height)], axis=-1).reshape(-1, 3)
         predicted = self.model.predict(torch.from_numpy(at))
         return Maps(x, y, height, *(p.T.reshape(-1, len(y), len(x)).numpy() for p in predicted))
@@ -237,7 +238,7 @@ class RssiScene:
             case "best receiver":
                 shares = np.bincount(maps.best.ravel(), minlength=len(self.receivers)) / maps.best.size
                 first = int(shares.argmax())
-                return f"The receiver with the highest prediction; {self.receivers[first]} on {shares[first]:.0%} of the map."
+                return f"Who hears best, as predicted: {self.receivers[first]} on {shares[first]:.0%} of the map."
 
     def heard(self, shown: Shown, x: float, y: float) -> Heard:
         """What is expected at a place [m], at the height of the map."""
@@ -273,7 +274,7 @@ class RssiScene:
     def picture(self, shown: Shown) -> bytes:
         """The map as a PNG with axes and legend."""
         layer, maps = self.layer(shown), self.maps(shown.height)
-        width, height = self.plan.high - self.plan.low
+        width, height = self.plan().size
         figure, (ax,) = figures.new_figure(1, 1, 8, 1 + 7 * height / width)
         extent = maps.corners
         if self.floor.plan:

@@ -143,13 +143,13 @@ class Fitted:
         match self.model:
             case SwiftWRF() | Vae() | Dcgan():
                 frame: Any = self.model if isinstance(self.model, SwiftWRF) else self.model.frame
-                return frame.centre + frame.scale * torch.tensor([[0.0], [-1], [1]], dtype=torch.float64)
+                return _cube(frame.centre, frame.scale)
             case CoarrayModel() | HybridModel():
                 return self.model.anchor
             case LinkDrawing():
                 link = self.model.link
                 reach = (link.fixed - link.centre).abs().max()
-                return link.centre + reach * torch.tensor([[0.0], [-1], [1]], dtype=torch.float64)
+                return _cube(link.centre, reach)
             case GeometryModel():
                 return self._inside(self.model)
         raise AssertionError(type(self.model))
@@ -205,17 +205,16 @@ class SpectraScene:
     @cached_property
     def places(self) -> NDArray[np.floating]:
         """Positions (n, 3) [m] that the page shows: those measured, or around which the models know spectra."""
-        if self.data is not None:
-            return self.data.position.numpy()
-        return torch.cat([fitted.region for fitted in self.fitted]).numpy()
+        known = [fitted.region for fitted in self.fitted] if self.data is None else [self.data.position]
+        return np.concatenate([position.double().numpy() for position in known])
 
     @property
     def start(self) -> NDArray[np.floating]:
         """Where the moving end stands at first: a measured position near the middle, or the middle."""
         middle = (self.places.min(axis=0) + self.places.max(axis=0)) / 2
-        if self.data is None:
-            return middle
-        return self.places[np.linalg.norm(self.places - middle, axis=1).argmin()]
+        nearest = int(np.linalg.norm(self.places - middle, axis=1).argmin())
+        start: NDArray[np.floating] = middle if self.data is None else self.places[nearest]
+        return start
 
     def draw(self, fitted: Fitted, position: NDArray[np.floating], quick: bool = False) -> Drawn:
         """The spectrum of a model with the moving end at a position (3,) [m]; quickly, perhaps on a coarser grid."""
@@ -268,6 +267,11 @@ def angle_between(a: Direction, b: Direction) -> float:
     """Great-circle angle of two directions [deg]."""
     first, second = (to_direction(*torch.tensor(direction, dtype=torch.float64).deg2rad()) for direction in (a, b))
     return float(great_circle(first, second).rad2deg())
+
+
+def _cube(centre: Tensor, half: Tensor) -> Tensor:
+    """The middle of a cube and two of its corners, (3, 3)."""
+    return centre + half * torch.tensor([[0.0], [-1], [1]], dtype=torch.float64)
 
 
 def _degrees(direction: Tensor) -> Direction:

@@ -14,11 +14,12 @@ from swiftwrf import AngularGrid
 from tasks.aoa.page_room import FIXED, MEASURED, in_plan
 from tasks.view.pictures import View, address, png
 from tasks.view.plan import Plan, cross, ring, text
-from tasks.view.spectra import Direction, Drawn, Fitted, Measured, SpectraScene, angle_between
+from tasks.view.spectra import Direction, Drawn, Measured, SpectraScene, angle_between
 from tasks.view.widgets import Latest, canvas, colour_bar, header
 
 UNSEEN, HERE, STRONGEST, SIGHT = "#bb8833", "#ee6677", "#ffffff", "#ee6677"
 STEP = 0.01  # of the plan, that an arrow key moves; ten times with Shift
+MOST_PLAN = (430, 480)  # pixels
 RATE = 20  # frames over which frames a second are told
 
 
@@ -50,7 +51,9 @@ class SpectrumPicture:
     def lay_out(self, view: View) -> None:
         """Takes the view, and gives it its room on the page."""
         self._view = view
-        self._picture.style(f"width: {'300px' if view.polar else '760px'}; margin: 10px 36px 30px 40px")
+        self._picture.style(
+            f"width: {_width(view)}px; margin: {'24px 50px 28px 50px' if view.polar else '6px 24px 24px 40px'}"
+        )
         self._picture._props["size"] = (view.width, view.height)
 
     def show(
@@ -61,7 +64,7 @@ class SpectrumPicture:
         assert self._view is not None
         drawn = png(self._view.lay(values, grid), self._colours, 0.0, high)
         self._picture.set_source(address(drawn))
-        unit = self._view.width / (300 if self._view.polar else 760)  # of this picture, a pixel of the page
+        unit = self._view.width / _width(self._view)  # of this picture, a pixel of the page
         shapes = [_axes(self._view, unit)]
         for (direction, colour), shape in zip(marks, (ring, cross), strict=False):
             if direction is not None:
@@ -69,17 +72,20 @@ class SpectrumPicture:
         self._picture.set_content("".join(shapes))
 
 
+def _width(view: View) -> int:
+    """Of a picture on the page [px]."""
+    return 290 if view.polar else 750
+
+
 def _axes(view: View, unit: float) -> str:
     """Numbers around the picture [deg]."""
     size = 12 * unit
-    parts = []
     if not view.polar:
-        for azimuth in (0, 90, 180, 270, 360):
-            parts.append(text(azimuth / 360 * view.width, view.height + 15 * unit, f"{azimuth}°", "middle", size))
-        for elevation in (0, 30, 60, 90):
-            _, y = view.place(0, elevation)
-            parts.append(text(-6 * unit, y + 4 * unit, f"{elevation}°", "end", size))
+        below, beside = view.height + 15 * unit, -6 * unit
+        parts = [text(a / 360 * view.width, below, f"{a}°", "middle", size) for a in (0, 90, 180, 270, 360)]
+        parts += [text(beside, view.place(0, e)[1] + 4 * unit, f"{e}°", "end", size) for e in (0, 30, 60, 90)]
         return "".join(parts)
+    parts = []
     middle = view.width / 2
     for elevation in (0, 30, 60):
         radius = (1 - elevation / 90) * middle
@@ -87,7 +93,11 @@ def _axes(view: View, unit: float) -> str:
         parts.append(f'{circle} stroke="{"currentColor" if elevation == 0 else "white"}" stroke-opacity="0.5"/>')
     for azimuth, anchor in ((0, "start"), (90, "middle"), (180, "end"), (270, "middle")):
         x, y = view.place(azimuth, -4)
-        parts.append(text(x, y + (12 * unit if azimuth == 270 else 4 * unit if azimuth != 90 else 0), f"{azimuth}°", anchor, size))
+        parts.append(
+            text(
+                x, y + (12 * unit if azimuth == 270 else 4 * unit if azimuth != 90 else 0), f"{azimuth}°", anchor, size
+            )
+        )
     return "".join(parts)
 
 
@@ -104,7 +114,7 @@ class SpectraPage:
         self._low, self._high = scene.places.min(axis=0) - 0.5, scene.places.max(axis=0) + 0.5
         walls = [ends for plane in planes if (ends := in_plan(plane, self._low, self._high)) is not None]
         fixed = [] if self._fixed is None else [self._fixed]
-        self._plan = Plan.around(scene.places, *fixed, *walls)
+        self._plan = Plan.around(scene.places, *fixed, *walls, most=MOST_PLAN)
         with header(scene.title, scene.notes):
             self._choices()
         with ui.row().classes("w-full no-wrap items-start gap-8"):
@@ -113,7 +123,9 @@ class SpectraPage:
                 self._spectrum = SpectrumPicture("Synthesized", "synthesized")
                 self._measured = SpectrumPicture("Nearest measured", "measured")
                 self._deviation = SpectrumPicture("Expected deviation of a measured spectrum", "deviation", "magma")
-                ui.html(colour_bar("viridis", 0, 1, "magnitude; ring: strongest direction, cross: line of sight"), sanitize=False)
+                with ui.column().classes("gap-1"):
+                    ui.html(colour_bar("viridis", 0, 1, "magnitude"), sanitize=False)
+                    ui.label("Ring: strongest direction; cross: line of sight.").classes("quiet")
         self._lay_out()
 
     @property
@@ -129,11 +141,11 @@ class SpectraPage:
         else:
             ui.label(titles[0]).classes("quiet")
         self._polar = ui.toggle({False: "rectangular", True: "polar"}, value=False, on_change=self._lay_out)
-        self._polar.props("dense no-caps")
+        self._polar.props("no-caps padding='2px 12px'")
 
     def _left(self) -> None:
         with ui.column().classes("gap-1").style("width: 500px; flex: none"):
-            self._picture = canvas(self._plan, "plan").style("width: 430px; margin: 24px 10px 34px 48px")
+            self._picture = canvas(self._plan, "plan")
             self._picture.on_mouse(self._pointed)
             self._picture.props("tabindex=0").on("keydown", self._pressed, js_handler=KEYS)
             self._end = self._picture.add_layer()
@@ -144,11 +156,13 @@ class SpectraPage:
                 self._height = ui.slider(min=low, max=high, step=0.01, value=middle, on_change=self._raised)
                 self._height.props('aria-label="height"')
                 self._metres = ui.label().classes("numbers").style("min-width: 4rem")
-            self._where = ui.label().classes("numbers").mark("where")
+            self._where = ui.label().classes("numbers").props('id="where"')
             self._angles = ui.label().classes("numbers")
             self._frame = ui.label().classes("quiet numbers").props('id="frame"')
             ui.html(self._legend(), sanitize=False).classes("quiet")
-            ui.label("Drag in the plan, or click it and use the arrow keys (Shift: ten times as far); Page Up and Down: height.").classes("quiet")
+            ui.label(
+                "Drag in the plan, or click it and use the arrow keys (Shift: ten times as far); Page Up and Down: height."
+            ).classes("quiet")
 
     def _legend(self) -> str:
         parts = [f'<span style="color:{HERE}">●</span> {self._scene.moving}']
@@ -159,7 +173,7 @@ class SpectraPage:
             parts.append(f'<span style="color:{FIXED}">✕</span> fixed end')
         if any(fitted.planes for fitted in self._scene.fitted):
             parts.append("lines: walls found, dashed where uncertain")
-        return " &nbsp; ".join(parts)
+        return "".join(f'<div style="display: inline-block; margin-right: 1em">{part}</div>' for part in parts)
 
     def _choose(self, number: int) -> None:
         self._fitted = self._scene.fitted[number]
@@ -231,23 +245,23 @@ class SpectraPage:
         if drawn.deviation is not None:
             self._most_deviation = max(self._most_deviation, float(drawn.deviation.max()))
             self._deviation.show(drawn.deviation, drawn.grid, self._most_deviation, [])
-            self._deviation.caption.set_text(f"black 0, white {self._most_deviation:.2f}; mean {drawn.deviation.mean():.3f}")
+            self._deviation.caption.set_text(
+                f"black 0, white {self._most_deviation:.2f}; mean {drawn.deviation.mean():.3f}"
+            )
         shapes = []
         if nearest is not None and self._scene.data is not None:
             self._show_measured(nearest)
             ends = self._plan.place([drawn.position, self._scene.places[nearest.number]])
             (x0, y0), (x1, y1) = ends
             shapes.append(f'<path d="M{x0:.1f} {y0:.1f}L{x1:.1f} {y1:.1f}" stroke="{HERE}" stroke-width="2"/>')
-        shapes.append(self._plan.dots(drawn.position[None], HERE, 9))
+        shapes.append(self._plan.dots(drawn.position[None], HERE, 8))
         self._end.set_content("".join(shapes))
 
     def _show_measured(self, nearest: Measured) -> None:
         data = self._scene.data
         assert data is not None
         learnt = "learnt from" if nearest.learnt else "not seen by the model"
-        self._measured.caption.set_text(
-            f"{nearest.away_m:.2f} m away, {learnt}; strongest {_told(nearest.strongest)}"
-        )
+        self._measured.caption.set_text(f"{nearest.away_m:.2f} m away, {learnt}; strongest {_told(nearest.strongest)}")
         if nearest.number != self._nearest_row:
             self._nearest_row = nearest.number
             azimuth, elevation = data.label[nearest.number].rad2deg().tolist()
@@ -260,7 +274,9 @@ class SpectraPage:
         self._metres.set_text(f"{z:.2f} m")
         sight = drawn.line_of_sight
         if sight is None:
-            self._angles.set_text("line of sight unknown: neither the measurements nor the model tell where the array is")
+            self._angles.set_text(
+                "line of sight unknown: neither the measurements nor the model tell where the array is"
+            )
         else:
             between = angle_between(drawn.strongest, sight)
             self._angles.set_text(f"line of sight {_told(sight)}; {between:.1f}° from the strongest direction")
@@ -269,7 +285,8 @@ class SpectraPage:
         rate = f", {(len(self._times) - 1) / span:.0f} frames a second" if len(self._times) == RATE and span > 0 else ""
         rows, columns = drawn.grid.shape
         self._frame.set_text(
-            f"frame {1e3 * seconds:.0f} ms, of which the model {1e3 * drawn.seconds:.1f} ms for {rows} x {columns} directions{rate}"
+            f"frame {1e3 * seconds:.0f} ms, of which the model {1e3 * drawn.seconds:.1f} ms for {rows} x {columns} "
+            f"directions{rate}"
         )
 
 

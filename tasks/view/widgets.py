@@ -32,7 +32,7 @@ class Latest(Generic[Wanted]):
     """
 
     def __init__(self, do: Callable[[Wanted], Awaitable[None]]) -> None:
-        self._do, self._wanted, self._busy = do, [], False
+        self._do, self._busy = do, False
         self._wanted: list[Wanted] = []
 
     def ask(self, wanted: Wanted) -> None:
@@ -57,17 +57,20 @@ def header(title: str, notes: list[str]) -> ui.row:
     with ui.row().classes("w-full items-center no-wrap"):
         ui.label(title).classes("text-h6 ellipsis").style("max-width: 40%")
         row = ui.row().classes("items-center gap-6 grow no-wrap")
-        ui.toggle({None: "auto", False: "light", True: "dark"}, value=None).props("dense no-caps flat").bind_value_to(dark)
+        ui.toggle({None: "auto", False: "light", True: "dark"}, value=None).props("dense no-caps flat").bind_value_to(
+            dark
+        )
     for note in notes:
         ui.label(note).classes("quiet")
     return row
 
 
 def canvas(plan: Plan, name: str) -> ui.interactive_image:
-    """An empty picture of the size of a plan, which tells where the pointer is."""
+    """A picture of the size of a plan, a pixel of the page for each of its own, which tells where the pointer is."""
     events = ["pointerdown", "pointermove", "pointerup", "pointerleave"]
     picture = ui.interactive_image(size=plan.size, events=events, sanitize=False)
-    return picture.classes("outside drag").mark(name).props(f'id="{name}"')
+    picture.style(f"width: {plan.size[0]}px; margin: 24px 10px 34px 48px")
+    return picture.classes("outside drag").props(f'id="{name}"')
 
 
 def colour_bar(colours: str, low: float, high: float, label: str) -> str:
@@ -79,7 +82,7 @@ def colour_bar(colours: str, low: float, high: float, label: str) -> str:
         for x, anchor, value in ((0, "start", low), (130, "middle", (low + high) / 2), (260, "end", high))
     )
     return (
-        f'<svg width="560" height="34"><defs><linearGradient id="bar-{colours}">{stops}</linearGradient></defs>'
+        f'<svg width="520" height="34"><defs><linearGradient id="bar-{colours}">{stops}</linearGradient></defs>'
         f'<rect width="260" height="14" fill="url(#bar-{colours})"/>{numbers}'
         f'<text x="272" y="12" font-size="13" fill="currentColor">{escape(label)}</text></svg>'
     )
