@@ -144,7 +144,7 @@ def _described(plane: dict[str, Any]) -> str:
 
 def _room_figure(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> Figure:
     figure, axes = figures.new_figure(1, 2, 11, 5)
-    low, high = _extent(planes, points)
+    low, high = extent(planes, np.concatenate([points["measured"], points["fixed"][None]]))
     plan = axes[0]
     for plane in planes:
         _draw_in_plan(plan, plane, low, high)
@@ -166,9 +166,8 @@ def _room_figure(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) 
     return figure
 
 
-def _extent(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Opposite corners of the room as far as it is known [m]."""
-    inside = np.concatenate([points["measured"], points["fixed"][None]])
+def extent(planes: list[dict[str, Any]], inside: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Opposite corners (3,) [m] of the room around positions (n, 3), as far as it is known."""
     low, high = inside.min(axis=0) - MARGIN, inside.max(axis=0) + MARGIN
     for plane in planes:
         normal = np.array(plane["normal"])

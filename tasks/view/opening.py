@@ -74,7 +74,7 @@ def _aoa_run(folder: Path, content: Row) -> SpectraScene:
 
 def _title(match: re.Match[str]) -> str:
     name = "swiftwrf" if match["name"] == "model" else match["name"]
-    return f"{name}, {float(match['share']):.4g} measured"
+    return f"{name}, {float(match['share']):.0%} measured"
 
 
 def _planes(folder: Path, share: str, model: Saved) -> list[dict[str, Any]]:

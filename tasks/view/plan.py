@@ -74,7 +74,7 @@ class Plan:
         parts.append(text(-6, -8, "y [m]", "end"))
         return "".join(parts)
 
-    def dots(self, at: ArrayLike, colour: str, radius: float = 3.0) -> str:
+    def dots(self, at: ArrayLike, colour: str, radius: float) -> str:
         """A dot at every position (n, 2 or 3) [m]."""
         steps = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in self.place(at))
         return f'<path d="{steps}" stroke="{colour}" stroke-width="{2 * radius}" stroke-linecap="round"/>'

@@ -11,7 +11,7 @@ from nicegui import events, run, ui
 from numpy.typing import NDArray
 
 from swiftwrf import AngularGrid
-from tasks.aoa.page_room import FIXED, MEASURED, in_plan
+from tasks.aoa.page_room import FIXED, MEASURED, extent, in_plan
 from tasks.view.pictures import View, address, png
 from tasks.view.plan import Plan, cross, ring, text
 from tasks.view.spectra import Direction, Drawn, Measured, SpectraScene, angle_between
@@ -20,6 +20,7 @@ from tasks.view.widgets import Latest, canvas, colour_bar, header
 UNSEEN, HERE, STRONGEST, SIGHT = "#bb8833", "#ee6677", "#ffffff", "#ee6677"
 STEP = 0.01  # of the plan, that an arrow key moves; ten times with Shift
 MOST_PLAN = (430, 480)  # pixels
+MANY = 400  # measured positions from which on their dots are smaller
 RATE = 20  # frames over which frames a second are told
 
 
@@ -51,6 +52,7 @@ class SpectrumPicture:
     def lay_out(self, view: View) -> None:
         """Takes the view, and gives it its room on the page."""
         self._view = view
+        self.column.style(f"width: {_width(view) + 100}px")
         self._picture.style(
             f"width: {_width(view)}px; margin: {'24px 50px 28px 50px' if view.polar else '6px 24px 24px 40px'}"
         )
@@ -111,10 +113,9 @@ class SpectraPage:
         self._most_deviation = 1e-3
         self._latest = Latest(self._draw)
         planes = [plane for fitted in scene.fitted for plane in fitted.planes]
-        self._low, self._high = scene.places.min(axis=0) - 0.5, scene.places.max(axis=0) + 0.5
-        walls = [ends for plane in planes if (ends := in_plan(plane, self._low, self._high)) is not None]
-        fixed = [] if self._fixed is None else [self._fixed]
-        self._plan = Plan.around(scene.places, *fixed, *walls, most=MOST_PLAN)
+        inside = scene.places if self._fixed is None else np.concatenate([scene.places, self._fixed[None]])
+        self._low, self._high = extent(planes, inside)
+        self._plan = Plan.around(inside, self._low, self._high, most=MOST_PLAN)
         with header(scene.title, scene.notes):
             self._choices()
         with ui.row().classes("w-full no-wrap items-start gap-8"):
@@ -194,7 +195,8 @@ class SpectraPage:
         parts = [plan.axes()]
         if data is not None:
             seen = np.zeros(len(data), dtype=bool) if learnt is None else learnt
-            parts += [plan.dots(data.position[~seen], UNSEEN), plan.dots(data.position[seen], MEASURED)]
+            radius = 3 if len(data) < MANY else 2
+            parts += [plan.dots(data.position[~seen], UNSEEN, radius), plan.dots(data.position[seen], MEASURED, radius)]
         for plane in self._fitted.planes:
             ends = in_plan(plane, self._low, self._high)
             if ends is not None:
