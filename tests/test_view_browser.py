@@ -79,7 +79,8 @@ def browser(tmp_path):
     options.binary_location = shutil.which("chromium")
     for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1400,1037"):
         options.add_argument(argument)
-    options.add_experimental_option("prefs", {"download.default_directory": str(tmp_path)})
+    several = "profile.default_content_setting_values.automatic_downloads"  # without asking the visitor
+    options.add_experimental_option("prefs", {"download.default_directory": str(tmp_path), several: 1})
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     driver = webdriver.Chrome(options, Service(shutil.which("chromedriver")))
     yield driver
@@ -170,8 +171,8 @@ def test_rssi_page_tells_what_is_under_the_pointer(browser, rssi_page, tmp_path)
     for kind, sentence in (("coverage", "% of the map"), ("best receiver", "hears best"), ("uncertainty", "interval")):
         press(browser, kind)
         until(lambda sentence=sentence: sentence in said(browser, "sentence"))
-    press(browser, "CSV")
     press(browser, "PNG")
+    press(browser, "CSV")
     file = until(lambda: next(tmp_path.glob("*.csv"), None))
     until(lambda: next(tmp_path.glob("*.png"), None))
     assert set(pd.read_csv(file)["receiver"]) == {"receiver01"}

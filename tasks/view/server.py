@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import socket
+from contextlib import suppress
 
 from nicegui import app, ui
 from starlette.middleware.trustedhost import TrustedHostMiddleware
@@ -38,6 +40,7 @@ def free_port(host: str, port: int) -> int:
 def serve(scene: SpectraScene | RssiScene, host: str, port: int) -> None:
     """Serves the page of what was opened, until it is interrupted."""
 
+    @ui.page("/")
     def page() -> None:
         if isinstance(scene, SpectraScene):
             spectra_page.show(scene)
@@ -46,10 +49,8 @@ def serve(scene: SpectraScene | RssiScene, host: str, port: int) -> None:
 
     if host in HERE:  # pages of others must not reach this one under a name that they own
         app.add_middleware(TrustedHostMiddleware, allowed_hosts=list(HERE))
-    shown = f"[{host}]" if ":" in host else host
-    app.on_startup(lambda: print(f"page: http://{shown}:{port} (Ctrl-C ends it)", flush=True))
+    app.on_startup(_tell(host, port))
     ui.run(
-        page,
         host=host,
         port=port,
         title=scene.title,
@@ -58,3 +59,15 @@ def serve(scene: SpectraScene | RssiScene, host: str, port: int) -> None:
         reload=False,
         show_welcome_message=False,
     )
+
+
+async def _tell(host: str, port: int) -> None:
+    """Says where the page is, once somebody answers there."""
+    while True:
+        with suppress(OSError):
+            _, writer = await asyncio.open_connection(host, port)
+            writer.close()
+            break
+        await asyncio.sleep(0.05)
+    name = f"[{host}]" if ":" in host else host
+    print(f"page: http://{name}:{port} (Ctrl-C ends it)", flush=True)
