@@ -246,6 +246,7 @@ def said(capsys, *arguments) -> str:
 def test_refusals(tmp_path, capsys, aoa_run, rssi_run):
     assert "is not there" in said(capsys, tmp_path / "nowhere", "--port", 0)
     assert "is no run" in said(capsys, tmp_path, "--port", 0)
+    assert "cannot be read" in said(capsys, "x" * 300, "--port", 0)
     (tmp_path / "text").write_text("x")
     assert "safetensors" in said(capsys, tmp_path / "text", "--port", 0)
     for source, names in ((aoa_run, "*mix*"), (rssi_run, "model.safetensors")):

@@ -25,10 +25,7 @@ PROGRAMS = ("chromium", "chromedriver")
 missing = [name for name in LIBRARIES if find_spec(name) is None] + [
     name for name in PROGRAMS if not shutil.which(name)
 ]
-pytestmark = [
-    pytest.mark.skipif(bool(missing), reason=f"needs {' and '.join(missing)}"),
-    pytest.mark.xdist_group("browser"),
-]
+pytestmark = pytest.mark.skipif(bool(missing), reason=f"needs {' and '.join(missing)}")
 ROOT = Path(__file__).parent.parent
 PATIENCE = 60  # [s], for machines that are busy
 MOVES = 60  # of a drag, one in 16 ms as a pointer's are
@@ -39,7 +36,7 @@ image.addEventListener('load', () => window.frames_seen.push(performance.now()))
 """
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def serve():
     """Starts the page of a run or model, and says where it is."""
     processes = []
@@ -59,19 +56,9 @@ def serve():
         assert process.wait(PATIENCE) in (0, 130)
 
 
-@pytest.fixture(scope="module")
-def spectra_page(serve, aoa_run) -> str:
-    return serve(aoa_run)
-
-
-@pytest.fixture(scope="module")
-def rssi_page(serve, rssi_run) -> str:
-    return serve(rssi_run)
-
-
 @pytest.fixture
-def browser(tmp_path):
-    """A browser that must have nothing to complain about in the end."""
+def browser(serve, tmp_path):
+    """A browser that must have nothing to complain about in the end, which comes before that of the servers."""
     from selenium import webdriver
     from selenium.webdriver.chrome.service import Service
 
@@ -123,37 +110,32 @@ def opened(browser, address, name, label):
     return find(browser, f"#{name}")
 
 
-def test_spectrum_follows_the_pointer(browser, spectra_page, record_property):
-    plan = opened(browser, spectra_page, "plan", "where")
+def follows_the_pointer(browser, plan):
+    """Frames a second while the moving end is dragged."""
     before = said(browser, "where"), find(browser, "#synthesized img").get_attribute("src")
     browser.execute_script(COUNT)
     chain = pointer(browser).move_to_element_with_offset(plan, -100, 0).click_and_hold()
     for move in range(MOVES):
         chain.move_by_offset(3, 1 if move % 2 else -1)
-    began = time.monotonic()
     chain.release().perform()
-    seconds = time.monotonic() - began
     until(lambda: said(browser, "where") != before[0])
-    frames = until(lambda: browser.execute_script("return window.frames_seen"))
-    rate = 1e3 * (len(frames) - 1) / (frames[-1] - frames[0]) if len(frames) > 1 else 0.0
-    record_property("frames_per_second", rate)
-    print(f"{len(frames)} frames for {MOVES} moves in {seconds:.1f} s: {rate:.1f} frames a second")
+    frames = browser.execute_script("return window.frames_seen")
     assert find(browser, "#synthesized img").get_attribute("src") != before[1]
     assert len(frames) >= 10  # it follows on the way, not only at the end
-    assert "frame" in said(browser, "frame")
+    assert "ms" in said(browser, "frame")
+    return 1e3 * (len(frames) - 1) / (frames[-1] - frames[0])
 
 
-def test_spectra_page_has_its_views_models_and_keys(browser, spectra_page):
+def has_views_models_and_keys(browser, plan):
     from selenium.webdriver.common.keys import Keys
 
-    plan = opened(browser, spectra_page, "plan", "where")
     rectangular = find(browser, "#measured img").get_attribute("src")
     press(browser, "polar")
     until(lambda: find(browser, "#measured img").get_attribute("src") != rectangular)
     assert not find(browser, "#deviation").is_displayed()
     find(browser, ".q-select").click()
     until(lambda: browser.find_elements("css selector", ".q-item"))
-    browser.find_elements("css selector", ".q-item")[1].click()
+    browser.find_elements("css selector", ".q-item")[1].click()  # a model that knows its deviation
     until(lambda: find(browser, "#deviation").is_displayed())
     pointer(browser).move_to_element_with_offset(plan, 20, 10).click().perform()
     for key in (Keys.ARROW_RIGHT, Keys.ARROW_UP, Keys.PAGE_UP):
@@ -162,8 +144,28 @@ def test_spectra_page_has_its_views_models_and_keys(browser, spectra_page):
         until(lambda before=before: said(browser, "where") != before)
 
 
-def test_rssi_page_tells_what_is_under_the_pointer(browser, rssi_page, tmp_path):
-    plan = opened(browser, rssi_page, "map", "sentence")
+def serves_nothing_else(address):
+    for path in ("config.json", "metrics.json", "..%2f..%2fetc/passwd", "docs", "openapi.json", "static/"):
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(f"{address}/{path}")
+    # nor answers to a name that somebody else lets point to this machine
+    request = urllib.request.Request(address, headers={"Host": "elsewhere.example"})
+    with pytest.raises(urllib.error.HTTPError, match="400"):
+        urllib.request.urlopen(request)
+
+
+def test_page_of_spectra(browser, serve, aoa_run, record_property):
+    address = serve(aoa_run)
+    serves_nothing_else(address)
+    plan = opened(browser, address, "plan", "where")
+    rate = follows_the_pointer(browser, plan)
+    record_property("frames_per_second", rate)
+    print(f"{rate:.1f} frames a second while dragging")
+    has_views_models_and_keys(browser, plan)
+
+
+def test_page_of_rssi(browser, serve, rssi_run, tmp_path):
+    plan = opened(browser, serve(rssi_run), "map", "sentence")
     pointer(browser).move_to_element_with_offset(plan, 30, 20).perform()
     told = until(lambda: "dBm" in said(browser, "here") and said(browser, "here"))
     pointer(browser).move_by_offset(-150, 60).perform()
@@ -176,18 +178,3 @@ def test_rssi_page_tells_what_is_under_the_pointer(browser, rssi_page, tmp_path)
     file = until(lambda: next(tmp_path.glob("*.csv"), None))
     until(lambda: next(tmp_path.glob("*.png"), None))
     assert set(pd.read_csv(file)["receiver"]) == {"receiver01"}
-
-
-@pytest.mark.parametrize(
-    "path", ["config.json", "metrics.json", "..%2f..%2fetc/passwd", "docs", "openapi.json", "static/"]
-)
-def test_serves_nothing_but_the_page(spectra_page, path):
-    with pytest.raises(urllib.error.HTTPError, match="404"):
-        urllib.request.urlopen(f"{spectra_page}/{path}")
-
-
-def test_answers_to_its_own_name_alone(spectra_page):
-    """A page of somebody else cannot reach it under a name that they let point to this machine."""
-    request = urllib.request.Request(spectra_page, headers={"Host": "elsewhere.example"})
-    with pytest.raises(urllib.error.HTTPError, match="400"):
-        urllib.request.urlopen(request)

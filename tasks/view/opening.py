@@ -29,9 +29,15 @@ def opened(source: Path) -> SpectraScene | RssiScene:
     Raises:
         InputError: nothing that can be looked at.
     """
-    if source.is_file():
+    try:
+        is_file, is_folder = source.is_file(), source.is_dir()
+    except OSError as error:
+        raise InputError(
+            f"{source} cannot be read ({error.strerror}); give the directory of a run, or a saved model"
+        ) from None
+    if is_file:
         return _saved(source)
-    if not source.is_dir():
+    if not is_folder:
         raise InputError(
             f"{source} is not there; give the directory of a run of tasks.aoa or tasks.rssi, or a saved model"
         )

@@ -165,7 +165,7 @@ class RssiScene:
     title: str
     model: RssiModel
     floor: Floor
-    _kept: dict[float, Maps] = field(default_factory=dict)
+    _kept: dict[str, Maps] = field(default_factory=dict)
 
     @property
     def receivers(self) -> tuple[str, ...]:
@@ -190,11 +190,11 @@ class RssiScene:
         return Plan.around(self.floor.measured, self.floor.receiver, corners, most=most)
 
     def maps(self, height: float) -> Maps:
-        """Predictions at a height [m]; those of one height are kept."""
-        if height not in self._kept:
-            self._kept.clear()
-            self._kept[height] = self._predicted(height)
-        return self._kept[height]
+        """Predictions at a height [m]; the last ones are kept."""
+        kept = self._kept.get("last")
+        if kept is None or kept.height != height:
+            kept = self._kept["last"] = self._predicted(height)
+        return kept
 
     def _predicted(self, height: float) -> Maps:
         plan = self.plan()

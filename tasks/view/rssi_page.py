@@ -15,6 +15,7 @@ from tasks.view.rssi import LEVEL, MOST_COLOURS, RECEIVER_COLOURS, Heard, Layer,
 from tasks.view.widgets import Latest, canvas, colour_bar, header
 
 CROSS = "#ee6677"
+DOT_COLOURS = 32
 MOST_MAP = (880, 700)  # pixels
 KINDS = {
     "RSSI": "RSSI",
@@ -116,16 +117,16 @@ class RssiPage:
         return "".join([*parts, self._plan.axes()])
 
     def _measured(self, receiver: int, layer: Layer) -> str:
-        """Measurements as dots in the colours of the map."""
+        """Measurements as dots in the colours of the map, with a white rim."""
         values = self._scene.floor.rssi_dbm[:, receiver]
         heard = np.isfinite(values)
+        at = self._scene.floor.measured[heard]
         scaled = (values[heard] - layer.low) / (layer.high - layer.low)
-        colours = [to_hex(colour) for colour in colormaps[layer.colours](scaled)]
-        at = self._plan.place(self._scene.floor.measured[heard])
-        return "".join(
-            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}" stroke="white" stroke-width="0.7"/>'
-            for (x, y), colour in zip(at, colours, strict=True)
-        )
+        step = np.rint(np.clip(scaled, 0, 1) * DOT_COLOURS).astype(int)
+        colours = [to_hex(colormaps[layer.colours](number / DOT_COLOURS)) for number in range(DOT_COLOURS + 1)]
+        # a path for each colour, not one for each dot, of which there may be very many
+        dots = [self._plan.dots(at[step == number], colours[number], 4) for number in np.unique(step)]
+        return "".join([self._plan.dots(at, "white", 4.7), *dots])
 
     def _pointed(self, event: events.MouseEventArguments) -> None:
         if event.type == "pointerleave":

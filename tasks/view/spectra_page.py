@@ -237,6 +237,8 @@ class SpectraPage:
         if drawn is not None and fitted is self._fitted:  # None where the server is being ended
             self._show(drawn, self._scene.nearest(fitted, asked.position))
             self._tell(drawn, time.perf_counter() - began)
+        if not asked.dragging:
+            await run.io_bound(lambda: fitted.quick)  # found before the pointer begins to drag
 
     def _show(self, drawn: Drawn, nearest: Measured | None) -> None:
         self._spectrum.show(
