@@ -59,7 +59,7 @@ def _saved(file: Path) -> SpectraScene | RssiScene:
     model = load(file)
     if isinstance(model, RssiModel):
         return RssiScene(file.name, model, Floor.of(model))
-    return SpectraScene(file.name, [Fitted(file.stem, model, planes_of(model))])
+    return SpectraScene(file.name, [Fitted(model.kind, model, planes_of(model))])
 
 
 def _aoa_run(folder: Path, content: Row) -> SpectraScene:

@@ -62,7 +62,7 @@ class Maps:
     """Predictions over the floor at one height.
 
     Args:
-        x, y: middles of the cells [m]; the cells are squares.
+        x, y: middles of the cells [m].
         height: [m].
         middle, low, high: prediction and its interval [dBm], (R, len(y), len(x)).
     """
@@ -77,8 +77,8 @@ class Maps:
     @property
     def corners(self) -> Corners:
         """x0, x1, y0, y1 of the picture of all cells [m]."""
-        half = (self.x[1] - self.x[0]) / 2
-        return self.x[0] - half, self.x[-1] + half, self.y[0] - half, self.y[-1] + half
+        half_x, half_y = (self.x[1] - self.x[0]) / 2, (self.y[1] - self.y[0]) / 2
+        return self.x[0] - half_x, self.x[-1] + half_x, self.y[0] - half_y, self.y[-1] + half_y
 
     @property
     def width(self) -> NDArray[np.floating]:
@@ -198,7 +198,8 @@ class RssiScene:
 
     def _predicted(self, height: float) -> Maps:
         plan = self.plan()
-        x, y = (plan.low[axis] + (np.arange(plan.size[axis]) + 0.5) / plan.scale for axis in (0, 1))
+        share = [(np.arange(cells) + 0.5) / cells for cells in plan.size]
+        x, y = (plan.low[axis] + share[axis] * (plan.high - plan.low)[axis] for axis in (0, 1))
         at = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), height)], axis=-1).reshape(-1, 3)
         predicted = self.model.predict(torch.from_numpy(at))
         return Maps(x, y, height, *(p.T.reshape(-1, len(y), len(x)).numpy() for p in predicted))
@@ -226,7 +227,8 @@ class RssiScene:
         name, maps = self.receivers[shown.receiver], self.maps(shown.height)
         match shown.kind:
             case "RSSI":
-                return f"RSSI of {name} as predicted; dots: measured, in the same colours."
+                dots = np.isfinite(self.floor.rssi_dbm[:, shown.receiver]).any()
+                return f"RSSI of {name} as predicted{'; dots: measured, in the same colours' if dots else ''}."
             case "interval":
                 return f"How far apart the ends of the {LEVEL:.0%} interval of a measurement at {name} lie."
             case "coverage":

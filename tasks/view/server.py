@@ -47,9 +47,20 @@ def serve(scene: SpectraScene | RssiScene, host: str, port: int) -> None:
         else:
             rssi_page.show(scene)
 
+    async def tell() -> None:
+        """Says where the page is, once somebody answers there."""
+        while True:
+            with suppress(OSError):
+                _, writer = await asyncio.open_connection(host, port)
+                writer.close()
+                break
+            await asyncio.sleep(0.05)
+        name = f"[{host}]" if ":" in host else host
+        print(f"page: http://{name}:{port} (Ctrl-C ends it)", flush=True)
+
     if host in HERE:  # pages of others must not reach this one under a name that they own
         app.add_middleware(TrustedHostMiddleware, allowed_hosts=list(HERE))
-    app.on_startup(_tell(host, port))
+    app.on_startup(tell)
     ui.run(
         host=host,
         port=port,
@@ -59,15 +70,3 @@ def serve(scene: SpectraScene | RssiScene, host: str, port: int) -> None:
         reload=False,
         show_welcome_message=False,
     )
-
-
-async def _tell(host: str, port: int) -> None:
-    """Says where the page is, once somebody answers there."""
-    while True:
-        with suppress(OSError):
-            _, writer = await asyncio.open_connection(host, port)
-            writer.close()
-            break
-        await asyncio.sleep(0.05)
-    name = f"[{host}]" if ":" in host else host
-    print(f"page: http://{name}:{port} (Ctrl-C ends it)", flush=True)

@@ -19,12 +19,13 @@ from swiftwrf.checkpoint import Saved
 from swiftwrf.comparison.dcgan import Dcgan
 from swiftwrf.comparison.drawing import LinkDrawing
 from swiftwrf.comparison.vae import Vae
-from swiftwrf.data.spectra import direction_of_link
+from swiftwrf.data.spectra import Moving, direction_of_link
 from swiftwrf.geometry import HybridModel
 from swiftwrf.positions import distance
 
 QUICK = 0.02  # [s] that a spectrum may take while the moving end is dragged
 Direction = tuple[float, float]  # azimuth, elevation [deg]
+Link = tuple[Tensor, Tensor, Moving]
 Draw = Callable[[Tensor], tuple[Tensor, Tensor | None]]  # positions to spectra and their deviations
 
 
@@ -166,19 +167,19 @@ class Fitted:
                 low[axis] = at
         return torch.stack([(low + high) / 2, low, high])
 
-    def line_of_sight(self, position: Tensor) -> Tensor | None:
-        """Direction (n, 2) [rad] of the transmitter, as far as the model knows the link."""
+    @property
+    def link(self) -> Link | None:
+        """Where the fixed end stands, how the array is turned and which end moves, as far as the model knows."""
         match self.model:
             case GeometryModel():
-                ends: Any = self.model
+                return self.model.fixed_position, self.model.rotation, self.model.moving
             case HybridModel():
-                ends = self.model.geometry
+                room = self.model.geometry
+                return room.fixed_position, room.rotation, room.moving
             case LinkDrawing():
                 link = self.model.link
-                return direction_of_link(position, link.fixed, link.rotation, link.moving)
-            case _:
-                return None
-        return direction_of_link(position, ends.fixed_position, ends.rotation, ends.moving)
+                return link.fixed, link.rotation, link.moving
+        return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,10 +198,26 @@ class SpectraScene:
     data: Spectra | None = None
     notes: list[str] = field(default_factory=list)
 
+    @cached_property
+    def link(self) -> Link | None:
+        """Where the fixed end stands, how the array is turned and which end moves, as the data or else a model tell."""
+        if self.data is not None:
+            if self.data.fixed_position is None or self.data.rotation is None:
+                return None
+            return self.data.fixed_position, self.data.rotation, self.data.moving
+        return next((fitted.link for fitted in self.fitted if fitted.link is not None), None)
+
     @property
     def moving(self) -> str:
         """What the moving end is called."""
-        return self.data.moving if self.data is not None else "moving end"
+        if self.data is not None:
+            return self.data.moving
+        return "moving end" if self.link is None else self.link[2]
+
+    @property
+    def fixed(self) -> NDArray[np.floating] | None:
+        """Where the other one stands (3,) [m]; None where it is unknown."""
+        return None if self.link is None else self.link[0].numpy()
 
     @cached_property
     def places(self) -> NDArray[np.floating]:
@@ -223,21 +240,16 @@ class SpectraScene:
         began = time.perf_counter()
         spectrum, deviation = draw(at)
         seconds = time.perf_counter() - began
+        sight = None if self.link is None else _degrees(direction_of_link(at, *self.link)[0])
         return Drawn(
             np.asarray(position, dtype=float),
             grid,
             spectrum[0].numpy(),
             None if deviation is None else deviation[0].numpy(),
             strongest(spectrum[0], grid),
-            self._line_of_sight(fitted, at),
+            sight,
             seconds,
         )
-
-    def _line_of_sight(self, fitted: Fitted, at: Tensor) -> Direction | None:
-        if self.data is not None and self.data.fixed_position is not None and self.data.rotation is not None:
-            return _degrees(self.data.direction_at(at)[0])
-        seen = fitted.line_of_sight(at)
-        return None if seen is None else _degrees(seen[0])
 
     def nearest(self, fitted: Fitted, position: NDArray[np.floating]) -> Measured | None:
         """The measured spectrum nearest to a position (3,) [m]; None where none are known."""

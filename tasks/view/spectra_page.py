@@ -113,7 +113,7 @@ class SpectraPage:
         self._most_deviation = 1e-3
         self._latest = Latest(self._draw)
         planes = [plane for fitted in scene.fitted for plane in fitted.planes]
-        inside = scene.places if self._fixed is None else np.concatenate([scene.places, self._fixed[None]])
+        inside = scene.places if self._scene.fixed is None else np.concatenate([scene.places, self._scene.fixed[None]])
         self._low, self._high = extent(planes, inside)
         self._plan = Plan.around(inside, self._low, self._high, most=MOST_PLAN)
         with header(scene.title, scene.notes):
@@ -128,11 +128,6 @@ class SpectraPage:
                     ui.html(colour_bar("viridis", 0, 1, "magnitude"), sanitize=False)
                     ui.label("Ring: strongest direction; cross: line of sight.").classes("quiet")
         self._lay_out()
-
-    @property
-    def _fixed(self) -> NDArray[np.floating] | None:
-        data = self._scene.data
-        return None if data is None or data.fixed_position is None else data.fixed_position.numpy()
 
     def _choices(self) -> None:
         titles = {number: fitted.title for number, fitted in enumerate(self._scene.fitted)}
@@ -170,7 +165,7 @@ class SpectraPage:
         if self._scene.data is not None:
             parts.append(f'<span style="color:{MEASURED}">●</span> measured, learnt from')
             parts.append(f'<span style="color:{UNSEEN}">●</span> measured, not seen by the model')
-        if self._fixed is not None:
+        if self._scene.fixed is not None:
             parts.append(f'<span style="color:{FIXED}">✕</span> fixed end')
         if any(fitted.planes for fitted in self._scene.fitted):
             parts.append("lines: walls found, dashed where uncertain")
@@ -201,8 +196,8 @@ class SpectraPage:
             ends = in_plan(plane, self._low, self._high)
             if ends is not None:
                 parts.append(plan.line(ends, plane["certain"]))
-        if self._fixed is not None:
-            parts.append(plan.cross(self._fixed, FIXED))
+        if self._scene.fixed is not None:
+            parts.append(plan.cross(self._scene.fixed, FIXED))
         return "".join(parts)
 
     def _pointed(self, event: events.MouseEventArguments) -> None:
