@@ -57,6 +57,11 @@ class Plan:
         east, north = np.clip(at, self.low, self.high).tolist()
         return east, north
 
+    def shows(self, at: ArrayLike) -> bool:
+        """Whether all of these positions (..., 2) [m] lie in the plan."""
+        at = np.asarray(at, dtype=float)
+        return bool(((self.low <= at) & (at <= self.high)).all())
+
     def axes(self) -> str:
         """Frame, ticks and their numbers, outside of the picture."""
         width, height = self.size

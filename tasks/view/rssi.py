@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
@@ -18,6 +19,7 @@ from tasks.records import as_table
 from tasks.view.plan import Plan
 
 CELLS = 120  # of a map, along its longer side
+LINE = 100  # characters of a picture's title
 LEVEL = 0.8  # of the model's intervals
 DEVIATIONS = ndtri((1 + LEVEL) / 2)  # half of an interval, of a normal variable
 RECEIVER_COLOURS, MOST_COLOURS = "tab20", 20
@@ -258,13 +260,13 @@ class RssiScene:
         above = maps.assured(shown.certainty)[r] >= shown.threshold
         rows = [
             {
-                "x_m": x,
-                "y_m": y,
+                "x_m": round(x, 4),
+                "y_m": round(y, 4),
                 "z_m": shown.height,
                 "receiver": self.receivers[r],
-                "predicted_dbm": float(maps.middle[r, i, j]),
-                "low_dbm": float(maps.low[r, i, j]),
-                "high_dbm": float(maps.high[r, i, j]),
+                "predicted_dbm": round(float(maps.middle[r, i, j]), 2),
+                "low_dbm": round(float(maps.low[r, i, j]), 2),
+                "high_dbm": round(float(maps.high[r, i, j]), 2),
                 f"above_{shown.threshold:g}_dbm_with_{shown.certainty:.0%}": int(above[i, j]),
                 "best_receiver": self.receivers[maps.best[i, j]],
             }
@@ -297,7 +299,8 @@ class RssiScene:
                 ax.annotate(figures.plain(self.receivers[number]), (x, y), (6, 6), textcoords="offset points")
         ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", xlim=extent[:2], ylim=extent[2:])
         ax.grid(visible=False)
-        ax.set_title(figures.plain(f"{self.sentence(shown)} Height {shown.height:.2f} m."), fontsize=8, wrap=True)
+        title = textwrap.fill(f"{self.sentence(shown)} Height {shown.height:.2f} m.", LINE)
+        ax.set_title(figures.plain(title), fontsize=8)
         if layer.label:
             figure.colorbar(drawn, ax=ax, label=layer.label, fraction=0.04, pad=0.02)
         stream = io.BytesIO()

@@ -22,7 +22,9 @@ from swiftwrf.comparison.vae import Vae
 from swiftwrf.data.spectra import Moving, direction_of_link
 from swiftwrf.geometry import HybridModel
 from swiftwrf.positions import distance
+from tasks.aoa.page_room import MARGIN, extent
 
+FAR = 1.5  # away from the measured positions, in their extent
 QUICK = 0.02  # [s] that a spectrum may take while the moving end is dragged
 Direction = tuple[float, float]  # azimuth, elevation [deg]
 Link = tuple[Tensor, Tensor, Moving]
@@ -224,6 +226,17 @@ class SpectraScene:
         """Positions (n, 3) [m] that the page shows: those measured, or around which the models know spectra."""
         known = [fitted.region for fitted in self.fitted] if self.data is None else [self.data.position]
         return np.concatenate([position.double().numpy() for position in known])
+
+    @cached_property
+    def box(self) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        """Opposite corners (3,) [m] of what the page shows: the room as far as it is known, but of what lies far from the
+        measured positions only the side on which it is, or there would be no room to drag between these."""
+        planes = [plane for fitted in self.fitted for plane in fitted.planes]
+        inside = self.places if self.fixed is None else np.concatenate([self.places, self.fixed[None]])
+        low, high = extent(planes, inside)
+        nearest, farthest = self.places.min(axis=0), self.places.max(axis=0)
+        margin = np.maximum(FAR * (farthest - nearest).max(), MARGIN)
+        return np.maximum(low, nearest - margin), np.minimum(high, farthest + margin)
 
     @property
     def start(self) -> NDArray[np.floating]:

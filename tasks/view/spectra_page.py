@@ -11,7 +11,7 @@ from nicegui import events, run, ui
 from numpy.typing import NDArray
 
 from swiftwrf import AngularGrid
-from tasks.aoa.page_room import FIXED, MEASURED, extent, in_plan
+from tasks.aoa.page_room import FIXED, MEASURED, in_plan
 from tasks.view.pictures import View, address, png
 from tasks.view.plan import Plan, cross, ring, text
 from tasks.view.spectra import Direction, Drawn, Measured, SpectraScene, angle_between
@@ -112,10 +112,8 @@ class SpectraPage:
         self._times: deque[float] = deque(maxlen=RATE)
         self._most_deviation = 1e-3
         self._latest = Latest(self._draw)
-        planes = [plane for fitted in scene.fitted for plane in fitted.planes]
-        inside = scene.places if self._scene.fixed is None else np.concatenate([scene.places, self._scene.fixed[None]])
-        self._low, self._high = extent(planes, inside)
-        self._plan = Plan.around(inside, self._low, self._high, most=MOST_PLAN)
+        self._low, self._high = scene.box
+        self._plan = Plan.around(self._low, self._high, most=MOST_PLAN)
         with header(scene.title, scene.notes):
             self._choices()
         with ui.row().classes("w-full no-wrap items-start gap-8"):
@@ -194,11 +192,22 @@ class SpectraPage:
             parts += [plan.dots(data.position[~seen], UNSEEN, radius), plan.dots(data.position[seen], MEASURED, radius)]
         for plane in self._fitted.planes:
             ends = in_plan(plane, self._low, self._high)
-            if ends is not None:
+            if ends is not None and plan.shows(ends):
                 parts.append(plan.line(ends, plane["certain"]))
         if self._scene.fixed is not None:
-            parts.append(plan.cross(self._scene.fixed, FIXED))
+            parts.append(self._fixed_end(self._scene.fixed))
         return "".join(parts)
+
+    def _fixed_end(self, at: NDArray[np.floating]) -> str:
+        """A cross, at the edge where it lies beyond."""
+        shown = np.clip(at[:2], self._plan.low, self._plan.high)
+        beyond = float(np.linalg.norm(at[:2] - shown))
+        if beyond == 0:
+            return self._plan.cross(at, FIXED)
+        x, y = self._plan.place(shown)
+        left = x < self._plan.size[0] / 2
+        label = text(x + (12 if left else -12), y + 4, f"{beyond:.1f} m beyond", "start" if left else "end")
+        return self._plan.cross(shown, FIXED) + label
 
     def _pointed(self, event: events.MouseEventArguments) -> None:
         if event.type == "pointerdown":
