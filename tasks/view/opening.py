@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from augment import withhold
+from augment import SYNTHESIZERS, withhold
 from swiftwrf import InputError, RssiModel, Spectra, load
 from swiftwrf.checkpoint import Saved, refusing
 from tasks.aoa.config import AoaConfig
@@ -19,8 +19,6 @@ from tasks.rssi.experiment import MODEL
 from tasks.run import configured
 from tasks.view.rssi import Floor, RssiScene
 from tasks.view.spectra import Fitted, SpectraScene, planes_of
-
-MODEL_FILE = re.compile(r"(?P<name>.+)-mix(?P<share>.+)\.safetensors")
 
 
 def opened(source: Path) -> SpectraScene | RssiScene:
@@ -63,7 +61,9 @@ def _saved(file: Path) -> SpectraScene | RssiScene:
 
 
 def _aoa_run(folder: Path, content: Row) -> SpectraScene:
-    found = [(match, file) for file in sorted(folder.iterdir()) if (match := MODEL_FILE.fullmatch(file.name))]
+    names = "|".join(map(re.escape, ("model", *SYNTHESIZERS)))  # estimators are kept beside them
+    pattern = re.compile(rf"(?P<name>{names})-mix(?P<share>.+)\.safetensors")
+    found = [(match, file) for file in sorted(folder.iterdir()) if (match := pattern.fullmatch(file.name))]
     if not found:
         raise InputError(
             f"{folder} holds no model: its synthesizers have none that can be saved; run tasks.aoa with --synthesizer "

@@ -29,6 +29,7 @@ NEEDED = {
     "convert": ["data", "taken"],
     "inspect": ["data"],
     "view": ["data"],
+    "estimate": ["data", "data"],
 }
 RIGHT = {
     "aoa": {
