@@ -1,0 +1,19 @@
+"""Ray-traced scenes: furnished rooms of boxes, or scene files, traced by Sionna RT (extra `raytrace`)."""
+
+from swiftwrf.data.raytraced.rooms import ROOMS, Box, FurnishedRoom
+from swiftwrf.data.raytraced.scene import Scene
+from swiftwrf.data.raytraced.surfaces import Material, Surface, outline
+from swiftwrf.data.raytraced.trace import TracedPaths, Tracing, trace
+
+__all__ = [
+    "ROOMS",
+    "Box",
+    "FurnishedRoom",
+    "Material",
+    "Scene",
+    "Surface",
+    "TracedPaths",
+    "Tracing",
+    "outline",
+    "trace",
+]
