@@ -42,6 +42,8 @@ from tasks.report.__main__ import run as report
 from tasks.rssi import experiment as rssi
 from tasks.rssi.predictors import PREDICTORS
 from tasks.run import command_line
+from tasks.scenes import ScenesConfig
+from tasks.scenes import run as scenes
 
 FIT = FitConfig(model=ModelConfig(n_primitives=4, rank=2), steps=30, check_every=5)
 SHORT = {"steps": 12, "check_every": 6, "batch": 8, "warm_up": 1}
@@ -59,6 +61,7 @@ TASKS = {
     "report": (ReportConfig, report),
     "convert": (ConvertConfig, convert),
     "inspect": (InspectConfig, inspect),
+    "scenes": (ScenesConfig, scenes),
 }
 FOR_LIFE = ExitStack()
 PREDICTORS_KEPT = ("swiftwrf", "mean", "mri_pooled", "mri_receiver")

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from swiftwrf import InputError
 from swiftwrf.data.files import CARRIERS_HZ, sha256
-from swiftwrf.data.raytraced import ROOMS, FurnishedRoom, Scene, Tracing, trace
+from swiftwrf.data.raytraced import ROOMS, SCENE_FILE, FurnishedRoom, Scene, Tracing, trace
 from swiftwrf.data.spectra import Moving
 from swiftwrf.data.writing import write_paths
 from tasks.directory import console, new_directory
@@ -25,7 +25,6 @@ from tasks.scenes.page import page
 
 MOST_POSITIONS, MOST_ORDER = 100_000, 8
 ATTEMPTS = 100  # draws a position before the region counts as full
-SCENE_FILE = ".xml"
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ NEEDED = {
     "report": ["run"],
     "convert": ["data", "taken"],
     "inspect": ["data"],
+    "scenes": ["--room", "office", "--moving", "receiver", "--positions", "5"],
 }
 RIGHT = {
     "aoa": {

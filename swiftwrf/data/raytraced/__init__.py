@@ -1,12 +1,13 @@
 """Ray-traced scenes: furnished rooms of boxes, or scene files, traced by Sionna RT (extra `raytrace`)."""
 
 from swiftwrf.data.raytraced.rooms import ROOMS, Box, FurnishedRoom
-from swiftwrf.data.raytraced.scene import Scene
+from swiftwrf.data.raytraced.scene import SCENE_FILE, Scene, sionna
 from swiftwrf.data.raytraced.surfaces import Material, Surface, outline
 from swiftwrf.data.raytraced.trace import TracedPaths, Tracing, trace
 
 __all__ = [
     "ROOMS",
+    "SCENE_FILE",
     "Box",
     "FurnishedRoom",
     "Material",
@@ -15,5 +16,6 @@ __all__ = [
     "TracedPaths",
     "Tracing",
     "outline",
+    "sionna",
     "trace",
 ]

@@ -12,6 +12,7 @@ import torch
 from swiftwrf.data.raytraced.surfaces import Material, Surface
 from swiftwrf.errors import InputError
 
+SCENE_FILE = ".xml"  # ends the names of scene files; others are of rooms
 ISOTROPIC = {"num_rows": 1, "num_cols": 1, "pattern": "iso", "polarization": "V"}
 
 
@@ -98,16 +99,16 @@ class Scene:
 
 
 def _material(material: Material) -> Any:
-    rt = sionna()
+    rt, name = sionna(), f"material-{material.name}"  # a scene has no two things of one name
     if material.relative_permittivity is not None:
         return rt.RadioMaterial(
-            material.name,
+            name,
             thickness=material.thickness_m,
             relative_permittivity=material.relative_permittivity,
             conductivity=material.conductivity,
         )
     try:
-        return rt.ITURadioMaterial(f"itu-{material.name}", material.name, material.thickness_m)
+        return rt.ITURadioMaterial(name, material.name, material.thickness_m)
     except ValueError:
         known = ", ".join(_table())
         raise InputError(f"{material.name!r} is no material of ITU-R P.2040; choose from {known}") from None

@@ -170,15 +170,18 @@ def _solved(held: Any, how: Tracing, rays: int, diffuse: bool) -> dict[str, NDAr
         seed=how.seed,
     )
     kept = paths.valid.numpy()[:, 0]
-    kind = np.moveaxis(paths.interactions.numpy()[:, :, 0], 0, -1).reshape(*kept.shape, -1)  # (n, paths, order)
+    kind = np.zeros((*kept.shape, how.order), dtype=np.int64)
+    depth = len(paths.interactions.numpy()) if kind.size else 0  # as deep as the deepest path
+    if depth:
+        kind[..., :depth] = np.moveaxis(paths.interactions.numpy()[:, :, 0], 0, -1)
     if diffuse:
         kept &= (kind == DIFFUSE).any(axis=-1)
     owner, path = np.nonzero(kept)
     real, imaginary = (part.numpy()[:, 0, 0, 0] for part in paths.a)
     corner = np.full((len(owner), how.order, 3), np.nan)
-    if kind.shape[-1]:
-        corner[:, : kind.shape[-1]] = np.moveaxis(paths.vertices.numpy()[:, :, 0], 0, -2)[owner, path]
-        corner[:, : kind.shape[-1]][kind[owner, path] == 0] = np.nan
+    if depth:
+        corner[:, :depth] = np.moveaxis(paths.vertices.numpy()[:, :, 0], 0, -2)[owner, path]
+    corner[kind[owner, path] == 0] = np.nan
     angles = {
         "departure": (paths.theta_t, paths.phi_t),
         "arrival": (paths.theta_r, paths.phi_r),
