@@ -10,7 +10,8 @@ import pytest
 import quick
 import torch
 
-from swiftwrf import AngularGrid, Spectra, simulated_room
+from swiftwrf import AngularGrid, InputError, Spectra, simulated_room
+from swiftwrf.data.raytraced import sionna
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # one thread a process: more would wait for each other
     torch.set_num_threads(1)
@@ -26,6 +27,25 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.skip(reason="needs an NVIDIA GPU"))
         if "data" in item.keywords and "SWIFTWRF_DATA" not in os.environ:
             item.add_marker(pytest.mark.skip(reason="needs the measured data: set SWIFTWRF_DATA to their folder"))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Tests of all synthesizers skip the one whose extra is missing."""
+    if getattr(item, "callspec", None) and item.callspec.params.get("name") == "raytrace":
+        _sionna_or_skip()
+
+
+def _sionna_or_skip() -> None:
+    try:
+        sionna()
+    except InputError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture
+def ray_tracer() -> None:
+    """Sionna RT, or a reason to skip."""
+    _sionna_or_skip()
 
 
 @pytest.fixture(scope="session")

@@ -36,15 +36,6 @@ EDGE_M = 0.01  # Sionna loses paths that pass an edge this closely
 OPTIONS = ("--room", "bedroom", "--moving", "receiver", "--positions", 5)
 
 
-@pytest.fixture
-def rt():
-    """Sionna RT, or a reason to skip."""
-    try:
-        return sionna()
-    except InputError as error:
-        pytest.skip(str(error))
-
-
 def empty(material: str) -> FurnishedRoom:
     return FurnishedRoom(SIZE, material, material, material, (), (3.1, 2.4, 2.6), ((1, 1, 0.8), (5, 4, 1.9)))
 
@@ -88,7 +79,7 @@ def test_a_box_is_closed_and_turned_outwards():
 
 
 @pytest.mark.parametrize("moving", ["transmitter", "receiver"])
-def test_the_direct_path_is_that_of_free_space(rt, moving):
+def test_the_direct_path_is_that_of_free_space(ray_tracer, moving):
     position = places(9)
     paths = trace(Scene([], FREQUENCY), FIXED, position, moving, Tracing(order=0))
     transmitter, receiver = ends(position, moving)
@@ -105,7 +96,7 @@ def test_the_direct_path_is_that_of_free_space(rt, moving):
 
 
 @pytest.mark.parametrize("moving", ["transmitter", "receiver"])
-def test_a_metal_box_has_the_image_sources_of_the_simulated_room(rt, moving):
+def test_a_metal_box_has_the_image_sources_of_the_simulated_room(ray_tracer, moving):
     """For vertical isotropic ends a perfect conductor reflects -1 at walls and +1 at floor and ceiling, at any angle. The
     metal of ITU-R P.2040 conducts less: its gains are up to 2e-3 lower after two reflections."""
     position = places(40)
@@ -148,7 +139,7 @@ def passes_an_edge(receiver: torch.Tensor, source: torch.Tensor) -> bool:
     return (second - first) * abs(float(source[axis])) < EDGE_M
 
 
-def test_a_concrete_wall_reflects_as_fresnel_says(rt):
+def test_a_concrete_wall_reflects_as_fresnel_says(ray_tracer):
     """At normal incidence, a slab of ITU-R P.2040's concrete; the image-source room has one number for all."""
     fixed, position = torch.tensor([3.0, 2.5, 1.5]).double(), torch.tensor([[4.0, 2.5, 1.5]]).double()
     paths = trace(Scene(empty("concrete").surfaces(), FREQUENCY), fixed, position, "receiver", Tracing(order=1))
@@ -164,7 +155,7 @@ def test_a_concrete_wall_reflects_as_fresnel_says(rt):
     assert 0.3 < abs(slab) < 0.5  # the simulated room's walls reflect 0.6
 
 
-def test_furniture_blocks_scatters_and_diffracts(rt):
+def test_furniture_blocks_scatters_and_diffracts(ray_tracer):
     wall = Surface.joined("block", Material("metal", 0.001), [box((2.5, 0, 0), (3.5, 3.0, 2.9))])
     surfaces = [*empty("metal").surfaces(), wall]
     fixed, position = torch.tensor([2.0, 1.0, 1.5]).double(), torch.tensor([[3.2, 4.0, 1.5], [1.5, 4.0, 1.0]]).double()
@@ -185,7 +176,7 @@ def test_furniture_blocks_scatters_and_diffracts(rt):
     assert not torch.equal(rough.gain, other.gain)
 
 
-def test_both_mobilities_see_the_same_paths(rt):
+def test_both_mobilities_see_the_same_paths(ray_tracer):
     room = ROOMS["bedroom"].make()
     scene = Scene(room.surfaces(), FREQUENCY)
     fixed, region = (torch.tensor(x, dtype=torch.float64) for x in (room.fixed, room.region))
@@ -201,7 +192,7 @@ def test_both_mobilities_see_the_same_paths(rt):
 
 
 @pytest.mark.parametrize("moving", ["transmitter", "receiver"])
-def test_a_scene_is_read_back_as_spectra(rt, tmp_path, moving):
+def test_a_scene_is_read_back_as_spectra(ray_tracer, tmp_path, moving):
     assert run("scenes", "--room", "bedroom", "--moving", moving, "--positions", 6, "--out", tmp_path / "scene") == 0
     data = load_spectra(tmp_path / "scene", grid=AngularGrid.hemisphere(15, 60))
     room = ROOMS["bedroom"].make()
@@ -215,7 +206,7 @@ def test_a_scene_is_read_back_as_spectra(rt, tmp_path, moving):
     assert "<svg" in (tmp_path / "scene" / "report.html").read_text()
 
 
-def test_a_scene_file_is_traced_as_the_room_that_it_describes(rt, tmp_path):
+def test_a_scene_file_is_traced_as_the_room_that_it_describes(ray_tracer, tmp_path):
     file = write_scene(tmp_path, "concrete")
     read = trace(Scene.read(file, FREQUENCY), FIXED, places(4), "receiver", Tracing())
     built = trace(Scene(empty("concrete").surfaces(), FREQUENCY), FIXED, places(4), "receiver", Tracing())
@@ -266,7 +257,7 @@ def write_scene(folder, material):
         (("--room", "{folder}/room.xml", *OPTIONS[2:], "--fixed", 0, 0, 9, "--region", 1, 1, 1, 2, 2, 2), "no path"),
     ],
 )
-def test_what_only_sionna_knows_is_refused(rt, tmp_path, capsys, arguments, says):
+def test_what_only_sionna_knows_is_refused(ray_tracer, tmp_path, capsys, arguments, says):
     write_scene(tmp_path, "concrete")
     (tmp_path / "junk.xml").write_text("junk")
     (tmp_path / "empty.xml").write_text("<scene/>")
@@ -343,7 +334,7 @@ def test_a_scene_that_cannot_be(tmp_path, capsys, monkeypatch, scene, synthesize
 # the synthesizer
 
 
-def test_the_synthesizer_draws_the_spectra_of_its_scene(rt, tmp_path):
+def test_the_synthesizer_draws_the_spectra_of_its_scene(ray_tracer, tmp_path):
     """Traced twice, once as data and once from the scene's name, they are the same; so is the moving array, turned."""
     run("scenes", *OPTIONS[:4], "--positions", 6, "--out", tmp_path / "scene")
     data = load_spectra(tmp_path / "scene", grid=AngularGrid.hemisphere(15, 60))
@@ -354,7 +345,7 @@ def test_the_synthesizer_draws_the_spectra_of_its_scene(rt, tmp_path):
     assert not synthesizer.synthesize(outside).any()
 
 
-def test_planes_of_a_found_room_reflect_as_strongly_as_the_spectra_say(rt):
+def test_planes_of_a_found_room_reflect_as_strongly_as_the_spectra_say(ray_tracer):
     data = simulated_room(n=4, grid=AngularGrid.hemisphere(15, 60))
     wall = Plane(normal=(1.0, 0.0, 0.0), offset_m=6.0, gain=-0.6, std_mm=1.0, certain=True)
     room = GeometryModel(
