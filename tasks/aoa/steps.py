@@ -13,13 +13,15 @@ from torch import Tensor
 from augment import Mixed, choose_synthesizer, make_synthesizer, mix
 from augment.choose import SLOW, candidates
 from augment.suggest import suggest
-from swiftwrf import FitError, GeometryModel, InputError, Spectra
+from augment.synthesizers import Synthesizer
+from swiftwrf import FitError, GeometryModel, InputError, Spectra, SwiftWRF
 from swiftwrf.checkpoint import Saved, read, write
 from swiftwrf.geometry import HybridModel
 from tasks.aoa import arms
 from tasks.aoa.advice import advise
 from tasks.aoa.config import AUTO
 from tasks.aoa.estimators import ESTIMATORS, learners
+from tasks.aoa.field import motion, strongest_direction
 from tasks.aoa.setting import At, Setting
 from tasks.claim import STEPS
 from tasks.metrics import AdviceMetrics
@@ -146,8 +148,10 @@ class Synthesis(Step[Setting]):
             "synthesize": time.perf_counter() - fitted,
         }
         write(folder / self.file, KIND, {key: as_bytes(spectrum) for key, spectrum in drawn.items()}, {})
-        if self.trains and self.at.repeat == 0 and synthesizer.model is not None:
-            self._keep_model(synthesizer.model, measured, setting.test, folder)
+        if self.trains and self.at.repeat == 0:
+            if synthesizer.model is not None:
+                self._keep_model(synthesizer.model, measured, setting.test, folder)
+            self._keep_field(synthesizer, measured, folder)
         return {"history": fit.records, "seconds": seconds}
 
     def _keep_model(self, model: Saved, measured: Spectra, test: Spectra, folder: Path) -> None:
@@ -168,6 +172,15 @@ class Synthesis(Step[Setting]):
                 "order": order.numpy(),
             }
             write_npz(folder / f"room-{share}.npz", places)
+
+    def _keep_field(self, synthesizer: Synthesizer, measured: Spectra, folder: Path) -> None:
+        """What the report shows of the field, and of the primitives where there are any."""
+        share = f"mix{self.at.share:g}"
+        if self.synthesizer not in SLOW:
+            field = strongest_direction(synthesizer, measured, synthesizer.settings.seed)
+            write_npz(folder / f"field-{self.synthesizer}-{share}.npz", field)
+        if isinstance(synthesizer.model, SwiftWRF):
+            write_npz(folder / f"motion-{share}.npz", motion(synthesizer.model, measured))
 
     def then(self, setting: Setting, value: Row) -> Sequence[Step[Setting]]:
         trainings = [arms.turbo(self.synthesizer)] if self.trains else []
