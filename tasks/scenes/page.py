@@ -12,12 +12,14 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from pandas import DataFrame
 from torch import Tensor
 
+from swiftwrf.angles import to_angles
 from swiftwrf.data.raytraced import Scene, Surface, TracedPaths, outline
 from swiftwrf.data.spectra import Moving
 from tasks.page import figures
-from tasks.page.page import Page, Plot, Section, Table
+from tasks.page.page import Number, Page, Plot, Section, Summary, Table
 
 FIXED, MOVING, EDGE = "#cc3311", "#4477aa", "#7a8494"
 ORDERS = (
@@ -42,55 +44,32 @@ ENCLOSING = 0.95  # of the scene's extent: a surface that is as large encloses i
 
 def page(name: str, scene: Scene, fixed: Tensor, position: Tensor, moving: Moving, paths: TracedPaths) -> Page:
     """The room, where the ends are, and the paths of the position in the middle of the others."""
-    materials = sorted({(s.material.name, s.material.thickness_m) for s in scene.surfaces})
-    power = (
-        10
-        * torch.zeros(len(paths.count), dtype=torch.float64)
-        .index_add(0, paths.owner, paths.gain.abs().square())
-        .log10()
-    )
-    rows = [
-        ["positions", str(len(position))],
-        ["with line of sight", f"{float(paths.line_of_sight.double().mean()):.0%}"],
-        ["paths a position, mean", f"{float(paths.count.double().mean()):.0f}"],
-        ["power of all paths, median [dB]", f"{float(power.median()):.1f}"],
-        ["longest path [m]", f"{float(paths.length.max()):.1f}"],
-        ["materials", ", ".join(f"{material} {1e3 * thick:g} mm" for material, thick in materials)],
+    sight = f"{float(paths.line_of_sight.double().mean()):.0%}"
+    numbers = [
+        Number(str(len(position)), f"positions of the {moving}, {sight} of them with line of sight"),
+        Number(f"{float(paths.count.double().mean()):.0f}", "paths to a position, mean"),
+        Number(f"{float(paths.power_db.median()):.0f} dB", "power of all paths to a position, median of the positions"),
     ]
-    middle = int((position - position.mean(dim=0)).norm(dim=1).argmin())
     other = "receiver" if moving == "transmitter" else "transmitter"
-    lead = f"Ray paths between {len(position)} positions of a {moving} and a {other} that stays, traced by Sionna RT."
+    meaning = [
+        f"Ray paths between a {moving} that moves and a {other} that stays, traced by Sionna RT. Gains and phases are those "
+        "of isotropic, vertically polarised ends; nothing is transmitted through what stands in the way."
+    ]
+    steps = [
+        "Go on with python -m tasks.aoa --mix 0.3 --data and this directory; the array lies level at the receiver."
+    ]
+    summary = Summary(numbers, _room(scene, fixed, position, moving, paths), meaning, steps)
+    materials = sorted({(s.material.name, s.material.thickness_m) for s in scene.surfaces})
+    rows = [[material, f"{1e3 * thickness:g}"] for material, thickness in materials]
+    table = Table(["material", "thickness [mm]"], rows, "What the surfaces are made of.")
+    middle = int((position - position.mean(dim=0)).norm(dim=1).argmin())
+    rays = _rays(scene, fixed, position[middle], paths, middle, moving)
     return Page(
-        f"Scene: {name}",
-        lead,
-        [
-            Section("What it holds", tables=[Table(["", ""], rows)]),
-            Section(
-                "The room",
-                plots=[
-                    Plot(
-                        "room",
-                        _room(scene, fixed, position, moving),
-                        "In plan and in space: surfaces, positions (blue), the end that stays (star).",
-                    )
-                ],
-            ),
-            Section(
-                "One position",
-                plots=[
-                    Plot(
-                        "rays",
-                        _rays(scene, fixed, position[middle], paths, middle, moving),
-                        f"The strongest paths (at most {STRONGEST}) of the position nearest to the middle of all, coloured "
-                        "by their number of reflections and other interactions; thick lines are strong.",
-                    )
-                ],
-            ),
-        ],
+        f"Scene: {name}", summary, [Section("One position", plots=[rays]), Section("Materials", tables=[table])]
     )
 
 
-def _room(scene: Scene, fixed: Tensor, position: Tensor, moving: Moving) -> Figure:
+def _room(scene: Scene, fixed: Tensor, position: Tensor, moving: Moving, paths: TracedPaths) -> Plot:
     figure, plan, space = _pair()
     _draw(scene.surfaces, plan, space)
     dots = position[:MOST_DOTS]
@@ -99,10 +78,13 @@ def _room(scene: Scene, fixed: Tensor, position: Tensor, moving: Moving) -> Figu
     space.scatter(*dots.T, s=2, color=MOVING, depthshade=False)
     space.scatter(*fixed, s=80, marker="*", color=FIXED, depthshade=False)
     figures.legend_below(figure, plan)
-    return figure
+    table = DataFrame(position.numpy(), columns=["x_m", "y_m", "z_m"]).assign(
+        line_of_sight=paths.line_of_sight.numpy(), paths=paths.count.numpy(), power_db=paths.power_db.numpy()
+    )
+    return Plot("room", figure, "In plan and in space: surfaces, positions (blue), the end that stays (star).", table)
 
 
-def _rays(scene: Scene, fixed: Tensor, place: Tensor, paths: TracedPaths, number: int, moving: Moving) -> Figure:
+def _rays(scene: Scene, fixed: Tensor, place: Tensor, paths: TracedPaths, number: int, moving: Moving) -> Plot:
     figure, plan, space = _pair()
     _draw(scene.surfaces, plan, space)
     own = (paths.owner == number).nonzero()[:, 0]
@@ -128,14 +110,28 @@ def _rays(scene: Scene, fixed: Tensor, place: Tensor, paths: TracedPaths, number
         Line2D([], [], color=MOVING, marker="o", linestyle="", label=f"{moving}, moves"),
     ]
     figure.legend(handles=entries, loc="outside lower center", ncols=6, frameon=False)
-    return figure
+    caption = (
+        f"The strongest paths (at most {STRONGEST}) of the position nearest to the middle of all, coloured by their number of "
+        "reflections and other interactions; thick lines are strong. The numbers say where each comes from, seen from the "
+        "receiver."
+    )
+    azimuth, elevation = (angle.rad2deg() for angle in to_angles(paths.direction[own]))
+    table = DataFrame(
+        {
+            "length_m": paths.length[own].numpy(),
+            "gain_db": level,
+            "interactions": paths.order[own].numpy(),
+            "azimuth_deg": azimuth.numpy(),
+            "elevation_deg": elevation.numpy() * paths.direction[own, 2].sign().numpy(),
+        }
+    )
+    return Plot("rays", figure, caption, table[::-1])
 
 
 def _pair() -> tuple[Figure, Axes, Any]:
     """Axes of a plan and of a view in space."""
-    figure, axes = figures.new_figure(1, 2, 11, 5)
-    axes[1].remove()
-    return figure, axes[0], figure.add_subplot(1, 2, 2, projection="3d")
+    figure, axes = figures.new_figure(1, 2, 12, 5)
+    return figure, axes[0], figures.in_space(figure, axes[1])
 
 
 def _draw(surfaces: list[Surface], plan: Axes, space: Any) -> None:
@@ -147,7 +143,7 @@ def _draw(surfaces: list[Surface], plan: Axes, space: Any) -> None:
         encloses = bool((np.ptp(surface.vertex, axis=0)[:2] > ENCLOSING * (high - low)[:2]).all())
         plan.add_collection(
             LineCollection(
-                list(edges[..., :2]), colors="#222222" if encloses else colour, linewidths=1.0 if encloses else 0.6
+                list(edges[..., :2]), colors="black" if encloses else colour, linewidths=1.0 if encloses else 0.6
             )
         )
         space.add_collection3d(Line3DCollection(list(edges), colors=EDGE if encloses else colour, linewidths=0.5))

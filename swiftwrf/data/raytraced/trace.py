@@ -78,6 +78,11 @@ class TracedPaths:
         return torch.arange(len(self.count)).repeat_interleave(self.count)
 
     @property
+    def power_db(self) -> Tensor:
+        """Sum of the powers of each position's paths, relative to what is sent, float64 (n,)."""
+        return 10 * torch.zeros(len(self.count)).double().index_add(0, self.owner, self.gain.abs().square()).log10()
+
+    @property
     def reached(self) -> TracedPaths:
         """Without the positions that no path reaches."""
         some = self.count > 0
