@@ -23,6 +23,7 @@ from swiftwrf import AngularGrid, GeometryModel, InputError, load_spectra, simul
 from swiftwrf.arrays import LIGHT_SPEED
 from swiftwrf.data.raytraced import ROOMS, FurnishedRoom, Material, Scene, Surface, Tracing, outline, sionna, trace
 from swiftwrf.data.raytraced.surfaces import box
+from swiftwrf.data.raytraced.trace import _first
 from swiftwrf.data.simulated.room import Room
 from swiftwrf.geometry import Plane
 from swiftwrf.geometry.sample import Residual
@@ -186,6 +187,13 @@ def test_both_mobilities_see_the_same_paths(ray_tracer):
     transmitters = fixed.expand_as(position)
     first = torch.where(there.order[:, None] > 0, there.corner[:, 0], position[there.owner]) - transmitters[there.owner]
     torch.testing.assert_close(first / first.norm(dim=1, keepdim=True), back.direction, rtol=0, atol=1e-4)
+
+
+def test_a_path_that_two_triangles_find_counts_once():
+    """The same image source: as long, from the same direction, at the same position."""
+    arrival = np.array([[1.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 0, 0]])
+    table = {"owner": np.array([0, 0, 0, 0, 1]), "length": np.array([2, 2 + 1e-5, 2, 3, 2]), "arrival": arrival}
+    assert _first(table).tolist() == [0, 2, 3, 4]
 
 
 # the command

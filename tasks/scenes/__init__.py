@@ -6,6 +6,7 @@ import shlex
 import sys
 import time
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
@@ -106,6 +107,7 @@ def run(config: ScenesConfig, resume: Path | None = None) -> None:
             "line_of_sight": int(paths.line_of_sight.sum()),
             "paths_per_position": float(paths.count.double().mean()),
             "seconds": seconds,
+            "sionna_rt": version("sionna-rt"),
         }
         write_json(folder / "scene.json", record)
         write_page(folder, page(Path(config.room).stem, scene, fixed, position, config.moving, paths))

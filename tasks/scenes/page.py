@@ -112,8 +112,8 @@ def _rays(scene: Scene, fixed: Tensor, place: Tensor, paths: TracedPaths, number
     figure.legend(handles=entries, loc="outside lower center", ncols=6, frameon=False)
     caption = (
         f"The strongest paths (at most {STRONGEST}) of the position nearest to the middle of all, coloured by their number "
-        "of reflections and other interactions; thick lines are strong. The numbers say where each comes from, seen from the "
-        "receiver."
+        "of reflections and other interactions; thick lines are strong. The numbers say where each comes from, seen from "
+        "the receiver."
     )
     azimuth, elevation = (angle.rad2deg() for angle in to_angles(paths.direction[own]))
     table = DataFrame(
