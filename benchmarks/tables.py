@@ -221,6 +221,18 @@ def ablation() -> str:
     return markdown(["variant", *scenes, "paper: SSIM / L1"], rows)
 
 
+def raytracing() -> str:
+    """Median PSNR of every method in the furnished rooms, and how many planes geometry found."""
+    rows = []
+    for scene, result in load("raytracing")["scenes"].items():
+        scores = result["methods"]
+        cells = [f"{s['psnr_db']['median']:.1f}" for s in scores.values()]
+        certain = sum(plane["certain"] for plane in result["planes"])
+        traced = result["traced"]
+        rows.append([scene, f"{traced['paths_per_position']:.0f}", *cells, f"{certain} of {len(result['planes'])}"])
+    return markdown(["scene, moving end", "paths a position", *scores, "planes certain"], rows)
+
+
 TABLES = {
     "synthesis": synthesis,
     "aoa": aoa,
@@ -234,13 +246,17 @@ TABLES = {
     "drawing": drawing,
     "ablation": ablation,
     "comparison": comparison,
+    "raytracing": raytracing,
     "comparison_counts": comparison_counts,
     "comparison_turbo": comparison_turbo,
     "synthesis_targets": synthesis_targets,
     "aoa_targets": aoa_targets,
     "rssi_targets": rssi_targets,
 }
-FILES = ("README.md", "docs/speed.md", "docs/stability.md", "docs/ablation.md", "docs/comparison.md", "docs/targets.md")
+FILES = (
+    "README.md",
+    *(f"docs/{name}.md" for name in ("speed", "stability", "ablation", "comparison", "targets", "raytracing")),
+)
 
 
 def rewrite(text: str) -> str:
