@@ -8,7 +8,6 @@ import time
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -21,7 +20,6 @@ from swiftwrf.data.writing import write_paths
 from tasks.directory import console, new_directory
 from tasks.page.page import write_page
 from tasks.records import write_json
-from tasks.run import choice
 from tasks.scenes.page import page
 
 MOST_POSITIONS, MOST_ORDER = 100_000, 8
@@ -36,7 +34,8 @@ class ScenesConfig:
     paths of one position.
     """
 
-    room: Annotated[str, choice(f"a room, or a Mitsuba scene (FILE{SCENE_FILE}) with radio materials", ROOMS)]
+    room: str
+    """a room by its name (above), or a Mitsuba scene with radio materials (FILE.xml)"""
     moving: Moving
     """which end moves; the array lies level at the receiver"""
     positions: int
