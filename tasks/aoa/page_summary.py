@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tasks.aoa import arms
+from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.page_room import advice_sentence
 from tasks.aoa.share import Share
 from tasks.page.page import Number, Plot, Summary
@@ -59,5 +60,15 @@ def _next_steps(share: Share, best: str) -> list[str]:
         steps.append(f"Measure next at the positions in suggested-mix{key}.csv; the section below has their map.")
     else:
         steps.append("Ask where to measure next with --suggest 20.")
-    models = sorted(share.run.folder.glob(f"*-mix{key}.safetensors"))
-    return [*steps, *(f"Draw spectra anywhere: swiftwrf.load({file.name!r}).synthesize(position)." for file in models)]
+    files = {
+        file.name.removesuffix(f"-mix{key}.safetensors") for file in share.run.folder.glob(f"*-mix{key}.safetensors")
+    }
+    estimators = sorted(files & set(ESTIMATORS))
+    steps += [
+        f"Estimate directions: python -m tasks.estimate {name}-mix{key}.safetensors SOURCE." for name in estimators
+    ]
+    steps += [
+        f"Draw spectra anywhere: swiftwrf.load('{name}-mix{key}.safetensors').synthesize(position)."
+        for name in sorted(files - set(ESTIMATORS))
+    ]
+    return steps

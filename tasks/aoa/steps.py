@@ -20,7 +20,7 @@ from swiftwrf.geometry import HybridModel
 from tasks.aoa import arms
 from tasks.aoa.advice import advise
 from tasks.aoa.config import AUTO
-from tasks.aoa.estimators import ESTIMATORS, learners
+from tasks.aoa.estimators import ESTIMATORS, SavedEstimator, learners
 from tasks.aoa.field import motion, strongest_direction
 from tasks.aoa.setting import At, Setting
 from tasks.claim import STEPS
@@ -225,8 +225,17 @@ class Arm(Step[Setting]):
         estimator.fit(train)
         fitted = time.perf_counter()
         estimate = estimator.estimate(setting.test.spectrum)
+        if isinstance(estimator, SavedEstimator) and self._is_kept(setting):
+            estimator.save(folder / f"{self.estimator}-mix{self.at.share:g}.safetensors")
         seconds = {"train": fitted - began, "estimate": time.perf_counter() - fitted}
         return {"estimate": estimate, "seconds": seconds, "history": estimator.history, "counts": train.counts}
+
+    def _is_kept(self, setting: Setting) -> bool:
+        """Whether it is what a user would take: trained on all that the first synthesizer adds."""
+        if self.synthesis is None or self.at.repeat:
+            return False
+        first = setting.config.synthesizer[0] in (AUTO, self.synthesis.synthesizer)
+        return first and self.training == arms.turbo(self.synthesis.synthesizer, extra=self.synthesis.further)
 
     def _training_set(self, setting: Setting, folder: Path) -> Mixed:
         if self.training == arms.UPPER.name:

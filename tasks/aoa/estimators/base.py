@@ -11,6 +11,7 @@ from torch import Tensor
 
 from augment import Mixed
 from swiftwrf import AngularGrid
+from swiftwrf.checkpoint import Saved
 from swiftwrf.registry import Registry
 from tasks.run import Preset
 
@@ -53,6 +54,10 @@ class Estimator(ABC):
     @abstractmethod
     def estimate(self, spectrum: Tensor) -> Tensor:
         """Azimuth and elevation (n, 2) [rad] of spectra (n, H, W)."""
+
+
+class SavedEstimator(Estimator, Saved):
+    """One that a file can hold once it is trained: `swiftwrf.load` brings it back, ready to estimate."""
 
 
 ESTIMATORS: Registry[Estimator] = Registry("estimator")
