@@ -259,11 +259,7 @@ class Blend:
                 held_out[i, out] = self._fitted(name, train, (~out).nonzero()[:, 0]).predict(place).double()
         heard = ~train.rssi_dbm.isnan()
         self.weights = dict(zip(names, self._weights(held_out[:, heard].T, train.rssi_dbm[heard]), strict=True))
-        self._members = {
-            name: self._fitted(name, train, torch.arange(len(train)))
-            for name, weight in self.weights.items()
-            if weight > 0
-        }
+        self._members = {name: self._fitted(name, train, torch.arange(len(train))) for name, weight in self.weights.items() if weight > 0}
 
     def _fitted(self, name: str, train: Rssi, rows: Tensor) -> Predictor:
         """A member, fitted to some rows."""
