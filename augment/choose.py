@@ -13,7 +13,7 @@ from swiftwrf import FitError, InputError, Spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.metrics import psnr
 
-SLOW = ("nerf2", "wrfgs", "vae", "dcgan")  # compared only where they are asked for by name
+SLOW = ("nerf2", "wrfgs", "vae", "dcgan", "raytrace")  # compared only where they are asked for by name
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ class Settings:
         checkpoint: a file that keeps the state of a long fit; where it exists, the fit goes on from it.
         on_record: called with the records of a fit.
         progress: show a progress bar on a terminal.
+        scene: of `raytrace`: a built-in room or a scene file, instead of the room that the spectra show.
     """
 
     validation: Validation = "random"
@@ -39,6 +40,7 @@ class Settings:
     checkpoint: Path | None = None
     on_record: Callable[[dict[str, Any]], None] | None = None
     progress: bool = True
+    scene: str | None = None
 
 
 class Synthesizer(ABC):
