@@ -112,7 +112,8 @@ def _compute_on(cluster: Cluster, run: Run, steps: Iterable[Step[Setting]], sett
 
 
 def _compute_away(setting: Setting, step: Step[Setting], *contents: bytes) -> tuple[Row, float, dict[str, bytes]]:
-    """On a worker or in another process, which have no directory of the run: values, seconds, and the content of the files that were left."""
+    """On a worker or in another process, which have no directory of the run: values, seconds, and the content of the files
+    that were left."""
     with TemporaryDirectory(prefix="swiftwrf-") as name:
         folder = Path(name)
         (folder / STEPS).mkdir()

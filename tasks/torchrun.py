@@ -68,23 +68,32 @@ def check_gpus() -> None:
     started, gpus = int(os.environ.get("LOCAL_WORLD_SIZE", "1")), torch.cuda.device_count()
     if _others is not None and started > gpus:
         raise InputError(
-            f"torchrun started {started} processes on a machine with {gpus} GPUs; use --nproc-per-node {gpus}, or --device cpu"
+            f"torchrun started {started} processes on a machine with {gpus} GPUs; use --nproc-per-node {gpus} or --device cpu"
         )
 
 
 def together(command: Callable[[], int]) -> int:
     """Runs the command in the first of the processes that torchrun started, and lets the others help; without them, just
     runs it. The exit code is that of the command, in all of them."""
-    global _others
     if int(os.environ.get("WORLD_SIZE", "1")) == 1 or not dist.is_torchelastic_launched():
         return command()
     gpu = int(os.environ["LOCAL_RANK"])
     if gpu < torch.cuda.device_count():
         torch.cuda.set_device(gpu)
-    dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo", timeout=PATIENCE)
-    control = dist.new_group(backend="gloo", timeout=PATIENCE)
-    if dist.get_rank() > 0:
-        return _help(control)
+    own = not dist.is_initialized()
+    if own:
+        dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo", timeout=PATIENCE)
+    control: Any = dist.new_group(backend="gloo", timeout=PATIENCE)
+    try:
+        return _lead(command, control) if dist.get_rank() == 0 else _help(control)
+    finally:
+        if own:
+            dist.destroy_process_group()
+
+
+def _lead(command: Callable[[], int], control: dist.ProcessGroup) -> int:
+    """Runs the command, then lets the others end; its exit code."""
+    global _others
     _others, code = Others(control), 1
     try:
         code = command()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -67,11 +68,11 @@ def fit(
     processes = Processes(group)
     fold = folds(train.position, config.validation, config.seed)
     work = train.at_most(config.max_azimuths)
-    kernel = processes.from_first(lambda: choose_kernel(work.position, work.spectrum, fold))
+    kernel = processes.from_first(partial(choose_kernel, work.position, work.spectrum, fold))
     if config.validation == "random":
         fold = torch.arange(len(train))  # regression leaves out one spectrum as easily as a fifth of them
     if config.model.rank == "auto":
-        rank = processes.from_first(lambda: _rank(work, config, fold, kernel))
+        rank = processes.from_first(partial(_rank, work, config, fold, kernel))
         config = replace(config, model=replace(config.model, rank=rank))
     with progress_bar(progress and processes.first) as bar:
         session = Session(checkpoint, fingerprint(work, asdict(config)), bar, on_record, processes)

@@ -74,8 +74,8 @@ class _SharedNorm(nn.BatchNorm2d):
         self.processes = processes
 
     def forward(self, x: Tensor) -> Tensor:
-        wide, pixels = x.float(), (0, 2, 3)
-        rows = self.processes.total(torch.tensor(float(len(x))))
+        wide, pixels = x.to(torch.promote_types(x.dtype, torch.float32)), (0, 2, 3)
+        rows = self.processes.total(wide.new_tensor(len(x)))
         n = rows * x.shape[2] * x.shape[3]
         mean = self.processes.total(wide.sum(pixels)) / n
         centred = wide - mean[:, None, None]
@@ -94,7 +94,7 @@ def _shared(network: nn.Module, processes: Processes) -> nn.Module:
             for name, child in module.named_children():
                 if isinstance(child, nn.BatchNorm2d):
                     setattr(module, name, _SharedNorm(child, processes))
-    return DistributedDataParallel(copied, broadcast_buffers=False, process_group=processes.group)
+    return DistributedDataParallel(copied, process_group=processes.group)
 
 
 def _backbone(circular: bool) -> nn.Module:
