@@ -68,7 +68,7 @@ def check_gpus() -> None:
     started, gpus = int(os.environ.get("LOCAL_WORLD_SIZE", "1")), torch.cuda.device_count()
     if _others is not None and started > gpus:
         raise InputError(
-            f"torchrun started {started} processes on a machine with {gpus} GPUs; use --nproc-per-node {gpus} or --device cpu"
+            f"torchrun started {started} processes on a machine of {gpus} GPUs; use --nproc-per-node {gpus} or --device cpu"
         )
 
 

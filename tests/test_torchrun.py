@@ -150,7 +150,7 @@ def test_what_torchrun_cannot_spread_is_refused(monkeypatch):
         pass
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    with pytest.raises(InputError, match="started 4 processes on a machine with 2 GPUs"):
+    with pytest.raises(InputError, match="started 4 processes on a machine of 2 GPUs"):
         torchrun.check_gpus()
 
 
