@@ -13,14 +13,15 @@ from functools import partial
 from pathlib import Path
 from unittest import mock
 
+import comparison
 import dask
 import pytest
 import torch
-from quick import run, said
+from quick import FIT, run, said
 from test_interrupts import same_results
 from test_rssi_model import with_field
 
-from swiftwrf import FitError, InputError, fit_rssi
+from swiftwrf import AngularGrid, FitError, InputError, fit_rssi, simulated_room
 from swiftwrf.rssi import fit as rssi_fit
 from tasks import cluster as clusters
 from tasks.cluster import Cluster
@@ -103,6 +104,26 @@ def test_rssi_has_the_same_bits_when_a_worker_dies(local, cluster, monkeypatch):
     data = with_field(n=40)
     here, there = fit_rssi(data), fit_rssi(data, parallel=cluster.map)
     assert torch.equal(there.predict(data.transmitter_position)[0], here.predict(data.transmitter_position)[0])
+
+
+def test_the_comparison_has_the_same_rows(local, tmp_path, monkeypatch, small_published):
+    data = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
+    written = []
+    monkeypatch.setattr(comparison, "scenes", lambda config: [("room random", data, "random")])
+    monkeypatch.setattr(comparison, "LEARNT", ("swiftwrf", "vae"))
+    monkeypatch.setattr(comparison, "write_result", lambda name, content: written.append(content["scenes"]))
+    monkeypatch.setattr(comparison, "draw", lambda found: None)
+    with mock.patch("augment.synthesizers.swiftwrf.FitConfig", return_value=FIT):
+        for address in (None, local.scheduler_address):
+            work = tmp_path / ("here" if address is None else "there")
+            comparison.main(comparison.Config(Path(), parts=("scenes",), work=work, scheduler=address))
+            assert not [file for file in work.rglob("*") if file.suffix not in ("", ".json")]
+    here, there = (found["room random"]["24"] for found in written)
+    assert list(there) == list(here) == ["mean", "nearest", "gp", "coarray", "swiftwrf", "vae"]
+    for method, row in here.items():
+        assert {key: there[method][key] for key in ("psnr_db", "ssim", "parameters", "machine")} == {
+            key: row[key] for key in ("psnr_db", "ssim", "parameters", "machine")
+        }
 
 
 def test_workers_take_the_threads_of_the_run(cluster):
