@@ -2,8 +2,8 @@
 learning with the spectra of several methods.
 
 Hours of work that can be stopped at any time: each row is kept in the folder `--work` once it is measured, unfinished fits
-and runs go on from their state, and the result holds all rows that are there. With `--scheduler` the rows are measured on the
-workers of a Dask cluster; each says on which machine, for seconds of different machines do not compare.
+and runs go on from their state, and the result holds all rows that are there. With `--scheduler` the rows are measured on
+the workers of a Dask cluster; each says on which machine, for seconds of different machines do not compare.
 """
 
 from __future__ import annotations
