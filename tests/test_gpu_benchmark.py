@@ -51,7 +51,7 @@ def test_targets_are_met_or_missed():
 
 STAND_IN = """#!/usr/bin/env bash
 case "$*" in
-  *torch.cuda*) exit 1 ;;
+  *torch.cuda* | *"import pytest"*) exit 1 ;;
   *pytest*cuda*) echo "a test failed"; exit 1 ;;
   *rasterize.py*) sleep 60 ;;
   *) echo "$*" ;;
@@ -77,7 +77,8 @@ def test_a_part_that_fails_or_hangs_costs_no_other(tmp_path):
     assert states.pop("tests") == "failed with code 1"
     assert states.pop("rasterize") == "stopped after 1 s"
     assert states.pop("sanitizer") == "left out: compute-sanitizer is not installed"
-    assert states == dict.fromkeys(("rates", "profile", "training", "coarray"), "done")
+    assert states == dict.fromkeys(("environment", "install", "rates", "profile", "training", "coarray"), "done")
+    assert "--editable .[dev]" in (folder / "gpu_install.log").read_text()
     assert (folder / "gpu_tests.log").read_text() == "a test failed\n"
     assert "--device cpu --quick" in (folder / "gpu_rates.log").read_text()
     assert "tiny sizes on the CPU" in done.stdout

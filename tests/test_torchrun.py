@@ -23,6 +23,7 @@ from augment import Mixed
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, fit, simulated_room
 from swiftwrf.fitting.state import Session
 from swiftwrf.processes import Processes
+from swiftwrf.threads import set_threads
 from tasks import torchrun
 from tasks.aoa.estimators import Settings, aann
 from tasks.aoa.estimators.aann import AANN, AANNConfig
@@ -52,17 +53,18 @@ def run(*arguments):
 
 
 def learnt(group=None):
-    """What a fit by gradient draws, what it tells, and what three steps make of the network.
+    """What a fit by gradient draws, what it tells, and what two steps make of the network.
 
-    Batches have a number that two does not divide. The network counts in double precision, in which three steps differ
+    Batches have a number that two does not divide. The network counts in double precision, in which two steps differ
     only if they are not the same.
     """
+    set_threads(1)
     room = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
     records = []
     model = fit(room, replace(CONFIG, batch=7), progress=False, on_record=records.append, group=group)
     backbone = aann._backbone
     with mock.patch.object(aann, "_backbone", lambda circular: backbone(circular).double()):
-        network = AANN(Settings(room.grid, group=group), AANNConfig(steps=3, batch=5))
+        network = AANN(Settings(room.grid, group=group), AANNConfig(steps=2, batch=5))
     network.fit(Mixed.measured(replace(room, spectrum=room.spectrum.double())))
     estimate = network.estimate(room.spectrum.double())
     losses = torch.tensor([record["loss"] for record in (*records, *network.history)])
@@ -81,6 +83,7 @@ def ended(tmp_path_factory):
         if len(calls) == 2:
             raise KeyboardInterrupt
 
+    set_threads(1)
     with mock.patch.object(Session, "evaluated", interrupt):
         assert run(*AOA, "--out", folder / "two") == 130
     assert list((folder / "two.partial" / "steps").glob("*-fit.safetensors"))
@@ -115,7 +118,7 @@ def test_a_shared_fit_is_that_of_one_process(ended):
 
 def test_a_run_goes_on_in_two_processes(ended):
     folder, said = ended
-    torch.set_num_threads(1)
+    set_threads(1)
     assert run(*AOA, "--out", folder / "one") == 0
     one, two = folder / "one", folder / "two"
     assert {file.name for file in two.iterdir()} == {file.name for file in one.iterdir()}
