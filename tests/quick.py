@@ -35,6 +35,8 @@ from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.estimators.baselines import Constant
 from tasks.convert import ConvertConfig
 from tasks.convert import run as convert
+from tasks.estimate import EstimateConfig
+from tasks.estimate import run as estimate
 from tasks.inspect import InspectConfig
 from tasks.inspect import run as inspect
 from tasks.report.__main__ import ReportConfig
@@ -58,6 +60,7 @@ TASKS = {
     "rssi": (rssi.RssiTaskConfig, rssi.run),
     "report": (ReportConfig, report),
     "convert": (ConvertConfig, convert),
+    "estimate": (EstimateConfig, estimate),
     "inspect": (InspectConfig, inspect),
 }
 FOR_LIFE = ExitStack()

@@ -146,6 +146,15 @@ def test_whole_run(small, tmp_path):
 
     html = (out / "report.html").read_text()
     assert "Where to measure next" in html
+    assert "What to do next" in html
+    field = pd.read_csv(next((out / "figures").glob("field-swiftwrf-mix0.5*.csv")))
+    for place, known in zip((field["x_m"], field["y_m"]), small.position.T.tolist(), strict=False):
+        assert place.between(min(known) - 1e-9, max(known) + 1e-9).all()
+    assert field["azimuth_deg"].between(0, 360).all()
+    assert field["elevation_deg"].between(0, 90).all()
+    motion = pd.read_csv(next((out / "figures").glob("motion-mix0.5*.csv")))
+    assert motion["strength"].ge(0).all()
+    assert motion["walked_m"].iloc[-1] > motion["walked_m"].iloc[0]
     assert "What this does not show" in html
     assert "<svg" in html
     assert not [line for line in html.splitlines() if 'src="http' in line or 'href="http' in line]
@@ -179,7 +188,7 @@ def test_a_new_estimator_is_in_help_metrics_report_and_colours(small, registered
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["mixes"]["0.5"]["methods"]["northern"]["elevation_deg"]["median"] > 0
     html = (tmp_path / "run" / "report.html").read_text()
-    assert "northern: always due north" in html
+    assert "<dt>northern</dt><dd>always due north</dd>" in html
     assert "#123456" in html
 
 

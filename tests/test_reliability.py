@@ -14,7 +14,6 @@ from quick import run, said
 
 from swiftwrf import InputError, durable
 from tasks.claim import Claim
-from tasks.page.page import Page, Plot, Section, write_page
 from tasks.page.records import Records
 from tasks.records import read_table, write_table
 from tasks.report import merge
@@ -172,14 +171,6 @@ def test_merged_reports_show_every_run(tmp_path, task, first, second, figures):
     assert len({name for name in drawn if "run1" in name}) == len({name for name in drawn if "run2" in name}) >= figures
     for name in (name for name in drawn if "run1" in name and name.startswith(("cdf", "map", "bars"))):
         assert drawn[name] != drawn[name.replace("run1", "run2")]
-
-
-def test_two_figures_of_one_name_are_refused(tmp_path):
-    from matplotlib.figure import Figure
-
-    plots = [Plot("same", Figure(), ""), Plot("same", Figure(), "")]
-    with pytest.raises(ValueError, match="same"):
-        write_page(tmp_path, Page("", "", [Section("", plots=plots)]))
 
 
 @pytest.mark.parametrize(

@@ -58,9 +58,20 @@ def estimator_of(name: str) -> str:
     return max(own, key=len) if own else NETWORK
 
 
+def is_network(name: str) -> bool:
+    """Whether the arm's estimator is the network."""
+    return estimator_of(name) == NETWORK
+
+
 def is_turbo(name: str) -> bool:
     """Whether synthetic spectra train this arm."""
     return training_of(name).startswith(TURBO)
+
+
+def drawn_by(names: Iterable[str]) -> list[str]:
+    """The synthesizers whose spectra train some of these arms."""
+    trainings = dict.fromkeys(training_of(name) for name in names if is_turbo(name))
+    return [name for name in SYNTHESIZERS if {turbo(name), turbo(name, extra=True)} & trainings.keys()]
 
 
 def baselines() -> list[str]:
@@ -68,23 +79,25 @@ def baselines() -> list[str]:
     return [name for name in ESTIMATORS if name != NETWORK]
 
 
+def terms() -> dict[str, str]:
+    """What the names of arms mean."""
+    return {
+        **{bound.name: bound.meaning for bound in (LOWER, UPPER)},
+        f"{TURBO}NAME": "trained on the measured share and on spectra that NAME synthesized at the withheld positions",
+        f"{TURBO}NAME{EXTRA}": "the same, and at as many further positions as --extra says",
+        **{entry.name: entry.meaning for entry in ESTIMATORS.entries()},
+        "no estimator's name": f"the network ({NETWORK}); an estimator's name alone is that one on the measured share",
+    }
+
+
 def meaning() -> str:
-    """All arms in words."""
-    texts = [f"{bound.name}: {bound.meaning}" for bound in (LOWER, UPPER)]
-    texts += [
-        f"{TURBO}NAME: trained on the measured share and on spectra that NAME synthesized at the withheld positions",
-        f"{TURBO}NAME{EXTRA}: the same, and at as many further positions as --extra says",
-    ]
-    texts += [f"{entry.name}: {entry.meaning}" for entry in ESTIMATORS.entries()]
-    return (
-        "; ".join(texts) + f". An arm without the name of an estimator is the network ({NETWORK}); an estimator's name "
-        "alone is that estimator on the measured share."
-    )
+    """The same as text."""
+    return "; ".join(f"{name}: {what}" for name, what in terms().items()) + "."
 
 
-def synthesizers(names: Iterable[str]) -> str:
-    """These synthesizers in words; runs may hold some that are registered no more."""
-    return "; ".join(f"{name}: {SYNTHESIZERS[name].meaning}" for name in names if name in SYNTHESIZERS) + "."
+def synthesizers(names: Iterable[str]) -> dict[str, str]:
+    """What the names of these synthesizers mean; runs may hold some that are registered no more."""
+    return {name: SYNTHESIZERS[name].meaning for name in names if name in SYNTHESIZERS}
 
 
 def palette() -> Palette:

@@ -84,8 +84,6 @@ def check(config: AoaConfig) -> None:
         )
     if len(set(config.mix)) < len(config.mix):
         raise InputError(f"--mix names a share twice: {' '.join(f'{s:g}' for s in config.mix)}")
-    if not config.synthesizer:
-        raise InputError(f"--synthesizer takes at least one of {', '.join(SYNTHESIZERS)}")
     if reading(config).given and config.data is None:
         raise InputError(f"--{reading(config).given[0]} says how --data is read; give it with --data")
     if config.repeats < 1:

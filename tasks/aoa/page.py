@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
+from pandas import DataFrame, concat
 
 from augment import SYNTHESIZERS
 from tasks.aoa import arms
-from tasks.aoa.estimators import ESTIMATORS
-from tasks.aoa.page_room import advice_sentence, choice_section, room_section
+from tasks.aoa.estimators import ESTIMATORS, learners
+from tasks.aoa.page_field import field_section
+from tasks.aoa.page_room import choice_section, room_section
 from tasks.aoa.page_suggest import suggestion_section
+from tasks.aoa.page_summary import summary
 from tasks.aoa.share import AoaRecords, Share, first_history, fits, place, scene
 from tasks.metrics import Angle, ErrorSummary
 from tasks.page import figures
@@ -32,36 +39,21 @@ def page(runs: list[AoaRecords]) -> Page:
     shares = [share for run in runs for share in Share.of(run)]
     sections = [_results(share, several) for share in shares]
     if len(shares) > 1:
-        sections.insert(0, _over_shares(shares))
+        sections.insert(0, Section("Error against the measured share", plots=[_over_shares(shares, "shares")]))
     for share in shares:
         sections += [
             section for section in (choice_section(share), room_section(share), suggestion_section(share)) if section
         ]
-    sections += [_synthesis(shares, several), *(_examples(share) for share in shares), *_size(runs)]
-    sections += [*(_speed(share) for share in shares), _training(runs)]
+    sections += [_synthesis(shares, several), *(_examples(share) for share in shares)]
+    sections += [section for share in shares if (section := field_section(share))]
+    sections += [
+        *(_speed(share) for share in shares),
+        Section("Training and size", plots=[*_size(runs), *_training(runs)]),
+    ]
     sections += [_time(shares, several), _limits(runs[0]), provenance(runs)]
     names = ", ".join(dict.fromkeys(place(run) for run in runs))
-    return Page(f"Angle of arrival: {names}", _lead(shares[0]), sections)
-
-
-def _lead(share: Share) -> str:
-    metrics, mix = share.run.metrics, share.mix
-    median = {name: arm["great_circle_deg"]["median"] for name, arm in mix["methods"].items()}
-    turbo = min((name for name in median if arms.is_turbo(name) and _is_network(name)), key=lambda name: median[name])
-    lower, upper = median[arms.LOWER.name], median[arms.UPPER.name]
-    best = min(median, key=lambda name: median[name])
-    sentences = [
-        f"On {share.scene}, with {mix['n_measured']} of {metrics['n_train']} training spectra measured ({share.percent}), "
-        f"turbo learning ({turbo}) changes the network's median great-circle error by {median[turbo] / lower - 1:+.0%}: "
-        f"{median[turbo]:.2f} degrees against {lower:.2f} on the measured share alone and {upper:.2f} with everything "
-        "measured.",
-        f"The best of all arms is {best} with {median[best]:.2f}. {metrics['n_test']} test spectra.",
-    ]
-    return " ".join([*sentences, *filter(None, [advice_sentence(share)])])
-
-
-def _is_network(name: str) -> bool:
-    return arms.estimator_of(name) == arms.NETWORK
+    picture = _over_shares(shares, "summary") if len(shares) > 1 else _estimators(shares[0])
+    return Page(f"Angle of arrival: {names}", summary(shares[0], picture), sections)
 
 
 def _results(share: Share, several: bool) -> Section:
@@ -72,7 +64,7 @@ def _results(share: Share, several: bool) -> Section:
     ]
     columns = ["method", *(f"{name} [deg]" for name in ERRORS.values()), "great circle, 90 %"]
     strong = frozenset(name for name in share.mix["methods"] if arms.is_turbo(name))
-    paragraphs = [arms.meaning()]
+    paragraphs = []
     if share.key in PAPER:
         elevation, azimuth = PAPER[share.key]
         paragraphs.append(
@@ -82,7 +74,7 @@ def _results(share: Share, several: bool) -> Section:
     table = Table(columns, rows, "Median error with its 95 % interval over the test spectra.", strong)
     parts = [[name, *(str(n) for n in counts.values())] for name, counts in share.mix["counts"].items()]
     origin = Table(["training set", "measured", "withheld positions", "further positions"], parts, "Spectra by origin.")
-    return Section(title, paragraphs, [table, origin], [_cdf(share), *_turbo_cdf(share)])
+    return Section(title, paragraphs, [table, origin], [_cdf(share), *_turbo_cdf(share)], arms.terms())
 
 
 def _with_interval(summary: ErrorSummary) -> str:
@@ -92,8 +84,10 @@ def _with_interval(summary: ErrorSummary) -> str:
 def _cdf(share: Share) -> Plot:
     table = share.run.table("errors")
     own = table[table["mix"] == float(share.key)]
-    own = own[[_is_network(name) or name in arms.baselines() for name in own["method"]]]  # more would hide each other
-    figure, axes = figures.new_figure(1, 3, 10, 3.3)
+    own = own[
+        [arms.is_network(name) or name in arms.baselines() for name in own["method"]]
+    ]  # more would hide each other
+    figure, axes = figures.new_figure(1, 3, 12, 3.8)
     for ax, (column, name) in zip(axes, ERRORS.items(), strict=True):
         groups = {str(method): part[column] for method, part in own.groupby("method", sort=False)}
         shown = [float(part.quantile(0.95)) for method, part in groups.items() if method != OFF_SCALE]
@@ -102,7 +96,7 @@ def _cdf(share: Share) -> Plot:
     axes[2].set_ylabel("")
     figures.legend_below(figure, axes[0])
     caption = "Distribution of the errors; full lines are networks, dashed ones baselines."
-    return Plot(f"cdf-{share.file_name}", figure, caption)
+    return Plot(f"cdf-{share.file_name}", figure, caption, own[["repeat", "index", "method", *ERRORS]])
 
 
 def _turbo_cdf(share: Share) -> list[Plot]:
@@ -112,7 +106,7 @@ def _turbo_cdf(share: Share) -> list[Plot]:
         return []
     table = share.run.table("errors")
     own = table[table["mix"] == float(share.key)]
-    figure, axes = figures.new_figure(1, 2, 8, 3.3)
+    figure, axes = figures.new_figure(1, 2, 12, 3.8)
     for ax, (column, name) in zip(axes, ERRORS.items(), strict=False):  # azimuth and elevation
         groups = {arm: own[own["method"] == arm][column] for arm in (arms.LOWER.name, *turbo, arms.UPPER.name)}
         limit = max(*(float(part.quantile(0.95)) for part in groups.values()), 1e-3)
@@ -120,22 +114,47 @@ def _turbo_cdf(share: Share) -> list[Plot]:
     axes[1].set_ylabel("")
     figures.legend_below(figure, axes[0])
     caption = "The network with spectra of each synthesizer at the withheld positions, between its bounds."
-    return [Plot(f"turbo-{share.file_name}", figure, caption)]
+    shown = own[own["method"].isin([arms.LOWER.name, *turbo, arms.UPPER.name])]
+    return [Plot(f"turbo-{share.file_name}", figure, caption, shown[["repeat", "index", "method", *ERRORS]])]
 
 
-def _over_shares(shares: list[Share]) -> Section:
-    every = (name for share in shares for name in share.mix["methods"])
+def _over_shares(shares: list[Share], name: str) -> Plot:
+    every = (arm for share in shares for arm in share.mix["methods"])
     names = dict.fromkeys(
-        name for name in every if name != OFF_SCALE and (_is_network(name) or name in arms.baselines())
+        arm for arm in every if arm != OFF_SCALE and (arms.is_network(arm) or arm in arms.baselines())
     )
     labels = [share.percent for share in shares]
     if len({place(share.run) for share in shares}) > 1:
         labels = [figures.plain(f"{s.percent}\n{s.run.metrics['data']}\n{s.run.metrics['split']}") for s in shares]
-    heights = {name: [_median_and_interval(share, name) for share in shares] for name in names}
-    figure, axes = figures.new_figure(1, 1, 8, 3.4)
+    heights = {arm: [_median_and_interval(share, arm) for share in shares] for arm in names}
+    figure, axes = figures.new_figure(1, 1, 7.2, 4)
     figures.bars(axes[0], arms.palette(), labels, heights, "median great-circle error [deg]")
     figures.legend_below(figure, axes[0])
-    return Section("Error against the measured share", plots=[Plot("shares", figure, "Whiskers: 95 % intervals.")])
+    caption = "Median error of each arm against the measured share; whiskers: 95 % intervals."
+    return Plot(name, figure, caption, _bars_data("share", labels, heights))
+
+
+def _estimators(share: Share) -> Plot:
+    """Of one share: each estimator on the measured spectra, with the synthetic ones, on everything."""
+    trainings = dict.fromkeys(map(arms.training_of, share.mix["methods"]))
+    estimators = [arms.NETWORK, *(name for name in learners() if name != arms.NETWORK)]
+    heights = {
+        training: [_median_and_interval(share, arms.arm(estimator, training)) for estimator in estimators]
+        for training in trainings
+    }
+    figure, axes = figures.new_figure(1, 1, 7.2, 4)
+    labels = [f"network ({name})" if name == arms.NETWORK else name.replace("_", " ") for name in estimators]
+    figures.bars(axes[0], arms.palette(), labels, heights, "median great-circle error [deg]")
+    figures.legend_below(figure, axes[0])
+    caption = f"Median error of each estimator on each training set, {share.title}; whiskers: 95 % intervals."
+    return Plot("summary", figure, caption, _bars_data("estimator", estimators, heights))
+
+
+def _bars_data(
+    group: str, groups: Sequence[str], heights: Mapping[str, Sequence[tuple[float, float, float]]]
+) -> DataFrame:
+    rows = [(of, name, *value) for name, values in heights.items() for of, value in zip(groups, values, strict=True)]
+    return DataFrame(rows, columns=[group, "method", "median_deg", "low_deg", "high_deg"])
 
 
 def _median_and_interval(share: Share, arm: str) -> tuple[float, float, float]:
@@ -161,7 +180,7 @@ def _synthesis(shares: list[Share], several: bool) -> Section:
     table = Table(["share and synthesizer", "SSIM", "PSNR [dB]", "L1"], rows, caption)
     names = dict.fromkeys(name for share in shares for name in share.mix["synthesis"])
     plots = [_ssim_cdf(share) for share in shares]
-    return Section("How good are the synthetic spectra?", [arms.synthesizers(names)], [table], plots)
+    return Section("How good are the synthetic spectra?", [], [table], plots, arms.synthesizers(names))
 
 
 def _ssim_cdf(share: Share) -> Plot:
@@ -171,7 +190,8 @@ def _ssim_cdf(share: Share) -> Plot:
     figure, axes = figures.new_figure(1, 1, 6, 3.3)
     figures.cdf(axes[0], arms.palette(), groups, "SSIM", limit=1)
     figures.legend_below(figure, axes[0])
-    return Plot(f"ssim-{share.file_name}", figure, f"Distribution of the SSIM over the test spectra, {share.title}.")
+    caption = f"Distribution of the SSIM over the test spectra, {share.title}."
+    return Plot(f"ssim-{share.file_name}", figure, caption, own[["repeat", "index", "synthesizer", "ssim"]])
 
 
 def _examples(share: Share) -> Section:
@@ -188,11 +208,25 @@ def _examples(share: Share) -> Section:
         )
     return Section(
         f"Six spectra at positions nobody measured ({share.title}, {example.get('synthesizer', 'swiftwrf')})",
-        plots=[Plot(f"spectra-{share.file_name}", figure, text)],
+        plots=[Plot(f"spectra-{share.file_name}", figure, text, _pixels(example))],
     )
 
 
-def _size(runs: list[AoaRecords]) -> list[Section]:
+def _pixels(example: dict[str, NDArray[Any]]) -> DataFrame:
+    """Spectra in 256 steps, a row of pixels each row; azimuth along the columns."""
+    kinds = [kind for kind in ("measured", "synthetic", "deviation") if kind in example]
+    images = np.stack([example[kind] for kind in kinds], axis=1)  # (n, kinds, H, W)
+    n, _, rows, columns = images.shape
+    names = {
+        "index": np.repeat(example["index"], len(kinds) * rows),
+        "kind": np.tile(np.repeat(kinds, rows), n),
+        "row": np.tile(np.arange(rows), n * len(kinds)),
+    }
+    table = DataFrame(images.reshape(-1, columns), columns=[f"column_{i}" for i in range(columns)])
+    return concat([DataFrame(names), table], axis=1)
+
+
+def _size(runs: list[AoaRecords]) -> list[Plot]:
     """Quality against size: what the fit of SwiftWRF tried, and what it took."""
     plots = []
     for run in runs:
@@ -211,11 +245,12 @@ def _size(runs: list[AoaRecords]) -> list[Section]:
             f"{scene(run)}, first share. Loss on measured spectra that each size did not see, at coarse resolution; the "
             f"model took the smallest within 0.2 % of the best: {n} primitives (line)."
         )
-        plots.append(Plot(f"size-{Share.of(run)[0].file_name}", figure, caption))
-    return [Section("How large a model the scene needs", plots=plots)] if plots else []
+        data = by_size[["n_primitives", "validation"]]
+        plots.append(Plot(f"size-{Share.of(run)[0].file_name}", figure, caption, data))
+    return plots
 
 
-def _training(runs: list[AoaRecords]) -> Section:
+def _training(runs: list[AoaRecords]) -> list[Plot]:
     plots = []
     for run in runs:
         history = first_history(run)
@@ -225,18 +260,23 @@ def _training(runs: list[AoaRecords]) -> Section:
         descents = history[(history["stage"] == "final") & (history["steps"] > 0)] if "steps" in history else None
         by_fit = () if descents is None else descents.groupby("synthesizer", sort=False)
         fitted = {str(name): (part["step"], part["loss"] / part["loss"].iloc[0]) for name, part in by_fit}
-        figure, axes = figures.new_figure(1, 2, 9, 3)
-        figures.curves(axes[0], arms.palette(), networks, "step", "loss of the network")
-        figures.curves(axes[1], arms.palette(), fitted, "step", "loss of the synthesizer, over its first")
-        axes[1].set_visible(bool(fitted))
+        panels = {"loss of the network": networks, "loss of the synthesizer, over its first": fitted}
+        panels = {label: lines for label, lines in panels.items() if lines}
+        figure, axes = figures.new_figure(1, max(len(panels), 1), 6 * max(len(panels), 1), 3.2)
+        for ax, (label, lines) in zip(axes, panels.items(), strict=False):
+            figures.curves(ax, arms.palette(), lines, "step", label)
         caption = f"{scene(run)}, first share and repeat: the networks, and synthesizers that are fitted by gradient."
-        plots.append(Plot(f"training-{Share.of(run)[0].file_name}", figure, caption))
-    return Section("Training", plots=plots)
+        curves = {f"network, {name}": line for name, line in networks.items()}
+        curves |= {f"synthesizer, {name}": line for name, line in fitted.items()}
+        parts = [DataFrame({"what": what, "step": steps, "loss": loss}) for what, (steps, loss) in curves.items()]
+        data = concat(parts) if parts else DataFrame(columns=["what", "step", "loss"])
+        plots.append(Plot(f"training-{Share.of(run)[0].file_name}", figure, caption, data))
+    return plots
 
 
 def _speed(share: Share) -> Section:
     synthesis = {name: scores for name, scores in share.mix["synthesis"].items() if name in SYNTHESIZERS}
-    methods = {n: a for n, a in share.mix["methods"].items() if _is_network(n) or n in ESTIMATORS}
+    methods = {n: a for n, a in share.mix["methods"].items() if arms.is_network(n) or n in ESTIMATORS}
     error = {name: rms_of_psnr(scores["psnr_db"]["median"]) for name, scores in synthesis.items()}
     fit = {name: max(scores["seconds"]["fit"], SHORTEST) for name, scores in synthesis.items()}
     draw = {name: max(scores["seconds"]["synthesize"], SHORTEST) for name, scores in synthesis.items()}
@@ -245,17 +285,29 @@ def _speed(share: Share) -> Section:
         for name, arm in methods.items()
     }
     palette = arms.palette()
-    figure, axes = figures.new_figure(1, 3, 10.5, 4.2)
+    figure, axes = figures.new_figure(1, 3, 12, 4.2)
     for ax, stage, seconds in zip(axes, ("fit", "synthesize"), (fit, draw), strict=False):
         points = {name: (seconds[name], error[name]) for name in synthesis}
-        figures.speed(ax, palette, points, f"seconds to {stage}", "RMS error of a spectrum")
+        figures.speed(ax, palette, points, f"seconds to {stage}", "RMS error of a spectrum", also=["swiftwrf"])
     figures.speed(axes[2], palette, estimators, "seconds to train and estimate", "median great-circle error [deg]")
     caption = (
         "Left and middle: synthesizers, seconds to fit and to draw the withheld and the test spectra. Right: estimators, "
         "the synthesizer's time not counted. The line is the Pareto front: what is not on it is beaten in both."
     )
     figures.legend_of(figure, palette, [*synthesis, *methods])
-    return Section(f"Speed against error ({share.title})", plots=[Plot(f"speed-{share.file_name}", figure, caption)])
+    data = concat(
+        [
+            DataFrame({"name": name, "stage": stage, "seconds": seconds[name], "rms_error": error[name]}, index=[0])
+            for stage, seconds in (("fit", fit), ("synthesize", draw))
+            for name in synthesis
+        ]
+        + [
+            DataFrame({"name": name, "stage": "train and estimate", "seconds": cost, "error_deg": wrong}, index=[0])
+            for name, (cost, wrong) in estimators.items()
+        ]
+    )
+    plot = Plot(f"speed-{share.file_name}", figure, caption, data)
+    return Section(f"Speed against error ({share.title})", plots=[plot])
 
 
 def _time(shares: list[Share], several: bool) -> Section:

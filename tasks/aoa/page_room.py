@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from pandas import DataFrame, concat
 
 from augment import SYNTHESIZERS
 from tasks.aoa import arms
@@ -78,7 +79,7 @@ def _gain(share: Share, advice: AdviceMetrics) -> Plot:
                 at, [0, *(100 * g["change"] for g in gains)], line, marker="o", markersize=4, color=colour, label=label
             )
             ax.fill_between(at, *_band(gains), color=colour, alpha=0.12, linewidth=0)
-    ax.axhline(0, color="#aeb7c6", linewidth=1)
+    ax.axhline(0, color=figures.RULE, linewidth=1)
     ax.set_xscale("symlog", linthresh=100)
     ax.set_xlim(left=0)
     ax.xaxis.set_major_formatter("{x:g}")
@@ -88,7 +89,7 @@ def _gain(share: Share, advice: AdviceMetrics) -> Plot:
         f"Measured spectra held out, {advice['stand_in']} trained on the others and on synthetic ones; bands: 95 % "
         "bootstrap intervals of the change. Below zero turbo learning helps."
     )
-    return Plot(f"gain-{share.file_name}", figure, caption)
+    return Plot(f"gain-{share.file_name}", figure, caption, DataFrame(advice["gains"]))
 
 
 def _band(gains: list[GainMetrics]) -> tuple[list[float], list[float]]:
@@ -130,8 +131,15 @@ def room_section(share: Share) -> Section | None:
         _room_figure(room["planes"], points),
         "In plan and in space: the planes (dashed: uncertain), measured positions, the fixed end and its images of first "
         "order. The images of a moving transmitter are those of the array that sees it.",
+        _places(points),
     )
     return Section(title, [text], [table], [plot])
+
+
+def _places(points: dict[str, NDArray[Any]]) -> DataFrame:
+    first = points["image"][points["order"] == 1]
+    parts = {"measured": points["measured"], "fixed end": points["fixed"][None], "image of first order": first}
+    return concat([DataFrame(at, columns=["x_m", "y_m", "z_m"]).assign(what=what) for what, at in parts.items()])
 
 
 def _described(plane: dict[str, Any]) -> str:
@@ -143,7 +151,7 @@ def _described(plane: dict[str, Any]) -> str:
 
 
 def _room_figure(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> Figure:
-    figure, axes = figures.new_figure(1, 2, 11, 5)
+    figure, axes = figures.new_figure(1, 2, 12, 5)
     low, high = _extent(planes, points)
     plan = axes[0]
     for plane in planes:
@@ -154,8 +162,7 @@ def _room_figure(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) 
     plan.plot(*points["image"][first][:, :2].T, "o", color=IMAGE, markersize=4, label="its images, first order")
     plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     figures.legend_below(figure, plan)
-    axes[1].remove()
-    space: Any = figure.add_subplot(1, 2, 2, projection="3d")
+    space = figures.in_space(figure, axes[1])
     for plane in planes:
         _draw_in_space(space, plane, low, high)
     space.scatter(*points["measured"].T, s=2, color=MEASURED)
@@ -192,7 +199,7 @@ def _draw_in_plan(ax: Axes, plane: dict[str, Any], low: NDArray[Any], high: NDAr
     else:
         x = np.array([e[0] for e in ends])
         y = (plane["offset_m"] - nx * x - nz * height) / ny
-    ax.plot(x, y, line, color="#333333", linewidth=1.3)
+    ax.plot(x, y, line, color="black", linewidth=1.3)
 
 
 def _draw_in_space(ax: Any, plane: dict[str, Any], low: NDArray[Any], high: NDArray[Any]) -> None:
@@ -205,4 +212,4 @@ def _draw_in_space(ax: Any, plane: dict[str, Any], low: NDArray[Any], high: NDAr
     )
     corner[..., axis] = (plane["offset_m"] - corner[..., others] @ normal[others]) / normal[axis]
     alpha = 0.12 if plane["certain"] else 0.05
-    ax.plot_surface(*np.moveaxis(corner, -1, 0), color="#333333", alpha=alpha, shade=False, edgecolor="#999999")
+    ax.plot_surface(*np.moveaxis(corner, -1, 0), color=figures.RULE, alpha=alpha, shade=False, edgecolor=figures.RULE)

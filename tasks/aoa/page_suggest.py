@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from pandas import DataFrame
 
 from tasks.aoa.share import Share
 from tasks.page import figures
@@ -36,4 +37,5 @@ def suggestion_section(share: Share) -> Section | None:
     )
     caption = "Left: in plan, numbered by rank. Right: expected variance over the region, averaged."
     title = f"Where to measure next ({share.title})"
-    return Section(title, [text], plots=[Plot(f"suggested-{share.file_name}", figure, caption)])
+    data = DataFrame(suggested, columns=["x_m", "y_m", "z_m"]).assign(variance_left=left[1:])
+    return Section(title, [text], plots=[Plot(f"suggested-{share.file_name}", figure, caption, data)])

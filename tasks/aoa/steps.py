@@ -11,16 +11,18 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from augment import SYNTHESIZERS, Mixed, Synthesizer, choose_synthesizer, make_synthesizer, mix
+from augment import SYNTHESIZERS, Mixed, choose_synthesizer, make_synthesizer, mix
 from augment.choose import SLOW, candidates
 from augment.suggest import suggest
-from swiftwrf import FitError, GeometryModel, InputError, Spectra
+from augment.synthesizers import Synthesizer
+from swiftwrf import FitError, GeometryModel, InputError, Spectra, SwiftWRF
 from swiftwrf.checkpoint import Saved, read, write
 from swiftwrf.geometry import HybridModel
 from tasks.aoa import arms
 from tasks.aoa.advice import advise
 from tasks.aoa.config import AUTO
-from tasks.aoa.estimators import ESTIMATORS, Estimator, learners
+from tasks.aoa.estimators import ESTIMATORS, Estimator, SavedEstimator, learners
+from tasks.aoa.field import motion, strongest_direction
 from tasks.aoa.setting import At, Setting
 from tasks.claim import STEPS
 from tasks.metrics import AdviceMetrics
@@ -157,8 +159,10 @@ class Synthesis(Step[Setting]):
             "synthesize": time.perf_counter() - fitted,
         }
         write(folder / self.file, KIND, {key: as_bytes(spectrum) for key, spectrum in drawn.items()}, {})
-        if self.trains and self.at.repeat == 0 and synthesizer.model is not None:
-            self._keep_model(synthesizer.model, measured, setting.test, folder)
+        if self.trains and self.at.repeat == 0:
+            if synthesizer.model is not None:
+                self._keep_model(synthesizer.model, measured, setting.test, folder)
+            self._keep_field(synthesizer, measured, folder)
         return {"history": fit.records, "seconds": seconds}
 
     def _keep_model(self, model: Saved, measured: Spectra, test: Spectra, folder: Path) -> None:
@@ -179,6 +183,15 @@ class Synthesis(Step[Setting]):
                 "order": order.numpy(),
             }
             write_npz(folder / f"room-{share}.npz", places)
+
+    def _keep_field(self, synthesizer: Synthesizer, measured: Spectra, folder: Path) -> None:
+        """What the report shows of the field, and of the primitives where there are any."""
+        share = f"mix{self.at.share:g}"
+        if self.synthesizer not in SLOW:
+            field = strongest_direction(synthesizer, measured, synthesizer.settings.seed)
+            write_npz(folder / f"field-{self.synthesizer}-{share}.npz", field)
+        if isinstance(synthesizer.model, SwiftWRF):
+            write_npz(folder / f"motion-{share}.npz", motion(synthesizer.model, measured))
 
     def then(self, setting: Setting, value: Row) -> Sequence[Step[Setting]]:
         trainings = [arms.turbo(self.synthesizer)] if self.trains else []
@@ -228,8 +241,17 @@ class Arm(Step[Setting]):
         estimator.fit(train)
         fitted = time.perf_counter()
         estimate = estimator.estimate(setting.test.spectrum)
+        if isinstance(estimator, SavedEstimator) and self._is_kept(setting):
+            estimator.save(folder / f"{self.estimator}-mix{self.at.share:g}.safetensors")
         seconds = {"train": fitted - began, "estimate": time.perf_counter() - fitted}
         return {"estimate": estimate, "seconds": seconds, "history": estimator.history, "counts": train.counts}
+
+    def _is_kept(self, setting: Setting) -> bool:
+        """Whether it is what a user would take: trained on all that the first synthesizer adds."""
+        if self.synthesis is None or self.at.repeat:
+            return False
+        first = setting.config.synthesizer[0] in (AUTO, self.synthesis.synthesizer)
+        return first and self.training == arms.turbo(self.synthesis.synthesizer, extra=self.synthesis.further)
 
     def _training_set(self, setting: Setting, folder: Path) -> Mixed:
         if self.training == arms.UPPER.name:

@@ -5,15 +5,16 @@ from __future__ import annotations
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from pandas import DataFrame
+from torch import Tensor
 
 from swiftwrf.angles import great_circle, to_direction
 from swiftwrf.data import Rssi, Spectra
 from swiftwrf.positions import distance
 from tasks.inspect.findings import Findings, nearest
 from tasks.page import figures
-from tasks.page.page import Page, Plot, Section, Table
+from tasks.page.page import Number, Page, Plot, Section, Summary, Table
 
 AXES = {"x": "#ee6677", "y": "#228833", "normal": "#4477aa"}
 DOTS, NONE = "#4477aa", "#bbbbbb"  # with line of sight, without
@@ -32,45 +33,55 @@ DIRECTIONS = (
 def page(data: Spectra | Rssi, kind: str, findings: Findings) -> Page:
     """What was found, and figures of it."""
     rows = [[finding.level, finding.text] for finding in findings.sentences]
-    warnings = sum(finding.level == "warning" for finding in findings.sentences)
-    table = Table(["", ""], rows, strong=frozenset(["warning"]))
-    plots = _rssi(data) if isinstance(data, Rssi) else _spectra(data)
-    lead = f"Read as {kind}; {warnings} warning{'' if warnings == 1 else 's'}."
+    warnings = [finding.text for finding in findings.sentences if finding.level == "warning"]
+    table = Table(["", ""], rows, strong=frozenset(["warning"]), long=True)
+    plan, *plots = _rssi(data) if isinstance(data, Rssi) else _spectra(data)
+    position = data.transmitter_position if isinstance(data, Rssi) else data.position
+    extent = " x ".join(f"{side:.2f}" for side in (position.amax(dim=0) - position.amin(dim=0)).tolist())
+    numbers = [
+        Number(str(len(warnings)), "warning" if len(warnings) == 1 else "warnings"),
+        Number(str(len(data)), f"measurements, read as {kind}"),
+        Number(f"{extent} m", "extent of the positions, x by y by z"),
+    ]
+    task = "rssi --rx all" if isinstance(data, Rssi) else "aoa --mix 0.3"
+    mend = ["Mend what the warnings say, and inspect again."] if warnings else []
+    summary = Summary(
+        numbers,
+        plan,
+        warnings or ["Nothing looks wrong. What cannot be seen from the files alone is not excluded by that."],
+        [*mend, f"Go on with python -m tasks.{task} --data and this source."],
+    )
     return Page(
-        f"Inspection: {data.name}", lead, [Section("Findings", tables=[table]), Section("Figures", plots=plots)]
+        f"Inspection: {data.name}", summary, [Section("Findings", tables=[table]), Section("Figures", plots=plots)]
     )
 
 
 def _spectra(data: Spectra) -> list[Plot]:
-    return [
-        Plot("plan", _plan(data), PLAN),
-        Plot("directions", _directions(data), DIRECTIONS),
-        Plot("neighbours", _neighbours(data), "Distance to the nearest other position; the line is half a wavelength."),
-    ]
+    return [_plan(data), _directions(data), _neighbours(data)]
 
 
 def _rssi(data: Rssi) -> list[Plot]:
-    plots = [
-        Plot(
-            "plan", _floor(data), "Positions, coloured by the strongest RSSI; crosses: receivers, where they are known."
-        )
-    ]
-    if data.located:
-        plots.append(Plot("law", _against_distance(data), "RSSI against the distance from the receiver."))
-    return [*plots, Plot("heard", _heard(data), "Share of the rows in which each receiver was heard.")]
+    return [_floor(data), *([_against_distance(data)] if data.located else []), _heard(data)]
 
 
-def _plan(data: Spectra) -> Figure:
-    figure, axes = figures.new_figure(1, 2, 9, 4)
+def _places(position: Tensor, **columns: Tensor) -> DataFrame:
+    """A row a position."""
+    own = {name: values.numpy() for name, values in columns.items()}
+    return DataFrame(position.numpy(), columns=["x_m", "y_m", "z_m"]).assign(**own)
+
+
+def _plan(data: Spectra) -> Plot:
+    figure, axes = figures.new_figure(1, 2, 7.4, 4)
+    marker = "^" if data.moving == "transmitter" else "*"
     for ax, (a, b) in zip(axes, ((0, 1), (0, 2)), strict=True):
         for free, colour in ((False, NONE), (True, DOTS)):
             place = data.position[data.line_of_sight == free]
             ax.plot(place[:, a], place[:, b], ".", markersize=3, color=colour)
         ax.set(xlabel=f"{'xyz'[a]} [m]", ylabel=f"{'xyz'[b]} [m]", aspect="equal")
         if data.fixed_position is not None:
-            ax.plot(*data.fixed_position[[a, b]].tolist(), "k^" if data.moving == "transmitter" else "k*", markersize=7)
+            ax.plot(*data.fixed_position[[a, b]].tolist(), marker, color="black", markersize=7)
         _draw_axes(ax, data, a, b)
-    return figure
+    return Plot("plan", figure, PLAN, _places(data.position, line_of_sight=data.line_of_sight))
 
 
 def _draw_axes(ax: Axes, data: Spectra, a: int, b: int) -> None:
@@ -93,31 +104,36 @@ def _draw_axes(ax: Axes, data: Spectra, a: int, b: int) -> None:
         )
 
 
-def _directions(data: Spectra) -> Figure:
+def _directions(data: Spectra) -> Plot:
     rows = data.line_of_sight.nonzero()[:MOST_DOTS, 0]
     peak = data.grid.direction.flatten(0, 1)[data.spectrum[rows].flatten(1).argmax(dim=1)]
     line = to_direction(*data.label[rows].unbind(-1))
     figure, axes = figures.new_figure(1, 3, 11, 3.6)
     for ax, (title, direction) in zip(axes, {"line of sight": line, "peak": peak}.items(), strict=False):
         ax.scatter(direction[:, 0], direction[:, 1], s=6, c=data.label[rows, 0].rad2deg(), cmap="hsv", vmin=0, vmax=360)
-        ax.add_patch(Circle((0, 0), 1, fill=False, color="#aeb7c6"))  # the array's horizon
+        ax.add_patch(Circle((0, 0), 1, fill=False, color=figures.RULE))  # the array's horizon
         ax.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal", title=title, xlabel="array x", ylabel="array y")
-    axes[2].hist(great_circle(peak, line).rad2deg().numpy(), bins=45, range=(0, 90), color=DOTS)
+    apart = great_circle(peak, line).rad2deg()
+    axes[2].hist(apart.numpy(), bins=45, range=(0, 90), color=DOTS)
     axes[2].set(xlabel="peak to line of sight [deg]", ylabel="spectra")
-    return figure
+    azimuth, elevation = data.label[rows].rad2deg().unbind(-1)
+    table = _places(data.position[rows], azimuth_deg=azimuth, elevation_deg=elevation, peak_from_line_deg=apart)
+    return Plot("directions", figure, DIRECTIONS, table)
 
 
-def _neighbours(data: Spectra) -> Figure:
+def _neighbours(data: Spectra) -> Plot:
     figure, axes = figures.new_figure(1, 1, 6, 3)
-    axes[0].hist(nearest(data.position).numpy(), bins=40, color=DOTS)
+    apart = nearest(data.position)
+    axes[0].hist(apart.numpy(), bins=40, color=DOTS)
     if data.array is not None:
         axes[0].axvline(data.array.wavelength / 2, color="#ee6677")
     axes[0].set(xlabel="nearest other position [m]", ylabel="positions")
-    return figure
+    caption = "Distance to the nearest other position; the line is half a wavelength."
+    return Plot("neighbours", figure, caption, _places(data.position, nearest_m=apart))
 
 
-def _floor(data: Rssi) -> Figure:
-    figure, axes = figures.new_figure(1, 1, 6, 4.5)
+def _floor(data: Rssi) -> Plot:
+    figure, axes = figures.new_figure(1, 1, 6.8, 4.8)
     place = data.transmitter_position
     strongest = data.rssi_dbm.nan_to_num(-torch.inf).amax(dim=1)
     drawn = axes[0].scatter(
@@ -129,19 +145,28 @@ def _floor(data: Rssi) -> Figure:
             axes[0].plot(*at[:2], "x", color="#ee6677", markersize=8, markeredgewidth=2)
             axes[0].annotate(figures.plain(name), at[:2], fontsize=7, xytext=(3, 3), textcoords="offset points")
     axes[0].set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    return figure
+    caption = "Positions, coloured by the strongest RSSI; crosses: receivers, where they are known."
+    return Plot("plan", figure, caption, _places(place, strongest_dbm=strongest))
 
 
-def _against_distance(data: Rssi) -> Figure:
+def _against_distance(data: Rssi) -> Plot:
     figure, axes = figures.new_figure(1, 1, 6, 3.6)
     apart = distance(data.transmitter_position, data.receiver_position)
     for c, name in enumerate(data.receiver_names[:MOST_RECEIVERS]):
         axes[0].plot(apart[:, c], data.rssi_dbm[:, c], ".", markersize=2, label=figures.plain(name))
     axes[0].set(xlabel="distance from the receiver [m]", ylabel="RSSI [dBm]", xscale="log")
-    return figure
+    row, column = (~data.rssi_dbm.isnan()).nonzero(as_tuple=True)
+    table = DataFrame(
+        {
+            "receiver": np.array(data.receiver_names)[column.numpy()],
+            "distance_m": apart[row, column].numpy(),
+            "rssi_dbm": data.rssi_dbm[row, column].numpy(),
+        }
+    )
+    return Plot("law", figure, "RSSI against the distance from the receiver.", table)
 
 
-def _heard(data: Rssi) -> Figure:
+def _heard(data: Rssi) -> Plot:
     share = (~data.rssi_dbm.isnan()).double().mean(dim=0)
     order = share.argsort(descending=True)[:MOST_RECEIVERS].tolist()
     names = [figures.plain(data.receiver_names[i]) for i in order]
@@ -149,4 +174,5 @@ def _heard(data: Rssi) -> Figure:
     axes[0].bar(np.arange(len(order)), share[order].numpy(), color=DOTS)
     axes[0].set(xticks=range(len(order)), xticklabels=names, ylabel="share heard", ylim=(0, 1))
     axes[0].tick_params(axis="x", labelrotation=60)
-    return figure
+    table = DataFrame({"receiver": data.receiver_names, "share_heard": share.numpy()})
+    return Plot("heard", figure, "Share of the rows in which each receiver was heard.", table)

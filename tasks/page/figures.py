@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,6 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from tasks.page.palette import Palette
 from tasks.summarise import pareto
 
+RULE, LINES, PAPER = "#aeb7c6", "#e4e8ef", "#fffffe"  # marks of reference, grid, background
+THEMED = {"#000000": "currentColor", LINES: "var(--lines)", PAPER: "none"}  # what the page's own colours replace
 STYLE: dict[str, Any] = {
     "svg.hashsalt": "swiftwrf-tasks",
     "svg.fonttype": "path",
@@ -23,8 +26,11 @@ STYLE: dict[str, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
-    "grid.color": "#e4e8ef",
     "axes.axisbelow": True,
+    "grid.color": LINES,
+    "figure.facecolor": PAPER,
+    "axes.facecolor": PAPER,
+    **{f"axes3d.{axis}axis.panecolor": PAPER for axis in "xyz"},
 }
 
 
@@ -34,6 +40,14 @@ def new_figure(rows: int, columns: int, width: float, height: float) -> tuple[Fi
         figure = Figure(figsize=(width, height), layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False)
     return figure, list(axes.flat)
+
+
+def in_space(figure: Figure, axes: Axes) -> Any:
+    """Axes with three dimensions in the place of others."""
+    place = axes.get_subplotspec()
+    axes.remove()
+    with matplotlib.style.context(STYLE):
+        return figure.add_subplot(place, projection="3d")
 
 
 def plain(name: str) -> str:
@@ -47,6 +61,14 @@ def as_svg(figure: Figure) -> str:
     with matplotlib.style.context(STYLE):
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
     return stream.getvalue()
+
+
+def for_page(svg: str, name: str) -> str:
+    """The same drawing as an element of a page: in the page's colours, light or dark, its identifiers its own."""
+    element = svg[svg.index("<svg") :]
+    for colour, themed in THEMED.items():
+        element = element.replace(colour, themed)
+    return re.sub(r'((?:id="|href="#|url\(#))', rf"\g<1>{name}-", element)
 
 
 def legend_below(figure: Figure, axes: Axes) -> None:
@@ -72,7 +94,7 @@ def cdf(axes: Axes, palette: Palette, errors: Mapping[str, ArrayLike], label: st
     for name, values in errors.items():
         style: dict[str, Any] = {"color": palette.colour(name), "linestyle": palette.line(name)}
         axes.ecdf(np.asarray(values), label=name, linewidth=1.4, **style)
-    axes.axhline(0.5, color="#aeb7c6", linewidth=0.8)
+    axes.axhline(0.5, color=RULE, linewidth=0.8)
     axes.set(xlabel=label, ylabel="share of test spectra", ylim=(0, 1), xlim=(0, limit))
 
 
@@ -155,7 +177,7 @@ def speed(
     """Cost against error, both logarithmic: the Pareto front is drawn, its members and those in `also` are named. Names
     are coloured as methods by what stands before their first comma."""
     front = pareto(points)
-    axes.plot(*zip(*(points[name] for name in front), strict=True), color="#aeb7c6", linewidth=1, zorder=1)
+    axes.plot(*zip(*(points[name] for name in front), strict=True), color=RULE, linewidth=1, zorder=1)
     for name, (cost, error) in points.items():
         colour = palette.colour(name.split(",")[0])
         axes.plot(cost, error, "o", color=colour, markersize=5 if name in front else 3.5, zorder=2)

@@ -40,5 +40,5 @@ def provenance(runs: Sequence[Records[Any]]) -> Section:
             *([["resumed", resumed]] if resumed else []),
             *([f"sha256 of {name}", digest] for name, digest in environment["input_sha256"].items()),
         ]
-        tables.append(Table(["", ""], rows))
+        tables.append(Table(["", ""], rows, long=True))
     return Section("Provenance", tables=tables)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from pandas import DataFrame, concat
 
 from tasks.metrics import RssiMetrics
 from tasks.page import figures
-from tasks.page.page import Page, Plot, Section, Table
+from tasks.page.page import Number, Page, Plot, Section, Summary, Table
 from tasks.page.palette import Palette
 from tasks.page.provenance import number, provenance
 from tasks.page.records import Records
@@ -15,6 +19,10 @@ from tasks.rssi.predictors import PREDICTORS
 from tasks.summarise import SHORTEST, paired_difference, running_median
 
 RssiRecords = Records[RssiMetrics]
+MISCALIBRATED = 0.05  # difference of coverage from what is promised, from which on the report warns
+MOST_MAPS = 24  # receivers with a map in the report; all are in the tables
+_FIELDS = {"predicted": "predicted_dbm", "width": "width_db"}
+_HEIGHTS = ["median_db", "low_db", "high_db"]
 OWN = "swiftwrf"  # the predictor that all others are compared with
 MANY = (
     300  # dots, from which on white edges would hide their colours, and each drawn by itself makes a page of megabytes
@@ -30,7 +38,7 @@ def page(runs: list[RssiRecords]) -> Page:
     """The page of these runs."""
     sections = [section for run in runs for section in _run(run, several=len(runs) > 1)]
     names = ", ".join(dict.fromkeys(_place(run) for run in runs))
-    return Page(f"RSSI: {names}", _lead(runs[0]), [*sections, _limits(runs[0]), provenance(runs)])
+    return Page(f"RSSI: {names}", _summary(runs[0]), [*sections, _limits(runs[0]), provenance(runs)])
 
 
 def _scene(run: RssiRecords) -> str:
@@ -42,52 +50,107 @@ def _place(run: RssiRecords) -> str:
     return f"{name}, {run.metrics['split']} split"
 
 
-def _lead(run: RssiRecords) -> str:
+def _summary(run: RssiRecords) -> Summary:
     error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
-    best = min((name for name in error if name != "swiftwrf"), key=lambda name: error[name]["median"])
+    own = error[OWN]
+    best = min((name for name in error if name != OWN), key=lambda name: error[name]["median"])
     interval = run.metrics["interval"]
-
-    def in_words(name: str) -> str:
-        return f"{error[name]['median']:.2f} dB (90 %: {error[name]['p90']:.1f})"
-
-    law = f" and one log-distance law for all receivers {in_words('mri_pooled')}" if "mri_pooled" in error else ""
-
-    return (
-        f"On {_scene(run)}, SwiftWRF's median absolute error over {error['swiftwrf']['n']} heard pairs at "
-        f"{len(run.metrics['receivers'])} receiver(s) is {in_words('swiftwrf')}; the best baseline, {best}, reaches "
-        f"{in_words(best)}{law}. "
-        f"The {interval['nominal']:.0%} interval covers {interval['coverage']:.0%} of the test measurements."
+    law = "mri_pooled"
+    law_too = f"; one log-distance law for all receivers: {error[law]['median']:.2f} dB" if law in error else ""
+    numbers = [
+        Number(
+            f"{own['median']:.2f} dB",
+            f"SwiftWRF's median absolute error, 95 % interval [{own['low']:.2f}, {own['high']:.2f}]; 90 % of the errors "
+            f"are below {own['p90']:.1f} dB",
+        ),
+        Number(f"{error[best]['median']:.2f} dB", f"the best baseline, {best}{law_too}"),
+        Number(
+            f"{interval['coverage']:.0%}",
+            f"of the test measurements lie in the {interval['nominal']:.0%} interval that comes with each prediction",
+        ),
+    ]
+    meaning = [
+        f"On {_scene(run)}, {run.metrics['n_train']} rows teach and {run.metrics['n_test']} test: {own['n']} heard pairs at "
+        f"{len(run.metrics['receivers'])} receiver(s).",
+        _against(run, best),
+    ]
+    picture = Plot(
+        f"summary-{run.file_name}", _maps(run, "predicted", "predicted RSSI [dBm]", 1), _MAP_CAPTION, _cells(run, 1)
     )
+    return Summary(numbers, picture, meaning, _next_steps(run))
+
+
+def _against(run: RssiRecords, best: str) -> str:
+    """Whether the model is better than the best baseline, or whether that is not known."""
+    mean, low, high = paired_difference(_by_method(run), OWN, best)
+    interval = f"{mean:+.2f} dB [{low:+.2f}, {high:+.2f}]"
+    if high < 0:
+        return f"On the same pairs SwiftWRF's mean error is lower than that of {best}: {interval}."
+    if low > 0:
+        return f"On the same pairs {best} has the lower mean error: SwiftWRF's differs by {interval}. Take {best} here."
+    return f"On the same pairs SwiftWRF and {best} cannot be told apart: {interval}."
+
+
+def _next_steps(run: RssiRecords) -> list[str]:
+    with np.load(run.folder / "maps.npz") as file:
+        maps = dict(file)
+    width = maps["width"].mean(axis=0)
+    row, column = np.unravel_index(np.argmax(width), width.shape)
+    steps = [
+        f"Measure around x = {maps['x'][column]:.1f} m, y = {maps['y'][row]:.1f} m: the 80 % interval is widest there "
+        f"({width[row, column]:.0f} dB on average over the receivers).",
+        "predictions.csv has every test row with its prediction and interval.",
+    ]
+    interval = run.metrics["interval"]
+    if abs(interval["coverage"] - interval["nominal"]) > MISCALIBRATED:
+        steps.append(
+            "The intervals are not calibrated on these rows; take their widths as a ranking, not as a promise."
+        )
+    if run.metrics["split"] == "random":
+        steps.append("Run --split block: it shows the error in a region where nothing was measured.")
+    return steps
 
 
 def _run(run: RssiRecords, several: bool) -> list[Section]:
     suffix = f" - {_scene(run)}" if several else ""
     name = run.file_name
-    plots = [Plot(f"bars-{name}", _bars(run), "Median absolute error; whiskers: its 95 % interval.")]
-    plots.append(Plot(f"cdf-{name}", _cdf(run), "Distribution of the absolute errors over all receivers."))
+    errors, cells = run.table("errors"), _cells(run)
+    heights = _heights(run)
+    medians = concat(
+        [DataFrame(v, index=_receivers(run), columns=_HEIGHTS).assign(method=m) for m, v in heights.items()]
+    )
+    pairs = errors[["receiver", "index", "method", "abs_error_db"]]
+    plots = [
+        Plot(
+            f"bars-{name}",
+            _bars(run, heights),
+            "Median absolute error; whiskers: its 95 % interval.",
+            medians.rename_axis("receiver").reset_index(),
+        ),
+        Plot(f"cdf-{name}", _cdf(errors), "Distribution of the absolute errors over all receivers.", pairs),
+    ]
     return [
         Section(
             f"Errors{suffix}",
-            [
-                "; ".join(f"{entry.name}: {entry.meaning}" for entry in PREDICTORS.entries()) + ".",
-                *(f"Left out: {reason}." for reason in run.metrics.get("left_out", {}).values()),
-            ],
+            [f"Left out: {reason}." for reason in run.metrics.get("left_out", {}).values()],
             [_table(run), _paired(run)],
             plots,
+            {entry.name: entry.meaning for entry in PREDICTORS.entries()},
         ),
         Section(
             f"Maps{suffix}",
             plots=[
-                Plot(f"map-{name}", _maps(run, "predicted", "predicted RSSI [dBm]"), _MAP_CAPTION),
+                Plot(f"map-{name}", _maps(run, "predicted", "predicted RSSI [dBm]"), _MAP_CAPTION, cells),
                 Plot(
                     f"width-{name}",
                     _maps(run, "width", "width of the 80 % interval [dB]"),
                     "Wider away from measurements.",
+                    cells,
                 ),
             ],
         ),
-        Section(f"Where the errors are{suffix}", plots=[Plot(f"where-{name}", _where(run), _WHERE_CAPTION)]),
-        Section(f"Speed against error{suffix}", plots=[Plot(f"speed-{name}", _speed(run), _SPEED_CAPTION)]),
+        Section(f"Where the errors are{suffix}", plots=[_where(run)]),
+        Section(f"Speed against error{suffix}", plots=[_speed(run)]),
     ]
 
 
@@ -122,8 +185,7 @@ def _table(run: RssiRecords) -> Table:
 
 
 def _paired(run: RssiRecords) -> Table:
-    errors = run.table("errors").pivot_table(index=["index", "receiver"], columns="method", values="abs_error_db")
-    rows = []
+    errors, rows = _by_method(run), []
     for name in run.metrics["overall"]:
         if name != OWN:
             mean, low, high = paired_difference(errors, OWN, name)
@@ -132,22 +194,38 @@ def _paired(run: RssiRecords) -> Table:
     return Table(["against", "difference [dB]"], rows, caption)
 
 
-def _bars(run: RssiRecords) -> Figure:
-    receivers = run.metrics["receivers"]
+def _by_method(run: RssiRecords) -> DataFrame:
+    """Absolute errors, a row a pair, a column a method."""
+    errors: DataFrame = run.table("errors").pivot_table(
+        index=["index", "receiver"], columns="method", values="abs_error_db"
+    )
+    return errors
+
+
+def _receivers(run: RssiRecords) -> list[str]:
+    return list(run.metrics["receivers"])
+
+
+def _heights(run: RssiRecords) -> dict[str, list[tuple[float, float, float]]]:
+    """Median error and its interval by method, in the order of the receivers."""
     heights = {}
     for name in run.metrics["overall"]:
-        errors = [methods[name]["abs_error_db"] for methods in receivers.values()]
+        errors = [methods[name]["abs_error_db"] for methods in run.metrics["receivers"].values()]
         heights[name] = [(error["median"], error["low"], error["high"]) for error in errors]
-    figure, axes = figures.new_figure(1, 1, max(5, 1.1 * len(receivers)), 3.6)
+    return heights
+
+
+def _bars(run: RssiRecords, heights: dict[str, list[tuple[float, float, float]]]) -> Figure:
+    receivers = _receivers(run)
+    figure, axes = figures.new_figure(1, 1, max(6, 1.1 * len(receivers)), 3.8)
     figures.bars(axes[0], palette(), [figures.plain(name) for name in receivers], heights, "median absolute error [dB]")
     axes[0].tick_params(axis="x", labelrotation=30 if len(receivers) > 6 else 0)
     figures.legend_below(figure, axes[0])
     return figure
 
 
-def _cdf(run: RssiRecords) -> Figure:
-    errors = run.table("errors")
-    figure, axes = figures.new_figure(1, 1, 6, 3.6)
+def _cdf(errors: DataFrame) -> Figure:
+    figure, axes = figures.new_figure(1, 1, 6, 3.8)
     groups = {str(name): part["abs_error_db"] for name, part in errors.groupby("method", sort=False)}
     limit = float(errors["abs_error_db"].quantile(0.98))
     figures.cdf(axes[0], palette(), groups, "absolute error [dB]", limit)
@@ -156,18 +234,38 @@ def _cdf(run: RssiRecords) -> Figure:
     return figure
 
 
-def _maps(run: RssiRecords, field: str, label: str) -> Figure:
+def _heard_most(maps: dict[str, NDArray[Any]], most: int) -> list[int]:
+    """Of the receivers, so many that were heard most, in their own order."""
+    heard = (~np.isnan(maps["measured"])).sum(axis=0)
+    return sorted(np.argsort(-heard, kind="stable")[:most].tolist())
+
+
+def _cells(run: RssiRecords, most: int = MOST_MAPS) -> DataFrame:
+    """The maps that `_maps` draws, a row a cell and receiver."""
     with np.load(run.folder / "maps.npz") as file:
         maps = dict(file)
-    n = len(maps["receiver_names"])
+    shown = _heard_most(maps, most)
+    names, ys, xs = (a.ravel() for a in np.meshgrid(maps["receiver_names"][shown], maps["y"], maps["x"], indexing="ij"))
+    values = {field: maps[kind][shown].ravel().round(2) for kind, field in _FIELDS.items()}
+    return DataFrame({"receiver": names, "x_m": xs.round(3), "y_m": ys.round(3)} | values)
+
+
+def _maps(run: RssiRecords, field: str, label: str, most: int = MOST_MAPS) -> Figure:
+    """Of the receivers that were heard most, in their own order."""
+    with np.load(run.folder / "maps.npz") as file:
+        maps = dict(file)
+    shown = _heard_most(maps, most)
+    n = len(shown)
     columns = min(3, n)
-    figure, axes = figures.new_figure(-(-n // columns), columns, 3.4 * columns + 0.8, 2.9 * -(-n // columns))
+    width = 6.8 if n == 1 else 12
+    across, down = np.ptp(maps["x"]), np.ptp(maps["y"])
+    height = (width - 0.8) / columns * min(max(down / max(across, 1e-9), 0.4), 1.6) + 0.6
+    figure, axes = figures.new_figure(-(-n // columns), columns, width, max(height * -(-n // columns), 3.6))
     low, high = np.nanpercentile(maps["measured"] if field == "predicted" else maps["width"], (1, 99))
     extent = (maps["x"][0], maps["x"][-1], maps["y"][0], maps["y"][-1])
-    for i, ax in enumerate(axes):
-        ax.set_visible(i < n)
-        if i >= n:
-            continue
+    for ax in axes[n:]:
+        ax.set_visible(False)
+    for i, ax in zip(shown, axes, strict=False):
         if "plan" in maps:
             ax.imshow(maps["plan"], extent=tuple(maps["plan_extent"]), aspect="equal", zorder=0)
         see_through = 0.75 if "plan" in maps else 1.0
@@ -201,7 +299,7 @@ def _maps(run: RssiRecords, field: str, label: str) -> Figure:
     return figure
 
 
-def _where(run: RssiRecords) -> Figure:
+def _where(run: RssiRecords) -> Plot:
     errors = run.table("errors")
     own = errors[errors["method"] == OWN]
     colour = palette().colour(OWN)
@@ -210,31 +308,34 @@ def _where(run: RssiRecords) -> Figure:
         "from_training_m": "distance from training positions [m]",
     }
     columns = {column: label for column, label in columns.items() if own[column].notna().any()}
-    figure, axes = figures.new_figure(1, 1 + len(columns), 3.4 * (1 + len(columns)), 3.3)
+    figure, axes = figures.new_figure(1, 1 + len(columns), 4 * (1 + len(columns)), 3.6)
     many = len(own) >= MANY
     axes[0].plot(own["measured_dbm"], own["predicted_dbm"], ".", markersize=2, color=colour, rasterized=many)
     ends = [own["measured_dbm"].min(), own["measured_dbm"].max()]
-    axes[0].plot(ends, ends, color="#aeb7c6", linewidth=1)
+    axes[0].plot(ends, ends, color=figures.RULE, linewidth=1)
     axes[0].set(xlabel="measured [dBm]", ylabel="predicted [dBm]")
     for ax, (column, label) in zip(axes[1:], columns.items(), strict=True):
         ordered = own.sort_values(column)
         ax.plot(ordered[column], ordered["abs_error_db"], ".", markersize=2, color="#bbbbbb", rasterized=many)
         ax.plot(ordered[column], running_median(ordered["abs_error_db"]), color=colour, linewidth=1.6)
         ax.set(xlabel=label, ylabel="absolute error [dB]")
-    return figure
+    data = own[["receiver", "index", "measured_dbm", "predicted_dbm", "abs_error_db", *columns]]
+    return Plot(f"where-{run.file_name}", figure, _WHERE_CAPTION, data)
 
 
-def _speed(run: RssiRecords) -> Figure:
+def _speed(run: RssiRecords) -> Plot:
     overall = run.metrics["overall"]
     error = {name: entry["abs_error_db"]["median"] for name, entry in overall.items()}
     fit = {name: max(entry["seconds"]["fit"], SHORTEST) for name, entry in overall.items()}
     predict = {name: max(entry["seconds"]["predict"], SHORTEST) for name, entry in overall.items()}
-    figure, axes = figures.new_figure(1, 2, 9, 3.2)
+    figure, axes = figures.new_figure(1, 2, 12, 4)
     for ax, stage, seconds in zip(axes, ("fit", "predict"), (fit, predict), strict=True):
         points = {name: (seconds[name], error[name]) for name in overall}
-        figures.speed(ax, palette(), points, f"seconds to {stage}", "median absolute error [dB]")
+        figures.speed(ax, palette(), points, f"seconds to {stage}", "median absolute error [dB]", also=[OWN])
     figures.legend_of(figure, palette(), list(overall))
-    return figure
+    columns = {"fit_s": fit, "predict_s": predict, "median_abs_error_db": error}
+    data = DataFrame(columns).rename_axis("method").reset_index()
+    return Plot(f"speed-{run.file_name}", figure, _SPEED_CAPTION, data)
 
 
 def _limits(run: RssiRecords) -> Section:

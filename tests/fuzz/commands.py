@@ -28,6 +28,7 @@ NEEDED = {
     "report": ["run"],
     "convert": ["data", "taken"],
     "inspect": ["data"],
+    "estimate": ["data", "data"],
 }
 RIGHT = {
     "aoa": {

@@ -20,6 +20,7 @@ from quick import PUBLISHED, PUBLISHED_RSSI
 from samples import snapshots as made_snapshots
 from samples import survey_rows, write_deepmimo, write_dichasus, write_espargos, write_snapshots, write_survey
 
+from augment import Mixed
 from swiftwrf import (
     AngularGrid,
     FitConfig,
@@ -41,6 +42,8 @@ from swiftwrf.data.writing import write_spectra
 from swiftwrf.geometry import fit_geometry, fit_hybrid
 from swiftwrf.gp import Kernel
 from swiftwrf.model import SwiftWRF
+from tasks.aoa.estimators import Settings
+from tasks.aoa.estimators.kernel_ridge import KernelRegression
 
 N = 12
 GRID = AngularGrid.hemisphere(8, 32)
@@ -135,6 +138,12 @@ def model_rssi(folder: Path) -> None:
     fit_rssi(rssi_room(n=40).receivers(["1", "2"])).save(folder / "model")
 
 
+def model_kernel_ridge(folder: Path) -> None:
+    estimator = KernelRegression(Settings(GRID))
+    estimator.fit(Mixed.measured(_room()))
+    estimator.save(folder / "model")
+
+
 def state_of_a_fit(folder: Path) -> None:
     go_on(folder)
 
@@ -174,6 +183,14 @@ def read_model(folder: Path) -> object:
     return drawn
 
 
+def read_estimator(folder: Path) -> torch.Tensor:
+    estimator = load(folder / "model")
+    assert isinstance(estimator, KernelRegression)
+    estimate = estimator.estimate(torch.rand(2, *estimator.settings.grid.shape))
+    assert estimate.isfinite().all()
+    return estimate
+
+
 def go_on(folder: Path) -> SwiftWRF:
     """A fit from its state; the choice of the kernel, which takes longest, is left out."""
     with mock.patch.object(sys.modules["swiftwrf.fitting.fit"], "choose_kernel", return_value=Kernel()):
@@ -207,5 +224,6 @@ KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "nerf2 rssi model": (model_nerf2_rssi, read_model),
     "vae model": (functools.partial(model_published, "vae"), read_model),
     "dcgan model": (functools.partial(model_published, "dcgan"), read_model),
+    "kernel ridge regression": (model_kernel_ridge, read_estimator),
     "fit state": (state_of_a_fit, go_on),
 }

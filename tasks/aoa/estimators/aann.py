@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import cast
 
 import torch
@@ -20,11 +20,12 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import update_bn
 
 from augment import Mixed
-from swiftwrf.angles import to_angles, to_direction
+from swiftwrf.angles import AngularGrid, to_angles, to_direction
+from swiftwrf.checkpoint import Header, expect
 from swiftwrf.data.spectra import coarsening
 from swiftwrf.processes import Processes
 from swiftwrf.progress import progress
-from tasks.aoa.estimators.base import ESTIMATORS, Estimator, Settings
+from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator, Settings
 
 LEAST_ROWS = 8  # a prime number of rows can only be averaged to one, which leaves nothing to learn from
 STATISTICS = 512  # spectra that the batch norms' statistics are taken from
@@ -113,7 +114,7 @@ def _backbone(circular: bool) -> nn.Module:
 
 
 @ESTIMATORS.register("aann", meaning="the angular neural network, trained in every arm that is no baseline")
-class AANN(Estimator):
+class AANN(SavedEstimator):
     """ResNet-50 with one input channel and an MLP head, from a seeded start; weights are not downloaded.
 
     Several processes share each batch, its statistics in the batch norms included: they train the network that one would,
@@ -137,6 +138,8 @@ class AANN(Estimator):
         self._network = network.to(device).to(memory_format=torch.channels_last)
         self._generator = torch.Generator().manual_seed(seed)
         self._autocast = torch.autocast(device.type, torch.bfloat16, enabled=_gains_from_bfloat16(device))
+
+    kind = "angle-of-arrival network"
 
     def _prepare(self, spectrum: Tensor) -> Tensor:
         factor = coarsening(spectrum.shape[1:], self._config.max_azimuths, LEAST_ROWS)
@@ -190,6 +193,28 @@ class AANN(Estimator):
     def estimate(self, spectrum: Tensor) -> Tensor:
         parts = [self._point(part, self._network) for part in self._prepare(spectrum).split(64)]
         return torch.stack(to_angles(torch.cat(parts).double().cpu()), dim=-1)
+
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        """Weights in half precision, which changes estimates by less than the array's noise does."""
+        weights = {f"network.{name}": value for name, value in self._network.state_dict().items()}
+        halved = {name: value.half() if value.is_floating_point() else value for name, value in weights.items()}
+        header = {"config": asdict(self._config), "grid": asdict(self.settings.grid)}
+        return {**halved, "mean": self._mean, "spread": self._spread}, header
+
+    @classmethod
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> AANN:
+        own = cls(Settings(AngularGrid(**header["grid"])), AANNConfig(**header["config"]))
+        weights = own._network.state_dict()
+        expect(
+            tensors,
+            {**{f"network.{name}": tuple(value.shape) for name, value in weights.items()}, "mean": (3,), "spread": ()},
+        )
+        own._network.load_state_dict(
+            {name: tensors[f"network.{name}"].to(value.dtype) for name, value in weights.items()}
+        )
+        own._network.eval()
+        own._mean, own._spread = tensors["mean"], tensors["spread"]
+        return own
 
 
 def _gains_from_bfloat16(device: torch.device) -> bool:

@@ -12,6 +12,7 @@ from torch.distributed import ProcessGroup
 
 from augment import Mixed
 from swiftwrf import AngularGrid
+from swiftwrf.checkpoint import Saved
 from swiftwrf.registry import Registry
 from tasks.run import Preset
 
@@ -58,6 +59,10 @@ class Estimator(ABC):
     @abstractmethod
     def estimate(self, spectrum: Tensor) -> Tensor:
         """Azimuth and elevation (n, 2) [rad] of spectra (n, H, W)."""
+
+
+class SavedEstimator(Estimator, Saved):
+    """One that a file can hold once it is trained: `swiftwrf.load` brings it back, ready to estimate."""
 
 
 ESTIMATORS: Registry[Estimator] = Registry("estimator")

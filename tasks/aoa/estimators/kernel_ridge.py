@@ -2,32 +2,38 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from sklearn.kernel_ridge import KernelRidge
+from sklearn.metrics.pairwise import rbf_kernel
 from sklearn.model_selection import GridSearchCV, KFold
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 from torch.nn import functional
 
 from augment import Mixed
-from swiftwrf.angles import to_angles, to_direction
+from swiftwrf import InputError
+from swiftwrf.angles import AngularGrid, to_angles, to_direction
+from swiftwrf.checkpoint import Header, expect
 from swiftwrf.data.spectra import coarsening
-from tasks.aoa.estimators.base import ESTIMATORS, Estimator
+from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator, Settings
 
 
 @ESTIMATORS.register(
     "kernel_ridge", meaning="kernel ridge regression from the spectrum to the direction", colour="#44aa99"
 )
-class KernelRegression(Estimator):
+class KernelRegression(SavedEstimator):
     """Kernel ridge regression (Saunders et al. 1998) from coarse spectra to unit vectors: strong where spectra are few.
 
     Width and penalty are chosen by cross-validation on the training spectra.
     """
 
+    kind = "kernel ridge regression"
     AZIMUTHS = 60  # the array's beams are wider than these columns
     CHOSEN_ROWS, KEPT_ROWS = 400, 4000  # its cost grows with their cube
 
@@ -44,11 +50,28 @@ class KernelRegression(Estimator):
         search = GridSearchCV(KernelRidge(kernel="rbf"), grid, cv=folds, scoring="neg_mean_absolute_error", refit=False)
         with threadpool_limits(1):  # many small problems: several threads would mostly wait for each other
             search.fit(some, direction[: self.CHOSEN_ROWS] - self._mean)
-        self._regression = KernelRidge(kernel="rbf", **search.best_params_).fit(feature, direction - self._mean)
+        regression = KernelRidge(kernel="rbf", **search.best_params_).fit(feature, direction - self._mean)
+        self._known, self._weight, self._gamma = feature, regression.dual_coef_, float(search.best_params_["gamma"])
 
     def estimate(self, spectrum: Tensor) -> Tensor:
-        pointing = self._regression.predict(self._feature(spectrum)) + self._mean
+        pointing = rbf_kernel(self._feature(spectrum), self._known, self._gamma) @ self._weight + self._mean
         return torch.stack(to_angles(torch.from_numpy(pointing)), dim=-1)
+
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        arrays = {"known": self._known, "weight": self._weight, "mean": self._mean}
+        tensors = {name: torch.from_numpy(array.astype(np.float32)) for name, array in arrays.items()}
+        return tensors, {"gamma": self._gamma, "grid": asdict(self.settings.grid)}
+
+    @classmethod
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> KernelRegression:
+        own = cls(Settings(AngularGrid(**header["grid"])))
+        n, pixels = len(tensors["known"]), own._feature(torch.zeros(1, *own.settings.grid.shape)).shape[1]
+        expect(tensors, {"known": (n, pixels), "weight": (n, 3), "mean": (3,)})
+        own._known, own._weight, own._mean = (tensors[name].double().numpy() for name in ("known", "weight", "mean"))
+        own._gamma = float(header["gamma"])
+        if not (own._gamma > 0 and math.isfinite(own._gamma)):
+            raise InputError(f"gamma must be positive and finite, got {own._gamma}")
+        return own
 
     def _feature(self, spectrum: Tensor) -> NDArray[Any]:
         factor = coarsening(spectrum.shape[1:], self.AZIMUTHS)

@@ -1,0 +1,118 @@
+"""The report's section on the synthesized field: strongest directions over the region, primitives along a walk."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+from numpy.typing import NDArray
+from pandas import DataFrame
+
+from tasks.aoa import arms
+from tasks.aoa.share import Share
+from tasks.page import figures
+from tasks.page.page import Plot, Section
+
+STILL = np.deg2rad(0.1)  # means that move less along the walk than this stay where they are
+
+
+def field_section(share: Share) -> Section | None:
+    """Maps of the strongest direction, and the primitives' change along a walk; None where neither was kept."""
+    names = arms.drawn_by(share.mix["methods"])
+    plots = [_map(share, name, field) for name in names if (field := _stored(share, f"field-{name}")) is not None]
+    if (motion := _stored(share, "motion")) is not None:
+        plots.append(_motion(share, motion))
+    return Section(f"The field over the region ({share.title})", plots=plots) if plots else None
+
+
+def _stored(share: Share, kind: str) -> dict[str, NDArray[Any]] | None:
+    file = share.run.folder / f"{kind}-mix{share.key}.npz"
+    if not file.is_file():
+        return None
+    with np.load(file) as stored:
+        return dict(stored)
+
+
+def _map(share: Share, name: str, field: dict[str, NDArray[Any]]) -> Plot:
+    x, y, z = field["position"].T
+    data = DataFrame(
+        {
+            "x_m": x,
+            "y_m": y,
+            "z_m": z,
+            "azimuth_deg": np.rad2deg(field["azimuth"]),
+            "elevation_deg": np.rad2deg(field["elevation"]),
+            "magnitude": field["magnitude"],
+        }
+    )
+    figure, axes = figures.new_figure(1, 3, 12, 3.8)
+    for ax, (column, label, colours, low, high) in zip(
+        axes,
+        (
+            ("azimuth_deg", "azimuth [deg]", "twilight", 0, 360),
+            ("elevation_deg", "elevation [deg]", "viridis", 0, 90),
+            ("magnitude", "magnitude", "magma", 0, 1),
+        ),
+        strict=True,
+    ):
+        drawn = ax.scatter(x, y, c=data[column], s=24, cmap=colours, vmin=low, vmax=high, linewidths=0, rasterized=True)
+        ax.set(xlabel="x [m]", aspect="equal")
+        figure.colorbar(drawn, ax=ax, label=label, fraction=0.05, pad=0.03)
+    axes[0].set_ylabel("y [m]")
+    caption = (
+        f"Where the strongest signal comes from, as {name} predicts it, at {len(x)} places in the region of the "
+        "measured positions, at their median height: azimuth, elevation, magnitude."
+    )
+    return Plot(f"field-{name}-{share.file_name}", figure, caption, data)
+
+
+def _motion(share: Share, motion: dict[str, NDArray[Any]]) -> Plot:
+    mean, strength = np.rad2deg(motion["mean"]), motion["strength"]
+    walked = np.linalg.norm(motion["walk"] - motion["walk"][0], axis=1)
+    figure, axes = figures.new_figure(1, 2, 12, 3.6)
+    moves = np.ptp(motion["mean"], axis=0).max() > STILL
+    _draw_primitives(axes[0], mean, np.rad2deg(1.0) ** 2 * motion["covariance"], strength.mean(axis=0))
+    if moves:
+        for k in range(mean.shape[1]):
+            axes[0].plot(*mean[:, k].T, color="#cc3311", linewidth=0.8)
+    _draw_strengths(figure, axes[1], walked, strength)
+    what = "red: the way of their means" if moves else "their means stay, their responses change"
+    caption = (
+        f"The {mean.shape[1]} strongest primitives. Left: where they lie (one standard deviation; darker is stronger; "
+        f"{what}). Right: the strength of each along a straight walk through the region, along its longest extent."
+    )
+    n_steps, n = strength.shape
+    data = DataFrame(
+        {
+            "walked_m": np.repeat(walked, n),
+            "primitive": np.tile(np.arange(n), n_steps),
+            "azimuth_deg": mean[..., 0].ravel(),
+            "elevation_deg": mean[..., 1].ravel(),
+            "strength": strength.ravel(),
+        }
+    )
+    return Plot(f"motion-{share.file_name}", figure, caption, data)
+
+
+def _draw_primitives(ax: Axes, mean: NDArray[Any], covariance: NDArray[Any], strength: NDArray[Any]) -> None:
+    """An ellipse each at the first step of the walk; means and covariances in degrees."""
+    for (azimuth, elevation), matrix, shade in zip(
+        mean[0], covariance, strength / max(strength.max(), 1e-12), strict=True
+    ):
+        values, vectors = np.linalg.eigh(matrix)
+        width, height = 2 * np.sqrt(values)
+        angle = np.rad2deg(np.arctan2(vectors[1, 0], vectors[0, 0]))
+        style: dict[str, Any] = {"facecolor": "none", "edgecolor": "#4477aa", "alpha": float(0.15 + 0.85 * shade)}
+        ax.add_patch(Ellipse((azimuth, elevation), width, height, angle=angle, linewidth=1.2, **style))
+    ax.set(xlim=(0, 360), ylim=(0, 90), xlabel="azimuth [deg]", ylabel="elevation [deg]", xticks=range(0, 361, 90))
+
+
+def _draw_strengths(figure: Figure, ax: Axes, walked: NDArray[Any], strength: NDArray[Any]) -> None:
+    extent = (walked[0], walked[-1], strength.shape[1] - 0.5, -0.5)
+    drawn = ax.imshow(strength.T, aspect="auto", extent=extent, cmap="magma", interpolation="nearest")
+    ax.set(xlabel="walked [m]", ylabel="primitive, by strength")
+    ax.grid(visible=False)
+    figure.colorbar(drawn, ax=ax, label="strength", fraction=0.05, pad=0.03)

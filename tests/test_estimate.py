@@ -1,0 +1,140 @@
+"""Trained estimators are kept, come back as they were, and take new spectra to directions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from quick import run, said
+
+from augment import Mixed
+from swiftwrf import AngularGrid, InputError, load, simulated_room
+from swiftwrf.checkpoint import read, write
+from swiftwrf.data.writing import write_spectra
+from swiftwrf.metrics import angle_errors
+from tasks.aoa.estimators import Settings
+from tasks.aoa.estimators.aann import AANN, AANNConfig
+from tasks.aoa.estimators.kernel_ridge import KernelRegression
+
+GRID = AngularGrid.hemisphere(8, 32)
+
+
+@pytest.fixture(scope="module")
+def small():
+    return simulated_room(n=60, grid=GRID)
+
+
+@pytest.fixture(scope="module")
+def network(small, tmp_path_factory):
+    """The real one, hardly trained, and its file."""
+    estimator = AANN(Settings(GRID), AANNConfig(steps=3, batch=8))
+    estimator.fit(Mixed.measured(small))
+    file = tmp_path_factory.mktemp("network") / "aann.safetensors"
+    estimator.save(file)
+    return estimator, file
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The directory of a run."""
+    folder = tmp_path_factory.mktemp("run") / "aoa"
+    assert run("aoa", "--mix", 0.5, "--synthesizer", "nearest", "idw", "--extra", 5, "--out", folder) == 0
+    return folder
+
+
+def test_kernel_ridge_comes_back(small, tmp_path):
+    estimator = KernelRegression(Settings(GRID))
+    estimator.fit(Mixed.measured(small))
+    estimator.save(tmp_path / "model")
+    again = load(tmp_path / "model").estimate(small.spectrum)
+    apart = angle_errors(again, estimator.estimate(small.spectrum))["great_circle"]
+    assert float(apart.max()) < 1e-5
+
+
+def test_the_network_comes_back_in_half_precision(small, network):
+    estimator, file = network
+    again = load(file)
+    assert again.settings.grid == GRID
+    apart = angle_errors(again.estimate(small.spectrum), estimator.estimate(small.spectrum))["great_circle"]
+    assert float(apart.rad2deg().max()) < 0.5  # of bfloat16, in which it computes: 8 bits
+    assert file.stat().st_size < 60e6
+
+
+@pytest.mark.parametrize("change", ["missing", "shape", "config", "grid"])
+def test_a_damaged_network_is_refused(network, tmp_path, change):
+    kind, tensors, header = read(network[1], AANN.kind)
+    match change:
+        case "missing":
+            del tensors["mean"]
+        case "shape":
+            tensors["network.fc.0.weight"] = torch.zeros(3, 3)
+        case "config":
+            header["config"]["layers"] = 3
+        case "grid":
+            del header["grid"]
+    write(tmp_path / "changed", kind, tensors, header)
+    with pytest.raises(InputError):
+        load(tmp_path / "changed")
+
+
+def test_a_run_keeps_the_estimator_that_saw_most(finished):
+    files = sorted(file.name for file in finished.glob("*.safetensors"))
+    assert files == ["kernel_ridge-mix0.5.safetensors"]  # the network of these runs is a stand-in that cannot be saved
+    assert "tasks.estimate kernel_ridge-mix0.5.safetensors" in (finished / "report.html").read_text()
+    estimator = load(finished / "kernel_ridge-mix0.5.safetensors")
+    errors = pd.read_csv(finished / "errors.csv")
+    own = errors[errors.method == "kernel_ridge_turbo_nearest_extra"]
+    test = simulated_room(n=30, grid=GRID).subset(torch.tensor(own["index"].tolist()))
+    estimate = estimator.estimate(test.spectrum).rad2deg().numpy()
+    np.testing.assert_allclose(estimate, own[["estimate_azimuth_deg", "estimate_elevation_deg"]], atol=1e-3)
+
+
+def test_directions_of_measured_and_unknown_positions(finished, small, tmp_path, capsys):
+    estimator = finished / "kernel_ridge-mix0.5.safetensors"
+    (tmp_path / "data").mkdir()
+    write_spectra(small, tmp_path / "data")
+    assert run("estimate", estimator, tmp_path / "data", "--out", tmp_path / "known.csv") == 0
+    assert "60 directions, median error" in capsys.readouterr().out
+    known = pd.read_csv(tmp_path / "known.csv")
+    assert known["index"].tolist() == list(range(60))
+    assert known["great_circle_deg"].between(0, 180).all()
+
+    np.save(tmp_path / "unknown.npy", small.spectrum.numpy())
+    assert run("estimate", estimator, tmp_path / "unknown.npy", "--out", tmp_path / "unknown.csv") == 0
+    unknown = pd.read_csv(tmp_path / "unknown.csv")
+    assert unknown.columns.tolist() == ["index", "azimuth_deg", "elevation_deg"]
+    np.testing.assert_allclose(unknown["elevation_deg"], known["elevation_deg"], atol=0.05)  # 8 or 16 bits on disk
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (np.zeros((3, 8, 16), np.float32), "--grid 8 32"),
+        (np.zeros((8, 32), np.float32), "(n, elevations, azimuths)"),
+        (np.zeros((3, 8, 32), np.int64), "floating-point"),
+        (np.full((3, 8, 32), 2.0), "magnitudes in [0, 1]"),
+        (np.full((3, 8, 32), np.nan), "magnitudes in [0, 1]"),
+        (np.zeros((0, 8, 32)), "floating-point"),
+    ],
+)
+def test_other_spectra_are_refused(finished, tmp_path, capsys, content, sentence):
+    np.save(tmp_path / "spectra.npy", content)
+    file = finished / "kernel_ridge-mix0.5.safetensors"
+    assert run("estimate", file, tmp_path / "spectra.npy", "--out", tmp_path / "out.csv") == 2
+    assert sentence in said(capsys)
+    assert not (tmp_path / "out.csv").exists()
+
+
+def test_other_files_are_refused(finished, small, tmp_path, capsys):
+    estimator, spectra = finished / "kernel_ridge-mix0.5.safetensors", tmp_path / "spectra.npy"
+    np.save(spectra, small.spectrum.numpy())
+    spectra.with_suffix(".txt").write_text("")
+    assert run("estimate", tmp_path / "none", spectra, "--out", tmp_path / "out.csv") == 2
+    assert "not a readable" in said(capsys)
+    assert run("estimate", estimator, tmp_path / "none.npy", "--out", tmp_path / "out.csv") == 2
+    assert "not a readable .npy" in said(capsys)
+    assert run("estimate", estimator, spectra, "--out", spectra) == 2
+    assert "exists already" in said(capsys)
+    assert run("estimate", estimator, spectra, "--out", tmp_path / "no" / "out.csv") == 2
+    assert "no directory" in said(capsys)

@@ -1,0 +1,73 @@
+"""The page of a report: what it holds, where its figures and their numbers lie, light and dark."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from pandas import DataFrame
+
+from tasks.page import figures
+from tasks.page.page import Number, Page, Plot, Section, Summary, Table, write_page
+from tasks.records import read_table
+
+
+def plot(name: str = "line", width: float = 6.0) -> Plot:
+    figure, axes = figures.new_figure(1, 1, width, 2)
+    axes[0].plot([0, 1], [1, 2], color=figures.RULE)
+    axes[0].set(xlabel="x <m>")
+    return Plot(name, figure, "A line.", DataFrame({"x": [0, 1], "method": ["=a", "b"]}))
+
+
+def page(*sections: Section, first: Plot | None = None) -> Page:
+    numbers = [Number("1 dB", "of <something>")]
+    return Page("A & B", Summary(numbers, first or plot("first"), ["What."], ["Next."]), list(sections))
+
+
+def test_every_figure_lies_in_the_page_and_as_a_file_with_its_numbers(tmp_path):
+    write_page(tmp_path, page(Section("One", plots=[plot()])))
+    html = (tmp_path / "report.html").read_text()
+    links = re.findall(r'href="(figures/[^"]+)"', html)
+    assert set(links) == {f"figures/{name}.{kind}" for name in ("first", "line") for kind in ("csv", "svg")}
+    assert all((tmp_path / link).is_file() for link in links)
+    assert html.count("<svg") == 2
+    assert read_table(tmp_path / "figures" / "line.csv")["method"].tolist() == ["=a", "b"]
+    assert "'=a" in (tmp_path / "figures" / "line.csv").read_text()  # no formula
+
+
+def test_text_is_escaped_and_identifiers_are_unique(tmp_path):
+    write_page(
+        tmp_path, page(Section("<One>", ["a < b"], terms={"<name>": "<meaning>"}), Section("Two", plots=[plot()]))
+    )
+    html = (tmp_path / "report.html").read_text()
+    assert "A &amp; B" in html
+    assert "of &lt;something&gt;" in html
+    assert "<name>" not in html
+    identifiers = re.findall(r' id="([^"]+)"', html)
+    assert len(identifiers) == len(set(identifiers))
+
+
+def test_figures_take_the_colours_of_the_page(tmp_path):
+    """Black text would not be seen on a dark page; in the files, which stand alone, colours stay as drawn."""
+    write_page(tmp_path, page())
+    html, file = (tmp_path / "report.html").read_text(), (tmp_path / "figures" / "first.svg").read_text()
+    drawn = html[html.index("<svg") :]
+    assert "prefers-color-scheme: dark" in html
+    assert "currentColor" in drawn
+    for colour in figures.THEMED:
+        assert colour not in drawn
+        assert colour in file
+    assert figures.RULE in drawn
+
+
+def test_what_is_wide_takes_the_whole_page():
+    assert plot(width=12).wide
+    assert not plot(width=6).wide
+    assert not Table(["a", "b"], [["x", "y"]]).wide
+    assert Table(["a", "b"], [["x" * 60, "y" * 60]]).wide
+    assert Table(["a", "b"], [["x", "y"]], long=True).wide
+
+
+def test_two_figures_of_one_name_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="same"):
+        write_page(tmp_path, page(Section("", plots=[plot("same"), plot("same")])))

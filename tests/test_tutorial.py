@@ -1,0 +1,38 @@
+"""Every block of the tutorial runs as it stands, in order, in one directory; the network is a stand-in."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from unittest import mock
+
+import pytest
+from quick import TASKS, QuickNetwork
+
+from tasks.aoa.arms import NETWORK
+from tasks.aoa.estimators import ESTIMATORS
+from tasks.run import command_line
+
+TEXT = (Path(__file__).parent.parent / "docs" / "tutorial.md").read_text()
+PARTS = re.split(r"^## ", TEXT, flags=re.MULTILINE)[1:]
+
+
+@pytest.mark.parametrize("part", PARTS, ids=[part.splitlines()[0] for part in PARTS])
+def test_every_block_runs(part, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    quick = replace(ESTIMATORS[NETWORK], make=QuickNetwork)
+    for language, block in re.findall(r"```(\w+)\n(.*?)```", part, flags=re.DOTALL):
+        if language == "python":
+            exec(block, names)
+            continue
+        python, dash_m, module, *arguments = shlex.split(block)
+        assert [python, dash_m] == ["python", "-m"]
+        name = module.removeprefix("tasks.")
+        config, function = TASKS[name]
+        with mock.patch.dict(ESTIMATORS._entries, {NETWORK: quick}):
+            assert command_line(module, config, function, arguments) == 0, block
+        out = Path(arguments[arguments.index("--out") + 1])
+        assert (out if out.suffix else out / "report.html").is_file()
