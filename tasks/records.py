@@ -70,12 +70,17 @@ def read_json(file: Path) -> Row:
 
 def write_table(file: Path, rows: Iterable[Row]) -> None:
     """A comma-separated table with the keys of the rows as columns."""
+    write_text(file, as_table(rows))
+
+
+def as_table(rows: Iterable[Row]) -> str:
+    """The text of such a table."""
     rows = list(rows)
     stream = io.StringIO(newline="")
     writer = csv.DictWriter(stream, list(dict.fromkeys(key for row in rows for key in row)))
     writer.writeheader()
     writer.writerows({key: _escaped(value) for key, value in row.items()} for row in rows)
-    write_text(file, stream.getvalue())
+    return stream.getvalue()
 
 
 def write_npz(file: Path, arrays: Mapping[str, Any]) -> None:

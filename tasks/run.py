@@ -102,8 +102,17 @@ def _parse(
         case _:
             description = "\n\n".join([inspect.cleandoc(config_type.__doc__ or ""), *([more()] if more else [])])
             return tyro.cli(config_type, prog=f"python -m {name}", description=description, args=arguments), None
+    return configured(config_type, values, folder), folder
+
+
+def configured(config_type: type[Config], values: Row, folder: Path) -> Config:
+    """The configuration that a run has kept as plain values.
+
+    Raises:
+        InputError: those of another version.
+    """
     try:
-        return config_type(**{key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}), folder
+        return config_type(**{key: tuple(v) if isinstance(v, list) else v for key, v in values.items()})
     except TypeError as error:
         raise InputError(f"{folder} was begun by another version of this command ({error}); start a new run") from None
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import quick
 import torch
+from PIL import Image
 
-from swiftwrf import AngularGrid, Spectra, simulated_room
+from swiftwrf import AngularGrid, FitConfig, ModelConfig, Spectra, fit, simulated_room
+from swiftwrf.data.writing import write_spectra
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # one thread a process: more would wait for each other
     torch.set_num_threads(1)
@@ -56,3 +59,27 @@ def small_published() -> Iterator[None]:
 @pytest.fixture
 def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def aoa_run(tmp_path_factory: pytest.TempPathFactory, room: Spectra) -> Path:
+    """A run of angle of arrival on files, whose second model knows its deviation."""
+    folder = tmp_path_factory.mktemp("aoa")
+    (folder / "data").mkdir()
+    write_spectra(room, folder / "data")
+    options = ("--synthesizer", "swiftwrf", "--extra", 0, "--data", folder / "data", "--out", folder / "run")
+    with mock.patch("tasks.aoa.steps.candidates", return_value=["idw"]):  # finding a room has tests of its own
+        assert quick.run("aoa", "--mix", 0.5, 1, *options) == 0
+    config = FitConfig(model=ModelConfig(n_primitives=16, rank=4))
+    fit(room, config, progress=False).save(folder / "run" / "model-mix1.safetensors")
+    return folder / "run"
+
+
+@pytest.fixture(scope="session")
+def rssi_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of RSSI at three receivers, over a floor plan."""
+    folder = tmp_path_factory.mktemp("rssi")
+    Image.new("RGB", (40, 30), "white").save(folder / "plan.png")
+    plan = ("--floor-plan", folder / "plan.png", "--floor-extent", 0, 20, 0, 15)
+    assert quick.run("rssi", "--rx", 1, 6, 12, *plan, "--out", folder / "run") == 0
+    return folder / "run"

@@ -44,6 +44,8 @@ from tasks.report.__main__ import run as report
 from tasks.rssi import experiment as rssi
 from tasks.rssi.predictors import PREDICTORS
 from tasks.run import command_line
+from tasks.view import ViewConfig
+from tasks.view import run as view
 
 FIT = FitConfig(model=ModelConfig(n_primitives=4, rank=2), steps=30, check_every=5)
 SHORT = {"steps": 12, "check_every": 6, "batch": 8, "warm_up": 1}
@@ -62,6 +64,7 @@ TASKS = {
     "convert": (ConvertConfig, convert),
     "estimate": (EstimateConfig, estimate),
     "inspect": (InspectConfig, inspect),
+    "view": (ViewConfig, view),
 }
 FOR_LIFE = ExitStack()
 PREDICTORS_KEPT = ("swiftwrf", "mean", "mri_pooled", "mri_receiver")

@@ -171,6 +171,17 @@ def test_deviations_hold_what_they_say(built_in_room):
     assert near.mean() < std.mean() < far.mean()
 
 
+def test_a_canvas_draws_the_same(room):
+    model = fit(room, FitConfig(model=ModelConfig(n_primitives=16, rank=4)), progress=False)
+    for grid in (None, AngularGrid.hemisphere(7, 30)):
+        canvas = model.canvas(grid)
+        for at in (room.position[:1], room.position):  # drawn one by one, and by one product
+            drawn, std = model.synthesize(at, canvas, return_std=True)
+            expected, expected_std = model.synthesize(at, grid, return_std=True)
+            torch.testing.assert_close(drawn, expected, rtol=0, atol=1e-4)  # what the cutoff leaves out
+            torch.testing.assert_close(std, expected_std)
+
+
 def test_a_fit_by_gradient_knows_no_deviation(room):
     model = fit(room, replace(QUICK, steps=20), progress=False)
     with pytest.raises(InputError, match="knows no standard deviations"):

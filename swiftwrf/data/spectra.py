@@ -96,9 +96,7 @@ class Spectra:
                 f"{self.name} does not say where the fixed end stands and how the array is turned, so the direction at "
                 "further positions is unknown"
             )
-        away = position.double() - self.fixed_position
-        towards = away if self.moving == "transmitter" else -away
-        return torch.stack(to_angles(towards @ self.rotation), dim=-1)
+        return direction_of_link(position, self.fixed_position, self.rotation, self.moving)
 
     def coarsen(self, factor: int) -> Spectra:
         """The same spectra averaged over squares of factor x factor pixels.
@@ -116,6 +114,14 @@ class Spectra:
     def at_most(self, azimuths: int) -> Spectra:
         """The same spectra averaged down to at most so many columns, with rows enough for SSIM; 0 keeps all pixels."""
         return self.coarsen(coarsening(self.grid.shape, azimuths, least_rows=WINDOW))
+
+
+def direction_of_link(position: Tensor, fixed_position: Tensor, rotation: Tensor, moving: Moving) -> Tensor:
+    """Azimuth and elevation (n, 2) [rad] at which the array sees the transmitter, with the moving end at positions
+    (n, 3) [m]; the other arguments as in `Spectra`."""
+    away = position.double() - fixed_position
+    towards = away if moving == "transmitter" else -away
+    return torch.stack(to_angles(towards @ rotation), dim=-1)
 
 
 def check_pixels(name: str, n: int, grid: AngularGrid) -> None:

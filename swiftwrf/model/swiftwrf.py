@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import ClassVar, Literal, overload
+from typing import ClassVar, Literal, NamedTuple, overload
 
 import torch
 from torch import Tensor, nn
@@ -74,6 +74,20 @@ class ModelConfig:
         """Canonical primitives at their start."""
         n, _ = self.size
         return Primitives(n, grid, bounded=self.bounded, axis_aligned=self.axis_aligned, generator=generator)
+
+
+class Canvas(NamedTuple):
+    """What all spectra that a model draws on a grid have in common; see `SwiftWRF.canvas`.
+
+    Args:
+        grid: directions that are drawn.
+        kernel: of primitives that stay where they are, (N, H, W); None where some move or there are too many.
+        variation: standard deviation of all spectra, (H, W); None where the model knows none.
+    """
+
+    grid: AngularGrid
+    kernel: Tensor | None
+    variation: Tensor | None
 
 
 class SwiftWRF(nn.Module, Saved):
@@ -168,22 +182,23 @@ class SwiftWRF(nn.Module, Saved):
         return self.draw(self.gaussians(position, deform=deform, stop_mean=stop_mean), len(position), self.grid)
 
     @overload
-    def synthesize(self, position: Tensor, grid: AngularGrid | None = None, batch: int = 64) -> Tensor: ...
+    def synthesize(self, position: Tensor, grid: AngularGrid | Canvas | None = None, batch: int = 64) -> Tensor: ...
 
     @overload
     def synthesize(
-        self, position: Tensor, grid: AngularGrid | None = None, batch: int = 64, *, return_std: Literal[True]
+        self, position: Tensor, grid: AngularGrid | Canvas | None = None, batch: int = 64, *, return_std: Literal[True]
     ) -> tuple[Tensor, Tensor]: ...
 
     @torch.no_grad()
     def synthesize(
-        self, position: Tensor, grid: AngularGrid | None = None, batch: int = 64, *, return_std: bool = False
+        self, position: Tensor, grid: AngularGrid | Canvas | None = None, batch: int = 64, *, return_std: bool = False
     ) -> Tensor | tuple[Tensor, Tensor]:
         """Spectra at any positions.
 
         Args:
             position: of the moving end [m], (n, 3).
-            grid: directions to draw; the model's own unless given. Any resolution will do.
+            grid: directions to draw; the model's own unless given. Any resolution will do. Who draws few spectra at a
+                time, but often, gives a `canvas`.
             batch: spectra drawn at a time, which bounds the memory.
             return_std: also by how much a measured spectrum is expected to differ, from the Gaussian process behind the
                 motion, calibrated on held-out training spectra: 80 % of all pixels lie within 1.28 of it.
@@ -198,11 +213,16 @@ class SwiftWRF(nn.Module, Saved):
         """
         position = check_positions(position)
         check_batch(batch)
-        grid = grid or self.grid
+        if isinstance(grid, Canvas):
+            grid, kernel, variation = grid
+        else:
+            grid = grid or self.grid
+            kernel = self._fixed_kernels(grid) if len(position) >= MANY else None
+            variation = None
+        if return_std and variation is None:
+            variation = self._variation(grid)  # refuses where there is none
         spectrum = torch.empty(len(position), *grid.shape)
         std = torch.empty_like(spectrum) if return_std else None
-        kernel = self._fixed_kernels(grid) if len(position) >= MANY else None
-        variation = self._variation(grid) if return_std else None
         for start in range(0, len(position), batch):
             x = self.normalise(position[start : start + batch].to(self.centre.device))
             gaussians = self.gaussians(x)
@@ -212,6 +232,17 @@ class SwiftWRF(nn.Module, Saved):
                 std[start : start + batch] = doubt[:, None, None] * variation
         spectrum = check_drawn(spectrum)
         return spectrum if std is None else (spectrum, check_drawn(std))
+
+    @torch.no_grad()
+    def canvas(self, grid: AngularGrid | None = None) -> Canvas:
+        """What does not depend on the position, computed once for all spectra to come: `synthesize` on a canvas draws a
+        single spectrum as fast as one of many. It holds as long as the parameters stay as they are.
+
+        Args:
+            grid: directions to draw; the model's own unless given.
+        """
+        grid = grid or self.grid
+        return Canvas(grid, self._fixed_kernels(grid), self._variation(grid) if self.knows_deviation else None)
 
     def _fixed_kernels(self, grid: AngularGrid) -> Tensor | None:
         """Kernels (N, H, W) of primitives that stay where they are, so that many spectra are one matrix product; None where

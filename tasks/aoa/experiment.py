@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from augment import withhold
-from swiftwrf import InputError, simulated_room
+from swiftwrf import InputError, Spectra, simulated_room
 from swiftwrf.data import read_spectra
 from swiftwrf.metrics import angle_errors, l1, psnr, ssim
 from tasks.aoa.config import AoaConfig, check, check_data, further_positions
@@ -38,10 +38,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
     """
     device = choose_device(config.device)
     check(config)
-    if config.data is None:
-        data = simulated_room(seed=config.seed, moving=config.moving or "transmitter")
-    else:
-        data = read_spectra(config.data, reading(config))
+    data = measurements(config)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
     check_data(data, config)
@@ -85,6 +82,17 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         }
         final = directory.finish(metrics, reporting(page))
     console.print(f"report: [bold]{final / 'report.html'}[/]")
+
+
+def measurements(config: AoaConfig) -> Spectra:
+    """The spectra that a run is about.
+
+    Raises:
+        InputError: they cannot be read.
+    """
+    if config.data is None:
+        return simulated_room(seed=config.seed, moving=config.moving or "transmitter")
+    return read_spectra(config.data, reading(config))
 
 
 class _Tables:

@@ -152,7 +152,7 @@ def _described(plane: dict[str, Any]) -> str:
 
 def _room_figure(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> Figure:
     figure, axes = figures.new_figure(1, 2, 12, 5)
-    low, high = _extent(planes, points)
+    low, high = extent(planes, np.concatenate([points["measured"], points["fixed"][None]]))
     plan = axes[0]
     for plane in planes:
         _draw_in_plan(plan, plane, low, high)
@@ -173,9 +173,8 @@ def _room_figure(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) 
     return figure
 
 
-def _extent(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Opposite corners of the room as far as it is known [m]."""
-    inside = np.concatenate([points["measured"], points["fixed"][None]])
+def extent(planes: list[dict[str, Any]], inside: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Opposite corners (3,) [m] of the room around positions (n, 3), as far as it is known."""
     low, high = inside.min(axis=0) - MARGIN, inside.max(axis=0) + MARGIN
     for plane in planes:
         normal = np.array(plane["normal"])
@@ -186,20 +185,24 @@ def _extent(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> tu
     return low, high
 
 
-def _draw_in_plan(ax: Axes, plane: dict[str, Any], low: NDArray[Any], high: NDArray[Any]) -> None:
+def in_plan(plane: dict[str, Any], low: NDArray[Any], high: NDArray[Any]) -> NDArray[Any] | None:
+    """Both ends (2, 2) [m] of a plane's line through the box from `low` to `high` (3,) at half its height, seen from
+    above; None for floors and ceilings."""
     nx, ny, nz = plane["normal"]
-    if abs(nz) > 0.7:  # floors and ceilings are no lines in a plan
-        return
-    line = "-" if plane["certain"] else "--"
-    ends = [low - MARGIN, high + MARGIN]
+    if abs(nz) > 0.7:
+        return None
     height = (low[2] + high[2]) / 2
     if abs(nx) >= abs(ny):
-        y = np.array([e[1] for e in ends])
-        x = (plane["offset_m"] - ny * y - nz * height) / nx
-    else:
-        x = np.array([e[0] for e in ends])
-        y = (plane["offset_m"] - nx * x - nz * height) / ny
-    ax.plot(x, y, line, color="black", linewidth=1.3)
+        y = np.array([low[1], high[1]])
+        return np.stack([(plane["offset_m"] - ny * y - nz * height) / nx, y], axis=1)
+    x = np.array([low[0], high[0]])
+    return np.stack([x, (plane["offset_m"] - nx * x - nz * height) / ny], axis=1)
+
+
+def _draw_in_plan(ax: Axes, plane: dict[str, Any], low: NDArray[Any], high: NDArray[Any]) -> None:
+    ends = in_plan(plane, low - MARGIN, high + MARGIN)
+    if ends is not None:
+        ax.plot(*ends.T, "-" if plane["certain"] else "--", color="black", linewidth=1.3)
 
 
 def _draw_in_space(ax: Any, plane: dict[str, Any], low: NDArray[Any], high: NDArray[Any]) -> None:

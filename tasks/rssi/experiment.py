@@ -25,6 +25,7 @@ from tasks.run import Preset, Row, Run, choose_device, console
 from tasks.source import TableSource, reading
 from tasks.summarise import error_summary, grouped
 
+MODEL = "model.safetensors"
 MAP_CELLS = 80  # along the longer side of the floor
 MOST_PLAN_PIXELS = 2**24
 
@@ -177,6 +178,7 @@ class _Tables:
             if isinstance(predictor, SwiftWRFPredictor):
                 _, low, high = predictor.model.predict(self.test.transmitter_position)
                 result |= {"low": low, "high": high, "n_primitives": predictor.model.n_primitives}
+                predictor.model.save(self.directory.path(MODEL))
                 self._keep_maps(predictor)
             return result
 

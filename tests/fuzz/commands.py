@@ -28,6 +28,7 @@ NEEDED = {
     "report": ["run"],
     "convert": ["data", "taken"],
     "inspect": ["data"],
+    "view": ["data"],
     "estimate": ["data", "data"],
 }
 RIGHT = {
@@ -65,7 +66,7 @@ def command_lines(draw: random.Random, folder: Path, count: int) -> Iterator[tup
             arguments += [draw.choice(values) for _ in range(draw.choice([0, 1, 1, 1, 2, 3, 4]))]
         if draw.random() < 0.1:
             arguments.append(draw.choice(values))
-        yield task, arguments if task == "convert" else [*arguments, "--out", str(taken)]
+        yield task, arguments if task in ("convert", "view") else [*arguments, "--out", str(taken)]
 
 
 def right_command_lines(draw: random.Random, folder: Path, count: int) -> Iterator[tuple[str, list[str]]]:

@@ -1,0 +1,296 @@
+"""What the page shows, without the page: views, plans, spectra and maps as they are computed, and what is refused."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import socket
+import sys
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import quick
+import torch
+from fuzz import kinds
+from PIL import Image
+
+from swiftwrf import AngularGrid, GeometryModel, InputError, fit_coarray, load
+from swiftwrf.geometry import HybridModel
+from swiftwrf.geometry.model import Plane
+from swiftwrf.geometry.sample import Residual
+from tasks.run import command_line
+from tasks.view import ViewConfig, run, spectra
+from tasks.view.opening import opened
+from tasks.view.pictures import View, png
+from tasks.view.plan import Plan, text
+from tasks.view.rssi import Shown
+from tasks.view.spectra import angle_between
+
+GRID = AngularGrid.hemisphere(15, 60)
+needs_the_extra = pytest.mark.skipif(find_spec("nicegui") is None, reason="needs the extra view")
+
+
+@pytest.mark.parametrize("view", [View.rectangular(GRID), View.disc()], ids=["rectangular", "polar"])
+@pytest.mark.parametrize("pixel", [(0, 0), (3, 10), (7, 59), (13, 31)])
+def test_a_direction_is_drawn_where_it_is_marked(view, pixel):
+    spectrum = np.zeros(GRID.shape)
+    spectrum[pixel] = 1
+    azimuth, elevation = GRID.azimuth[pixel[1]].rad2deg(), GRID.elevation[pixel[0]].rad2deg()
+    row, column = (view.lay(spectrum, GRID) == 1).nonzero()
+    if not view.polar and pixel[1] == 0:  # half of it lies beyond the seam
+        row, column = row[column < view.width / 2], column[column < view.width / 2]
+    x, y = view.place(float(azimuth), float(elevation))
+    assert np.hypot(column + 0.5 - x, row + 0.5 - y).min() <= 1
+    assert abs(row.mean() + 0.5 - y) <= 0.6 * view.height / GRID.n_elevation
+
+
+def test_polar_view_is_clear_outside_the_hemisphere():
+    laid = View.disc().lay(np.ones(GRID.shape), GRID)
+    assert np.isnan(laid[0, 0])
+    assert np.isfinite(laid).mean() == pytest.approx(np.pi / 4, abs=0.01)
+
+
+def test_pictures_have_the_ends_of_the_colours_and_clear_pixels():
+    content = png(np.array([[0.0, 1.0, np.nan, 7.0]]), "viridis")
+    pixels = np.asarray(Image.open(io.BytesIO(content)).convert("RGBA"))[0]
+    np.testing.assert_allclose(pixels[:, 3], [255, 255, 0, 255])
+    np.testing.assert_allclose(pixels[[0, 1], :3], [[68, 1, 84], [253, 231, 37]], atol=2)
+    assert (pixels[3] == pixels[1]).all()
+
+
+def test_plan_goes_there_and_back_and_keeps_inside():
+    plan = Plan.around(np.array([[0.0, 0, 1], [4, 2, 1]]), [np.nan, np.nan, 0], most=(400, 300))
+    assert plan.position(*plan.place([1.5, 0.5])) == pytest.approx((1.5, 0.5))
+    assert plan.shows([[0, 0], [4, 2]])
+    assert not plan.shows([[0, 0], [4, 9]])
+    assert plan.position(-1e6, 1e6) == pytest.approx((plan.low[0], plan.low[1]))
+    assert max(plan.size[0] / 400, plan.size[1] / 300) == pytest.approx(1, abs=0.01)
+
+
+def test_a_path_along_an_axis_leaves_room_to_drag():
+    width, height = Plan.around([[0.0, 3], [10, 3]], most=(500, 500)).size
+    assert height > 0.3 * width
+
+
+def test_texts_are_texts():
+    assert "<script>" not in text(0, 0, "<script>")
+
+
+def test_scene_of_a_run(aoa_run, room):
+    scene = opened(aoa_run)
+    assert [fitted.title for fitted in scene.fitted] == ["swiftwrf, 50% measured", "swiftwrf, 100% measured"]
+    train, test = room.split("random", 0)
+    assert [int(fitted.learnt.sum()) for fitted in scene.fitted] == [round(0.5 * len(train)), len(train)]
+    assert not scene.fitted[1].learnt[test.index].any()
+    np.testing.assert_allclose(scene.data.position, room.position, atol=1e-6)
+    assert (scene.places == scene.start).all(axis=1).any()
+
+
+def test_drawn_spectrum_is_that_of_the_model(aoa_run):
+    scene = opened(aoa_run)
+    fitted, at = scene.fitted[1], np.array([3.0, 2.5, 1.1])
+    drawn = scene.draw(fitted, at)
+    spectrum, deviation = fitted.model.synthesize(torch.from_numpy(at)[None], return_std=True)
+    np.testing.assert_allclose(drawn.spectrum, spectrum[0], atol=1e-4)
+    np.testing.assert_allclose(drawn.deviation, deviation[0], atol=1e-5)
+    row, column = np.unravel_index(spectrum[0].argmax(), GRID.shape)
+    strongest = float(GRID.azimuth[column].rad2deg()), float(GRID.elevation[row].rad2deg())
+    assert drawn.strongest == pytest.approx(strongest)
+    direction = scene.data.direction_at(torch.from_numpy(at)[None])[0].rad2deg()
+    assert drawn.line_of_sight == pytest.approx(tuple(direction.tolist()))
+    assert scene.draw(scene.fitted[0], at).deviation is None  # fitted by gradient
+
+
+def test_nearest_measured_spectrum(aoa_run, room):
+    scene = opened(aoa_run)
+    at = room.position[7].numpy() + np.array([0, 0, 0.001])
+    nearest = scene.nearest(scene.fitted[0], at)
+    assert (nearest.number, nearest.learnt) == (7, bool(scene.fitted[0].learnt[7]))
+    assert nearest.away_m == pytest.approx(0.001, abs=1e-5)
+    np.testing.assert_allclose(nearest.spectrum, room.spectrum[7], atol=1 / 255)
+
+
+@pytest.mark.parametrize(("seconds", "shape"), [(1e9, (15, 60)), (0.0, (1, 4))])
+def test_a_slow_model_is_dragged_on_a_coarser_grid(aoa_run, monkeypatch, seconds, shape):
+    monkeypatch.setattr(spectra, "QUICK", seconds)
+    scene = opened(aoa_run)
+    drawn = scene.draw(scene.fitted[1], scene.start, quick=True)
+    assert drawn.grid.shape == drawn.spectrum.shape == drawn.deviation.shape == shape
+    assert scene.draw(scene.fitted[1], scene.start).spectrum.shape == (15, 60)
+
+
+def saved(kind, folder, room) -> Path:
+    """A model of that kind, by itself; rooms are made, for finding one takes long."""
+    if kind in ("geometry", "hybrid"):
+        plane = Plane((1.0, 0.0, 0.0), 6.0, -0.5, 1.0, True)
+        link = room.array, room.grid, room.rotation, room.fixed_position, room.moving
+        model = GeometryModel(*link, [plane], 1, 0.1, 0.1, "made", torch.zeros(1, 1), Residual())
+        if kind == "hybrid":
+            kernel, rest = fit_coarray(room, progress=False).kernel, torch.zeros(1, room.spectrum[0].numel())
+            model = HybridModel(model, 1.0, kernel, room.position, torch.zeros(len(room), 0), rest)
+        model.save(folder / "model")
+    elif kind in quick.PUBLISHED:
+        kinds.model_published(kind, folder)
+    else:
+        getattr(kinds, f"model_{kind}")(folder)
+    return folder / "model"
+
+
+@pytest.mark.parametrize("kind", ["swiftwrf", "coarray", "geometry", "hybrid", *quick.PUBLISHED])
+def test_a_model_by_itself(tmp_path, room, kind):
+    scene = opened(saved(kind, tmp_path, room))
+    drawn = scene.draw(scene.fitted[0], scene.start, quick=True)
+    assert np.isfinite(drawn.spectrum).all()
+    assert (scene.places.min(axis=0) <= scene.start).all()
+    assert (scene.start <= scene.places.max(axis=0)).all()
+    assert scene.nearest(scene.fitted[0], scene.start) is None
+    assert (drawn.line_of_sight is not None) == (kind in ("geometry", "hybrid", "nerf2", "wrfgs"))
+    assert bool(scene.fitted[0].planes) == (kind in ("geometry", "hybrid"))
+
+
+def test_far_ends_leave_room_to_drag(aoa_run):
+    scene = opened(aoa_run)
+    low, high = scene.box
+    assert (low <= scene.fixed).all()
+    assert (scene.fixed <= high).all()
+    far = replace(scene, data=replace(scene.data, fixed_position=torch.tensor([100.0, 2, 1])))
+    width = np.ptp(scene.places, axis=0).max()
+    assert far.box[1][0] == pytest.approx(scene.places[:, 0].max() + spectra.FAR * width)
+
+
+def test_angles_are_great_circles():
+    assert angle_between((350, 0), (10, 0)) == pytest.approx(20)
+    assert angle_between((0, 80), (180, 80)) == pytest.approx(20)
+
+
+def test_measurements_that_changed_or_went_are_not_shown(aoa_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(aoa_run, folder)
+    for file, key, value in (("environment.json", "input_sha256", {}), ("config.json", "data", str(tmp_path / "gone"))):
+        content = json.loads((folder / file).read_text())
+        content.get("config", content)[key] = value
+        (folder / file).write_text(json.dumps(content))
+        scene = opened(folder)
+        assert scene.data is None
+        assert len(scene.notes) == 1
+        assert np.isfinite(scene.draw(scene.fitted[0], scene.start).spectrum).all()
+
+
+def test_room_of_another_model_on_the_same_spectra(aoa_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(aoa_run, folder)
+    plane = {"normal": [1.0, 0, 0], "offset_m": 6.0, "gain": -0.5, "std_mm": 1.0, "certain": True}
+    (folder / "geometry-mix1.json").write_text(json.dumps({"planes": [plane]}))
+    assert [fitted.planes for fitted in opened(folder).fitted] == [[], [plane]]
+
+
+def test_maps_are_those_of_the_model(rssi_run):
+    scene = opened(rssi_run)
+    assert scene.receivers == ("receiver01", "receiver06", "receiver12")
+    assert scene.floor.plan[1] == (0, 20, 0, 15)
+    maps = scene.maps(1.2)
+    i, j = 5, 17
+    at = torch.tensor([[maps.x[j], maps.y[i], 1.2]], dtype=torch.float64)
+    middle, low, high = (p[0].numpy() for p in load(rssi_run / "model.safetensors").predict(at))
+    np.testing.assert_allclose(maps.middle[:, i, j], middle, atol=1e-3)
+    assert maps.best[i, j] == middle.argmax()
+    heard = scene.heard(Shown("RSSI", 1, 1.2), maps.x[j], maps.y[i])
+    assert (heard.middle, heard.low, heard.high) == pytest.approx((middle[1], low[1], high[1]))
+    assert heard.best == (middle.argmax(), pytest.approx(middle.max()))
+
+
+def test_certainty_is_that_of_the_interval(rssi_run):
+    """90 % of a normal variable lie above the lower end of its 80 % interval, half above its middle."""
+    maps = opened(rssi_run).maps(1.2)
+    np.testing.assert_allclose(maps.assured(0.9), maps.low, atol=1e-3)
+    np.testing.assert_allclose(maps.assured(0.5), maps.middle, atol=1e-3)
+
+
+def test_coverage_is_where_the_value_is_assured(rssi_run):
+    scene = opened(rssi_run)
+    maps = scene.maps(1.2)
+    threshold = float(np.median(maps.low[2]))
+    shown = Shown("coverage", 2, 1.2, threshold, 0.9)
+    covered = np.isfinite(scene.layer(shown).values)
+    assert covered.mean() == pytest.approx(0.5, abs=0.01)
+    assert scene.sentence(shown).startswith("50% of the map")
+    i, j = np.argwhere(covered)[0]
+    assert scene.heard(shown, maps.x[j], maps.y[i]).above >= 0.9 - 1e-3
+    i, j = np.argwhere(~covered)[0]
+    assert scene.heard(shown, maps.x[j], maps.y[i]).above <= 0.9 + 1e-3
+
+
+def test_exports(rssi_run):
+    scene = opened(rssi_run)
+    for kind in scene.kinds:
+        assert Image.open(io.BytesIO(scene.picture(Shown(kind, 1, 1.2)))).format == "PNG"
+    table = pd.read_csv(io.StringIO(scene.table(Shown("coverage", 1, 1.2, -70.0, 0.9))))
+    maps = scene.maps(1.2)
+    assert len(table) == maps.best.size
+    np.testing.assert_allclose(table["predicted_dbm"], maps.middle[1].ravel(), atol=0.006)
+    np.testing.assert_array_equal(table["above_-70_dbm_with_90%"], maps.assured(0.9)[1].ravel() >= -70)
+
+
+def test_one_receiver_has_no_best(rssi_run):
+    scene = opened(rssi_run)
+    names = scene.receivers[:1]
+    assert "best receiver" in scene.kinds
+    assert "best receiver" not in replace(scene, model=replace(scene.model, receiver_names=names)).kinds
+
+
+def test_an_rssi_model_by_itself(rssi_run):
+    scene = opened(rssi_run / "model.safetensors")
+    assert np.isfinite(scene.layer(Shown("RSSI", 0, scene.heights[1])).values).all()
+    assert np.isnan(scene.floor.rssi_dbm).all()
+
+
+def said(capsys, *arguments) -> str:
+    assert command_line("tasks.view", ViewConfig, run, [str(a) for a in arguments]) == 2
+    return quick.said(capsys)
+
+
+@needs_the_extra
+def test_refusals(tmp_path, capsys, aoa_run, rssi_run):
+    assert "is not there" in said(capsys, tmp_path / "nowhere", "--port", 0)
+    assert "is no run" in said(capsys, tmp_path, "--port", 0)
+    assert "cannot be read" in said(capsys, "x" * 300, "--port", 0)
+    (tmp_path / "text").write_text("x")
+    assert "safetensors" in said(capsys, tmp_path / "text", "--port", 0)
+    for source, names in ((aoa_run, "*mix*"), (rssi_run, "model.safetensors")):
+        bare = tmp_path / source.parent.name
+        shutil.copytree(source, bare)
+        for file in bare.glob(names):
+            file.unlink()
+        assert "holds no model" in said(capsys, bare, "--port", 0)
+    (bare / "config.json").write_text('{"task": "inspect"}')
+    assert "tasks.inspect" in said(capsys, bare, "--port", 0)
+    kinds.model_nerf2_rssi(tmp_path)
+    assert "can be looked at" in said(capsys, tmp_path / "model", "--port", 0)
+
+
+@needs_the_extra
+def test_addresses_that_cannot_be_listened_on(capsys, rssi_run):
+    assert "--port must be" in said(capsys, rssi_run, "--port", 70000)
+    assert "--host" in said(capsys, rssi_run, "--host", "203.0.113.1")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        assert "is in use" in said(capsys, rssi_run, "--port", taken.getsockname()[1])
+
+
+def test_without_the_extra(capsys, monkeypatch, rssi_run):
+    for name in [name for name in sys.modules if name.startswith("tasks.view.") and name.endswith(("server", "page"))]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "nicegui", None)
+    assert "pip install 'swiftwrf-tasks[view]'" in said(capsys, rssi_run)
+
+
+def test_records_that_are_damaged(aoa_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(aoa_run, folder)
+    (folder / "geometry-mix1.json").write_text("{}")
+    with pytest.raises(InputError, match="not those of a run"):
+        opened(folder)
