@@ -11,8 +11,10 @@ import torch
 from augment.synthesizers import SYNTHESIZERS, Settings, Synthesizer, lacks, make_synthesizer
 from swiftwrf import FitError, InputError, Spectra
 from swiftwrf.data.splits import folds
+from swiftwrf.gp import thinned
 from swiftwrf.metrics import psnr
 
+JUDGES = 1000  # held-out spectra of a fold that are compared: more do not change the choice
 SLOW = ("nerf2", "wrfgs", "vae", "dcgan", "raytrace")  # compared only where they are asked for by name
 
 
@@ -73,7 +75,8 @@ def choose_synthesizer(measured: Spectra, settings: Settings, names: Iterable[st
     for name in names or candidates(measured):
         began, found, trials[name] = time.perf_counter(), [], []
         for number in range(int(fold.max()) + 1):
-            kept, out = (measured.subset(rows.nonzero()[:, 0]) for rows in (fold != number, fold == number))
+            rows = (fold == number).nonzero()[:, 0]
+            kept, out = measured.subset((fold != number).nonzero()[:, 0]), measured.subset(*thinned(rows, rows=JUDGES))
             synthesizer = make_synthesizer(name, quiet)
             try:
                 if trials[name]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 from augment.places import FURTHER, Places
 from swiftwrf import InputError, Spectra
 from swiftwrf.data.splits import MIN_TRAINING
+from swiftwrf.store import Store
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,25 +19,34 @@ class Mixed:
     """A training set for an estimator of the angle of arrival.
 
     Args:
-        spectrum: (n, H, W).
+        stores: of the spectra (n, H, W), one after the other.
         label: azimuth and elevation [rad], (n, 2).
         index: number of each sample's place in the data set, -1 for further places, (n,).
         synthetic: origin of each spectrum: False measured, True synthesized, (n,).
     """
 
-    spectrum: Tensor
+    stores: tuple[Store, ...]
     label: Tensor
     index: Tensor
     synthetic: Tensor
 
     def __len__(self) -> int:
-        return len(self.spectrum)
+        return len(self.label)
+
+    @property
+    def spectrum(self) -> Tensor:
+        """All spectra, float32 (n, H, W)."""
+        return torch.cat([store[:] for store in self.stores])
+
+    def batches(self) -> Iterator[Tensor]:
+        """All spectra in order, float32, as many at once as fit into memory."""
+        return (batch for store in self.stores for batch in store.batches())
 
     @classmethod
     def measured(cls, spectra: Spectra) -> Mixed:
         """Measured spectra alone."""
         synthetic = torch.zeros(len(spectra), dtype=torch.bool)
-        return cls(spectra.spectrum, spectra.label, spectra.index, synthetic)
+        return cls((spectra.store,), spectra.label, spectra.index, synthetic)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -45,7 +56,7 @@ class Mixed:
         return {"measured": len(self) - synthetic, "withheld": synthetic - further, "further": further}
 
     def add(self, places: Places, synthetic: Tensor) -> Mixed:
-        """With synthetic spectra (n, H, W) at these places, after those there are.
+        """With synthetic spectra (n, H, W) at these places, after those there are; magnitudes, or bytes, where 255 is 1.
 
         Raises:
             InputError: another number of spectra than places.
@@ -53,7 +64,7 @@ class Mixed:
         if len(synthetic) != len(places):
             raise InputError(f"expected one synthetic spectrum for each of {len(places)} places, got {len(synthetic)}")
         return Mixed(
-            torch.cat([self.spectrum, synthetic]),
+            (*self.stores, Store(synthetic)),
             torch.cat([self.label, places.label]),
             torch.cat([self.index, places.index]),
             torch.cat([self.synthetic, torch.ones(len(synthetic), dtype=torch.bool)]),

@@ -11,7 +11,7 @@ from scipy.spatial import Delaunay
 from torch import Tensor
 
 from swiftwrf import Spectra
-from swiftwrf.positions import distance
+from swiftwrf.positions import nearest
 
 FURTHER = -1  # index of a place that is no place of the data set
 FLAT = 1e-3  # extent below which a direction of the region counts as none, as a share of the largest
@@ -62,14 +62,13 @@ def draw_positions(known: Tensor, n: int, seed: int) -> Tensor:
     _, extent, axes = torch.linalg.svd(known - centre, full_matrices=False)
     axes = axes[extent > FLAT * extent[0].clamp_min(1e-12)]  # the directions in which the positions extend
     flat = ((known - centre) @ axes.T).numpy()
-    apart = distance(known, known)
-    apart.fill_diagonal_(torch.inf)
     # eight nearest neighbours make the scale of a region; the nearest one alone would be the step along a path
-    scale = float(apart.topk(min(8, len(known) - 1), largest=False).values[:, -1].quantile(NEAR))
+    apart, _ = nearest(known, known, min(9, len(known)))  # each is its own nearest
+    scale = float(apart[:, -1].quantile(NEAR))
     drawn = torch.empty(0, 3, dtype=torch.float64)
     while len(drawn) < n:
         inside = torch.from_numpy(_in_hull(flat, 2 * n, generator)) @ axes + centre
-        near = distance(inside, known).min(dim=1).values <= scale
+        near = nearest(inside, known, 1)[0][:, 0] <= scale
         drawn = torch.cat([drawn, inside[near]])
     return drawn[:n]
 

@@ -46,7 +46,7 @@ def suggest(measured: Spectra, count: int, seed: int = 0) -> Suggestion:
     check_training(measured)
     if not 1 <= count <= MOST:
         raise InputError(f"between 1 and {MOST} positions can be suggested, not {count}")
-    kernel = choose_kernel(measured.position, measured.spectrum, folds(measured.position, "random", seed))
+    kernel = choose_kernel(measured.position, measured.store, folds(measured.position, "random", seed))
     candidate = draw_positions(measured.position, CANDIDATES, seed)
     (known,) = thinned(measured.position, rows=KNOWN)
     chosen, left = most_informative(kernel, known, candidate, count)

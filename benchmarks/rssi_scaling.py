@@ -1,18 +1,31 @@
-"""How the time and memory of the RSSI model grow with rows and receivers, on the simulated floor."""
+"""How the time and memory of the RSSI model grow with rows and receivers, on the simulated floor.
+
+Each point runs in a process of its own, so that its peak is its own; seconds are those of the processor.
+"""
 
 from __future__ import annotations
 
-import resource
-import time
-from dataclasses import replace
+import json
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
 
 import torch
+import tyro
+from committed import RESULTS
 from record import write_result
+from scaling import measuring
 
 from swiftwrf import Rssi, RssiConfig, fit_rssi, rssi_room
 
-ROWS = (1_000, 10_000, 100_000)
-RECEIVERS = (12, 48)
+POINTS = ((1_000, 12), (10_000, 12), (100_000, 12), (1_000, 48), (1_000, 500))
+PREDICTED = 100_000
+
+
+@dataclass(frozen=True)
+class Config:
+    points: tuple[tuple[int, int], ...] = POINTS
+    """rows and receivers; other points that were measured before are kept"""
 
 
 def widen(data: Rssi, n: int) -> Rssi:
@@ -21,28 +34,30 @@ def widen(data: Rssi, n: int) -> Rssi:
     return replace(data.columns(columns), receiver_names=tuple(f"r{i}" for i in range(n)))
 
 
-def main() -> None:
-    """Fits and predicts at each size."""
-    rows = []
-    for n, receivers in [(n, RECEIVERS[0]) for n in ROWS] + [(ROWS[0], r) for r in RECEIVERS[1:]]:
-        data = widen(rssi_room(n=n), receivers)
-        began = time.perf_counter()
-        model = fit_rssi(data, RssiConfig())
-        fitted = time.perf_counter()
-        places = data.transmitter_position.repeat(-(-100_000 // n), 1)[:100_000]
-        predicting = time.perf_counter()
+def measure(n: int, receivers: int) -> dict[str, float]:
+    """Fits and predicts at one size, in this process."""
+    data = widen(rssi_room(n=n), receivers)
+    found: dict[str, float] = {"rows": n, "receivers": receivers}
+    with measuring(found, "fit "):
+        model = fit_rssi(data, RssiConfig(), progress=False)
+    places = data.transmitter_position.repeat(-(-PREDICTED // n), 1)[:PREDICTED]
+    with measuring(found, "predict "):
         model.predict(places)
-        row = {
-            "rows": n,
-            "receivers": receivers,
-            "fit_s": fitted - began,
-            "predict_100000_s": time.perf_counter() - predicting,
-            "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        }
-        rows.append(row)
-        print(row, flush=True)
-    write_result("scaling_rssi", {"threads": torch.get_num_threads(), "rows": rows})
+    return found
+
+
+def main(config: Config) -> None:
+    """Measures each point."""
+    kept = RESULTS / "scaling_rssi.json"
+    rows = json.loads(kept.read_text())["rows"] if kept.is_file() else []
+    for n, receivers in config.points:
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as fresh:
+            found = fresh.submit(measure, n, receivers).result()
+        print(found, flush=True)
+        rows = [row for row in rows if (row["rows"], row["receivers"]) != (n, receivers)] + [found]
+        rows.sort(key=lambda row: (row["receivers"], row["rows"]))
+        write_result("scaling_rssi", {"threads": torch.get_num_threads(), "predicted": PREDICTED, "rows": rows})
 
 
 if __name__ == "__main__":
-    main()
+    main(tyro.cli(Config))

@@ -31,6 +31,7 @@ from swiftwrf import (
 from swiftwrf.gp import Kernel
 from swiftwrf.metrics import psnr
 from swiftwrf.rasterize import Maker, rasterize_magnitude
+from swiftwrf.store import Store
 from swiftwrf.testing.hard_cases import HARD_CASES, field_errors, magnitude_errors
 from swiftwrf.testing.tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
 
@@ -145,7 +146,7 @@ def room(n: int = 40) -> Spectra:
 def with_spectrum(change: Callable[[Tensor], Tensor]) -> Spectra:
     """The room with other spectra."""
     spectra = room()
-    return replace(spectra, spectrum=change(spectra.spectrum.clone()))
+    return replace(spectra, store=Store(change(spectra.spectrum.clone())))
 
 
 def with_position(change: Callable[[Tensor], Tensor]) -> Spectra:

@@ -256,7 +256,50 @@ def raytracing() -> str:
     return markdown(["scene, moving end", "paths a position", *scores, "planes certain"], rows)
 
 
+def scaling() -> str:
+    """Seconds of a processor of each stage at each size, peak memory, and the growth to the largest size."""
+    content = load("scaling")
+    sizes = [row["n"] for row in content["rows"]]
+    rows = []
+    for label, growth in content["slopes"].items():
+        stage, part = label.split(", ")
+        cells = [f"{row['stages'][stage][part]:.1f} s" for row in content["rows"]]
+        peaks = [f"{row['stages'][stage]['rss_gib']:.1f}" for row in content["rows"]]
+        anonymous = content["rows"][-1]["stages"][stage]["anonymous_gib"]
+        name = f"{stage}, {part.removesuffix(' seconds')}" if " " in part else stage
+        rows.append([name, *cells, f"{list(growth.values())[-1]:.2f}", " / ".join(peaks), f"{anonymous:.1f}"])
+    columns = ["stage", *(f"{n:,}" for n in sizes), f"exponent to {sizes[-1]:,}", "peak of each size [GiB]"]
+    return markdown([*columns, "not from files [GiB]"], rows)
+
+
+def scaling_rssi() -> str:
+    """Seconds of a processor of the RSSI model, and its peak memory."""
+    content = load("scaling_rssi")
+    rows = [
+        [
+            f"{row['rows']:,.0f}",
+            f"{row['receivers']:.0f}",
+            f"{row['fit seconds']:.1f} s",
+            f"{row['predict seconds']:.2f} s",
+            f"{row['rss_gib']:.1f}",
+        ]
+        for row in content["rows"]
+    ]
+    return markdown(["rows", "receivers", "fit", f"{content['predicted']:,} positions", "peak [GiB]"], rows)
+
+
+def scaling_quality() -> str:
+    """Median PSNR between the positions of the walk."""
+    content = load("scaling")
+    names = [stage for stage, values in content["rows"][0]["stages"].items() if "psnr_db" in values]
+    rows = [[f"{row['n']:,}", *(f"{row['stages'][name]['psnr_db']:.1f}" for name in names)] for row in content["rows"]]
+    return markdown(["spectra", *names], rows)
+
+
 TABLES = {
+    "scaling": scaling,
+    "scaling_quality": scaling_quality,
+    "scaling_rssi": scaling_rssi,
     "headline": headline,
     "synthesis": synthesis,
     "aoa": aoa,
@@ -283,6 +326,7 @@ FILES = (
     "docs/choosing.md",
     "docs/tutorial.md",
     "docs/speed.md",
+    "docs/memory.md",
     "docs/stability.md",
     "docs/ablation.md",
     "docs/comparison.md",

@@ -9,8 +9,9 @@ l, -l, a cosine and a sine. Gaussians need neither the array's geometry nor its 
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -22,15 +23,17 @@ from torch import Tensor
 from swiftwrf.angles import AngularGrid
 from swiftwrf.arrays import PlanarArray, basis, differences
 from swiftwrf.checkpoint import Header, Saved, expect, refusing, restore
+from swiftwrf.components import Components, principal_components
 from swiftwrf.data.spectra import Spectra, check_training, fingerprint
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
-from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel
+from swiftwrf.gp import EXACT, GaussianProcess, Kernel, choose_kernel, inducing
 from swiftwrf.positions import check_batch, check_drawn, check_positions
 from swiftwrf.progress import progress_bar
 from swiftwrf.threads import single_thread
 
 COMPONENTS = 64  # principal components of the training magnitudes that the model keeps at most
+LEAST = 1e-6  # share of the variance below which a component is left out
 DTYPES = {torch.float64: ("anchor", "readout"), torch.float32: ("offset", "form")}
 
 
@@ -91,7 +94,7 @@ class CoarrayModel(Saved):
         array: the antenna array.
         grid: what `synthesize` draws unless told otherwise.
         kernel: of the process, lengths in [m].
-        anchor: the training positions, float64 (n, 3) [m].
+        anchor: the training positions, or 2000 of them that carry what more tell, float64 (n, 3) [m].
         readout: kernel weights to K component scores and the offset, float64 (n, K + 1).
         offset: the mean of what stretching took from a spectrum, (1,).
         form: scores, with a 1 in front, to coefficients by a quadratic form, (1 + 2 P, K + 1, K + 1).
@@ -122,7 +125,7 @@ class CoarrayModel(Saved):
         """Of the squared spectrum, (n, 1 + 2 P), and the offset to take off its root, (n, 1); drawn from the posterior at
         each position where there is a generator."""
         predicted = (self.kernel(position, self.anchor) @ self.readout).float()
-        if generator is not None:  # a score's variance over the training spectra is 1 / n
+        if generator is not None:  # a score's variance is 1 over the number of anchors
             unknown = (self.process.variance(position) / len(self.anchor)).sqrt().float()
             noise = torch.randn(len(position), predicted.shape[1] - 1, generator=generator)
             predicted[:, :-1] += unknown[:, None] * noise
@@ -240,21 +243,39 @@ def fit_coarray(
 
 @single_thread()
 def _solve(train: Spectra, array: PlanarArray, fold: Tensor) -> CoarrayModel:
-    functions, flat = basis(array, train.grid, torch.float32), train.spectrum.flatten(1)
+    functions = basis(array, train.grid, torch.float32)
     inverse = _inverse(array, train.grid).float()
-    offset = _offset(flat, functions, inverse)
-    flat = flat + offset
-    mean = flat.mean(dim=0)
-    # principal components from the inner products, of which there are far fewer than pixels
-    value, vector = torch.linalg.eigh(((flat - mean) @ (flat - mean).T).double())
-    vector = vector[:, value > 1e-6 * value.sum()][:, -COMPONENTS:]
-    component = torch.cat([mean[None], vector.T.float() @ (flat - mean)])
-    form = _quadratic_form(component, inverse)
+    parts = list(train.store.parts())
+    offset = torch.cat([_offset(train.store[rows].flatten(1), functions, inverse) for rows in parts])
 
-    kernel = choose_kernel(train.position, train.spectrum, fold)
+    def batches() -> Iterator[Tensor]:
+        return (train.store[rows].flatten(1) + offset[rows] for rows in parts)
+
+    few = len(train) <= EXACT
+    if few:
+        mean, vector, component = _components(torch.cat(list(batches())))
+    else:
+        mean, vector, component = principal_components(batches, COMPONENTS, LEAST)
+        scale = math.sqrt(len(train) / EXACT)  # a score's variance is 1 over the number of anchors, see `coefficients`
+        vector, component = scale * vector, component / scale
+    form = _quadratic_form(torch.cat([mean[None], component]), inverse)
+
+    kernel = choose_kernel(train.position, train.store, fold)
     target = torch.cat([vector, (offset - offset.mean()).double()], dim=1)
-    readout = torch.linalg.solve(kernel.noisy_gram(train.position), target)
-    return CoarrayModel(array, train.grid, kernel, train.position, readout, offset.mean()[None], form)
+    if few:
+        anchor, readout = train.position, torch.linalg.solve(kernel.noisy_gram(train.position), target)
+    else:
+        anchor, _, normal, right = inducing(train.position, kernel, target, EXACT)
+        readout = torch.linalg.solve(normal, right)
+    return CoarrayModel(array, train.grid, kernel, anchor, readout, offset.mean()[None], form)
+
+
+def _components(flat: Tensor) -> Components:
+    """Principal components from the rows' inner products, of which there are far fewer than pixels."""
+    mean = flat.mean(dim=0)
+    value, vector = torch.linalg.eigh(((flat - mean) @ (flat - mean).T).double())
+    vector = vector[:, value > LEAST * value.sum()][:, -COMPONENTS:]
+    return Components(mean, vector, vector.T.float() @ (flat - mean))
 
 
 def _quadratic_form(component: Tensor, inverse: Tensor) -> Tensor:

@@ -13,6 +13,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
+def cache_folder() -> Path:
+    """Where files lie that can be made anew: `$XDG_CACHE_HOME/swiftwrf`, or `~/.cache/swiftwrf`."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "swiftwrf"
+
+
 def sync(path: Path) -> None:
     """Brings a file, or the names in a directory, to the disk."""
     with suppress(PermissionError):  # a directory that may be written but not read, and directories on Windows

@@ -17,13 +17,16 @@ import torch
 from torch import Tensor, nn
 
 from swiftwrf.errors import InputError
-from swiftwrf.positions import distance
+from swiftwrf.positions import distance, nearest
+from swiftwrf.store import Store
 from swiftwrf.threads import single_thread
 
 NOISES = (1e-3, 1e-2, 1e-1)  # of spectra: little of a measured one is not a function of position
 NEGLIGIBLE = 5e-4  # share of the error at held-out positions that components may add which are left out
 JITTER = 1e-6  # relative variance that keeps neighbouring anchors apart
 ROWS = 4096  # positions regressed at a time
+EXACT = 2000  # positions up to which a process is exact; beyond, time and memory would grow with their cube and square
+NEAR = 64  # positions that tell of one among many: farther ones hardly change the mean
 MAX_ROWS = 400  # more do not change the choice, and a candidate costs their number cubed
 
 
@@ -99,6 +102,30 @@ class GaussianProcess:
         return variance.clamp(0, 1)
 
 
+class NearbyProcess:
+    """The same for any number of known positions: each position is told of by the nearest of them alone (local Gaussian
+    processes: R. B. Gramacy and D. W. Apley, Journal of Computational and Graphical Statistics 24, 2015).
+
+    Args:
+        kernel: with its noise.
+        known: positions (n, 3) of the values.
+    """
+
+    def __init__(self, kernel: Kernel, known: Tensor) -> None:
+        self.kernel, self.known = kernel, known.double()
+
+    def weights(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """At positions (m, 3): numbers of the known values that make up the mean, (m, k), by which weights, float64 (m, k),
+        and the variance of the field (without noise), relative to k(0) = 1, float64 (m,)."""
+        position = position.double()
+        _, number = nearest(position, self.known, min(NEAR, len(self.known)))
+        near = self.known[number]
+        noisy = self.kernel(near, near) + self.kernel.noise * torch.eye(number.shape[1], dtype=torch.float64)
+        cross = self.kernel(position[:, None], near)[:, 0]
+        weight = torch.linalg.solve(noisy, cross)
+        return number, weight, (1 - (weight * cross).sum(dim=1)).clamp(0, 1)
+
+
 class SmoothField(nn.Module):
     """K smooth random functions of position, c(s) = k(s, Z) R^-T z with anchors Z and k(Z, Z) + noise = R R^T.
 
@@ -139,13 +166,7 @@ class SmoothField(nn.Module):
                 torch.linalg.cholesky(kernel.noisy_gram(position)), value, upper=False
             ).to(position)
             return field
-        (anchor,) = thinned(position, rows=anchors)
-        among = kernel(anchor.double(), anchor.double()) + JITTER * torch.eye(anchors, dtype=torch.float64)
-        normal, right = kernel.noise * among, torch.zeros(anchors, value.shape[1], dtype=torch.float64)
-        for rows in torch.arange(len(position)).split(ROWS):
-            cross = kernel(anchor.double(), position[rows].double())
-            normal += cross @ cross.T
-            right += cross @ value[rows]
+        anchor, among, normal, right = inducing(position, kernel, value, anchors)
         # what the posterior covariance takes off the prior one is k W W^T k
         certain, direction = torch.linalg.eigh(torch.linalg.inv(among) - kernel.noise * torch.linalg.inv(normal))
         root = certain.clamp_min(1e-12 * float(certain.max())).sqrt()
@@ -167,8 +188,30 @@ class SmoothField(nn.Module):
         return self.coefficient.square().sum()
 
 
+def inducing(position: Tensor, kernel: Kernel, value: Tensor, anchors: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Normal equations of the subset of regressors: the mean at s is k(s, Z) normal^-1 right.
+
+    Args:
+        position: of all values, (n, 3).
+        kernel: with its noise.
+        value: (n, K).
+        anchors: M of the positions, evenly chosen, that carry what all tell.
+
+    Returns:
+        Z (M, 3), k(Z, Z) (M, M), the normal matrix (M, M) and the right-hand side (M, K), float64 but Z.
+    """
+    (anchor,) = thinned(position, rows=anchors)
+    among = kernel(anchor.double(), anchor.double()) + JITTER * torch.eye(anchors, dtype=torch.float64)
+    normal, right = kernel.noise * among, torch.zeros(anchors, value.shape[1], dtype=torch.float64)
+    for rows in torch.arange(len(position)).split(ROWS):
+        cross = kernel(anchor.double(), position[rows].double())
+        normal += cross @ cross.T
+        right += cross @ value[rows].double()
+    return anchor, among, normal, right
+
+
 @single_thread()
-def choose_kernel(position: Tensor, spectrum: Tensor, fold: Tensor) -> Kernel:
+def choose_kernel(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> Kernel:
     """The candidate with the highest mean logarithm of 1 / MSE over held-out spectra.
 
     Args:
@@ -191,7 +234,7 @@ def choose_kernel(position: Tensor, spectrum: Tensor, fold: Tensor) -> Kernel:
 
 
 @single_thread()
-def choose_rank(position: Tensor, spectrum: Tensor, fold: Tensor, kernel: Kernel) -> int:
+def choose_rank(position: Tensor, spectrum: Tensor | Store, fold: Tensor, kernel: Kernel) -> int:
     """How many principal components of the spectra it takes until the variance of the others no longer counts beside the
     error at positions that are held out.
 
@@ -263,10 +306,11 @@ def most_informative(kernel: Kernel, known: Tensor, candidate: Tensor, count: in
     return torch.tensor(chosen, dtype=torch.int64), torch.stack(left).clamp_min(0)
 
 
-def thinned(*tensors: Tensor, rows: int = MAX_ROWS) -> list[Tensor]:
+def thinned(*tensors: Tensor | Store, rows: int = MAX_ROWS) -> list[Tensor]:
     """At most so many rows of each, the same ones, evenly spread."""
     n = len(tensors[0])
-    return [t[torch.linspace(0, n - 1, rows).long()] if n > rows else t for t in tensors]
+    some = torch.linspace(0, n - 1, rows).long() if n > rows else slice(None)
+    return [t[some] for t in tensors]
 
 
 def _inner_products(spectrum: Tensor) -> Tensor:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from swiftwrf.errors import InputError
 
 FARTHEST = 1e15
+MANY = 2000  # known positions from which on a tree finds the nearest ones faster than all distances do
 
 
 def check_positions(position: Tensor) -> Tensor:
@@ -53,3 +55,17 @@ def distance(a: Tensor, b: Tensor) -> Tensor:
     would give weights of inf / inf.
     """
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist").clamp(max=FARTHEST)
+
+
+def nearest(position: Tensor, known: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Distances from positions (n, 3) to the k nearest of known ones (m, 3), ascending, and the numbers of those, (n, k).
+
+    Time grows with n log m where there are many (k-d tree: J. L. Bentley, Communications of the ACM 18, 1975).
+    """
+    position, known = position.double(), known.double()
+    if len(known) > MANY:
+        apart, number = cKDTree(known.numpy()).query(position.numpy(), k=range(1, k + 1))
+        return torch.from_numpy(apart), torch.from_numpy(number).long()
+    if k == 1:  # the first of several at one place
+        return distance(position, known).min(dim=1, keepdim=True)
+    return distance(position, known).topk(k, largest=False)

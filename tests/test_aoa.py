@@ -15,6 +15,7 @@ from augment import SYNTHESIZERS, Mixed, choose, lacks
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, load, simulated_room
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
+from swiftwrf.store import Store
 from tasks.aoa import arms, experiment, steps
 from tasks.aoa.config import AoaConfig
 from tasks.aoa.estimators import ESTIMATORS, Settings, aann
@@ -56,7 +57,10 @@ def test_peak_of_a_known_spectrum():
 
 def test_constant_is_the_mean_direction_over_the_seam():
     train = Mixed(
-        torch.zeros(2, 1, 1), torch.tensor([[350.0, 10], [10, 10]]).deg2rad(), torch.arange(2), torch.zeros(2).bool()
+        (Store(torch.zeros(2, 1, 1)),),
+        torch.tensor([[350.0, 10], [10, 10]]).deg2rad(),
+        torch.arange(2),
+        torch.zeros(2).bool(),
     )
     constant = Constant(Settings(AngularGrid.hemisphere(10, 40)))
     constant.fit(train)
@@ -77,7 +81,7 @@ def test_aann_learns_a_toy(circular):
     spectrum = torch.zeros(16, 16, 64)
     for i in range(16):
         spectrum[i, 4:10, 16 * (i % 4) : 16 * (i % 4) + 8] = 1
-    train = Mixed(spectrum, label, torch.arange(16), torch.zeros(16).bool())
+    train = Mixed((Store(spectrum),), label, torch.arange(16), torch.zeros(16).bool())
     settings = Settings(AngularGrid.hemisphere(16, 64))
     network = AANN(settings, AANNConfig(steps=60, batch=8, rate=1e-3, max_azimuths=0, circular=circular))
     network.fit(train)

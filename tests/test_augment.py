@@ -25,6 +25,7 @@ from augment.synthesizers.idw import weights
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, simulated_room
 from swiftwrf.metrics import psnr
 from swiftwrf.registry import Entry
+from swiftwrf.store import Store
 
 ROOM = simulated_room(n=60, seed=3, grid=AngularGrid.hemisphere(15, 60))
 TRAIN, TEST = ROOM.split("random", 0)
@@ -101,8 +102,10 @@ def test_look_ups_return_measured_spectra_at_measured_positions(name):
 
 
 def test_idw_of_two_neighbours_is_their_weighted_mean():
-    weight = weights(torch.tensor([[1.0, 0, 0]]), torch.tensor([[0.0, 0, 0], [3, 0, 0], [9, 0, 0]]).double(), 2)
-    assert weight[0].tolist() == pytest.approx([2 / 3, 1 / 3, 0])
+    known = torch.tensor([[0.0, 0, 0], [9, 0, 0], [3, 0, 0]]).double()
+    number, weight = weights(torch.tensor([[1.0, 0, 0]]), known, 2)
+    assert number[0].tolist() == [0, 2]
+    assert weight[0].tolist() == pytest.approx([2 / 3, 1 / 3])
 
 
 def test_unknown_synthesizer():
@@ -196,5 +199,5 @@ def test_choice_advice_and_further_places_see_the_measured_share_alone(share, se
         assert kept | out == own
         assert torch.equal(train.spectrum, ROOM.spectrum[train.index])
     assert not own & (set(withheld.index.tolist()) | set(TEST.index.tolist()))
-    blank = replace(measured, spectrum=torch.full_like(measured.spectrum, torch.nan))
+    blank = replace(measured, store=Store(torch.full_like(measured.spectrum, torch.nan)))
     assert torch.equal(draw_places(blank, 9, 0).position, draw_places(measured, 9, 0).position)

@@ -38,6 +38,7 @@ from swiftwrf.comparison.vae import Normal
 from swiftwrf.comparison.volume import FIRST_PHASE, PATH_GAIN, Medium, integrate
 from swiftwrf.metrics import psnr
 from swiftwrf.model.encoding import encode
+from swiftwrf.store import Store
 
 GRID = AngularGrid.hemisphere(90, 360)
 LEARNS = {
@@ -56,7 +57,7 @@ def blob(n=40) -> Spectra:
     position = torch.stack([3 + along, torch.full_like(along, 2.5), torch.ones_like(along)], dim=1)
     mean = torch.stack([math.pi + 2 * along, torch.full_like(along, 0.7)], dim=1)[:, None].float()
     cholesky, weight = torch.tensor([[0.5, 0.0, 0.4]]), torch.tensor([[[0.9, 0.0]]]).repeat(n, 1, 1)
-    return replace(room, position=position, spectrum=rasterize_magnitude(mean, cholesky, weight, grid, cutoff=None))
+    return replace(room, position=position, store=Store(rasterize_magnitude(mean, cholesky, weight, grid, cutoff=None)))
 
 
 def count(model):
@@ -334,7 +335,7 @@ def test_what_is_not_finite_stops_the_fit(room, monkeypatch, name):
     broken = room.spectrum.clone()
     broken[7, 3, 3] = float("nan")
     with pytest.raises(InputError, match="training spectrum 7"):
-        fit(replace(room, spectrum=broken), PUBLISHED[name], progress=False)
+        fit(replace(room, store=Store(broken)), PUBLISHED[name], progress=False)
     monkeypatch.setattr(Training, "rate", lambda self, step: 1e30)
     with pytest.raises(FitError, match="rate below"):
         fit(room, PUBLISHED[name], progress=False)

@@ -14,6 +14,7 @@ from swiftwrf.fitting.search import doubling_search
 from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel
 from swiftwrf.metrics import psnr
 from swiftwrf.rasterize import reference
+from swiftwrf.store import Store
 
 QUICK = FitConfig(model=ModelConfig(n_primitives=24), steps=80, check_every=20)  # by gradient
 
@@ -93,7 +94,7 @@ def scene_of(position, spectrum, grid):
     return Spectra(
         name="exact",
         position=position,
-        spectrum=spectrum,
+        store=Store(spectrum),
         grid=grid,
         label=torch.zeros(len(position), 2, dtype=torch.float64),
         line_of_sight=torch.ones(len(position), dtype=torch.bool),
@@ -251,7 +252,7 @@ def test_refuses_too_few_spectra_and_what_is_not_finite(room):
     broken = room.spectrum.clone()
     broken[7, 3, 3] = float("nan")
     with pytest.raises(InputError, match="training spectrum 7"):
-        fit(replace(room, spectrum=broken), QUICK, progress=False)
+        fit(replace(room, store=Store(broken)), QUICK, progress=False)
 
 
 def test_folds_partition_and_repeat(room):

@@ -15,6 +15,7 @@ from swiftwrf.geometry.images import Scene, field, mirror, sequences
 from swiftwrf.geometry.observe import autocorrelation, correlations, element_phases
 from swiftwrf.geometry.refine import derivatives
 from swiftwrf.metrics import psnr
+from swiftwrf.store import Store
 
 GRID = AngularGrid.hemisphere(10, 40)
 ARRAY = PlanarArray.square(4, 915e6)
@@ -47,7 +48,7 @@ def spectra(
     return Spectra(
         name="closed form",
         position=position,
-        spectrum=array.spectrum(channel * torch.polar(torch.ones_like(turn), turn), GRID),
+        store=Store(array.spectrum(channel * torch.polar(torch.ones_like(turn), turn), GRID)),
         grid=GRID,
         label=torch.zeros(n, 2, dtype=torch.float64),
         line_of_sight=torch.ones(n, dtype=torch.bool),
@@ -87,7 +88,7 @@ def test_phases_of_the_elements_follow_from_the_spectra():
     generator = torch.Generator().manual_seed(0)
     angle = 3 * torch.randn(30, 16, dtype=torch.float64, generator=generator)
     channel = torch.polar(torch.ones_like(angle), angle)
-    data = replace(spectra({}, n=30), spectrum=ARRAY.spectrum(channel, GRID))
+    data = replace(spectra({}, n=30), store=Store(ARRAY.spectrum(channel, GRID)))
     torch.testing.assert_close(correlations(data), autocorrelation(channel, ARRAY), atol=1e-5, rtol=0)
     found, error = element_phases(correlations(data), ARRAY)
     match = torch.stack([(channel.conj() * f).mean(1).abs() for f in (found, found.conj().flip(1))]).amax(0)
@@ -174,7 +175,7 @@ def test_pure_noise_has_no_certain_plane():
     generator = torch.Generator().manual_seed(0)
     data = spectra({}, n=30)
     channel = torch.randn(30, 16, dtype=torch.complex128, generator=generator)
-    model = fit(replace(data, spectrum=ARRAY.spectrum(channel, GRID)), further=0, width=1)
+    model = fit(replace(data, store=Store(ARRAY.spectrum(channel, GRID))), further=0, width=1)
     assert not any(p.certain for p in model.planes)
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 
 import numba
 import pytest
@@ -54,6 +57,17 @@ def test_torch_keeps_its_threads():
         assert torch.get_num_threads() == numba.config.NUMBA_NUM_THREADS + 1
     finally:
         torch.set_num_threads(before)
+
+
+def test_the_first_drawing_keeps_the_number_of_threads():
+    """Numba starts its threads once a process, and they are as many as the processor has."""
+    code = (
+        "import torch, swiftwrf; from swiftwrf.rssi.head import Head; "
+        "Head(1, 2, 0).requires_grad_(False).draw(); print(torch.get_num_threads())"
+    )
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True, check=True)
+    assert done.stdout == "1\n"
 
 
 def test_one_primitive_is_the_gaussian_of_the_formula():

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from swiftwrf import AngularGrid, InputError, load_rssi, load_snapshots, load_spectra, rssi_room
 from swiftwrf.data import Reading
+from swiftwrf.store import Store
 from tasks.inspect.findings import inspect
 
 GRID = AngularGrid.hemisphere(24, 96)
@@ -36,7 +37,7 @@ def moved(change):
 
 
 def drawn(change):
-    return replace(SPECTRA, spectrum=change(SPECTRA.spectrum))
+    return replace(SPECTRA, store=Store(change(SPECTRA.spectrum)))
 
 
 def placed(change, receivers=False):

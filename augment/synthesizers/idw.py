@@ -8,7 +8,8 @@ from torch import Tensor
 from augment.synthesizers.base import SYNTHESIZERS, Synthesizer
 from swiftwrf import Spectra
 from swiftwrf.data.splits import folds
-from swiftwrf.positions import distance
+from swiftwrf.gp import EXACT, thinned
+from swiftwrf.positions import nearest
 
 CANDIDATES = (1, 2, 3, 5, 8, 13, 20, 30)
 
@@ -19,27 +20,33 @@ class InverseDistance(Synthesizer):
 
     def fit(self, train: Spectra) -> None:
         self._train = train
-        fold = folds(train.position, self.settings.validation, self.settings.seed)
-        candidates = [k for k in CANDIDATES if k <= len(train) - int(fold.bincount().max())]
-        self.k = min(candidates, key=lambda k: self._held_out_loss(k, fold))
-
-    def _held_out_loss(self, k: int, fold: Tensor) -> float:
-        position, flat = self._train.position, self._train.spectrum.flatten(1)
-        loss = 0.0
-        for number in range(int(fold.max()) + 1):
-            out = fold == number
-            predicted = weights(position[out], position[~out], k) @ flat[~out]
-            loss += float((predicted - flat[out]).square().sum())
-        return loss
+        (rows,) = thinned(torch.arange(len(train)), rows=EXACT)
+        fold = folds(train.position, self.settings.validation, self.settings.seed)[rows]
+        candidates = [k for k in CANDIDATES if k <= len(rows) - int(fold.bincount().max())]
+        some = train.subset(rows)
+        position, flat = some.position, some.spectrum.flatten(1)
+        self.k = min(candidates, key=lambda k: _held_out_loss(k, position, flat, fold))
 
     def synthesize(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        weight = weights(position, self._train.position, self.k)
-        return (weight @ self._train.spectrum.flatten(1)).reshape(-1, *self._train.grid.shape)
+        number, weight = weights(position, self._train.position, self.k)
+        drawn = torch.empty(len(position), *self._train.grid.shape)
+        for i, (rows, share) in enumerate(zip(number, weight, strict=True)):
+            torch.tensordot(share, self._train.store[rows], dims=1, out=drawn[i])
+        return drawn
 
 
-def weights(position: Tensor, known: Tensor, k: int) -> Tensor:
-    """Weights (n, m) of the k nearest of m known positions; a known position itself gets all its own."""
-    apart, nearest = distance(position.double(), known).topk(k, largest=False)
+def _held_out_loss(k: int, position: Tensor, flat: Tensor, fold: Tensor) -> float:
+    loss = 0.0
+    for number in range(int(fold.max()) + 1):
+        out = fold == number
+        near, share = weights(position[out], position[~out], k)
+        weight = torch.zeros(int(out.sum()), int((~out).sum())).scatter_(1, near, share)
+        loss += float((weight @ flat[~out] - flat[out]).square().sum())
+    return loss
+
+
+def weights(position: Tensor, known: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Numbers of the k nearest of known positions, and their weights, (n, k); a known position itself gets all its own."""
+    apart, number = nearest(position, known, k)
     inverse = 1 / apart.clamp_min(1e-9)
-    weight = torch.zeros(len(position), len(known), dtype=torch.float64)
-    return weight.scatter_(1, nearest, inverse / inverse.sum(dim=1, keepdim=True)).float()
+    return number, (inverse / inverse.sum(dim=1, keepdim=True)).float()

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from augment.synthesizers.base import SYNTHESIZERS, Synthesizer
 from swiftwrf import Spectra
-from swiftwrf.positions import distance
+from swiftwrf.positions import nearest
 
 
 @SYNTHESIZERS.register("nearest", meaning="the spectrum of the nearest measured position", colour="#ccbb44")
@@ -18,4 +18,4 @@ class Nearest(Synthesizer):
         self._train = train
 
     def synthesize(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        return self._train.spectrum[distance(position.double(), self._train.position).argmin(dim=1)]
+        return self._train.store[nearest(position, self._train.position, 1)[1][:, 0]]

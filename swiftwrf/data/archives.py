@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from swiftwrf.errors import InputError
 
 MOST_BYTES, MOST_STORED = 2**30, 2**33  # unpacked, and as they lie in the file
+MOST_IN_ROWS = 2**36  # as they lie in a file that is read some rows at a time
 NUMPY, HDF5 = (".npz",), (".h5", ".hdf5")
 ARCHIVES = (*NUMPY, *HDF5)  # suffixes of files that hold arrays by name
 Arrays = dict[str, NDArray[Any]]
@@ -80,17 +81,51 @@ def read_arrays(file: Path, needed: Sequence[str], optional: Sequence[str] = ())
             return {name: _read_member(archive, member) for name, member in members.items()}
 
 
-def read_array(file: Path) -> NDArray[Any]:
-    """The array of numbers in an npy file.
+def array_header(file: Path, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and type of the array in an npy file, or of the array of that name in an npz archive.
 
     Raises:
-        InputError: no such file, one that is broken or holds something else than numbers, or more than 8 gigabytes.
+        InputError: as `read_rows`.
     """
+    with _opened(file, name) as (stream, size):
+        shape, _, dtype = _header(stream, name, size)
+        return shape, dtype
+
+
+def read_rows(file: Path, name: str, rows: int) -> Iterator[NDArray[Any]]:
+    """The same array, so many rows at a time.
+
+    Raises:
+        InputError: no such file, one that is broken or holds something else than numbers, or more than 64 gigabytes.
+    """
+    with _opened(file, name) as (stream, size):
+        shape, by_columns, dtype = _header(stream, name, size)
+        if by_columns:  # no row lies in one piece
+            _check_total(size, file)
+            yield np.frombuffer(stream.read(), dtype).reshape(shape, order="F")
+            return
+        row = math.prod(shape[1:]) * dtype.itemsize
+        for start in range(0, shape[0], rows):
+            count = min(rows, shape[0] - start)
+            yield np.frombuffer(stream.read(count * row), dtype).reshape(count, *shape[1:])
+
+
+@contextmanager
+def _opened(file: Path, name: str) -> Iterator[tuple[Any, int]]:
+    """A stream of an npy file or of a member of an npz archive, and its length."""
     if not file.is_file():
         raise InputError(f"{file} is missing")
-    with refusing_broken(file, "an npy file"), file.open("rb") as stream:
-        _check_total(file.stat().st_size, file)
-        return _read_stream(stream, file.name, file.stat().st_size)
+    if file.suffix not in NUMPY:
+        with refusing_broken(file, "an npy file"), file.open("rb") as stream:
+            _check_total(file.stat().st_size, file, MOST_IN_ROWS)
+            yield stream, file.stat().st_size
+        return
+    with refusing_broken(file, "an npz archive"), zipfile.ZipFile(file) as archive:
+        _choose(file, {member.removesuffix(".npy") for member in archive.namelist()}, [name], ())
+        member = archive.getinfo(f"{name}.npy")
+        _check_total(member.file_size, file, MOST_IN_ROWS)
+        with archive.open(member) as stream:
+            yield stream, member.file_size
 
 
 @contextmanager
@@ -111,9 +146,9 @@ def _choose(file: Path, stored: set[str], needed: Sequence[str], optional: Seque
     return [*needed, *(name for name in optional if name in stored)]
 
 
-def _check_total(total: int, file: Path) -> None:
+def _check_total(total: int, file: Path, most: int = MOST_STORED) -> None:
     """Refuses what unpacks to far more than the file has, and what fills any memory."""
-    most = max(MOST_BYTES, min(file.stat().st_size, MOST_STORED))
+    most = max(MOST_BYTES, min(file.stat().st_size, most))
     if total > most:
         raise InputError(f"it unpacks to {total} bytes; at most {most} are read, so split the data")
 
@@ -124,14 +159,20 @@ def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[A
 
 
 def _read_stream(stream: Any, name: str, size: int) -> NDArray[Any]:
-    """One array; what its header claims must be what lies behind it, before memory is taken for it."""
+    """One array."""
+    shape, by_columns, dtype = _header(stream, name, size)
+    return np.frombuffer(stream.read(), dtype).reshape(shape, order="F" if by_columns else "C")
+
+
+def _header(stream: Any, name: str, size: int) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, order and type of an array; what its header claims must lie behind it before memory is taken for it."""
     readers = {(1, 0): read_array_header_1_0, (2, 0): read_array_header_2_0}
     shape, by_columns, dtype = readers[read_magic(stream)](stream)
     if dtype.kind not in "biufc":
         raise ValueError(f"{name} holds {dtype}, expected numbers")
     if math.prod(shape) * dtype.itemsize != size - stream.tell():
         raise ValueError(f"{name} does not hold the {shape} numbers that it claims")
-    return np.frombuffer(stream.read(), dtype).reshape(shape, order="F" if by_columns else "C")
+    return shape, by_columns, dtype
 
 
 def _hdf5(file: Path) -> Any:

@@ -14,7 +14,7 @@ from swiftwrf.angles import to_angles
 from swiftwrf.arrays import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.files import sha256
 from swiftwrf.data.reading import Reading
-from swiftwrf.data.spectra import GRID, Moving, Spectra, check_pixels
+from swiftwrf.data.spectra import GRID, Moving, Spectra, array_spectra, check_pixels
 from swiftwrf.errors import InputError
 
 ARRAY_SIDE = 4
@@ -73,7 +73,7 @@ class Rays:
         return Spectra(
             name=folder.resolve().name,
             position=position,
-            spectrum=array.spectrum(array.channel(self.direction, self.gain, owner, n), grid),
+            store=array_spectra(array, array.channel(self.direction, self.gain, owner, n), grid),
             grid=grid,
             label=torch.stack(to_angles(self.transmitter - self.receiver), dim=-1),
             line_of_sight=self.line_of_sight,

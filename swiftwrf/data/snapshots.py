@@ -11,7 +11,7 @@ from torch import Tensor
 from swiftwrf.angles import AngularGrid, to_angles
 from swiftwrf.arrays import PlanarArray
 from swiftwrf.beamforming import PHASE
-from swiftwrf.data.spectra import GRID, Spectra, check_pixels
+from swiftwrf.data.spectra import GRID, Spectra, array_spectra, check_pixels
 from swiftwrf.data.splits import choose_split
 from swiftwrf.errors import InputError
 
@@ -94,7 +94,7 @@ class Snapshots:
         return Spectra(
             name=self.name,
             position=self.position,
-            spectrum=self.array.spectrum(self.channel, grid, beamformer),
+            store=array_spectra(self.array, self.channel, grid, beamformer),
             grid=grid,
             label=torch.stack(to_angles(self.direction), dim=-1),
             line_of_sight=self.line_of_sight,

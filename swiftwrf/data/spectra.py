@@ -11,17 +11,17 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from swiftwrf.angles import AngularGrid, to_angles
 from swiftwrf.arrays import PlanarArray
+from swiftwrf.beamforming import PHASE
 from swiftwrf.data.splits import MIN_TRAINING, choose_split
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
+from swiftwrf.store import AT_ONCE, MOST_PIXELS, Store, stored, too_many
 
 Moving = Literal["transmitter", "receiver"]
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
-MOST_PIXELS = 2**29  # of all spectra of a data set: 2 GiB
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class Spectra:
     Args:
         name: of the data set.
         position: of the moving end, float64 (n, 3) [m].
-        spectrum: magnitudes in [0, 1], float32 (n, n_elevation, n_azimuth).
+        store: the spectra as they were measured, (n, n_elevation, n_azimuth); by the batch or all at once float32.
         grid: the directions of a spectrum's pixels.
         label: azimuth and elevation of the line of sight in array coordinates, float64 (n, 2) [rad].
         line_of_sight: whether the direct path is free, bool (n,); where it is unknown it is taken to be.
@@ -48,7 +48,7 @@ class Spectra:
 
     name: str
     position: Tensor
-    spectrum: Tensor
+    store: Store
     grid: AngularGrid
     label: Tensor
     line_of_sight: Tensor
@@ -64,12 +64,30 @@ class Spectra:
     def __len__(self) -> int:
         return len(self.position)
 
+    @property
+    def spectrum(self) -> Tensor:
+        """All magnitudes, float32 (n, n_elevation, n_azimuth) in [0, 1].
+
+        Raises:
+            InputError: more than fit into memory.
+        """
+        if math.prod(self.store.shape) > MOST_PIXELS:
+            raise InputError(
+                f"{self.name} has {len(self)} spectra, which do not fit into memory at once; take some (subset) or read "
+                "them by the batch (store)"
+            )
+        return self.store[:]
+
+    def in_memory(self) -> Spectra:
+        """The same with their spectra as float32, for those who look at them again and again."""
+        return replace(self, store=Store(self.spectrum))
+
     def subset(self, rows: Tensor) -> Spectra:
         """The given rows, in the given order; splits named for the whole set are dropped."""
         return replace(
             self,
             position=self.position[rows],
-            spectrum=self.spectrum[rows],
+            store=self.store.subset(rows),
             label=self.label[rows],
             line_of_sight=self.line_of_sight[rows],
             index=self.index[rows],
@@ -108,12 +126,28 @@ class Spectra:
             return self
         if any(size % factor for size in self.grid.shape):
             raise InputError(f"spectra of {self.grid.shape} pixels cannot be averaged over {factor} x {factor} of them")
-        small = functional.avg_pool2d(self.spectrum[:, None], factor)[:, 0]
-        return replace(self, spectrum=small, grid=self.grid.coarsen(factor))
+        return replace(self, store=self.store.coarsen(factor), grid=self.grid.coarsen(factor))
 
     def at_most(self, azimuths: int) -> Spectra:
         """The same spectra averaged down to at most so many columns, with rows enough for SSIM; 0 keeps all pixels."""
         return self.coarsen(coarsening(self.grid.shape, azimuths, least_rows=WINDOW))
+
+
+def array_spectra(array: PlanarArray, channel: Tensor, grid: AngularGrid, beamformer: str = PHASE) -> Store:
+    """What an array reports of channels, as `PlanarArray.spectrum`, whatever their number.
+
+    Raises:
+        InputError: as there; a cache directory without room.
+    """
+
+    def key() -> str:
+        digest = hashlib.sha256(repr((beamformer, array.wavelength, array.element.tolist(), grid)).encode())
+        digest.update(channel.contiguous().numpy().data)
+        return digest.hexdigest()
+
+    shape = (len(channel), *grid.shape)
+    rows = torch.arange(len(channel)).split(max(1, AT_ONCE // math.prod(grid.shape)))
+    return stored(shape, torch.float32, key, lambda: (array.spectrum(channel[r], grid, beamformer) for r in rows))
 
 
 def direction_of_link(position: Tensor, fixed_position: Tensor, rotation: Tensor, moving: Moving) -> Tensor:
@@ -125,15 +159,15 @@ def direction_of_link(position: Tensor, fixed_position: Tensor, rotation: Tensor
 
 
 def check_pixels(name: str, n: int, grid: AngularGrid) -> None:
-    """Refuses more spectra than fit into memory.
+    """Refuses more spectra than anybody measures.
 
     Raises:
         InputError: so many.
     """
-    if n * math.prod(grid.shape) > MOST_PIXELS:
+    if too_many((n, *grid.shape)):
         raise InputError(
-            f"{name} has {n} positions, whose spectra would have more than {MOST_PIXELS:.3g} pixels; take one measurement "
-            "of several (every) or a coarser grid"
+            f"{name} has {n} positions, whose spectra would have {n * math.prod(grid.shape):.3g} pixels; take "
+            "one measurement of several (every) or a coarser grid"
         )
 
 
@@ -153,15 +187,22 @@ def check_training(train: Spectra) -> None:
     """
     if len(train) < MIN_TRAINING:
         raise InputError(f"a fit needs at least {MIN_TRAINING} spectra, got {len(train)}")
-    for name, tensor in (("position", train.position), ("spectrum", train.spectrum)):
-        bad = (~tensor.isfinite()).flatten(1).any(dim=1).nonzero()
-        if len(bad):
-            raise InputError(f"{name} of training spectrum {int(bad[0])} is not finite; mend or leave it out")
+    bad = [("position", int(row)) for row in _not_finite(train.position)[:1]]
+    if train.store.values.is_floating_point():
+        for rows in train.store.parts():
+            bad += [("spectrum", rows.start + int(row)) for row in _not_finite(train.store[rows])[:1]]
+    if bad:
+        name, row = bad[0]
+        raise InputError(f"{name} of training spectrum {row} is not finite; mend or leave it out")
+
+
+def _not_finite(values: Tensor) -> Tensor:
+    """Rows of values (n, ...) that hold something not finite."""
+    return (~values.isfinite()).flatten(1).any(dim=1).nonzero()[:, 0]
 
 
 def fingerprint(train: Spectra, *settings: Any) -> str:
     """Tells whether something kept on disk belongs to these spectra and settings (plain values)."""
-    digest = hashlib.sha256(json.dumps(settings).encode())
-    for tensor in (train.position, train.spectrum):
-        digest.update(tensor.numpy().tobytes())
+    digest = hashlib.sha256(json.dumps([*settings, train.store.digest()]).encode())
+    digest.update(train.position.numpy().tobytes())
     return digest.hexdigest()

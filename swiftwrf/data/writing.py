@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,9 @@ from swiftwrf.data.formats.nerf2_rssi import NOT_HEARD
 from swiftwrf.data.raytraced import TracedPaths
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Moving, Spectra
-from swiftwrf.durable import write_bytes, write_text
+from swiftwrf.durable import replacing, write_bytes, write_text
 from swiftwrf.errors import InputError
+from swiftwrf.store import write_npy
 
 
 def write_spectra(data: Spectra, folder: Path) -> None:
@@ -45,9 +47,12 @@ def write_spectra(data: Spectra, folder: Path) -> None:
         gateway |= {"frequency_hz": data.array.frequency_hz, "element_position": data.array.element.tolist()}
     write_text(folder / "gateway_info.yml", yaml.safe_dump({"gateway1": gateway}, sort_keys=False))
     write_text(folder / f"{'tx' if data.moving == 'transmitter' else 'rx'}_pos.csv", _csv("x,y,z", data.position))
-    stream = io.BytesIO()
-    np.savez(stream, spectrum=data.spectrum.numpy(), line_of_sight=data.line_of_sight.numpy())
-    write_bytes(folder / "spectrum.npz", stream.getvalue())
+    with replacing(folder / "spectrum.npz") as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        with archive.open("spectrum.npy", "w", force_zip64=True) as stream:
+            dtype, batches = data.store.exact()
+            write_npy(stream, data.store.shape, dtype, batches)
+        with archive.open("line_of_sight.npy", "w") as stream:
+            np.save(stream, data.line_of_sight.numpy())
     _write_splits(data.named_splits, folder, first=1)
 
 

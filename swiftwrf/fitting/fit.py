@@ -68,7 +68,7 @@ def fit(
     processes = Processes(group)
     fold = folds(train.position, config.validation, config.seed)
     work = train.at_most(config.max_azimuths)
-    kernel = processes.from_first(partial(choose_kernel, work.position, work.spectrum, fold))
+    kernel = processes.from_first(partial(choose_kernel, work.position, work.store, fold))
     if config.validation == "random":
         fold = torch.arange(len(train))  # regression leaves out one spectrum as easily as a fifth of them
     if config.model.rank == "auto":
@@ -88,7 +88,7 @@ def fit(
 
 def _rank(train: Spectra, config: FitConfig, fold: Tensor, kernel: Kernel) -> int:
     deformation = deformation_type(config.model.deformation)
-    return deformation.choose_rank(train.position, train.spectrum, fold, kernel)
+    return deformation.choose_rank(train.position, train.store, fold, kernel)
 
 
 def _regress(regression: Regression, config: FitConfig, session: Session) -> SwiftWRF:

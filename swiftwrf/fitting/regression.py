@@ -57,8 +57,8 @@ class Regression:
         self.config, self.kernel = config, kernel
         (rows,) = thinned(torch.arange(len(train)), rows=MAX_ROWS)
         self.train, self.fold = train, fold[rows]
-        self.some = train.subset(rows)
-        self.small = self.some.at_most(SHAPE_AZIMUTHS)
+        self.some = train.subset(rows).in_memory()
+        self.small = self.some.at_most(SHAPE_AZIMUTHS).in_memory()
         self.primitives: dict[int, Primitives] = {}
 
     @single_thread()
@@ -81,7 +81,8 @@ class Regression:
         deformation: Deformation = Static()
         if len(component):
             flat = component.flatten(1)
-            score = (train.spectrum - mean).flatten(1) @ flat.T / flat.square().sum(dim=1)
+            scores = [(part - mean).flatten(1) @ flat.T for part in train.store.batches()]
+            score = torch.cat(scores) / flat.square().sum(dim=1)
             position = normalise(train.position, centre, scale)
             field = SmoothField.regress(position, self.kernel.scaled(1 / float(scale)), score, MAX_ANCHORS)
             basis = torch.zeros(len(component), n, sum(COMPONENTS[c] for c in config.components))

@@ -17,6 +17,7 @@ from swiftwrf.geometry.orient import GAIN, candidates
 from swiftwrf.geometry.planes import Planes, advantage, clearly, correlation_score, flipped
 from swiftwrf.geometry.search import BETTER, PERFECT, STARTS, Search, find_room
 from swiftwrf.geometry.verdict import judged
+from swiftwrf.gp import thinned
 from swiftwrf.progress import progress_bar
 from swiftwrf.threads import single_thread
 
@@ -24,6 +25,7 @@ SOLVED = 0.1  # relative error of a spectrum's autocorrelation up to which its p
 NEEDED = 2.5  # standard errors by which held-out spectra must be better for a plane or an order
 FURTHER = 4.0  # the same for a plane of any orientation, of which far more are tried
 TRIED = 8  # candidates of any orientation that are refined
+MOST = 2000  # spectra that are looked at: a room is a few dozen numbers
 MANY = 300  # positions from which one held-out part decides, not all in turn
 
 
@@ -55,7 +57,7 @@ def fit_geometry(
     seed: int = 0,
     progress: bool = True,
 ) -> GeometryModel:
-    """Finds the planes that mirror the known fixed end.
+    """Finds the planes that mirror the known fixed end, from at most 2000 of the spectra, evenly chosen.
 
     Args:
         train: the only spectra it sees, with array, rotation and fixed end.
@@ -68,7 +70,7 @@ def fit_geometry(
         InputError: no array, rotation or fixed end; fewer than 10 spectra, or something not finite; spectra that the
             array cannot have produced; all positions at one place.
     """
-    config = config or GeometryConfig()
+    config, train = config or GeometryConfig(), _evenly(train)
     scene, fold = _observe(train, validation, seed)
     assert train.array is not None
     kept, held = scene.subset((fold != 0).nonzero()[:, 0]), scene.subset((fold == 0).nonzero()[:, 0])
@@ -99,12 +101,17 @@ def refit_geometry(model: GeometryModel, train: Spectra, *, seed: int = 0) -> Ge
     Raises:
         InputError: as `fit_geometry`.
     """
-    scene, _ = _observe(train, "random", seed)
+    scene, _ = _observe(_evenly(train), "random", seed)
     normal, offset, gain = model.tensors()
     room = Planes(normal, offset, gain, model.order).refined(scene)
     found = zip(model.planes, room.normal[0].tolist(), room.offset[0].tolist(), room.gain[0].tolist(), strict=True)
     planes = [replace(plane, normal=tuple(n), offset_m=o, gain=g) for plane, n, o, g in found]
     return replace(model, planes=planes)
+
+
+def _evenly(train: Spectra) -> Spectra:
+    """At most 2000 of the spectra, evenly chosen."""
+    return train.subset(thinned(torch.arange(len(train)), rows=MOST)[0]) if len(train) > MOST else train
 
 
 def _some(scene: Scene, most: int, seed: int) -> Scene:

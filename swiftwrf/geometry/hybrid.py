@@ -17,6 +17,7 @@ from torch import Tensor
 from swiftwrf.checkpoint import Header, Saved
 from swiftwrf.data.spectra import Spectra, check_training
 from swiftwrf.data.splits import Validation, folds
+from swiftwrf.errors import InputError
 from swiftwrf.geometry.model import GeometryModel
 from swiftwrf.gp import Kernel, choose_kernel, held_out_weights
 from swiftwrf.positions import check_batch, check_drawn, check_positions
@@ -24,6 +25,7 @@ from swiftwrf.threads import single_thread
 
 COMPONENTS = 64  # principal components of the difference that are kept at most
 PIXELS = 4000  # of a spectrum that are enough to choose kernel and share
+MOST = 10_000  # spectra: all their inner products are computed
 FIRST = 0.7  # share with which the kernel is chosen
 
 
@@ -94,9 +96,14 @@ def fit_hybrid(
         seed: of what is held out.
 
     Raises:
-        InputError: fewer than 10 spectra, or something not finite.
+        InputError: fewer than 10 spectra or more than 10,000, or something not finite.
     """
     check_training(train)
+    if len(train) > MOST:
+        raise InputError(
+            f"hybrid is fitted to all inner products of its spectra, at most {MOST} of them, not {len(train)}; take "
+            "geometry, coarray or swiftwrf, or fewer spectra"
+        )
     seen, known = train.spectrum.flatten(1), geometry.synthesize(train.position).flatten(1)
     fold = folds(train.position, validation, seed)
     stride = max(1, seen.shape[1] // PIXELS) | 1

@@ -33,11 +33,12 @@ def autocorrelation(channel: Tensor, array: PlanarArray) -> Tensor:
 def correlations(spectra: Spectra) -> Tensor:
     """r(l) of each spectrum by least squares on its square, complex128 (n, P); pixels are left out where there are many."""
     assert spectra.array is not None
-    functions, flat = basis(spectra.array, spectra.grid), spectra.spectrum.flatten(1)
-    stride = max(1, flat.shape[1] // PIXELS)
+    functions = basis(spectra.array, spectra.grid)
+    stride = max(1, functions.shape[1] // PIXELS)
     stride += 1 - stride % 2  # odd, so that it does not keep to some columns only
     inverse = torch.linalg.pinv(functions[:, ::stride])
-    coefficient = flat[:, ::stride].double().square() @ inverse
+    some = (part.flatten(1)[:, ::stride] for part in spectra.store.batches())
+    coefficient = torch.cat([part.double().square() @ inverse for part in some])
     half = (coefficient.shape[1] - 1) // 2
     return torch.complex(coefficient[:, 1 : 1 + half], coefficient[:, 1 + half :]) / 2
 

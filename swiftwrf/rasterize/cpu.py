@@ -178,12 +178,19 @@ def _arguments(mean: Tensor, cholesky: Tensor, weight: Tensor, cutoff: float | N
     return (*arrays, reach2, 1 if cutoff is None else ANCHOR)
 
 
+@threads_kept()
+def _threads() -> int:
+    """Of numba, which starts them when it is first asked for their number."""
+    number: int = numba.get_num_threads()
+    return number
+
+
 @torch.library.custom_op("swiftwrf::rasterize_cpu", mutates_args=(), device_types="cpu")
 def _rasterize(
     mean: Tensor, cholesky: Tensor, weight: Tensor, n_elevation: int, n_azimuth: int, cutoff: float | None
 ) -> Tensor:
     out = weight.new_empty(mean.shape[0], 2, n_elevation, n_azimuth)
-    threads = numba.get_num_threads()
+    threads = _threads()
     n_bands = 1 if mean.shape[0] >= threads else min(threads, n_elevation)
     with threads_kept():
         _draw(*_arguments(mean, cholesky, weight, cutoff), n_bands, out.numpy())
@@ -196,7 +203,7 @@ def _rasterize_backward(
 ) -> tuple[Tensor, Tensor, Tensor]:
     d_mean, d_weight = torch.empty_like(mean), torch.empty_like(weight)
     d_cholesky = cholesky.new_empty(*mean.shape[:2], 3)
-    threads = numba.get_num_threads()
+    threads = _threads()
     block = max(1, mean.shape[1] if mean.shape[0] >= threads else -(-mean.shape[1] // threads))
     arguments = _arguments(mean, cholesky, weight, cutoff)
     derivatives = (d_mean.numpy(), d_cholesky.numpy(), d_weight.numpy())

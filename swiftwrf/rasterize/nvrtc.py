@@ -18,6 +18,7 @@ from pathlib import Path
 
 import torch
 
+from swiftwrf.durable import cache_folder
 from swiftwrf.errors import InputError
 
 # with subnormals flushed exp2f is one instruction; divisions and roots to 2 units in the last place, without a subroutine
@@ -156,7 +157,7 @@ def _image(nvrtc: Nvrtc, source: str, capability: int) -> bytes:
     """The compiled source, from the cache where it is there and whole."""
     target = nvrtc.target(capability)
     key = hashlib.sha256("\0".join((source, *OPTIONS)).encode()).hexdigest()[:16]
-    path = _cache_folder() / f"rasterize-{key}-{target}-nvrtc{nvrtc.version}"
+    path = cache_folder() / f"rasterize-{key}-{target}-nvrtc{nvrtc.version}"
     try:
         digest, image = (content := path.read_bytes())[:32], content[32:]
         if hashlib.sha256(image).digest() == digest:
@@ -172,10 +173,6 @@ def _image(nvrtc: Nvrtc, source: str, capability: int) -> bytes:
     except OSError:
         pass  # a folder that cannot be written costs a compilation next time
     return image
-
-
-def _cache_folder() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "swiftwrf"
 
 
 def _nvrtc_paths() -> Iterator[str]:

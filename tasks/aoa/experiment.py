@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -12,6 +13,7 @@ from swiftwrf import InputError, Spectra, simulated_room
 from swiftwrf.data import read_spectra
 from swiftwrf.data.files import sha256
 from swiftwrf.metrics import angle_errors, l1, psnr, ssim
+from swiftwrf.store import Store
 from tasks.aoa.config import AoaConfig, check, check_data, further_positions
 from tasks.aoa.page import page
 from tasks.aoa.results import mix_metrics
@@ -151,7 +153,7 @@ class _Tables:
         for key, called in (("test", step.synthesizer), ("test sample", step.synthesizer + SAMPLE)):
             if key in drawn:
                 arm = step.at.row | {"synthesizer": called}
-                scores = {score: function(drawn[key], self.test.spectrum) for score, function in SCORE.items()}
+                scores = {name: self._score(function, drawn[key]) for name, function in SCORE.items()}
                 self.synthesis += _rows(arm, {"index": self.test.index} | scores)
                 self.synthesis_seconds.append(arm | value["seconds"])
         self.history += [step.at.row | {"synthesizer": step.synthesizer} | row for row in value["history"]]
@@ -168,10 +170,15 @@ class _Tables:
         places = {"measured": measured.position.numpy(), "suggested": position.numpy(), "left": left.numpy()}
         self.directory.write_npz(f"{name}.npz", places)
 
-    def _keep_examples(self, share: float, name: str, drawn: dict[str, Tensor]) -> None:
+    def _score(self, function: Callable[[Tensor, Tensor], Tensor], drawn: Store) -> Tensor:
+        """Of each spectrum at the test positions."""
+        pairs = zip(drawn.batches(), self.test.store.batches(), strict=True)
+        return torch.cat([function(*pair) for pair in pairs])
+
+    def _keep_examples(self, share: float, name: str, drawn: dict[str, Store]) -> None:
         """Measured and synthetic spectra at test positions for the report, chosen by rule."""
-        measured, synthetic = self.test.spectrum, drawn["test"]
-        score = psnr(synthetic, measured)
+        measured, synthetic = self.test.store, drawn["test"]
+        score = self._score(psnr, synthetic)
         order = score.argsort()
         chosen = order[[round(q * (len(order) - 1)) for q in EXAMPLE_QUANTILES]]
         examples = {
@@ -184,7 +191,9 @@ class _Tables:
         if "test deviation" in drawn:
             deviation = drawn["test deviation"]
             examples["deviation"] = as_bytes(deviation[chosen]).numpy()
-            examples["coverage"] = float(((synthetic - measured).abs() <= NORMAL_80 * deviation).float().mean())
+            triples = zip(synthetic.batches(), measured.batches(), deviation.batches(), strict=True)
+            inside = torch.cat([((s - m).abs() <= NORMAL_80 * d).float().mean((1, 2)) for s, m, d in triples])
+            examples["coverage"] = float(inside.mean())
         self.directory.write_npz(f"examples-mix{share:g}.npz", examples)
 
     def summary(self, share: float) -> MixMetrics:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -18,6 +18,7 @@ from augment.synthesizers import Synthesizer
 from swiftwrf import FitError, GeometryModel, InputError, Spectra, SwiftWRF
 from swiftwrf.checkpoint import Saved, read, write
 from swiftwrf.geometry import HybridModel
+from swiftwrf.store import Store
 from tasks.aoa import arms
 from tasks.aoa.advice import advise
 from tasks.aoa.config import AUTO
@@ -32,6 +33,7 @@ from tasks.steps import Step
 from tasks.torchrun import group
 
 KIND = "synthetic spectra"
+AT_ONCE = 4096  # positions that are drawn before they are rounded: half a gigabyte of 90 x 360 pixels
 
 
 def steps_at(setting: Setting, at: At) -> list[Step[Setting]]:
@@ -117,9 +119,9 @@ class Synthesis(Step[Setting]):
         """Where the spectra are kept."""
         return f"{STEPS}/{self.name}.safetensors"
 
-    def spectra(self, folder: Path) -> dict[str, Tensor]:
+    def spectra(self, folder: Path) -> dict[str, Store]:
         """Those kept in this folder: `test`, `test deviation`, `test sample`, `withheld`, `further`, as far as drawn."""
-        return {key: spectrum.float() / 255 for key, spectrum in read(folder / self.file, KIND)[1].items()}
+        return {key: Store(spectrum) for key, spectrum in read(folder / self.file, KIND)[1].items()}
 
     def compute(self, setting: Setting, folder: Path) -> Row:
         try:
@@ -143,22 +145,23 @@ class Synthesis(Step[Setting]):
         synthesizer.fit(measured)
         fitted = time.perf_counter()
         generator = torch.Generator().manual_seed(settings.seed)
-        drawn = {"test": synthesizer.synthesize(setting.test.position)}
-        deviation = synthesizer.deviation(setting.test.position)
-        if deviation is not None:
-            drawn["test deviation"] = deviation
+        test = setting.test.position
+        drawn = {"test": _as_bytes_at(test, synthesizer.synthesize)}
+        if synthesizer.deviation(test[:1]) is not None:
+            drawn["test deviation"] = _as_bytes_at(test, synthesizer.deviation)
         if synthesizer.samples:
-            drawn["test sample"] = synthesizer.synthesize(setting.test.position, generator)
+            drawn["test sample"] = _as_bytes_at(test, lambda some: synthesizer.synthesize(some, generator))
         own = generator if self.sampled and synthesizer.samples else None
         if self.trains:
-            drawn["withheld"] = synthesizer.synthesize(withheld.position, own)
+            drawn["withheld"] = _as_bytes_at(withheld.position, lambda some: synthesizer.synthesize(some, own))
         if self.further:
-            drawn["further"] = synthesizer.synthesize(setting.further(self.at, measured).position, own)
+            places = setting.further(self.at, measured)
+            drawn["further"] = _as_bytes_at(places.position, lambda some: synthesizer.synthesize(some, own))
         seconds = {
             "fit": fitted - fit.began + fit.earlier + synthesizer.shared_seconds,
             "synthesize": time.perf_counter() - fitted,
         }
-        write(folder / self.file, KIND, {key: as_bytes(spectrum) for key, spectrum in drawn.items()}, {})
+        write(folder / self.file, KIND, drawn, {})
         if self.trains and self.at.repeat == 0:
             if synthesizer.model is not None:
                 self._keep_model(synthesizer.model, measured, setting.test, folder)
@@ -240,7 +243,7 @@ class Arm(Step[Setting]):
         began = time.perf_counter()
         estimator.fit(train)
         fitted = time.perf_counter()
-        estimate = estimator.estimate(setting.test.spectrum)
+        estimate = torch.cat([estimator.estimate(part) for part in setting.test.store.batches()])
         if isinstance(estimator, SavedEstimator) and self._is_kept(setting):
             estimator.save(folder / f"{self.estimator}-mix{self.at.share:g}.safetensors")
         seconds = {"train": fitted - began, "estimate": time.perf_counter() - fitted}
@@ -260,9 +263,9 @@ class Arm(Step[Setting]):
         if self.synthesis is None:
             return Mixed.measured(measured)
         drawn = self.synthesis.spectra(folder)
-        mixed = mix(measured, withheld, drawn["withheld"])
+        mixed = mix(measured, withheld, drawn["withheld"].values)
         if self.training == arms.turbo(self.synthesis.synthesizer, extra=True):
-            mixed = mixed.add(setting.further(self.at, measured), drawn["further"])
+            mixed = mixed.add(setting.further(self.at, measured), drawn["further"].values)
         return mixed
 
 
@@ -297,6 +300,12 @@ class _FitHistory:
         """One record; those of earlier sessions come first."""
         self.records.append(record)
         self.earlier = max(self.earlier, record.get("elapsed", 0.0) - (time.perf_counter() - self.began))
+
+
+def _as_bytes_at(position: Tensor, draw: Callable[[Tensor], Tensor | None]) -> Tensor:
+    """What is drawn at positions (n, 3), some at a time."""
+    parts = (draw(some) for some in position.split(AT_ONCE))
+    return torch.cat([as_bytes(part) for part in parts if part is not None])
 
 
 def as_bytes(spectrum: Tensor) -> Tensor:

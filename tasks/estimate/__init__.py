@@ -14,6 +14,7 @@ from torch import Tensor
 from swiftwrf import InputError, Spectra, load
 from swiftwrf.data import read_spectra
 from swiftwrf.metrics import angle_errors
+from swiftwrf.store import Store
 from tasks.aoa.estimators import SavedEstimator
 from tasks.records import write_table
 from tasks.source import SpectraSource, reading
@@ -49,19 +50,19 @@ def run(config: EstimateConfig, resume: Path | None = None) -> None:
     if not isinstance(estimator, SavedEstimator):
         raise InputError(f"{config.estimator} holds a {estimator.kind}; give an estimator that tasks.aoa trained")
     known = None if config.source.endswith(".npy") else read_spectra(config.source, reading(config))
-    spectrum = _read_array(Path(config.source)) if known is None else known.spectrum
-    _check_like(estimator, spectrum, known, config.source)
-    estimate = estimator.estimate(spectrum)
+    store = Store(_read_array(Path(config.source))) if known is None else known.store
+    _check_like(estimator, store, known, config.source)
+    estimate = torch.cat([estimator.estimate(part) for part in store.batches()])
     columns = {"azimuth_deg": estimate[:, 0].rad2deg(), "elevation_deg": estimate[:, 1].rad2deg()}
     if known is not None:
         truth = known.label.rad2deg()
         columns |= {"truth_azimuth_deg": truth[:, 0], "truth_elevation_deg": truth[:, 1]}
         columns["great_circle_deg"] = angle_errors(estimate, known.label)["great_circle"].rad2deg()
-    index = torch.arange(len(spectrum)) if known is None else known.index
+    index = torch.arange(len(store)) if known is None else known.index
     rows = zip(index.tolist(), *(column.tolist() for column in columns.values()), strict=True)
     write_table(out, [dict(zip(("index", *columns), row, strict=True)) for row in rows])
     error = f", median error {columns['great_circle_deg'].median():.2f} degrees" if known is not None else ""
-    print(f"{len(spectrum)} directions{error}: {out}")
+    print(f"{len(store)} directions{error}: {out}")
 
 
 def _read_array(file: Path) -> Tensor:
@@ -78,11 +79,11 @@ def _read_array(file: Path) -> Tensor:
     return spectrum
 
 
-def _check_like(estimator: SavedEstimator, spectrum: Tensor, known: Spectra | None, source: str) -> None:
+def _check_like(estimator: SavedEstimator, store: Store, known: Spectra | None, source: str) -> None:
     """Refuses spectra on another grid than the estimator's."""
     own = estimator.settings.grid
-    if tuple(spectrum.shape[1:]) != own.shape or (known is not None and known.grid != own):
-        shape, its = (" x ".join(map(str, s)) for s in (tuple(spectrum.shape[1:]), own.shape))
+    if store.shape[1:] != own.shape or (known is not None and known.grid != own):
+        shape, its = (" x ".join(map(str, s)) for s in (store.shape[1:], own.shape))
         raise InputError(
             f"{source} has spectra of {shape} directions, the estimator was trained on others ({its}); where spectra are "
             f"computed, --grid {' '.join(map(str, own.shape))} makes them alike"

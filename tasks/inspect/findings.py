@@ -136,10 +136,11 @@ def _spectra(data: Spectra, findings: Findings) -> None:
         findings.say(
             "The antenna array and its carrier are not described (--array tells them); coarray and geometry need them."
         )
-    peak = data.spectrum.flatten(1).amax(dim=1)
+    peak = torch.cat([part.flatten(1).amax(dim=1) for part in data.store.batches()])
+    least = torch.cat([part.flatten(1).amin(dim=1) for part in data.store.batches()])
     if float(peak.min()) < 0.05:
         findings.warn(f"{int((peak < 0.05).sum())} spectra are nearly empty, below 0.05 everywhere.")
-    if bool((data.spectrum.flatten(1).amin(dim=1) == peak).any()):
+    if bool((least == peak).any()):
         findings.warn("Some spectra have one value everywhere.")
     _splits(data, findings)
 

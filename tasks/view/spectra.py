@@ -270,7 +270,7 @@ class SpectraScene:
             return None
         away = distance(torch.as_tensor(position, dtype=torch.float64).reshape(1, 3), self.data.position)[0]
         row = int(away.argmin())
-        spectrum = self.data.spectrum[row]
+        spectrum = self.data.store[row : row + 1][0]
         learnt = fitted.learnt is not None and bool(fitted.learnt[row])
         return Measured(row, float(away[row]), learnt, spectrum.numpy(), strongest(spectrum, self.data.grid))
 

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import io
+import math
 import struct
 import warnings
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ from torch import Tensor
 
 from swiftwrf.angles import AngularGrid, ArrayPose
 from swiftwrf.arrays import LIGHT_SPEED, PlanarArray
-from swiftwrf.data.archives import read_array, read_arrays
+from swiftwrf.data.archives import array_header, array_names, read_arrays, read_rows
 from swiftwrf.data.files import (
     FARTHEST,
     check_carrier,
@@ -36,9 +38,10 @@ from swiftwrf.data.files import (
 )
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format
 from swiftwrf.data.reading import Reading
-from swiftwrf.data.spectra import MOST_PIXELS, Moving, Spectra, check_pixels
+from swiftwrf.data.spectra import Moving, Spectra, check_pixels
 from swiftwrf.data.splits import read_split, split_names
 from swiftwrf.errors import InputError
+from swiftwrf.store import AT_ONCE, MOST_EACH, MOST_PIXELS, Store, stored, too_many
 
 # what Pillow raises on broken files
 BROKEN = (
@@ -83,7 +86,7 @@ def _read(folder: Path, how: Reading) -> Spectra:
         raise InputError(f"{folder} must hold one of tx_pos.csv (moving transmitter) and rx_pos.csv (moving receiver)")
     moving: Moving = "transmitter" if tables[0].name == "tx_pos.csv" else "receiver"
     position = read_positions(tables[0])
-    spectrum, line_of_sight, digests = _read_spectra(folder, len(position))
+    store, line_of_sight, digests = _read_spectra(folder, len(position))
     fixed = torch.tensor(pose.position, dtype=torch.float64)
     ends = (position, fixed) if moving == "transmitter" else (fixed, position)
     if bool((position == fixed).all(dim=1).any()):
@@ -93,8 +96,8 @@ def _read(folder: Path, how: Reading) -> Spectra:
     return Spectra(
         name=folder.resolve().name,
         position=position,
-        spectrum=spectrum,
-        grid=AngularGrid.hemisphere(*spectrum.shape[1:]),
+        store=store,
+        grid=AngularGrid.hemisphere(*store.shape[1:]),
         label=pose.line_of_sight(*ends),
         line_of_sight=line_of_sight,
         moving=moving,
@@ -143,8 +146,8 @@ def _read_array(file: Path, gateway: dict[str, Any]) -> PlanarArray | None:
     return PlanarArray(torch.tensor(places, dtype=torch.float64), LIGHT_SPEED / frequency)
 
 
-def _read_spectra(folder: Path, n: int) -> tuple[Tensor, Tensor, dict[str, str]]:
-    """Spectra, float32 (n, H, W) in [0, 1], whether the line of sight is free, and digests of the files."""
+def _read_spectra(folder: Path, n: int) -> tuple[Store, Tensor, dict[str, str]]:
+    """Spectra (n, H, W) in [0, 1], whether the line of sight is free, and digests of the files."""
     free = torch.ones(n, dtype=torch.bool)
     arrays = [file for file in (folder / "spectrum.npy", folder / "spectrum.npz") if file.is_file()]
     if len(arrays) + (folder / "spectrum").is_dir() > 1:
@@ -153,28 +156,43 @@ def _read_spectra(folder: Path, n: int) -> tuple[Tensor, Tensor, dict[str, str]]
         spectrum, digest = _read_images(folder / "spectrum", n)
         return spectrum, free, {"spectrum/*.png": digest}
     file = arrays[0]
-    single = file.suffix == ".npy"
-    content = {"spectrum": read_array(file)} if single else read_arrays(file, ["spectrum"], ["line_of_sight"])
-    if (seen := content.get("line_of_sight")) is not None:
+    if file.suffix == ".npz" and "line_of_sight" in array_names(file):
+        seen = read_arrays(file, ["line_of_sight"])["line_of_sight"]
         if seen.shape != (n,) or seen.dtype.kind != "b":
             raise InputError(f"{file}: line_of_sight must be {n} truth values, got {seen.dtype} of shape {seen.shape}")
         free = torch.from_numpy(seen.copy())
-    return _checked(file, content["spectrum"], n), free, {file.name: sha256(file)}
+    digest = sha256(file)
+    return _read_values(file, n, digest), free, {file.name: digest}
 
 
-def _checked(file: Path, values: NDArray[Any], n: int) -> Tensor:
+def _read_values(file: Path, n: int, digest: str) -> Store:
     """Spectra of an array: magnitudes in [0, 1], or bytes as images have them."""
-    if values.ndim != 3 or len(values) != n or min(values.shape) < 2 or values.dtype.kind not in "fu":
+    shape, kind = array_header(file, "spectrum")
+    if len(shape) != 3 or shape[0] != n or min(shape) < 2 or kind.kind not in "fu":
         raise InputError(
-            f"{file}: expected spectra of shape ({n}, elevations, azimuths) for {n} positions, got {values.dtype} of shape "
-            f"{values.shape}"
+            f"{file}: expected spectra of shape ({n}, elevations, azimuths) for {n} positions, got {kind} of shape {shape}"
         )
-    if values.shape[1] > values.shape[2]:
+    if shape[1] > shape[2]:
         raise InputError(
-            f"{file}: spectra have {values.shape[1]} elevations and {values.shape[2]} azimuths; these look swapped, so give "
+            f"{file}: spectra have {shape[1]} elevations and {shape[2]} azimuths; these look swapped, so give "
             "spectrum.transpose(0, 2, 1)"
         )
-    check_pixels(str(file), n, AngularGrid.hemisphere(*values.shape[1:]))
+    check_pixels(str(file), n, AngularGrid.hemisphere(*shape[1:]))
+    kept = {1: torch.uint8, 2: torch.float16}.get(kind.itemsize, torch.float32)
+    if kind.kind == "u" and kept == torch.float16:
+        kept = torch.float32  # 16 bits in full
+    rows = max(1, AT_ONCE // math.prod(shape[1:]))
+
+    def batches() -> Iterator[Tensor]:
+        return (_checked(file, values, kept) for values in read_rows(file, "spectrum", rows))
+
+    return stored(shape, kept, lambda: digest, batches)
+
+
+def _checked(file: Path, values: NDArray[Any], kept: torch.dtype) -> Tensor:
+    """Some spectra of an array in the type that they are kept in."""
+    if kept == torch.uint8:
+        return torch.from_numpy(values.copy())
     if values.dtype.kind == "u":
         values = values / np.float32(np.iinfo(values.dtype).max)
     low, high = float(values.min()), float(values.max())
@@ -183,11 +201,12 @@ def _checked(file: Path, values: NDArray[Any], n: int) -> Tensor:
             f"{file}: spectra are magnitudes in [0, 1], got {low:.4g} to {high:.4g}; convert decibels to magnitudes and "
             "divide by the largest"
         )
-    return torch.from_numpy(values.astype(np.float32)).clamp(0, 1)
+    native = values.astype(np.float16 if kept == torch.float16 else np.float32)
+    return torch.from_numpy(native).clamp(0, 1)
 
 
-def _read_images(folder: Path, n: int) -> tuple[Tensor, str]:
-    """`00001.png` to `n`.png as float32 (n, H, W) in [0, 1], all grey and of one shape, and the digest of all files."""
+def _read_images(folder: Path, n: int) -> tuple[Store, str]:
+    """`00001.png` to `n`.png as (n, H, W), all grey and of one shape, and the digest of all files."""
     if not folder.is_dir():
         raise InputError(f"{folder} is missing; expected one grey image a position, 00001.png to {n:05d}.png")
     found = len(list(folder.glob("*.png")))
@@ -195,15 +214,20 @@ def _read_images(folder: Path, n: int) -> tuple[Tensor, str]:
         raise InputError(f"{folder} holds {found} images, but there are {n} positions; each position needs its image")
     files = [folder / f"{number:05d}.png" for number in range(1, n + 1)]
     shape: tuple[int, int] | None = None
-    images, digests = [], []
+    digests = []
     for file in files:
         if not file.is_file():
             raise InputError(f"{file} is missing; images are numbered from 00001.png without gaps")
         content = read_bytes(file)
         digests.append((file.name, hashlib.sha256(content).hexdigest()))
         shape = _check_size(file, content, n, shape)
-        images.append(_decode(file, content))
-    return torch.from_numpy(np.stack(images)).float() / 255, sha256_of_all(digests)
+    assert shape is not None
+    digest = sha256_of_all(digests)
+
+    def batches() -> Iterator[Tensor]:
+        return (torch.from_numpy(_decode(file, read_bytes(file)).copy())[None] for file in files)
+
+    return stored((n, *shape), torch.uint8, lambda: digest, batches), digest
 
 
 def _opened(file: Path, content: bytes) -> Image.Image:
@@ -227,10 +251,10 @@ def _check_size(file: Path, content: bytes, n: int, shape: tuple[int, int] | Non
             f"{file} has {rows} x {columns} pixels; a spectrum has 4 columns a row "
             "(elevations to 90, azimuths to 360 degrees), e.g. 90 x 360"
         )
-    if n * rows * columns > MOST_PIXELS:
+    if too_many((n, rows, columns)):
         raise InputError(
-            f"{file} has {rows} x {columns} pixels, with {n} images {n * rows * columns:.3g}; average them down to at most "
-            f"{MOST_PIXELS:.3g} in all"
+            f"{file} has {rows} x {columns} pixels, with {n} images {n * rows * columns:.3g}; average them down to "
+            f"at most {MOST_PIXELS:.3g} in all or {MOST_EACH:.3g} each"
         )
     if shape is not None and (rows, columns) != shape:
         raise InputError(

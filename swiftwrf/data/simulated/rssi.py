@@ -27,6 +27,7 @@ CHANNELS_HZ = (2.402e9, 2.426e9, 2.480e9)  # of BLE advertisements; a receiver c
 TRANSMIT_DBM = -8.0
 PACKET_NOISE_DB = 2.0
 SENSITIVITY_DBM = -97.0
+AT_ONCE = 4096  # positions whose paths are found together: half a gigabyte
 MISSED = 0.1  # share of packets lost to scanning gaps and collisions, whatever their power
 
 
@@ -61,5 +62,7 @@ def rssi_room(n: int = 600, seed: int = 0) -> Rssi:
 
 def _power(position: Tensor, receiver: Tensor) -> Tensor:
     """Power gain of the coherent sum of all paths on each channel, (n, channels) [dB]."""
-    sums = [replace(FLOOR, frequency_hz=f).paths(position, receiver).gain.sum(dim=1).abs() for f in CHANNELS_HZ]
+    floors = [replace(FLOOR, frequency_hz=f) for f in CHANNELS_HZ]
+    parts = position.split(AT_ONCE)
+    sums = [torch.cat([floor.paths(some, receiver).gain.sum(dim=1).abs() for some in parts]) for floor in floors]
     return 20 * torch.stack(sums, dim=1).clamp_min(1e-9).log10()

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from swiftwrf.checkpoint import Header
 from swiftwrf.gp import Kernel
 from swiftwrf.registry import Registry
+from swiftwrf.store import Store
 
 COMPONENTS = {"mean": 2, "response": 2, "attenuation": 1, "cholesky": 3}  # what can deform, and its numbers a primitive
 
@@ -74,7 +75,7 @@ class Deformation(nn.Module, ABC):
         return {}
 
     @classmethod
-    def choose_rank(cls, position: Tensor, spectrum: Tensor, fold: Tensor, kernel: Kernel) -> int:
+    def choose_rank(cls, position: Tensor, spectrum: Store, fold: Tensor, kernel: Kernel) -> int:
         """How many motions training spectra call for; see `swiftwrf.gp.choose_rank`. 0 for those that mix none."""
         return 0
 

@@ -14,6 +14,7 @@ from swiftwrf import gp
 from swiftwrf.checkpoint import Header, expect
 from swiftwrf.errors import InputError
 from swiftwrf.model.deformation.base import COMPONENTS, DEFORMATIONS, Deformation, Offsets, Setting
+from swiftwrf.store import Store
 
 
 @DEFORMATIONS.register("motion_basis", meaning="low-rank motion, smooth by a Gaussian-process prior; fast")
@@ -64,7 +65,7 @@ class MotionBasis(Deformation):
         return {"kernel": asdict(self.field.kernel)}
 
     @classmethod
-    def choose_rank(cls, position: Tensor, spectrum: Tensor, fold: Tensor, kernel: gp.Kernel) -> int:
+    def choose_rank(cls, position: Tensor, spectrum: Store, fold: Tensor, kernel: gp.Kernel) -> int:
         return gp.choose_rank(position, spectrum, fold, kernel)
 
     def forward(self, position: Tensor, mean: Tensor) -> Offsets:

@@ -150,7 +150,7 @@ class AANN(SavedEstimator):
         config, processes = self._config, Processes(self.settings.group)
         network = self._network if processes.group is None else _shared(self._network, processes)
         weight = processes.weight(min(config.batch, len(train)))
-        spectrum = self._prepare(train.spectrum)
+        spectrum = torch.cat([self._prepare(part) for part in train.batches()])
         direction = to_direction(*train.label.unbind(-1)).float().to(self._device)
         self._mean = functional.normalize(direction.mean(dim=0), dim=0)
         self._spread = (direction - self._mean).square().sum(dim=1).mean().sqrt().clamp_min(1e-4)

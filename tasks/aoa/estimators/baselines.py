@@ -44,7 +44,14 @@ class NearestSpectrum(Estimator):
     """The label of the training spectrum with the least squared difference: look-up, hard to beat on a dense path."""
 
     def fit(self, train: Mixed) -> None:
-        self._spectrum, self._label = train.spectrum.flatten(1), train.label
+        self._train = train
 
     def estimate(self, spectrum: Tensor) -> Tensor:
-        return self._label[torch.cdist(spectrum.flatten(1), self._spectrum).argmin(dim=1)]
+        flat, start = spectrum.flatten(1), 0
+        least, label = torch.full((len(flat),), torch.inf), self._train.label.new_empty(len(flat), 2)
+        for part in self._train.batches():
+            apart, number = torch.cdist(flat, part.flatten(1)).min(dim=1)
+            nearer = apart < least
+            least, label[nearer] = torch.minimum(apart, least), self._train.label[start + number[nearer]]
+            start += len(part)
+        return label

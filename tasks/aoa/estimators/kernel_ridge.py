@@ -39,7 +39,7 @@ class KernelRegression(SavedEstimator):
 
     def fit(self, train: Mixed) -> None:
         order = np.random.default_rng(self.settings.seed).permutation(len(train))[: self.KEPT_ROWS]
-        feature = self._feature(train.spectrum)[order]
+        feature = np.concatenate([self._feature(part) for part in train.batches()])[order]
         direction = to_direction(*train.label.unbind(-1)).numpy()[order]
         self._mean = direction.mean(axis=0)
         some = feature[: self.CHOSEN_ROWS]

@@ -1,0 +1,216 @@
+"""How time and memory grow with the number of spectra, on a dense walk through the simulated room.
+
+Every stage of every size runs in a process of its own, so that its peak is its own. `rss_gib` is the peak of everything
+resident; that counts the pages of the file of spectra that were looked at, which the system takes back whenever somebody
+else needs the memory. `anonymous_gib` is the peak of what cannot be taken back.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from committed import RESULTS, ROOT
+from record import write_result
+
+from augment import Mixed, Settings, make_synthesizer
+from swiftwrf import AngularGrid, Spectra, load_spectra, simulated_room
+from swiftwrf.data.simulated.spectra import REGION
+from swiftwrf.data.writing import write_spectra
+from swiftwrf.metrics import psnr
+from swiftwrf.store import stored
+from tasks.aoa.estimators import Settings as EstimatorSettings
+from tasks.aoa.estimators.aann import AANN, AANNConfig
+from tasks.page import figures
+
+GRID = AngularGrid.hemisphere(90, 360)
+SIZES = (300, 1_000, 10_000, 100_000)
+SYNTHESIZERS = ("swiftwrf", "coarray", "gp")
+STEP = 0.01  # [m] between two spectra: a person who walks, a hundred spectra a second
+TURNS = (0.91, 0.37, 0.73)  # [rad / m] of the walk along x, y and z, which never comes back to its beginning
+AT_ONCE = 2048  # spectra that are simulated together
+DRAWN = 1_000  # positions between those of the walk that spectra are synthesized at
+TRAINING_STEPS = 5
+SAMPLED = 0.02  # [s] between two looks at the memory
+GIB = 2**20  # in kibibytes
+MOST_GIB = 6  # that any stage may take
+
+
+@dataclass(frozen=True)
+class Config:
+    sizes: tuple[int, ...] = SIZES
+    """numbers of spectra; results of other sizes that were measured before are kept"""
+    folder: Path | None = None
+    """for the data, with room for three times their size; a temporary one unless given"""
+
+
+def main(config: Config) -> None:
+    """Measures each stage of each size."""
+    kept = RESULTS / "scaling.json"
+    rows = {row["n"]: row for row in json.loads(kept.read_text())["rows"]} if kept.is_file() else {}
+    for n in config.sizes:
+        with tempfile.TemporaryDirectory(dir=config.folder) as folder:
+            rows[n] = {"n": n, "stages": {stage: run(stage, n, folder) for stage in STAGES}}
+        ordered = [rows[n] for n in sorted(rows)]
+        write_result("scaling", {"threads": torch.get_num_threads(), "rows": ordered, "slopes": slopes(ordered)})
+        draw(ordered)
+
+
+def run(stage: str, n: int, folder: str) -> dict[str, float]:
+    """One stage in a process of its own."""
+    os.environ["XDG_CACHE_HOME"] = folder
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as fresh:
+        found = fresh.submit(measure, stage, Path(folder), n).result()
+    print(n, stage, found, flush=True)
+    return found
+
+
+def slopes(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Exponent of the growth of each stage's seconds between neighbouring sizes: 1 is linear."""
+    found: dict[str, dict[str, float]] = {}
+    for small, large in pairwise(rows):
+        for stage, values in large["stages"].items():
+            for part in [key for key in values if key.endswith("seconds")]:
+                growth = np.log(values[part] / small["stages"][stage][part]) / np.log(large["n"] / small["n"])
+                found.setdefault(f"{stage}, {part}", {})[f"{small['n']} to {large['n']}"] = round(float(growth), 2)
+    return found
+
+
+def draw(rows: list[dict[str, Any]]) -> None:
+    """Seconds and peak memory of the stages against the number of spectra."""
+    panels, (time_axis, memory_axis) = figures.new_figure(1, 2, 9, 3.4)
+    for stage in STAGES:
+        for part in [key for key in rows[0]["stages"][stage] if key.endswith("seconds")]:
+            values = [row["stages"][stage][part] for row in rows]
+            time_axis.plot([row["n"] for row in rows], values, marker="o", label=f"{stage} {part[:-8]}".strip())
+        memory_axis.plot([row["n"] for row in rows], [row["stages"][stage]["rss_gib"] for row in rows], marker="o")
+    memory_axis.axhline(MOST_GIB, color=figures.RULE)
+    for axis, label in ((time_axis, "seconds of a processor"), (memory_axis, "peak resident memory [GiB]")):
+        axis.set(xscale="log", xlabel="spectra of 90 x 360 pixels", ylabel=label)
+    time_axis.set(yscale="log")
+    figures.legend_below(panels, time_axis)
+    (ROOT / "docs" / "figures" / "scaling.svg").write_text(figures.as_svg(panels))
+
+
+def walk(at: torch.Tensor) -> torch.Tensor:
+    """Positions (n, 3) [m] in the room's region after so many spectra (n,) of the walk."""
+    low, high = torch.tensor(REGION, dtype=torch.float64)
+    turned = at.double()[:, None] * STEP * torch.tensor(TURNS, dtype=torch.float64)
+    return (low + high) / 2 + (high - low) / 2 * torch.sin(turned)
+
+
+def simulated(at: torch.Tensor) -> Spectra:
+    """Spectra of the walk in eight bits, as images have them; made by the batch straight into their store."""
+    position = walk(at)
+    parts = position.split(AT_ONCE)
+
+    def batches() -> Iterator[torch.Tensor]:
+        for seed, some in enumerate(parts):
+            yield (simulated_room(position=some, seed=seed, grid=GRID).spectrum * 255).round().to(torch.uint8)
+
+    coarse = simulated_room(position=position, grid=AngularGrid.hemisphere(2, 8))
+    store = stored((len(at), *GRID.shape), torch.uint8, lambda: repr((len(at), float(at[0]))), batches)
+    return replace(coarse, store=store, grid=GRID)
+
+
+def between(n: int) -> torch.Tensor:
+    """Where spectra are synthesized: evenly along the walk, half-way between two measured ones."""
+    return torch.linspace(0, n - 2, DRAWN).floor() + 0.5
+
+
+@contextmanager
+def measuring(found: dict[str, float], part: str = "") -> Iterator[None]:
+    """Notes processor time, and the peaks of memory so far."""
+    began, before = time.perf_counter(), time.process_time()
+    ended = threading.Event()
+    peak = [0]
+
+    def look() -> None:
+        while not ended.wait(SAMPLED):
+            peak[0] = max(peak[0], status("RssAnon"))
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    yield
+    found[f"{part}seconds"], found[f"{part}elapsed"] = time.process_time() - before, time.perf_counter() - began
+    ended.set()
+    thread.join()
+    found["anonymous_gib"] = max(found.get("anonymous_gib", 0.0), max(peak[0], status("RssAnon")) / GIB)
+    found["rss_gib"] = status("VmHWM") / GIB
+
+
+def status(name: str) -> int:
+    """A size that the kernel tells of this process [KiB]."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
+
+
+def generate(folder: Path, n: int, found: dict[str, float]) -> None:
+    """Writes the walk, and the spectra between its positions."""
+    with measuring(found):
+        for name, at in (("walk", torch.arange(n)), ("between", between(n))):
+            (folder / name).mkdir()
+            write_spectra(simulated(at), folder / name)
+
+
+def load(folder: Path, n: int, found: dict[str, float]) -> None:
+    """Opens the walk."""
+    with measuring(found):
+        assert len(load_spectra(folder / "walk")) == n
+
+
+def synthesizing(name: str) -> Callable[[Path, int, dict[str, float]], None]:
+    """The stage of one synthesizer."""
+
+    def stage(folder: Path, n: int, found: dict[str, float]) -> None:
+        data, unseen = load_spectra(folder / "walk"), load_spectra(folder / "between")
+        synthesizer = make_synthesizer(name, Settings(progress=False))
+        with measuring(found, "fit "):
+            synthesizer.fit(data)
+        with measuring(found, "synthesize "):
+            drawn = synthesizer.synthesize(unseen.position)
+        found["psnr_db"] = float(psnr(drawn, unseen.spectrum).median())
+
+    return stage
+
+
+def train(folder: Path, n: int, found: dict[str, float]) -> None:
+    """A few steps of the network."""
+    data = load_spectra(folder / "walk")
+    network = AANN(EstimatorSettings(data.grid), AANNConfig(steps=TRAINING_STEPS))
+    with measuring(found):
+        network.fit(Mixed.measured(data))
+
+
+STAGES: dict[str, Callable[[Path, int, dict[str, float]], None]] = {
+    "generate": generate,
+    "load first": load,
+    "load again": load,
+    **{name: synthesizing(name) for name in SYNTHESIZERS},
+    "train": train,
+}
+
+
+def measure(stage: str, folder: Path, n: int) -> dict[str, float]:
+    """Times and peaks of a stage, in this process."""
+    found: dict[str, float] = {}
+    STAGES[stage](folder, n, found)
+    return {key: round(value, 3) for key, value in found.items()}
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
