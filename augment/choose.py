@@ -15,7 +15,7 @@ from swiftwrf.gp import thinned
 from swiftwrf.metrics import psnr
 
 JUDGES = 1000  # held-out spectra of a fold that are compared: more do not change the choice
-SLOW = ("nerf2", "wrfgs", "vae", "dcgan")  # compared only where they are asked for by name
+SLOW = ("nerf2", "wrfgs", "vae", "dcgan", "raytrace")  # compared only where they are asked for by name
 
 
 @dataclass(frozen=True)

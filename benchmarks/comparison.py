@@ -2,17 +2,18 @@
 learning with the spectra of several methods.
 
 Hours of work that can be stopped at any time: each row is kept in the folder `--work` once it is measured, unfinished fits
-and runs go on from their state, and the result holds all rows that are there.
+and runs go on from their state, and the result holds all rows that are there. With `--scheduler` the rows are measured on
+the workers of a Dask cluster; each says on which machine, for seconds of different machines do not compare.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import torch
@@ -30,6 +31,8 @@ from swiftwrf.durable import write_text
 from swiftwrf.metrics import l1, psnr, ssim, summary
 from tasks.aoa.config import AoaConfig
 from tasks.aoa.experiment import run
+from tasks.cluster import Cluster, connected
+from tasks.environment import machine
 from tasks.page import figures
 from tasks.page.palette import Palette
 
@@ -42,6 +45,7 @@ SHARES = (0.1, 0.3, 0.5, 0.7)
 TURBO = ("swiftwrf", "nerf2", "wrfgs")
 QUICKER = 5  # by how much --quick shortens fits by gradient
 BATCH, REPEATS = 8, 3  # spectra a call, and calls, of which a rate is the median
+CPU = torch.device("cpu")
 Row = dict[str, Any]
 
 
@@ -60,21 +64,19 @@ class Config:
     spectra, no networks"""
     work: Path = Path("runs/comparison")
     """folder of what is measured so far"""
+    scheduler: str | None = None
+    """address of a Dask scheduler whose workers measure the rows and train the networks (extra: cluster)"""
 
 
 def main(config: Config) -> None:
     """Measures what is not there yet and writes `results/comparison.json` (`comparison_quick.json`) and the figures."""
     rows = config.work / ("quick" if config.quick else "rows")
     rows.mkdir(parents=True, exist_ok=True)
-    for scene, data, split in scenes(config):
-        if config.only and not scene.startswith(config.only):
-            continue
-        train, test = data.split(split)
-        for n in numbers(scene, len(train), config):
-            some = train.subset(torch.randperm(len(train), generator=torch.Generator().manual_seed(0))[:n])
-            for method in (*BASELINES, *LEARNT):
-                if method == MEAN or not lacks(method, data):
-                    kept(rows / f"{scene} {n} {method}", partial(row, method, some, test, split, config.quick))
+    with connected(config.scheduler, CPU) as cluster:
+        for job, found in measured(jobs(config, rows), cluster):
+            print(job.file.name, f"{found['psnr_db']['median']:.2f} dB, {found['fit_seconds']:.0f} s", flush=True)
+            write_text(Path(f"{job.file}.json"), json.dumps(found))
+            job.state.unlink(missing_ok=True)
     if "turbo" in config.parts and not config.quick:
         train_networks(config)
     result = {"scenes": gathered(rows), "turbo": None if config.quick else turbo(config.work)}
@@ -101,14 +103,69 @@ def numbers(scene: str, everything: int, config: Config) -> list[int]:
     return found
 
 
-def kept(file: Path, measure: Callable[[Path], Row]) -> None:
-    """Measures a row unless it is there; `measure` is given a place for the state of its fit."""
-    done, state = Path(f"{file}.json"), Path(f"{file}.state")
-    if not done.exists():
-        found = measure(state)
-        print(file.name, f"{found['psnr_db']['median']:.2f} dB, {found['fit_seconds']:.0f} s", flush=True)
-        write_text(done, json.dumps(found))
-        state.unlink(missing_ok=True)
+@dataclass(frozen=True)
+class Job:
+    """A row that is to be measured.
+
+    Args:
+        file: where it is kept, without suffix.
+        method: its name.
+        n: number of training spectra.
+        split: of the scene.
+        quick: whether fits by gradient are shortened.
+    """
+
+    file: Path
+    method: str
+    n: int
+    split: str
+    quick: bool
+
+    @property
+    def state(self) -> Path:
+        """Of its fit, as long as that is unfinished."""
+        return Path(f"{self.file}.state")
+
+    def measure(self, train: Spectra, test: Spectra, state: Path) -> Row:
+        """The row, and where it was measured."""
+        some = train.subset(torch.randperm(len(train), generator=torch.Generator().manual_seed(0))[: self.n])
+        return row(self.method, some, test, self.split, self.quick, state) | {"machine": machine(CPU)}
+
+
+def jobs(config: Config, rows: Path) -> Iterator[tuple[Spectra, Spectra, list[Job]]]:
+    """Training and test spectra of each scene, with its rows that are not there yet."""
+    for scene, data, split in scenes(config):
+        if config.only and not scene.startswith(config.only):
+            continue
+        train, test = data.split(split)
+        methods = [method for method in (*BASELINES, *LEARNT) if method == MEAN or not lacks(method, data)]
+        wanted = [
+            Job(rows / f"{scene} {n} {method}", method, n, split, config.quick)
+            for n in numbers(scene, len(train), config)
+            for method in methods
+        ]
+        yield train, test, [job for job in wanted if not Path(f"{job.file}.json").exists()]
+
+
+def measured(jobs: Iterable[tuple[Spectra, Spectra, list[Job]]], cluster: Cluster | None) -> Iterator[tuple[Job, Row]]:
+    """Each row as it gets done, here or on a cluster, where an unfinished fit begins anew."""
+    if cluster is None:
+        for train, test, some in jobs:
+            yield from ((job, job.measure(train, test, job.state)) for job in some)
+        return
+    function, pending = cluster.hold(measure_away), {}
+    for train, test, some in jobs:
+        scene = cluster.hold((train, test))
+        pending |= {cluster.submit(job.file.name, function, job, scene): job for job in some}
+    while pending:
+        future, found = cluster.next(pending)
+        yield pending.pop(future), found
+
+
+def measure_away(job: Job, scene: tuple[Spectra, Spectra]) -> Row:
+    """On a worker."""
+    with TemporaryDirectory(prefix="swiftwrf-") as folder:
+        return job.measure(*scene, Path(folder) / "fit.state")
 
 
 def gathered(rows: Path) -> dict[str, dict[str, dict[str, Row]]]:
@@ -182,7 +239,9 @@ def train_networks(config: Config) -> None:
     out = config.work / "turbo"
     stopped = out.with_name("turbo.partial")
     if not out.exists():
-        task = AoaConfig(SHARES, str(config.data / "s23-200"), synthesizer=TURBO, extra=0, out=str(out))
+        task = AoaConfig(
+            SHARES, str(config.data / "s23-200"), synthesizer=TURBO, extra=0, out=str(out), scheduler=config.scheduler
+        )
         run(task, stopped if stopped.exists() else None)
 
 

@@ -10,18 +10,20 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import numba
 import numpy as np
 import torch
 import tyro
-from record import write_result
+from record import RESULTS, write_result
 from torch import Tensor
 
 from swiftwrf import AngularGrid, ModelConfig, SwiftWRF, rasterize
 from swiftwrf.gp import Kernel
 from swiftwrf.rasterize import Maker, rasterize_magnitude
+from tasks.run import choose_device
 
 Rate = dict[str, float]
 CUTOFF = 1e-3
@@ -35,11 +37,15 @@ class Config:
     """few primitives, small grids, one batch size"""
     seconds: float = 1.0
     """time for the repeats of one rate; at least 3, at most 50 of them"""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """where to draw; auto takes the GPU where there is one"""
+    out: Path = RESULTS
+    """folder of the result"""
 
 
 def main(config: Config) -> None:
-    """Measures every combination and writes `results/rasterize_<cpu or GPU>.json`."""
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    """Measures every combination and writes `rasterize_<cpu or GPU>.json`."""
+    device = choose_device(config.device)
     sizes = {"n": [50, 200], "grid": [(16, 16), (90, 360)], "batch": [8]}
     if not config.quick:
         batch = [1, 8] if device.type == "cpu" else [1, 16, 256, 4096]
@@ -55,7 +61,7 @@ def main(config: Config) -> None:
     name = torch.cuda.get_device_name().replace(" ", "-").lower() if device.type == "cuda" else "cpu"
     threads = {"torch": torch.get_num_threads(), "numba": numba.get_num_threads()}
     content = {"cutoff": CUTOFF, "quick": config.quick, "threads": threads, "gpu": machine, "rows": rows}
-    write_result(f"rasterize_{name}", content, device)
+    write_result(f"rasterize_{name}", content, device, config.out)
 
 
 def measure(
@@ -141,17 +147,28 @@ def with_gradients(inputs: list[Tensor], grid: AngularGrid, maker: Maker) -> Non
 
 def end_to_end(n: int, batch: int, grid: AngularGrid, device: torch.device, seconds: float) -> Rate:
     """Positions in, magnitudes out, with the motion basis."""
-    generator = torch.Generator().manual_seed(0)
-    anchor = torch.rand(200, 3, generator=generator)
-    config = ModelConfig(n_primitives=n, rank=32, cutoff=CUTOFF)
-    model = SwiftWRF.make(config, grid, anchor, Kernel(), generator=generator).to(device)
+    model = model_of(n, grid, device)
     with torch.no_grad():
-        mean, cholesky, _ = scene(n, 1, device)  # the primitives that are drawn alone
+        position = model.normalise(positions(batch).to(device))
+        return rate(lambda: model(position), batch, device, seconds)
+
+
+def model_of(n: int, grid: AngularGrid, device: torch.device) -> SwiftWRF:
+    """With a motion basis of the responses, and the primitives of `scene`."""
+    config = ModelConfig(n_primitives=n, rank=32, cutoff=CUTOFF)
+    generator = torch.Generator().manual_seed(0)
+    model = SwiftWRF.make(config, grid, positions(200), Kernel(), generator=generator).to(device)
+    with torch.no_grad():
+        mean, cholesky, _ = scene(n, 1, device)
         l1, l2, l3 = cholesky.unbind(-1)
         model.primitives.mean.copy_(mean[0])
         model.primitives.cholesky.copy_(torch.stack([l1.log(), l2 / l3, l3.log()], dim=-1))
-        position = model.normalise(torch.rand(batch, 3, generator=generator).to(device))
-        return rate(lambda: model(position), batch, device, seconds)
+    return model
+
+
+def positions(n: int) -> Tensor:
+    """In a cube of a metre."""
+    return torch.rand(n, 3, generator=torch.Generator().manual_seed(0))
 
 
 def rate(draw: Callable[[], Any], batch: int, device: torch.device, seconds: float) -> Rate:

@@ -15,11 +15,13 @@ from tasks.environment import environment
 RESULTS = Path(__file__).parent / "results"
 
 
-def write_result(name: str, content: dict[str, Any], device: torch.device | None = None) -> None:
-    """Writes `results/NAME.json`: strict JSON with the command and where it ran (`device`, by default the CPU)."""
-    RESULTS.mkdir(exist_ok=True)
+def write_result(
+    name: str, content: dict[str, Any], device: torch.device | None = None, folder: Path = RESULTS
+) -> None:
+    """Writes `NAME.json` into the folder: strict JSON with the command and where it ran (`device`, by default the CPU)."""
+    folder.mkdir(parents=True, exist_ok=True)
     command = shlex.join(["python", *(Path(a).name if Path(a).exists() else a for a in sys.argv)])
     record = {"command": command, "environment": environment(device or torch.device("cpu"), {}), **content}
-    file = RESULTS / f"{name}.json"
+    file = folder / f"{name}.json"
     file.write_text(json.dumps(record, indent=1, allow_nan=False) + "\n")
     print(f"wrote {file}")

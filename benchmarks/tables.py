@@ -244,6 +244,18 @@ def ablation() -> str:
     return markdown(["variant", *scenes, "paper: SSIM / L1"], rows)
 
 
+def raytracing() -> str:
+    """Median PSNR of every method in the furnished rooms, and how many planes geometry found."""
+    rows = []
+    for scene, result in load("raytracing")["scenes"].items():
+        scores = result["methods"]
+        cells = [f"{s['psnr_db']['median']:.1f}" for s in scores.values()]
+        certain = sum(plane["certain"] for plane in result["planes"])
+        traced = result["traced"]
+        rows.append([scene, f"{traced['paths_per_position']:.0f}", *cells, f"{certain} of {len(result['planes'])}"])
+    return markdown(["scene, moving end", "paths a position", *scores, "planes certain"], rows)
+
+
 def scaling() -> str:
     """Seconds of a processor of each stage at each size, peak memory, and the growth to the largest size."""
     content = load("scaling")
@@ -301,6 +313,7 @@ TABLES = {
     "drawing": drawing,
     "ablation": ablation,
     "comparison": comparison,
+    "raytracing": raytracing,
     "comparison_counts": comparison_counts,
     "comparison_turbo": comparison_turbo,
     "synthesis_targets": synthesis_targets,
@@ -318,6 +331,7 @@ FILES = (
     "docs/ablation.md",
     "docs/comparison.md",
     "docs/targets.md",
+    "docs/raytracing.md",
 )
 
 

@@ -26,7 +26,7 @@ def progress_bar(shown: bool = True) -> Progress:
 Item = TypeVar("Item")
 
 
-def progress(items: Sequence[Item], description: str) -> Iterator[Item]:
+def progress(items: Sequence[Item], description: str, shown: bool = True) -> Iterator[Item]:
     """The items, with a bar."""
-    with progress_bar() as bar:
+    with progress_bar(shown) as bar:
         yield from bar.track(items, description=description)

@@ -25,6 +25,7 @@ from swiftwrf.threads import set_threads
 from tasks.directory import console
 from tasks.environment import machine, packages
 from tasks.run import choose_device
+from tasks.torchrun import others
 
 if TYPE_CHECKING:
     from distributed import Future
@@ -41,11 +42,14 @@ def connected(address: str | None, device: torch.device) -> Iterator[Cluster | N
     """The cluster of the scheduler at this address; None where there is no address.
 
     Raises:
-        InputError: the optional extra is not installed, the address cannot be one, nobody answers there, or no workers come.
+        InputError: the optional extra is not installed, the address cannot be one, nobody answers there, no workers come, or
+            torchrun started this process.
     """
     if address is None:
         yield None
         return
+    if others() is not None:
+        raise InputError("--scheduler and torchrun both spread the steps of a run; use one of them")
     cluster = Cluster(address, device)
     try:
         yield cluster

@@ -159,7 +159,8 @@ class Run:
         threads = self._environment.get("threads")
         if isinstance(threads, int) and 1 <= threads <= 1024:  # they are part of the seed
             set_threads(threads)
-        session = {name: value for name, value in environment(device, source).items() if name in ("commit", "start")}
+        here = environment(device, source)
+        session = {name: here[name] for name in ("commit", "start", "processes")}
         self._environment["resumed"] = [*self._environment.get("resumed", []), session]
         self.write_json(ENVIRONMENT, self._environment)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import distributed as dist
 
 
 def now() -> str:
@@ -23,7 +24,7 @@ def environment(device: torch.device, source: dict[str, str]) -> dict[str, Any]:
     """Code, versions, machine and input of a run.
 
     The number of threads belongs to the seed: sums over threads are added up in another order, and a training turns the
-    last bit of a sum into degrees.
+    last bit of a sum into degrees. So does the number of processes, which add up sums, too.
     """
     return {
         "commit": _commit(),
@@ -32,6 +33,7 @@ def environment(device: torch.device, source: dict[str, str]) -> dict[str, Any]:
         "packages": packages(),
         "device": machine(device),
         "threads": torch.get_num_threads(),
+        "processes": dist.get_world_size() if dist.is_initialized() else 1,
         "input_sha256": source,
         "start": now(),
     }

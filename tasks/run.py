@@ -8,6 +8,7 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 from unicodedata import category
@@ -20,6 +21,7 @@ from swiftwrf.errors import one_line
 from swiftwrf.registry import Registry
 from tasks.directory import Run, console, saved_config
 from tasks.records import Row
+from tasks.torchrun import check_gpus, together
 
 Config = TypeVar("Config")
 Preset = Literal["quick", "paper"]
@@ -34,7 +36,8 @@ def command_line(
     arguments: Sequence[str],
     more: Callable[[], str] | None = None,
 ) -> int:
-    """Parses the arguments into `config_type`, runs the task and turns its errors into sentences and exit codes.
+    """Parses the arguments into `config_type`, runs the task and turns its errors into sentences and exit codes; under
+    torchrun in the first process, for which the others compute.
 
     `--resume DIR` takes the configuration from an interrupted run instead; where to compute on, here or on the cluster of
     `--scheduler`, is said anew. The help says what the docstring of
@@ -43,6 +46,16 @@ def command_line(
     Returns:
         0: done; 2: wrong input, or nowhere to write, said in one sentence; 1: a fit that broke; 130: interrupted.
     """
+    return together(partial(_command, name, config_type, task, arguments, more))
+
+
+def _command(
+    name: str,
+    config_type: type[Config],
+    task: Callable[[Config, Path | None], None],
+    arguments: Sequence[str],
+    more: Callable[[], str] | None,
+) -> int:
     try:
         config, folder = _parse(name, config_type, arguments, more)
         _check_values(config)
@@ -136,12 +149,14 @@ def choose_device(name: str) -> torch.device:
     """The device of that name; `auto` is the GPU where there is one.
 
     Raises:
-        InputError: a GPU asked for where there is none.
+        InputError: a GPU asked for where there is none, or fewer of them than processes.
     """
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda needs an NVIDIA GPU that torch can use, and there is none; use --device cpu")
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda":
+        check_gpus()
     return torch.device(name)
 
 

@@ -12,7 +12,8 @@ import quick
 import torch
 from PIL import Image
 
-from swiftwrf import AngularGrid, FitConfig, ModelConfig, Spectra, fit, simulated_room
+from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, Spectra, fit, simulated_room
+from swiftwrf.data.raytraced import sionna
 from swiftwrf.data.writing import write_spectra
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # one thread a process: more would wait for each other
@@ -29,6 +30,25 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.skip(reason="needs an NVIDIA GPU"))
         if "data" in item.keywords and "SWIFTWRF_DATA" not in os.environ:
             item.add_marker(pytest.mark.skip(reason="needs the measured data: set SWIFTWRF_DATA to their folder"))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Tests of all synthesizers skip the one whose extra is missing."""
+    if getattr(item, "callspec", None) and item.callspec.params.get("name") == "raytrace":
+        _sionna_or_skip()
+
+
+def _sionna_or_skip() -> None:
+    try:
+        sionna()
+    except InputError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture
+def ray_tracer() -> None:
+    """Sionna RT, or a reason to skip."""
+    _sionna_or_skip()
 
 
 @pytest.fixture(scope="session")

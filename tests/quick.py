@@ -44,6 +44,8 @@ from tasks.report.__main__ import run as report
 from tasks.rssi import experiment as rssi
 from tasks.rssi.predictors import PREDICTORS
 from tasks.run import command_line
+from tasks.scenes import ScenesConfig
+from tasks.scenes import run as scenes
 from tasks.view import ViewConfig
 from tasks.view import run as view
 
@@ -65,6 +67,7 @@ TASKS = {
     "estimate": (EstimateConfig, estimate),
     "inspect": (InspectConfig, inspect),
     "view": (ViewConfig, view),
+    "scenes": (ScenesConfig, scenes),
 }
 FOR_LIFE = ExitStack()
 PREDICTORS_KEPT = ("swiftwrf", "mean", "mri_pooled", "mri_receiver")

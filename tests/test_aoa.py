@@ -202,7 +202,7 @@ def test_a_new_synthesizer_is_in_help_report_and_colours(monkeypatch, capsys):
     with pytest.raises(SystemExit):
         run("--help")
     assert "dark: nothing anywhere" in " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert arms.synthesizers(["dark", "gone"]) == "dark: nothing anywhere."
+    assert arms.synthesizers(["dark", "gone"]) == {"dark": "nothing anywhere"}
     assert arms.palette().colour("dark") == arms.palette().colour("turbo_dark") == "#123456"
 
 

@@ -13,14 +13,17 @@ from functools import partial
 from pathlib import Path
 from unittest import mock
 
+import ablation
+import comparison
 import dask
+import model_size
 import pytest
 import torch
 from quick import run, said
 from test_interrupts import same_results
 from test_rssi_model import with_field
 
-from swiftwrf import FitError, InputError, fit_rssi
+from swiftwrf import AngularGrid, FitError, InputError, fit_rssi, simulated_room
 from swiftwrf.rssi import fit as rssi_fit
 from tasks import cluster as clusters
 from tasks.cluster import Cluster
@@ -103,6 +106,48 @@ def test_rssi_has_the_same_bits_when_a_worker_dies(local, cluster, monkeypatch):
     data = with_field(n=40)
     here, there = fit_rssi(data), fit_rssi(data, parallel=cluster.map)
     assert torch.equal(there.predict(data.transmitter_position)[0], here.predict(data.transmitter_position)[0])
+
+
+def test_the_comparison_has_the_same_rows(local, tmp_path, monkeypatch, small_published):
+    data = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
+    written = []
+    monkeypatch.setattr(comparison, "scenes", lambda config: [("room random", data, "random")])
+    monkeypatch.setattr(comparison, "BASELINES", ("mean", "nearest"))
+    monkeypatch.setattr(comparison, "LEARNT", ("vae",))
+    monkeypatch.setattr(comparison, "write_result", lambda name, content: written.append(content["scenes"]))
+    monkeypatch.setattr(comparison, "draw", lambda found: None)
+    for address in (None, local.scheduler_address):
+        work = tmp_path / ("here" if address is None else "there")
+        comparison.main(comparison.Config(Path(), parts=("scenes",), work=work, scheduler=address))
+        assert not list(work.rglob("*.state"))
+    here, there = (found["room random"]["24"] for found in written)
+    assert list(there) == list(here) == ["mean", "nearest", "vae"]
+    assert scores(there.values()) == scores(here.values())
+
+
+def scores(rows):
+    """The rows but for what no two measurements share."""
+    return [{key: value for key, value in row.items() if key not in ("seconds", "fit_seconds", "ms")} for row in rows]
+
+
+def test_studies_have_the_same_scores(local, tmp_path, monkeypatch):
+    data = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
+    written = []
+    for study in (ablation, model_size):
+        monkeypatch.setattr(study, "simulated_room", lambda: data)
+        monkeypatch.setattr(study, "write_result", lambda name, content: written.append(content))
+    monkeypatch.setattr(model_size, "SIZES", (16,))
+    monkeypatch.setattr(ablation, "variants", lambda default, gradient: {"default": default})
+    for study in (ablation, model_size):
+        for address in (None, local.scheduler_address):
+            study.main(study.Config(scheduler=address))
+    found = [content["scenes"]["simulated-room random"] for content in written]
+    varied = [scores(study["variants"].values()) for study in found[:2]]
+    sized = [scores([study["auto"], *study["fixed"]]) for study in found[2:]]
+    assert varied[0] == varied[1]
+    assert sized[0] == sized[1]
+    assert "psnr_db" in varied[0][0]
+    assert ["workers" in content for content in written] == [False, True, False, True]
 
 
 def test_workers_take_the_threads_of_the_run(cluster):

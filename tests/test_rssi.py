@@ -106,7 +106,8 @@ def test_predictors_say_what_they_are():
     for entry in PREDICTORS.entries():
         assert entry.meaning
         assert entry.colour is not None
-    assert list(PREDICTORS) == ["swiftwrf", "mean", "mri_pooled", "mri_receiver", "mri_residual", "knn", "gp", "nerf2"]
+    baselines = ["mean", "mri_pooled", "mri_receiver", "mri_residual", "knn", "gp"]
+    assert list(PREDICTORS) == ["swiftwrf", *baselines, "nerf2", "blend"]
 
 
 def test_unknown_predictor():
@@ -124,11 +125,12 @@ def run(*arguments):
     return command_line("tasks.rssi", experiment.RssiTaskConfig, experiment.run, [str(a) for a in arguments])
 
 
-def test_whole_run(small, tmp_path):
+def test_whole_run(small, tmp_path, monkeypatch):
+    monkeypatch.setattr(predictors, "BLENDED", ("knn", "mri_residual"))
     plan = tmp_path / "plan.png"
     Image.new("RGB", (40, 30), "white").save(plan)
     floor = ("--floor-plan", plan, "--floor-extent", 0, 20, 0, 16)
-    assert run("--rx", "1", "receiver06", *floor, "--also", "nerf2", "--out", tmp_path / "run") == 0
+    assert run("--rx", "1", "receiver06", *floor, "--also", "nerf2", "blend", "--out", tmp_path / "run") == 0
     out = tmp_path / "run"
     metrics = json.loads((out / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(name))
     assert (metrics["task"], metrics["data"], metrics["split"]) == ("rssi", "simulated-room", "random")
@@ -226,3 +228,23 @@ def test_neighbours_are_those_that_a_grid_search_chooses():
         search = GridSearchCV(KNeighborsRegressor(), grid, scoring="neg_mean_absolute_error", cv=PredefinedSplit(own))
         found = predictor._regressor(x, y, own)
         assert {"n_neighbors": found.n_neighbors, "weights": found.weights} == search.fit(x, y).best_params_
+
+
+def test_a_blend_takes_the_part_that_is_right(monkeypatch):
+    monkeypatch.setattr(predictors, "BLENDED", ("mri_receiver", "mean"))
+    data = law_only()
+    blend = PREDICTORS["blend"].make(Settings(pool=data))
+    blend.fit(data)
+    assert blend.weights == pytest.approx({"mri_receiver": 1, "mean": 0}, abs=1e-6)
+    torch.testing.assert_close(blend.predict(data.transmitter_position), data.rssi_dbm, atol=1e-3, rtol=0)
+
+
+def test_a_blend_weighs_noisy_parts(monkeypatch):
+    """The weights are positive where each part knows something, and sum to 1."""
+    monkeypatch.setattr(predictors, "BLENDED", ("knn", "mri_receiver"))
+    train, test = rssi_room(n=200).receivers(["1", "2"]).split()
+    blend = PREDICTORS["blend"].make(Settings(pool=train))
+    blend.fit(train)
+    assert sum(blend.weights.values()) == pytest.approx(1)
+    assert min(blend.weights.values()) > 0.05
+    assert blend.predict(test.transmitter_position).shape == test.rssi_dbm.shape

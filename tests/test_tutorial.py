@@ -1,4 +1,4 @@
-"""Every block of the tutorial runs as it stands, in order, in one directory; the network is a stand-in."""
+"""Every block of the tutorial runs as it stands, in order, in one directory; what takes long is made cheaper."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-from quick import TASKS, QuickNetwork
+from quick import PREDICTORS_KEPT, TASKS, QuickNetwork
 
+from swiftwrf import RssiConfig
 from tasks.aoa.arms import NETWORK
 from tasks.aoa.estimators import ESTIMATORS
+from tasks.rssi.predictors import PREDICTORS
 from tasks.run import command_line
 
 TEXT = (Path(__file__).parent.parent / "docs" / "tutorial.md").read_text()
@@ -32,7 +34,13 @@ def test_every_block_runs(part, tmp_path, monkeypatch):
         assert [python, dash_m] == ["python", "-m"]
         name = module.removeprefix("tasks.")
         config, function = TASKS[name]
-        with mock.patch.dict(ESTIMATORS._entries, {NETWORK: quick}):
+        with (
+            mock.patch.dict(ESTIMATORS._entries, {NETWORK: quick}),
+            mock.patch(
+                "tasks.rssi.predictors.RssiConfig", lambda **given: RssiConfig(**given, steps=2, n_primitives=0)
+            ),
+            mock.patch.object(PREDICTORS, "_entries", {name: PREDICTORS[name] for name in PREDICTORS_KEPT}),
+        ):
             assert command_line(module, config, function, arguments) == 0, block
         out = Path(arguments[arguments.index("--out") + 1])
         assert (out if out.suffix else out / "report.html").is_file()

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
+from torch.distributed import ProcessGroup
 
 from swiftwrf import Spectra
 from swiftwrf.checkpoint import Saved
@@ -30,6 +31,8 @@ class Settings:
         checkpoint: a file that keeps the state of a long fit; where it exists, the fit goes on from it.
         on_record: called with the records of a fit.
         progress: show a progress bar on a terminal.
+        scene: of `raytrace`: a built-in room or a scene file, instead of the room that the spectra show.
+        group: processes of `torch.distributed` that fit one of those that are `shared`.
     """
 
     validation: Validation = "random"
@@ -39,6 +42,8 @@ class Settings:
     checkpoint: Path | None = None
     on_record: Callable[[dict[str, Any]], None] | None = None
     progress: bool = True
+    scene: str | None = None
+    group: ProcessGroup | None = None
 
 
 class Synthesizer(ABC):
@@ -46,6 +51,8 @@ class Synthesizer(ABC):
 
     samples: ClassVar[bool] = False
     """whether `synthesize` can draw instead of predicting the mean"""
+    shared: ClassVar[bool] = False
+    """whether several processes fit one together"""
     shared_seconds: float = 0.0
     """of its fit, spent by another synthesizer that needed the same"""
 

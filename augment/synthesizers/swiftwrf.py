@@ -15,6 +15,8 @@ from swiftwrf import FitConfig, Spectra, SwiftWRF, fit
 class SwiftWRFSynthesizer(Synthesizer):
     """2D Gaussians that change with the position, as many as the scene needs."""
 
+    shared = True
+
     def fit(self, train: Spectra) -> None:
         self._fit(train, FitConfig.paper() if self.settings.preset == "paper" else FitConfig())
 
@@ -33,6 +35,7 @@ class SwiftWRFSynthesizer(Synthesizer):
             checkpoint=own.checkpoint,
             on_record=own.on_record,
             progress=own.progress,
+            group=own.group,
         )
 
     def synthesize(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:

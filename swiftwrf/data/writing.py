@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,10 @@ from torch import Tensor
 
 from swiftwrf.angles import AngularGrid
 from swiftwrf.data.formats.nerf2_rssi import NOT_HEARD
+from swiftwrf.data.raytraced import TracedPaths
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.spectra import Spectra
-from swiftwrf.durable import replacing, write_text
+from swiftwrf.data.spectra import Moving, Spectra
+from swiftwrf.durable import replacing, write_bytes, write_text
 from swiftwrf.errors import InputError
 from swiftwrf.store import write_npy
 
@@ -71,6 +73,35 @@ def write_rssi(data: Rssi, folder: Path) -> None:
         places = dict(zip(data.receiver_names, data.receiver_position.tolist(), strict=True))
         write_text(folder / "gateway_position.yml", yaml.safe_dump(places, sort_keys=False, allow_unicode=True))
     _write_splits(data.named_splits, folder, first=0)
+
+
+def write_paths(
+    folder: Path, paths: TracedPaths, fixed: Tensor, position: Tensor, moving: Moving, frequency_hz: float
+) -> None:
+    """paths.npz.
+
+    Args:
+        folder: to write to, which exists.
+        paths: of all positions, at least one each.
+        fixed: position of the end that stays, (3,) [m].
+        position: of the end that moves, (n, 3) [m].
+        moving: which end that is.
+        frequency_hz: of the carrier.
+    """
+    ends = (position, fixed.expand_as(position))
+    transmitter, receiver = ends if moving == "transmitter" else ends[::-1]
+    stream = io.BytesIO()
+    np.savez_compressed(
+        stream,
+        transmitter_position=transmitter.numpy(),
+        receiver_position=receiver.numpy(),
+        path_count=paths.count.numpy(),
+        last_point=paths.last_point(transmitter).numpy(),
+        gain=paths.gain.numpy(),
+        line_of_sight=paths.line_of_sight.numpy(),
+        frequency_hz=np.float64(frequency_hz),
+    )
+    write_bytes(folder / "paths.npz", stream.getvalue())
 
 
 def _csv(header: str, values: Tensor) -> str:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import torch
+from torch import Tensor
+from torch.distributed import ProcessGroup
 
 from swiftwrf.data.spectra import Spectra, check_training, fingerprint
 from swiftwrf.data.splits import folds
@@ -16,9 +19,10 @@ from swiftwrf.fitting.optimise import Optimisation
 from swiftwrf.fitting.regression import Regression
 from swiftwrf.fitting.search import doubling_search
 from swiftwrf.fitting.state import Record, Session, Size
-from swiftwrf.gp import choose_kernel
+from swiftwrf.gp import Kernel, choose_kernel
 from swiftwrf.model import SwiftWRF
 from swiftwrf.model.deformation import deformation_type
+from swiftwrf.processes import Processes
 from swiftwrf.progress import progress_bar
 
 FEWEST, MOST = 16, 512  # primitives that the search tries
@@ -32,6 +36,7 @@ def fit(
     checkpoint: Path | None = None,
     on_record: Callable[[Record], None] | None = None,
     progress: bool = True,
+    group: ProcessGroup | None = None,
 ) -> SwiftWRF:
     """Fits a SwiftWRF model to spectra.
 
@@ -47,35 +52,43 @@ def fit(
             (of the search), seconds of that run and elapsed ones of the fit; a fit that goes on begins with the records
             of its earlier sessions.
         progress: show a progress bar on a terminal.
+        group: processes of `torch.distributed` that share the batches of a fit by gradient. Each of them makes this call
+            with the same spectra and configuration, and gets the model of one process but for the rounding of sums; only
+            the first keeps the checkpoint, is told records and shows progress.
 
     Raises:
-        InputError: fewer than 10 spectra, something not finite, a configuration that does not fit together, or a
-            checkpoint of another fit.
+        InputError: fewer than 10 spectra, something not finite, a configuration that does not fit together, a
+            checkpoint of another fit, or more processes than spectra in a batch.
         FitError: a loss or gradient that is not finite (the checkpoint holds the last good state), or a fit that ends
             worse than it began.
     """
     config = config or FitConfig()
     check_training(train)
     config.check()
+    processes = Processes(group)
     fold = folds(train.position, config.validation, config.seed)
     work = train.at_most(config.max_azimuths)
-    kernel = choose_kernel(work.position, work.store, fold)
+    kernel = processes.from_first(partial(choose_kernel, work.position, work.store, fold))
     if config.validation == "random":
         fold = torch.arange(len(train))  # regression leaves out one spectrum as easily as a fifth of them
     if config.model.rank == "auto":
-        deformation = deformation_type(config.model.deformation)
-        rank = deformation.choose_rank(work.position, work.store, fold, kernel)
+        rank = processes.from_first(partial(_rank, work, config, fold, kernel))
         config = replace(config, model=replace(config.model, rank=rank))
-    with progress_bar(progress) as bar:
-        session = Session(checkpoint, fingerprint(work, asdict(config)), bar, on_record)
+    with progress_bar(progress and processes.first) as bar:
+        session = Session(checkpoint, fingerprint(work, asdict(config)), bar, on_record, processes)
         if config.steps:
-            optimisation = Optimisation(config, work, kernel, device)
+            optimisation = Optimisation(config, work, kernel, device, processes)
             optimisation.run(session)
             model = optimisation.result
         else:
             model = _regress(Regression(work, config, kernel, fold), config, session).to(device)
     model.grid = train.grid
     return model.eval()
+
+
+def _rank(train: Spectra, config: FitConfig, fold: Tensor, kernel: Kernel) -> int:
+    deformation = deformation_type(config.model.deformation)
+    return deformation.choose_rank(train.position, train.store, fold, kernel)
 
 
 def _regress(regression: Regression, config: FitConfig, session: Session) -> SwiftWRF:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from swiftwrf import checkpoint
 from swiftwrf.errors import InputError
+from swiftwrf.processes import Processes
 
 Record = dict[str, Any]
 KIND = "fit state"
@@ -58,6 +59,7 @@ class Session:
         owner: fingerprint of configuration and spectra.
         bar: shows progress.
         on_record: is called at each evaluation.
+        processes: that go on together; only the first reads, writes and informs.
         saved: the state of an earlier session of the same fit.
         losses: on held-out spectra, of runs that are done, by their key.
         records: of all evaluations of the fit, those of earlier sessions first.
@@ -71,6 +73,7 @@ class Session:
     owner: str
     bar: Progress
     on_record: Callable[[Record], None] | None
+    processes: Processes = field(default_factory=Processes)
     saved: State | None = None
     losses: dict[str, float] = field(default_factory=dict)
     records: list[Record] = field(default_factory=list)
@@ -78,17 +81,22 @@ class Session:
     began: float = field(default_factory=time.perf_counter)
 
     def __post_init__(self) -> None:
-        if self.path is not None and self.path.exists():
-            _, tensors, header = checkpoint.read(self.path, KIND)
-            if header.get("fingerprint") != self.owner:
-                raise InputError(
-                    f"{self.path} is the state of another fit (other spectra or settings); remove it or give another path"
-                )
-            with checkpoint.refusing(f"{self.path} is no state that a fit can go on from"):
-                self.saved, self.losses = State(header, tensors), dict(header["losses"])
-                self.records, self.earlier = list(header["records"]), float(header["elapsed"])
-            for record in self.records:
-                self._inform(record)
+        self.saved = self.processes.from_first(self._read)
+        for record in self.records:
+            self._inform(record)
+
+    def _read(self) -> State | None:
+        if self.path is None or not self.path.exists():
+            return None
+        _, tensors, header = checkpoint.read(self.path, KIND)
+        if header.get("fingerprint") != self.owner:
+            raise InputError(
+                f"{self.path} is the state of another fit (other spectra or settings); remove it or give another path"
+            )
+        with checkpoint.refusing(f"{self.path} is no state that a fit can go on from"):
+            self.losses, self.records = dict(header["losses"]), list(header["records"])
+            self.earlier = float(header["elapsed"])
+        return State(header, tensors)
 
     @property
     def elapsed(self) -> float:
@@ -100,7 +108,7 @@ class Session:
         after an interruption has it once."""
         record = record | {"elapsed": self.elapsed}
         self.records.append(record)
-        if self.path is not None:
+        if self.path is not None and self.processes.first:
             shared = {
                 "losses": self.losses,
                 "fingerprint": self.owner,
@@ -111,5 +119,5 @@ class Session:
         self._inform(record)
 
     def _inform(self, record: Record) -> None:
-        if self.on_record is not None:
+        if self.on_record is not None and self.processes.first:
             self.on_record(record)

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
 from augment import SYNTHESIZERS, lacks
 from augment.suggest import MOST as MOST_SUGGESTED
 from swiftwrf import InputError, Spectra
+from swiftwrf.data.raytraced import ROOMS, SCENE_FILE, sionna
 from swiftwrf.data.spectra import Moving
 from swiftwrf.metrics import WINDOW
 from tasks.run import SEEDS, Preset, choice
 from tasks.source import SpectraSource, reading
 
 AUTO = "auto"  # the synthesizer that suits the scene
+RAYTRACE = "raytrace"  # the synthesizer that takes --scene
 EXTRA = 3000  # further positions unless told otherwise
 
 
@@ -38,6 +41,9 @@ class AoaConfig(SpectraSource):
             SYNTHESIZERS,
         ),
     ] = (AUTO,)
+    scene: str | None = None
+    """room of tasks.scenes or Mitsuba scene (FILE.xml) that synthesizer raytrace traces, in the coordinates of the data
+    (default: the room that it finds from the spectra)"""
     extra: int | None = None
     """further positions in the region of the measured ones at which spectra are synthesized, too (default: 3000 where
     held-out measured spectra gain from them, else none)"""
@@ -72,6 +78,10 @@ def check(config: AoaConfig) -> None:
     for name in config.synthesizer:
         if name != AUTO:
             SYNTHESIZERS[name]  # refuses an unknown one
+    if RAYTRACE in config.synthesizer:
+        sionna()  # refuses before anything is computed
+    if config.scene is not None:
+        _check_scene(config.scene, config.synthesizer)
     if config.extra is not None and config.extra < 0:
         raise InputError(f"--extra takes a number of positions, got {config.extra}")
     if not 0 <= config.suggest <= MOST_SUGGESTED:
@@ -90,6 +100,15 @@ def check(config: AoaConfig) -> None:
         raise InputError(f"--repeats must be at least 1, got {config.repeats}")
     if config.seed + config.repeats > SEEDS:
         raise InputError(f"--seed {config.seed} leaves no seeds for {config.repeats} repeats; choose a smaller one")
+
+
+def _check_scene(scene: str, synthesizers: tuple[str, ...]) -> None:
+    if RAYTRACE not in synthesizers:
+        raise InputError(f"--scene is for synthesizer {RAYTRACE}; add it to --synthesizer, or leave --scene out")
+    if not scene.endswith(SCENE_FILE):
+        ROOMS[scene]  # refuses an unknown one
+    elif not Path(scene).is_file():
+        raise InputError(f"--scene {scene} is not there; expected a Mitsuba scene, or one of {', '.join(ROOMS)}")
 
 
 def check_data(data: Spectra, config: AoaConfig) -> None:

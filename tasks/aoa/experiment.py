@@ -11,6 +11,7 @@ from torch import Tensor
 from augment import withhold
 from swiftwrf import InputError, Spectra, simulated_room
 from swiftwrf.data import read_spectra
+from swiftwrf.data.files import sha256
 from swiftwrf.metrics import angle_errors, l1, psnr, ssim
 from swiftwrf.store import Store
 from tasks.aoa.config import AoaConfig, check, check_data, further_positions
@@ -56,10 +57,13 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
             steps += steps_at(setting, At(share, repeat))
     if config.suggest:
         steps += [Suggestion(At(share, 0)) for share in config.mix]
+    source = data.source
+    if config.scene is not None and Path(config.scene).is_file():
+        source = {**source, f"scene {Path(config.scene).name}": sha256(Path(config.scene))}
     label = f"mix{'_'.join(f'{share:g}' for share in config.mix)}-s{config.seed}"
     with (
         connected(config.scheduler, device) as cluster,
-        Run("aoa", config.out, label, config, device, data.source, resume) as directory,
+        Run("aoa", config.out, label, config, device, source, resume) as directory,
     ):
         tables = _Tables(setting, directory)
         for step, value in computed(directory, steps, setting, cluster):

@@ -62,6 +62,7 @@ class Setting:
             seed=self.config.seed + at.repeat,
             preset=self.config.preset,
             device=self.device,
+            scene=self.config.scene,
         )
 
     def of_estimators(self, at: At) -> Settings:

@@ -6,11 +6,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import torch
 from torch import Tensor
 
-from augment import Mixed, choose_synthesizer, make_synthesizer, mix
+from augment import SYNTHESIZERS, Mixed, choose_synthesizer, make_synthesizer, mix
 from augment.choose import SLOW, candidates
 from augment.suggest import suggest
 from augment.synthesizers import Synthesizer
@@ -21,7 +22,7 @@ from swiftwrf.store import Store
 from tasks.aoa import arms
 from tasks.aoa.advice import advise
 from tasks.aoa.config import AUTO
-from tasks.aoa.estimators import ESTIMATORS, SavedEstimator, learners
+from tasks.aoa.estimators import ESTIMATORS, Estimator, SavedEstimator, learners
 from tasks.aoa.field import motion, strongest_direction
 from tasks.aoa.setting import At, Setting
 from tasks.claim import STEPS
@@ -29,6 +30,7 @@ from tasks.metrics import AdviceMetrics
 from tasks.records import write_json, write_npz
 from tasks.run import Row
 from tasks.steps import Step
+from tasks.torchrun import group
 
 KIND = "synthetic spectra"
 AT_ONCE = 4096  # positions that are drawn before they are rounded: half a gigabyte of 90 x 360 pixels
@@ -109,6 +111,10 @@ class Synthesis(Step[Setting]):
         return f"synthesis_{self.synthesizer}-{self.at}"
 
     @property
+    def shared(self) -> bool:
+        return cast(type[Synthesizer], SYNTHESIZERS[self.synthesizer].make).shared
+
+    @property
     def file(self) -> str:
         """Where the spectra are kept."""
         return f"{STEPS}/{self.name}.safetensors"
@@ -129,7 +135,12 @@ class Synthesis(Step[Setting]):
         measured, withheld = setting.withhold(self.at)
         fit = _FitHistory()
         checkpoint = folder / STEPS / f"{self.name}-fit.safetensors"
-        settings = replace(setting.of_synthesizers(self.at), checkpoint=checkpoint, on_record=fit.add)
+        settings = replace(
+            setting.of_synthesizers(self.at),
+            checkpoint=checkpoint,
+            on_record=fit.add,
+            group=group() if self.shared else None,
+        )
         synthesizer = make_synthesizer(self.synthesizer, settings)
         synthesizer.fit(measured)
         fitted = time.perf_counter()
@@ -218,12 +229,17 @@ class Arm(Step[Setting]):
         return f"{self.method}-r{self.at.repeat}" if self.training == arms.UPPER.name else f"{self.method}-{self.at}"
 
     @property
+    def shared(self) -> bool:
+        return cast(type[Estimator], ESTIMATORS[self.estimator].make).shared
+
+    @property
     def reads(self) -> tuple[str, ...]:
         return (self.synthesis.file,) if self.synthesis else ()
 
     def compute(self, setting: Setting, folder: Path) -> Row:
         train = self._training_set(setting, folder)
-        estimator = ESTIMATORS[self.estimator].make(setting.of_estimators(self.at))
+        settings = replace(setting.of_estimators(self.at), group=group() if self.shared else None)
+        estimator = ESTIMATORS[self.estimator].make(settings)
         began = time.perf_counter()
         estimator.fit(train)
         fitted = time.perf_counter()

@@ -23,6 +23,7 @@ def provenance(runs: Sequence[Records[Any]]) -> Section:
         resumed = ", ".join(
             f"{session['start']} (commit {session['commit']})" for session in environment.get("resumed", [])
         )
+        processes = environment.get("processes", 1)
         rows = [
             *([["run", f"{run.number}: {run.folder.name}"]] if run.number else []),
             ["command", run.config["command"]],
@@ -34,6 +35,7 @@ def provenance(runs: Sequence[Records[Any]]) -> Section:
                 "threads",
                 f"{environment['threads']}; like the seed, another number changes the networks, by up to degrees",
             ],
+            *([["processes", f"{processes}; as the threads"]] if processes > 1 else []),
             ["time", f"{environment['start']} to {environment.get('end', '-')}"],
             *([["resumed", resumed]] if resumed else []),
             *([f"sha256 of {name}", digest] for name, digest in environment["input_sha256"].items()),

@@ -242,8 +242,8 @@ class NeRF2Predictor:
 
 
 class Blend:
-    """A weighted mean of the best predictors. The weights, the same at all receivers, are those with the least absolute error
-    on held-out training rows (stacking: L. Breiman, "Stacked regressions", Machine Learning 24, 1996)."""
+    """A weighted mean of the best predictors. The weights, the same at all receivers, are those with the least absolute
+    error on held-out training rows (stacking: L. Breiman, "Stacked regressions", Machine Learning 24, 1996)."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
@@ -259,7 +259,11 @@ class Blend:
                 held_out[i, out] = self._fitted(name, train, (~out).nonzero()[:, 0]).predict(place).double()
         heard = ~train.rssi_dbm.isnan()
         self.weights = dict(zip(names, self._weights(held_out[:, heard].T, train.rssi_dbm[heard]), strict=True))
-        self._members = {name: self._fitted(name, train, torch.arange(len(train))) for name, weight in self.weights.items() if weight > 0}
+        self._members = {
+            name: self._fitted(name, train, torch.arange(len(train)))
+            for name, weight in self.weights.items()
+            if weight > 0
+        }
 
     def _fitted(self, name: str, train: Rssi, rows: Tensor) -> Predictor:
         """A member, fitted to some rows."""
@@ -269,7 +273,7 @@ class Blend:
         return predictor
 
     def _weights(self, predicted: Tensor, measured: Tensor) -> list[float]:
-        """Non-negative, of sum 1, for predictions (n, m) of n values: a linear programme in the weights and the errors' sizes."""
+        """Non-negative, of sum 1, for predictions (n, m) of n values: a linear programme in weights and absolute errors."""
         some = np.random.default_rng(self._settings.seed).permutation(len(measured))[:MOST_PAIRS]
         known, values = csr_array(predicted.numpy()[some]), measured.numpy()[some]
         n, m = known.shape

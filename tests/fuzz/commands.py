@@ -29,6 +29,7 @@ NEEDED = {
     "convert": ["data", "taken"],
     "inspect": ["data"],
     "view": ["data"],
+    "scenes": ["--room", "office", "--moving", "receiver", "--positions", "5"],
     "estimate": ["data", "data"],
 }
 RIGHT = {

@@ -7,6 +7,7 @@ labels' spread, so that training starts from the constant estimator.
 
 from __future__ import annotations
 
+import copy
 import time
 from dataclasses import asdict, dataclass
 from typing import cast
@@ -15,12 +16,14 @@ import torch
 import torchvision
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import update_bn
 
 from augment import Mixed
 from swiftwrf.angles import AngularGrid, to_angles, to_direction
 from swiftwrf.checkpoint import Header, expect
 from swiftwrf.data.spectra import coarsening
+from swiftwrf.processes import Processes
 from swiftwrf.progress import progress
 from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator, Settings
 
@@ -63,6 +66,38 @@ class _CircularConv(nn.Module):
         return cast(Tensor, self.inner(wrapped))
 
 
+class _SharedNorm(nn.BatchNorm2d):
+    """What `nn.SyncBatchNorm` is on GPUs, for CPUs, where torch has none: statistics of the batch of all processes."""
+
+    def __init__(self, inner: nn.BatchNorm2d, processes: Processes) -> None:
+        super().__init__(inner.num_features, eps=inner.eps)
+        self.load_state_dict(inner.state_dict())
+        self.processes = processes
+
+    def forward(self, x: Tensor) -> Tensor:
+        wide, pixels = x.to(torch.promote_types(x.dtype, torch.float32)), (0, 2, 3)
+        rows = self.processes.total(wide.new_tensor(len(x)))
+        n = rows * x.shape[2] * x.shape[3]
+        mean = self.processes.total(wide.sum(pixels)) / n
+        centred = wide - mean[:, None, None]
+        variance = self.processes.total(centred.square().sum(pixels)) / n
+        scale = self.weight * (variance + self.eps).rsqrt()
+        return (centred * scale[:, None, None] + self.bias[:, None, None]).to(x.dtype)
+
+
+def _shared(network: nn.Module, processes: Processes) -> nn.Module:
+    """A copy to be trained by several processes, whose batch norms see the whole batch."""
+    copied = copy.deepcopy(network)
+    if next(copied.parameters()).is_cuda:
+        copied = nn.SyncBatchNorm.convert_sync_batchnorm(copied, processes.group)
+    else:
+        for module in list(copied.modules()):
+            for name, child in module.named_children():
+                if isinstance(child, nn.BatchNorm2d):
+                    setattr(module, name, _SharedNorm(child, processes))
+    return DistributedDataParallel(copied, process_group=processes.group)
+
+
 def _backbone(circular: bool) -> nn.Module:
     network: nn.Module = torchvision.models.resnet50(weights=None)
     network.conv1 = nn.Conv2d(1, 64, kernel_size=7, stride=2, padding=3, bias=False)
@@ -82,10 +117,15 @@ def _backbone(circular: bool) -> nn.Module:
 class AANN(SavedEstimator):
     """ResNet-50 with one input channel and an MLP head, from a seeded start; weights are not downloaded.
 
+    Several processes share each batch, its statistics in the batch norms included: they train the network that one would,
+    but for the rounding of sums.
+
     Args:
-        settings: seed of weights and batches, device, and the preset of the training.
+        settings: seed of weights and batches, device, the preset of the training, and the processes that share it.
         config: of the training, in place of the preset's.
     """
+
+    shared = True
 
     def __init__(self, settings: Settings, config: AANNConfig | None = None) -> None:
         super().__init__(settings)
@@ -107,7 +147,9 @@ class AANN(SavedEstimator):
         return (2 * small - 1).to(self._device, memory_format=torch.channels_last)
 
     def fit(self, train: Mixed) -> None:
-        config, network = self._config, self._network
+        config, processes = self._config, Processes(self.settings.group)
+        network = self._network if processes.group is None else _shared(self._network, processes)
+        weight = processes.weight(min(config.batch, len(train)))
         spectrum = torch.cat([self._prepare(part) for part in train.batches()])
         direction = to_direction(*train.label.unbind(-1)).float().to(self._device)
         self._mean = functional.normalize(direction.mean(dim=0), dim=0)
@@ -116,35 +158,40 @@ class AANN(SavedEstimator):
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, config.rate, total_steps=config.steps)
         network.train()
         began, order = time.perf_counter(), torch.empty(0, dtype=torch.int64)
-        for step in progress(range(1, config.steps + 1), "AANN"):
+        for step in progress(range(1, config.steps + 1), "AANN", shown=processes.first):
             if len(order) < min(config.batch, len(train)):
                 order = torch.randperm(len(train), generator=self._generator)
-            rows, order = order[: config.batch], order[config.batch :]
-            miss = (self._point(spectrum[rows]) - direction[rows]) / self._spread
-            loss = functional.smooth_l1_loss(miss, torch.zeros_like(miss))
+            batch, order = order[: config.batch], order[config.batch :]
+            rows = processes.own(batch)
+            miss = (self._point(spectrum[rows], network) - direction[rows]) / self._spread
+            loss = weight * functional.smooth_l1_loss(miss, torch.zeros_like(miss))
             optimiser.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(network.parameters(), 1.0)
             optimiser.step()
             schedule.step()
             if step % 10 == 0 or step == config.steps:
+                processes.average([loss.detach()])
                 self.history.append({"step": step, "loss": loss.item(), "seconds": time.perf_counter() - began})
 
+        if isinstance(network, DistributedDataParallel):
+            self._network.load_state_dict(network.module.state_dict())
+        network = self._network.train()
         # a short training leaves the batch norms' running statistics behind the weights, so they are taken anew
         some = torch.randperm(len(train), generator=self._generator)[:STATISTICS]
         with self._autocast:
             update_bn(spectrum[some].split(64), network)
         network.eval()
 
-    def _point(self, prepared: Tensor) -> Tensor:
+    def _point(self, prepared: Tensor, network: nn.Module) -> Tensor:
         """Unit vectors (n, 3) of prepared spectra."""
         with self._autocast:
-            offset = self._network(prepared)
+            offset = network(prepared)
         return functional.normalize(self._mean + self._spread * offset.float(), dim=1)
 
     @torch.no_grad()
     def estimate(self, spectrum: Tensor) -> Tensor:
-        parts = [self._point(part) for part in self._prepare(spectrum).split(64)]
+        parts = [self._point(part, self._network) for part in self._prepare(spectrum).split(64)]
         return torch.stack(to_angles(torch.cat(parts).double().cpu()), dim=-1)
 
     def state(self) -> tuple[dict[str, Tensor], Header]:

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor
+from torch.distributed import ProcessGroup
 
 from augment import Mixed
 from swiftwrf import AngularGrid
@@ -25,12 +26,14 @@ class Settings:
         seed: of what is random.
         device: where to train.
         preset: how large and how long.
+        group: processes of `torch.distributed` that train one of those that are `shared`.
     """
 
     grid: AngularGrid
     seed: int = 0
     device: torch.device | str = "cpu"
     preset: Preset = "quick"
+    group: ProcessGroup | None = None
 
 
 class Estimator(ABC):
@@ -42,6 +45,8 @@ class Estimator(ABC):
 
     learns: ClassVar[bool] = True
     """whether more labelled spectra can make it better"""
+    shared: ClassVar[bool] = False
+    """whether several processes train one together"""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings

@@ -1,0 +1,242 @@
+"""What a GPU does beside `rasterize.py`: rates from positions to spectra, seconds of training, what limits drawing.
+
+One part a call, so that a part that fails or takes too long costs no other; `gpu.sh` calls them all. Targets stand in the
+result with what was measured. Everything runs on a CPU, too, and quickly with --quick, to try it.
+"""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import tyro
+from rasterize import CUTOFF, gpu_rates, kernel_values, model_of, positions, rate, scene, with_gradients
+from record import RESULTS, write_result
+from torch.autograd import DeviceType
+from torch.profiler import ProfilerActivity, profile
+
+from augment import Mixed
+from swiftwrf import AngularGrid, FitConfig, ModelConfig, fit, fit_coarray, simulated_room
+from swiftwrf.rasterize import rasterize_magnitude
+from tasks.aoa.estimators import Settings
+from tasks.aoa.estimators.aann import AANN, AANNConfig
+from tasks.run import choose_device
+
+FORWARD = {10_000: (600e3, 1e6), 1000: (1.8e6, 1.8e6)}  # by N: spectra a second that drawing should reach, and the goal
+WITH_GRADIENTS = {1000: (600e3, 600e3)}
+END_TO_END = 0.8  # of the rate of drawing alone
+COUNTERS = {  # of Nsight Compute: shares of the peak [%]
+    "issue": "sm__inst_issued.avg.pct_of_peak_sustained_elapsed",
+    "exponentials": "sm__inst_executed_pipe_xu.avg.pct_of_peak_sustained_elapsed",
+    "memory": "gpu__dram_throughput.avg.pct_of_peak_sustained_elapsed",
+    "occupancy": "sm__warps_active.avg.pct_of_peak_sustained_active",
+}
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Config:
+    part: tyro.conf.Positional[Literal["rates", "training", "coarray", "profile", "draw"]]
+    """what to measure; draw measures nothing and is what a profiler looks at"""
+    out: Path = RESULTS
+    """folder of the result"""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """where to compute; auto takes the GPU where there is one"""
+    quick: bool = False
+    """small grids, few primitives, few steps: to try it"""
+    seconds: float = 0.5
+    """time for the repeats of one rate; at least 3, at most 50 of them"""
+
+
+def main(config: Config) -> None:
+    """Measures one part and writes `gpu_<part>.json`."""
+    device = choose_device(config.device)
+    measure: Callable[[Config, torch.device], Row | None] = PARTS[config.part]
+    found = measure(config, device)
+    if found is not None:
+        write_result(f"gpu_{config.part}", {"quick": config.quick, **found}, device, config.out)
+
+
+def sizes(config: Config) -> tuple[AngularGrid, tuple[int, ...], tuple[int, ...]]:
+    """Grid, numbers of primitives, batches."""
+    if config.quick:
+        return AngularGrid.hemisphere(8, 32), (16, 64), (4,)
+    return AngularGrid.hemisphere(90, 360), (64, 1000, 10_000), (64, 1024)
+
+
+def rates(config: Config, device: torch.device) -> Row:
+    """Spectra a second: drawing alone, with gradients, the model on its device, and `synthesize`, which brings them to the
+    CPU."""
+    grid, numbers, batches = sizes(config)
+    rows = []
+    for n in numbers:
+        model = model_of(n, grid, device)
+        for batch in batches:
+            inputs, position = scene(n, batch, device), positions(batch)
+            calls = {
+                "forward": partial(rasterize_magnitude, *inputs, grid, "auto", CUTOFF),
+                "forward_backward": partial(with_gradients, inputs, grid, "auto"),
+                "model": partial(model, model.normalise(position.to(device))),
+                "synthesize": partial(model.synthesize, position, batch=batch),
+            }
+            row: Row = {"n": n, "batch": batch}
+            for name, call in calls.items():
+                with torch.set_grad_enabled(name == "forward_backward"):
+                    row[f"{name}_per_s"] = rate(call, batch, device, config.seconds)
+            print({key: f"{x['median']:.4g}" if isinstance(x, dict) else x for key, x in row.items()}, flush=True)
+            rows.append(row)
+    found = targets(rows)
+    for target in found:
+        print(target["what"], f"{target['measured']:.3g}", "met" if target["met"] else f"missed, {target['least']:.3g}")
+    return {"grid": grid.shape, "cutoff": CUTOFF, "rows": rows, "targets": found}
+
+
+def targets(rows: list[Row]) -> list[Row]:
+    """What was aimed at and what the best batch reaches."""
+
+    def best(n: int, name: str) -> float:
+        return max(float(row[f"{name}_per_s"]["median"]) for row in rows if row["n"] == n)
+
+    found = []
+    for name, aims in (("forward", FORWARD), ("forward_backward", WITH_GRADIENTS)):
+        for n, (least, goal) in aims.items():
+            if any(row["n"] == n for row in rows):
+                found.append({"what": f"{name}, N = {n}", "least": least, "goal": goal, "measured": best(n, name)})
+    for n in sorted({row["n"] for row in rows}):
+        for name in ("model", "synthesize"):
+            share = best(n, name) / best(n, "forward")
+            found.append({"what": f"{name}, of forward, N = {n}", "least": END_TO_END, "goal": 1.0, "measured": share})
+    return [target | {"met": target["measured"] >= target["least"]} for target in found]
+
+
+def training(config: Config, device: torch.device) -> Row:
+    """Seconds of the fit by regression, of a fit by gradient and of the network, on the built-in room."""
+    steps, n = (4, 16) if config.quick else (200, 1000)
+    grid = AngularGrid.hemisphere(8, 32) if config.quick else AngularGrid.hemisphere(90, 360)
+    train, _ = simulated_room(n=40 if config.quick else 300, grid=grid).split()
+    found = FitConfig(model=ModelConfig(n_primitives=n)) if config.quick else FitConfig()
+    everything = ModelConfig(n_primitives=n, components=("mean", "response", "attenuation", "cholesky"))
+    gradient = FitConfig(model=everything, steps=steps, check_every=steps, max_azimuths=0)
+    network = AANNConfig(steps=2, batch=4) if config.quick else AANNConfig()
+    seconds = {
+        "regression": timed(lambda: fit(train, found, device=device, progress=False), device),
+        f"gradient, N = {n}, {steps} steps": timed(lambda: fit(train, gradient, device=device, progress=False), device),
+        f"network, {network.steps} steps": timed(
+            lambda: AANN(Settings(grid, device=device), network).fit(Mixed.measured(train)), device
+        ),
+    }
+    print(seconds, flush=True)
+    return {"grid": grid.shape, "n_train": len(train), "seconds": seconds}
+
+
+def coarray(config: Config, device: torch.device) -> Row:
+    """Spectra a second of the co-array's model, which draws on the CPU of the machine."""
+    grid, _, batches = sizes(config)
+    model = fit_coarray(simulated_room(n=40, grid=grid), progress=False)
+    cpu = torch.device("cpu")
+    found = {str(n): rate(partial(model.synthesize, positions(n)), n, cpu, config.seconds) for n in batches}
+    print(found, flush=True)
+    return {"grid": grid.shape, "threads": torch.get_num_threads(), "synthesize_per_s": found}
+
+
+def profiled(config: Config, device: torch.device) -> Row:
+    """Where the time of drawing goes, by kernel, and what share of the bound of exponentials and of memory is reached."""
+    grid, numbers, batches = sizes(config)
+    batch, rows = batches[-1], []
+    machine = gpu_rates() if device.type == "cuda" else None
+    for n in numbers:
+        inputs, model = scene(n, batch, device), model_of(n, grid, device)
+        position = model.normalise(positions(batch).to(device))
+        with torch.no_grad():
+            drawing = rate(partial(rasterize_magnitude, *inputs, grid, "auto", CUTOFF), batch, device, config.seconds)
+            row: Row = {"n": n, "batch": batch, "forward_per_s": drawing["median"]}
+            row["model"] = kernels_of(partial(model, position), device)
+        if machine is not None:
+            row["share_of_bounds"] = {
+                "exponentials": drawing["median"] * kernel_values(inputs, grid) / machine["exponentials_per_s"],
+                "writing": drawing["median"] * 4 * grid.n_elevation * grid.n_azimuth / machine["bytes_per_s"],
+            }
+        row["limit"] = limit(row)
+        print(row["limit"], flush=True)
+        rows.append(row)
+    return {"grid": grid.shape, "gpu": machine, "rows": rows, "counters": counters(config, device)}
+
+
+def limit(row: Row) -> str:
+    """The profile in a sentence."""
+    kernels = row["model"]["kernels"]
+    name, share = max(kernels.items(), key=lambda found: found[1]) if kernels else ("nothing", 0.0)
+    text = f"N = {row['n']}: {name} takes {share:.0%} of the model's time, the device waits {row['model']['idle']:.0%} of it"
+    if "share_of_bounds" in row:
+        bounds = row["share_of_bounds"]
+        nearest = max(bounds, key=lambda bound: bounds[bound])
+        text += f"; drawing reaches {bounds[nearest]:.0%} of the bound of {nearest}, which is the nearest"
+    return text
+
+
+def kernels_of(call: Callable[[], Any], device: torch.device, calls: int = 5) -> Row:
+    """Shares of the time of a call that its kernels take, the longest first, and in which the device waits."""
+    gpu = device.type == "cuda"
+    for _ in range(2):
+        call()
+    with profile(activities=[ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if gpu else [])]) as profiler:
+        seconds = timed(lambda: [call() for _ in range(calls)], device)
+    kind = DeviceType.CUDA if gpu else DeviceType.CPU
+    spent: dict[str, float] = {}
+    for event in profiler.key_averages():
+        if event.device_type == kind:
+            taken = event.self_device_time_total if gpu else event.self_cpu_time_total
+            spent[event.key] = spent.get(event.key, 0.0) + 1e-6 * taken / seconds
+    longest = sorted(spent.items(), key=lambda found: -found[1])[:8]
+    return {"seconds": seconds / calls, "kernels": dict(longest), "idle": max(0.0, 1 - sum(spent.values()))}
+
+
+def counters(config: Config, device: torch.device) -> Row | str:
+    """What Nsight Compute counts in the drawing kernel; or why it does not."""
+    ncu = shutil.which("ncu")
+    if device.type != "cuda" or ncu is None:
+        return "no GPU" if device.type != "cuda" else "Nsight Compute (ncu) is not installed"
+    command = [ncu, "--csv", "--page=raw", "--kernel-name=rasterize", "--launch-skip=1", "--launch-count=1"]
+    draw = [sys.executable, __file__, "draw", *(["--quick"] if config.quick else [])]
+    done = subprocess.run(
+        [*command, f"--metrics={','.join(COUNTERS.values())}", *draw], capture_output=True, text=True, check=False
+    )
+    lines = [line for line in done.stdout.splitlines() if line.startswith('"')]
+    if done.returncode or len(lines) < 3:  # names, units, values
+        return (done.stdout + done.stderr)[-1000:]
+    values = dict(zip(*list(csv.reader([lines[0], lines[2]])), strict=True))
+    return {name: values.get(metric) for name, metric in COUNTERS.items()}
+
+
+def draw(config: Config, device: torch.device) -> None:
+    """The largest scene, three times."""
+    grid, numbers, batches = sizes(config)
+    inputs = scene(numbers[-1], batches[-1], device)
+    for _ in range(3):
+        rasterize_magnitude(*inputs, grid, "auto", CUTOFF)
+
+
+def timed(call: Callable[[], Any], device: torch.device) -> float:
+    """Seconds of one call, until the device has done it."""
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+    began = time.perf_counter()
+    call()
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter() - began
+
+
+PARTS = {"rates": rates, "training": training, "coarray": coarray, "profile": profiled, "draw": draw}
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

@@ -1,0 +1,79 @@
+"""Synthesizer `raytrace` beside others in the three furnished rooms, none of which it is told; needs the extra `raytrace`.
+
+Each room is traced anew by tasks.scenes, so this also says how long that takes. Spectra of 30 x 120 pixels, split at random;
+each row is kept in the folder `--work` once it is measured.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import tyro
+from record import write_result
+
+from augment import Settings, make_synthesizer
+from swiftwrf import AngularGrid, Spectra, load_spectra
+from swiftwrf.data.raytraced import ROOMS
+from swiftwrf.data.spectra import Moving
+from swiftwrf.durable import write_text
+from swiftwrf.metrics import psnr, ssim, summary
+from tasks.scenes import ScenesConfig, run
+
+GRID = AngularGrid.hemisphere(30, 120)
+METHODS = ("nearest", "gp", "coarray", "swiftwrf", "geometry", "hybrid", "raytrace")
+
+
+@dataclass(frozen=True)
+class Config:
+    positions: int = 200
+    """of each scene, a fifth of them for the test"""
+    work: Path = Path("runs/raytracing")
+    """folder of the scenes and of what is measured so far"""
+
+
+def main(config: Config) -> None:
+    """Measures what is not there yet and writes `results/raytracing.json`."""
+    scenes = {}
+    for room in ROOMS:
+        for moving in get_args(Moving):
+            name = f"{room} {moving} {config.positions}"
+            folder, file = config.work / name, config.work / f"{name}.json"
+            if not folder.exists():
+                run(ScenesConfig(room=room, moving=moving, positions=config.positions, out=str(folder)))
+            if not file.exists():
+                write_text(file, json.dumps(measure(folder)))
+            scenes[f"{room}, {moving}"] = json.loads(file.read_text())
+    write_result("raytracing", {"grid": GRID.shape, "scenes": scenes})
+
+
+def measure(folder: Path) -> dict[str, Any]:
+    """Scores of every method at the test positions, the room that was found, and the seconds."""
+    scene = json.loads((folder / "scene.json").read_text())
+    train, test = load_spectra(folder, grid=GRID).split("random")
+    scores: dict[str, Any] = {"mean": score(train.spectrum.mean(dim=0).expand_as(test.spectrum), test)}
+    found = None
+    for name in METHODS:
+        synthesizer, began = make_synthesizer(name, Settings(progress=False)), time.perf_counter()
+        synthesizer.fit(train)
+        fitted = time.perf_counter()
+        drawn = synthesizer.synthesize(test.position)
+        seconds = {"fit": fitted - began + synthesizer.shared_seconds, "synthesize": time.perf_counter() - fitted}
+        scores[name] = score(drawn, test) | {"seconds": seconds}
+        if name == "geometry" and synthesizer.model is not None:
+            found = synthesizer.model.state()[1]["planes"]
+        print(f"{folder.name} {name}: {scores[name]['psnr_db']['median']:.2f} dB, {seconds['fit']:.0f} s", flush=True)
+    kept = ("positions", "line_of_sight", "paths_per_position", "seconds")
+    return {"traced": {key: scene[key] for key in kept}, "n_train": len(train), "planes": found, "methods": scores}
+
+
+def score(drawn: Any, test: Spectra) -> dict[str, Any]:
+    """Of the drawn spectra."""
+    return {"psnr_db": summary(psnr(drawn, test.spectrum)), "ssim": summary(ssim(drawn, test.spectrum))}
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

@@ -1,0 +1,154 @@
+"""A scene as Sionna RT holds it: made of surfaces, or read from a Mitsuba file. Sionna is imported here, and when needed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from swiftwrf.data.raytraced.surfaces import Material, Surface
+from swiftwrf.errors import InputError
+
+SCENE_FILE = ".xml"  # ends the names of scene files; others are of rooms
+ISOTROPIC = {"num_rows": 1, "num_cols": 1, "pattern": "iso", "polarization": "V"}
+
+
+def sionna() -> Any:
+    """The module `sionna.rt`.
+
+    Raises:
+        InputError: it is not installed, or finds neither a GPU nor LLVM.
+    """
+    try:
+        import drjit
+        import sionna.rt
+    except ImportError as error:
+        if "LLVM" in str(error):
+            raise InputError(
+                "Sionna RT finds no LLVM, which it needs without an NVIDIA GPU; install it (apt-get install libllvm19) and "
+                "let DRJIT_LIBLLVM_PATH name its libLLVM.so"
+            ) from None
+        raise InputError(
+            "ray tracing needs Sionna RT; install it with pip install 'swiftwrf-tasks[raytrace]'"
+        ) from None
+    drjit.set_thread_count(torch.get_num_threads())
+    return sionna.rt
+
+
+class Scene:
+    """Surfaces of materials at a carrier, ready to be traced.
+
+    Args:
+        surfaces: what the scene consists of.
+        frequency_hz: of the carrier.
+        scattering: share of the reflected amplitude that all materials scatter, Sionna's scattering coefficient.
+
+    Raises:
+        InputError: Sionna RT or LLVM is missing, or a material is unknown or has no constants at the carrier.
+    """
+
+    def __init__(self, surfaces: Sequence[Surface], frequency_hz: float, scattering: float = 0.0) -> None:
+        rt = sionna()
+        self._set_up(rt.load_scene(), frequency_hz)
+        materials: dict[Material, Any] = {}
+        for surface in surfaces:
+            if surface.material not in materials:
+                materials[surface.material] = _material(surface.material)
+        try:
+            self.held.edit(add=[_object(surface, materials[surface.material]) for surface in surfaces])
+        except ValueError as error:
+            raise InputError(_why(surfaces, frequency_hz, error)) from None
+        self._scatter(scattering)
+        self.surfaces = list(surfaces)
+
+    @classmethod
+    def read(cls, file: Path, frequency_hz: float, scattering: float = 0.0) -> Scene:
+        """The scene in a Mitsuba XML file, with the radio materials that it names.
+
+        Raises:
+            InputError: as above; no such file, or it is no scene with objects.
+        """
+        if not file.is_file():
+            raise InputError(f"{file} is not there; expected a Mitsuba scene (XML) or the name of a room")
+        rt, scene = sionna(), cls.__new__(cls)
+        try:
+            held = rt.load_scene(str(file))
+        except Exception as error:  # parsers of XML, meshes and materials, each with errors of its own
+            raise InputError(f"{file} is no scene that Sionna RT reads ({error})") from None
+        if not held.objects:
+            raise InputError(f"{file} is a scene without objects; there is nothing to trace")
+        try:
+            scene._set_up(held, frequency_hz)
+        except ValueError as error:
+            raise InputError(f"{file} has a material without constants at {frequency_hz:g} Hz ({error})") from None
+        scene._scatter(scattering)
+        scene.surfaces = [_surface(name, thing) for name, thing in held.objects.items()]
+        return scene
+
+    def _set_up(self, held: Any, frequency_hz: float) -> None:
+        held.frequency = frequency_hz
+        held.tx_array = held.rx_array = sionna().PlanarArray(**ISOTROPIC)
+        self.held = held
+
+    def _scatter(self, coefficient: float) -> None:
+        for material in self.held.radio_materials.values():
+            material.scattering_coefficient = coefficient
+
+
+def _material(material: Material) -> Any:
+    rt, name = sionna(), f"material-{material.name}"  # a scene has no two things of one name
+    if material.relative_permittivity is not None:
+        return rt.RadioMaterial(
+            name,
+            thickness=material.thickness_m,
+            relative_permittivity=material.relative_permittivity,
+            conductivity=material.conductivity,
+        )
+    try:
+        return rt.ITURadioMaterial(name, material.name, material.thickness_m)
+    except ValueError:
+        known = ", ".join(_table())
+        raise InputError(f"{material.name!r} is no material of ITU-R P.2040; choose from {known}") from None
+
+
+def _table() -> dict[str, dict[tuple[float, float], Any]]:
+    """Materials of ITU-R P.2040 and the carriers [GHz] at which they are known."""
+    from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
+
+    table: dict[str, dict[tuple[float, float], Any]] = ITU_MATERIALS_PROPERTIES
+    return table
+
+
+def _why(surfaces: Sequence[Surface], frequency_hz: float, error: ValueError) -> str:
+    """The material that is not known at the carrier, and where it is."""
+    for name in dict.fromkeys(surface.material.name for surface in surfaces):
+        ranges = list(_table().get(name, ()))
+        if ranges and not any(low <= frequency_hz / 1e9 <= high for low, high in ranges):
+            known = ", ".join(f"{low:g} to {high:g}" for low, high in sorted(ranges))
+            return f"ITU-R P.2040 knows {name} at {known} GHz, not at {frequency_hz / 1e9:g} GHz; choose another --frequency"
+    return f"Sionna RT refuses the scene ({error})"
+
+
+def _object(surface: Surface, material: Any) -> Any:
+    import mitsuba
+
+    mesh = mitsuba.Mesh(surface.name, len(surface.vertex), len(surface.triangle))
+    content = mitsuba.traverse(mesh)
+    content["vertex_positions"] = surface.vertex.astype(np.float32).ravel()
+    content["faces"] = surface.triangle.astype(np.uint32).ravel()
+    content.update()
+    return sionna().SceneObject(mi_mesh=mesh, name=surface.name, radio_material=material)
+
+
+def _surface(name: str, thing: Any) -> Surface:
+    """What a drawing needs of an object that Sionna read."""
+    import mitsuba
+
+    content = mitsuba.traverse(thing.mi_mesh)
+    vertex = np.array(content["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    triangle = np.array(content["faces"], dtype=np.int64).reshape(-1, 3)
+    material = thing.radio_material
+    return Surface(name, Material(material.name, float(np.array(material.thickness).item())), vertex, triangle)

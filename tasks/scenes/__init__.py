@@ -1,0 +1,186 @@
+"""Ray paths traced in a furnished room or a scene file, written as `load_spectra` reads them."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import time
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from swiftwrf import InputError
+from swiftwrf.data.files import CARRIERS_HZ, sha256
+from swiftwrf.data.raytraced import ROOMS, SCENE_FILE, FurnishedRoom, Scene, Tracing, trace
+from swiftwrf.data.spectra import Moving
+from swiftwrf.data.writing import write_paths
+from tasks.directory import console, new_directory
+from tasks.page.page import write_page
+from tasks.records import write_json
+from tasks.scenes.page import page
+
+MOST_POSITIONS, MOST_ORDER = 100_000, 8
+ATTEMPTS = 100  # draws a position before the region counts as full
+
+
+@dataclass(frozen=True)
+class ScenesConfig:
+    """Ray paths in a room with furniture or in a scene file of Mitsuba, traced by Sionna RT (extra: raytrace).
+
+    The directory holds paths.npz, which --data of the tasks reads, and a page with the room in plan, in space, and with the
+    paths of one position.
+    """
+
+    room: str
+    """a room by its name (above), or a Mitsuba scene with radio materials (FILE.xml)"""
+    moving: Moving
+    """which end moves; the array lies level at the receiver"""
+    positions: int
+    """how many, at random in the region, none of them in furniture"""
+    out: str
+    """directory to write; must not exist"""
+    frequency: float = 2.4e9
+    """carrier [Hz]; ITU-R P.2040 knows most materials from 1 GHz on"""
+    walls: str | None = None
+    """material of the room's walls, of ITU-R P.2040: concrete, brick, plasterboard, wood, glass, metal, ... (default: the
+    room's own)"""
+    floor: str | None = None
+    """material of its floor"""
+    ceiling: str | None = None
+    """material of its ceiling"""
+    order: int = 3
+    """most reflections (and other interactions) of a path"""
+    scattering: float = 0.0
+    """share of the reflected amplitude that surfaces scatter, 0 to 1; 0 scatters nothing"""
+    diffraction: bool = False
+    """also paths by way of one edge"""
+    fixed: tuple[float, float, float] | None = None
+    """position of the end that stays [m] (default: the room's own)"""
+    region: tuple[float, float, float, float, float, float] | None = None
+    """where the other end goes: opposite corners x y z x y z [m] (default: the room's own)"""
+    seed: int = 0
+    """of positions, rays and scattered phases"""
+
+
+def run(config: ScenesConfig, resume: Path | None = None) -> None:
+    """Draws positions, traces, and writes.
+
+    Raises:
+        InputError: an option that makes no sense, no such room or scene, positions outside of it, a material that is not
+            known at the carrier; Sionna RT or LLVM is missing.
+    """
+    if resume is not None:
+        raise InputError("tracing takes minutes and cannot be resumed; start it again")
+    check(config)
+    room, fixed, region = where(config)
+    with new_directory(Path(config.out), "a scene") as folder:
+        position = draw_positions(room, region, config.positions, config.seed)
+        if room is None:
+            scene = Scene.read(Path(config.room), config.frequency, config.scattering)
+        else:
+            scene = Scene(room.surfaces(), config.frequency, config.scattering)
+        began = time.perf_counter()
+        how = Tracing(config.order, config.scattering > 0, config.diffraction, config.seed)
+        paths = trace(scene, fixed, position, config.moving, how)
+        seconds = time.perf_counter() - began
+        heard = paths.count > 0
+        if not bool(heard.any()):
+            raise InputError(
+                f"no path reaches any of the {len(position)} positions; is the fixed end inside the scene?"
+            )
+        if not bool(heard.all()):
+            console.print(f"positions that no path reaches are left out: {int((~heard).sum())}")
+            position, paths = position[heard], paths.reached
+        write_paths(folder, paths, fixed, position, config.moving, config.frequency)
+        record = {
+            "command": shlex.join(["python", "-m", "tasks.scenes", *sys.argv[1:]]),
+            "options": asdict(config),
+            "source_sha256": {Path(config.room).name: sha256(Path(config.room))} if room is None else {},
+            "fixed": fixed.tolist(),
+            "region": region.tolist(),
+            "surfaces": {s.name: s.material.name for s in scene.surfaces},
+            "positions": len(position),
+            "line_of_sight": int(paths.line_of_sight.sum()),
+            "paths_per_position": float(paths.count.double().mean()),
+            "seconds": seconds,
+            "sionna_rt": version("sionna-rt"),
+        }
+        write_json(folder / "scene.json", record)
+        write_page(folder, page(Path(config.room).stem, scene, fixed, position, config.moving, paths))
+    each = float(paths.count.double().mean())
+    print(f"{len(position)} positions with {each:.0f} paths each, traced in {seconds:.0f} s: {config.out}")
+
+
+def check(config: ScenesConfig) -> None:
+    """Refuses what makes no sense whatever the room.
+
+    Raises:
+        InputError: such an option.
+    """
+    if not 2 <= config.positions <= MOST_POSITIONS:
+        raise InputError(f"--positions takes 2 to {MOST_POSITIONS}, got {config.positions}")
+    if not CARRIERS_HZ[0] <= config.frequency <= CARRIERS_HZ[1]:
+        raise InputError(f"--frequency takes the carrier in Hz, e.g. 2.4e9, got {config.frequency:g}")
+    if not 0 <= config.order <= MOST_ORDER:
+        raise InputError(f"--order takes 0 to {MOST_ORDER} reflections, got {config.order}")
+    if not 0 <= config.scattering <= 1:
+        raise InputError(f"--scattering takes 0 to 1, got {config.scattering:g}")
+    if config.order == 0 and (config.scattering or config.diffraction):
+        raise InputError("--order 0 leaves the direct path alone; scattering and diffraction need at least --order 1")
+    if not config.room.endswith(SCENE_FILE):
+        ROOMS[config.room]  # refuses an unknown one
+        return
+    if not Path(config.room).is_file():
+        raise InputError(f"{config.room} is not there; expected a Mitsuba scene, or one of {', '.join(ROOMS)}")
+    for name in ("walls", "floor", "ceiling"):
+        if getattr(config, name) is not None:
+            raise InputError(f"--{name} is for the rooms ({', '.join(ROOMS)}); {config.room} names its own materials")
+    for name in ("fixed", "region"):
+        if getattr(config, name) is None:
+            raise InputError(
+                f"{config.room} does not say where the ends are; give --fixed X Y Z and --region X Y Z X Y Z"
+            )
+
+
+def where(config: ScenesConfig) -> tuple[FurnishedRoom | None, Tensor, Tensor]:
+    """The room, where one end stays (3,) and the region where the other goes (2, 3) [m].
+
+    Raises:
+        InputError: either is outside the room, or the fixed end is in its furniture.
+    """
+    room = None if config.room.endswith(SCENE_FILE) else ROOMS[config.room].make()
+    corners = (config.region[:3], config.region[3:]) if config.region else room.region if room else ()
+    region = torch.tensor(corners, dtype=torch.float64).sort(dim=0).values
+    fixed = torch.tensor(config.fixed or (room.fixed if room else ()), dtype=torch.float64)
+    if room is None:
+        return None, fixed, region
+    room = room.of_materials(config.walls, config.floor, config.ceiling)
+    size = " x ".join(f"{side:g}" for side in room.size)
+    if not bool(room.free(fixed[None])):
+        raise InputError(f"--fixed {_listed(fixed)} is outside the room of {size} m, at a wall, or in furniture")
+    if not bool(((region >= 0) & (region <= torch.tensor(room.size))).all()):
+        raise InputError(f"--region {_listed(region.flatten())} is not inside the room of {size} m")
+    return room, fixed, region
+
+
+def _listed(numbers: Tensor) -> str:
+    return " ".join(f"{x:g}" for x in numbers.tolist())
+
+
+def draw_positions(room: FurnishedRoom | None, region: Tensor, count: int, seed: int) -> Tensor:
+    """Random positions in the region, away from walls and furniture, float64 (count, 3) [m].
+
+    Raises:
+        InputError: furniture takes (nearly) all of the region.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    found = torch.empty(0, 3, dtype=torch.float64)
+    for _ in range(ATTEMPTS):
+        drawn = region[0] + (region[1] - region[0]) * torch.rand(count, 3, dtype=torch.float64, generator=generator)
+        found = torch.cat([found, drawn if room is None else drawn[room.free(drawn)]])
+        if len(found) >= count:
+            return found[:count]
+    raise InputError(f"only {len(found)} of {count} positions are free of walls and furniture; choose another --region")

@@ -1,0 +1,174 @@
+"""The page of a scene: the room in plan and in space, and the paths of one position."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from pandas import DataFrame
+from torch import Tensor
+
+from swiftwrf.angles import to_angles
+from swiftwrf.data.raytraced import Scene, Surface, TracedPaths, outline
+from swiftwrf.data.spectra import Moving
+from tasks.page import figures
+from tasks.page.page import Number, Page, Plot, Section, Summary, Table
+
+FIXED, MOVING, EDGE = "#cc3311", "#4477aa", "#7a8494"
+ORDERS = (
+    "#222222",
+    "#0077bb",
+    "#009988",
+    "#ee7733",
+    "#aa4499",
+)  # of paths by their interactions; the last one and more
+MATERIALS = {  # any other is grey
+    "carpet_tile": "#88aa55",
+    "chipboard": "#ddaa33",
+    "glass": "#66ccee",
+    "metal": "#555555",
+    "wood": "#aa7744",
+}
+OTHER = "#999999"
+STRONGEST = 25  # paths of one position that are drawn
+MOST_DOTS = 1000
+ENCLOSING = 0.95  # of the scene's extent: a surface that is as large encloses it and is drawn as outline only
+
+
+def page(name: str, scene: Scene, fixed: Tensor, position: Tensor, moving: Moving, paths: TracedPaths) -> Page:
+    """The room, where the ends are, and the paths of the position in the middle of the others."""
+    sight = f"{float(paths.line_of_sight.double().mean()):.0%}"
+    numbers = [
+        Number(str(len(position)), f"positions of the {moving}, {sight} of them with line of sight"),
+        Number(f"{float(paths.count.double().mean()):.0f}", "paths to a position, mean"),
+        Number(f"{float(paths.power_db.median()):.0f} dB", "power of all paths to a position, median of the positions"),
+    ]
+    other = "receiver" if moving == "transmitter" else "transmitter"
+    meaning = [
+        f"Ray paths between a {moving} that moves and a {other} that stays, traced by Sionna RT. Gains and phases are those "
+        "of isotropic, vertically polarised ends; nothing is transmitted through what stands in the way."
+    ]
+    steps = [
+        "Go on with python -m tasks.aoa --mix 0.3 --data and this directory; the array lies level at the receiver."
+    ]
+    summary = Summary(numbers, _room(scene, fixed, position, moving, paths), meaning, steps)
+    materials = sorted({(s.material.name, s.material.thickness_m) for s in scene.surfaces})
+    rows = [[material, f"{1e3 * thickness:g}"] for material, thickness in materials]
+    table = Table(["material", "thickness [mm]"], rows, "What the surfaces are made of.")
+    middle = int((position - position.mean(dim=0)).norm(dim=1).argmin())
+    rays = _rays(scene, fixed, position[middle], paths, middle, moving)
+    return Page(
+        f"Scene: {name}", summary, [Section("One position", plots=[rays]), Section("Materials", tables=[table])]
+    )
+
+
+def _room(scene: Scene, fixed: Tensor, position: Tensor, moving: Moving, paths: TracedPaths) -> Plot:
+    figure, plan, space = _pair()
+    _draw(scene.surfaces, plan, space)
+    dots = position[:MOST_DOTS]
+    plan.plot(*dots[:, :2].T, ".", color=MOVING, markersize=2.5, label=f"{moving}, moves")
+    plan.plot(*fixed[:2], "*", color=FIXED, markersize=12, label="end that stays", linestyle="")
+    space.scatter(*dots.T, s=2, color=MOVING, depthshade=False)
+    space.scatter(*fixed, s=80, marker="*", color=FIXED, depthshade=False)
+    figures.legend_below(figure, plan)
+    table = DataFrame(position.numpy(), columns=["x_m", "y_m", "z_m"]).assign(
+        line_of_sight=paths.line_of_sight.numpy(), paths=paths.count.numpy(), power_db=paths.power_db.numpy()
+    )
+    return Plot("room", figure, "In plan and in space: surfaces, positions (blue), the end that stays (star).", table)
+
+
+def _rays(scene: Scene, fixed: Tensor, place: Tensor, paths: TracedPaths, number: int, moving: Moving) -> Plot:
+    figure, plan, space = _pair()
+    _draw(scene.surfaces, plan, space)
+    own = (paths.owner == number).nonzero()[:, 0]
+    own = own[paths.gain[own].abs().argsort()[-STRONGEST:]]  # the strongest on top
+    start, end = (fixed, place) if moving == "receiver" else (place, fixed)
+    level = 20 * paths.gain[own].abs().log10().numpy()
+    width = 0.3 + 1.9 * Normalize(level.min(), max(level.max(), level.min() + 1), clip=True)(level)
+    order = paths.order[own].clamp(max=len(ORDERS) - 1).tolist()
+    lines = []
+    for row in own.tolist():
+        corner = paths.corner[row]
+        lines.append(torch.cat([start[None], corner[corner[:, 0].isfinite()], end[None]]).numpy())
+    style: dict[str, Any] = {"colors": [ORDERS[k] for k in order], "linewidths": width, "alpha": 0.8}
+    plan.add_collection(LineCollection([line[:, :2] for line in lines], zorder=3, **style))
+    space.add_collection3d(Line3DCollection(lines, **style))
+    for at, marker, colour in ((fixed, "*", FIXED), (place, "o", MOVING)):
+        plan.plot(*at[:2], marker, color=colour, markersize=12 if marker == "*" else 7, zorder=4)
+        space.scatter(*at, s=80 if marker == "*" else 40, marker=marker, color=colour, depthshade=False)
+    named = {0: "direct", 1: "1 interaction", len(ORDERS) - 1: f"{len(ORDERS) - 1} and more"}
+    entries = [Line2D([], [], color=ORDERS[k], label=named.get(k, f"{k} interactions")) for k in sorted(set(order))]
+    entries += [
+        Line2D([], [], color=FIXED, marker="*", markersize=10, linestyle="", label="end that stays"),
+        Line2D([], [], color=MOVING, marker="o", linestyle="", label=f"{moving}, moves"),
+    ]
+    figure.legend(handles=entries, loc="outside lower center", ncols=6, frameon=False)
+    caption = (
+        f"The strongest paths (at most {STRONGEST}) of the position nearest to the middle of all, coloured by their number "
+        "of reflections and other interactions; thick lines are strong. The numbers say where each comes from, seen from "
+        "the receiver."
+    )
+    azimuth, elevation = (angle.rad2deg() for angle in to_angles(paths.direction[own]))
+    table = DataFrame(
+        {
+            "length_m": paths.length[own].numpy(),
+            "gain_db": level,
+            "interactions": paths.order[own].numpy(),
+            "azimuth_deg": azimuth.numpy(),
+            "elevation_deg": elevation.numpy() * paths.direction[own, 2].sign().numpy(),
+        }
+    )
+    return Plot("rays", figure, caption, table[::-1])
+
+
+def _pair() -> tuple[Figure, Axes, Any]:
+    """Axes of a plan and of a view in space."""
+    figure, axes = figures.new_figure(1, 2, 12, 5)
+    return figure, axes[0], figures.in_space(figure, axes[1])
+
+
+def _draw(surfaces: list[Surface], plan: Axes, space: Any) -> None:
+    """What stands in the room, filled; what encloses it, as outline."""
+    every = np.concatenate([surface.vertex for surface in surfaces])
+    low, high = every.min(axis=0), every.max(axis=0)
+    for surface in surfaces:
+        edges, colour = outline(surface), MATERIALS.get(surface.material.name, OTHER)
+        encloses = bool((np.ptp(surface.vertex, axis=0)[:2] > ENCLOSING * (high - low)[:2]).all())
+        plan.add_collection(
+            LineCollection(
+                list(edges[..., :2]), colors="black" if encloses else colour, linewidths=1.0 if encloses else 0.6
+            )
+        )
+        space.add_collection3d(Line3DCollection(list(edges), colors=EDGE if encloses else colour, linewidths=0.5))
+        if not encloses:
+            faces = surface.vertex[surface.triangle]
+            plan.add_collection(PolyCollection(list(faces[..., :2]), facecolors=colour, edgecolors="none", alpha=0.12))
+            space.add_collection3d(Poly3DCollection(list(faces), facecolors=colour, edgecolors="none", alpha=0.15))
+    margin = 0.03 * float((high - low).max())
+    for set_limits, axis in ((plan.set_xlim, 0), (plan.set_ylim, 1)):
+        set_limits(low[axis] - margin, high[axis] + margin)
+    plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    space.set(
+        xlabel="x [m]",
+        ylabel="y [m]",
+        zlabel="z [m]",
+        xlim=(low[0], high[0]),
+        ylim=(low[1], high[1]),
+        zlim=(low[2], high[2]),
+    )
+    space.set_box_aspect(np.maximum(high - low, 0.1 * (high - low).max()))
+    names = list(dict.fromkeys(s.material.name for s in surfaces if s.name.startswith("furniture")))
+    if names:
+        handles = [
+            Line2D([], [], color=MATERIALS.get(name, OTHER), linewidth=4, alpha=0.6, label=name) for name in names
+        ]
+        plan.legend(
+            handles=handles, fontsize=7, loc="upper left", bbox_to_anchor=(0, -0.12), ncols=len(names), frameon=False
+        )
