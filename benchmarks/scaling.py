@@ -93,11 +93,17 @@ def slopes(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
 def draw(rows: list[dict[str, Any]]) -> None:
     """Seconds and peak memory of the stages against the number of spectra."""
     panels, (time_axis, memory_axis) = figures.new_figure(1, 2, 9, 3.4)
-    for stage in STAGES:
-        for part in [key for key in rows[0]["stages"][stage] if key.endswith("seconds")]:
-            values = [row["stages"][stage][part] for row in rows]
-            time_axis.plot([row["n"] for row in rows], values, marker="o", label=f"{stage} {part[:-8]}".strip())
-        memory_axis.plot([row["n"] for row in rows], [row["stages"][stage]["rss_gib"] for row in rows], marker="o")
+    sizes = [row["n"] for row in rows]
+    for number, stage in enumerate(STAGES):
+        found = [row["stages"][stage] for row in rows]
+        style = {"marker": "o", "color": f"C{number}"}
+        for part in [key for key in found[0] if key.endswith("seconds")]:
+            line, label = (
+                "--" if part.startswith("synthesize") else "-",
+                f"{stage} {part.removesuffix('seconds')}".strip(),
+            )
+            time_axis.plot(sizes, [values[part] for values in found], line, label=label, **style)
+        memory_axis.plot(sizes, [values["rss_gib"] for values in found], **style)
     memory_axis.axhline(MOST_GIB, color=figures.RULE)
     for axis, label in ((time_axis, "seconds of a processor"), (memory_axis, "peak resident memory [GiB]")):
         axis.set(xscale="log", xlabel="spectra of 90 x 360 pixels", ylabel=label)

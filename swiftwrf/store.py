@@ -57,9 +57,11 @@ class Store:
         return len(self), rows // self.factor, columns // self.factor
 
     def __getitem__(self, rows: Tensor | slice) -> Tensor:
-        """Some of the spectra, float32."""
+        """Some of the spectra, float32; of float64 values float64, for those who compute in it."""
         measured = self.measured(rows)
-        spectrum = measured.float() if measured.is_floating_point() else measured.float() / 255
+        spectrum = measured if measured.dtype == torch.float64 else measured.float()
+        if measured.dtype == torch.uint8:
+            spectrum = spectrum / 255
         return spectrum if self.factor == 1 else functional.avg_pool2d(spectrum[:, None], self.factor)[:, 0]
 
     def measured(self, rows: Tensor | slice) -> Tensor:
@@ -68,9 +70,9 @@ class Store:
 
     def exact(self) -> tuple[torch.dtype, Iterator[Tensor]]:
         """All spectra in order, by the batch, in the smallest type that loses nothing, and that type."""
-        if self.factor == 1:
+        if self.factor == 1 and self.values.dtype in TYPES:
             return self.values.dtype, (self.measured(rows) for rows in self.parts())
-        return torch.float32, self.batches()
+        return torch.float32, (batch.float() for batch in self.batches())
 
     def subset(self, rows: Tensor) -> Store:
         """The given rows, in the given order."""

@@ -23,6 +23,7 @@ from augment import Mixed
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, fit, simulated_room
 from swiftwrf.fitting.state import Session
 from swiftwrf.processes import Processes
+from swiftwrf.store import Store
 from swiftwrf.threads import set_threads
 from tasks import torchrun
 from tasks.aoa.estimators import Settings, aann
@@ -65,7 +66,7 @@ def learnt(group=None):
     backbone = aann._backbone
     with mock.patch.object(aann, "_backbone", lambda circular: backbone(circular).double()):
         network = AANN(Settings(room.grid, group=group), AANNConfig(steps=2, batch=5))
-    network.fit(Mixed.measured(replace(room, spectrum=room.spectrum.double())))
+    network.fit(Mixed.measured(replace(room, store=Store(room.spectrum.double()))))
     estimate = network.estimate(room.spectrum.double())
     losses = torch.tensor([record["loss"] for record in (*records, *network.history)])
     return {"drawn": model.synthesize(room.position), "losses": losses, "estimate": estimate}
