@@ -52,6 +52,27 @@ def _drawn_by(arm: str) -> str:
     return arm.removeprefix("turbo_").replace("_", ", ")
 
 
+def reliability() -> str:
+    """How everything ended that was attacked."""
+    done = load("reliability")
+    ends = done["mutations"].values()
+    read, refused, wrong = (sum(end.get(key, 0) for end in ends) for key in ("read", "refused", "wrong"))
+    lines, right, kills, disks, races = (done[part] for part in ("commands", "right", "kills", "disks", "races"))
+    rows = [
+        [f"{read + refused:,} mutations of {len(ends)} kinds of files", f"{read} read, {refused:,} refused", wrong],
+        [
+            f"{sum(lines.values()) - lines['wrong']} mistyped command lines",
+            f"{lines['exit 2']} refused",
+            lines["wrong"],
+        ],
+        [f"{sum(right.values()) - right['wrong']} right command lines", f"{right['exit 0']} done", right["wrong"]],
+        [f"{kills['kills']} kills", f"{kills['runs']} runs resumed to the same tables", kills["wrong"]],
+        [f"{disks['full disks']} full disks", "each a sentence, nothing half-written", disks["wrong"]],
+        [f"{races['races']} races for one directory", "one run each", races["wrong"]],
+    ]
+    return markdown(["attack", "end", "wrong"], [[str(cell) for cell in row] for row in rows])
+
+
 def headline() -> str:
     """What turbo learning gains in each scene with 30 % of the positions measured."""
     rows = []
@@ -327,6 +348,7 @@ FILES = (
     "docs/tutorial.md",
     "docs/speed.md",
     "docs/memory.md",
+    "docs/reliability.md",
     "docs/stability.md",
     "docs/ablation.md",
     "docs/comparison.md",

@@ -74,9 +74,7 @@ def _summary(run: RssiRecords) -> Summary:
         f"{len(run.metrics['receivers'])} receiver(s).",
         _against(run, best),
     ]
-    picture = Plot(
-        f"summary-{run.file_name}", _maps(run, "predicted", "predicted RSSI [dBm]", 1), _MAP_CAPTION, _cells(run, 1)
-    )
+    picture = Plot("summary", _maps(run, "predicted", "predicted RSSI [dBm]", 1), _MAP_CAPTION, _cells(run, 1))
     return Summary(numbers, picture, meaning, _next_steps(run))
 
 
