@@ -322,6 +322,7 @@ TABLES = {
     "scaling_quality": scaling_quality,
     "scaling_rssi": scaling_rssi,
     "headline": headline,
+    "reliability": reliability,
     "synthesis": synthesis,
     "aoa": aoa,
     "room": room,
