@@ -45,7 +45,7 @@ class RssiTaskConfig(TableSource):
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
     also: tuple[str, ...] = ()
-    """predictors that take minutes and are compared only when named: nerf2"""
+    """predictors that take minutes and are compared only when named: nerf2, blend"""
     preset: Preset = "quick"
     """of SwiftWRF: quick corrects a log-distance law; paper is the plain head"""
     floor_plan: str | None = None
