@@ -10,7 +10,6 @@ import csv
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -19,7 +18,7 @@ from typing import Any, Literal
 
 import torch
 import tyro
-from rasterize import CUTOFF, gpu_rates, kernel_values, model_of, positions, rate, scene, with_gradients
+from rasterize import CUTOFF, gpu_rates, kernel_values, model_of, positions, rate, scene, timed, with_gradients
 from record import RESULTS, write_result
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
@@ -223,17 +222,6 @@ def draw(config: Config, device: torch.device) -> None:
     inputs = scene(numbers[-1], batches[-1], device)
     for _ in range(3):
         rasterize_magnitude(*inputs, grid, "auto", CUTOFF)
-
-
-def timed(call: Callable[[], Any], device: torch.device) -> float:
-    """Seconds of one call, until the device has done it."""
-    if device.type == "cuda":
-        torch.cuda.synchronize()
-    began = time.perf_counter()
-    call()
-    if device.type == "cuda":
-        torch.cuda.synchronize()
-    return time.perf_counter() - began
 
 
 PARTS = {"rates": rates, "training": training, "coarray": coarray, "profile": profiled, "draw": draw}

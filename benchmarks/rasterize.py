@@ -171,21 +171,23 @@ def positions(n: int) -> Tensor:
     return torch.rand(n, 3, generator=torch.Generator().manual_seed(0))
 
 
+def timed(call: Callable[[], Any], device: torch.device) -> float:
+    """Seconds of one call, until the device has done it."""
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+    began = time.perf_counter()
+    call()
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter() - began
+
+
 def rate(draw: Callable[[], Any], batch: int, device: torch.device, seconds: float) -> Rate:
     """Spectra per second after two warm-up calls: median, least and most of the repeats."""
 
-    def timed() -> float:
-        if device.type == "cuda":
-            torch.cuda.synchronize()
-        began = time.perf_counter()
-        draw()
-        if device.type == "cuda":
-            torch.cuda.synchronize()
-        return time.perf_counter() - began
-
-    timed()
-    repeats = int(np.clip(seconds / timed(), 3, 50))
-    taken = [timed() for _ in range(repeats)]
+    timed(draw, device)
+    repeats = int(np.clip(seconds / timed(draw, device), 3, 50))
+    taken = [timed(draw, device) for _ in range(repeats)]
     return {"median": batch / float(np.median(taken)), "low": batch / max(taken), "high": batch / min(taken)}
 
 

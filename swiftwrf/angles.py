@@ -113,6 +113,11 @@ class AngularGrid:
         """Unit vector of each pixel in array coordinates, float64 (n_elevation, n_azimuth, 3)."""
         return to_direction(self.azimuth[None, :], self.elevation[:, None])
 
+    def strongest(self, spectrum: Tensor) -> Tensor:
+        """Azimuth and elevation (n, 2) [rad] of the largest magnitude of each spectrum (n, n_elevation, n_azimuth)."""
+        pixel = spectrum.flatten(1).argmax(dim=1)
+        return torch.stack([self.azimuth[pixel % self.n_azimuth], self.elevation[pixel // self.n_azimuth]], dim=-1)
+
 
 def _even_step(values: list[float], name: str) -> float:
     if len(values) < 2:

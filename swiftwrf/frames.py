@@ -105,8 +105,7 @@ def check_frames(spectra: Spectra) -> FrameReport | None:
     if len(rows) < FEW or spectra.fixed_position is None or spectra.rotation is None:
         return None
     rows = rows[torch.linspace(0, len(rows) - 1, min(MOST_POSITIONS, len(rows))).round().long()]
-    strongest = spectra.store[rows].flatten(1).argmax(dim=1)
-    peak = spectra.grid.direction.flatten(0, 1)[strongest]
+    peak = to_direction(*spectra.grid.strongest(spectra.store[rows]).unbind(-1))
     sign = 1.0 if spectra.moving == "transmitter" else -1.0
     scene = _Scene(spectra.position[rows], spectra.fixed_position, spectra.rotation, sign)
     declared = scene.direction()

@@ -249,6 +249,12 @@ def exact(monkeypatch):
     return to
 
 
+def fitted(name, train):
+    synthesizer = SYNTHESIZERS[name].make(Settings(progress=False))
+    synthesizer.fit(train)
+    return synthesizer
+
+
 @pytest.mark.parametrize("name", ["gp", "coarray", "swiftwrf", "idw", "nearest"])
 def test_what_is_not_exact_predicts_nearly_as_well(name, exact):
     data = simulated_room(n=400, grid=AngularGrid.hemisphere(8, 32))
@@ -256,8 +262,7 @@ def test_what_is_not_exact_predicts_nearly_as_well(name, exact):
     score = []
     for n in (400, 240):
         exact(n)
-        synthesizer = SYNTHESIZERS[name].make(Settings(progress=False))
-        synthesizer.fit(train)
+        synthesizer = fitted(name, train)
         score.append(float(psnr(synthesizer.synthesize(test.position), test.spectrum).median()))
     assert score[1] == pytest.approx(score[0], abs=0.5)
 
@@ -269,8 +274,7 @@ def test_draws_scatter_as_those_of_the_exact_method(name, exact):
     scatter = []
     for n in (400, 240):
         exact(n)
-        synthesizer = SYNTHESIZERS[name].make(Settings(progress=False))
-        synthesizer.fit(train)
+        synthesizer = fitted(name, train)
         drawn = synthesizer.synthesize(test.position, torch.Generator().manual_seed(0))
         scatter.append(float((drawn - synthesizer.synthesize(test.position)).std()))
     assert scatter[1] == pytest.approx(scatter[0], rel=0.2)

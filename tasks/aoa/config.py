@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Literal
 
 from augment import SYNTHESIZERS, lacks
 from augment.suggest import MOST as MOST_SUGGESTED
 from swiftwrf import InputError, Spectra
-from swiftwrf.data.raytraced import ROOMS, SCENE_FILE, sionna
+from swiftwrf.data.raytraced import check_scene, sionna
 from swiftwrf.data.spectra import Moving
 from swiftwrf.metrics import WINDOW
 from tasks.run import SEEDS, Preset, choice
@@ -105,10 +104,7 @@ def check(config: AoaConfig) -> None:
 def _check_scene(scene: str, synthesizers: tuple[str, ...]) -> None:
     if RAYTRACE not in synthesizers:
         raise InputError(f"--scene is for synthesizer {RAYTRACE}; add it to --synthesizer, or leave --scene out")
-    if not scene.endswith(SCENE_FILE):
-        ROOMS[scene]  # refuses an unknown one
-    elif not Path(scene).is_file():
-        raise InputError(f"--scene {scene} is not there; expected a Mitsuba scene, or one of {', '.join(ROOMS)}")
+    check_scene(scene, "--scene ")
 
 
 def check_data(data: Spectra, config: AoaConfig) -> None:

@@ -24,18 +24,18 @@ def strongest_direction(synthesizer: Synthesizer, measured: Spectra, seed: int) 
     measured positions, all at their median height."""
     position = draw_positions(measured.position, PLACES, seed)
     position[:, 2] = measured.position[:, 2].median()
-    grid = measured.grid
-    columns: list[Tensor] = []
+    direction: list[Tensor] = []
+    magnitude: list[Tensor] = []
     for part in position.split(BATCH):
-        magnitude, pixel = synthesizer.synthesize(part).flatten(1).max(dim=1)
-        row, column = pixel // grid.shape[1], pixel % grid.shape[1]
-        columns.append(torch.stack([grid.azimuth[column], grid.elevation[row], magnitude], dim=1))
-    azimuth, elevation, magnitude = torch.cat(columns).T
+        spectrum = synthesizer.synthesize(part)
+        direction.append(measured.grid.strongest(spectrum))
+        magnitude.append(spectrum.amax(dim=(1, 2)))
+    azimuth, elevation = torch.cat(direction).T.numpy()
     return {
         "position": position.numpy(),
-        "azimuth": azimuth.numpy(),
-        "elevation": elevation.numpy(),
-        "magnitude": magnitude.numpy(),
+        "azimuth": azimuth,
+        "elevation": elevation,
+        "magnitude": torch.cat(magnitude).numpy(),
     }
 
 

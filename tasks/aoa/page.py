@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -131,7 +130,7 @@ def _over_shares(shares: list[Share], name: str) -> Plot:
     figures.bars(axes[0], arms.palette(), labels, heights, "median great-circle error [deg]")
     figures.legend_below(figure, axes[0])
     caption = "Median error of each arm against the measured share; whiskers: 95 % intervals."
-    return Plot(name, figure, caption, _bars_data("share", labels, heights))
+    return Plot(name, figure, caption, figures.bars_data("share", labels, heights, "deg"))
 
 
 def _estimators(share: Share) -> Plot:
@@ -147,14 +146,7 @@ def _estimators(share: Share) -> Plot:
     figures.bars(axes[0], arms.palette(), labels, heights, "median great-circle error [deg]")
     figures.legend_below(figure, axes[0])
     caption = f"Median error of each estimator on each training set, {share.title}; whiskers: 95 % intervals."
-    return Plot("summary", figure, caption, _bars_data("estimator", estimators, heights))
-
-
-def _bars_data(
-    group: str, groups: Sequence[str], heights: Mapping[str, Sequence[tuple[float, float, float]]]
-) -> DataFrame:
-    rows = [(of, name, *value) for name, values in heights.items() for of, value in zip(groups, values, strict=True)]
-    return DataFrame(rows, columns=[group, "method", "median_deg", "low_deg", "high_deg"])
+    return Plot("summary", figure, caption, figures.bars_data("estimator", estimators, heights, "deg"))
 
 
 def _median_and_interval(share: Share, arm: str) -> tuple[float, float, float]:
@@ -195,8 +187,7 @@ def _ssim_cdf(share: Share) -> Plot:
 
 
 def _examples(share: Share) -> Section:
-    with np.load(share.run.folder / f"examples-mix{share.key}.npz") as file:
-        example = dict(file)
+    example = share.run.arrays(f"examples-mix{share.key}")
     captions = [f"no. {i + 1}\n{db:.1f} dB" for i, db in zip(example["index"], example["psnr_db"], strict=True)]
     deviation = example["deviation"] / 255.0 if "deviation" in example else None
     figure = figures.spectra(example["measured"] / 255.0, example["synthetic"] / 255.0, captions, deviation)

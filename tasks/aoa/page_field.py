@@ -29,11 +29,8 @@ def field_section(share: Share) -> Section | None:
 
 
 def _stored(share: Share, kind: str) -> dict[str, NDArray[Any]] | None:
-    file = share.run.folder / f"{kind}-mix{share.key}.npz"
-    if not file.is_file():
-        return None
-    with np.load(file) as stored:
-        return dict(stored)
+    name = f"{kind}-mix{share.key}"
+    return share.run.arrays(name) if share.run.holds(name) else None
 
 
 def _map(share: Share, name: str, field: dict[str, NDArray[Any]]) -> Plot:

@@ -124,8 +124,7 @@ def room_section(share: Share) -> Section | None:
         f"1 - correlation with held-out spectra: {room['score_held_out']:.3f}; share of the spectra's power that the room "
         f"leaves unexplained: {room['unexplained']:.0%}. The planes stand in geometry-mix{share.key}.json."
     )
-    with np.load(share.run.folder / f"room-mix{share.key}.npz") as stored:
-        points = dict(stored)
+    points = share.run.arrays(f"room-mix{share.key}")
     plot = Plot(
         f"room-{share.file_name}",
         _room_figure(room["planes"], points),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 from pandas import DataFrame
 
 from tasks.aoa.share import Share
@@ -15,11 +14,10 @@ NUMBERED = 30  # suggestions whose rank is written beside them; more would hide 
 
 def suggestion_section(share: Share) -> Section | None:
     """A plan of the suggested positions, and what measuring there is expected to bring; None where none were asked for."""
-    file = share.run.folder / f"suggested-mix{share.key}.npz"
-    if not file.is_file():
+    name = f"suggested-mix{share.key}"
+    if not share.run.holds(name):
         return None
-    with np.load(file) as stored:
-        measured, suggested, left = stored["measured"], stored["suggested"], stored["left"]
+    measured, suggested, left = (share.run.arrays(name)[key] for key in ("measured", "suggested", "left"))
     figure, (plan, gain) = figures.new_figure(1, 2, 11, 4.2)
     plan.plot(*measured[:, :2].T, ".", color=MEASURED, markersize=3, label="measured")
     plan.plot(*suggested[:, :2].T, "o", color=SUGGESTED, markersize=4, label="to measure next")

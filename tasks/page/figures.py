@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
+from pandas import DataFrame
 
 from tasks.page.palette import Palette
 from tasks.summarise import pareto
@@ -115,6 +116,14 @@ def bars(
         axes.bar(at, value, width * 0.92, yerr=error, label=name, **style)
     axes.set(xticks=range(len(groups)), xticklabels=groups, ylabel=label)
     axes.grid(axis="x", visible=False)
+
+
+def bars_data(
+    group: str, groups: Sequence[str], heights: Mapping[str, Sequence[tuple[float, float, float]]], unit: str
+) -> DataFrame:
+    """The numbers of such bars, a row each."""
+    rows = [(of, name, *value) for name, values in heights.items() for of, value in zip(groups, values, strict=True)]
+    return DataFrame(rows, columns=[group, "method", f"median_{unit}", f"low_{unit}", f"high_{unit}"])
 
 
 def spectra(

@@ -7,6 +7,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
+import numpy as np
+from numpy.typing import NDArray
 from pandas import DataFrame
 
 from swiftwrf import InputError
@@ -36,6 +38,8 @@ class Records(Generic[Metrics]):
                 raise InputError(f"{folder} is no finished run: it has no metrics.json")
             metrics = read_json(file)
         self.metrics = cast(Metrics, metrics)
+        self._tables: dict[str, DataFrame] = {}
+        self._arrays: dict[str, dict[str, NDArray[Any]]] = {}
 
     @property
     def label(self) -> str:
@@ -59,5 +63,18 @@ class Records(Generic[Metrics]):
         return read_json(self.folder / "environment.json")
 
     def table(self, name: str) -> DataFrame:
-        """One of the run's tables, e.g. `errors`."""
-        return read_table(self.folder / f"{name}.csv")
+        """One of the run's tables, e.g. `errors`; not to be changed."""
+        if name not in self._tables:
+            self._tables[name] = read_table(self.folder / f"{name}.csv")
+        return self._tables[name]
+
+    def holds(self, name: str) -> bool:
+        """Whether the run left arrays of that name."""
+        return (self.folder / f"{name}.npz").is_file()
+
+    def arrays(self, name: str) -> dict[str, NDArray[Any]]:
+        """Arrays that the run left, by their names, e.g. `maps`."""
+        if name not in self._arrays:
+            with np.load(self.folder / f"{name}.npz") as file:
+                self._arrays[name] = dict(file)
+        return self._arrays[name]

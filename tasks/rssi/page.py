@@ -7,23 +7,18 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from pandas import DataFrame, concat
+from pandas import DataFrame
 
-from tasks.metrics import RssiMetrics
 from tasks.page import figures
-from tasks.page.page import Number, Page, Plot, Section, Summary, Table
+from tasks.page.page import Page, Plot, Section, Table
 from tasks.page.palette import Palette
 from tasks.page.provenance import number, provenance
-from tasks.page.records import Records
+from tasks.rssi.page_summary import OWN, RssiRecords, by_method, place, scene, summary
 from tasks.rssi.predictors import PREDICTORS
 from tasks.summarise import SHORTEST, paired_difference, running_median
 
-RssiRecords = Records[RssiMetrics]
-MISCALIBRATED = 0.05  # difference of coverage from what is promised, from which on the report warns
 MOST_MAPS = 24  # receivers with a map in the report; all are in the tables
 _FIELDS = {"predicted": "predicted_dbm", "width": "width_db"}
-_HEIGHTS = ["median_db", "low_db", "high_db"]
-OWN = "swiftwrf"  # the predictor that all others are compared with
 MANY = (
     300  # dots, from which on white edges would hide their colours, and each drawn by itself makes a page of megabytes
 )
@@ -37,93 +32,23 @@ def palette() -> Palette:
 def page(runs: list[RssiRecords]) -> Page:
     """The page of these runs."""
     sections = [section for run in runs for section in _run(run, several=len(runs) > 1)]
-    names = ", ".join(dict.fromkeys(_place(run) for run in runs))
-    return Page(f"RSSI: {names}", _summary(runs[0]), [*sections, _limits(runs[0]), provenance(runs)])
-
-
-def _scene(run: RssiRecords) -> str:
-    return _place(run) + run.label
-
-
-def _place(run: RssiRecords) -> str:
-    name = "the simulated floor" if run.metrics["data"] == "simulated-room" else run.metrics["data"]
-    return f"{name}, {run.metrics['split']} split"
-
-
-def _summary(run: RssiRecords) -> Summary:
-    error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
-    own = error[OWN]
-    best = min((name for name in error if name != OWN), key=lambda name: error[name]["median"])
-    interval = run.metrics["interval"]
-    law = "mri_pooled"
-    law_too = f"; one log-distance law for all receivers: {error[law]['median']:.2f} dB" if law in error else ""
-    numbers = [
-        Number(
-            f"{own['median']:.2f} dB",
-            f"SwiftWRF's median absolute error, 95 % interval [{own['low']:.2f}, {own['high']:.2f}]; 90 % of the errors "
-            f"are below {own['p90']:.1f} dB",
-        ),
-        Number(f"{error[best]['median']:.2f} dB", f"the best baseline, {best}{law_too}"),
-        Number(
-            f"{interval['coverage']:.0%}",
-            f"of the test measurements lie in the {interval['nominal']:.0%} interval that comes with each prediction",
-        ),
-    ]
-    meaning = [
-        f"On {_scene(run)}, {run.metrics['n_train']} rows teach and {run.metrics['n_test']} test: {own['n']} heard pairs at "
-        f"{len(run.metrics['receivers'])} receiver(s).",
-        _against(run, best),
-    ]
-    picture = Plot("summary", _maps(run, "predicted", "predicted RSSI [dBm]", 1), _MAP_CAPTION, _cells(run, 1))
-    return Summary(numbers, picture, meaning, _next_steps(run))
-
-
-def _against(run: RssiRecords, best: str) -> str:
-    """Whether the model is better than the best baseline, or whether that is not known."""
-    mean, low, high = paired_difference(_by_method(run), OWN, best)
-    interval = f"{mean:+.2f} dB [{low:+.2f}, {high:+.2f}]"
-    if high < 0:
-        return f"On the same pairs SwiftWRF's mean error is lower than that of {best}: {interval}."
-    if low > 0:
-        return f"On the same pairs {best} has the lower mean error: SwiftWRF's differs by {interval}. Take {best} here."
-    return f"On the same pairs SwiftWRF and {best} cannot be told apart: {interval}."
-
-
-def _next_steps(run: RssiRecords) -> list[str]:
-    with np.load(run.folder / "maps.npz") as file:
-        maps = dict(file)
-    width = maps["width"].mean(axis=0)
-    row, column = np.unravel_index(np.argmax(width), width.shape)
-    steps = [
-        f"Measure around x = {maps['x'][column]:.1f} m, y = {maps['y'][row]:.1f} m: the 80 % interval is widest there "
-        f"({width[row, column]:.0f} dB on average over the receivers).",
-        "predictions.csv has every test row with its prediction and interval.",
-    ]
-    interval = run.metrics["interval"]
-    if abs(interval["coverage"] - interval["nominal"]) > MISCALIBRATED:
-        steps.append(
-            "The intervals are not calibrated on these rows; take their widths as a ranking, not as a promise."
-        )
-    if run.metrics["split"] == "random":
-        steps.append("Run --split block: it shows the error in a region where nothing was measured.")
-    return steps
+    names = ", ".join(dict.fromkeys(place(run) for run in runs))
+    picture = Plot("summary", _maps(runs[0], "predicted", "predicted RSSI [dBm]", 1), _MAP_CAPTION, _cells(runs[0], 1))
+    return Page(f"RSSI: {names}", summary(runs[0], picture), [*sections, _limits(runs[0]), provenance(runs)])
 
 
 def _run(run: RssiRecords, several: bool) -> list[Section]:
-    suffix = f" - {_scene(run)}" if several else ""
+    suffix = f" - {scene(run)}" if several else ""
     name = run.file_name
     errors, cells = run.table("errors"), _cells(run)
     heights = _heights(run)
-    medians = concat(
-        [DataFrame(v, index=_receivers(run), columns=_HEIGHTS).assign(method=m) for m, v in heights.items()]
-    )
     pairs = errors[["receiver", "index", "method", "abs_error_db"]]
     plots = [
         Plot(
             f"bars-{name}",
             _bars(run, heights),
             "Median absolute error; whiskers: its 95 % interval.",
-            medians.rename_axis("receiver").reset_index(),
+            figures.bars_data("receiver", _receivers(run), heights, "db"),
         ),
         Plot(f"cdf-{name}", _cdf(errors), "Distribution of the absolute errors over all receivers.", pairs),
     ]
@@ -183,21 +108,13 @@ def _table(run: RssiRecords) -> Table:
 
 
 def _paired(run: RssiRecords) -> Table:
-    errors, rows = _by_method(run), []
+    errors, rows = by_method(run), []
     for name in run.metrics["overall"]:
         if name != OWN:
             mean, low, high = paired_difference(errors, OWN, name)
             rows.append([name, f"{mean:+.2f} [{low:+.2f}, {high:+.2f}]"])
     caption = "Mean of SwiftWRF's absolute error minus the method's on the same pairs; 95 % bootstrap over test rows."
     return Table(["against", "difference [dB]"], rows, caption)
-
-
-def _by_method(run: RssiRecords) -> DataFrame:
-    """Absolute errors, a row a pair, a column a method."""
-    errors: DataFrame = run.table("errors").pivot_table(
-        index=["index", "receiver"], columns="method", values="abs_error_db"
-    )
-    return errors
 
 
 def _receivers(run: RssiRecords) -> list[str]:
@@ -240,8 +157,7 @@ def _heard_most(maps: dict[str, NDArray[Any]], most: int) -> list[int]:
 
 def _cells(run: RssiRecords, most: int = MOST_MAPS) -> DataFrame:
     """The maps that `_maps` draws, a row a cell and receiver."""
-    with np.load(run.folder / "maps.npz") as file:
-        maps = dict(file)
+    maps = run.arrays("maps")
     shown = _heard_most(maps, most)
     names, ys, xs = (a.ravel() for a in np.meshgrid(maps["receiver_names"][shown], maps["y"], maps["x"], indexing="ij"))
     values = {field: maps[kind][shown].ravel().round(2) for kind, field in _FIELDS.items()}
@@ -250,8 +166,7 @@ def _cells(run: RssiRecords, most: int = MOST_MAPS) -> DataFrame:
 
 def _maps(run: RssiRecords, field: str, label: str, most: int = MOST_MAPS) -> Figure:
     """Of the receivers that were heard most, in their own order."""
-    with np.load(run.folder / "maps.npz") as file:
-        maps = dict(file)
+    maps = run.arrays("maps")
     shown = _heard_most(maps, most)
     n = len(shown)
     columns = min(3, n)

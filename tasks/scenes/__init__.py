@@ -14,7 +14,7 @@ from torch import Tensor
 
 from swiftwrf import InputError
 from swiftwrf.data.files import CARRIERS_HZ, sha256
-from swiftwrf.data.raytraced import ROOMS, SCENE_FILE, FurnishedRoom, Scene, Tracing, trace
+from swiftwrf.data.raytraced import ROOMS, SCENE_FILE, FurnishedRoom, Scene, Tracing, check_scene, trace
 from swiftwrf.data.spectra import Moving
 from swiftwrf.data.writing import write_paths
 from tasks.directory import console, new_directory
@@ -130,11 +130,9 @@ def check(config: ScenesConfig) -> None:
         raise InputError(f"--scattering takes 0 to 1, got {config.scattering:g}")
     if config.order == 0 and (config.scattering or config.diffraction):
         raise InputError("--order 0 leaves the direct path alone; scattering and diffraction need at least --order 1")
+    check_scene(config.room)
     if not config.room.endswith(SCENE_FILE):
-        ROOMS[config.room]  # refuses an unknown one
         return
-    if not Path(config.room).is_file():
-        raise InputError(f"{config.room} is not there; expected a Mitsuba scene, or one of {', '.join(ROOMS)}")
     for name in ("walls", "floor", "ceiling"):
         if getattr(config, name) is not None:
             raise InputError(f"--{name} is for the rooms ({', '.join(ROOMS)}); {config.room} names its own materials")

@@ -284,8 +284,7 @@ def planes_of(model: Saved) -> list[dict[str, Any]]:
 
 def strongest(spectrum: Tensor, grid: AngularGrid) -> Direction:
     """Direction of the largest magnitude of a spectrum (n_elevation, n_azimuth)."""
-    row, column = divmod(int(spectrum.argmax()), grid.n_azimuth)
-    return _degrees(torch.stack([grid.azimuth[column], grid.elevation[row]]))
+    return _degrees(grid.strongest(spectrum[None])[0])
 
 
 def angle_between(a: Direction, b: Direction) -> float:

@@ -1,7 +1,7 @@
 """Ray-traced scenes: furnished rooms of boxes, or scene files, traced by Sionna RT (extra `raytrace`)."""
 
 from swiftwrf.data.raytraced.rooms import ROOMS, Box, FurnishedRoom
-from swiftwrf.data.raytraced.scene import SCENE_FILE, Scene, sionna
+from swiftwrf.data.raytraced.scene import SCENE_FILE, Scene, check_scene, sionna
 from swiftwrf.data.raytraced.surfaces import Material, Surface, outline
 from swiftwrf.data.raytraced.trace import TracedPaths, Tracing, trace
 
@@ -15,6 +15,7 @@ __all__ = [
     "Surface",
     "TracedPaths",
     "Tracing",
+    "check_scene",
     "outline",
     "sionna",
     "trace",

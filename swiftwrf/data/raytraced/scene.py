@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from swiftwrf.data.raytraced.rooms import ROOMS
 from swiftwrf.data.raytraced.surfaces import Material, Surface
 from swiftwrf.errors import InputError
 
@@ -36,6 +37,22 @@ def sionna() -> Any:
         ) from None
     drjit.set_thread_count(torch.get_num_threads())
     return sionna.rt
+
+
+def check_scene(name: str, said: str = "") -> None:
+    """Refuses what is neither a room's name nor a scene file, before anything is computed.
+
+    Args:
+        name: of a room, or a path that ends in `.xml`.
+        said: what stands before it in the sentence, e.g. the option.
+
+    Raises:
+        InputError: no such room or file.
+    """
+    if not name.endswith(SCENE_FILE):
+        ROOMS[name]  # refuses an unknown one
+    elif not Path(name).is_file():
+        raise InputError(f"{said}{name} is not there; expected a Mitsuba scene, or one of {', '.join(ROOMS)}")
 
 
 class Scene:

@@ -125,6 +125,7 @@ class AANN(SavedEstimator):
         config: of the training, in place of the preset's.
     """
 
+    kind = "angle-of-arrival network"
     shared = True
 
     def __init__(self, settings: Settings, config: AANNConfig | None = None) -> None:
@@ -138,8 +139,6 @@ class AANN(SavedEstimator):
         self._network = network.to(device).to(memory_format=torch.channels_last)
         self._generator = torch.Generator().manual_seed(seed)
         self._autocast = torch.autocast(device.type, torch.bfloat16, enabled=_gains_from_bfloat16(device))
-
-    kind = "angle-of-arrival network"
 
     def _prepare(self, spectrum: Tensor) -> Tensor:
         factor = coarsening(spectrum.shape[1:], self._config.max_azimuths, LEAST_ROWS)

@@ -20,9 +20,7 @@ class Peak(Estimator):
         """Nothing to learn."""
 
     def estimate(self, spectrum: Tensor) -> Tensor:
-        grid, pixel = self.settings.grid, spectrum.flatten(1).argmax(dim=1)
-        row, column = pixel // grid.n_azimuth, pixel % grid.n_azimuth
-        return torch.stack([grid.azimuth[column], grid.elevation[row]], dim=-1)
+        return self.settings.grid.strongest(spectrum)
 
 
 @ESTIMATORS.register("constant", meaning="the mean direction of the measured labels", colour="#999999")

@@ -1,0 +1,92 @@
+"""What the report says first: three numbers, a picture, what they mean, what to do next."""
+
+from __future__ import annotations
+
+import numpy as np
+from pandas import DataFrame
+
+from tasks.metrics import RssiMetrics
+from tasks.page.page import Number, Plot, Summary
+from tasks.page.records import Records
+from tasks.summarise import paired_difference
+
+RssiRecords = Records[RssiMetrics]
+OWN = "swiftwrf"  # the predictor that all others are compared with
+MISCALIBRATED = 0.05  # difference of coverage from what is promised, from which on the report warns
+
+
+def summary(run: RssiRecords, picture: Plot) -> Summary:
+    """Of one run."""
+    error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
+    own = error[OWN]
+    best = min((name for name in error if name != OWN), key=lambda name: error[name]["median"])
+    interval = run.metrics["interval"]
+    law = "mri_pooled"
+    law_too = f"; one log-distance law for all receivers: {error[law]['median']:.2f} dB" if law in error else ""
+    numbers = [
+        Number(
+            f"{own['median']:.2f} dB",
+            f"SwiftWRF's median absolute error, 95 % interval [{own['low']:.2f}, {own['high']:.2f}]; 90 % of the errors "
+            f"are below {own['p90']:.1f} dB",
+        ),
+        Number(f"{error[best]['median']:.2f} dB", f"the best baseline, {best}{law_too}"),
+        Number(
+            f"{interval['coverage']:.0%}",
+            f"of the test measurements lie in the {interval['nominal']:.0%} interval that comes with each prediction",
+        ),
+    ]
+    meaning = [
+        f"On {scene(run)}, {run.metrics['n_train']} rows teach and {run.metrics['n_test']} test: {own['n']} heard pairs at "
+        f"{len(run.metrics['receivers'])} receiver(s).",
+        _against(run, best),
+    ]
+    return Summary(numbers, picture, meaning, _next_steps(run))
+
+
+def _against(run: RssiRecords, best: str) -> str:
+    """Whether the model is better than the best baseline, or whether that is not known."""
+    mean, low, high = paired_difference(by_method(run), OWN, best)
+    interval = f"{mean:+.2f} dB [{low:+.2f}, {high:+.2f}]"
+    if high < 0:
+        return f"On the same pairs SwiftWRF's mean error is lower than that of {best}: {interval}."
+    if low > 0:
+        return f"On the same pairs {best} has the lower mean error: SwiftWRF's differs by {interval}. Take {best} here."
+    return f"On the same pairs SwiftWRF and {best} cannot be told apart: {interval}."
+
+
+def _next_steps(run: RssiRecords) -> list[str]:
+    maps = run.arrays("maps")
+    width = maps["width"].mean(axis=0)
+    row, column = np.unravel_index(np.argmax(width), width.shape)
+    steps = [
+        f"Measure around x = {maps['x'][column]:.1f} m, y = {maps['y'][row]:.1f} m: the 80 % interval is widest there "
+        f"({width[row, column]:.0f} dB on average over the receivers).",
+        "predictions.csv has every test row with its prediction and interval.",
+    ]
+    interval = run.metrics["interval"]
+    if abs(interval["coverage"] - interval["nominal"]) > MISCALIBRATED:
+        steps.append(
+            "The intervals are not calibrated on these rows; take their widths as a ranking, not as a promise."
+        )
+    if run.metrics["split"] == "random":
+        steps.append("Run --split block: it shows the error in a region where nothing was measured.")
+    return steps
+
+
+def scene(run: RssiRecords) -> str:
+    """The data and the split of a run in words, and which run it is where there are several."""
+    return place(run) + run.label
+
+
+def place(run: RssiRecords) -> str:
+    """The data and the split of a run in words."""
+    name = "the simulated floor" if run.metrics["data"] == "simulated-room" else run.metrics["data"]
+    return f"{name}, {run.metrics['split']} split"
+
+
+def by_method(run: RssiRecords) -> DataFrame:
+    """Absolute errors, a row a pair, a column a method."""
+    errors: DataFrame = run.table("errors").pivot_table(
+        index=["index", "receiver"], columns="method", values="abs_error_db"
+    )
+    return errors
