@@ -1,10 +1,9 @@
-"""The fast maker for CPUs: each primitive visits only the pixels its kernel reaches, rows advance by two multiplications.
+"""The fast maker for CPUs: each primitive visits only the pixels its kernel reaches, and the processor's lanes share a row.
 
-Along a row the exponent is a quadratic in the column, so neighbouring kernel values have a ratio r that itself changes by a
-constant ratio s: g *= r, r *= s. Rounding grows with the square of the number of steps, hence both are computed anew
-every `ANCHOR` columns (every column where cutoff is None). Work is spread over positions and, where there are few, over
-bands of rows (forward) or blocks of primitives (backward); no sum depends on how it was spread, so the bits are the same
-for any number of threads and any batch size.
+Along a row the exponent is a parabola in the column about the row's own centre, so a row needs no exponential of its own:
+each lane computes 2^t of its column by a polynomial. Work is spread over positions and, where there are few, over bands of
+rows (forward) or blocks of primitives (backward); sums are put in the lanes' order when the kernels are compiled and no sum
+depends on how work was spread, so the bits are the same for any number of threads and any batch size.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, call-arg, no-any-return"
@@ -23,9 +22,9 @@ from torch import Tensor
 from swiftwrf.angles import AngularGrid
 from swiftwrf.threads import threads_kept
 
-ANCHOR = 16  # columns between two exact exponentials: 16^2 / 2 roundings stay under 1e-5 of the kernel
+BASE2 = np.float32(-0.5 / math.log(2))  # of half a squared distance: exp(-x / 2) = 2^(BASE2 x)
 
-_FAST = {"contract", "nsz", "arcp"}  # not reassoc or nnan: sums keep their order, and what is not finite stays visible
+_FAST = {"contract", "nsz", "arcp", "reassoc"}  # not nnan or ninf: what is not finite stays visible
 _inline = njit(inline="always", fastmath=_FAST)
 
 
@@ -48,76 +47,122 @@ def _rows(y, l2, l3, reach2, top, bottom):
 
 
 @_inline
-def _columns(x, dy, l2, l3, inv1, inv3, reach2, n_azimuth):
-    """First column and one past the last that a kernel centred on column `x` reaches on the row `dy` above its centre.
+def _columns(fraction, middle, half, n_azimuth):
+    """First column and one past the last of a row whose kernel reaches `half` columns to both sides of `middle`.
 
-    Completing the square: u^2 + v^2 = dy^2 / (l2^2 + l3^2) + curvature (dx - lean dy)^2. Never more than the turn centred
-    on the mean (the nearest image), and a direction half a turn away is drawn once.
+    Never more than the turn centred on the mean, at `fraction` (the nearest image), and a direction half a turn away is
+    drawn once.
     """
-    shear = l2 * inv1 * inv3
-    curvature = inv1 * inv1 + shear * shear
-    remain = reach2 - dy * dy / (l2 * l2 + l3 * l3)
-    if remain < 0:
-        return 0, 0
-    half = math.sqrt(remain / curvature)
-    middle = x + shear * inv3 / curvature * dy
+    low, high = middle - half, middle + half
     half_turn = 0.5 * n_azimuth
-    first = math.ceil(max(middle - half, x - half_turn))
-    last = math.floor(min(middle + half, x + half_turn))
-    return int(first), min(int(last) + 1, int(first) + n_azimuth)
+    if low < fraction - half_turn:
+        low = fraction - half_turn
+    if high > fraction + half_turn:
+        high = fraction + half_turn
+    first = np.int64(np.ceil(low))
+    return first, min(np.int64(np.floor(high)) + 1, first + n_azimuth)
+
+
+@_inline
+def _exp2(t):
+    """2^t to 3e-7 of itself; what is below the smallest normal number is that number."""
+    t = np.float32(-126) if t < np.float32(-126) else t  # written so that nan stays nan
+    whole = np.floor(t + np.float32(0.5))
+    x = t - whole
+    power = np.float32(1.3276470e-3)  # least relative error on [-1/2, 1/2]
+    power = power * x + np.float32(9.6755410e-3)
+    power = power * x + np.float32(5.5507135e-2)
+    power = power * x + np.float32(2.4022120e-1)
+    power = power * x + np.float32(6.9314694e-1)
+    power = power * x + np.float32(1.0000001)
+    exponent = np.int32((np.int32(whole) + 127) << 23)
+    return power * np.int32(exponent).view(np.float32)
+
+
+@_inline
+def _kernel(start, n_columns, drop, bend, kernel):
+    """2^(drop + bend d^2) at the distances d = start, start + 1, ... from the row's centre."""
+    for k in range(n_columns):
+        d = start + np.float32(np.int32(k))
+        kernel[k] = _exp2(drop + bend * d * d)
+
+
+@_inline
+def _add(kernel, begin, end, weight_re, weight_im, re, im, pixel):
+    """Adds a part of a row of kernel values, from `pixel` on."""
+    for k in range(end - begin):
+        g = kernel[begin + k]
+        re[pixel + k] += weight_re * g
+        im[pixel + k] += weight_im * g
+
+
+@_inline
+def _sums(kernel, begin, end, start, weight_re, weight_im, re, im, pixel):
+    """Over a part of a row: kernel times derivative, real and imaginary; z, their weighted sum, times d and times d^2."""
+    zero = np.float32(0)
+    d_re, d_im, z_d, z_dd = zero, zero, zero, zero
+    for k in range(end - begin):
+        g = kernel[begin + k]
+        g_re, g_im = g * re[pixel + k], g * im[pixel + k]
+        d_re += g_re
+        d_im += g_im
+        d = start + np.float32(np.int32(begin + k))
+        z = d * (weight_re * g_re + weight_im * g_im)
+        z_d += z
+        z_dd += d * z
+    return d_re, d_im, z_d, z_dd
 
 
 @_jit
-def _draw(mean, cholesky, weight, reach2, anchor, n_bands, out):
+def _draw(mean, cholesky, weight, reach2, n_elevation, n_azimuth, n_bands, out):
     n_position, n = mean.shape[0], mean.shape[1]
-    n_elevation, n_azimuth = out.shape[2], out.shape[3]
     shared = cholesky.shape[0] == 1
     band = (n_elevation + n_bands - 1) // n_bands
-    half = np.float32(0.5)
     for task in prange(n_position * n_bands):
+        kernel = np.empty(n_azimuth, np.float32)
         b = task // n_bands
         top = min((task % n_bands) * band, n_elevation)
         bottom = min(top + band, n_elevation)
         re, im = out[b, 0], out[b, 1]
-        re[top:bottom] = np.float32(0)
-        im[top:bottom] = np.float32(0)
+        re[top * n_azimuth : bottom * n_azimuth] = np.float32(0)
+        im[top * n_azimuth : bottom * n_azimuth] = np.float32(0)
         c = 0 if shared else b
         for i in range(n):
             l1, l2, l3 = cholesky[c, i, 0], cholesky[c, i, 1], cholesky[c, i, 2]
             x, y = mean[b, i, 0], mean[b, i, 1]
             weight_re, weight_im = weight[b, i, 0], weight[b, i, 1]
+            # completing the square: u^2 + v^2 = steepness dy^2 + curvature (dx - lean dy)^2
             inv1, inv3 = np.float32(1) / l1, np.float32(1) / l3
             shear = l2 * inv1 * inv3
             curvature = inv1 * inv1 + shear * shear
-            s = math.exp(-curvature)
+            lean, steepness = shear * inv3 / curvature, np.float32(1) / (l2 * l2 + l3 * l3)
+            whole = np.int64(math.floor(x))
+            fraction = x - whole  # in float64: a kernel may be far narrower than a pixel
             first_row, end_row = _rows(y, l2, l3, reach2, top, bottom)
             for row in range(first_row, end_row):
                 dy = np.float32(row - y)
-                first, end = _columns(x, dy, l2, l3, inv1, inv3, reach2, n_azimuth)
-                column = first % n_azimuth
-                for start in range(first, end, anchor):
-                    u = np.float32(start - x) * inv1
-                    v = (dy - l2 * u) * inv3
-                    g = math.exp(-half * (u * u + v * v))
-                    r = math.exp(v * shear - u * inv1 - half * curvature)
-                    for _ in range(start, min(start + anchor, end)):
-                        re[row, column] += weight_re * g
-                        im[row, column] += weight_im * g
-                        g *= r
-                        r *= s
-                        column += 1
-                        if column == n_azimuth:
-                            column = 0
+                remain = reach2 - steepness * dy * dy
+                if remain < 0:
+                    continue
+                middle = fraction + lean * dy
+                first, end = _columns(fraction, middle, math.sqrt(remain / curvature), n_azimuth)
+                if end <= first:
+                    continue
+                start = np.float32(first - middle)
+                _kernel(start, end - first, BASE2 * steepness * dy * dy, BASE2 * curvature, kernel)
+                column = (whole + first) % n_azimuth
+                wrap = min(end - first, n_azimuth - column)
+                _add(kernel, 0, wrap, weight_re, weight_im, re, im, row * n_azimuth + column)
+                _add(kernel, wrap, end - first, weight_re, weight_im, re, im, row * n_azimuth)
 
 
 @_jit
-def _draw_backward(grad, mean, cholesky, weight, reach2, anchor, block, d_mean, d_cholesky, d_weight):
+def _draw_backward(grad, mean, cholesky, weight, reach2, n_elevation, n_azimuth, block, d_mean, d_cholesky, d_weight):
     n_position, n = mean.shape[0], mean.shape[1]
-    n_elevation, n_azimuth = grad.shape[2], grad.shape[3]
     shared = cholesky.shape[0] == 1
     n_blocks = (n + block - 1) // block
-    half, zero = np.float32(0.5), np.float32(0)
     for task in prange(n_position * n_blocks):
+        kernel = np.empty(n_azimuth, np.float32)
         b = task // n_blocks
         begin = (task % n_blocks) * block
         re, im = grad[b, 0], grad[b, 1]
@@ -129,38 +174,40 @@ def _draw_backward(grad, mean, cholesky, weight, reach2, anchor, block, d_mean, 
             inv1, inv3 = np.float32(1) / l1, np.float32(1) / l3
             shear = l2 * inv1 * inv3
             curvature = inv1 * inv1 + shear * shear
-            s = math.exp(-curvature)
-            d_re, d_im = zero, zero
+            lean, steepness = shear * inv3 / curvature, np.float32(1) / (l2 * l2 + l3 * l3)
+            whole = np.int64(math.floor(x))
+            fraction = x - whole  # in float64: a kernel may be far narrower than a pixel
+            d_re, d_im = 0.0, 0.0
             # sums of z, the kernel times the derivative by it, over the footprint with u, v, u^2, u v, v^2
-            z_u, z_v, z_uu, z_uv, z_vv = zero, zero, zero, zero, zero
+            z_u, z_v, z_uu, z_uv, z_vv = 0.0, 0.0, 0.0, 0.0, 0.0
             first_row, end_row = _rows(y, l2, l3, reach2, 0, n_elevation)
             for row in range(first_row, end_row):
                 dy = np.float32(row - y)
-                first, end = _columns(x, dy, l2, l3, inv1, inv3, reach2, n_azimuth)
-                column = first % n_azimuth
-                for start in range(first, end, anchor):
-                    u = np.float32(start - x) * inv1
-                    v = (dy - l2 * u) * inv3
-                    g = math.exp(-half * (u * u + v * v))
-                    r = math.exp(v * shear - u * inv1 - half * curvature)
-                    for _ in range(start, min(start + anchor, end)):
-                        grad_re, grad_im = re[row, column], im[row, column]
-                        d_re += g * grad_re
-                        d_im += g * grad_im
-                        z = g * (weight_re * grad_re + weight_im * grad_im)
-                        zu, zv = z * u, z * v
-                        z_u += zu
-                        z_v += zv
-                        z_uu += zu * u
-                        z_uv += zu * v
-                        z_vv += zv * v
-                        g *= r
-                        r *= s
-                        u += inv1
-                        v -= shear
-                        column += 1
-                        if column == n_azimuth:
-                            column = 0
+                remain = reach2 - steepness * dy * dy
+                if remain < 0:
+                    continue
+                middle = fraction + lean * dy
+                first, end = _columns(fraction, middle, math.sqrt(remain / curvature), n_azimuth)
+                if end <= first:
+                    continue
+                start = np.float32(first - middle)
+                _kernel(start, end - first, BASE2 * steepness * dy * dy, BASE2 * curvature, kernel)
+                column = (whole + first) % n_azimuth
+                wrap = min(end - first, n_azimuth - column)
+                near = _sums(kernel, 0, wrap, start, weight_re, weight_im, re, im, row * n_azimuth + column)
+                far = _sums(kernel, wrap, end - first, start, weight_re, weight_im, re, im, row * n_azimuth)
+                s_re, s_im, z_d, z_dd = near[0] + far[0], near[1] + far[1], near[2] + far[2], near[3] + far[3]
+                d_re += s_re
+                d_im += s_im
+                # along the row u and v are straight lines in d: u + inv1 d, v - shear d
+                z = weight_re * s_re + weight_im * s_im
+                u = lean * dy * inv1
+                v = (dy - l2 * u) * inv3
+                z_u += u * z + inv1 * z_d
+                z_v += v * z - shear * z_d
+                z_uu += u * u * z + 2 * u * inv1 * z_d + inv1 * inv1 * z_dd
+                z_uv += u * v * z + (v * inv1 - u * shear) * z_d - inv1 * shear * z_dd
+                z_vv += v * v * z - 2 * v * shear * z_d + shear * shear * z_dd
             d_mean[b, i, 0] = inv1 * z_u - shear * z_v
             d_mean[b, i, 1] = inv3 * z_v
             d_cholesky[b, i, 0] = inv1 * z_uu - shear * z_uv
@@ -175,7 +222,7 @@ def _arguments(mean: Tensor, cholesky: Tensor, weight: Tensor, cutoff: float | N
     reach2 = np.float32(210.0 if cutoff is None else -2 * math.log(cutoff))
     per_position = cholesky if cholesky.dim() == 3 else cholesky[None]
     arrays = (t.detach().contiguous().numpy() for t in (mean, per_position, weight))
-    return (*arrays, reach2, 1 if cutoff is None else ANCHOR)
+    return (*arrays, reach2)
 
 
 @threads_kept()
@@ -193,7 +240,7 @@ def _rasterize(
     threads = _threads()
     n_bands = 1 if mean.shape[0] >= threads else min(threads, n_elevation)
     with threads_kept():
-        _draw(*_arguments(mean, cholesky, weight, cutoff), n_bands, out.numpy())
+        _draw(*_arguments(mean, cholesky, weight, cutoff), n_elevation, n_azimuth, n_bands, out.flatten(2).numpy())
     return out
 
 
@@ -208,7 +255,7 @@ def _rasterize_backward(
     arguments = _arguments(mean, cholesky, weight, cutoff)
     derivatives = (d_mean.numpy(), d_cholesky.numpy(), d_weight.numpy())
     with threads_kept():
-        _draw_backward(grad.contiguous().numpy(), *arguments, block, *derivatives)
+        _draw_backward(grad.contiguous().flatten(2).numpy(), *arguments, *grad.shape[2:], block, *derivatives)
     return d_mean, d_cholesky if cholesky.dim() == 3 else d_cholesky.sum(0), d_weight
 
 
