@@ -64,9 +64,9 @@ class Registry(Generic[Made]):
 
         return decorate
 
-    def discover(self, package: str, path: list[str]) -> None:
-        """Imports every module of a package, so that each registers what it holds."""
-        for module in sorted(module.name for module in pkgutil.iter_modules(path)):
+    def discover(self, package: str, path: list[str], first: tuple[str, ...] = ()) -> None:
+        """Imports every module of a package, those named `first` before the others, so that each registers what it holds."""
+        for module in (*first, *sorted(module.name for module in pkgutil.iter_modules(path))):
             importlib.import_module(f"{package}.{module}")
 
     def __getitem__(self, name: str) -> Entry[Made]:

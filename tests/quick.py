@@ -91,7 +91,7 @@ def small_published() -> Iterator[None]:
         for name, config in PUBLISHED.items():
             made = staticmethod(lambda config=config: config)
             patches.enter_context(mock.patch.object(SYNTHESIZERS[name].make, "config", made))
-        patches.enter_context(mock.patch("tasks.rssi.predictors.NeRF2RssiConfig", return_value=PUBLISHED_RSSI))
+        patches.enter_context(mock.patch("tasks.rssi.predictors.nerf2.NeRF2RssiConfig", return_value=PUBLISHED_RSSI))
         yield
 
 
@@ -106,7 +106,9 @@ def quick() -> Iterator[None]:
         mock.patch.object(aoa, "simulated_room", return_value=spectra),
         mock.patch.object(rssi, "rssi_room", return_value=floor),
         mock.patch("augment.synthesizers.swiftwrf.FitConfig", return_value=FIT),
-        mock.patch("tasks.rssi.predictors.RssiConfig", lambda **given: RssiConfig(**given, steps=2, n_primitives=0)),
+        mock.patch(
+            "tasks.rssi.predictors.swiftwrf.RssiConfig", lambda **given: RssiConfig(**given, steps=2, n_primitives=0)
+        ),
         mock.patch("tasks.rssi.experiment.MAP_CELLS", 8),
         mock.patch.dict(ESTIMATORS._entries, {NETWORK: network}),
         mock.patch.object(

@@ -18,8 +18,9 @@ from swiftwrf import InputError, Rssi, fit_rssi, load, rssi_room
 from swiftwrf.comparison import NeRF2RssiConfig, NeRF2RssiSize
 from swiftwrf.data.splits import folds
 from tasks.report import merge
-from tasks.rssi import experiment, predictors
-from tasks.rssi.predictors import NEIGHBOURS, PREDICTORS, Settings, lacks
+from tasks.rssi import experiment
+from tasks.rssi.predictors import PREDICTORS, Settings, blend, lacks, nerf2
+from tasks.rssi.predictors.regressors import NEIGHBOURS
 from tasks.run import command_line
 
 
@@ -74,7 +75,7 @@ def test_pooled_law_pools_over_all_receivers_of_the_data():
 def short_nerf2(monkeypatch):
     """A field that is fitted in a second."""
     size = NeRF2RssiSize(width=16, bands=2, samples=4, azimuths=4, elevations=2)
-    monkeypatch.setattr(predictors, "NeRF2RssiConfig", lambda: NeRF2RssiConfig(size=size, steps=300, rate=2e-2))
+    monkeypatch.setattr(nerf2, "NeRF2RssiConfig", lambda: NeRF2RssiConfig(size=size, steps=300, rate=2e-2))
 
 
 @pytest.mark.parametrize("name", list(PREDICTORS))
@@ -106,8 +107,8 @@ def test_predictors_say_what_they_are():
     for entry in PREDICTORS.entries():
         assert entry.meaning
         assert entry.colour is not None
-    baselines = ["mean", "mri_pooled", "mri_receiver", "mri_residual", "knn", "gp"]
-    assert list(PREDICTORS) == ["swiftwrf", *baselines, "nerf2", "blend"]
+    baselines = ["mean", "mri_pooled", "mri_receiver", "knn", "mri_residual", "gp"]
+    assert list(PREDICTORS) == ["swiftwrf", *baselines, "blend", "nerf2"]
 
 
 def test_unknown_predictor():
@@ -126,7 +127,7 @@ def run(*arguments):
 
 
 def test_whole_run(small, tmp_path, monkeypatch):
-    monkeypatch.setattr(predictors, "BLENDED", ("knn", "mri_residual"))
+    monkeypatch.setattr(blend, "BLENDED", ("knn", "mri_residual"))
     plan = tmp_path / "plan.png"
     Image.new("RGB", (40, 30), "white").save(plan)
     floor = ("--floor-plan", plan, "--floor-extent", 0, 20, 0, 16)
@@ -231,20 +232,20 @@ def test_neighbours_are_those_that_a_grid_search_chooses():
 
 
 def test_a_blend_takes_the_part_that_is_right(monkeypatch):
-    monkeypatch.setattr(predictors, "BLENDED", ("mri_receiver", "mean"))
+    monkeypatch.setattr(blend, "BLENDED", ("mri_receiver", "mean"))
     data = law_only()
-    blend = PREDICTORS["blend"].make(Settings(pool=data))
-    blend.fit(data)
-    assert blend.weights == pytest.approx({"mri_receiver": 1, "mean": 0}, abs=1e-6)
-    torch.testing.assert_close(blend.predict(data.transmitter_position), data.rssi_dbm, atol=1e-3, rtol=0)
+    blended = PREDICTORS["blend"].make(Settings(pool=data))
+    blended.fit(data)
+    assert blended.weights == pytest.approx({"mri_receiver": 1, "mean": 0}, abs=1e-6)
+    torch.testing.assert_close(blended.predict(data.transmitter_position), data.rssi_dbm, atol=1e-3, rtol=0)
 
 
 def test_a_blend_weighs_noisy_parts(monkeypatch):
     """The weights are positive where each part knows something, and sum to 1."""
-    monkeypatch.setattr(predictors, "BLENDED", ("knn", "mri_receiver"))
+    monkeypatch.setattr(blend, "BLENDED", ("knn", "mri_receiver"))
     train, test = rssi_room(n=200).receivers(["1", "2"]).split()
-    blend = PREDICTORS["blend"].make(Settings(pool=train))
-    blend.fit(train)
-    assert sum(blend.weights.values()) == pytest.approx(1)
-    assert min(blend.weights.values()) > 0.05
-    assert blend.predict(test.transmitter_position).shape == test.rssi_dbm.shape
+    blended = PREDICTORS["blend"].make(Settings(pool=train))
+    blended.fit(train)
+    assert sum(blended.weights.values()) == pytest.approx(1)
+    assert min(blended.weights.values()) > 0.05
+    assert blended.predict(test.transmitter_position).shape == test.rssi_dbm.shape

@@ -37,7 +37,8 @@ def test_every_block_runs(part, tmp_path, monkeypatch):
         with (
             mock.patch.dict(ESTIMATORS._entries, {NETWORK: quick}),
             mock.patch(
-                "tasks.rssi.predictors.RssiConfig", lambda **given: RssiConfig(**given, steps=2, n_primitives=0)
+                "tasks.rssi.predictors.swiftwrf.RssiConfig",
+                lambda **given: RssiConfig(**given, steps=2, n_primitives=0),
             ),
             mock.patch.object(PREDICTORS, "_entries", {name: PREDICTORS[name] for name in PREDICTORS_KEPT}),
         ):

@@ -20,7 +20,8 @@ from tasks.cluster import connected
 from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
 from tasks.page.page import reporting
 from tasks.rssi.page import page
-from tasks.rssi.predictors import PREDICTORS, SLOW, Settings, SwiftWRFPredictor, lacks
+from tasks.rssi.predictors import PREDICTORS, SLOW, Settings, lacks
+from tasks.rssi.predictors.swiftwrf import SwiftWRFPredictor
 from tasks.run import Preset, Row, Run, choose_device, console
 from tasks.source import TableSource, reading
 from tasks.summarise import error_summary, grouped
