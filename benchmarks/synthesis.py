@@ -14,7 +14,7 @@ from augment import Settings, make_synthesizer
 from swiftwrf import Spectra, load_spectra, project, simulated_room
 from swiftwrf.arrays import PlanarArray
 from swiftwrf.data.splits import validation_for
-from swiftwrf.metrics import l1, psnr, ssim, summary
+from swiftwrf.metrics import covered, l1, psnr, ssim, summary
 
 S23_ARRAY = PlanarArray.square(4, 915e6, spacing=0.16)  # which the files of s23-200 do not describe
 SCENES = (("s23-200", "random"), ("s23-200", "block"), ("newrf-bedroom", "random"), ("newrf-office", "random"))
@@ -50,6 +50,7 @@ def measure(data: Spectra, split: str, seed: int) -> dict[str, Any]:
     train, test = data.split(split, seed)
     drawn = {"mean": train.spectrum.mean(dim=0).expand_as(test.spectrum)}
     seconds: dict[str, dict[str, float]] = {}
+    inside: dict[str, float] = {}
     for name in ("nearest", "idw", "gp", "coarray", "swiftwrf"):
         synthesizer = make_synthesizer(name, Settings(validation=validation_for(split), seed=seed))
         began = time.perf_counter()
@@ -57,6 +58,9 @@ def measure(data: Spectra, split: str, seed: int) -> dict[str, Any]:
         fitted = time.perf_counter()
         drawn[name] = synthesizer.synthesize(test.position)
         seconds[name] = {"fit": fitted - began, "synthesize": time.perf_counter() - fitted}
+        deviation = synthesizer.deviation(test.position)
+        if deviation is not None:
+            inside[name] = float(covered(drawn[name], deviation, test.spectrum).mean())
     if train.array is not None:
         stretched = data.name.startswith("s23")
         drawn["swiftwrf, projected"] = project(drawn["swiftwrf"], train.array, train.grid, stretched=stretched)
@@ -66,6 +70,7 @@ def measure(data: Spectra, split: str, seed: int) -> dict[str, Any]:
             "psnr_db": summary(psnr(spectrum, test.spectrum)),
             "l1": summary(l1(spectrum, test.spectrum)),
             "seconds": seconds.get(name),
+            "covered_by_80": inside.get(name),
         }
         for name, spectrum in drawn.items()
     }

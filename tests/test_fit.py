@@ -12,7 +12,7 @@ from swiftwrf.data.splits import folds
 from swiftwrf.fitting.optimise import Optimisation
 from swiftwrf.fitting.search import doubling_search
 from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel
-from swiftwrf.metrics import psnr
+from swiftwrf.metrics import covered, psnr
 from swiftwrf.rasterize import reference
 from swiftwrf.store import Store
 
@@ -165,7 +165,7 @@ def test_deviations_hold_what_they_say(built_in_room):
     train, test = built_in_room
     model = fit(train, progress=False)
     drawn, std = model.synthesize(test.position, return_std=True)
-    inside = ((drawn - test.spectrum).abs() <= 1.2816 * std).float().mean()
+    inside = covered(drawn, std, test.spectrum).mean()
     assert 0.75 < inside < 0.85
     _, far = model.synthesize(test.position + 100, return_std=True)
     _, near = model.synthesize(train.position, return_std=True)

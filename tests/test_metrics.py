@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
 from swiftwrf import InputError
-from swiftwrf.metrics import angle_errors, l1, median_interval, psnr, ssim, summary
+from swiftwrf.metrics import angle_errors, covered, l1, median_interval, psnr, ssim, summary
 
 
 def test_ssim_is_that_of_scikit_image(generator):
@@ -66,3 +66,10 @@ def test_a_first_ssim_under_inference_mode_leaves_later_gradients_alone(generato
         ssim(a, a)
     ssim(a, a.detach() / 2).backward()
     assert a.grad.isfinite().all()
+
+
+def test_four_fifths_of_a_normal_variable_are_covered():
+    noise = torch.randn(3, 200, 200, generator=torch.Generator().manual_seed(0))
+    share = covered(torch.zeros_like(noise), 2 * torch.ones_like(noise), 2 * noise)
+    assert share.tolist() == pytest.approx([0.8] * 3, abs=0.01)
+    assert covered(noise, torch.zeros_like(noise), noise).tolist() == [1, 1, 1]

@@ -20,6 +20,7 @@ from swiftwrf.data.spectra import Spectra
 from swiftwrf.fitting.config import FitConfig
 from swiftwrf.fitting.loss import spectrum_loss
 from swiftwrf.gp import Kernel, SmoothField, held_out, thinned
+from swiftwrf.metrics import NORMAL_80
 from swiftwrf.model import ModelConfig, SwiftWRF
 from swiftwrf.model.deformation import COMPONENTS, Deformation
 from swiftwrf.model.deformation.motion_basis import MotionBasis
@@ -39,8 +40,7 @@ SINGULAR = 1e-9  # share of the variance below which a component is rounding
 BEYOND = 0.5  # spacings by which the first means lie outside the grid at the horizon
 FILLING = 16  # one primitive in so many starts where the others leave most
 PEAK = 1.5  # its standard deviation at the start, in pixels
-INSIDE = 0.8  # share of predictions inside an interval that calibrates their deviation
-NORMAL = 1.2816  # standard deviations of a normal variable that hold that share
+INSIDE = 0.8  # share of predictions inside the interval that calibrates their deviation
 
 
 class Regression:
@@ -113,7 +113,7 @@ class Regression:
         drawn, variance = self._held_out(self.some, kernel)
         prior = _draw(response, kernel).square().sum(dim=0).clamp_min(1e-12)
         miss = (drawn - self.some.spectrum).abs() / (variance[:, None, None] * prior).sqrt()
-        return float(np.quantile(miss, INSIDE)) / NORMAL
+        return float(np.quantile(miss, INSIDE)) / NORMAL_80
 
     def _kernel(self, n: int, grid: AngularGrid) -> Tensor:
         """Kernels of n primitives in the shapes that suit the spectra, (n, H, W)."""

@@ -12,7 +12,7 @@ from augment import withhold
 from swiftwrf import InputError, Spectra, simulated_room
 from swiftwrf.data import read_spectra
 from swiftwrf.data.files import sha256
-from swiftwrf.metrics import angle_errors, l1, psnr, ssim
+from swiftwrf.metrics import angle_errors, covered, l1, psnr, ssim
 from swiftwrf.store import Store
 from tasks.aoa.config import AoaConfig, check, check_data, further_positions
 from tasks.aoa.page import page
@@ -28,7 +28,6 @@ from tasks.steps import Step, computed
 
 SCORE = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
 SAMPLE = " sample"  # after the name of a synthesizer whose draws are scored instead of its means
-NORMAL_80 = 1.2816  # standard deviations about the mean that hold 80 % of a normal variable
 EXAMPLE_QUANTILES = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)  # of the PSNR at the test positions: the best to the worst spectrum
 
 
@@ -192,7 +191,7 @@ class _Tables:
             deviation = drawn["test deviation"]
             examples["deviation"] = as_bytes(deviation[chosen]).numpy()
             triples = zip(synthetic.batches(), measured.batches(), deviation.batches(), strict=True)
-            inside = torch.cat([((s - m).abs() <= NORMAL_80 * d).float().mean((1, 2)) for s, m, d in triples])
+            inside = torch.cat([covered(s, d, m) for s, m, d in triples])
             examples["coverage"] = float(inside.mean())
         self.directory.write_npz(f"examples-mix{share:g}.npz", examples)
 
