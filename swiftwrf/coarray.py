@@ -9,7 +9,6 @@ l, -l, a cosine and a sine. Gaussians need neither the array's geometry nor its 
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -27,7 +26,7 @@ from swiftwrf.components import Components, principal_components
 from swiftwrf.data.spectra import Spectra, check_training, fingerprint
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
-from swiftwrf.gp import EXACT, GaussianProcess, Kernel, choose_kernel, inducing
+from swiftwrf.gp import EXACT, GaussianProcess, Kernel, NearbyProcess, choose_kernel
 from swiftwrf.positions import check_batch, check_drawn, check_positions
 from swiftwrf.progress import progress_bar
 from swiftwrf.threads import single_thread
@@ -94,8 +93,9 @@ class CoarrayModel(Saved):
         array: the antenna array.
         grid: what `synthesize` draws unless told otherwise.
         kernel: of the process, lengths in [m].
-        anchor: the training positions, or 2000 of them that carry what more tell, float64 (n, 3) [m].
-        readout: kernel weights to K component scores and the offset, float64 (n, K + 1).
+        anchor: the training positions, float64 (n, 3) [m].
+        readout: kernel weights to K component scores and the offset; these themselves where there are more than 2000
+            positions, of which the nearest tell; float64 (n, K + 1).
         offset: the mean of what stretching took from a spectrum, (1,).
         form: scores, with a 1 in front, to coefficients by a quadratic form, (1 + 2 P, K + 1, K + 1).
     """
@@ -116,15 +116,17 @@ class CoarrayModel(Saved):
         return self.readout.numel() + self.form.numel()
 
     @cached_property
-    @torch.inference_mode(False)
-    def process(self) -> GaussianProcess:
+    def process(self) -> GaussianProcess | NearbyProcess:
         """That of the component scores."""
-        return GaussianProcess(self.kernel, self.anchor)
+        return (GaussianProcess if len(self.anchor) <= EXACT else NearbyProcess)(self.kernel, self.anchor)
 
     def coefficients(self, position: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         """Of the squared spectrum, (n, 1 + 2 P), and the offset to take off its root, (n, 1); drawn from the posterior at
         each position where there is a generator."""
-        predicted = (self.kernel(position, self.anchor) @ self.readout).float()
+        if isinstance(self.process, NearbyProcess):
+            predicted = self.process.mean(position, self.readout).float()
+        else:
+            predicted = (self.kernel(position, self.anchor) @ self.readout).float()
         if generator is not None:  # a score's variance is 1 over the number of anchors
             unknown = (self.process.variance(position) / len(self.anchor)).sqrt().float()
             noise = torch.randn(len(position), predicted.shape[1] - 1, generator=generator)
@@ -256,18 +258,12 @@ def _solve(train: Spectra, array: PlanarArray, fold: Tensor) -> CoarrayModel:
         mean, vector, component = _components(torch.cat(list(batches())))
     else:
         mean, vector, component = principal_components(batches, COMPONENTS, LEAST)
-        scale = math.sqrt(len(train) / EXACT)  # a score's variance is 1 over the number of anchors, see `coefficients`
-        vector, component = scale * vector, component / scale
     form = _quadratic_form(torch.cat([mean[None], component]), inverse)
 
     kernel = choose_kernel(train.position, train.store, fold)
     target = torch.cat([vector, (offset - offset.mean()).double()], dim=1)
-    if few:
-        anchor, readout = train.position, torch.linalg.solve(kernel.noisy_gram(train.position), target)
-    else:
-        anchor, _, normal, right = inducing(train.position, kernel, target, EXACT)
-        readout = torch.linalg.solve(normal, right)
-    return CoarrayModel(array, train.grid, kernel, anchor, readout, offset.mean()[None], form)
+    readout = torch.linalg.solve(kernel.noisy_gram(train.position), target) if few else target
+    return CoarrayModel(array, train.grid, kernel, train.position, readout, offset.mean()[None], form)
 
 
 def _components(flat: Tensor) -> Components:

@@ -12,19 +12,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor, nn
 
 from swiftwrf.errors import InputError
-from swiftwrf.positions import distance, nearest
+from swiftwrf.positions import Neighbours, distance
 from swiftwrf.store import Store
 from swiftwrf.threads import single_thread
 
 NOISES = (1e-3, 1e-2, 1e-1)  # of spectra: little of a measured one is not a function of position
 NEGLIGIBLE = 5e-4  # share of the error at held-out positions that components may add which are left out
 JITTER = 1e-6  # relative variance that keeps neighbouring anchors apart
-ROWS = 4096  # positions regressed at a time
 EXACT = 2000  # positions up to which a process is exact; beyond, time and memory would grow with their cube and square
 NEAR = 64  # positions that tell of one among many: farther ones hardly change the mean
 MAX_ROWS = 400  # more do not change the choice, and a candidate costs their number cubed
@@ -88,7 +88,13 @@ class GaussianProcess:
 
     def __init__(self, kernel: Kernel, known: Tensor) -> None:
         self.kernel, self.known = kernel, known.double()
-        self.inverse = torch.linalg.inv(kernel.noisy_gram(known))
+
+    @cached_property
+    @torch.inference_mode(False)
+    def inverse(self) -> Tensor:
+        """Of the covariance of the noisy values, (n, n)."""
+        inverse: Tensor = torch.linalg.inv(self.kernel.noisy_gram(self.known))
+        return inverse
 
     def weights(self, position: Tensor) -> Tensor:
         """By which the known values make up the mean at positions (m, 3), float64 (m, n)."""
@@ -112,18 +118,27 @@ class NearbyProcess:
     """
 
     def __init__(self, kernel: Kernel, known: Tensor) -> None:
-        self.kernel, self.known = kernel, known.double()
+        self.kernel, self.known, self._neighbours = kernel, known.double(), Neighbours(known)
 
     def weights(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """At positions (m, 3): numbers of the known values that make up the mean, (m, k), by which weights, float64 (m, k),
         and the variance of the field (without noise), relative to k(0) = 1, float64 (m,)."""
-        position = position.double()
-        _, number = nearest(position, self.known, min(NEAR, len(self.known)))
+        position = position.to(self.known)
+        number = self._neighbours(position, min(NEAR, len(self.known)))[1].to(self.known.device)
         near = self.known[number]
-        noisy = self.kernel(near, near) + self.kernel.noise * torch.eye(number.shape[1], dtype=torch.float64)
+        noisy = self.kernel(near, near) + self.kernel.noise * torch.eye(number.shape[1]).to(near)
         cross = self.kernel(position[:, None], near)[:, 0]
         weight = torch.linalg.solve(noisy, cross)
         return number, weight, (1 - (weight * cross).sum(dim=1)).clamp(0, 1)
+
+    def mean(self, position: Tensor, value: Tensor) -> Tensor:
+        """Of functions with known values (n, K) at positions (m, 3), float64 (m, K)."""
+        number, weight, _ = self.weights(position)
+        return torch.einsum("mk,mkc->mc", weight, value[number].double())
+
+    def variance(self, position: Tensor) -> Tensor:
+        """Of the field (without noise) at positions (m, 3), relative to k(0) = 1, float64 (m,)."""
+        return self.weights(position)[2]
 
 
 class SmoothField(nn.Module):
@@ -153,25 +168,12 @@ class SmoothField(nn.Module):
 
     @classmethod
     @single_thread()
-    def regress(cls, position: Tensor, kernel: Kernel, value: Tensor, anchors: int) -> SmoothField:
-        """The functions that a Gaussian process tells from values (n, K) at normalised positions (n, 3).
-
-        Where there are more positions than `anchors`, evenly chosen ones carry what all tell (subset of regressors;
-        Rasmussen and Williams 2006, section 8.3.1), so that time grows with n and not its cube.
-        """
-        value = value.double()
-        if len(position) <= anchors:
-            field = cls(position, kernel, value.shape[1])
-            field.coefficient.data = torch.linalg.solve_triangular(
-                torch.linalg.cholesky(kernel.noisy_gram(position)), value, upper=False
-            ).to(position)
-            return field
-        anchor, among, normal, right = inducing(position, kernel, value, anchors)
-        # what the posterior covariance takes off the prior one is k W W^T k
-        certain, direction = torch.linalg.eigh(torch.linalg.inv(among) - kernel.noise * torch.linalg.inv(normal))
-        root = certain.clamp_min(1e-12 * float(certain.max())).sqrt()
-        field = cls(anchor, kernel, value.shape[1], (direction * root).to(position))
-        field.coefficient.data = ((direction / root).T @ torch.linalg.solve(normal, right)).to(position)
+    def regress(cls, position: Tensor, kernel: Kernel, value: Tensor) -> SmoothField:
+        """The functions that a Gaussian process tells from values (n, K) at normalised positions (n, 3)."""
+        field = cls(position, kernel, value.shape[1])
+        field.coefficient.data = torch.linalg.solve_triangular(
+            torch.linalg.cholesky(kernel.noisy_gram(position)), value.double(), upper=False
+        ).to(position)
         return field
 
     def variance(self, position: Tensor) -> Tensor:
@@ -188,26 +190,40 @@ class SmoothField(nn.Module):
         return self.coefficient.square().sum()
 
 
-def inducing(position: Tensor, kernel: Kernel, value: Tensor, anchors: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Normal equations of the subset of regressors: the mean at s is k(s, Z) normal^-1 right.
+class NearbyField(nn.Module):
+    """What a smooth field tells of too many positions for one: its functions at a position from the values at the nearest
+    ones alone.
 
     Args:
-        position: of all values, (n, 3).
-        kernel: with its noise.
-        value: (n, K).
-        anchors: M of the positions, evenly chosen, that carry what all tell.
-
-    Returns:
-        Z (M, 3), k(Z, Z) (M, M), the normal matrix (M, M) and the right-hand side (M, K), float64 but Z.
+        anchor: normalised positions (M, 3).
+        kernel: on normalised positions, with its noise.
+        value: of K functions, (M, K).
     """
-    (anchor,) = thinned(position, rows=anchors)
-    among = kernel(anchor.double(), anchor.double()) + JITTER * torch.eye(anchors, dtype=torch.float64)
-    normal, right = kernel.noise * among, torch.zeros(anchors, value.shape[1], dtype=torch.float64)
-    for rows in torch.arange(len(position)).split(ROWS):
-        cross = kernel(anchor.double(), position[rows].double())
-        normal += cross @ cross.T
-        right += cross @ value[rows].double()
-    return anchor, among, normal, right
+
+    def __init__(self, anchor: Tensor, kernel: Kernel, value: Tensor) -> None:
+        super().__init__()
+        self.kernel = kernel
+        self.register_buffer("anchor", anchor)
+        self.register_buffer("value", value.to(anchor))
+        self._process: NearbyProcess | None = None
+
+    anchor: Tensor
+    value: Tensor
+
+    @property
+    def process(self) -> NearbyProcess:
+        """Made at first use, when the anchors are where they stay."""
+        if self._process is None or self._process.known.device != self.anchor.device:
+            self._process = NearbyProcess(self.kernel, self.anchor)
+        return self._process
+
+    def variance(self, position: Tensor) -> Tensor:
+        """Of the functions at positions (B, 3), relative to k(0) = 1, (B,)."""
+        return self.process.variance(position).to(position)
+
+    def forward(self, position: Tensor) -> Tensor:
+        """The functions at positions (B, 3), (B, K)."""
+        return self.process.mean(position, self.value).to(position)
 
 
 @single_thread()

@@ -57,15 +57,29 @@ def distance(a: Tensor, b: Tensor) -> Tensor:
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist").clamp(max=FARTHEST)
 
 
-def nearest(position: Tensor, known: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """Distances from positions (n, 3) to the k nearest of known ones (m, 3), ascending, and the numbers of those, (n, k).
+class Neighbours:
+    """Finds the nearest of known positions: by all distances where these are few, else by a tree that is built once, so that
+    time grows with the logarithm of their number (k-d tree: J. L. Bentley, Communications of the ACM 18, 1975).
 
-    Time grows with n log m where there are many (k-d tree: J. L. Bentley, Communications of the ACM 18, 1975).
+    Args:
+        known: positions (m, 3).
     """
-    position, known = position.double(), known.double()
-    if len(known) > MANY:
-        apart, number = cKDTree(known.numpy()).query(position.numpy(), k=range(1, k + 1))
-        return torch.from_numpy(apart), torch.from_numpy(number).long()
-    if k == 1:  # the first of several at one place
-        return distance(position, known).min(dim=1, keepdim=True)
-    return distance(position, known).topk(k, largest=False)
+
+    def __init__(self, known: Tensor) -> None:
+        self._known = known.detach().double().cpu()
+        self._tree = cKDTree(self._known.numpy()) if len(known) > MANY else None
+
+    def __call__(self, position: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        """Distances from positions (n, 3) to the k nearest, ascending, float64, and the numbers of those, (n, k)."""
+        position = position.detach().double().cpu()
+        if self._tree is not None:
+            apart, number = self._tree.query(position.numpy(), k=range(1, k + 1))
+            return torch.from_numpy(apart), torch.from_numpy(number).long()
+        if k == 1:  # the first of several at one place
+            return distance(position, self._known).min(dim=1, keepdim=True)
+        return distance(position, self._known).topk(k, largest=False)
+
+
+def nearest(position: Tensor, known: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Distances from positions (n, 3) to the k nearest of known ones (m, 3), ascending, and the numbers of those, (n, k)."""
+    return Neighbours(known)(position, k)

@@ -8,7 +8,16 @@ import torch
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import Matern
 
-from swiftwrf.gp import GaussianProcess, Kernel, SmoothField, choose_kernel, choose_rank, held_out, most_informative
+from swiftwrf.gp import (
+    GaussianProcess,
+    Kernel,
+    NearbyField,
+    SmoothField,
+    choose_kernel,
+    choose_rank,
+    held_out,
+    most_informative,
+)
 
 KERNEL = Kernel(long=1.0, short=0.3, share=0.6, noise=1e-2)
 
@@ -78,18 +87,25 @@ def test_held_out_predictions_are_those_of_a_process_without_the_fold(generator,
         torch.testing.assert_close(variance[out], process.variance(position[out]) + KERNEL.noise)
 
 
-def test_regression_on_fewer_anchors_tells_nearly_the_same(generator):
-    """Mean and variance of the exact process, from a third of the positions as anchors of a smooth field."""
-    position = 2 * torch.rand(300, 3, generator=generator) - 1
+def test_smooth_fields_are_the_process(generator):
+    """Of all positions, and of the nearest, which here are all but a few far ones; and how they change with the position."""
+    position = 2 * torch.rand(70, 3, generator=generator) - 1
     value = torch.sin(position @ torch.randn(3, 2, generator=generator))
-    kernel = Kernel(long=8.0, short=2.0, share=0.05, noise=1e-2)
+    kernel = Kernel(long=8.0, short=0.4, share=0.05, noise=1e-2)
     new = 1.6 * torch.rand(50, 3, generator=generator) - 0.8
-    exact, sparse = (SmoothField.regress(position, kernel, value, anchors) for anchors in (300, 100))
     process = GaussianProcess(kernel, position)
-    torch.testing.assert_close(exact(new), (process.weights(new) @ value.double()).float(), atol=1e-4, rtol=0)
-    torch.testing.assert_close(exact.variance(new), process.variance(new).float(), atol=1e-4, rtol=0)
-    assert (sparse(new) - exact(new)).abs().max() < 0.05
-    assert (sparse.variance(new) - exact.variance(new)).abs().max() < 0.05  # at the corners, where anchors are rare
+    wanted = (process.weights(new) @ value.double()).float()
+    for field, tolerance in (
+        (SmoothField.regress(position, kernel, value), 1e-4),
+        (NearbyField(position, kernel, value), 0.02),
+    ):
+        torch.testing.assert_close(field(new), wanted, atol=tolerance, rtol=0)
+        torch.testing.assert_close(field.variance(new), process.variance(new).float(), atol=tolerance, rtol=0)
+        at = new[:3].clone().requires_grad_()
+        field(at).sum().backward()
+        step = torch.tensor([1e-3, 0.0, 0.0])
+        slope = (field(new[:3] + step) - field(new[:3] - step)).sum(dim=1) / 2e-3
+        torch.testing.assert_close(at.grad[:, 0], slope.detach(), atol=0.01, rtol=0.01)
 
 
 def test_suggested_positions_beat_random_ones(generator):

@@ -14,7 +14,7 @@ from PIL import Image
 
 from augment import SYNTHESIZERS, Settings
 from augment.synthesizers import gp as pixels
-from swiftwrf import AngularGrid, InputError, coarray, fit_coarray, load_spectra, positions, simulated_room, store
+from swiftwrf import AngularGrid, InputError, coarray, fit_coarray, load, load_spectra, positions, simulated_room, store
 from swiftwrf.components import principal_components
 from swiftwrf.data.formats import nerf2
 from swiftwrf.data.spectra import check_training, fingerprint
@@ -243,7 +243,7 @@ def exact(monkeypatch):
     """Sets from how many spectra on methods are no longer exact."""
 
     def to(n):
-        for module, name in ((coarray, "EXACT"), (pixels, "EXACT"), (regression, "MAX_ANCHORS"), (positions, "MANY")):
+        for module, name in ((coarray, "EXACT"), (pixels, "EXACT"), (regression, "EXACT"), (positions, "MANY")):
             monkeypatch.setattr(module, name, n)
 
     return to
@@ -265,6 +265,19 @@ def test_what_is_not_exact_predicts_nearly_as_well(name, exact):
         synthesizer = fitted(name, train)
         score.append(float(psnr(synthesizer.synthesize(test.position), test.spectrum).median()))
     assert score[1] == pytest.approx(score[0], abs=0.5)
+
+
+@pytest.mark.parametrize("name", ["coarray", "swiftwrf"])
+def test_models_of_many_spectra_come_back_from_their_files(name, exact, tmp_path):
+    data = simulated_room(n=400, grid=AngularGrid.hemisphere(8, 32))
+    exact(240)
+    model = fitted(name, data).model
+    model.save(tmp_path / "model.safetensors")
+    again, position = load(tmp_path / "model.safetensors"), data.position[::7] + 0.03
+    torch.testing.assert_close(again.synthesize(position), model.synthesize(position), atol=0, rtol=0)
+    if name == "swiftwrf":
+        for kept, own in zip(*(m.synthesize(position, return_std=True) for m in (again, model)), strict=True):
+            torch.testing.assert_close(kept, own, atol=0, rtol=0)
 
 
 @pytest.mark.parametrize("name", ["gp", "coarray"])

@@ -19,7 +19,7 @@ from swiftwrf.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.fitting.config import FitConfig
 from swiftwrf.fitting.loss import spectrum_loss
-from swiftwrf.gp import Kernel, SmoothField, held_out, thinned
+from swiftwrf.gp import EXACT, Kernel, NearbyField, SmoothField, held_out, thinned
 from swiftwrf.metrics import NORMAL_80
 from swiftwrf.model import ModelConfig, SwiftWRF
 from swiftwrf.model.deformation import COMPONENTS, Deformation
@@ -34,7 +34,6 @@ SHAPE_STEPS = 60
 SHAPE_RATE = 0.02  # of means [rad] and logarithms of widths
 RIDGE = 1e-6  # of a kernel's mean square: keeps neighbours from cancelling each other with large responses
 MAX_ROWS = 1000  # spectra that choose the shapes and judge a size; more do not change the choice
-MAX_ANCHORS = 2000  # of the motion: time and memory grow with their square
 SHAPE_AZIMUTHS = 90  # columns of the spectra that the shapes are found on: an array's beams are far wider
 SINGULAR = 1e-9  # share of the variance below which a component is rounding
 BEYOND = 0.5  # spacings by which the first means lie outside the grid at the horizon
@@ -84,7 +83,8 @@ class Regression:
             scores = [(part - mean).flatten(1) @ flat.T for part in train.store.batches()]
             score = torch.cat(scores) / flat.square().sum(dim=1)
             position = normalise(train.position, centre, scale)
-            field = SmoothField.regress(position, self.kernel.scaled(1 / float(scale)), score, MAX_ANCHORS)
+            regress = SmoothField.regress if len(train) <= EXACT else NearbyField
+            field = regress(position, self.kernel.scaled(1 / float(scale)), score)
             basis = torch.zeros(len(component), n, sum(COMPONENTS[c] for c in config.components))
             at = sum(COMPONENTS[c] for c in config.components[: config.components.index("response")])
             basis[..., at] = response[1:] / attenuation

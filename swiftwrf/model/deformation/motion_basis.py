@@ -25,7 +25,7 @@ class MotionBasis(Deformation):
     whatever the number of primitives.
 
     Args:
-        field: the smooth functions.
+        field: the smooth functions; those of neighbours are not fitted by gradient.
         basis: motions of the primitives, (rank, N, numbers that deform).
         components: that deform.
         deviation: of measured spectra about the drawn ones, relative to what the prior of the motion says; 0 where it
@@ -33,7 +33,11 @@ class MotionBasis(Deformation):
     """
 
     def __init__(
-        self, field: gp.SmoothField, basis: Tensor, components: tuple[str, ...], deviation: float = 0.0
+        self,
+        field: gp.SmoothField | gp.NearbyField,
+        basis: Tensor,
+        components: tuple[str, ...],
+        deviation: float = 0.0,
     ) -> None:
         super().__init__()
         self.components, self.field, self.basis = components, field, nn.Parameter(basis)
@@ -51,15 +55,17 @@ class MotionBasis(Deformation):
     @classmethod
     def restore(cls, components: tuple[str, ...], header: Header, tensors: Mapping[str, Tensor]) -> MotionBasis:
         rank, n, m = header["config"]["rank"], header["config"]["n_primitives"], len(tensors["field.anchor"])
-        shapes = {"anchor": (m, 3), "whiten": (m, m), "coefficient": (m, rank)}
+        kernel, few = gp.Kernel(**header["kernel"]), "field.whiten" in tensors
+        own = {"whiten": (m, m), "coefficient": (m, rank)} if few else {"value": (m, rank)}
+        field_shapes = {f"field.{name}": shape for name, shape in ({"anchor": (m, 3)} | own).items()}
         basis_shape = (rank, n, sum(COMPONENTS[c] for c in components))
-        field_shapes = {f"field.{name}": shape for name, shape in shapes.items()}
         expect(dict(tensors), field_shapes | {"basis": basis_shape, "deviation": ()})
         if not float(tensors["deviation"]) >= 0:
             raise InputError(f"deviation is {float(tensors['deviation'])}, expected 0 or more")
-        anchor, whiten, basis = (tensors[name] for name in ("field.anchor", "field.whiten", "basis"))
-        field = gp.SmoothField(anchor, gp.Kernel(**header["kernel"]), len(basis), whiten)
-        return cls(field, basis.clone(), components)
+        anchor, basis = tensors["field.anchor"], tensors["basis"].clone()
+        if few:
+            return cls(gp.SmoothField(anchor, kernel, rank, tensors["field.whiten"]), basis, components)
+        return cls(gp.NearbyField(anchor, kernel, tensors["field.value"]), basis, components)
 
     def header(self) -> Header:
         return {"kernel": asdict(self.field.kernel)}
@@ -78,7 +84,9 @@ class MotionBasis(Deformation):
         return self.deviation * (self.field.variance(position) + self.field.kernel.noise).sqrt()
 
     def prior(self) -> Tensor:
+        assert isinstance(self.field, gp.SmoothField)
         return self.field.prior()
 
     def parameter_groups(self, rate: float, own_rate: float | None) -> list[dict[str, Any]]:
+        assert isinstance(self.field, gp.SmoothField)
         return [{"params": [self.field.coefficient], "peak": rate}, {"params": [self.basis], "peak": rate / 2}]
