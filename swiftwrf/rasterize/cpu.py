@@ -47,20 +47,34 @@ def _rows(y, l2, l3, reach2, top, bottom):
 
 
 @_inline
-def _columns(fraction, middle, half, n_azimuth):
-    """First column and one past the last of a row whose kernel reaches `half` columns to both sides of `middle`.
+def _shape(l1, l2, l3):
+    """What turns differences into exponents: u = inv1 dx and v = inv3 dy - shear dx, and, the square completed,
+    u^2 + v^2 = steepness dy^2 + curvature (dx - lean dy)^2."""
+    inv1, inv3 = np.float32(1) / l1, np.float32(1) / l3
+    shear = l2 * inv1 * inv3
+    curvature = inv1 * inv1 + shear * shear
+    return inv1, inv3, shear, curvature, shear * inv3 / curvature, np.float32(1) / (l2 * l2 + l3 * l3)
 
-    Never more than the turn centred on the mean, at `fraction` (the nearest image), and a direction half a turn away is
-    drawn once.
+
+@_inline
+def _columns(x, dy, curvature, lean, steepness, reach2, n_azimuth):
+    """First column and one past the last that a kernel centred on column `x` reaches on the row `dy` above its centre, and
+    how far the first is from the row's own centre.
+
+    Never more than the turn centred on the mean (the nearest image), and a direction half a turn away is drawn once.
     """
+    remain = reach2 - steepness * dy * dy
+    if remain < 0:
+        return 0, 0, np.float32(0)
+    half, middle = math.sqrt(remain / curvature), x + lean * dy
     low, high = middle - half, middle + half
     half_turn = 0.5 * n_azimuth
-    if low < fraction - half_turn:
-        low = fraction - half_turn
-    if high > fraction + half_turn:
-        high = fraction + half_turn
+    if low < x - half_turn:
+        low = x - half_turn
+    if high > x + half_turn:
+        high = x + half_turn
     first = np.int64(np.ceil(low))
-    return first, min(np.int64(np.floor(high)) + 1, first + n_azimuth)
+    return first, min(np.int64(np.floor(high)) + 1, first + n_azimuth), np.float32(first - middle)
 
 
 @_inline
@@ -131,24 +145,15 @@ def _draw(mean, cholesky, weight, reach2, n_elevation, n_azimuth, n_bands, out):
             l1, l2, l3 = cholesky[c, i, 0], cholesky[c, i, 1], cholesky[c, i, 2]
             x, y = mean[b, i, 0], mean[b, i, 1]
             weight_re, weight_im = weight[b, i, 0], weight[b, i, 1]
-            # completing the square: u^2 + v^2 = steepness dy^2 + curvature (dx - lean dy)^2
-            inv1, inv3 = np.float32(1) / l1, np.float32(1) / l3
-            shear = l2 * inv1 * inv3
-            curvature = inv1 * inv1 + shear * shear
-            lean, steepness = shear * inv3 / curvature, np.float32(1) / (l2 * l2 + l3 * l3)
+            _, _, _, curvature, lean, steepness = _shape(l1, l2, l3)
             whole = np.int64(math.floor(x))
             fraction = x - whole  # in float64: a kernel may be far narrower than a pixel
             first_row, end_row = _rows(y, l2, l3, reach2, top, bottom)
             for row in range(first_row, end_row):
                 dy = np.float32(row - y)
-                remain = reach2 - steepness * dy * dy
-                if remain < 0:
-                    continue
-                middle = fraction + lean * dy
-                first, end = _columns(fraction, middle, math.sqrt(remain / curvature), n_azimuth)
+                first, end, start = _columns(fraction, dy, curvature, lean, steepness, reach2, n_azimuth)
                 if end <= first:
                     continue
-                start = np.float32(first - middle)
                 _kernel(start, end - first, BASE2 * steepness * dy * dy, BASE2 * curvature, kernel)
                 column = (whole + first) % n_azimuth
                 wrap = min(end - first, n_azimuth - column)
@@ -171,10 +176,7 @@ def _draw_backward(grad, mean, cholesky, weight, reach2, n_elevation, n_azimuth,
             l1, l2, l3 = cholesky[c, i, 0], cholesky[c, i, 1], cholesky[c, i, 2]
             x, y = mean[b, i, 0], mean[b, i, 1]
             weight_re, weight_im = weight[b, i, 0], weight[b, i, 1]
-            inv1, inv3 = np.float32(1) / l1, np.float32(1) / l3
-            shear = l2 * inv1 * inv3
-            curvature = inv1 * inv1 + shear * shear
-            lean, steepness = shear * inv3 / curvature, np.float32(1) / (l2 * l2 + l3 * l3)
+            inv1, inv3, shear, curvature, lean, steepness = _shape(l1, l2, l3)
             whole = np.int64(math.floor(x))
             fraction = x - whole  # in float64: a kernel may be far narrower than a pixel
             d_re, d_im = 0.0, 0.0
@@ -183,14 +185,9 @@ def _draw_backward(grad, mean, cholesky, weight, reach2, n_elevation, n_azimuth,
             first_row, end_row = _rows(y, l2, l3, reach2, 0, n_elevation)
             for row in range(first_row, end_row):
                 dy = np.float32(row - y)
-                remain = reach2 - steepness * dy * dy
-                if remain < 0:
-                    continue
-                middle = fraction + lean * dy
-                first, end = _columns(fraction, middle, math.sqrt(remain / curvature), n_azimuth)
+                first, end, start = _columns(fraction, dy, curvature, lean, steepness, reach2, n_azimuth)
                 if end <= first:
                     continue
-                start = np.float32(first - middle)
                 _kernel(start, end - first, BASE2 * steepness * dy * dy, BASE2 * curvature, kernel)
                 column = (whole + first) % n_azimuth
                 wrap = min(end - first, n_azimuth - column)
