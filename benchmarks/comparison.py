@@ -28,6 +28,7 @@ from augment.synthesizers.published import Published
 from swiftwrf import Spectra, simulated_room
 from swiftwrf.data.splits import validation_for
 from swiftwrf.durable import write_text
+from swiftwrf.gp import thinned
 from swiftwrf.metrics import l1, psnr, ssim, summary
 from tasks.aoa.config import AoaConfig
 from tasks.aoa.experiment import run
@@ -43,6 +44,7 @@ LEARNT = ("swiftwrf", "nerf2", "wrfgs", "vae", "dcgan")
 COUNTS = (20, 40, 80)  # training spectra of s23-200 random; all of them are in the table of scenes
 SHARES = (0.1, 0.3, 0.5, 0.7)
 TURBO = ("swiftwrf", "nerf2", "wrfgs")
+JUDGES = 50  # test spectra of a scene, evenly chosen: a neural field takes seconds to draw one
 QUICKER = 5  # by how much --quick shortens fits by gradient
 BATCH, REPEATS = 8, 3  # spectra a call, and calls, of which a rate is the median
 CPU = torch.device("cpu")
@@ -138,6 +140,7 @@ def jobs(config: Config, rows: Path) -> Iterator[tuple[Spectra, Spectra, list[Jo
         if config.only and not scene.startswith(config.only):
             continue
         train, test = data.split(split)
+        test = test.subset(*thinned(torch.arange(len(test)), rows=JUDGES))
         methods = [method for method in (*BASELINES, *LEARNT) if method == MEAN or not lacks(method, data)]
         wanted = [
             Job(rows / f"{scene} {n} {method}", method, n, split, config.quick)
