@@ -123,13 +123,25 @@ def _wall_error(planes: list[dict[str, Any]], axis: int, offset: float) -> float
 
 def rssi() -> str:
     """Median and 90 % of the absolute errors of each predictor, and the interval's coverage."""
-    methods = ("mean", "mri_pooled", "mri_receiver", "mri_residual", "knn", "gp", "swiftwrf")
+    methods = ("mean", "mri_pooled", "mri_receiver", "mri_residual", "knn", "gp", "swiftwrf", "blend")
     rows = []
     for metrics in rssi_runs():
         errors = [metrics["overall"][name]["abs_error_db"] for name in methods]
         cells = [f"{e['median']:.2f} / {e['p90']:.1f}" for e in errors]
         rows.append([f"{metrics['data']}, {metrics['split']}", *cells, f"{metrics['interval']['coverage']:.0%}"])
-    return markdown(["data, split", *methods, "80 % interval covers"], rows)
+    return markdown(["data, split", *methods, "80 % interval of swiftwrf covers"], rows)
+
+
+def floor() -> str:
+    """How far `swiftwrf` and the blend are from the best baseline of each run on the built-in floor."""
+    own, rows = ("swiftwrf", "blend"), []
+    for file in sorted(RESULTS.glob("floor_*.json")):
+        metrics = load(file.stem)["metrics"]
+        median = {name: entry["abs_error_db"]["median"] for name, entry in metrics["overall"].items()}
+        best = min((name for name in median if name not in own), key=lambda name: median[name])
+        cells = [f"{median[name]:.2f} ({median[name] - median[best]:+.3f})" for name in own]
+        rows.append([str(metrics["seed"]), f"`{best}`: {median[best]:.2f}", *cells])
+    return markdown(["seed", "best baseline [dB]", *own], rows)
 
 
 def size() -> str:
@@ -328,6 +340,7 @@ TABLES = {
     "aoa": aoa,
     "room": room,
     "rssi": rssi,
+    "floor": floor,
     "size": size,
     "hard_cases": hard_cases,
     "precision": precision,

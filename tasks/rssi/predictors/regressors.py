@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from sklearn.dummy import DummyRegressor
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 from sklearn.neighbors import KNeighborsRegressor, NearestNeighbors
@@ -123,6 +125,8 @@ class GaussianProcess(_PerReceiver):
         kernel = kernel + WhiteKernel(scale / 2, (scale * 1e-3, scale * 10))
         order = np.random.default_rng(self._seed).permutation(len(y))
         tuned, kept = order[:TUNED_ROWS], order[:KEPT_ROWS]
-        with threadpool_limits(1):  # many small systems, for which threads mostly wait for each other
+        # many small systems, for which threads mostly wait for each other
+        with threadpool_limits(1), warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)  # a bound that is reached is the answer
             fitted = GaussianProcessRegressor(kernel, random_state=self._seed).fit(x[tuned], y[tuned])
             return GaussianProcessRegressor(fitted.kernel_, optimizer=None).fit(x[kept], y[kept])
