@@ -16,6 +16,7 @@ from tasks.page.palette import Palette
 NETWORK = "aann"  # of the estimators: the one that the paper trains
 TURBO = "turbo_"  # before the name of the synthesizer
 EXTRA = "_extra"  # after it, where further positions are added to the withheld ones
+AUTO = f"{TURBO}auto"  # what each repeat chose, where repeats chose differently
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,7 @@ def terms() -> dict[str, str]:
         **{bound.name: bound.meaning for bound in (LOWER, UPPER)},
         f"{TURBO}NAME": "trained on the measured share and on spectra that NAME synthesized at the withheld positions",
         f"{TURBO}NAME{EXTRA}": "the same, and at as many further positions as --extra says",
+        AUTO: "what each repeat chose by cross-validation, synthesizer and further positions, where they chose differently",
         **{entry.name: entry.meaning for entry in ESTIMATORS.entries()},
         "no estimator's name": f"the network ({NETWORK}); an estimator's name alone is that one on the measured share",
     }
@@ -108,6 +110,7 @@ def palette() -> Palette:
     colours |= drawn
     for name, colour in drawn.items():
         colours |= {turbo(name): colour, turbo(name, extra=True): _darker(colour)}
+    colours[AUTO] = "#332288"
     dashed = set(baselines())
     for estimator in learners():
         if estimator != NETWORK:

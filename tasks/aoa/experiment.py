@@ -14,8 +14,9 @@ from swiftwrf.data import read_spectra
 from swiftwrf.data.files import sha256
 from swiftwrf.metrics import angle_errors, covered, l1, psnr, ssim
 from swiftwrf.store import Store
-from tasks.aoa.config import AoaConfig, check, check_data, further_positions
+from tasks.aoa.config import AUTO, AoaConfig, check, check_data, further_positions
 from tasks.aoa.page import page
+from tasks.aoa.pooled import pooled
 from tasks.aoa.results import mix_metrics
 from tasks.aoa.setting import At, Setting
 from tasks.aoa.steps import Arm, Choice, Suggestion, Synthesis, as_bytes, steps_at
@@ -67,6 +68,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         tables = _Tables(setting, directory)
         for step, value in computed(directory, steps, setting, cluster):
             tables.add(step, value)
+        tables.pool()
         directory.write_csv("errors.csv", tables.errors)
         directory.write_csv("synthesis.csv", tables.synthesis)
         directory.write_csv("history.csv", tables.history)
@@ -128,6 +130,12 @@ class _Tables:
             case Suggestion():
                 self._add_suggestion(step, value)
 
+    def pool(self) -> None:
+        """Gives each arm all repeats, once all steps are added."""
+        auto = self.setting.config.synthesizer == (AUTO,)
+        self.errors = pooled(self.errors, auto)
+        self.training_seconds = pooled(self.training_seconds, auto)
+
     def _add_arm(self, step: Arm, value: Row) -> None:
         self.counts.setdefault(step.at.share, {})[step.training] = value["counts"]
         arm = step.at.row | {"method": step.method}
@@ -154,7 +162,8 @@ class _Tables:
                 arm = step.at.row | {"synthesizer": called}
                 scores = {name: self._score(function, drawn[key]) for name, function in SCORE.items()}
                 self.synthesis += _rows(arm, {"index": self.test.index} | scores)
-                self.synthesis_seconds.append(arm | value["seconds"])
+                trains = step.trains and called == step.synthesizer
+                self.synthesis_seconds.append(arm | value["seconds"] | {"trains": trains})
         self.history += [step.at.row | {"synthesizer": step.synthesizer} | row for row in value["history"]]
         if step.at.repeat == 0 and step.trains and share not in self._kept_examples:
             self._kept_examples.add(share)

@@ -11,7 +11,6 @@ from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 from pandas import DataFrame
 
-from tasks.aoa import arms
 from tasks.aoa.share import Share
 from tasks.page import figures
 from tasks.page.page import Plot, Section
@@ -21,7 +20,7 @@ STILL = np.deg2rad(0.1)  # means that move less along the walk than this stay wh
 
 def field_section(share: Share) -> Section | None:
     """Maps of the strongest direction, and the primitives' change along a walk; None where neither was kept."""
-    names = arms.drawn_by(share.mix["methods"])
+    names = share.drawn_by(share.mix["methods"])
     plots = [_map(share, name, field) for name in names if (field := _stored(share, f"field-{name}")) is not None]
     if (motion := _stored(share, "motion")) is not None:
         plots.append(_motion(share, motion))

@@ -16,7 +16,7 @@ def summary(share: Share, picture: Plot) -> Summary:
     turbo = min((n for n in error if arms.is_turbo(n) and arms.is_network(n)), key=lambda n: error[n]["median"])
     lower, upper = error[arms.LOWER.name]["median"], error[arms.UPPER.name]["median"]
     own, best = error[turbo], min(error, key=lambda name: error[name]["median"])
-    drawn_by = arms.drawn_by([turbo])[0]
+    drawn_by = share.drawn_by([turbo])[0]
     quality = mix["synthesis"][drawn_by]["psnr_db"]
     numbers = [
         Number(

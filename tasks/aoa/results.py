@@ -25,12 +25,12 @@ def mix_metrics(
         n_measured: spectra.
         counts: of spectra by origin in each training set.
         choice, advice: of the first repeat, where there are any.
-        rows: `errors`, `training_seconds`, `synthesis` and `synthesis_seconds` of all shares.
+        rows: `errors`, `training_seconds`, `synthesis` and `synthesis_seconds` of all shares, the last with whether
+            the spectra train an arm.
     """
     own = {name: DataFrame([row for row in table if row["mix"] == share]) for name, table in rows.items()}
     training, fits = own["training_seconds"], own["synthesis_seconds"]
-    trained = [name for name in training["method"].unique() if arms.is_turbo(name)]
-    asked_for = fits[[any(arms.training_of(t) == arms.turbo(s) for t in trained) for s in fits["synthesizer"]]]
+    asked_for = fits[fits["trains"]]
     networks = training[[arms.estimator_of(name) == arms.NETWORK for name in training["method"]]]
     return {
         "n_measured": n_measured,

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from pandas import DataFrame
 
+from tasks.aoa import arms
 from tasks.metrics import AoaMetrics, MixMetrics
 from tasks.page.records import Records
 
@@ -33,6 +35,11 @@ class Share:
     def mix(self) -> MixMetrics:
         """Its numbers."""
         return self.run.metrics["mixes"][self.key]
+
+    def drawn_by(self, names: Iterable[str]) -> list[str]:
+        """The synthesizers whose spectra train these arms; that of the first repeat, where repeats chose differently."""
+        choice = self.mix["choice"]
+        return arms.drawn_by(names) or ([choice["name"]] if choice else [])
 
     @property
     def percent(self) -> str:

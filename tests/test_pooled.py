@@ -1,0 +1,63 @@
+"""Arms of several repeats that chose differently."""
+
+import json
+from dataclasses import replace
+from itertools import cycle
+from unittest import mock
+
+import pandas as pd
+from quick import run
+
+from tasks.aoa.pooled import pooled
+from tasks.aoa.steps import choose_synthesizer
+
+
+def rows(*repeats):
+    """Rows of one share: in each repeat the arms of these trainings, and what is not synthetic."""
+    return [
+        {"mix": 0.3, "repeat": repeat, "method": method, "value": 10 * repeat + number}
+        for repeat, methods in enumerate(repeats)
+        for number, method in enumerate(("measured_only", *methods))
+    ]
+
+
+def values(found, method):
+    return [row["value"] for row in found if row["method"] == method]
+
+
+def test_repeats_that_agree_stay_as_they_are():
+    given = rows(("turbo_gp", "kernel_ridge_turbo_gp"), ("turbo_gp", "kernel_ridge_turbo_gp"))
+    assert pooled(given, auto=True) == given
+
+
+def test_what_each_repeat_chose_is_one_arm():
+    given = rows(
+        ("turbo_gp", "kernel_ridge_turbo_gp"), ("turbo_idw", "turbo_idw_extra", "kernel_ridge_turbo_idw_extra")
+    )
+    found = pooled(given, auto=True)
+    assert {row["method"] for row in found} == {"measured_only", "turbo_auto", "kernel_ridge_turbo_auto"}
+    assert values(found, "turbo_auto") == [1, 12]  # with further positions where there are some
+    assert values(found, "kernel_ridge_turbo_auto") == [2, 13]
+    assert values(found, "measured_only") == [0, 10]
+
+
+def test_named_synthesizers_add_nothing_where_nothing_is_advised():
+    found = pooled(rows(("turbo_gp",), ("turbo_gp", "turbo_gp_extra")), auto=False)
+    assert values(found, "turbo_gp") == [1, 11]
+    assert values(found, "turbo_gp_extra") == [1, 12]
+
+
+def test_a_run_whose_repeats_choose_differently(tmp_path):
+    chosen = cycle(("gp", "idw"))
+
+    def choose(*given):
+        return replace(choose_synthesizer(*given), name=next(chosen))
+
+    with mock.patch("tasks.aoa.steps.choose_synthesizer", choose):
+        assert run("aoa", "--mix", 0.7, "--repeats", 2, "--extra", 0, "--out", tmp_path / "run") == 0
+    methods = json.loads((tmp_path / "run" / "metrics.json").read_text())["mixes"]["0.7"]["methods"]
+    assert [name for name in methods if name.startswith("turbo_")] == ["turbo_auto"]
+    errors = pd.read_csv(tmp_path / "run" / "errors.csv")
+    per_arm = errors.groupby("method").size()
+    assert per_arm["turbo_auto"] == per_arm["measured_only"]
+    assert "turbo_auto" in (tmp_path / "run" / "report.html").read_text()
