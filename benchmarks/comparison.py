@@ -271,6 +271,8 @@ def draw(found: dict[str, dict[str, dict[str, Row]]]) -> None:
         rows = next(iter(by_count.values()))  # all training spectra
         points = {name: (r["ms"]["median"], 10 ** (-r["psnr_db"]["median"] / 20)) for name, r in rows.items()}
         figures.speed(ax, palette, points, f"milliseconds a spectrum, {scene}", "RMS error", list(points))
+    for ax in axes[len(found) :]:
+        ax.set_axis_off()
     (folder / "comparison_speed.svg").write_text(figures.as_svg(panels))
     curves = found.get("s23-200 random", {})
     if len(curves) > 1:
@@ -281,6 +283,8 @@ def draw(found: dict[str, dict[str, dict[str, Row]]]) -> None:
             own = [n for n in numbers if name in curves[str(n)]]
             axes[0].plot(own, [s["median"] for s in at], "o-", markersize=3, label=name, color=palette.colour(name))
         axes[0].set(xscale="log", xlabel="training spectra", ylabel="median SSIM")
+        axes[0].set_xticks(numbers, [str(n) for n in numbers])
+        axes[0].minorticks_off()
         figures.legend_below(panel, axes[0])
         (folder / "comparison_counts.svg").write_text(figures.as_svg(panel))
 
