@@ -110,6 +110,10 @@ def test_aann_is_seeded_and_leaves_the_global_generator_alone(room):
     assert torch.equal(torch.get_rng_state(), state)
 
 
+def test_a_training_is_as_long_as_the_scene_needs():
+    assert [AANNConfig.quick(n).steps for n in (0, 240, 1525, 100_000)] == [250, 250, 953, 2000]
+
+
 def test_whole_run(small, tmp_path):
     out = tmp_path / "run"
     more = ("--repeats", 2, "--extra", 20, "--suggest", 4)

@@ -67,4 +67,6 @@ class Setting:
 
     def of_estimators(self, at: At) -> Settings:
         """What estimators are made with."""
-        return Settings(self.train.grid, self.config.seed + at.repeat, self.device, self.config.preset)
+        return Settings(
+            self.train.grid, self.config.seed + at.repeat, self.device, self.config.preset, spectra=len(self.train)
+        )

@@ -28,6 +28,8 @@ from swiftwrf.progress import progress
 from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator, Settings
 
 LEAST_ROWS = 8  # a prime number of rows can only be averaged to one, which leaves nothing to learn from
+LOOKS = 20  # that a quick training takes at each spectrum of a scene with many
+MOST_STEPS = 2000  # of a quick training
 STATISTICS = 512  # spectra that the batch norms' statistics are taken from
 
 
@@ -45,6 +47,12 @@ class AANNConfig:
     """larger spectra are averaged down for the network; 0 keeps all pixels"""
     circular: bool = False
     """pad the azimuth circularly, as the physics has it, instead of with zeros"""
+
+    @classmethod
+    def quick(cls, spectra: int) -> AANNConfig:
+        """As long as a scene of so many spectra needs: 250 steps leave 1,500 spectra half-learnt."""
+        enough = round(LOOKS * spectra / cls.batch)
+        return cls(steps=min(max(cls.steps, enough), MOST_STEPS))
 
     @classmethod
     def paper(cls) -> AANNConfig:
@@ -130,7 +138,7 @@ class AANN(SavedEstimator):
 
     def __init__(self, settings: Settings, config: AANNConfig | None = None) -> None:
         super().__init__(settings)
-        config = config or (AANNConfig.paper() if settings.preset == "paper" else AANNConfig())
+        config = config or (AANNConfig.paper() if settings.preset == "paper" else AANNConfig.quick(settings.spectra))
         seed, device = settings.seed, torch.device(settings.device)
         self._config, self._device = config, device
         with torch.random.fork_rng(devices=[]):  # torchvision draws its weights from the global generator

@@ -26,6 +26,8 @@ class Settings:
         seed: of what is random.
         device: where to train.
         preset: how large and how long.
+        spectra: that there would be with everything measured: how long a training lasts, whatever it is given, must follow
+            from one number, or the longer training would win.
         group: processes of `torch.distributed` that train one of those that are `shared`.
     """
 
@@ -33,6 +35,7 @@ class Settings:
     seed: int = 0
     device: torch.device | str = "cpu"
     preset: Preset = "quick"
+    spectra: int = 0
     group: ProcessGroup | None = None
 
 
