@@ -18,7 +18,7 @@ from swiftwrf.metrics import angle_errors
 from swiftwrf.store import Store
 from tasks.aoa import arms, experiment, steps
 from tasks.aoa.config import AoaConfig
-from tasks.aoa.estimators import ESTIMATORS, Settings, aann
+from tasks.aoa.estimators import ESTIMATORS, Settings
 from tasks.aoa.estimators.aann import AANN, AANNConfig
 from tasks.aoa.estimators.baselines import Constant, NearestSpectrum, Peak
 from tasks.page.palette import Palette
@@ -38,7 +38,7 @@ def small(monkeypatch):
         monkeypatch.setattr(
             place, "candidates", lambda data: [n for n in ("idw", "gp", "coarray") if not lacks(n, data)]
         )
-    monkeypatch.setattr(aann, "AANNConfig", lambda: AANNConfig(steps=2, batch=4))
+    monkeypatch.setattr(AANNConfig, "quick", lambda spectra: AANNConfig(steps=2, batch=4))
     return room
 
 
