@@ -74,8 +74,9 @@ def aoa_targets() -> str:
             change = median[turbo] / median["measured_only"] - 1
             aim = lower.get(share)
             missed = [] if aim is None or change <= -aim else [f"{change + aim:.0%}"]
-            if share in below_all and median[turbo] >= median["measured_all"]:
-                missed.append("not below everything measured")
+            above = median[turbo] - median["measured_all"]
+            if share in below_all and above >= 0:
+                missed.append(f"{above:.2f} degrees above everything measured")
             target = (
                 "" if aim is None else f"-{aim:.0%}" + (", below everything measured" if share in below_all else "")
             )
