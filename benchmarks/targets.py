@@ -76,7 +76,7 @@ def aoa_targets() -> str:
             missed = [] if aim is None or change <= -aim else [f"{change + aim:.0%}"]
             above = median[turbo] - median["measured_all"]
             if share in below_all and above >= 0:
-                missed.append(f"{above:.2f} degrees above everything measured")
+                missed.append(f"{above:.2f} degrees (everything measured)")
             target = (
                 "" if aim is None else f"-{aim:.0%}" + (", below everything measured" if share in below_all else "")
             )
