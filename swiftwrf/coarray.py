@@ -124,9 +124,10 @@ class CoarrayModel(Saved):
         """Of the squared spectrum, (n, 1 + 2 P), and the offset to take off its root, (n, 1); drawn from the posterior at
         each position where there is a generator."""
         if isinstance(self.process, NearbyProcess):
-            predicted = self.process.mean(position, self.readout).float()
+            mean = self.process.mean(position, self.readout)
         else:
-            predicted = (self.kernel(position, self.anchor) @ self.readout).float()
+            mean = self.kernel(position, self.anchor) @ self.readout
+        predicted = mean.float()
         if generator is not None:  # a score's variance is 1 over the number of anchors
             unknown = (self.process.variance(position) / len(self.anchor)).sqrt().float()
             noise = torch.randn(len(position), predicted.shape[1] - 1, generator=generator)

@@ -215,7 +215,7 @@ def _draw_backward(grad, mean, cholesky, weight, reach2, n_elevation, n_azimuth,
 
 
 def _arguments(mean: Tensor, cholesky: Tensor, weight: Tensor, cutoff: float | None) -> tuple[object, ...]:
-    """What both kernels take first; `REACH2` of cutoff None is where exp(-reach2 / 2) is 0 in float32."""
+    """What both kernels take first; `reach2` of cutoff None is where exp(-reach2 / 2) is 0 in float32."""
     reach2 = np.float32(210.0 if cutoff is None else -2 * math.log(cutoff))
     per_position = cholesky if cholesky.dim() == 3 else cholesky[None]
     arrays = (t.detach().contiguous().numpy() for t in (mean, per_position, weight))
