@@ -161,7 +161,7 @@ def size() -> str:
                 str(enough["n_primitives"]),
                 f"{auto['parameters'] / enough['parameters']:.1f}",
                 f"{auto['seconds']:.1f} s",
-                f"{auto['seconds'] / _at(fixed, auto['n_primitives'])['seconds']:.1f}",
+                f"{auto['processor_seconds'] / _at(fixed, auto['n_primitives'])['processor_seconds']:.1f}",
             ]
         )
     columns = ["scene, split", "N, K", "PSNR [dB]", "of N = 16 ... 1024 (best)", "smallest within 0.1 dB"]

@@ -16,7 +16,7 @@ from swiftwrf.data.spectra import Spectra, check_training, fingerprint
 from swiftwrf.data.splits import folds
 from swiftwrf.fitting.config import FitConfig
 from swiftwrf.fitting.optimise import Optimisation
-from swiftwrf.fitting.regression import Regression
+from swiftwrf.fitting.regression import TRIAL_STEPS, Regression
 from swiftwrf.fitting.search import doubling_search
 from swiftwrf.fitting.state import Record, Session, Size
 from swiftwrf.gp import Kernel, choose_kernel
@@ -106,7 +106,7 @@ def _regress(regression: Regression, config: FitConfig, session: Session) -> Swi
         session.bar.update(task, description=str(size))
         if size.key not in session.losses:
             began = time.perf_counter()
-            session.losses[size.key] = regression.held_out_loss(n)
+            session.losses[size.key] = regression.held_out_loss(n, TRIAL_STEPS)
             record(size, began, session.losses[size.key], session.losses[size.key])
         return session.losses[size.key]
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -31,6 +32,7 @@ from swiftwrf.rasterize.reference import kernels
 from swiftwrf.threads import single_thread
 
 SHAPE_STEPS = 60
+TRIAL_STEPS = 8  # tell sizes apart as well as all of them do
 SHAPE_RATE = 0.02  # of means [rad] and logarithms of widths
 RIDGE = 1e-6  # of a kernel's mean square: keeps neighbours from cancelling each other with large responses
 MAX_ROWS = 1000  # spectra that choose the shapes and judge a size; more do not change the choice
@@ -58,21 +60,22 @@ class Regression:
         self.train, self.fold = train, fold[rows]
         self.some = train.subset(rows).in_memory()
         self.small = self.some.at_most(SHAPE_AZIMUTHS).in_memory()
-        self.primitives: dict[int, Primitives] = {}
+        self.primitives: dict[tuple[int, int], Primitives] = {}
 
     @single_thread()
-    def held_out_loss(self, n: int) -> float:
-        """Of n primitives, on spectra that the regression has not seen."""
-        drawn, _ = self._held_out(self.small, self._kernel(n, self.small.grid))
+    def held_out_loss(self, n: int, steps: int = SHAPE_STEPS) -> float:
+        """Of n primitives, shaped in so many steps, on spectra that the regression has not seen."""
+        kernel = _kernels(self._shaped(n, steps), self.small.grid, self.config.model).detach()
+        drawn, _ = self._held_out(self.small, kernel)
         return float(spectrum_loss(drawn, self.small.spectrum, self.config.ssim_weight, self.config.pixel_loss))
 
     @single_thread()
     def model(self, n: int) -> SwiftWRF:
         """Of n primitives, from all spectra."""
-        train, kernel = self.train, self._kernel(n, self.train.grid)
+        train, primitives = self.train, self._shaped(n, SHAPE_STEPS)
+        kernel = _kernels(primitives, train.grid, self.config.model).detach()
         mean, component = self._components(self.some)
         response = _responses(kernel, torch.cat([mean[None], component]))
-        primitives = self.primitives[n]
         attenuation = torch.sigmoid(primitives.attenuation.detach())
         primitives.response.data = torch.stack([response[0] / attenuation, torch.zeros(n)], dim=1)
         config = replace(self.config.model, n_primitives=n, rank=len(component))
@@ -115,26 +118,28 @@ class Regression:
         miss = (drawn - self.some.spectrum).abs() / (variance[:, None, None] * prior).sqrt()
         return float(np.quantile(miss, INSIDE)) / NORMAL_80
 
-    def _kernel(self, n: int, grid: AngularGrid) -> Tensor:
-        """Kernels of n primitives in the shapes that suit the spectra, (n, H, W)."""
-        config = replace(self.config.model, n_primitives=n)
-        if n not in self.primitives:
-            self.primitives[n] = self._shaped(config)
-        return _kernels(self.primitives[n], grid, config).detach()
+    def _shaped(self, n: int, steps: int) -> Primitives:
+        """n primitives that leave least of the mean spectrum and the principal components after so many steps."""
+        if (n, steps) not in self.primitives:
+            self.primitives[n, steps] = self._shape(replace(self.config.model, n_primitives=n), steps)
+        return self.primitives[n, steps]
 
-    def _shaped(self, config: ModelConfig) -> Primitives:
-        """Primitives that leave least of the mean spectrum and the principal components."""
+    @cached_property
+    def _target(self) -> Tensor:
+        """Mean spectrum and principal components that shapes are found on, (1 + K, H, W)."""
+        mean, component = self._components(self.small)
+        return torch.cat([mean[None], component])
+
+    def _shape(self, config: ModelConfig, steps: int) -> Primitives:
         grid = self.small.grid
         primitives = config.make_primitives(grid, torch.Generator().manual_seed(self.config.seed))
         _spread(primitives)
-        mean, component = self._components(self.small)
-        target = torch.cat([mean[None], component])
-        kernel = _kernels(primitives, grid, config).detach()
+        target, kernel = self._target, _kernels(primitives, grid, config).detach()
         _fill(primitives, (_draw(_responses(kernel, target), kernel) - target).square().sum(dim=0), grid)
         shapes = [primitives.mean, primitives.cholesky]
         optimiser = torch.optim.Adam(shapes, lr=SHAPE_RATE, betas=(0.9, 0.99))
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, SHAPE_STEPS)
-        for _ in range(SHAPE_STEPS):
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+        for _ in range(steps):
             kernel = _kernels(primitives, grid, config)
             # at the best responses the loss does not change with them, so they count as constants
             left = _draw(_responses(kernel.detach(), target), kernel) - target
