@@ -134,7 +134,7 @@ def test_whole_run(small, tmp_path, monkeypatch):
     assert run("--rx", "1", "receiver06", *floor, "--also", "nerf2", "blend", "--out", tmp_path / "run") == 0
     out = tmp_path / "run"
     metrics = json.loads((out / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(name))
-    assert (metrics["task"], metrics["data"], metrics["split"]) == ("rssi", "simulated-room", "random")
+    assert (metrics["task"], metrics["data"], metrics["split"]) == ("rssi", "simulated-floor", "random")
     assert set(metrics["overall"]) == set(PREDICTORS)
     assert set(metrics["receivers"]) == {"receiver01", "receiver06"}
     assert set(metrics["seconds"]) == {"fit", "predict"}
@@ -181,7 +181,7 @@ def test_predictors_without_positions_of_the_receivers(name):
         assert "needs the positions of the receivers" in lacks(name, data)
     if name.startswith("mri"):
         with pytest.raises(
-            InputError, match="needs the positions of the receivers, which simulated-room does not tell"
+            InputError, match="needs the positions of the receivers, which simulated-floor does not tell"
         ):
             predictor.fit(data)
     elif not PREDICTORS[name].needs:

@@ -15,7 +15,7 @@ from tasks.aoa.page_field import field_section
 from tasks.aoa.page_room import choice_section, room_section
 from tasks.aoa.page_suggest import suggestion_section
 from tasks.aoa.page_summary import summary
-from tasks.aoa.share import AoaRecords, Share, first_history, fits, place, scene
+from tasks.aoa.share import AoaRecords, Share, first_history, fits
 from tasks.metrics import Angle, ErrorSummary
 from tasks.page import figures
 from tasks.page.page import Page, Plot, Section, Table
@@ -50,13 +50,13 @@ def page(runs: list[AoaRecords]) -> Page:
         Section("Training and size", plots=[*_size(runs), *_training(runs)]),
     ]
     sections += [_time(shares, several), _limits(runs[0]), provenance(runs)]
-    names = ", ".join(dict.fromkeys(place(run) for run in runs))
+    names = ", ".join(dict.fromkeys(run.place for run in runs))
     picture = _over_shares(shares, "summary") if len(shares) > 1 else _estimators(shares[0])
     return Page(f"Angle of arrival: {names}", summary(shares[0], picture), sections)
 
 
 def _results(share: Share, several: bool) -> Section:
-    title = f"{share.percent} measured" + (f" - {share.scene}, seed {share.run.metrics['seed']}" if several else "")
+    title = f"{share.percent} measured" + (f" - {share.run.scene}, seed {share.run.metrics['seed']}" if several else "")
     rows = [
         [name, *(_with_interval(arm[column]) for column in ERRORS), number(arm["great_circle_deg"]["p90"])]
         for name, arm in share.mix["methods"].items()
@@ -123,7 +123,7 @@ def _over_shares(shares: list[Share], name: str) -> Plot:
         arm for arm in every if arm != OFF_SCALE and (arms.is_network(arm) or arm in arms.baselines())
     )
     labels = [share.percent for share in shares]
-    if len({place(share.run) for share in shares}) > 1:
+    if len({share.run.place for share in shares}) > 1:
         labels = [figures.plain(f"{s.percent}\n{s.run.metrics['data']}\n{s.run.metrics['split']}") for s in shares]
     heights = {arm: [_median_and_interval(share, arm) for share in shares] for arm in names}
     figure, axes = figures.new_figure(1, 1, 7.2, 4)
@@ -161,7 +161,7 @@ def _synthesis(shares: list[Share], several: bool) -> Section:
     rows = []
     for share in shares:
         for name, scores in share.mix["synthesis"].items():
-            what = f"{share.percent} {name}" + (f", {share.scene}" if several else "")
+            what = f"{share.percent} {name}" + (f", {share.run.scene}" if several else "")
             db = scores["psnr_db"]
             interval = f"{number(db['median'], 1)} [{number(db['low'], 1)}, {number(db['high'], 1)}]"
             rows.append([what, number(scores["ssim"]["median"], 3), interval, number(scores["l1"]["mean"], 4)])
@@ -233,7 +233,7 @@ def _size(runs: list[AoaRecords]) -> list[Plot]:
         axes[0].xaxis.set_major_formatter("{x:g}")
         axes[0].set(xlabel="primitives", ylabel="loss on held-out spectra")
         caption = (
-            f"{scene(run)}, first share. Loss on measured spectra that each size did not see, at coarse resolution; the "
+            f"{run.scene}, first share. Loss on measured spectra that each size did not see, at coarse resolution; the "
             f"model took the smallest within 0.2 % of the best: {n} primitives (line)."
         )
         data = by_size[["n_primitives", "validation"]]
@@ -256,7 +256,7 @@ def _training(runs: list[AoaRecords]) -> list[Plot]:
         figure, axes = figures.new_figure(1, max(len(panels), 1), 6 * max(len(panels), 1), 3.2)
         for ax, (label, lines) in zip(axes, panels.items(), strict=False):
             figures.curves(ax, arms.palette(), lines, "step", label)
-        caption = f"{scene(run)}, first share and repeat: the networks, and synthesizers that are fitted by gradient."
+        caption = f"{run.scene}, first share and repeat: the networks, and synthesizers that are fitted by gradient."
         curves = {f"network, {name}": line for name, line in networks.items()}
         curves |= {f"synthesizer, {name}": line for name, line in fitted.items()}
         parts = [DataFrame({"what": what, "step": steps, "loss": loss}) for what, (steps, loss) in curves.items()]
@@ -306,7 +306,7 @@ def _time(shares: list[Share], several: bool) -> Section:
     for share in shares:
         seconds = share.mix["seconds"]
         cells = (number(value, 1) for value in (seconds["fit"], seconds["synthesize"], seconds["train"]))
-        rows.append([share.percent + (f", {share.scene}" if several else ""), *cells])
+        rows.append([share.percent + (f", {share.run.scene}" if several else ""), *cells])
     caption = "Seconds on the machine named below; train: the networks of all arms together."
     return Section("Where the time went", tables=[Table(["share", "fit", "synthesize", "train"], rows, caption)])
 

@@ -34,9 +34,9 @@ def summary(share: Share, picture: Plot) -> Summary:
         ),
     ]
     meaning = [
-        f"On {share.scene}, {mix['n_measured']} of {metrics['n_train']} training spectra are measured ({share.percent}); "
-        f"the spectra at the other positions are synthesized, and the network learns from both. It is tested on "
-        f"{metrics['n_test']} spectra that nothing here has seen.",
+        f"On {share.run.scene}, {mix['n_measured']} of {metrics['n_train']} training spectra are measured "
+        f"({share.percent}); the spectra at the other positions are synthesized, and the network learns from both. "
+        f"It is tested on {metrics['n_test']} spectra that nothing here has seen.",
         f"The best of all arms is {best} with a median error of {error[best]['median']:.2f} degrees.",
         *filter(None, [advice_sentence(share)]),
     ]

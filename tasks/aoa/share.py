@@ -47,11 +47,6 @@ class Share:
         return f"{float(self.key):.0%}"
 
     @property
-    def scene(self) -> str:
-        """The data and their split in words."""
-        return scene(self.run)
-
-    @property
     def file_name(self) -> str:
         """What its figures are called after."""
         return f"mix{self.key}-{self.run.file_name}"
@@ -60,17 +55,6 @@ class Share:
     def title(self) -> str:
         """The share, and which run it is of where there are several."""
         return f"{self.percent} measured{self.run.label}"
-
-
-def scene(run: AoaRecords) -> str:
-    """The data and the split of a run in words, and which run it is where there are several."""
-    return place(run) + run.label
-
-
-def place(run: AoaRecords) -> str:
-    """The data and the split of a run in words."""
-    name = "the simulated room" if run.metrics["data"] == "simulated-room" else run.metrics["data"]
-    return f"{name}, {run.metrics['split']} split"
 
 
 def first_history(run: AoaRecords) -> DataFrame:

@@ -47,6 +47,17 @@ class Records(Generic[Metrics]):
         return f", run {self.number}" if self.number else ""
 
     @property
+    def place(self) -> str:
+        """The data and their split in words."""
+        data = self.metrics["data"]
+        return f"{'the ' + data.replace('-', ' ') if data.startswith('simulated-') else data}, {self.metrics['split']} split"
+
+    @property
+    def scene(self) -> str:
+        """The data and their split in words, and which run it is where there are several."""
+        return self.place + self.label
+
+    @property
     def file_name(self) -> str:
         """What the figures of the run are called after: no figure of one run takes the place of another's."""
         names = [re.sub(r"[^\w.=-]+", "_", self.metrics[key], flags=re.ASCII)[:40] for key in ("data", "split")]

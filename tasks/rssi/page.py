@@ -13,7 +13,7 @@ from tasks.page import figures
 from tasks.page.page import Page, Plot, Section, Table
 from tasks.page.palette import Palette
 from tasks.page.provenance import number, provenance
-from tasks.rssi.page_summary import OWN, RssiRecords, by_method, place, scene, summary
+from tasks.rssi.page_summary import OWN, RssiRecords, by_method, summary
 from tasks.rssi.predictors import PREDICTORS
 from tasks.summarise import SHORTEST, paired_difference, running_median
 
@@ -32,13 +32,13 @@ def palette() -> Palette:
 def page(runs: list[RssiRecords]) -> Page:
     """The page of these runs."""
     sections = [section for run in runs for section in _run(run, several=len(runs) > 1)]
-    names = ", ".join(dict.fromkeys(place(run) for run in runs))
+    names = ", ".join(dict.fromkeys(run.place for run in runs))
     picture = Plot("summary", _maps(runs[0], "predicted", "predicted RSSI [dBm]", 1), _MAP_CAPTION, _cells(runs[0], 1))
     return Page(f"RSSI: {names}", summary(runs[0], picture), [*sections, _limits(runs[0]), provenance(runs)])
 
 
 def _run(run: RssiRecords, several: bool) -> list[Section]:
-    suffix = f" - {scene(run)}" if several else ""
+    suffix = f" - {run.scene}" if several else ""
     name = run.file_name
     errors, cells = run.table("errors"), _cells(run)
     heights = _heights(run)
@@ -260,6 +260,6 @@ def _limits(run: RssiRecords) -> Section:
         "narrow. The paired table draws whole test rows, which mends that in part.",
         "The paper's table (2.91 dB for SwiftWRF, 6.74 for MRI) is of other data; compare methods here, not with it.",
     ]
-    if run.metrics["data"] == "simulated-room":
+    if run.metrics["data"] == "simulated-floor":
         texts.append("This floor is simulated. It shows that the software works, no more.")
     return Section("What this does not show", texts)

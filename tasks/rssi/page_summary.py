@@ -36,7 +36,7 @@ def summary(run: RssiRecords, picture: Plot) -> Summary:
         ),
     ]
     meaning = [
-        f"On {scene(run)}, {run.metrics['n_train']} rows teach and {run.metrics['n_test']} test: {own['n']} heard pairs at "
+        f"On {run.scene}, {run.metrics['n_train']} rows teach and {run.metrics['n_test']} test: {own['n']} heard pairs at "
         f"{len(run.metrics['receivers'])} receiver(s).",
         _against(run, best),
     ]
@@ -71,17 +71,6 @@ def _next_steps(run: RssiRecords) -> list[str]:
     if run.metrics["split"] == "random":
         steps.append("Run --split block: it shows the error in a region where nothing was measured.")
     return steps
-
-
-def scene(run: RssiRecords) -> str:
-    """The data and the split of a run in words, and which run it is where there are several."""
-    return place(run) + run.label
-
-
-def place(run: RssiRecords) -> str:
-    """The data and the split of a run in words."""
-    name = "the simulated floor" if run.metrics["data"] == "simulated-room" else run.metrics["data"]
-    return f"{name}, {run.metrics['split']} split"
 
 
 def by_method(run: RssiRecords) -> DataFrame:

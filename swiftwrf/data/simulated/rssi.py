@@ -51,7 +51,7 @@ def rssi_room(n: int = 600, seed: int = 0) -> Rssi:
     rssi = (TRANSMIT_DBM + gain_db + power.gather(2, channel)[..., 0] + noise).round()
     missed = (torch.rand(n, 12, generator=generator) < MISSED) | (rssi < SENSITIVITY_DBM)
     return Rssi(
-        name="simulated-room",
+        name="simulated-floor",
         receiver_names=tuple(f"receiver{number:02d}" for number in range(1, 13)),
         receiver_position=receiver,
         transmitter_position=position,
