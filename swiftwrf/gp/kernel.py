@@ -1,0 +1,71 @@
+"""The kernel of the process, and the candidates that data choose among."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from swiftwrf.errors import InputError
+from swiftwrf.positions import distance
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """How alike a field is at two positions, by their distance r: a rough long-range and a smooth short-range part.
+
+        k(r) = share exp(-r / long) + (1 - share) (1 + sqrt(3) r / short) exp(-sqrt(3) r / short)
+
+    The long part (Matern 1/2) carries the rough field between rooms' positions, the short one (Matern 3/2) follows a path
+    sampled densely.
+
+    Args:
+        long, short: correlation lengths, in the unit of the positions.
+        share: of the long part, in [0, 1].
+        noise: variance of what is not a function of position, relative to k(0) = 1.
+
+    Raises:
+        InputError: a length, share or noise that makes no kernel.
+    """
+
+    long: float = 0.5
+    short: float = 0.1
+    share: float = 0.6
+    noise: float = 1e-2
+
+    def __post_init__(self) -> None:
+        finite = all(map(math.isfinite, (self.long, self.short, self.share, self.noise)))
+        if not (finite and self.long > 0 and self.short > 0 and 0 <= self.share <= 1 and self.noise >= 0):
+            raise InputError(f"a kernel needs lengths above 0, a share in [0, 1] and a noise from 0, got {self}")
+
+    def scaled(self, factor: float) -> Kernel:
+        """The same kernel on positions multiplied by `factor`."""
+        return replace(self, long=self.long * factor, short=self.short * factor)
+
+    def __call__(self, a: Tensor, b: Tensor) -> Tensor:
+        """k between positions (n, 3) and (m, 3), (n, m)."""
+        r = distance(a, b)
+        if self.share == 1:
+            return torch.exp(-r / self.long)
+        near = math.sqrt(3) * r / self.short
+        value: Tensor = self.share * torch.exp(-r / self.long) + (1 - self.share) * (1 + near) * torch.exp(-near)
+        return value
+
+    def noisy_gram(self, position: Tensor) -> Tensor:
+        """Covariance of noisy values at positions (n, 3), float64 (n, n)."""
+        position = position.double()
+        noisy: Tensor = self(position, position) + self.noise * torch.eye(len(position), dtype=torch.float64)
+        return noisy
+
+
+def candidates(position: Tensor, noises: Sequence[float]) -> Iterator[Kernel]:
+    """Kernels with lengths from the extent of the positions (n, 3) [m] down, with and without a short-range part."""
+    extent = float((position.max(0).values - position.min(0).values).max()) or 1.0
+    for noise in noises:
+        for k in range(5):
+            long = extent / 2**k
+            yield Kernel(long=long, short=extent, share=1.0, noise=noise)
+            yield from (Kernel(long=long, short=extent / 3 / 2**j, share=0.6, noise=noise) for j in range(1, 6))
