@@ -22,7 +22,7 @@ from swiftwrf.comparison.vae import Vae
 from swiftwrf.data.spectra import Moving, direction_of_link
 from swiftwrf.geometry import HybridModel
 from swiftwrf.positions import distance
-from tasks.aoa.page_room import MARGIN, extent
+from tasks.aoa.page.room import MARGIN, extent
 
 FAR = 1.5  # away from the measured positions, in their extent
 QUICK = 0.02  # [s] that a spectrum may take while the moving end is dragged

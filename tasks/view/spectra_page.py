@@ -11,7 +11,7 @@ from nicegui import events, run, ui
 from numpy.typing import NDArray
 
 from swiftwrf import AngularGrid
-from tasks.aoa.page_room import FIXED, MEASURED, in_plan
+from tasks.aoa.page.room import FIXED, MEASURED, in_plan
 from tasks.view.pictures import View, address, png
 from tasks.view.plan import Plan, cross, ring, text
 from tasks.view.spectra import Direction, Drawn, Measured, SpectraScene, angle_between

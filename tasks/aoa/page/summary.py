@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tasks.aoa import arms
 from tasks.aoa.estimators import ESTIMATORS
-from tasks.aoa.page_room import advice_sentence
+from tasks.aoa.page.room import advice_sentence
 from tasks.aoa.share import Share
 from tasks.page.page import Number, Plot, Summary
 

@@ -13,7 +13,7 @@ from tasks.page import figures
 from tasks.page.page import Page, Plot, Section, Table
 from tasks.page.palette import Palette
 from tasks.page.provenance import number, provenance
-from tasks.rssi.page_summary import OWN, RssiRecords, by_method, summary
+from tasks.rssi.page.summary import OWN, RssiRecords, by_method, summary
 from tasks.rssi.predictors import PREDICTORS
 from tasks.summarise import SHORTEST, paired_difference, running_median
 
