@@ -13,6 +13,8 @@ from targets import aoa_targets, rssi_targets, synthesis_targets
 
 from tasks.summarise import pareto
 
+SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")  # of a room
+
 
 def synthesis() -> str:
     """Median SSIM and PSNR of each synthesizer on each scene."""
@@ -101,24 +103,42 @@ def room() -> str:
             walls = WALLS.get(content["metrics"]["data"])
             if walls is None:
                 continue
-            errors = [_wall_error(found["planes"], *wall) for wall in walls]
-            cells = ["not found" if error is None else f"{1000 * error:.1f}" for error in errors]
+            cells = [_millimetres(_wall_error(found["planes"], *wall)) for wall in walls]
             certain = sum(plane["certain"] for plane in found["planes"])
             scene = f"{content['metrics']['data']}, {content['metrics']['moving']}"
             n = content["metrics"]["mixes"][share]["n_measured"]
             psnr = content["metrics"]["mixes"][share]["synthesis"]
             quality = [f"{psnr[s]['psnr_db']['median']:.1f}" for s in ("geometry", "hybrid", "coarray", "gp")]
             rows.append([scene, str(n), *cells, f"{certain} of {len(found['planes'])}", *quality])
-    sides = ("x-", "x+", "y-", "y+", "z-", "z+")
     methods = ("geometry", "hybrid", "coarray", "gp")
-    return markdown(["scene, moving end", "spectra", *(f"{s} [mm]" for s in sides), "certain", *methods], rows)
+    return markdown(["scene, moving end", "spectra", *(f"{s} [mm]" for s in SIDES), "certain", *methods], rows)
+
+
+def walls() -> str:
+    """The planes that geometry found in several draws of the measured share."""
+    rows = []
+    for case, found in load("geometry")["cases"].items():
+        scene, moving, _, draw = case.split(", ")
+        planes = [plane for plane in found["walls"].values() if plane]
+        cells = [_millimetres(plane and plane["error_mm"]) for plane in found["walls"].values()]
+        covered = sum(plane["error_mm"] <= 3 * plane["std_mm"] for plane in planes if plane["certain"])
+        certain = f"{covered} of {sum(plane['certain'] for plane in planes)}"
+        quality = [f"{found['psnr_db'][name]['median']:.1f}" for name in ("geometry", "hybrid")]
+        what = f"{scene}, {moving.removeprefix('moving ')}, {draw}"
+        rows.append([what, str(found["positions"]), *cells, certain, *quality, f"{found['cpu_seconds']:.0f} s"])
+    columns = ["scene, moving end", "spectra", *(f"{side} [mm]" for side in SIDES), "certain ones within 3 deviations"]
+    return markdown([*columns, "geometry", "hybrid", "processor time"], rows)
+
+
+def _millimetres(error: float | None) -> str:
+    return "not found" if error is None else f"{error:.1f}"
 
 
 def _wall_error(planes: list[dict[str, Any]], axis: int, offset: float) -> float | None:
-    """Distance [m] of the nearest plane found along an axis, None beyond half a metre."""
+    """Distance [mm] of the nearest plane found along an axis, None beyond half a metre."""
     own = [p["offset_m"] * p["normal"][axis] for p in planes if abs(p["normal"][axis]) > 0.99]
     error = min((abs(at - offset) for at in own), default=1.0)
-    return error if error < 0.5 else None
+    return 1000 * error if error < 0.5 else None
 
 
 def rssi() -> str:
@@ -339,6 +359,7 @@ TABLES = {
     "synthesis": synthesis,
     "aoa": aoa,
     "room": room,
+    "walls": walls,
     "rssi": rssi,
     "floor": floor,
     "size": size,
