@@ -237,3 +237,34 @@ def test_hybrid_is_not_worse_than_geometry():
     assert float(gained.mean()) > -0.5
     again = HybridModel.from_state(*hybrid.state())
     assert torch.equal(again.synthesize(test.position), hybrid.synthesize(test.position))
+
+
+def test_strengths_follow_a_shadow():
+    """A wall that does not reflect to one half of the region: its amplitude is known where the phases say so."""
+    whole, bare = spectra(SIX, n=160), spectra({n: o for n, o in SIX.items() if n != (0, 0, 1)}, n=160)
+    hidden = whole.position[:, 0] > 2.5
+    spectrum = torch.where(hidden[:, None, None], bare.spectrum, whole.spectrum)
+    data = replace(whole, store=Store(spectrum))
+    train, test = data.subset(torch.arange(0, 120)), data.subset(torch.arange(120, 160))
+    room = fit(train, further=0)
+    hybrid = fit_hybrid(train, room)
+    assert hybrid.strengths is not None
+    gained = psnr(hybrid.synthesize(test.position), test.spectrum) - psnr(room.synthesize(test.position), test.spectrum)
+    assert float(gained.median()) > 5
+    drawn = hybrid.synthesize(test.position, torch.Generator().manual_seed(0))
+    assert float(psnr(drawn, test.spectrum).median()) < float(
+        psnr(hybrid.synthesize(test.position), test.spectrum).median()
+    )
+    again = HybridModel.from_state(*hybrid.state())
+    assert torch.equal(again.synthesize(test.position), hybrid.synthesize(test.position))
+    tensors, header = hybrid.state()
+    with pytest.raises(InputError, match=r"strengths\.readout has shape"):
+        HybridModel.from_state({**tensors, "strengths.readout": tensors["strengths.readout"][:, 1:]}, header)
+    like = fit_hybrid(train.subset(torch.arange(60)), room, like=hybrid)  # too few to choose, enough to go on from
+    assert like.strengths is not None
+    assert like.strengths.smoothness == hybrid.strengths.smoothness
+
+
+def test_strengths_stay_constant_where_nothing_is_hidden():
+    data = spectra(SIX, n=120)
+    assert fit_hybrid(data, fit(data, further=0)).strengths is None

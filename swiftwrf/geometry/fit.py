@@ -71,7 +71,8 @@ def fit_geometry(
             array cannot have produced; all positions at one place.
     """
     config, train = config or GeometryConfig(), _evenly(train)
-    scene, fold = _observe(train, validation, seed)
+    scene, _ = observe(train, seed)
+    fold = folds(scene.moving, validation, seed)
     assert train.array is not None
     kept, held = scene.subset((fold != 0).nonzero()[:, 0]), scene.subset((fold == 0).nonzero()[:, 0])
     with progress_bar(progress) as bar:
@@ -82,7 +83,7 @@ def fit_geometry(
     score = correlation_score(held, Planes.of(found).refined(kept), train.array)
     found = Search(_some(scene, config.positions, seed), config.reach, sign).improve(found)
     room = Planes.of(found).refined(scene)
-    splits = _splits(scene, fold)
+    splits = split(scene, fold)
     room = _settled(_pruned(room, scene, splits), scene)
     room = _extended(room, scene, splits, config)
     room = _with_order(room, splits, config.max_order)
@@ -101,7 +102,7 @@ def refit_geometry(model: GeometryModel, train: Spectra, *, seed: int = 0) -> Ge
     Raises:
         InputError: as `fit_geometry`.
     """
-    scene, _ = _observe(_evenly(train), "random", seed)
+    scene, _ = observe(train, seed)
     normal, offset, gain = model.tensors()
     room = Planes(normal, offset, gain, model.order).refined(scene)
     found = zip(model.planes, room.normal[0].tolist(), room.offset[0].tolist(), room.gain[0].tolist(), strict=True)
@@ -111,7 +112,7 @@ def refit_geometry(model: GeometryModel, train: Spectra, *, seed: int = 0) -> Ge
 
 def _evenly(train: Spectra) -> Spectra:
     """At most 2000 of the spectra, evenly chosen."""
-    return train.subset(thinned(torch.arange(len(train)), rows=MOST)[0]) if len(train) > MOST else train
+    return train.subset(*thinned(torch.arange(len(train)), rows=MOST)) if len(train) > MOST else train
 
 
 def _some(scene: Scene, most: int, seed: int) -> Scene:
@@ -120,14 +121,20 @@ def _some(scene: Scene, most: int, seed: int) -> Scene:
     return scene.subset(rows.sort().values)
 
 
-def _splits(scene: Scene, fold: Tensor) -> list[tuple[Scene, Scene]]:
+def split(scene: Scene, fold: Tensor) -> list[tuple[Scene, Scene]]:
     """Kept and held-out positions; all folds in turn where there are few positions."""
     out = [fold == number for number in (fold.unique().tolist() if len(fold) < MANY else [0])]
     return [(scene.subset((~o).nonzero()[:, 0]), scene.subset(o.nonzero()[:, 0])) for o in out]
 
 
-def _observe(train: Spectra, validation: Validation, seed: int) -> tuple[Scene, Tensor]:
-    """What the solved spectra say, and the fold of each."""
+def observe(train: Spectra, seed: int = 0) -> tuple[Scene, Tensor]:
+    """What the spectra say of the channel, at most 2000 of them, and the numbers of those that say it.
+
+    Raises:
+        InputError: as `fit_geometry`.
+    """
+    (rows,) = thinned(torch.arange(len(train)), rows=MOST)
+    train = _evenly(train)
     check_training(train)
     for value, what in ((train.array, "which array took the spectra"), (train.rotation, "how the array is turned")):
         if value is None:
@@ -147,7 +154,7 @@ def _observe(train: Spectra, validation: Validation, seed: int) -> tuple[Scene, 
     scene = Scene.of(
         train.position[solved], train.fixed_position, train.moving, train.array, train.rotation, channel[solved]
     )
-    return scene, folds(train.position[solved], validation, seed)
+    return scene, rows[solved]
 
 
 def _held_out(room: Planes, splits: list[tuple[Scene, Scene]], steps: int = 4) -> Tensor:

@@ -1,9 +1,10 @@
-"""Geometry plus the smooth part of what it leaves: a Gaussian process on the difference of the spectra.
+"""Geometry plus what is smooth: the strengths of its paths, and a Gaussian process on what these leave of the spectra.
 
-    spectrum(s) = a geometry(s) + mean + k(s, training positions) w
+    spectrum(s) = a geometry(s; strengths(s)) + mean + k(s, training positions) w
 
-Where the planes explain only a part, their fringes are worth their share a: the least-squares share at training spectra
-that are held out from the process, hence never worse there than the better of the two parts.
+Strengths vary where held-out spectra call for it. Where the paths explain only a part, their fringes are worth their share
+a: the least-squares share at training spectra that are held out from the strengths and from the process, hence never worse
+there than the better of the two parts.
 """
 
 from __future__ import annotations
@@ -14,11 +15,13 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from swiftwrf.checkpoint import Header, Saved
+from swiftwrf.checkpoint import Header, Saved, expect
 from swiftwrf.data.spectra import Spectra, check_training
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
+from swiftwrf.geometry.fit import observe, split
 from swiftwrf.geometry.model import GeometryModel
+from swiftwrf.geometry.strengths import Smoothness, Strengths, choose_smoothness, fit_strengths, may_vary
 from swiftwrf.gp import Kernel, choose_kernel, held_out_weights
 from swiftwrf.positions import check_batch, check_drawn, check_positions
 from swiftwrf.threads import single_thread
@@ -26,6 +29,7 @@ from swiftwrf.threads import single_thread
 COMPONENTS = 64  # principal components of the difference that are kept at most
 PIXELS = 4000  # of a spectrum that are enough to choose kernel and share
 MOST = 10_000  # spectra: all their inner products are computed
+BATCH = 256  # spectra at a time
 FIRST = 0.7  # share with which the kernel is chosen
 
 
@@ -35,6 +39,7 @@ class HybridModel(Saved):
 
     Args:
         geometry: the room.
+        strengths: of its paths; None where they are the same everywhere.
         share: of its spectra in the prediction, 0 to 1.
         kernel: of the process, lengths in [m].
         anchor: training positions, float64 (n, 3) [m].
@@ -45,6 +50,7 @@ class HybridModel(Saved):
     kind: ClassVar[str] = "hybrid model"
 
     geometry: GeometryModel
+    strengths: Strengths | None
     share: float
     kernel: Kernel
     anchor: Tensor
@@ -52,7 +58,7 @@ class HybridModel(Saved):
     component: Tensor
 
     @torch.no_grad()
-    def synthesize(self, position: Tensor, generator: torch.Generator | None = None, batch: int = 256) -> Tensor:
+    def synthesize(self, position: Tensor, generator: torch.Generator | None = None, batch: int = BATCH) -> Tensor:
         """Spectra at positions (n, 3) [m] of the moving end, float32 (n, n_elevation, n_azimuth) in [0, 1]; with a generator
         the room's part is drawn.
 
@@ -66,7 +72,7 @@ class HybridModel(Saved):
             rows = slice(start, start + batch)
             score = self.kernel(position[rows], self.anchor).float() @ self.readout
             smooth = (self.component[0] + score @ self.component[1:]).reshape(-1, *self.geometry.grid.shape)
-            sharp = self.share * self.geometry.synthesize(position[rows], generator) if self.share else 0.0
+            sharp = self.share * _room(self.geometry, self.strengths, position[rows], generator) if self.share else 0.0
             spectrum[rows] = (smooth + sharp).clamp(0, 1)
         return check_drawn(spectrum)
 
@@ -74,26 +80,43 @@ class HybridModel(Saved):
         """All there is to save: tensors and plain values."""
         tensors, values = self.geometry.state()
         own = {"anchor": self.anchor, "readout": self.readout, "component": self.component}
-        return tensors | own, values | {"share": self.share, "kernel": asdict(self.kernel)}
+        values |= {"share": self.share, "kernel": asdict(self.kernel), "smoothness": None}
+        if self.strengths is not None:
+            own |= {"strengths.anchor": self.strengths.anchor, "strengths.readout": self.strengths.readout}
+            values["smoothness"] = asdict(self.strengths.smoothness)
+        return tensors | own, values
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> HybridModel:
         """The model that `state` described."""
         own = {name: tensors[name] for name in ("anchor", "readout", "component")}
-        return cls(GeometryModel.from_state(tensors, header), header["share"], Kernel(**header["kernel"]), **own)
+        geometry = GeometryModel.from_state(tensors, header)
+        strengths, smoothness = None, header.get("smoothness")  # files of before have none
+        if smoothness is not None:
+            n, paths = len(tensors.get("strengths.anchor", ())), len(geometry.image_sources()[0])
+            expect(tensors, {"strengths.anchor": (n, 3), "strengths.readout": (n, paths)})
+            prior = Smoothness(Kernel(**smoothness["kernel"]), smoothness["misfit"])
+            strengths = Strengths(prior, tensors["strengths.anchor"], tensors["strengths.readout"])
+        return cls(geometry, strengths, header["share"], Kernel(**header["kernel"]), **own)
 
 
 @single_thread()
 def fit_hybrid(
-    train: Spectra, geometry: GeometryModel, *, validation: Validation = "random", seed: int = 0
+    train: Spectra,
+    geometry: GeometryModel,
+    *,
+    validation: Validation = "random",
+    seed: int = 0,
+    like: HybridModel | None = None,
 ) -> HybridModel:
-    """Fits the process to what the room leaves of its own training spectra.
+    """Fits strengths to what the spectra say of the paths, and the process to what the room leaves of them.
 
     Args:
         train: the only spectra it sees.
         geometry: found from the same spectra.
         validation: how they are held out to choose kernel and share.
         seed: of what is held out.
+        like: a model of the same room from other spectra, whose smoothness of the strengths is taken.
 
     Raises:
         InputError: fewer than 10 spectra or more than 10,000, or something not finite.
@@ -104,8 +127,9 @@ def fit_hybrid(
             f"hybrid is fitted to all inner products of its spectra, at most {MOST} of them, not {len(train)}; take "
             "geometry, coarray or swiftwrf, or fewer spectra"
         )
-    seen, known = train.spectrum.flatten(1), geometry.synthesize(train.position).flatten(1)
     fold = folds(train.position, validation, seed)
+    strengths, known = _strengths(train, geometry, fold, seed, like)
+    seen, known = train.spectrum.flatten(1), known.flatten(1)
     stride = max(1, seen.shape[1] // PIXELS) | 1
     some, some_known = seen[:, ::stride], known[:, ::stride]
     kernel = choose_kernel(train.position, (some - FIRST * some_known)[:, None], fold)
@@ -113,13 +137,44 @@ def fit_hybrid(
     left = seen - share * known
     if not gains:
         nothing = torch.zeros(1, seen.shape[1])
-        return HybridModel(geometry, 1.0, kernel, train.position, torch.zeros(len(train), 0), nothing)
+        return HybridModel(geometry, strengths, 1.0, kernel, train.position, torch.zeros(len(train), 0), nothing)
     mean = left.mean(0)
     value, vector = torch.linalg.eigh(((left - mean) @ (left - mean).T).double())
     vector = vector[:, value > 1e-6 * value.sum()][:, -COMPONENTS:]
     readout = torch.linalg.solve(kernel.noisy_gram(train.position), vector).float()
     component = torch.cat([mean[None], vector.T.float() @ (left - mean)])
-    return HybridModel(geometry, share, kernel, train.position, readout, component)
+    return HybridModel(geometry, strengths, share, kernel, train.position, readout, component)
+
+
+def _room(
+    geometry: GeometryModel, strengths: Strengths | None, position: Tensor, generator: torch.Generator | None = None
+) -> Tensor:
+    """Spectra (n, H, W) that follow from the paths."""
+    if strengths is None:
+        return geometry.synthesize(position, generator)
+    channels = (strengths.channel(geometry, part, generator) for part in position.split(BATCH))
+    return torch.cat([geometry.array.spectrum(channel, geometry.grid) for channel in channels])
+
+
+def _strengths(
+    train: Spectra, geometry: GeometryModel, fold: Tensor, seed: int, like: HybridModel | None
+) -> tuple[Strengths | None, Tensor]:
+    """Strengths from all training spectra, and the spectra (n, H, W) that follow at each one's position from the others."""
+    known = geometry.synthesize(train.position)
+    smoothness = like.strengths.smoothness if like and like.strengths else None
+    if smoothness is None and (like or not may_vary(geometry, len(train))):
+        return None, known
+    scene, rows = observe(train, seed)
+    smoothness = smoothness or choose_smoothness(geometry, split(scene, fold[rows]))
+    if smoothness is None:
+        return None, known
+    strengths = fit_strengths(geometry, scene, smoothness)
+    known = _room(geometry, strengths, train.position)  # right for those that `rows` leaves out
+    for number in fold.unique():
+        out = rows[fold[rows] == number]
+        kept = scene.subset((fold[rows] != number).nonzero()[:, 0])
+        known[out] = _room(geometry, fit_strengths(geometry, kept, smoothness), train.position[out])
+    return strengths, known
 
 
 def _share(position: Tensor, seen: Tensor, known: Tensor, fold: Tensor, kernel: Kernel) -> tuple[float, bool]:

@@ -52,6 +52,11 @@ class Scene:
     def __len__(self) -> int:
         return max(len(self.transmitter), len(self.receiver))
 
+    @property
+    def moving(self) -> Tensor:
+        """Positions of the end that moves, (n, 3) [m]."""
+        return self.transmitter if len(self.transmitter) > 1 else self.receiver
+
     def subset(self, rows: Tensor) -> Scene:
         """The given positions only."""
         pick = [p[rows] if len(p) > 1 else p for p in (self.transmitter, self.receiver)]

@@ -98,8 +98,7 @@ def _rival(scene: Scene, room: Planes, plane: int) -> tuple[float, float]:
 
 def _flat(scene: Scene) -> str:
     """A doubt where the positions lie on a line or in a plane, from where many rooms look alike."""
-    moving = scene.transmitter if len(scene.transmitter) > 1 else scene.receiver
-    extent = torch.linalg.svdvals(moving - moving.mean(0)) / math.sqrt(len(moving))
+    extent = torch.linalg.svdvals(scene.moving - scene.moving.mean(0)) / math.sqrt(len(scene))
     if float(extent[2]) * scene.wavenumber > FLAT:
         return ""
     shape = "a line" if float(extent[1]) * scene.wavenumber <= FLAT else "a plane"
