@@ -27,7 +27,7 @@ from swiftwrf.gp import GaussianProcess, Kernel
 
 DEVIATION = 0.6  # of an amplitude from its plane's gain
 LENGTHS = (2, 4, 8)  # parts of the region over which amplitudes are alike
-MISFITS = (0.3, 1.0)
+MISFITS = (0.3, 1.0)  # twice the coherence that a spectrum may well miss
 NUGGET = 1e-3  # variance of an amplitude that is no function of position
 STEPS, RATE = 80, 0.1  # of Adam, on standard normal variables
 LEAST = 100  # positions; fewer do not tell where a shadow ends
@@ -88,6 +88,7 @@ def paths(geometry: GeometryModel, scene: Scene) -> tuple[Tensor, Tensor]:
     return wave, torch.cat([torch.ones(1), image_gain(gain, sequence)[0]])
 
 
+@torch.enable_grad()
 def fit_strengths(geometry: GeometryModel, scene: Scene, smoothness: Smoothness) -> Strengths:
     """The most plausible amplitudes, given the phases that the scene observed."""
     wave, gain = paths(geometry, scene)
