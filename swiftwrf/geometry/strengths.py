@@ -81,11 +81,13 @@ def paths(geometry: GeometryModel, scene: Scene) -> tuple[Tensor, Tensor]:
     (1 + S,)."""
     normal, offset, gain = geometry.tensors()
     sequence = sequences(normal[0], geometry.order)
-    source = images(scene, normal, offset, sequence)
-    reflected = scene.wave(source) * visibility(scene, normal, offset, sequence, source)[..., None]
-    both = (scene.wave(scene.transmitter)[None], reflected[0])
-    wave = torch.cat([part.expand(-1, len(scene), -1) for part in both]).transpose(0, 1)
-    return wave, torch.cat([torch.ones(1), image_gain(gain, sequence)[0]])
+    wave, strength = [scene.wave(scene.transmitter)[None]], [torch.ones(1)]
+    if sequence:
+        source = images(scene, normal, offset, sequence)
+        reflected = scene.wave(source) * visibility(scene, normal, offset, sequence, source)[..., None]
+        wave.append(reflected[0])
+        strength.append(image_gain(gain, sequence)[0])
+    return torch.cat([part.expand(-1, len(scene), -1) for part in wave]).transpose(0, 1), torch.cat(strength)
 
 
 @torch.enable_grad()

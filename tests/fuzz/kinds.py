@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
@@ -40,6 +41,8 @@ from swiftwrf import (
 )
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.geometry import fit_geometry, fit_hybrid
+from swiftwrf.geometry.fit import observe
+from swiftwrf.geometry.strengths import Smoothness, fit_strengths
 from swiftwrf.gp import Kernel
 from swiftwrf.model import SwiftWRF
 from tasks.aoa.estimators import Settings
@@ -122,7 +125,9 @@ def model_geometry(folder: Path) -> None:
 
 
 def model_hybrid(folder: Path) -> None:
-    fit_hybrid(_room(), fit_geometry(_room(), progress=False)).save(folder / "model")
+    geometry = fit_geometry(_room(), progress=False)
+    strengths = fit_strengths(geometry, observe(_room())[0], Smoothness(Kernel(), misfit=1.0))
+    replace(fit_hybrid(_room(), geometry), strengths=strengths).save(folder / "model")
 
 
 def model_published(name: str, folder: Path) -> None:
