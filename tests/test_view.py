@@ -132,7 +132,7 @@ def saved(kind, folder, room) -> Path:
         model = GeometryModel(*link, [plane], 1, 0.1, 0.1, "made", torch.zeros(1, 1), Residual())
         if kind == "hybrid":
             kernel, rest = fit_coarray(room, progress=False).kernel, torch.zeros(1, room.spectrum[0].numel())
-            model = HybridModel(model, 1.0, kernel, room.position, torch.zeros(len(room), 0), rest)
+            model = HybridModel(model, None, 1.0, kernel, room.position, torch.zeros(len(room), 0), rest)
         model.save(folder / "model")
     elif kind in quick.PUBLISHED:
         kinds.model_published(kind, folder)
