@@ -70,7 +70,7 @@ def fit_geometry(
         InputError: no array, rotation or fixed end; fewer than 10 spectra, or something not finite; spectra that the
             array cannot have produced; all positions at one place.
     """
-    config, train = config or GeometryConfig(), _evenly(train)
+    config, (train, _) = config or GeometryConfig(), _evenly(train)
     scene, _ = observe(train, seed)
     fold = folds(scene.moving, validation, seed)
     assert train.array is not None
@@ -110,9 +110,10 @@ def refit_geometry(model: GeometryModel, train: Spectra, *, seed: int = 0) -> Ge
     return replace(model, planes=planes)
 
 
-def _evenly(train: Spectra) -> Spectra:
-    """At most 2000 of the spectra, evenly chosen."""
-    return train.subset(*thinned(torch.arange(len(train)), rows=MOST)) if len(train) > MOST else train
+def _evenly(train: Spectra) -> tuple[Spectra, Tensor]:
+    """At most 2000 of the spectra, evenly chosen, and their numbers."""
+    (rows,) = thinned(torch.arange(len(train)), rows=MOST)
+    return train.subset(rows) if len(train) > MOST else train, rows
 
 
 def _some(scene: Scene, most: int, seed: int) -> Scene:
@@ -133,8 +134,7 @@ def observe(train: Spectra, seed: int = 0) -> tuple[Scene, Tensor]:
     Raises:
         InputError: as `fit_geometry`.
     """
-    (rows,) = thinned(torch.arange(len(train)), rows=MOST)
-    train = _evenly(train)
+    train, rows = _evenly(train)
     check_training(train)
     for value, what in ((train.array, "which array took the spectra"), (train.rotation, "how the array is turned")):
         if value is None:

@@ -160,16 +160,19 @@ def _strengths(
     train: Spectra, geometry: GeometryModel, fold: Tensor, seed: int, like: HybridModel | None
 ) -> tuple[Strengths | None, Tensor]:
     """Strengths from all training spectra, and the spectra (n, H, W) that follow at each one's position from the others."""
-    known = geometry.synthesize(train.position)
     smoothness = like.strengths.smoothness if like and like.strengths else None
     if smoothness is None and (like or not may_vary(geometry, len(train))):
-        return None, known
+        return None, geometry.synthesize(train.position)
     scene, rows = observe(train, seed)
     smoothness = smoothness or choose_smoothness(geometry, split(scene, fold[rows]))
     if smoothness is None:
-        return None, known
+        return None, geometry.synthesize(train.position)
     strengths = fit_strengths(geometry, scene, smoothness)
-    known = _room(geometry, strengths, train.position)  # right for those that `rows` leaves out
+    known = torch.empty(len(train), *geometry.grid.shape)
+    unseen = torch.ones(len(train), dtype=torch.bool)
+    unseen[rows] = False
+    if unseen.any():
+        known[unseen] = _room(geometry, strengths, train.position[unseen])
     for number in fold.unique():
         out = rows[fold[rows] == number]
         kept = scene.subset((fold[rows] != number).nonzero()[:, 0])
