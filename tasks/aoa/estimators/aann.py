@@ -28,8 +28,9 @@ from swiftwrf.progress import progress
 from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator, Settings
 
 LEAST_ROWS = 8  # a prime number of rows can only be averaged to one, which leaves nothing to learn from
-LOOKS = 20  # that a quick training takes at each spectrum of a scene with many
-MOST_STEPS = 2000  # of a quick training
+MANY = 400  # spectra of a scene, above which a quick training is longer, in larger batches
+LOOKS = 40  # that it then takes at each of them
+MOST_STEPS = 1000  # of them
 STATISTICS = 512  # spectra that the batch norms' statistics are taken from
 
 
@@ -50,9 +51,14 @@ class AANNConfig:
 
     @classmethod
     def quick(cls, spectra: int) -> AANNConfig:
-        """As long as a scene of so many spectra needs: 250 steps leave 1,500 spectra half-learnt."""
-        enough = round(LOOKS * spectra / cls.batch)
-        return cls(steps=min(max(cls.steps, enough), MOST_STEPS))
+        """As long as a scene of so many spectra needs: 250 steps leave 1,500 spectra half-learnt.
+
+        A step moves 25 million weights whatever its batch, so that 64 spectra take little longer than 32.
+        """
+        if spectra <= MANY:
+            return cls()
+        batch = 2 * cls.batch
+        return cls(steps=min(round(LOOKS * spectra / batch), MOST_STEPS), batch=batch)
 
     @classmethod
     def paper(cls) -> AANNConfig:
