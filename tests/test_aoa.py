@@ -112,7 +112,13 @@ def test_aann_is_seeded_and_leaves_the_global_generator_alone(room):
 
 def test_a_training_is_as_long_as_the_scene_needs():
     quick = [AANNConfig.quick(n) for n in (0, 240, 780, 1525, 100_000)]
-    assert [(config.steps, config.batch) for config in quick] == [(250, 32), (250, 32), (488, 64), (953, 64), (1000, 64)]
+    assert [(config.steps, config.batch) for config in quick] == [
+        (250, 32),
+        (250, 32),
+        (488, 64),
+        (953, 64),
+        (1000, 64),
+    ]
 
 
 def test_whole_run(small, tmp_path):
