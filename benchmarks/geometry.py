@@ -8,43 +8,44 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from record import write_result
 
 from swiftwrf import Spectra, load_spectra, simulated_room
-from swiftwrf.geometry import GeometryModel, fit_geometry
+from swiftwrf.data.spectra import Moving
+from swiftwrf.geometry import fit_geometry
 from swiftwrf.geometry.hybrid import fit_hybrid
 from swiftwrf.metrics import psnr, summary
 
-WALLS = {
-    "newrf-bedroom": [(0, -2.28), (0, 2.28), (1, -2.28), (1, 2.28), (2, 0.0), (2, 3.0)],
-    "newrf-office": [(0, 0.010), (0, 5.010), (1, 0.016), (1, 8.016), (2, 0.0), (2, 3.2)],
-    "simulated-room": [(0, 0.0), (0, 6.0), (1, 0.0), (1, 5.0), (2, 0.0), (2, 3.0)],
+SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")  # of a room
+WALLS = {  # where they are on each side [m]
+    "newrf-bedroom": (-2.28, 2.28, -2.28, 2.28, 0.0, 3.0),
+    "newrf-office": (0.010, 5.010, 0.016, 8.016, 0.0, 3.2),
+    "simulated-room": (0.0, 6.0, 0.0, 5.0, 0.0, 3.0),
 }
-CASES = [
+PARALLEL = 0.9  # cosine between a wall's normal and a plane's, above which it may be that wall
+CASES: list[tuple[str, Moving, float, int]] = [  # scene, end that moves, measured share, draw
     ("newrf-bedroom", "receiver", 1.0, 0),
     *(("newrf-bedroom", "receiver", 0.1, draw) for draw in range(3)),
     ("simulated-room", "transmitter", 0.3, 0),
     ("simulated-room", "receiver", 0.3, 0),
     ("newrf-office", "receiver", 1.0, 0),
-    *(("simulated-room", moving, 0.3, draw) for draw in (1, 2) for moving in ("transmitter", "receiver")),
+    *(("simulated-room", moving, 0.3, draw) for draw in (1, 2) for moving in get_args(Moving)),
 ]
 
 
-def nearest(model: GeometryModel, axis: int, offset: float) -> dict[str, Any] | None:
-    """The plane found on the side of a true wall that is closest to it."""
-    side = [
-        (abs(p.offset_m * p.normal[axis] - offset), p)
-        for p in model.planes
-        if abs(p.normal[axis]) > 0.9 and p.normal[axis] * (offset - float(model.fixed_position[axis])) > 0
-    ]
-    if not side:
+def nearest(planes: list[dict[str, Any]], side: str, offset: float) -> dict[str, Any] | None:
+    """The plane found on this side of the room closest to the true wall at `offset` [m], None where there is none."""
+    axis, outward = "xyz".index(side[0]), 1 if side[1] == "+" else -1
+    own = [plane for plane in planes if outward * plane["normal"][axis] > PARALLEL]
+    if not own:
         return None
-    error, plane = min(side, key=lambda s: s[0])
-    found = plane.offset_m * plane.normal[axis]
-    return {"found_m": found, "error_mm": 1000 * error, "std_mm": plane.std_mm, "certain": plane.certain}
+    plane = min(own, key=lambda plane: abs(outward * plane["offset_m"] - offset))
+    found = outward * plane["offset_m"]
+    told = {"std_mm": plane["std_mm"], "certain": plane["certain"]}
+    return {"found_m": found, "error_mm": 1000 * abs(found - offset), **told}
 
 
 def measure(data: Spectra, share: float, draw: int) -> dict[str, Any]:
@@ -56,8 +57,8 @@ def measure(data: Spectra, share: float, draw: int) -> dict[str, Any]:
     model = fit_geometry(train, progress=False)
     seconds, cpu_seconds = time.perf_counter() - began, time.process_time() - cpu
     hybrid = fit_hybrid(train, model)
-    axes = "xyz"
-    walls = {f"{axes[a]} = {o}": nearest(model, a, o) for a, o in WALLS[data.name]}
+    planes = model.to_json()["planes"]
+    walls = {f"{side[0]} = {o}": nearest(planes, side, o) for side, o in zip(SIDES, WALLS[data.name], strict=True)}
     return {
         "positions": len(train),
         "seconds": seconds,

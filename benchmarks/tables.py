@@ -8,12 +8,10 @@ from typing import Any
 
 from committed import RESULTS, ROOT, aoa_runs, interval, load, markdown, rssi_runs, turbo_arm
 from comparison_tables import comparison, comparison_counts, comparison_turbo
-from geometry import WALLS
+from geometry import SIDES, WALLS, nearest
 from targets import aoa_targets, rssi_targets, synthesis_targets
 
 from tasks.summarise import pareto
-
-SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")  # of a room
 
 
 def synthesis() -> str:
@@ -103,7 +101,8 @@ def room() -> str:
             walls = WALLS.get(content["metrics"]["data"])
             if walls is None:
                 continue
-            cells = [_millimetres(_wall_error(found["planes"], *wall)) for wall in walls]
+            own = [nearest(found["planes"], *wall) for wall in zip(SIDES, walls, strict=True)]
+            cells = [_millimetres(plane) for plane in own]
             certain = sum(plane["certain"] for plane in found["planes"])
             scene = f"{content['metrics']['data']}, {content['metrics']['moving']}"
             n = content["metrics"]["mixes"][share]["n_measured"]
@@ -120,7 +119,7 @@ def walls() -> str:
     for case, found in load("geometry")["cases"].items():
         scene, moving, _, draw = case.split(", ")
         planes = [plane for plane in found["walls"].values() if plane]
-        cells = [_millimetres(plane and plane["error_mm"]) for plane in found["walls"].values()]
+        cells = [_millimetres(plane) for plane in found["walls"].values()]
         covered = sum(plane["error_mm"] <= 3 * plane["std_mm"] for plane in planes if plane["certain"])
         certain = f"{covered} of {sum(plane['certain'] for plane in planes)}"
         quality = [f"{found['psnr_db'][name]['median']:.1f}" for name in ("geometry", "hybrid")]
@@ -130,15 +129,8 @@ def walls() -> str:
     return markdown([*columns, "geometry", "hybrid", "processor time"], rows)
 
 
-def _millimetres(error: float | None) -> str:
-    return "not found" if error is None else f"{error:.1f}"
-
-
-def _wall_error(planes: list[dict[str, Any]], axis: int, offset: float) -> float | None:
-    """Distance [mm] of the nearest plane found along an axis, None beyond half a metre."""
-    own = [p["offset_m"] * p["normal"][axis] for p in planes if abs(p["normal"][axis]) > 0.99]
-    error = min((abs(at - offset) for at in own), default=1.0)
-    return 1000 * error if error < 0.5 else None
+def _millimetres(plane: dict[str, Any] | None) -> str:
+    return "not found" if plane is None else f"{plane['error_mm']:.1f}"
 
 
 def rssi() -> str:

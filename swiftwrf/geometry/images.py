@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.arrays import PlanarArray
+from swiftwrf.data.spectra import Moving
 
 RIGHT = 0.02  # |cosine| below which two planes count as perpendicular, above 1 - RIGHT**2 as parallel
 
@@ -27,6 +28,7 @@ class Scene:
 
     Args:
         transmitter, receiver: positions, float64 (n, 3) or, of the fixed end, (1, 3) [m].
+        end: which of them moves.
         element: phase that a wave from unit vector u gains at each element is element @ u, float32 (K, 3) [rad].
         wavenumber: [rad / m].
         channel: observed phases, complex64 (n, 2, K): of unit modulus, and the same seen by an array turned by half a turn.
@@ -34,33 +36,35 @@ class Scene:
 
     transmitter: Tensor
     receiver: Tensor
+    end: Moving
     element: Tensor
     wavenumber: float
     channel: Tensor
 
     @classmethod
     def of(
-        cls, position: Tensor, fixed: Tensor, moving: str, array: PlanarArray, rotation: Tensor, channel: Tensor
+        cls, position: Tensor, fixed: Tensor, moving: Moving, array: PlanarArray, rotation: Tensor, channel: Tensor
     ) -> Scene:
         """The scene of a moving end at `position` (n, 3) [m] and a fixed one (3,) [m]; `channel` (n, K) of modulus 1."""
         transmitter, receiver = (position, fixed[None]) if moving == "transmitter" else (fixed[None], position)
         wavenumber = 2 * math.pi / array.wavelength
         element = wavenumber * array.element.double() @ rotation[:, :2].T.double()
         both = torch.stack([channel, channel.conj().flip(1)], dim=1)
-        return cls(transmitter, receiver, element.float(), wavenumber, both.to(torch.complex64))
+        return cls(transmitter, receiver, moving, element.float(), wavenumber, both.to(torch.complex64))
 
     def __len__(self) -> int:
-        return max(len(self.transmitter), len(self.receiver))
+        return len(self.moving)
 
     @property
     def moving(self) -> Tensor:
         """Positions of the end that moves, (n, 3) [m]."""
-        return self.transmitter if len(self.transmitter) > 1 else self.receiver
+        return self.transmitter if self.end == "transmitter" else self.receiver
 
     def subset(self, rows: Tensor) -> Scene:
         """The given positions only."""
-        pick = [p[rows] if len(p) > 1 else p for p in (self.transmitter, self.receiver)]
-        return replace(self, transmitter=pick[0], receiver=pick[1], channel=self.channel[rows])
+        moving = self.moving[rows]
+        ends = (moving, self.receiver) if self.end == "transmitter" else (self.transmitter, moving)
+        return replace(self, transmitter=ends[0], receiver=ends[1], channel=self.channel[rows])
 
     def wave(self, source: Tensor) -> Tensor:
         """What each element hears from sources (..., n or 1, 3) [m]: exp(-j k d) / d, complex64 (..., n, K)."""
