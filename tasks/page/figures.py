@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.transforms import Bbox
 from numpy.typing import ArrayLike, NDArray
 from pandas import DataFrame
 
@@ -20,6 +21,13 @@ from tasks.summarise import pareto
 
 RULE, LINES, PAPER = "#aeb7c6", "#e4e8ef", "#fffffe"  # marks of reference, grid, background
 THEMED = {"#000000": "currentColor", LINES: "var(--lines)", PAPER: "none"}  # what the page's own colours replace
+LABEL = 7  # size of a point's name [pt]
+BESIDE = (
+    ((5, 3), "left"),
+    ((5, -9), "left"),
+    ((-5, 3), "right"),
+    ((-5, -9), "right"),
+)  # its places [pt], and alignment
 STYLE: dict[str, Any] = {
     "svg.hashsalt": "swiftwrf-tasks",
     "svg.fonttype": "path",
@@ -190,11 +198,29 @@ def speed(
     for name, (cost, error) in points.items():
         colour = palette.colour(name.split(",")[0])
         axes.plot(cost, error, "o", color=colour, markersize=5 if name in front else 3.5, zorder=2)
-        if name in front or name in also:
-            axes.annotate(name, (cost, error), textcoords="offset points", xytext=(5, 3), fontsize=7)
     axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
     axes.margins(x=0.25, y=0.1)
+    taken: list[Bbox] = []
+    for name, point in points.items():
+        if name in front or name in also:
+            taken.append(_label(axes, name, point, taken))
     low, high = axes.get_ylim()
     if high < 30 * low:  # plain numbers where powers of ten would be few
         axes.yaxis.set_major_formatter("{x:g}")
         axes.yaxis.set_minor_formatter("{x:g}")
+
+
+def _label(axes: Axes, name: str, point: tuple[float, float], taken: Sequence[Bbox]) -> Bbox:
+    """Names a point where that covers none of the boxes taken, if there is such a place, and returns its own box."""
+    figure = axes.get_figure(root=True)
+    assert figure is not None  # an axes outside of a figure has no places
+    x, y = axes.transData.transform(point) * 72 / figure.dpi
+    width, height = 0.65 * LABEL * len(name), LABEL
+    boxes = [
+        Bbox.from_bounds(x + dx - (width if side == "right" else 0), y + dy, width, height) for (dx, dy), side in BESIDE
+    ]
+    free = [n for n, box in enumerate(boxes) if not any(box.overlaps(other) for other in taken)]
+    best = free[0] if free else 0
+    offset, side = BESIDE[best]
+    axes.annotate(name, point, textcoords="offset points", xytext=offset, fontsize=LABEL, horizontalalignment=side)
+    return boxes[best]
