@@ -1,4 +1,4 @@
-"""Positions and the distances between them."""
+"""Positions, the frame they are normalised in, and the distances between them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from torch import Tensor
 from swiftwrf.errors import InputError
 
 FARTHEST = 1e15
+FAR = 1e6  # normalised: beyond, all is equally far, and float32 must not overflow
 MANY = 2000  # known positions from which on a tree finds the nearest ones faster than all distances do
 
 
@@ -45,6 +46,18 @@ def check_drawn(spectrum: Tensor) -> Tensor:
     if not bool(spectrum.isfinite().all()):
         raise InputError("the model draws values that are not finite; its parameters overflow, so fit it anew")
     return spectrum
+
+
+def frame(position: Tensor) -> tuple[Tensor, Tensor]:
+    """Centre (3,) and half the longest side () of the box around positions (n, 3) [m], float64."""
+    low, high = position.double().min(dim=0).values, position.double().max(dim=0).values
+    half = (high - low).max() / 2
+    return (low + high) / 2, half if half > 0 else torch.ones_like(half)
+
+
+def normalise(position: Tensor, centre: Tensor, scale: Tensor | float) -> Tensor:
+    """Positions (n, 3) [m] in a frame, float32."""
+    return ((position.double() - centre) / scale).clamp(-FAR, FAR).float()
 
 
 def distance(a: Tensor, b: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ from swiftwrf.geometry import HybridModel
 from swiftwrf.geometry.model import Plane
 from swiftwrf.geometry.sample import Residual
 from tasks.run import command_line
-from tasks.view import ViewConfig, run, spectra
+from tasks.view import ViewConfig, fitted, run, spectra
 from tasks.view.opening import opened
 from tasks.view.pictures import View, png
 from tasks.view.plan import Plan, text
@@ -117,7 +117,7 @@ def test_nearest_measured_spectrum(aoa_run, room):
 
 @pytest.mark.parametrize(("seconds", "shape"), [(1e9, (15, 60)), (0.0, (1, 4))])
 def test_a_slow_model_is_dragged_on_a_coarser_grid(aoa_run, monkeypatch, seconds, shape):
-    monkeypatch.setattr(spectra, "QUICK", seconds)
+    monkeypatch.setattr(fitted, "QUICK", seconds)
     scene = opened(aoa_run)
     drawn = scene.draw(scene.fitted[1], scene.start, quick=True)
     assert drawn.grid.shape == drawn.spectrum.shape == drawn.deviation.shape == shape

@@ -16,8 +16,7 @@ from swiftwrf.comparison.base import Size
 from swiftwrf.data.spectra import Moving, Spectra
 from swiftwrf.errors import InputError
 from swiftwrf.fitting.descent import Model
-from swiftwrf.model.swiftwrf import frame, normalise
-from swiftwrf.positions import check_batch, check_drawn, check_positions
+from swiftwrf.positions import check_batch, check_drawn, check_positions, frame, normalise
 
 
 def restored(make: Callable[[], Model], tensors: dict[str, Tensor]) -> Model:

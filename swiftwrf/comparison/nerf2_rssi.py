@@ -30,8 +30,7 @@ from swiftwrf.comparison.drawing import chunks, draw_parameters, restored
 from swiftwrf.comparison.nerf2 import SAMPLES_AT_ONCE, Field, NeRF2Size, received
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.fitting.state import Record
-from swiftwrf.model.swiftwrf import frame, normalise
-from swiftwrf.positions import check_drawn, check_positions
+from swiftwrf.positions import check_drawn, check_positions, frame, normalise
 from swiftwrf.rssi.prepare import check
 from swiftwrf.rssi.state import fingerprint
 

@@ -27,7 +27,7 @@ from swiftwrf.model.deformation import COMPONENTS, Deformation
 from swiftwrf.model.deformation.motion_basis import MotionBasis
 from swiftwrf.model.deformation.static import Static
 from swiftwrf.model.primitives import Primitives
-from swiftwrf.model.swiftwrf import frame, normalise
+from swiftwrf.positions import frame, normalise
 from swiftwrf.rasterize.reference import kernels
 from swiftwrf.threads import single_thread
 

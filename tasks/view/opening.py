@@ -17,8 +17,9 @@ from tasks.claim import CONFIG, ENVIRONMENT
 from tasks.records import Row, read_json
 from tasks.rssi.experiment import MODEL
 from tasks.run import configured
+from tasks.view.fitted import Fitted, planes_of
 from tasks.view.rssi import Floor, RssiScene
-from tasks.view.spectra import Fitted, SpectraScene, planes_of
+from tasks.view.spectra import SpectraScene
 
 
 def opened(source: Path) -> SpectraScene | RssiScene:
