@@ -8,7 +8,7 @@ from torch import Tensor
 from augment.synthesizers.base import SYNTHESIZERS, Synthesizer
 from swiftwrf import Spectra
 from swiftwrf.data.splits import folds
-from swiftwrf.gp import EXACT, thinned
+from swiftwrf.gp import EXACT, inner_products, squared_errors, thinned
 from swiftwrf.positions import nearest
 
 CANDIDATES = (1, 2, 3, 5, 8, 13, 20, 30)
@@ -24,8 +24,8 @@ class InverseDistance(Synthesizer):
         fold = folds(train.position, self.settings.validation, self.settings.seed)[rows]
         candidates = [k for k in CANDIDATES if k <= len(rows) - int(fold.bincount().max())]
         some = train.subset(rows)
-        position, flat = some.position, some.spectrum.flatten(1)
-        self.k = min(candidates, key=lambda k: _held_out_loss(k, position, flat, fold))
+        gram = inner_products(some.spectrum)
+        self.k = min(candidates, key=lambda k: _held_out_loss(k, some.position, gram, fold))
 
     def synthesize(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
         number, weight = weights(position, self._train.position, self.k)
@@ -35,13 +35,13 @@ class InverseDistance(Synthesizer):
         return drawn
 
 
-def _held_out_loss(k: int, position: Tensor, flat: Tensor, fold: Tensor) -> float:
+def _held_out_loss(k: int, position: Tensor, gram: Tensor, fold: Tensor) -> float:
     loss = 0.0
-    for number in range(int(fold.max()) + 1):
-        out = fold == number
-        near, share = weights(position[out], position[~out], k)
-        weight = torch.zeros(int(out.sum()), int((~out).sum())).scatter_(1, near, share)
-        loss += float((weight @ flat[~out] - flat[out]).square().sum())
+    for number in fold.unique():
+        out, kept = fold == number, fold != number
+        near, share = weights(position[out], position[kept], k)
+        weight = torch.zeros(len(near), int(kept.sum()), dtype=gram.dtype).scatter_(1, near, share.to(gram.dtype))
+        loss += float(squared_errors(gram, out, kept, weight).sum())
     return loss
 
 

@@ -1,6 +1,6 @@
 """The one Gaussian process: its kernel and how it is chosen, regression, and smooth fields under its prior."""
 
-from swiftwrf.gp.choice import choose_kernel, choose_rank, most_informative, thinned
+from swiftwrf.gp.choice import choose_kernel, choose_rank, inner_products, most_informative, squared_errors, thinned
 from swiftwrf.gp.field import NearbyField, SmoothField
 from swiftwrf.gp.kernel import Kernel, candidates
 from swiftwrf.gp.process import EXACT, GaussianProcess, NearbyProcess, held_out, held_out_weights
@@ -17,6 +17,8 @@ __all__ = [
     "choose_rank",
     "held_out",
     "held_out_weights",
+    "inner_products",
     "most_informative",
+    "squared_errors",
     "thinned",
 ]

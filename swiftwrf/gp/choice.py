@@ -33,14 +33,12 @@ def choose_kernel(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> K
         fold: number of the part that each is held out with, (n,).
     """
     position, spectrum, fold = thinned(position, spectrum, fold)
-    gram = _inner_products(spectrum)
+    gram = inner_products(spectrum)
 
     def score(kernel: Kernel) -> float:
         total = 0.0
         for out, kept, gain in held_out_weights(kernel, position, fold):
-            own = gram.diagonal()[out]
-            error = own - 2 * (gain * gram[out][:, kept]).sum(1) + ((gain @ gram[kept][:, kept]) * gain).sum(1)
-            total -= float(error.clamp_min(1e-12).log().sum())
+            total -= float(squared_errors(gram, out, kept, gain).clamp_min(1e-12).log().sum())
         return total
 
     return max(candidates(position, NOISES), key=score)
@@ -56,7 +54,7 @@ def choose_rank(position: Tensor, spectrum: Tensor | Store, fold: Tensor, kernel
         kernel: what it chose.
     """
     position, spectrum, fold = thinned(position, spectrum, fold)
-    variance, vector = torch.linalg.eigh(_inner_products(spectrum))
+    variance, vector = torch.linalg.eigh(inner_products(spectrum))
     variance = variance.flip(0).clamp_min(0)
     component = vector.flip(1) * variance.sqrt()  # (n, n), one column a component
     predicted, _ = held_out(kernel, position, fold, component)
@@ -103,8 +101,20 @@ def thinned(*tensors: Tensor | Store, rows: int = MAX_ROWS) -> list[Tensor]:
     return [t[some] for t in tensors]
 
 
-def _inner_products(spectrum: Tensor) -> Tensor:
+def inner_products(spectrum: Tensor) -> Tensor:
     """Of the spectra's differences from their mean, a pixel, float64 (n, n)."""
     flat = spectrum.flatten(1).double()
     flat = flat - flat.mean(dim=0)
     return flat @ flat.T / flat.shape[1]
+
+
+def squared_errors(gram: Tensor, out: Tensor, kept: Tensor, weight: Tensor) -> Tensor:
+    """Of sums of spectra against spectra that are held out, a pixel, from the inner products of all, (o,).
+
+    Args:
+        gram: inner products, (n, n).
+        out, kept: which spectra are held out and which are summed, bool (n,).
+        weight: of each one kept in each sum, (o, k); the mean spectrum makes up for what the weights lack of 1.
+    """
+    own = gram.diagonal()[out]
+    return own - 2 * (weight * gram[out][:, kept]).sum(1) + ((weight @ gram[kept][:, kept]) * weight).sum(1)
