@@ -53,7 +53,7 @@ class AANNConfig:
     def quick(cls, spectra: int) -> AANNConfig:
         """As long as a scene of so many spectra needs: 250 steps leave 1,500 spectra half-learnt.
 
-        A step moves 25 million weights whatever its batch, so that 64 spectra take little longer than 32.
+        A step moves 25 million weights whatever its batch, so one of 64 spectra takes only a third longer than one of 32.
         """
         if spectra <= MANY:
             return cls()
