@@ -90,6 +90,23 @@ def kill_a_worker(local):
     os.kill(up[0].pid, signal.SIGKILL)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="the worker's allocator is set where it is glibc")
+def test_workers_keep_the_memory_that_a_training_frees(cluster):
+    def faults(_):
+        import resource
+
+        def block():
+            return [torch.empty(2**18).fill_(1.0) for _ in range(40)]  # 1 MiB each
+
+        block()
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        for _ in range(20):
+            block()
+        return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+    assert max(cluster.map(faults, range(2))) < 20_000  # 200,000 as Dask sets it
+
+
 def test_aoa_has_the_same_numbers_when_a_worker_dies(local, whole, tmp_path, monkeypatch):
     during(monkeypatch, (Run, "keep", 4), lambda: kill_a_worker(local))
     assert run(*AOA, "--scheduler", local.scheduler_address, "--out", tmp_path / "run") == 0
