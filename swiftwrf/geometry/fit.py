@@ -26,7 +26,7 @@ NEEDED = 2.5  # standard errors by which held-out spectra must be better for a p
 FURTHER = 4.0  # the same for a plane of any orientation, of which far more are tried
 TRIED = 8  # candidates of any orientation that are refined
 MOST = 2000  # spectra that are looked at: a room is a few dozen numbers
-MANY = 300  # positions from which one held-out part decides, not all in turn
+ENOUGH = 300  # held-out positions to decide by: as many parts are held out in turn as that takes
 
 
 @dataclass(frozen=True)
@@ -123,8 +123,10 @@ def _some(scene: Scene, most: int, seed: int) -> Scene:
 
 
 def split(scene: Scene, fold: Tensor) -> list[tuple[Scene, Scene]]:
-    """Kept and held-out positions; all folds in turn where there are few positions."""
-    out = [fold == number for number in (fold.unique().tolist() if len(fold) < MANY else [0])]
+    """Kept and held-out positions, of one part after the other until enough of them have been held out."""
+    numbers, sizes = fold.unique(return_counts=True)
+    needed = int((sizes.cumsum(0) < ENOUGH).sum()) + 1
+    out = [fold == number for number in numbers[:needed]]
     return [(scene.subset((~o).nonzero()[:, 0]), scene.subset(o.nonzero()[:, 0])) for o in out]
 
 
