@@ -21,6 +21,7 @@ from tasks.summarise import pareto
 
 RULE, LINES, PAPER = "#aeb7c6", "#e4e8ef", "#fffffe"  # marks of reference, grid, background
 THEMED = {"#000000": "currentColor", LINES: "var(--lines)", PAPER: "none"}  # what the page's own colours replace
+LONGEST = 100  # characters of a line of a name
 LABEL = 7  # size of a point's name [pt]
 BESIDE = (
     ((5, 3), "left"),
@@ -60,8 +61,9 @@ def in_space(figure: Figure, axes: Axes) -> Any:
 
 
 def plain(name: str) -> str:
-    """A name as text of a figure: dollars in it begin no formula."""
-    return name.replace("$", r"\$")
+    """A name as text of a figure: dollars in it begin no formula, and a line of it leaves room for the figure."""
+    lines = (line if len(line) <= LONGEST else f"{line[: LONGEST - 1]}…" for line in name.split("\n"))
+    return "\n".join(lines).replace("$", r"\$")
 
 
 def as_svg(figure: Figure) -> str:
