@@ -103,8 +103,8 @@ def thinned(*tensors: Tensor | Store, rows: int = MAX_ROWS) -> list[Tensor]:
 
 def inner_products(spectrum: Tensor) -> Tensor:
     """Of the spectra's differences from their mean, a pixel, float64 (n, n)."""
-    flat = spectrum.flatten(1).double()
-    flat = flat - flat.mean(dim=0)
+    flat = spectrum.flatten(1)
+    flat = flat - flat.mean(dim=0, dtype=torch.float64)  # what it takes of memory is this difference
     return flat @ flat.T / flat.shape[1]
 
 

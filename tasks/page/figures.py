@@ -21,14 +21,9 @@ from tasks.summarise import pareto
 
 RULE, LINES, PAPER = "#aeb7c6", "#e4e8ef", "#fffffe"  # marks of reference, grid, background
 THEMED = {"#000000": "currentColor", LINES: "var(--lines)", PAPER: "none"}  # what the page's own colours replace
-LONGEST = 100  # characters of a line of a name
+LONGEST = 100  # characters of a line of text
 LABEL = 7  # size of a point's name [pt]
-BESIDE = (
-    ((5, 3), "left"),
-    ((5, -9), "left"),
-    ((-5, 3), "right"),
-    ((-5, -9), "right"),
-)  # its places [pt], and alignment
+BESIDE = (((5, 3), "left"), ((5, -9), "left"), ((-5, 3), "right"), ((-5, -9), "right"))  # where it may stand [pt]
 STYLE: dict[str, Any] = {
     "svg.hashsalt": "swiftwrf-tasks",
     "svg.fonttype": "path",
@@ -221,8 +216,7 @@ def _label(axes: Axes, name: str, point: tuple[float, float], taken: Sequence[Bb
     boxes = [
         Bbox.from_bounds(x + dx - (width if side == "right" else 0), y + dy, width, height) for (dx, dy), side in BESIDE
     ]
-    free = [n for n, box in enumerate(boxes) if not any(box.overlaps(other) for other in taken)]
-    best = free[0] if free else 0
+    best = next((n for n, box in enumerate(boxes) if not any(box.overlaps(other) for other in taken)), 0)
     offset, side = BESIDE[best]
     axes.annotate(name, point, textcoords="offset points", xytext=offset, fontsize=LABEL, horizontalalignment=side)
     return boxes[best]

@@ -19,7 +19,6 @@ from tasks.records import as_table
 from tasks.view.plan import Plan
 
 CELLS = 120  # of a map, along its longer side
-LINE = 100  # characters of a picture's title
 LEVEL = 0.8  # of the model's intervals
 DEVIATIONS = ndtri((1 + LEVEL) / 2)  # half of an interval, of a normal variable
 RECEIVER_COLOURS, MOST_COLOURS = "tab20", 20
@@ -299,7 +298,7 @@ class RssiScene:
                 ax.annotate(figures.plain(self.receivers[number]), (x, y), (6, 6), textcoords="offset points")
         ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", xlim=extent[:2], ylim=extent[2:])
         ax.grid(visible=False)
-        title = textwrap.fill(f"{self.sentence(shown)} Height {shown.height:.2f} m.", LINE)
+        title = textwrap.fill(f"{self.sentence(shown)} Height {shown.height:.2f} m.", figures.LONGEST)
         ax.set_title(figures.plain(title), fontsize=8)
         if layer.label:
             figure.colorbar(drawn, ax=ax, label=layer.label, fraction=0.04, pad=0.02)
