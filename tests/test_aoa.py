@@ -11,12 +11,14 @@ import pandas as pd
 import pytest
 import torch
 
-from augment import SYNTHESIZERS, Mixed, choose, lacks
+import augment
+from augment import SYNTHESIZERS, Mixed, Synthesizer, Trial, choose, lacks, make_synthesizer
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, load, simulated_room
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.store import Store
 from tasks.aoa import arms, experiment, steps
+from tasks.aoa.advice import advise
 from tasks.aoa.config import AoaConfig
 from tasks.aoa.estimators import ESTIMATORS, Settings
 from tasks.aoa.estimators.aann import AANN, AANNConfig
@@ -108,6 +110,33 @@ def test_aann_is_seeded_and_leaves_the_global_generator_alone(room):
         estimates.append(network.estimate(room.spectrum))
     assert torch.equal(*estimates)
     assert torch.equal(torch.get_rng_state(), state)
+
+
+@pytest.mark.parametrize(("right", "sampled"), [("means", False), ("draws", True), ("both", False)])
+def test_draws_train_only_where_they_are_better_than_means_beyond_doubt(room, right, sampled):
+    fold = torch.arange(len(room)) % 4 == 0
+    kept, out = room.subset((~fold).nonzero()[:, 0]), room.subset(fold.nonzero()[:, 0])
+
+    class Told(Synthesizer):
+        """Knows all spectra; what it draws in the wrong way is noise."""
+
+        samples = True
+
+        def fit(self, train):
+            self.known = make_synthesizer("gp")
+            self.known.fit(room)
+
+        def synthesize(self, position, generator=None):
+            good = self.known.synthesize(position)
+            if right in ("both", "means" if generator is None else "draws"):
+                return good
+            return torch.rand(good.shape, generator=torch.Generator().manual_seed(0))
+
+    synthesizer = Told(augment.Settings())
+    synthesizer.fit(kept)
+    advice = advise([Trial(synthesizer, kept, out)], Settings(room.grid), extra=100)
+    assert advice["sampled"] is sampled
+    assert [gain["sampled"] for gain in advice["gains"]] == [False, True]
 
 
 def test_a_training_is_as_long_as_the_scene_needs():

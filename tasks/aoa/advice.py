@@ -33,26 +33,33 @@ def advise(trials: Sequence[Trial], settings: Settings, extra: int) -> AdviceMet
         settings: of the stand-in.
         extra: number of further positions that the run adds; larger numbers are not compared.
     """
-    alone = np.concatenate([_errors(trial, 0, False, settings) for trial in trials])
 
-    def gain(number: int, sampled: bool) -> GainMetrics:
-        turbo = np.concatenate([_errors(trial, number, sampled, settings) for trial in trials])
+    def errors(number: int, sampled: bool = False) -> NDArray[np.float64]:
+        return np.concatenate([_errors(trial, number, sampled, settings) for trial in trials])
+
+    def gain(number: int, sampled: bool, turbo: NDArray[np.float64]) -> GainMetrics:
         return {"extra": number, "sampled": sampled, **_paired(alone, turbo)}
 
-    gains: list[GainMetrics] = []
+    alone, gains, sampled = errors(0), [], False
     if extra:
         middle = min(MIDDLE, extra)  # where means and draws are compared
-        gains = [gain(middle, sampled) for sampled in ((False, True) if trials[0].synthesizer.samples else (False,))]
-        better = min(gains, key=lambda found: found["median_deg"])["sampled"]
+        predicted = errors(middle)
+        gains.append(gain(middle, False, predicted))
+        if trials[0].synthesizer.samples:
+            drawn = errors(middle, sampled=True)
+            gains.append(gain(middle, True, drawn))
+            sampled = _paired(predicted, drawn)["high"] < 0  # draws must be better beyond doubt
         others = sorted({*(n for n in NUMBERS if n < extra), extra} - {middle})
-        gains += [gain(number, better) for number in others]
-    best = min(gains, key=lambda gain: gain["median_deg"], default=None)
+        gains += [gain(number, sampled, errors(number, sampled)) for number in others]
+    best = min(
+        (gain for gain in gains if gain["sampled"] == sampled), key=lambda gain: gain["median_deg"], default=None
+    )
     return {
         "stand_in": STAND_IN,
         "n_held_out": len(alone),
         "measured_only_deg": float(np.median(alone)),
         "gains": gains,
-        "sampled": bool(best and best["sampled"]),
+        "sampled": sampled,
         "recommended_extra": best["extra"] if best and best["change"] < 0 else 0,
         "helps": bool(best and best["high"] < 0),
     }
@@ -71,11 +78,11 @@ def _errors(trial: Trial, extra: int, sampled: bool, settings: Settings) -> NDAr
     return cast(NDArray[np.float64], errors.double().numpy())
 
 
-def _paired(alone: NDArray[np.float64], turbo: NDArray[np.float64]) -> ChangeMetrics:
-    """Median with synthetic spectra, its relative change against the median without, and the 95 % bootstrap interval of
-    that change over held-out spectra."""
-    rows = np.random.default_rng(0).integers(len(alone), size=(DRAWS, len(alone)))
-    medians = np.median(turbo[rows], axis=1), np.median(alone[rows], axis=1)
+def _paired(before: NDArray[np.float64], after: NDArray[np.float64]) -> ChangeMetrics:
+    """Median of `after`, its relative change against that of `before`, and the 95 % bootstrap interval of that change over
+    held-out spectra."""
+    rows = np.random.default_rng(0).integers(len(before), size=(DRAWS, len(before)))
+    medians = np.median(after[rows], axis=1), np.median(before[rows], axis=1)
     low, high = np.percentile(medians[0] / np.maximum(medians[1], 1e-9) - 1, (2.5, 97.5))
-    change = float(np.median(turbo) / max(float(np.median(alone)), 1e-9) - 1)
-    return {"median_deg": float(np.median(turbo)), "change": change, "low": float(low), "high": float(high)}
+    change = float(np.median(after) / max(float(np.median(before)), 1e-9) - 1)
+    return {"median_deg": float(np.median(after)), "change": change, "low": float(low), "high": float(high)}

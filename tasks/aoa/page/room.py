@@ -28,7 +28,8 @@ def advice_sentence(share: Share) -> str | None:
     advice = share.mix["advice"]
     if advice is None or not advice["gains"]:
         return None
-    best = min(advice["gains"], key=lambda gain: gain["median_deg"])
+    taken = [gain for gain in advice["gains"] if gain["sampled"] == advice["sampled"]]
+    best = min(taken, key=lambda gain: gain["median_deg"])
     change = f"{best['change']:+.0%} [{best['low']:+.0%}, {best['high']:+.0%}]"
     found = (
         f"Cross-validation inside the measured share ({advice['n_held_out']} spectra held out, {advice['stand_in']} as "
