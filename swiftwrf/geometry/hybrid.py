@@ -100,6 +100,12 @@ class HybridModel(Saved):
         return cls(geometry, strengths, header["share"], Kernel(**header["kernel"]), **own)
 
 
+def room_of(model: Saved) -> GeometryModel | None:
+    """The room that a model found; None where it knows of none."""
+    room = model.geometry if isinstance(model, HybridModel) else model
+    return room if isinstance(room, GeometryModel) else None
+
+
 @single_thread()
 def fit_hybrid(
     train: Spectra,

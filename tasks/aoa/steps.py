@@ -15,9 +15,9 @@ from augment import SYNTHESIZERS, Mixed, choose_synthesizer, make_synthesizer, m
 from augment.choose import SLOW, candidates
 from augment.suggest import suggest
 from augment.synthesizers import Synthesizer
-from swiftwrf import FitError, GeometryModel, InputError, Spectra, SwiftWRF
+from swiftwrf import FitError, InputError, Spectra, SwiftWRF
 from swiftwrf.checkpoint import Saved, read, write
-from swiftwrf.geometry import HybridModel
+from swiftwrf.geometry import room_of
 from swiftwrf.store import Store
 from tasks.aoa import arms
 from tasks.aoa.advice import advise
@@ -173,8 +173,8 @@ class Synthesis(Step[Setting]):
         share = f"mix{self.at.share:g}"
         prefix = "model" if self.synthesizer == "swiftwrf" else self.synthesizer
         model.save(folder / f"{prefix}-{share}.safetensors")
-        room = model.geometry if isinstance(model, HybridModel) else model
-        if isinstance(room, GeometryModel):
+        room = room_of(model)
+        if room is not None:
             write_json(folder / f"geometry-{share}.json", room.to_json())
             at, gain, order = room.image_sources()
             places = {

@@ -19,7 +19,7 @@ from swiftwrf.comparison.dcgan import Dcgan
 from swiftwrf.comparison.drawing import LinkDrawing
 from swiftwrf.comparison.vae import Vae
 from swiftwrf.data.spectra import Moving
-from swiftwrf.geometry import HybridModel
+from swiftwrf.geometry import HybridModel, room_of
 
 QUICK = 0.02  # [s] that a spectrum may take while the moving end is dragged
 Link = tuple[Tensor, Tensor, Moving]
@@ -52,7 +52,7 @@ class Fitted:
     @cached_property
     def grid(self) -> AngularGrid:
         """That of the spectra it was fitted to."""
-        model: Any = self.model.geometry if isinstance(self.model, HybridModel) else self.model
+        model: Any = room_of(self.model) or self.model
         grid: AngularGrid = model.grid
         return grid
 
@@ -126,22 +126,17 @@ class Fitted:
     @property
     def link(self) -> Link | None:
         """Where the fixed end stands, how the array is turned and which end moves, as far as the model knows."""
-        match self.model:
-            case GeometryModel():
-                return self.model.fixed_position, self.model.rotation, self.model.moving
-            case HybridModel():
-                room = self.model.geometry
-                return room.fixed_position, room.rotation, room.moving
-            case LinkDrawing():
-                link = self.model.link
-                return link.fixed, link.rotation, link.moving
-        return None
+        if isinstance(self.model, LinkDrawing):
+            link = self.model.link
+            return link.fixed, link.rotation, link.moving
+        room = room_of(self.model)
+        return None if room is None else (room.fixed_position, room.rotation, room.moving)
 
 
 def planes_of(model: Saved) -> list[dict[str, Any]]:
     """The room that a model found, as in geometry-mix*.json; none where it knows of none."""
-    room = model.geometry if isinstance(model, HybridModel) else model
-    planes: list[dict[str, Any]] = room.to_json()["planes"] if isinstance(room, GeometryModel) else []
+    room = room_of(model)
+    planes: list[dict[str, Any]] = room.to_json()["planes"] if room is not None else []
     return planes
 
 
