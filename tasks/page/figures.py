@@ -139,16 +139,17 @@ def spectra(
 ) -> Figure:
     """Measured, synthesized, their difference and, where it is known, the deviation that was expected, one row a spectrum;
     azimuth to the right, elevation upwards [deg]."""
+    missed = synthetic - measured
+    most = float(np.abs(missed).max()) or 1.0  # a scale from -1 to 1 would show a good spectrum's misses as nothing
     columns = [
-        ("measured", measured, "viridis", 0),
-        ("synthesized", synthetic, "viridis", 0),
-        ("synthesized - measured", synthetic - measured, "RdBu_r", -1),
-        *([("expected deviation", deviation, "magma", 0)] if deviation is not None else []),
+        ("measured", measured, "viridis", (0.0, 1.0)),
+        ("synthesized", synthetic, "viridis", (0.0, 1.0)),
+        ("synthesized - measured", missed, "RdBu_r", (-most, most)),
+        *([("expected deviation", deviation, "magma", (0.0, float(deviation.max())))] if deviation is not None else []),
     ]
     n = len(columns)
     figure, axes = new_figure(len(measured), n, 3 * n, 0.95 * len(measured) + 0.6)
-    for column, (title, images, colours, low) in enumerate(columns):
-        high = float(deviation.max()) if deviation is not None and images is deviation else 1
+    for column, (title, images, colours, (low, high)) in enumerate(columns):
         for row, image in enumerate(images):
             ax = axes[n * row + column]
             drawn = ax.imshow(
