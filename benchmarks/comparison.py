@@ -2,12 +2,14 @@
 learning with the spectra of several methods.
 
 Hours of work that can be stopped at any time: each row is kept in the folder `--work` once it is measured, unfinished fits
-and runs go on from their state, and the result holds all rows that are there. With `--scheduler` the rows are measured on
-the workers of a Dask cluster; each says on which machine, for seconds of different machines do not compare.
+and runs go on from their state. The result holds those rows, and of the committed result those that were not measured
+again, so that a scene can be added to it. With `--scheduler` the rows are measured on the workers of a Dask cluster; each
+says on which machine, for seconds of different machines do not compare.
 """
 
 from __future__ import annotations
 
+import copy
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -19,6 +21,7 @@ from typing import Any, Literal
 import torch
 import tyro
 from committed import ROOT
+from committed import load as committed
 from record import write_result
 from synthesis import load
 from torch import Tensor, nn
@@ -49,6 +52,7 @@ QUICKER = 5  # by how much --quick shortens fits by gradient
 BATCH, REPEATS = 8, 3  # spectra a call, and calls, of which a rate is the median
 CPU = torch.device("cpu")
 Row = dict[str, Any]
+Table = dict[str, dict[str, dict[str, Row]]]  # by scene, number of training spectra and method
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,7 @@ def main(config: Config) -> None:
     """Measures what is not there yet and writes `results/comparison.json` (`comparison_quick.json`) and the figures."""
     rows = config.work / ("quick" if config.quick else "rows")
     rows.mkdir(parents=True, exist_ok=True)
+    began = time.perf_counter()
     with connected(config.scheduler, CPU) as cluster:
         for job, found in measured(jobs(config, rows), cluster):
             print(job.file.name, f"{found['psnr_db']['median']:.2f} dB, {found['fit_seconds']:.0f} s", flush=True)
@@ -81,10 +86,13 @@ def main(config: Config) -> None:
             job.state.unlink(missing_ok=True)
     if "turbo" in config.parts and not config.quick:
         train_networks(config)
-    result = {"scenes": gathered(rows), "turbo": None if config.quick else turbo(config.work)}
-    write_result("comparison_quick" if config.quick else "comparison", result)
-    if not config.quick:
-        draw(result["scenes"])
+    if config.quick:
+        write_result("comparison_quick", {"scenes": gathered(rows, {}), "seconds": time.perf_counter() - began})
+        return
+    earlier = committed("comparison")
+    result = {"scenes": gathered(rows, earlier["scenes"]), "turbo": turbo(config.work) or earlier["turbo"]}
+    write_result("comparison", result)
+    draw(result["scenes"])
 
 
 def scenes(config: Config) -> Iterator[tuple[str, Spectra, str]]:
@@ -171,14 +179,20 @@ def measure_away(job: Job, scene: tuple[Spectra, Spectra]) -> Row:
         return job.measure(*scene, Path(folder) / "fit.state")
 
 
-def gathered(rows: Path) -> dict[str, dict[str, dict[str, Row]]]:
-    """All rows that are there, by scene, number of training spectra and method."""
-    found: dict[str, dict[str, dict[str, Row]]] = {}
-    order = [*BASELINES, *LEARNT]
-    files = [(*file.stem.rsplit(" ", 2), file) for file in rows.glob("*.json")]
-    for scene, n, method, file in sorted(files, key=lambda f: (f[0], -int(f[1]), order.index(f[2]))):
+def gathered(rows: Path, earlier: Table) -> Table:
+    """All rows that are there, and the earlier ones that were not measured again."""
+    found = copy.deepcopy(earlier)
+    for file in rows.glob("*.json"):
+        scene, n, method = file.stem.rsplit(" ", 2)
         found.setdefault(scene, {}).setdefault(n, {})[method] = json.loads(file.read_text())
-    return found
+    order = [*BASELINES, *LEARNT]
+    return {
+        scene: {
+            n: dict(sorted(by_method.items(), key=lambda item: order.index(item[0])))
+            for n, by_method in sorted(by_count.items(), key=lambda item: -int(item[0]))
+        }
+        for scene, by_count in sorted(found.items())
+    }
 
 
 def row(method: str, train: Spectra, test: Spectra, split: str, quick: bool, state: Path) -> Row:
@@ -263,7 +277,7 @@ def turbo(work: Path) -> Row | None:
     }
 
 
-def draw(found: dict[str, dict[str, dict[str, Row]]]) -> None:
+def draw(found: Table) -> None:
     """Speed against error on each scene, and SSIM against the number of training spectra."""
     folder, palette = ROOT / "docs" / "figures", Palette.of(SYNTHESIZERS.entries())
     panels, axes = figures.new_figure(-(-len(found) // 2), min(2, len(found)), 10, 3.4 * -(-len(found) // 2))

@@ -51,9 +51,7 @@ def advise(trials: Sequence[Trial], settings: Settings, extra: int) -> AdviceMet
             sampled = _paired(predicted, drawn)["high"] < 0  # draws must be better beyond doubt
         others = sorted({*(n for n in NUMBERS if n < extra), extra} - {middle})
         gains += [gain(number, sampled, errors(number, sampled)) for number in others]
-    best = min(
-        (gain for gain in gains if gain["sampled"] == sampled), key=lambda gain: gain["median_deg"], default=None
-    )
+    best = best_gain(gains, sampled)
     return {
         "stand_in": STAND_IN,
         "n_held_out": len(alone),
@@ -63,6 +61,12 @@ def advise(trials: Sequence[Trial], settings: Settings, extra: int) -> AdviceMet
         "recommended_extra": best["extra"] if best and best["change"] < 0 else 0,
         "helps": bool(best and best["high"] < 0),
     }
+
+
+def best_gain(gains: Sequence[GainMetrics], sampled: bool) -> GainMetrics | None:
+    """The number of further positions with the lowest error, of draws or of means; None where nothing was compared."""
+    taken = (gain for gain in gains if gain["sampled"] == sampled)
+    return min(taken, key=lambda gain: gain["median_deg"], default=None)
 
 
 def _errors(trial: Trial, extra: int, sampled: bool, settings: Settings) -> NDArray[np.float64]:

@@ -13,6 +13,7 @@ from pandas import DataFrame, concat
 
 from augment import SYNTHESIZERS
 from tasks.aoa import arms
+from tasks.aoa.advice import best_gain
 from tasks.aoa.share import Share
 from tasks.metrics import AdviceMetrics, GainMetrics
 from tasks.page import figures
@@ -26,10 +27,9 @@ FIXED, MEASURED, IMAGE = "#cc3311", "#4477aa", "#ee8866"
 def advice_sentence(share: Share) -> str | None:
     """Whether turbo learning helps, in a sentence; None where nothing was compared."""
     advice = share.mix["advice"]
-    if advice is None or not advice["gains"]:
+    best = best_gain(advice["gains"], advice["sampled"]) if advice else None
+    if advice is None or best is None:
         return None
-    taken = [gain for gain in advice["gains"] if gain["sampled"] == advice["sampled"]]
-    best = min(taken, key=lambda gain: gain["median_deg"])
     change = f"{best['change']:+.0%} [{best['low']:+.0%}, {best['high']:+.0%}]"
     found = (
         f"Cross-validation inside the measured share ({advice['n_held_out']} spectra held out, {advice['stand_in']} as "
