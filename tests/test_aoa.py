@@ -101,6 +101,27 @@ def test_circular_padding_makes_rolled_spectra_alike():
     torch.testing.assert_close(convolution(x).roll(4, dims=-1), convolution(x.roll(4, dims=-1)))
 
 
+@pytest.mark.parametrize("circular", [False, True])
+def test_pointwise_convolutions_are_matrix_products(circular):
+    """The same function with the same weights, in value and gradient."""
+    from tasks.aoa.estimators.aann import _backbone, _Pointwise
+
+    spectrum = torch.rand(4, 1, 9, 40, dtype=torch.float64)
+    found = {}
+    for products in (False, True):
+        torch.manual_seed(0)
+        network = _backbone(circular, products).double()
+        torch.nn.init.normal_(network.fc[2].weight)
+        x = spectrum.clone().requires_grad_()
+        value = network(x)
+        gradient = torch.autograd.grad(value.square().sum(), [x, *network.parameters()])
+        found[products] = network, value, gradient
+    (definition, *expected), (network, *actual) = found[False], found[True]
+    assert sum(isinstance(m, _Pointwise) for m in network.modules()) == 36
+    torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-7)
+    assert list(network.state_dict()) == list(definition.state_dict())
+
+
 def test_aann_is_seeded_and_leaves_the_global_generator_alone(room):
     state = torch.get_rng_state()
     estimates = []

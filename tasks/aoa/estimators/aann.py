@@ -80,6 +80,19 @@ class _CircularConv(nn.Module):
         return cast(Tensor, self.inner(wrapped))
 
 
+class _Pointwise(nn.Module):
+    """A convolution of 1 x 1 as the matrix product that it is, over channels that lie side by side."""
+
+    def __init__(self, inner: nn.Conv2d) -> None:
+        super().__init__()
+        self.weight, self.stride = inner.weight, inner.stride
+
+    def forward(self, x: Tensor) -> Tensor:
+        rows, columns = self.stride
+        pixels = x[:, :, ::rows, ::columns].permute(0, 2, 3, 1)
+        return functional.linear(pixels, self.weight[:, :, 0, 0]).permute(0, 3, 1, 2)
+
+
 class _SharedNorm(nn.BatchNorm2d):
     """What `nn.SyncBatchNorm` is on GPUs, for CPUs, where torch has none: statistics of the batch of all processes."""
 
@@ -112,18 +125,27 @@ def _shared(network: nn.Module, processes: Processes) -> nn.Module:
     return DistributedDataParallel(copied, process_group=processes.group)
 
 
-def _backbone(circular: bool) -> nn.Module:
+def _backbone(circular: bool, products: bool) -> nn.Module:
+    """ResNet-50 with one input channel and the head.
+
+    Args:
+        circular: pads the azimuth circularly.
+        products: computes its pointwise convolutions, two thirds of all, as matrix products.
+    """
     network: nn.Module = torchvision.models.resnet50(weights=None)
     network.conv1 = nn.Conv2d(1, 64, kernel_size=7, stride=2, padding=3, bias=False)
     last = nn.Linear(256, 3)
     network.fc = nn.Sequential(nn.Linear(2048, 256), nn.ReLU(), last)
     nn.init.zeros_(last.weight)
     nn.init.zeros_(last.bias)
-    if circular:
-        for module in list(network.modules()):
-            for name, child in module.named_children():
-                if isinstance(child, nn.Conv2d) and child.padding != (0, 0):
-                    setattr(module, name, _CircularConv(child))
+    for module in list(network.modules()):
+        for name, child in module.named_children():
+            if not isinstance(child, nn.Conv2d):
+                continue
+            if products and child.kernel_size == (1, 1):
+                setattr(module, name, _Pointwise(child))
+            elif circular and child.padding != (0, 0):
+                setattr(module, name, _CircularConv(child))
     return network
 
 
@@ -146,13 +168,14 @@ class AANN(SavedEstimator):
         super().__init__(settings)
         config = config or (AANNConfig.paper() if settings.preset == "paper" else AANNConfig.quick(settings.spectra))
         seed, device = settings.seed, torch.device(settings.device)
+        bfloat16 = _gains_from_bfloat16(device)
         self._config, self._device = config, device
         with torch.random.fork_rng(devices=[]):  # torchvision draws its weights from the global generator
             torch.manual_seed(seed)
-            network = _backbone(config.circular)
+            network = _backbone(config.circular, device.type == "cpu" and not bfloat16)
         self._network = network.to(device).to(memory_format=torch.channels_last)
         self._generator = torch.Generator().manual_seed(seed)
-        self._autocast = torch.autocast(device.type, torch.bfloat16, enabled=_gains_from_bfloat16(device))
+        self._autocast = torch.autocast(device.type, torch.bfloat16, enabled=bfloat16)
 
     def _prepare(self, spectrum: Tensor) -> Tensor:
         factor = coarsening(spectrum.shape[1:], self._config.max_azimuths, LEAST_ROWS)
