@@ -101,6 +101,27 @@ def test_circular_padding_makes_rolled_spectra_alike():
     torch.testing.assert_close(convolution(x).roll(4, dims=-1), convolution(x.roll(4, dims=-1)))
 
 
+def test_kernel_ridge_regression_chooses_as_a_plain_grid_search_does(room):
+    """Width and penalty by one kernel matrix a width, as by scikit-learn's search over both with a kernel for each."""
+    from sklearn.kernel_ridge import KernelRidge
+    from sklearn.model_selection import GridSearchCV, KFold
+
+    from tasks.aoa.estimators.kernel_ridge import PENALTIES, WIDTHS, KernelRegression
+
+    generator = np.random.default_rng(0)
+    feature, offset = generator.normal(size=(60, 21)), generator.normal(size=(60, 3))
+    offset[:, 0] += feature[:, 0]
+    gamma, alpha = KernelRegression(Settings(room.grid, seed=3))._choose(feature, offset)
+    some = feature[:, ::7]
+    apart = [7 * np.square(some[i] - some[j]).sum() for i in range(60) for j in range(60) if i != j]
+    grid = {"gamma": [width / np.median(apart) for width in WIDTHS], "alpha": PENALTIES}
+    folds = KFold(5, shuffle=True, random_state=3)
+    search = GridSearchCV(KernelRidge(kernel="rbf"), grid, cv=folds, scoring="neg_mean_absolute_error")
+    best = search.fit(feature, offset).best_params_
+    assert gamma == pytest.approx(best["gamma"])
+    assert alpha == best["alpha"]
+
+
 @pytest.mark.parametrize("circular", [False, True])
 def test_pointwise_convolutions_are_matrix_products(circular):
     """The same function with the same weights, in value and gradient."""

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from sklearn.kernel_ridge import KernelRidge
-from sklearn.metrics.pairwise import rbf_kernel
+from sklearn.metrics.pairwise import euclidean_distances, rbf_kernel
 from sklearn.model_selection import GridSearchCV, KFold
 from threadpoolctl import threadpool_limits
 from torch import Tensor
@@ -22,6 +22,9 @@ from swiftwrf.angles import AngularGrid, to_angles, to_direction
 from swiftwrf.checkpoint import Header, expect
 from swiftwrf.data.spectra import coarsening
 from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator, Settings
+
+WIDTHS = (0.1, 0.3, 1.0, 3.0)  # of the kernel, as gamma times the median squared distance
+PENALTIES = [1e-4, 1e-3, 1e-2, 1e-1]
 
 
 @ESTIMATORS.register(
@@ -42,16 +45,26 @@ class KernelRegression(SavedEstimator):
         feature = np.concatenate([self._feature(part) for part in train.batches()])[order]
         direction = to_direction(*train.label.unbind(-1)).numpy()[order]
         self._mean = direction.mean(axis=0)
-        some = feature[: self.CHOSEN_ROWS]
-        apart = ((some[:, None, ::7] - some[None, :, ::7]) ** 2).sum(axis=-1) * 7  # every seventh pixel will do
-        width = 1 / max(float(np.median(apart[~np.eye(len(some), dtype=bool)])), 1e-9)
-        grid = {"alpha": [1e-4, 1e-3, 1e-2, 1e-1], "gamma": [factor * width for factor in (0.1, 0.3, 1.0, 3.0)]}
-        folds = KFold(min(5, len(some)), shuffle=True, random_state=self.settings.seed)
-        search = GridSearchCV(KernelRidge(kernel="rbf"), grid, cv=folds, scoring="neg_mean_absolute_error", refit=False)
+        chosen = slice(self.CHOSEN_ROWS)
+        gamma, alpha = self._choose(feature[chosen], direction[chosen] - self._mean)
+        regression = KernelRidge(kernel="rbf", alpha=alpha, gamma=gamma).fit(feature, direction - self._mean)
+        self._known, self._weight, self._gamma = feature, regression.dual_coef_, gamma
+
+    def _choose(self, feature: NDArray[Any], offset: NDArray[Any]) -> tuple[float, float]:
+        """Width gamma and penalty alpha with the least mean absolute error on held-out rows."""
+        apart = euclidean_distances(feature[:, ::7], squared=True) * 7  # every seventh pixel will do
+        width = 1 / max(float(np.median(apart[~np.eye(len(feature), dtype=bool)])), 1e-9)
+        folds = KFold(min(5, len(feature)), shuffle=True, random_state=self.settings.seed)
+        found = []
         with threadpool_limits(1):  # many small problems: several threads would mostly wait for each other
-            search.fit(some, direction[: self.CHOSEN_ROWS] - self._mean)
-        regression = KernelRidge(kernel="rbf", **search.best_params_).fit(feature, direction - self._mean)
-        self._known, self._weight, self._gamma = feature, regression.dual_coef_, float(search.best_params_["gamma"])
+            for gamma in (factor * width for factor in WIDTHS):
+                ridge = KernelRidge(kernel="precomputed")  # one kernel matrix serves all folds and penalties
+                search = GridSearchCV(
+                    ridge, {"alpha": PENALTIES}, cv=folds, scoring="neg_mean_absolute_error", refit=False
+                )
+                search.fit(rbf_kernel(feature, gamma=gamma), offset)
+                found.append((search.best_score_, gamma, search.best_params_["alpha"]))
+        return max(found)[1:]
 
     def estimate(self, spectrum: Tensor) -> Tensor:
         pointing = rbf_kernel(self._feature(spectrum), self._known, self._gamma) @ self._weight + self._mean
