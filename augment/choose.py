@@ -10,6 +10,7 @@ import torch
 
 from augment.synthesizers import SYNTHESIZERS, Settings, Synthesizer, lacks, make_synthesizer
 from swiftwrf import FitError, InputError, Spectra
+from swiftwrf.data.spectra import check_training
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import thinned
 from swiftwrf.metrics import psnr
@@ -22,9 +23,12 @@ SLOW = ("nerf2", "wrfgs", "vae", "dcgan", "raytrace")  # compared only where the
 class Trial:
     """A synthesizer fitted without some measured spectra, and those.
 
+    What a search decides (which planes there are, how many primitives) was decided without the `out` of the first trial
+    only; what is fitted (where the planes are, how they reflect) was fitted without each one's.
+
     Args:
         synthesizer: fitted to `kept`.
-        kept, out: measured spectra that it saw and did not see.
+        kept, out: measured spectra that it was fitted to, and those that it was not.
     """
 
     synthesizer: Synthesizer
@@ -65,8 +69,9 @@ def choose_synthesizer(measured: Spectra, settings: Settings, names: Iterable[st
         names: of the candidates; all that apply and are fast unless given.
 
     Raises:
-        InputError: fewer than 10 spectra, or no candidate that can be fitted.
+        InputError: fewer than 10 spectra, something not finite, or no candidate that can be fitted.
     """
+    check_training(measured)
     fold = folds(measured.position, settings.validation, settings.seed)
     quiet = replace(settings, checkpoint=None, on_record=None, preset="quick", progress=False)
     score: dict[str, float] = {}
@@ -83,10 +88,11 @@ def choose_synthesizer(measured: Spectra, settings: Settings, names: Iterable[st
                     synthesizer.fit_like(trials[name][0].synthesizer, kept)
                 else:
                     synthesizer.fit(kept)
+                drawn = synthesizer.synthesize(out.position)
             except (InputError, FitError):  # one that cannot be fitted here is no candidate
                 break
             trials[name].append(Trial(synthesizer, kept, out))
-            found.append(psnr(synthesizer.synthesize(out.position), out.spectrum))
+            found.append(psnr(drawn, out.spectrum))
         else:
             score[name] = float(torch.cat(found).median())
         shared = sum(trial.synthesizer.shared_seconds for trial in trials[name])

@@ -15,6 +15,7 @@ from swiftwrf.positions import nearest
 
 FURTHER = -1  # index of a place that is no place of the data set
 FLAT = 1e-3  # extent below which a direction of the region counts as none, as a share of the largest
+LEAST = 1e-3  # share of the hull that the region takes up at least
 NEAR = 0.95  # quantile of the measured neighbours' distances within which a drawn place has a measured one
 
 
@@ -55,7 +56,8 @@ def draw_positions(known: Tensor, n: int, seed: int) -> Tensor:
     """Positions (n, 3) drawn evenly in the region of known ones (m, 3) [m].
 
     The region is the positions' convex hull, in as many dimensions as they extend in, without what lies farther from all of
-    them than they do from each other: a hull alone would fill the inside of a path round a room.
+    them than they do from each other: a hull alone would fill the inside of a path round a room. Where spots were measured
+    again and again, within a tracker's error, that would leave next to nothing; it reaches as far as `LEAST` asks for then.
     """
     generator = np.random.default_rng(seed)
     centre = known.mean(dim=0)
@@ -63,13 +65,16 @@ def draw_positions(known: Tensor, n: int, seed: int) -> Tensor:
     axes = axes[extent > FLAT * extent[0].clamp_min(1e-12)]  # the directions in which the positions extend
     flat = ((known - centre) @ axes.T).numpy()
     # eight nearest neighbours make the scale of a region; the nearest one alone would be the step along a path
-    apart, _ = nearest(known, known, min(9, len(known)))  # each is its own nearest
+    spots = known.unique(dim=0)
+    apart, _ = nearest(spots, spots, min(9, len(spots)))  # each is its own nearest
     scale = float(apart[:, -1].quantile(NEAR))
-    drawn = torch.empty(0, 3, dtype=torch.float64)
+    drawn, tried = torch.empty(0, 3, dtype=torch.float64), 0
     while len(drawn) < n:
         inside = torch.from_numpy(_in_hull(flat, 2 * n, generator)) @ axes + centre
         near = nearest(inside, known, 1)[0][:, 0] <= scale
-        drawn = torch.cat([drawn, inside[near]])
+        tried, drawn = tried + len(inside), torch.cat([drawn, inside[near]])
+        if tried * LEAST >= 1 and len(drawn) < tried * LEAST:
+            scale, tried, drawn = 2 * scale, 0, drawn[:0]
     return drawn[:n]
 
 

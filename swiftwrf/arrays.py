@@ -17,6 +17,7 @@ LIGHT_SPEED = 299_792_458.0  # [m / s]
 MOST_ELEMENTS = 4096  # of an array: what follows grows with their square
 MOST_VALUES = 2**28  # of the co-array's functions on a grid: 2 GiB
 SAME = 1e-6  # differences closer than this share of a wavelength are one
+OPPOSITE = 1e-2  # an element closer than this share of a wavelength to where it would lie opposite does so
 AT_ONCE, MOST_PAIRS = 256, 2**24  # spectra, and pairs of elements, in double precision
 
 
@@ -73,6 +74,16 @@ class PlanarArray:
         number r * columns + c, columns ascend along x and rows along y."""
         y, x = (spacing * (torch.arange(n, dtype=torch.float64) - (n - 1) / 2) for n in (rows, columns))
         return cls(torch.cartesian_prod(y, x).flip(1), LIGHT_SPEED / frequency_hz)
+
+    @property
+    def opposite(self) -> Tensor | None:
+        """Which element lies across the array's centre from each one, (K,); None where none does for one of them.
+
+        An array with such elements cannot tell a channel from its conjugate, seen by an array turned by half a turn.
+        """
+        centre = (self.element.amax(dim=0) + self.element.amin(dim=0)) / 2
+        apart, number = torch.cdist(2 * centre - self.element, self.element).min(dim=1)
+        return number if bool((apart < OPPOSITE * self.wavelength).all()) else None
 
     def phase(self, direction: Tensor) -> Tensor:
         """By how much each element leads the origin for a wave from unit vectors (..., 3), (..., K) [rad] (paper, the

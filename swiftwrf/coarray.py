@@ -78,7 +78,7 @@ def _offset(flat: Tensor, functions: Tensor, inverse: Tensor) -> Tensor:
     The residual of (s + c)^2 is that of s^2 plus 2 c times that of s: a line in c, whose shortest point is known.
     """
     residual, of_square = (x - x @ inverse @ functions for x in (flat, flat.square()))
-    least = -(residual * of_square).sum(1) / (2 * residual.square().sum(1)).clamp_min(1e-300)
+    least = -(residual * of_square).sum(1) / (2 * residual.square().sum(1)).clamp_min(torch.finfo(flat.dtype).tiny)
     return least.clamp_min(0)[:, None]
 
 

@@ -21,6 +21,7 @@ from augment import (
     withhold,
 )
 from augment.choose import candidates
+from augment.places import draw_positions
 from augment.synthesizers.idw import weights
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, simulated_room
 from swiftwrf.metrics import psnr
@@ -137,6 +138,17 @@ def test_places_are_not_drawn_inside_a_ring():
     assert (places.position[:, :2] - torch.tensor([3.0, 2.5])).norm(dim=1).min() > 0.4
 
 
+@pytest.mark.parametrize("jitter", [0.0, 1e-3])
+def test_places_are_drawn_between_spots_that_were_measured_again_and_again(jitter):
+    generator = torch.Generator().manual_seed(0)
+    spot = 10 * torch.rand(30, 2, dtype=torch.float64, generator=generator).repeat_interleave(12, 0)
+    spot = spot + jitter * torch.randn(360, 2, dtype=torch.float64, generator=generator)
+    known = torch.cat([spot, torch.full((360, 1), 1.5, dtype=torch.float64)], dim=1)
+    drawn = draw_positions(known, 100, seed=0)
+    assert len(drawn) == 100
+    assert torch.cdist(drawn, known).amin(dim=1).max() > 10 * jitter
+
+
 def test_direction_needs_to_know_the_fixed_end():
     with pytest.raises(InputError, match="where the fixed end stands"):
         draw_places(replace(ROOM, fixed_position=None), 10, seed=0)
@@ -171,6 +183,10 @@ def test_choice_takes_the_best_on_held_out_spectra_and_sees_nothing_else():
     assert "geometry" in candidates(TRAIN)
     assert not set(PUBLISHED) & set(candidates(TRAIN))  # they take minutes
     assert not {"geometry", "hybrid", "coarray"} & set(candidates(replace(TRAIN, array=None)))
+    spectrum = TRAIN.spectrum.clone()
+    spectrum[5, 2, 3] = torch.nan
+    with pytest.raises(InputError, match="spectrum of training spectrum 5 is not finite"):
+        choose_synthesizer(replace(TRAIN, store=Store(spectrum)), Settings(), ("nearest", "gp"))
 
 
 @settings(max_examples=15, deadline=None)

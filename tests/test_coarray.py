@@ -11,6 +11,7 @@ from swiftwrf import AngularGrid, CoarrayModel, InputError, fit_coarray, load, l
 from swiftwrf.arrays import PlanarArray
 from swiftwrf.coarray import basis, differences
 from swiftwrf.metrics import psnr, ssim
+from swiftwrf.store import Store
 
 GRID = AngularGrid.hemisphere(15, 60)
 
@@ -108,6 +109,16 @@ def test_fit_goes_on_from_what_was_kept_and_refuses_what_is_of_others(room, tmp_
     assert torch.equal(again.synthesize(room.position), model.synthesize(room.position))
     with pytest.raises(InputError, match="another fit"):
         fit_coarray(room, seed=1, checkpoint=kept)
+    other = replace(room, array=PlanarArray(room.array.element, 1.1 * room.array.wavelength))
+    with pytest.raises(InputError, match="another fit"):
+        fit_coarray(other, checkpoint=kept)
+
+
+def test_a_spectrum_without_any_signal_spoils_nothing(room):
+    spectrum = room.spectrum.clone()
+    spectrum[3] = 0
+    model = fit_coarray(replace(room, store=Store(spectrum)))
+    assert psnr(model.synthesize(room.position[4:]), spectrum[4:]).median() > 15
 
 
 def test_refuses_spectra_of_an_unknown_array_and_positions_that_are_none(room):

@@ -10,10 +10,13 @@ import torch
 from swiftwrf import AngularGrid, InputError, Spectra, simulated_room
 from swiftwrf.arrays import PlanarArray
 from swiftwrf.geometry import GeometryConfig, GeometryModel, fit_geometry
-from swiftwrf.geometry.hybrid import HybridModel, fit_hybrid
+from swiftwrf.geometry.fit import observe
+from swiftwrf.geometry.hybrid import HybridModel, _strengths, fit_hybrid
 from swiftwrf.geometry.images import Scene, field, mirror, sequences
 from swiftwrf.geometry.observe import autocorrelation, correlations, element_phases
 from swiftwrf.geometry.refine import derivatives
+from swiftwrf.geometry.strengths import Smoothness, Strengths, fit_strengths
+from swiftwrf.gp import Kernel
 from swiftwrf.metrics import psnr
 from swiftwrf.store import Store
 
@@ -82,6 +85,19 @@ def noisy():
 @pytest.fixture(scope="module")
 def room(noisy):
     return fit(noisy)
+
+
+def test_elements_may_be_listed_in_any_order():
+    """Of phases that the spectra cannot tell apart, one fits the room, wherever each element's opposite one is listed."""
+    order = torch.randperm(16, generator=torch.Generator().manual_seed(1))
+    plain, shuffled = ARRAY, PlanarArray(ARRAY.element[order], ARRAY.wavelength)
+    normal = torch.tensor([list(SIX)], dtype=torch.float64)
+    offset = torch.tensor([list(SIX.values())], dtype=torch.float64)
+    for array in (plain, shuffled):
+        scene, _ = observe(spectra(SIX, array=array))
+        waves = field(scene, normal, offset, torch.full((1, 6), -0.6), sequences(normal[0], 2))[0]
+        assert float(scene.score(scene.wave(scene.transmitter) + waves)) < 1e-3
+    assert PlanarArray(ARRAY.element[:7], ARRAY.wavelength).opposite is None
 
 
 def test_phases_of_the_elements_follow_from_the_spectra():
@@ -263,6 +279,23 @@ def test_strengths_follow_a_shadow():
     like = fit_hybrid(train.subset(torch.arange(60)), room, like=hybrid)  # too few to choose, enough to go on from
     assert like.strengths is not None
     assert like.strengths.smoothness == hybrid.strengths.smoothness
+
+
+def test_strengths_are_held_out_from_spectra_that_were_not_observed_too(monkeypatch):
+    """What stands for predictions of one fold follows from the observed spectra of the other folds."""
+    monkeypatch.setattr("swiftwrf.geometry.fit.MOST", 40)
+    data, fold = spectra(SIX, n=80), torch.arange(80) % 3
+    room = fit(data, further=0)
+    smoothness = Smoothness(Kernel(long=0.5, short=1.0, share=1.0, noise=1e-3), misfit=0.3)
+    chosen = Strengths(smoothness, data.position, torch.zeros(80, 1))
+    like = HybridModel(room, chosen, 1.0, smoothness.kernel, data.position, torch.zeros(80, 0), torch.zeros(1, 1))
+    _, known = _strengths(data, room, fold, 0, like)
+    scene, rows = observe(data)
+    assert len(rows) <= 40
+    for number in range(3):
+        fitted = fit_strengths(room, scene.subset((fold[rows] != number).nonzero()[:, 0]), smoothness)
+        expected = ARRAY.spectrum(fitted.channel(room, data.position[fold == number]), GRID)
+        torch.testing.assert_close(known[fold == number], expected)
 
 
 def test_strengths_stay_constant_where_nothing_is_hidden():

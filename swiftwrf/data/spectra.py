@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import torch
@@ -202,7 +202,10 @@ def _not_finite(values: Tensor) -> Tensor:
 
 
 def fingerprint(train: Spectra, *settings: Any) -> str:
-    """Tells whether something kept on disk belongs to these spectra and settings (plain values)."""
-    digest = hashlib.sha256(json.dumps([*settings, train.store.digest()]).encode())
+    """Tells whether something kept belongs to these spectra, what is known of their scene, and settings (plain values)."""
+    array = train.array and [train.array.wavelength, train.array.element.tolist()]
+    known = [None if value is None else value.tolist() for value in (train.rotation, train.fixed_position)]
+    scene = [asdict(train.grid), train.moving, array, *known]
+    digest = hashlib.sha256(json.dumps([*settings, scene, train.store.digest()]).encode())
     digest.update(train.position.numpy().tobytes())
     return digest.hexdigest()

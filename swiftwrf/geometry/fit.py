@@ -85,7 +85,7 @@ def fit_geometry(
     room = Planes.of(found).refined(scene)
     splits = split(scene, fold)
     room = _settled(_pruned(room, scene, splits), scene)
-    room = _extended(room, scene, splits, config)
+    room = _extended(room, scene, splits, config, seed)
     room = _with_order(room, splits, config.max_order)
     return judged(train, scene, room.refined(scene), score, config.reach)
 
@@ -190,9 +190,11 @@ def _settled(room: Planes, scene: Scene) -> Planes:
     return room
 
 
-def _extended(room: Planes, scene: Scene, splits: list[tuple[Scene, Scene]], config: GeometryConfig) -> Planes:
+def _extended(
+    room: Planes, scene: Scene, splits: list[tuple[Scene, Scene]], config: GeometryConfig, seed: int
+) -> Planes:
     """With further planes of any orientation, as long as held-out spectra need them."""
-    some = _some(scene, config.positions, 0)
+    some = _some(scene, config.positions, seed)
     for _ in range(config.further):
         if float(some.score(room.field(some))) < PERFECT:
             break

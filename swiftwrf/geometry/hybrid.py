@@ -175,12 +175,8 @@ def _strengths(
         return None, geometry.synthesize(train.position)
     strengths = fit_strengths(geometry, scene, smoothness)
     known = torch.empty(len(train), *geometry.grid.shape)
-    unseen = torch.ones(len(train), dtype=torch.bool)
-    unseen[rows] = False
-    if unseen.any():
-        known[unseen] = _room(geometry, strengths, train.position[unseen])
     for number in fold.unique():
-        out = rows[fold[rows] == number]
+        out = (fold == number).nonzero()[:, 0]  # those of which nothing was observed, too
         kept = scene.subset((fold[rows] != number).nonzero()[:, 0])
         known[out] = _room(geometry, fit_strengths(geometry, kept, smoothness), train.position[out])
     return strengths, known

@@ -31,7 +31,8 @@ class Scene:
         end: which of them moves.
         element: phase that a wave from unit vector u gains at each element is element @ u, float32 (K, 3) [rad].
         wavenumber: [rad / m].
-        channel: observed phases, complex64 (n, 2, K): of unit modulus, and the same seen by an array turned by half a turn.
+        channel: observed phases, complex64 (n, 2, K): of unit modulus, and the same seen by an array turned by half a turn,
+            which the spectra cannot tell apart where each element has an opposite one.
     """
 
     transmitter: Tensor
@@ -49,7 +50,8 @@ class Scene:
         transmitter, receiver = (position, fixed[None]) if moving == "transmitter" else (fixed[None], position)
         wavenumber = 2 * math.pi / array.wavelength
         element = wavenumber * array.element.double() @ rotation[:, :2].T.double()
-        both = torch.stack([channel, channel.conj().flip(1)], dim=1)
+        opposite = array.opposite
+        both = torch.stack([channel, channel if opposite is None else channel.conj()[:, opposite]], dim=1)
         return cls(transmitter, receiver, moving, element.float(), wavenumber, both.to(torch.complex64))
 
     def __len__(self) -> int:
@@ -119,6 +121,14 @@ def images(scene: Scene, normal: Tensor, offset: Tensor, sequence: list[Sequence
                 i = s[end - 1]
                 found[s[:end]] = mirror(found[s[: end - 1]], normal[:, i, None], offset[:, i, None])
     return torch.stack([found[s] for s in sequence], dim=1)
+
+
+def turn_of(scene: Scene, normal: Tensor, offset: Tensor, plane: int) -> float:
+    """By how much a plane of the room (1, P, 3), (1, P) moves to turn the phase of its reflection by a full turn, on
+    average [m]."""
+    ray = images(scene, normal, offset, [(plane,)])[0, 0] - scene.receiver
+    cosine = float((ray @ normal[0, plane] / ray.norm(dim=-1)).abs().mean().clamp_min(0.3))
+    return math.pi / (scene.wavenumber * cosine)
 
 
 def field(scene: Scene, normal: Tensor, offset: Tensor, gain: Tensor, sequence: list[Sequence]) -> Tensor:

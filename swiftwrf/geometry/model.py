@@ -54,7 +54,8 @@ class GeometryModel(Saved):
         moving: which end moves.
         planes: what was found, none where there was nothing to find.
         order: of the images.
-        score_held_out: 1 - correlation of predicted and observed co-array numbers of training spectra that were held out.
+        score_held_out: 1 - correlation of predicted and observed co-array numbers of training spectra that were held out
+            from the search for planes along the sides, its first stage.
         unexplained: share of the power of all training spectra's co-array numbers that the prediction leaves.
         verdict: the finding in a sentence.
         covariance: of the offsets [m^2], (P, P).
@@ -82,8 +83,8 @@ class GeometryModel(Saved):
 
         Args:
             position: [m], (n, 3).
-            generator: draws a sample - plane offsets within their deviations, paths that are blocked, further paths as
-                strong as what the planes leave - instead of the most plausible spectrum.
+            generator: draws a sample - plane offsets within their deviations (anew for every `batch` spectra), paths that
+                are blocked, further paths as strong as what the planes leave - instead of the most plausible spectrum.
             batch: spectra at a time.
 
         Returns:

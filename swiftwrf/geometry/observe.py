@@ -35,7 +35,7 @@ def correlations(spectra: Spectra) -> Tensor:
     assert spectra.array is not None
     functions = basis(spectra.array, spectra.grid)
     stride = max(1, functions.shape[1] // PIXELS)
-    stride += 1 - stride % 2  # odd, so that it does not keep to some columns only
+    stride += 1 - stride % 2  # odd: an even one would keep to every other column
     inverse = torch.linalg.pinv(functions[:, ::stride])
     some = (part.flatten(1)[:, ::stride] for part in spectra.store.batches())
     coefficient = torch.cat([part.double().square() @ inverse for part in some])

@@ -36,8 +36,7 @@ def candidates(scene: Scene, base: Tensor, reach: float, top: int) -> list[tuple
         top: how many.
     """
     both = torch.cat([scene.transmitter, scene.receiver])
-    moving = scene.transmitter if len(scene.transmitter) > 1 else scene.receiver
-    rows = (moving - moving.mean(0)).norm(dim=1).argsort()[:NEAR]
+    rows = (scene.moving - scene.moving.mean(0)).norm(dim=1).argsort()[:NEAR]
     near, base = scene.subset(rows), base[rows]
     found: list[tuple[float, Tensor, float, float]] = []
     distance = torch.arange(0.5, reach * scene.wavenumber, 0.6, dtype=torch.float64) / scene.wavenumber

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from swiftwrf.arrays import PlanarArray
-from swiftwrf.geometry.images import Scene, Sequence, field, images, sequences
+from swiftwrf.geometry.images import Scene, Sequence, field, sequences, turn_of
 from swiftwrf.geometry.observe import autocorrelation
 from swiftwrf.geometry.refine import refine
 from swiftwrf.geometry.search import Room
@@ -68,17 +68,10 @@ def clearly(a: Tensor, b: Tensor) -> float:
     return max(advantage(a, b), advantage(explained(a), explained(b)))
 
 
-def turn_of(scene: Scene, room: Planes, plane: int) -> float:
-    """By how much a plane moves to turn the phase of its reflection by a full turn, on average [m]."""
-    ray = images(scene, room.normal, room.offset, [(plane,)])[0, 0] - scene.receiver
-    cosine = float((ray @ room.normal[0, plane] / ray.norm(dim=-1)).abs().mean().clamp_min(0.3))
-    return math.pi / (scene.wavenumber * cosine)
-
-
 def flipped(scene: Scene, room: Planes, plane: int = -1) -> list[Planes]:
     """The rooms in which a plane reflects with the other sign, and its wave is in step again to either side."""
     plane %= room.normal.shape[1]
-    turn, rooms = turn_of(scene, room, plane), []
+    turn, rooms = turn_of(scene, room.normal, room.offset, plane), []
     for step in (-turn / 2, turn / 2):
         offset, gain = room.offset.clone(), room.gain.clone()
         offset[:, plane] += step

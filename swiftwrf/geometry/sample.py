@@ -38,8 +38,8 @@ def draw(
     residual: Residual,
     generator: torch.Generator,
 ) -> Tensor:
-    """One field a position, complex64 (n, K): planes (1, P, 3), (1, P) moved once for all positions within their
-    covariance [m^2], each path there or not, further paths from anywhere."""
+    """One field a position, complex64 (n, K): planes (1, P, 3), (1, P) moved once a call within their covariance
+    [m^2], each path there or not, further paths from anywhere."""
     n, k = len(scene), len(scene.element)
     direct = (torch.rand(n, 1, generator=generator) < residual.direct).float()
     total = direct * scene.wave(scene.transmitter)

@@ -16,7 +16,7 @@ from dataclasses import field as of
 import torch
 from torch import Tensor
 
-from swiftwrf.geometry.images import Scene, field, images, sequences
+from swiftwrf.geometry.images import Scene, field, sequences, turn_of
 from swiftwrf.geometry.refine import refine
 
 SIDES = torch.tensor(
@@ -222,9 +222,7 @@ class Search:
                 continue
             one = Room(0.0, {side: room.offset[side]}, room.gain)
             normal, offset, _ = one.tensors()
-            ray = images(self.scene, normal, offset, [(0,)])[0, 0] - self.scene.receiver
-            cosine = float((ray @ SIDES[side] / ray.norm(dim=-1)).mean().abs().clamp_min(0.3))
-            turn = torch.pi / (self.scene.wavenumber * cosine)
+            turn = turn_of(self.scene, normal, offset, 0)
             low = float(self.offsets[side][0])
             steps = [room.offset[side] + m * turn for m in (0, -1, 1, -2, 2)]
             found.append([(o, room.gain[side]) for o in steps if o >= low - self.step])

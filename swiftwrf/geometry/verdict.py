@@ -8,9 +8,9 @@ from dataclasses import replace
 import torch
 
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.geometry.images import Scene, field
+from swiftwrf.geometry.images import Scene, field, turn_of
 from swiftwrf.geometry.model import GeometryModel, Plane
-from swiftwrf.geometry.planes import Planes, advantage, correlation_score, explained, flipped, turn_of
+from swiftwrf.geometry.planes import Planes, advantage, correlation_score, explained, flipped
 from swiftwrf.geometry.refine import deviations
 from swiftwrf.geometry.sample import Residual, residual_statistics
 
@@ -75,7 +75,7 @@ def _rival(scene: Scene, room: Planes, plane: int) -> tuple[float, float]:
     Rivals are the best place of a scan around the plane, and the places where a wave of the other sign is in step; each is
     refined together with all other planes.
     """
-    turn = turn_of(scene, room, plane)
+    turn = turn_of(scene, room.normal, room.offset, plane)
     step = torch.arange(turn / 2, 3.5 * turn, 0.4 / scene.wavenumber, dtype=torch.float64)
     beside = torch.cat([-step.flip(0), step])
     offset = room.offset.repeat(len(beside), 1)

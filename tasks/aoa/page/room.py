@@ -122,8 +122,9 @@ def room_section(share: Share) -> Section | None:
         "well, or held-out spectra hardly need the plane.",
     )
     text = (
-        f"1 - correlation with held-out spectra: {room['score_held_out']:.3f}; share of the spectra's power that the room "
-        f"leaves unexplained: {room['unexplained']:.0%}. The planes stand in geometry-mix{share.key}.json."
+        f"1 - correlation with spectra held out from the search's first stage: {room['score_held_out']:.3f}; share of the "
+        f"spectra's power that the room leaves unexplained: {room['unexplained']:.0%}. The planes stand in "
+        f"geometry-mix{share.key}.json."
     )
     points = share.run.arrays(f"room-mix{share.key}")
     plot = Plot(
