@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from tasks.aoa import arms
 from tasks.metrics import AoaMetrics, ErrorSummary, MixMetrics, RssiMetrics
 
 ROOT = Path(__file__).parent.parent
@@ -36,8 +37,7 @@ def markdown(columns: list[str], rows: list[list[str]]) -> str:
 
 def turbo_arm(mix: MixMetrics) -> str:
     """The network's arm with synthetic spectra, that with further positions if there is one."""
-    names = [name for name in mix["methods"] if name.startswith("turbo_")]
-    return max(names, key=lambda name: name.endswith("_extra"))
+    return arms.taken(mix["methods"])
 
 
 def interval(error: ErrorSummary) -> str:

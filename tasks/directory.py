@@ -160,7 +160,13 @@ class Run:
         if isinstance(threads, int) and 1 <= threads <= 1024:  # they are part of the seed
             set_threads(threads)
         here = environment(device, source)
-        session = {name: here[name] for name in ("commit", "start", "processes")}
+        versions = self._environment.get("packages")
+        if versions != here["packages"]:
+            other = ", ".join(f"{n} {v}" for n, v in (versions or {}).items() if here["packages"].get(n) != v)
+            raise InputError(
+                f"{self.folder} began with {other or 'other libraries'}; go on with these or start a new run"
+            )
+        session = {name: here[name] for name in ("commit", "start", "processes", "device")}
         self._environment["resumed"] = [*self._environment.get("resumed", []), session]
         self.write_json(ENVIRONMENT, self._environment)
 

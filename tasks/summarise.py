@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import cast
 
@@ -12,6 +13,7 @@ from pandas import DataFrame, Series
 from swiftwrf.metrics import summary
 from tasks.metrics import ErrorSummary
 
+LEAST_ROWS = 10  # of a test, for an interval of differences
 SHORTEST = 1e-5  # seconds: what took less is drawn here, for logarithmic axes have no zero
 
 
@@ -45,16 +47,20 @@ def averaged(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dic
 def paired_difference(errors: DataFrame, method: str, other: str) -> tuple[float, float, float]:
     """Mean of one method's errors minus another's on the same pairs, and its 95 % interval.
 
-    The interval is a bootstrap over test rows, for the receivers of one row are not independent.
+    The interval is a bootstrap over test rows, for the receivers of one row are not independent; nan for fewer than 10 rows,
+    with which a bootstrap sees differences where there are none.
 
     Args:
         errors: a column a method, one row a pair, indexed by `index` (the test row) and `receiver`.
     """
     difference = (errors[method] - errors[other]).groupby(level="index").agg(["sum", "count"]).to_numpy()
+    mean = float(difference[:, 0].sum() / difference[:, 1].sum())
+    if len(difference) < LEAST_ROWS:
+        return mean, math.nan, math.nan
     draws = np.random.default_rng(0).integers(len(difference), size=(1000, len(difference)))
     sums = difference[draws].sum(axis=1)
     low, high = np.percentile(sums[:, 0] / sums[:, 1], (2.5, 97.5))
-    return float(difference[:, 0].sum() / difference[:, 1].sum()), float(low), float(high)
+    return mean, float(low), float(high)
 
 
 def running_median(values: Series) -> Series:

@@ -101,6 +101,20 @@ def test_circular_padding_makes_rolled_spectra_alike():
     torch.testing.assert_close(convolution(x).roll(4, dims=-1), convolution(x.roll(4, dims=-1)))
 
 
+def test_the_headline_is_of_the_network_that_is_kept():
+    """Named by what trained it, not by its error on test spectra."""
+    names = [
+        "measured_only",
+        "turbo_gp",
+        "kernel_ridge_turbo_gp_extra",
+        "turbo_gp_extra",
+        "turbo_idw_extra",
+        "measured_all",
+    ]
+    assert arms.taken(names) == "turbo_gp_extra"
+    assert arms.taken(["turbo_gp", "turbo_idw", "kernel_ridge_turbo_gp"]) == "turbo_gp"
+
+
 def test_kernel_ridge_regression_chooses_as_a_plain_grid_search_does(room):
     """Width and penalty by one kernel matrix a width, as by scikit-learn's search over both with a kernel for each."""
     from sklearn.kernel_ridge import KernelRidge

@@ -158,6 +158,7 @@ def test_calibration_sees_the_training_part_alone(tmp_path, capsys):
         (("{source}", "{new}", "--grid", 1, 1), "--grid"),
         (("{source}", "{new}", "--every", 0), "--every must be at least 1"),
         (("{survey}", "{new}", "--calibrate"), "takes array snapshots"),
+        (("{source}", "{new}", "--split", "block"), "--split and --seed are of the calibration; give --calibrate, too"),
         (("{survey}", "{new}", "--beamformer", "capon"), "takes no beamformer"),
         (("{source}", "{new}", "--beamformer", "music"), "unknown beamformer"),
         (("{source}", "{new}", "--calibrate", "--split", "days"), "no split 'days'"),

@@ -104,6 +104,8 @@ def test_directions_of_measured_and_unknown_positions(finished, small, tmp_path,
     assert run("estimate", estimator, tmp_path / "unknown.npy", "--out", tmp_path / "unknown.csv") == 0
     unknown = pd.read_csv(tmp_path / "unknown.csv")
     assert unknown.columns.tolist() == ["index", "azimuth_deg", "elevation_deg"]
+    assert run("estimate", estimator, tmp_path / "unknown.npy", "--every", 7, "--out", tmp_path / "some.csv") == 2
+    assert "--every does not apply" in said(capsys)
     np.testing.assert_allclose(unknown["elevation_deg"], known["elevation_deg"], atol=0.05)  # 8 or 16 bits on disk
 
 

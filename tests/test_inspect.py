@@ -10,6 +10,8 @@ import torch
 from quick import said
 from samples import WAVELENGTH, write_snapshots, write_survey
 
+from swiftwrf import AngularGrid, simulated_room
+from swiftwrf.data.writing import write_spectra
 from tasks.inspect.findings import nearest
 
 
@@ -51,7 +53,18 @@ def test_survey(tmp_path, capsys):
 
 def test_the_nearest_other_position():
     position = torch.tensor([[0.0, 0, 0], [0, 0, 2], [0, 1, 0], [0, 1, 0]], dtype=torch.float64)
-    assert nearest(position).tolist() == [1, 2, 0, 0]
+    rows, apart = nearest(position)
+    assert rows.tolist() == [0, 1, 2, 3]
+    assert apart.tolist() == [1, 2, 0, 0]
+
+
+def test_more_positions_than_are_looked_at(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("tasks.inspect.findings.MOST_POSITIONS", 20)
+    room = simulated_room(n=15, grid=AngularGrid.hemisphere(8, 32))
+    (tmp_path / "source").mkdir()
+    write_spectra(room.subset(torch.arange(15).repeat(2)), tmp_path / "source")
+    assert run(tmp_path / "source", "--out", tmp_path / "page") == 0
+    assert "30 positions occur more than once" in capsys.readouterr().out
 
 
 def test_refusals_leave_nothing(tmp_path, capsys):

@@ -105,6 +105,25 @@ def test_resume_refuses_changed_data(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "run.partial" / "steps" / "mean.json").exists()
 
 
+def test_resume_refuses_other_versions(stopped, capsys):
+    """A library of another version computes other numbers; on a cluster, too, such workers are refused."""
+    file = stopped / "environment.json"
+    content = json.loads(file.read_text())
+    file.write_text(json.dumps(content | {"packages": content["packages"] | {"torch": "0.1"}}))
+    assert run("rssi", "--resume", stopped) == 2
+    assert "began with torch 0.1; go on with these" in said(capsys)
+    assert (stopped / "steps" / "mean.json").exists()
+
+
+def test_report_says_where_a_run_went_on(stopped):
+    file = stopped / "environment.json"
+    content = json.loads(file.read_text())
+    file.write_text(json.dumps(content | {"device": "an abacus"}))
+    assert run("rssi", "--resume", stopped) == 0
+    report = (stopped.with_name("run") / "report.html").read_text()
+    assert f"; device {content['device']})" in report
+
+
 def test_resumed_run_keeps_its_number_of_threads(stopped):
     file = stopped / "environment.json"
     content, before = json.loads(file.read_text()), torch.get_num_threads()

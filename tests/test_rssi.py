@@ -19,9 +19,11 @@ from swiftwrf.comparison import NeRF2RssiConfig, NeRF2RssiSize
 from swiftwrf.data.splits import folds
 from tasks.report import merge
 from tasks.rssi import experiment
+from tasks.rssi.page.summary import varies
 from tasks.rssi.predictors import PREDICTORS, Settings, blend, lacks, nerf2
 from tasks.rssi.predictors.regressors import NEIGHBOURS
 from tasks.run import command_line
+from tasks.summarise import paired_difference
 
 
 def law_only(n=60, noise=0.0, level=-50.0, exponent=2.0, seed=0):
@@ -249,3 +251,19 @@ def test_a_blend_weighs_noisy_parts(monkeypatch):
     assert sum(blended.weights.values()) == pytest.approx(1)
     assert min(blended.weights.values()) > 0.05
     assert blended.predict(test.transmitter_position).shape == test.rssi_dbm.shape
+
+
+@pytest.mark.parametrize(("rows", "known"), [(1, False), (9, False), (10, True)])
+def test_few_test_rows_tell_no_difference(rows, known):
+    index = pd.MultiIndex.from_product([range(rows), ["a", "b"]], names=["index", "receiver"])
+    errors = pd.DataFrame({"one": np.arange(2.0 * rows), "other": 1.0}, index=index)
+    mean, low, high = paired_difference(errors, "one", "other")
+    assert mean == pytest.approx(rows - 1.5)
+    assert (low < mean < high) == known
+
+
+def test_an_interval_of_one_width_sends_nobody_to_measure():
+    even = np.full((2, 4, 5), [[[7.0]], [[8.0]]])
+    assert not varies(even)
+    even[1, 2, 3] += 1
+    assert varies(even)

@@ -34,8 +34,13 @@ def test_receivers_by_number_name_and_all(folder):
     assert data.receivers(["b", "1"]).receiver_names == ("b", "a")
     with pytest.raises(InputError, match="there are 1 a, 2 b, 3 c"):
         data.receivers(["4"])
+    every = data.receivers(["all"])
+    assert every.receiver_names == ("a", "b")
+    assert every.notes == ("receivers heard in fewer than 10 rows are left out: c",)
     with pytest.raises(InputError, match=r"'c'.*5 rows"):
-        data.receivers(["all"])
+        data.receivers(["c"])
+    with pytest.raises(InputError, match="was heard in 10 rows"):
+        data.columns([2]).receivers(["all"])
     with pytest.raises(InputError, match="once"):
         data.receivers(["a", "1"])
 

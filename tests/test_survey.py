@@ -53,6 +53,16 @@ def test_long_table(tmp_path):
     assert same(load_rssi(tmp_path / "walk.csv"))
 
 
+def test_long_parquet_may_lack_times_and_not_receivers(tmp_path):
+    times = [*pd.date_range("2026-01-01", periods=11, freq="s"), pd.NaT]
+    table = pd.DataFrame({"x": range(12), "y": 1.0, "z": 1.0, "time": times, "receiver": "a", "rssi": -50.0})
+    table.to_parquet(tmp_path / "walk.parquet")
+    assert len(load_rssi(tmp_path / "walk.parquet")) == 12
+    table.assign(receiver=["a"] * 4 + [None] + ["a"] * 7).to_parquet(tmp_path / "walk.parquet")
+    with pytest.raises(InputError, match="row 5 has no receiver"):
+        load_rssi(tmp_path / "walk.parquet")
+
+
 def test_packets_of_one_place_have_a_row_each(tmp_path):
     header = ["x", "y", "Receiver Name", "RSSI [dBm]"]
     rows = [[1, 1, "a", -50], [1, 1, "b", -60], [1, 1, "a", -52], [2, 2, "b", -70]]
@@ -105,6 +115,10 @@ def test_columns_named_by_the_user(tmp_path):
         load_rssi(file)
     data = load_rssi(file, columns={"x": "easting_of_robot", "rssi": "ap *"})
     assert data.receiver_names == ("ap one", "ap two")
+    named = write_survey(
+        tmp_path, "named.csv", header=["x", "y", "a[1]", "a1"], rows=[[i, i, -50, -60] for i in range(12)]
+    )
+    assert load_rssi(named, columns={"rssi": "a[1]"}).receiver_names == ("a[1]",)  # before it is taken for a pattern
     with pytest.raises(InputError, match="no column 'nowhere' for y"):
         load_rssi(file, columns={"x": "easting_of_robot", "y": "nowhere"})
     with pytest.raises(InputError, match="columns takes x, y, z, time, receiver, rssi, got 'w'"):
@@ -155,6 +169,11 @@ REFUSED = {
     "empty position": (_table("x,y,a", ",2,-50", "1,2,-50"), "row 1 has no usable x"),
     "far position": (_table("x,y,a", "1e12,2,-50"), "at most 1e"),
     "too strong": (_table("x,y,a", "1,2,-50", "1,2,-50", "1,2,31"), "row 3, receiver a: 31 dBm"),
+    "too strong, long": (
+        _table("x,y,receiver,rssi", "1,2,a,-50", "1,2,b,-50", "2,2,a,31"),
+        "row 3, receiver a: 31 dBm",
+    ),
+    "no receiver": (_table("x,y,receiver,rssi", "1,2,a,-50", "1,2,,-50"), "row 2 has no receiver in column receiver"),
     "never heard": (_table("x,y,a", "1,2,-100"), "no heard value"),
     "ragged": (lambda f: write_survey(f) and (f / "walk.csv").write_text("x,y,a\n1,2\n"), "has 2 values"),
     "no rows": (lambda f: write_survey(f) and (f / "walk.csv").write_text("x,y,a\n"), "no rows"),

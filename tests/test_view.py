@@ -171,7 +171,14 @@ def test_angles_are_great_circles():
 def test_measurements_that_changed_or_went_are_not_shown(aoa_run, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(aoa_run, folder)
-    for file, key, value in (("environment.json", "input_sha256", {}), ("config.json", "data", str(tmp_path / "gone"))):
+    environment = json.loads((folder / "environment.json").read_text())
+    environment["input_sha256"]["scene box.xml"] = "of a scene that was traced"
+    (folder / "environment.json").write_text(json.dumps(environment))
+    assert opened(folder).data is not None
+    for file, key, value in (
+        ("environment.json", "input_sha256", {}),
+        ("config.json", "data", str(tmp_path / "gone")),
+    ):
         content = json.loads((folder / file).read_text())
         content.get("config", content)[key] = value
         (folder / file).write_text(json.dumps(content))

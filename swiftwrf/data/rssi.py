@@ -10,6 +10,8 @@ from torch import Tensor
 from swiftwrf.data.splits import MIN_TRAINING, choose_split
 from swiftwrf.errors import InputError
 
+MOST_LISTED = 12  # receivers that a note names
+
 
 @dataclass(frozen=True, eq=False)
 class Rssi:
@@ -65,12 +67,15 @@ class Rssi:
         return self.subset(train), self.subset(test)
 
     def receivers(self, asked: Sequence[str]) -> Rssi:
-        """Only the receivers asked for: names, numbers counted from 1 in file order, or `all`.
+        """Only the receivers asked for: names, numbers counted from 1 in file order, or `all`, which leaves out those that
+        were heard in fewer than 10 rows and says so in `notes`.
 
         Raises:
             InputError: a receiver that there is not, one asked for twice, or one heard in fewer than 10 rows.
         """
-        columns = list(range(len(self.receiver_names))) if list(asked) == ["all"] else [self._column(a) for a in asked]
+        if list(asked) == ["all"]:
+            return self._heard_enough()
+        columns = [self._column(a) for a in asked]
         if not columns or len(set(columns)) < len(columns):
             raise InputError(f"ask for each receiver once, got {' '.join(asked) or 'none'}")
         for column in columns:
@@ -81,6 +86,18 @@ class Rssi:
                     f"at least {MIN_TRAINING} are needed"
                 )
         return self.columns(columns)
+
+    def _heard_enough(self) -> Rssi:
+        enough = (~self.rssi_dbm.isnan()).sum(dim=0) >= MIN_TRAINING
+        if not bool(enough.any()):
+            raise InputError(f"no receiver of {self.name} was heard in {MIN_TRAINING} rows")
+        found = self.columns(enough.nonzero()[:, 0].tolist())
+        rare = [name for name, heard in zip(self.receiver_names, enough.tolist(), strict=True) if not heard]
+        if not rare:
+            return found
+        listed = ", ".join(rare[:MOST_LISTED]) + (f" and {len(rare) - MOST_LISTED} more" if rare[MOST_LISTED:] else "")
+        note = f"receivers heard in fewer than {MIN_TRAINING} rows are left out: {listed}"
+        return replace(found, notes=(*found.notes, note))
 
     def columns(self, columns: list[int]) -> Rssi:
         """The receivers of these columns, in this order."""

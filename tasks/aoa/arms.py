@@ -69,6 +69,13 @@ def is_turbo(name: str) -> bool:
     return training_of(name).startswith(TURBO)
 
 
+def taken(names: Iterable[str]) -> str:
+    """Of these arms, the network's that a user would take and a run keeps: with the spectra of the first synthesizer, at
+    further positions, too, where there are some. Errors play no part: the best of several on test spectra would flatter."""
+    own = [name for name in names if is_turbo(name) and is_network(name)]
+    return max(own, key=lambda name: name.endswith(EXTRA))  # the first of equals
+
+
 def drawn_by(names: Iterable[str]) -> list[str]:
     """The synthesizers whose spectra train some of these arms."""
     trainings = dict.fromkeys(training_of(name) for name in names if is_turbo(name))

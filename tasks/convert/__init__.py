@@ -33,8 +33,8 @@ class ConvertConfig(SpectraSource, TableSource):
     calibrate: bool = False
     """estimate phases of the elements and the array's orientation from the training positions of array snapshots, and take
     them out"""
-    split: str = "random"
-    """with --calibrate: the split whose training part it sees; it is written beside the spectra"""
+    split: str | None = None
+    """with --calibrate: the split whose training part it sees (random unless given); it is written beside the spectra"""
     seed: int = 0
     """of that split"""
 
@@ -48,6 +48,8 @@ def run(config: ConvertConfig, resume: Path | None = None) -> None:
     if resume is not None:
         raise InputError("a conversion cannot be resumed; start it again")
     how = reading(config)
+    if (config.split is not None or config.seed) and not config.calibrate:
+        raise InputError("--split and --seed are of the calibration; give --calibrate, too")
     with new_directory(Path(config.out), "a directory") as folder:
         data = read(config.source, how, SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
         found = None
@@ -70,7 +72,8 @@ def run(config: ConvertConfig, resume: Path | None = None) -> None:
 def _calibrated(data: Spectra | Snapshots | Rssi, config: ConvertConfig) -> tuple[Snapshots, Calibration]:
     if not isinstance(data, Snapshots):
         raise InputError("--calibrate takes array snapshots; spectra and RSSI do not hold the elements' phases")
-    train, test = data.split(config.split, config.seed)
+    name = config.split or "random"
+    train, test = data.split(name, config.seed)
     found = calibrate(train)
     phase, turn = float(found.phase_std.rad2deg().max()), float(found.turn.rad2deg().norm())
     console.print(
@@ -79,7 +82,7 @@ def _calibrated(data: Spectra | Snapshots | Rssi, config: ConvertConfig) -> tupl
         f"positions held out, {found.before:.0%} before"
     )
     rows = torch.searchsorted(data.index, train.index), torch.searchsorted(data.index, test.index)
-    return replace(found.apply(data), named_splits={**data.named_splits, config.split: rows}), found
+    return replace(found.apply(data), named_splits={**data.named_splits, name: rows}), found
 
 
 def _write(data: Spectra | Snapshots | Rssi, how: Reading, folder: Path) -> str:

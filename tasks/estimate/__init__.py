@@ -49,7 +49,11 @@ def run(config: EstimateConfig, resume: Path | None = None) -> None:
     estimator = load(config.estimator)
     if not isinstance(estimator, SavedEstimator):
         raise InputError(f"{config.estimator} holds a {estimator.kind}; give an estimator that tasks.aoa trained")
-    known = None if config.source.endswith(".npy") else read_spectra(config.source, reading(config))
+    how, known = reading(config), None
+    if not config.source.endswith(".npy"):
+        known = read_spectra(config.source, how)
+    elif how.given:
+        raise InputError(f"{config.source} holds spectra as they are; --{how.given[0]} does not apply")
     store = Store(_read_array(Path(config.source))) if known is None else known.store
     _check_like(estimator, store, known, config.source)
     estimate = torch.cat([estimator.estimate(part) for part in store.batches()])

@@ -86,8 +86,9 @@ def _positions(position: Tensor, findings: Findings, wavelength: float | None = 
         findings.warn(
             f"All positions have one {' and one '.join(flat)}; directions and planes cannot be told from them."
         )
-    near = nearest(position)
-    same = int((near == 0).sum())
+    _, near = nearest(position)
+    _, times = position.unique(dim=0, return_counts=True)
+    same = int(times[times > 1].sum())
     if same:
         findings.warn(f"{same} positions occur more than once; a random split puts the same place into both parts.")
     middle = float(near.median())
@@ -106,12 +107,12 @@ def _positions(position: Tensor, findings: Findings, wavelength: float | None = 
         findings.warn(f"{text}: interpolators see no fringes between such positions; geometry needs none.")
 
 
-def nearest(position: Tensor) -> Tensor:
-    """Distance from each position (n, 3) to the nearest other one, (n,) [m]; of many positions, from some."""
+def nearest(position: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows of positions (n, 3), all or, of many, some, and the distance from each to the nearest other one [m]."""
     some = torch.linspace(0, len(position) - 1, min(MOST_POSITIONS, len(position))).round().long()
     apart = torch.cat([distance(position[rows], position) for rows in some.split(500)])
     apart[torch.arange(len(some)), some] = torch.inf
-    return apart.amin(dim=1)
+    return some, apart.amin(dim=1)
 
 
 def _splits(data: Spectra | Snapshots | Rssi, findings: Findings) -> None:
@@ -267,10 +268,8 @@ def _columns(data: Rssi, heard: Tensor, findings: Findings) -> None:
         return len(others) > 0 and float(weakest.double().mean()) > REPEATED and float(others.min() - values.min()) > 3
 
     if repeated := those(edged):
-        low = float(data.rssi_dbm[heard].min())
         findings.warn(
-            f"One weakest value ({low:g} dBm) is frequent and stands apart; does it mean not heard? Receivers: "
-            f"{_listed(repeated)}."
+            f"The weakest value is frequent and stands apart; does it mean not heard? Receivers: {_listed(repeated)}."
         )
     filled = data.rssi_dbm.nan_to_num(0.0)
     same = [

@@ -123,13 +123,13 @@ def _directions(data: Spectra) -> Plot:
 
 def _neighbours(data: Spectra) -> Plot:
     figure, axes = figures.new_figure(1, 1, 6, 3)
-    apart = nearest(data.position)
+    rows, apart = nearest(data.position)
     axes[0].hist(apart.numpy(), bins=40, color=DOTS)
     if data.array is not None:
         axes[0].axvline(data.array.wavelength / 2, color="#ee6677")
     axes[0].set(xlabel="nearest other position [m]", ylabel="positions")
     caption = "Distance to the nearest other position; the line is half a wavelength."
-    return Plot("neighbours", figure, caption, _places(data.position, nearest_m=apart))
+    return Plot("neighbours", figure, caption, _places(data.position[rows], nearest_m=apart))
 
 
 def _floor(data: Rssi) -> Plot:

@@ -21,7 +21,7 @@ def provenance(runs: Sequence[Records[Any]]) -> Section:
         environment = run.environment
         packages = ", ".join(f"{name} {version}" for name, version in environment["packages"].items())
         resumed = ", ".join(
-            f"{session['start']} (commit {session['commit']})" for session in environment.get("resumed", [])
+            f"{session['start']} ({_changed(session, environment)})" for session in environment.get("resumed", [])
         )
         processes = environment.get("processes", 1)
         rows = [
@@ -42,3 +42,13 @@ def provenance(runs: Sequence[Records[Any]]) -> Section:
         ]
         tables.append(Table(["", ""], rows, long=True))
     return Section("Provenance", tables=tables)
+
+
+def _changed(session: dict[str, Any], first: dict[str, Any]) -> str:
+    """The code of a session that went on, and what else was not as at the beginning."""
+    differing = [
+        f"{name} {session[name]}"
+        for name in ("device", "processes")
+        if name in session and session[name] != first[name]
+    ]
+    return "; ".join([f"commit {session['commit']}", *differing])

@@ -74,9 +74,9 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         PREDICTORS[name]  # refuses an unknown one
     plan = _read_floor_plan(config)
     whole = _load(config)
-    for note in whole.notes:
-        console.print(f"{whole.name}: {note}")
     data, (pool, _) = whole.receivers(config.rx), whole.split(config.split, config.seed)
+    for note in data.notes:
+        console.print(f"{data.name}: {note}")
     train, test = data.split(config.split, config.seed)
     if not bool((~test.rssi_dbm.isnan()).any()):
         raise InputError(f"split {config.split!r} of {data.name} has no heard test rows for these receivers")

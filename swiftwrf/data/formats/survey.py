@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from swiftwrf.data.files import FARTHEST, sha256
@@ -167,17 +168,22 @@ def _positions(file: Path, table: pd.DataFrame, roles: dict[str, str], notes: li
 def _long(file: Path, table: pd.DataFrame, roles: dict[str, str], position: Tensor) -> tuple[list[str], Tensor, Tensor]:
     """Receivers, RSSI and positions, one row for each time and place; of several packets of a receiver there, each has a
     row."""
-    receiver = table[roles["receiver"]].astype(str).str.strip()
+    receiver = table[roles["receiver"]].astype(str).fillna("").str.strip()
+    nameless = (receiver == "").to_numpy().nonzero()[0]
+    if len(nameless):
+        raise InputError(f"{file} row {nameless[0] + 1} has no receiver in column {roles['receiver']}")
+    heard = column_of_numbers(file, table, roles["rssi"])
+    _check_powers(file, heard[:, None], receiver.to_numpy()[:, None])
     keys = pd.DataFrame(position.numpy(), columns=list("xyz"))
     if "time" in roles:
-        keys["time"] = table[roles["time"]].astype(str).to_numpy()
+        keys["time"] = table[roles["time"]].astype(str).fillna("").to_numpy()
     keys["repeat"] = keys.assign(receiver=receiver.to_numpy()).groupby([*keys.columns, "receiver"]).cumcount()
     row = keys.groupby(list(keys.columns), sort=False).ngroup().to_numpy()
     column, names = pd.factorize(receiver)
     n = int(row.max()) + 1
     _check_size(file, n, len(names))
     values = np.full((n, len(names)), np.nan)
-    values[row, column] = column_of_numbers(file, table, roles["rssi"])
+    values[row, column] = heard
     where = np.empty(n, dtype=np.int64)
     where[row] = np.arange(len(row))
     return list(names), torch.from_numpy(values), position[torch.from_numpy(where)]
@@ -189,7 +195,7 @@ def _wide(
     """Receivers and RSSI: the columns that match what was asked for, or all that hold nothing but RSSI."""
     others = [name for name in table.columns if name not in roles.values() or name == roles.get("rssi")]
     if "rssi" in asked:
-        names = fnmatch.filter(others, asked["rssi"])
+        names = [asked["rssi"]] if asked["rssi"] in others else fnmatch.filter(others, asked["rssi"])
     else:
         names = [name for name in others if _is_rssi(table[name])]
         unused = [name for name in others if name not in names]
@@ -202,6 +208,7 @@ def _wide(
         )
     _check_size(file, len(table), len(names))
     values = np.stack([column_of_numbers(file, table, name) for name in names], axis=1)
+    _check_powers(file, values, np.broadcast_to(np.array(names, dtype=object), values.shape))
     return names, torch.from_numpy(values)
 
 
@@ -213,6 +220,17 @@ def _is_rssi(column: pd.Series) -> bool:
         return False
     heard = known[~np.isin(known, SENTINELS)]
     return not len(heard) or LOWEST <= float(np.median(heard)) < 0
+
+
+def _check_powers(file: Path, values: NDArray[np.float64], receiver: NDArray[np.object_]) -> None:
+    """Refuses what is neither a received power nor says that nothing was heard; all (rows of the file, columns)."""
+    bad = np.argwhere(((values < LOWEST) | (values > HIGHEST)) & ~np.isin(values, SENTINELS))
+    if len(bad):
+        row, column = bad[0]
+        raise InputError(
+            f"{file} row {row + 1}, receiver {receiver[row, column]}: {values[row, column]:g} dBm is no received power; "
+            f"expected {LOWEST:g} to {HIGHEST:g}, or {', '.join(f'{v:g}' for v in SENTINELS)} or nothing for not heard"
+        )
 
 
 def _check_size(file: Path, rows: int, receivers: int) -> None:
@@ -234,13 +252,6 @@ def _heard(file: Path, names: list[str], rssi: Tensor, notes: list[str]) -> tupl
     if weaker and bool((rssi == NOT_HEARD).any()):
         notes.append(f"values below {NOT_HEARD:g} dBm occur, so {NOT_HEARD:g} counts as measured, not as not heard")
     rssi = rssi.masked_fill(sentinel, torch.nan)
-    bad = ((rssi < LOWEST) | (rssi > HIGHEST)).nonzero()
-    if len(bad):
-        row, column = bad[0].tolist()
-        raise InputError(
-            f"{file} row {row + 1}, receiver {names[column]}: {float(rssi[row, column]):g} dBm is no received power; "
-            f"expected {LOWEST:g} to {HIGHEST:g}, or {', '.join(f'{v:g}' for v in SENTINELS)} or nothing for not heard"
-        )
     kept = (~rssi.isnan()).any(dim=0).nonzero()[:, 0].tolist()
     if not kept:
         raise InputError(f"{file} holds no heard value of any receiver")

@@ -48,8 +48,8 @@ def _limits(run: AoaRecords) -> Section:
     ]
     if run.metrics["split"] == "random":
         texts.append(
-            "A random split of positions along a path tests look-up more than prediction: nearest neighbours are "
-            "millimetres away. Use --split block for positions in a region without measurements."
+            "A random split of positions along a path tests look-up more than prediction: each test position has a training "
+            "position beside it. Use --split block for positions in a region without measurements."
         )
     if run.metrics["data"] == "simulated-room":
         texts.append(

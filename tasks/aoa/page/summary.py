@@ -13,7 +13,7 @@ def summary(share: Share, picture: Plot) -> Summary:
     """Of one share."""
     metrics, mix = share.run.metrics, share.mix
     error = {name: arm["great_circle_deg"] for name, arm in mix["methods"].items()}
-    turbo = min((n for n in error if arms.is_turbo(n) and arms.is_network(n)), key=lambda n: error[n]["median"])
+    turbo = arms.taken(error)
     lower, upper = error[arms.LOWER.name]["median"], error[arms.UPPER.name]["median"]
     own, best = error[turbo], min(error, key=lambda name: error[name]["median"])
     drawn_by = share.drawn_by([turbo])[0]

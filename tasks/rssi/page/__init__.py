@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from tasks.page import figures
 from tasks.page.page import Page, Plot, Section, Table
 from tasks.page.palette import Palette
 from tasks.page.provenance import number, provenance
-from tasks.rssi.page.summary import OWN, RssiRecords, by_method, summary
+from tasks.rssi.page.summary import OWN, RssiRecords, by_method, summary, varies
 from tasks.rssi.predictors import PREDICTORS
 from tasks.summarise import SHORTEST, paired_difference, running_median
 
@@ -67,7 +68,7 @@ def _run(run: RssiRecords, several: bool) -> list[Section]:
                 Plot(
                     f"width-{name}",
                     _maps(run, "width", "width of the 80 % interval [dB]"),
-                    "Wider away from measurements.",
+                    _WIDER if varies(run.arrays("maps")["width"]) else _EVEN,
                     cells,
                 ),
             ],
@@ -78,12 +79,14 @@ def _run(run: RssiRecords, several: bool) -> list[Section]:
 
 
 _MAP_CAPTION = (
-    "The predicted field with the training measurements in the same colours; a cross marks the receiver. At the median "
-    "height of the measurements."
+    "The predicted field with the training measurements in the same colours; a cross marks the receiver where its place is "
+    "known. At the median height of the measurements."
 )
+_WIDER = "Wider away from measurements."
+_EVEN = "Equally wide everywhere: these receivers' RSSI follows from their laws, and no field about them was found."
 _WHERE_CAPTION = (
-    "Predicted against measured, and the absolute error (dots; line: running median) against the distance from the receiver "
-    "and from the nearest training position. SwiftWRF, all receivers."
+    "Predicted against measured, and the absolute error (dots; line: running median) against the distance from the "
+    "receiver, where its place is known, and from the nearest training position. SwiftWRF, all receivers."
 )
 _SPEED_CAPTION = (
     "Seconds to fit and to predict the test rows against the median error, both logarithmic. The line is the Pareto front: "
@@ -112,7 +115,8 @@ def _paired(run: RssiRecords) -> Table:
     for name in run.metrics["overall"]:
         if name != OWN:
             mean, low, high = paired_difference(errors, OWN, name)
-            rows.append([name, f"{mean:+.2f} [{low:+.2f}, {high:+.2f}]"])
+            interval = "" if math.isnan(low) else f" [{low:+.2f}, {high:+.2f}]"
+            rows.append([name, f"{mean:+.2f}{interval}"])
     caption = "Mean of SwiftWRF's absolute error minus the method's on the same pairs; 95 % bootstrap over test rows."
     return Table(["against", "difference [dB]"], rows, caption)
 
@@ -253,8 +257,8 @@ def _speed(run: RssiRecords) -> Plot:
 
 def _limits(run: RssiRecords) -> Section:
     texts = [
-        "A single packet scatters about the mean of its place by 2 to 3 dB, mostly because it says nothing of its channel; "
-        "no predictor of the mean can be better than that.",
+        "Single packets scatter about the mean of their place, BLE packets that do not say their channel by 2 to 3 dB; no "
+        "predictor of the mean can be better than this scatter is in the data at hand.",
         "Values that were not heard are neither learnt from nor scored; nothing here says where a receiver is out of reach.",
         "Intervals of medians treat pairs as independent draws; along a walked path they are not, and the intervals are too "
         "narrow. The paired table draws whole test rows, which mends that in part.",

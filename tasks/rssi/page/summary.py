@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numpy.typing import NDArray
 from pandas import DataFrame
 
 from tasks.metrics import RssiMetrics
@@ -12,6 +15,7 @@ from tasks.summarise import paired_difference
 
 RssiRecords = Records[RssiMetrics]
 OWN = "swiftwrf"  # the predictor that all others are compared with
+EVEN = 0.01  # difference of widths [dB] up to which an interval counts as equally wide everywhere
 MISCALIBRATED = 0.05  # difference of coverage from what is promised, from which on the report warns
 
 
@@ -46,6 +50,8 @@ def summary(run: RssiRecords, picture: Plot) -> Summary:
 def _against(run: RssiRecords, best: str) -> str:
     """Whether the model is better than the best baseline, or whether that is not known."""
     mean, low, high = paired_difference(by_method(run), OWN, best)
+    if math.isnan(low):
+        return f"{run.metrics['n_test']} test rows are too few to tell SwiftWRF and {best} apart."
     interval = f"{mean:+.2f} dB [{low:+.2f}, {high:+.2f}]"
     if high < 0:
         return f"On the same pairs SwiftWRF's mean error is lower than that of {best}: {interval}."
@@ -57,20 +63,27 @@ def _against(run: RssiRecords, best: str) -> str:
 def _next_steps(run: RssiRecords) -> list[str]:
     maps = run.arrays("maps")
     width = maps["width"].mean(axis=0)
-    row, column = np.unravel_index(np.argmax(width), width.shape)
-    steps = [
-        f"Measure around x = {maps['x'][column]:.1f} m, y = {maps['y'][row]:.1f} m: the 80 % interval is widest there "
-        f"({width[row, column]:.0f} dB on average over the receivers).",
-        "predictions.csv has every test row with its prediction and interval.",
-    ]
+    steps = []
+    if varies(maps["width"]):
+        row, column = np.unravel_index(np.argmax(width), width.shape)
+        steps.append(
+            f"Measure around x = {maps['x'][column]:.1f} m, y = {maps['y'][row]:.1f} m: the 80 % interval is widest there "
+            f"({width[row, column]:.0f} dB on average over the receivers)."
+        )
+    steps.append("predictions.csv has every test row with its prediction and interval.")
     interval = run.metrics["interval"]
     if abs(interval["coverage"] - interval["nominal"]) > MISCALIBRATED:
-        steps.append(
-            "The intervals are not calibrated on these rows; take their widths as a ranking, not as a promise."
-        )
+        ranking = "take their widths as a ranking, not as a promise" if varies(maps["width"]) else "do not rely on them"
+        steps.append(f"The intervals are not calibrated on these rows; {ranking}.")
     if run.metrics["split"] == "random":
         steps.append("Run --split block: it shows the error in a region where nothing was measured.")
     return steps
+
+
+def varies(width: NDArray[np.float64]) -> bool:
+    """Whether an interval is wider in some places than in others: a receiver whose RSSI follows from its law alone has one
+    width everywhere."""
+    return bool(np.ptp(width, axis=(1, 2)).max() > EVEN)
 
 
 def by_method(run: RssiRecords) -> DataFrame:
