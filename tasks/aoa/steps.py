@@ -15,19 +15,17 @@ from augment import SYNTHESIZERS, Mixed, choose_synthesizer, make_synthesizer, m
 from augment.choose import SLOW, candidates
 from augment.suggest import suggest
 from augment.synthesizers import Synthesizer
-from swiftwrf import FitError, InputError, Spectra, SwiftWRF
-from swiftwrf.checkpoint import Saved, read, write
-from swiftwrf.geometry import room_of
+from swiftwrf import FitError, InputError
+from swiftwrf.checkpoint import read, write
 from swiftwrf.store import Store
 from tasks.aoa import arms
 from tasks.aoa.advice import advise
 from tasks.aoa.config import AUTO
 from tasks.aoa.estimators import ESTIMATORS, Estimator, SavedEstimator, learners
-from tasks.aoa.field import motion, strongest_direction
+from tasks.aoa.keep import keep
 from tasks.aoa.setting import At, Setting
 from tasks.claim import STEPS
 from tasks.metrics import AdviceMetrics
-from tasks.records import write_json, write_npz
 from tasks.run import Row
 from tasks.steps import Step
 from tasks.torchrun import group
@@ -163,38 +161,8 @@ class Synthesis(Step[Setting]):
         }
         write(folder / self.file, KIND, drawn, {})
         if self.trains and self.at.repeat == 0:
-            if synthesizer.model is not None:
-                self._keep_model(synthesizer.model, measured, setting.test, folder)
-            self._keep_field(synthesizer, measured, folder)
+            keep(self.synthesizer, synthesizer, self.at.share, measured, setting.test, folder)
         return {"history": fit.records, "seconds": seconds}
-
-    def _keep_model(self, model: Saved, measured: Spectra, test: Spectra, folder: Path) -> None:
-        """The fitted model, and the room where one was found."""
-        share = f"mix{self.at.share:g}"
-        prefix = "model" if self.synthesizer == "swiftwrf" else self.synthesizer
-        model.save(folder / f"{prefix}-{share}.safetensors")
-        room = room_of(model)
-        if room is not None:
-            write_json(folder / f"geometry-{share}.json", room.to_json())
-            at, gain, order = room.image_sources()
-            places = {
-                "measured": measured.position.numpy(),
-                "test": test.position.numpy(),
-                "fixed": room.fixed_position.numpy(),
-                "image": at.numpy(),
-                "gain": gain.numpy(),
-                "order": order.numpy(),
-            }
-            write_npz(folder / f"room-{share}.npz", places)
-
-    def _keep_field(self, synthesizer: Synthesizer, measured: Spectra, folder: Path) -> None:
-        """What the report shows of the field, and of the primitives where there are any."""
-        share = f"mix{self.at.share:g}"
-        if self.synthesizer not in SLOW:
-            field = strongest_direction(synthesizer, measured, synthesizer.settings.seed)
-            write_npz(folder / f"field-{self.synthesizer}-{share}.npz", field)
-        if isinstance(synthesizer.model, SwiftWRF):
-            write_npz(folder / f"motion-{share}.npz", motion(synthesizer.model, measured))
 
     def then(self, setting: Setting, value: Row) -> Sequence[Step[Setting]]:
         trainings = [arms.turbo(self.synthesizer)] if self.trains else []
