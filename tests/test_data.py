@@ -11,7 +11,7 @@ from PIL import Image
 
 from swiftwrf import InputError, load_spectra
 from swiftwrf.data.spectra import coarsening
-from swiftwrf.data.splits import block_split, random_split, slabs
+from swiftwrf.data.splits import block_split, random_split, slabs, split_names
 
 N = 12
 
@@ -191,6 +191,22 @@ def test_seeded_splits_are_partitions(generator):
         assert len(test) in (11, 12)
         assert split(3)[1].tolist() == test.tolist()
         assert split(4)[1].tolist() != test.tolist()
+
+
+def test_repeats_at_one_place_share_a_slab(generator):
+    spot = torch.rand(23, 3, generator=generator, dtype=torch.float64)
+    repeated = spot.repeat_interleave(20, 0)[torch.randperm(460, generator=generator)]
+    slab = slabs(repeated, 5)
+    assert slab.unique().tolist() == [0, 1, 2, 3, 4]
+    for place in spot:
+        assert len(slab[(repeated == place).all(dim=1)].unique()) == 1
+    assert slabs(torch.zeros(10, 3), 5).bincount().tolist() == [2] * 5  # one place cannot be held out whole
+
+
+def test_files_that_only_begin_as_splits_do(tmp_path):
+    for name in ("train_index.txt", "train_index_days.txt", "train_index2.txt", "train_index (copy).txt"):
+        (tmp_path / name).touch()
+    assert split_names(tmp_path) == ["random", "days"]
 
 
 def test_slabs_are_equal_and_do_not_interleave(generator):

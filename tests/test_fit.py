@@ -294,3 +294,17 @@ def test_recovers_a_scene_that_it_can_represent_exactly(generator):
     after = psnr(optimisation.result(optimisation.position).detach(), scene.spectrum).median()
     assert before < 35 < 50 < after
     assert apart(optimisation.result) < 0.5 * began  # the spectra do not tell more at this length
+
+
+def test_a_fit_that_ended_worse_is_refused_again(room, tmp_path, monkeypatch):
+    """Its state is kept, and the same call must not take it for a result."""
+    honest = Optimisation.record
+
+    def record(self, loss):
+        self.first_loss = -1.0  # better than any loss
+        return honest(self, loss)
+
+    monkeypatch.setattr(Optimisation, "record", record)
+    for _ in range(2):
+        with pytest.raises(FitError, match="worse than the -1 it began with"):
+            fit(room, replace(QUICK, steps=20), progress=False, checkpoint=tmp_path / "state")

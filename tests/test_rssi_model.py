@@ -273,6 +273,25 @@ def test_interrupted_fit_goes_on(tmp_path, monkeypatch):
         fit_rssi(data, RssiConfig(huber=2.0), checkpoint=state)
 
 
+@pytest.mark.parametrize("plain", [False, True])
+def test_a_fit_with_gaps_goes_on(tmp_path, plain):
+    """What was not heard is nan, which files do not hold."""
+    data = with_field(n=60)
+    data.rssi_dbm[::5, 0] = torch.nan
+    config = RssiConfig(plain=plain, steps=5) if plain else None
+    drawn = [
+        fit_rssi(data, config, checkpoint=tmp_path / "state").predict(data.transmitter_position)[0] for _ in range(2)
+    ]
+    assert torch.equal(*drawn)
+
+
+@pytest.mark.parametrize("heard", [12, 0])
+def test_a_receiver_that_few_of_many_rows_heard(heard):
+    data = with_field(n=700)
+    data.rssi_dbm[torch.randperm(700, generator=torch.Generator().manual_seed(0))[heard:], 0] = torch.nan
+    assert fit_rssi(data).predict(data.transmitter_position[:5])[0].isfinite().all()
+
+
 # --- ordinary input that is awkward ----------------------------------------------------------------------------------
 
 

@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
 from typing import Any, Literal
 
 import torch
@@ -141,7 +142,8 @@ def array_spectra(array: PlanarArray, channel: Tensor, grid: AngularGrid, beamfo
     """
 
     def key() -> str:
-        digest = hashlib.sha256(repr((beamformer, array.wavelength, array.element.tolist(), grid)).encode())
+        how = version("swiftwrf-tasks"), beamformer, array.wavelength, array.element.tolist(), grid
+        digest = hashlib.sha256(repr(how).encode())
         digest.update(channel.contiguous().numpy().data)
         return digest.hexdigest()
 

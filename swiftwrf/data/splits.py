@@ -21,8 +21,8 @@ Validation = Literal["random", "block"]
 
 def split_names(folder: Path) -> list[str]:
     """Names of the splits that a folder offers: `train_index_NAME.txt` is NAME, `train_index.txt` is random."""
-    suffixes = (file.stem.removeprefix("train_index") for file in sorted(folder.glob("train_index*.txt")))
-    return [suffix.removeprefix("_") or "random" for suffix in suffixes]
+    files = [*folder.glob("train_index.txt"), *sorted(folder.glob("train_index_?*.txt"))]
+    return [file.stem.removeprefix("train_index").removeprefix("_") or "random" for file in files]
 
 
 def read_split(folder: Path, name: str, n: int, first: int) -> tuple[Tensor, Tensor]:
@@ -82,12 +82,15 @@ def random_split(n: int, seed: int) -> tuple[Tensor, Tensor]:
 
 def slabs(position: Tensor, n_slabs: int) -> Tensor:
     """Number of the slab, 0 to n_slabs - 1, of each position (n, 3): equally many positions in each, cut across the
-    direction in which the positions extend most. Neighbours share a slab, so a slab held out is a place held out."""
+    direction in which the positions extend most. Neighbours share a slab, and repeats at one place do, so a slab held out
+    is a place held out."""
     centred = position.double() - position.double().mean(dim=0)
     direction = torch.linalg.svd(centred, full_matrices=False).Vh[0]
     rank = (centred @ direction).argsort(stable=True).argsort()
-    slab: Tensor = rank * n_slabs // len(position)
-    return slab
+    _, spot, times = position.unique(dim=0, return_inverse=True, return_counts=True)
+    middle = torch.zeros_like(times).index_add_(0, spot, rank) // times
+    whole, even = (place * n_slabs // len(position) for place in (middle[spot], rank))
+    return whole if len(whole.unique()) == n_slabs else even  # few places cannot be held out whole
 
 
 def block_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:

@@ -22,7 +22,7 @@ from swiftwrf.processes import Processes
 
 Model = TypeVar("Model", bound=nn.Module)
 
-KEPT = {"step": int, "seconds": float, "first_loss": float}  # what is saved beside the tensors
+KEPT = {"step": int, "seconds": float, "first_loss": float, "last_loss": float}  # what is saved beside the tensors
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,8 @@ class Descent(ABC, Generic[Model]):
         self.name, self.model, self.schedule, self.processes = name, model, schedule, processes or Processes()
         self.optimiser = torch.optim.Adam(groups, betas=schedule.betas, weight_decay=schedule.weight_decay)
         self.average = self.averaged()
-        self.step, self.seconds, self.first_loss = 0, 0.0, math.inf
+        self.step, self.seconds = 0, 0.0
+        self.first_loss = self.last_loss = math.inf
         device = next(model.parameters()).device
         self.broken_at = torch.tensor(schedule.steps, device=device)  # the first step whose loss was not finite
 
@@ -152,14 +153,14 @@ class Descent(ABC, Generic[Model]):
                 self.first_loss = float(loss)
             session.bar.update(task, completed=self.step)
             if self._evaluates_after(self.step):
-                self.seconds = time.perf_counter() - began
+                self.seconds, self.last_loss = time.perf_counter() - began, float(loss)
                 session.evaluated(self.record(loss), *self._state())
-                if self.step == steps and float(loss) > self.first_loss:
-                    raise FitError(
-                        f"the fit ended with a loss of {float(loss):.3g}, worse than the {self.first_loss:.3g} it began "
-                        f"with; {self._advice()}"
-                    )
         session.bar.remove_task(task)
+        if self.last_loss > self.first_loss:  # also where a kept state had ended so
+            raise FitError(
+                f"the fit ended with a loss of {self.last_loss:.3g}, worse than the {self.first_loss:.3g} it began with; "
+                f"{self._advice()}"
+            )
 
     def record(self, loss: Tensor) -> Record:
         """What is told at an evaluation."""
@@ -182,7 +183,8 @@ class Descent(ABC, Generic[Model]):
 
     def _restore(self, saved: State) -> None:
         header, tensors = saved.header, saved.tensors
-        self.step, self.seconds, self.first_loss = (kind(header[name]) for name, kind in KEPT.items())
+        for name, kind in KEPT.items():
+            setattr(self, name, kind(header[name]))
         if not 0 <= self.step <= self.schedule.steps:
             raise InputError(f"its step {self.step} is none of {self.schedule.steps}")
         for prefix, module in (("model.", self.model), ("average.", self.average)):
@@ -198,4 +200,4 @@ class Descent(ABC, Generic[Model]):
 def warm_cosine(step: int, steps: int, warm_up: int, final: float) -> float:
     """Share of a rate that rises over `warm_up` steps and decays to `final` along a cosine."""
     cosine = 0.5 * (1 + math.cos(math.pi * step / steps))
-    return min(1.0, (step + 1) / warm_up) * (final + (1 - final) * cosine)
+    return min(1.0, (step + 1) / max(warm_up, 1)) * (final + (1 - final) * cosine)

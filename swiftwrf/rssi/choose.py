@@ -24,7 +24,8 @@ def choose_kernel(position: Tensor, residual: Tensor, fold: Tensor) -> tuple[Ker
         residual: what the law leaves (n, R) [dB], nan where not heard.
         fold: number of the part that each site is held out with, (n,).
     """
-    position, residual, fold = thinned(position, residual, fold, rows=MAX_ROWS)
+    some = (~residual.isnan()).any(dim=1)
+    position, residual, fold = thinned(position[some], residual[some], fold[some], rows=MAX_ROWS)
     residual = residual[:, (~residual.isnan()).any(dim=0)]
     (columns,) = thinned(torch.arange(residual.shape[1]), rows=MAX_RECEIVERS)
     left = [_Left(values, fold) for values in residual[:, columns].T]

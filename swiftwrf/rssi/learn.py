@@ -64,8 +64,8 @@ def _descend(
         batch = rows[torch.randint(len(rows), (min(config.batch, len(rows)),), generator=generator)].to(device)
         known = ~measured[batch].isnan()
         missed = ((predict(batch) - measured[batch]) / noise[batch])[known]
-        loss = functional.huber_loss(missed, torch.zeros_like(missed), delta=config.huber)
-        loss = loss + 0.5 * white.square().sum() / max(heard, 1)
+        loss = functional.huber_loss(missed, torch.zeros_like(missed), delta=config.huber, reduction="sum")
+        loss = loss / max(len(missed), 1) + 0.5 * white.square().sum() / max(heard, 1)
         if not math.isfinite(loss.item()):
             raise FitError(
                 f"the RSSI fit broke at step {step}: loss {loss.item():.3g}; try a rate below {config.rate:g}"

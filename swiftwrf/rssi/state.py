@@ -8,12 +8,16 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from swiftwrf import checkpoint as files
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import InputError
 from swiftwrf.rssi.solve import Fitted
 
 KIND = "rssi fit state"
+GAPS = ".gaps"  # after the name of a tensor with nan for what was not heard, which files do not hold: where it is
 
 
 class State:
@@ -38,7 +42,7 @@ class State:
                 f"{path} is the state of another fit (other measurements or settings); remove it or give another path"
             )
         for number in header["groups"]:
-            self.fitted[number] = Fitted(*(tensors[f"{number}.{name}"] for name in Fitted._fields))
+            self.fitted[number] = Fitted(*(_with_gaps(tensors, f"{number}.{name}") for name in Fitted._fields))
 
     def add(self, number: int, fitted: Fitted) -> None:
         """Keeps one more group."""
@@ -46,7 +50,14 @@ class State:
         if self._path is None:
             return
         tensors = {f"{n}.{name}": value for n, f in self.fitted.items() for name, value in f._asdict().items()}
-        files.write(self._path, KIND, tensors, {"fingerprint": self._owner, "groups": list(self.fitted)})
+        gaps = {f"{name}{GAPS}": value.isnan() for name, value in tensors.items() if bool(value.isnan().any())}
+        whole = {name: value.nan_to_num() for name, value in tensors.items()}
+        files.write(self._path, KIND, whole | gaps, {"fingerprint": self._owner, "groups": list(self.fitted)})
+
+
+def _with_gaps(tensors: dict[str, Tensor], name: str) -> Tensor:
+    value = tensors[name]
+    return value.masked_fill(tensors[name + GAPS], torch.nan) if name + GAPS in tensors else value
 
 
 def fingerprint(config: Any, train: Rssi, pool: Rssi) -> str:

@@ -49,7 +49,7 @@ class MotionBasis(Deformation):
     def initial(cls, setting: Setting, *, generator: torch.Generator) -> MotionBasis:
         rank, size = setting.rank, sum(COMPONENTS[c] for c in setting.components)
         field = gp.SmoothField(setting.anchor, setting.kernel, rank)
-        basis = 0.1 / math.sqrt(rank) * torch.randn(rank, setting.n, size, generator=generator)
+        basis = 0.1 / math.sqrt(max(rank, 1)) * torch.randn(rank, setting.n, size, generator=generator)
         return cls(field, basis, setting.components)
 
     @classmethod
