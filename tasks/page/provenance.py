@@ -49,6 +49,6 @@ def _changed(session: dict[str, Any], first: dict[str, Any]) -> str:
     differing = [
         f"{name} {session[name]}"
         for name in ("device", "processes")
-        if name in session and session[name] != first[name]
+        if name in session and session[name] != first.get(name)
     ]
     return "; ".join([f"commit {session['commit']}", *differing])

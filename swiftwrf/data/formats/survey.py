@@ -168,7 +168,7 @@ def _positions(file: Path, table: pd.DataFrame, roles: dict[str, str], notes: li
 def _long(file: Path, table: pd.DataFrame, roles: dict[str, str], position: Tensor) -> tuple[list[str], Tensor, Tensor]:
     """Receivers, RSSI and positions, one row for each time and place; of several packets of a receiver there, each has a
     row."""
-    receiver = table[roles["receiver"]].astype(str).fillna("").str.strip()
+    receiver = _text(table[roles["receiver"]])
     nameless = (receiver == "").to_numpy().nonzero()[0]
     if len(nameless):
         raise InputError(f"{file} row {nameless[0] + 1} has no receiver in column {roles['receiver']}")
@@ -176,7 +176,7 @@ def _long(file: Path, table: pd.DataFrame, roles: dict[str, str], position: Tens
     _check_powers(file, heard[:, None], receiver.to_numpy()[:, None])
     keys = pd.DataFrame(position.numpy(), columns=list("xyz"))
     if "time" in roles:
-        keys["time"] = table[roles["time"]].astype(str).fillna("").to_numpy()
+        keys["time"] = _text(table[roles["time"]]).to_numpy()
     keys["repeat"] = keys.assign(receiver=receiver.to_numpy()).groupby([*keys.columns, "receiver"]).cumcount()
     row = keys.groupby(list(keys.columns), sort=False).ngroup().to_numpy()
     column, names = pd.factorize(receiver)
@@ -187,6 +187,11 @@ def _long(file: Path, table: pd.DataFrame, roles: dict[str, str], position: Tens
     where = np.empty(n, dtype=np.int64)
     where[row] = np.arange(len(row))
     return list(names), torch.from_numpy(values), position[torch.from_numpy(where)]
+
+
+def _text(column: pd.Series) -> pd.Series:
+    """Its cells as text, empty where there is nothing."""
+    return column.astype(object).where(column.notna(), "").astype(str).str.strip()
 
 
 def _wide(
