@@ -22,6 +22,8 @@ from swiftwrf.data.splits import MIN_TRAINING, folds
 from tasks.rssi.predictors.base import PREDICTORS, RECEIVERS, Predictor, Settings
 from tasks.rssi.predictors.laws import LogDistance, Mean
 
+# scikit-learn's own choice for many neighbours takes distances from squares and a product, which map coordinates cancel
+SEARCH = "kd_tree"
 NEIGHBOURS = (1, 3, 5, 8, 12, 20, 40, 80, 120)
 TUNED_ROWS, KEPT_ROWS = 500, 1500  # of the Gaussian process: its cost grows with their cube
 
@@ -79,7 +81,8 @@ class NearestNeighbours(_PerReceiver):
         errors = {(k, weights): 0.0 for k in NEIGHBOURS if k <= fewest for weights in ("uniform", "distance")}
         for number in numbers:  # one search for neighbours serves all settings, as GridSearchCV would not
             out, kept = fold == number, fold != number
-            distance, row = NearestNeighbors(n_neighbors=max(errors)[0]).fit(x[kept]).kneighbors(x[out])
+            search = NearestNeighbors(n_neighbors=max(errors)[0], algorithm=SEARCH)
+            distance, row = search.fit(x[kept]).kneighbors(x[out])
             near = y[kept][row]
             with np.errstate(divide="ignore"):
                 inverse = 1 / distance
@@ -89,7 +92,7 @@ class NearestNeighbours(_PerReceiver):
                 predicted = (weight * near[:, :k]).sum(axis=1) / weight.sum(axis=1)
                 errors[k, weights] += float(np.abs(predicted - y[out]).mean()) / len(numbers)
         k, weights = min(errors, key=lambda setting: errors[setting])
-        return KNeighborsRegressor(k, weights=weights).fit(x, y)
+        return KNeighborsRegressor(k, weights=weights, algorithm=SEARCH).fit(x, y)
 
 
 @PREDICTORS.register(
