@@ -6,8 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tasks.aoa import arms
-from tasks.metrics import AoaMetrics, ErrorSummary, MixMetrics, RssiMetrics
+from tasks.metrics import AoaMetrics, ErrorSummary, RssiMetrics
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
@@ -33,11 +32,6 @@ def markdown(columns: list[str], rows: list[list[str]]) -> str:
     """The table in Markdown."""
     lines = [columns, ["---"] * len(columns), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def turbo_arm(mix: MixMetrics) -> str:
-    """The network's arm with synthetic spectra, that with further positions if there is one."""
-    return arms.taken(mix["methods"])
 
 
 def interval(error: ErrorSummary) -> str:

@@ -6,11 +6,12 @@ import json
 import re
 from typing import Any
 
-from committed import RESULTS, ROOT, aoa_runs, interval, load, markdown, rssi_runs, turbo_arm
+from committed import RESULTS, ROOT, aoa_runs, interval, load, markdown, rssi_runs
 from comparison_tables import comparison, comparison_counts, comparison_turbo
 from geometry import SIDES, WALLS, nearest
 from targets import aoa_targets, rssi_targets, synthesis_targets
 
+from tasks.aoa.arms import taken
 from tasks.summarise import pareto
 
 
@@ -41,7 +42,7 @@ def aoa() -> str:
     for metrics in aoa_runs():
         scene = f"{metrics['data']}, {metrics['split']}, {metrics['moving']}"
         for share, mix in metrics["mixes"].items():
-            arms, turbo = mix["methods"], turbo_arm(mix)
+            arms, turbo = mix["methods"], taken(mix["methods"])
             names = (*fixed, turbo, f"kernel_ridge_{turbo}", "measured_all")
             cells = [interval(arms[name]["great_circle_deg"]) if name in arms else "" for name in names]
             rows.append([scene, f"{float(share):.0%}", *cells, _drawn_by(turbo)])
@@ -80,14 +81,13 @@ def headline() -> str:
     for metrics in aoa_runs():
         if "0.3" not in metrics["mixes"]:
             continue
-        mix = metrics["mixes"]["0.3"]
-        error = {
-            name: mix["methods"][name]["great_circle_deg"] for name in ("measured_only", turbo_arm(mix), "measured_all")
-        }
+        methods = metrics["mixes"]["0.3"]["methods"]
+        turbo = taken(methods)
+        error = {name: methods[name]["great_circle_deg"] for name in ("measured_only", turbo, "measured_all")}
         lower, own, _ = error.values()
         gain = f"{own['median'] / lower['median'] - 1:+.0%}"
         scene = f"{metrics['data']}, {metrics['split']} split, {metrics['moving']} moves"
-        rows.append([scene, *map(interval, error.values()), gain, _drawn_by(turbo_arm(mix))])
+        rows.append([scene, *map(interval, error.values()), gain, _drawn_by(turbo)])
     columns = ["scene", "measured share alone", "with synthetic spectra", "everything measured", "gain", "synthesizer"]
     return markdown(columns, rows)
 

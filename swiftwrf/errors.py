@@ -1,6 +1,11 @@
 """The two ways this package says no."""
 
+from __future__ import annotations
+
+from collections.abc import Iterable
+
 LONGEST = 300  # characters of a message: what came may be a megabyte long
+MOST = 12  # names in a message
 
 
 def one_line(message: str) -> str:
@@ -11,6 +16,12 @@ def one_line(message: str) -> str:
         return line
     kept = LONGEST - len(" ... ")
     return f"{line[: kept // 2]} ... {line[-(kept - kept // 2) :]}"
+
+
+def listed(names: Iterable[object]) -> str:
+    """The first names, and how many more there are."""
+    found = [str(name) for name in names]
+    return ", ".join(found[:MOST]) + (f" and {len(found) - MOST} more" if found[MOST:] else "")
 
 
 class InputError(ValueError):

@@ -8,9 +8,7 @@ from dataclasses import dataclass, field, replace
 from torch import Tensor
 
 from swiftwrf.data.splits import MIN_TRAINING, choose_split
-from swiftwrf.errors import InputError
-
-MOST_LISTED = 12  # receivers that a note names
+from swiftwrf.errors import InputError, listed
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +93,7 @@ class Rssi:
         rare = [name for name, heard in zip(self.receiver_names, enough.tolist(), strict=True) if not heard]
         if not rare:
             return found
-        listed = ", ".join(rare[:MOST_LISTED]) + (f" and {len(rare) - MOST_LISTED} more" if rare[MOST_LISTED:] else "")
-        note = f"receivers heard in fewer than {MIN_TRAINING} rows are left out: {listed}"
+        note = f"receivers heard in fewer than {MIN_TRAINING} rows are left out: {listed(rare)}"
         return replace(found, notes=(*found.notes, note))
 
     def columns(self, columns: list[int]) -> Rssi:

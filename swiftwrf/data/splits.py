@@ -89,10 +89,10 @@ def slabs(position: Tensor, n_slabs: int) -> Tensor:
     rank = (centred @ direction).argsort(stable=True).argsort()
     _, spot, times = position.unique(dim=0, return_inverse=True, return_counts=True)
     middle = torch.zeros_like(times).index_add_(0, spot, rank) // times
-    whole: Tensor = middle[spot] * n_slabs // len(position)
-    if len(whole.unique()) < n_slabs:  # few places cannot be held out whole
-        whole = rank * n_slabs // len(position)
-    return whole
+    slab: Tensor = middle[spot] * n_slabs // len(position)
+    if len(slab.unique()) < n_slabs:  # few places cannot be held out whole
+        slab = rank * n_slabs // len(position)
+    return slab
 
 
 def block_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:

@@ -81,11 +81,12 @@ def fit_geometry(
             _some(kept, config.positions, seed), config.reach, width=config.width, tick=lambda: bar.advance(task)
         )
     score = correlation_score(held, Planes.of(found).refined(kept), train.array)
-    found = Search(_some(scene, config.positions, seed), config.reach, sign).improve(found)
+    some = _some(scene, config.positions, seed)
+    found = Search(some, config.reach, sign).improve(found)
     room = Planes.of(found).refined(scene)
     splits = split(scene, fold)
     room = _settled(_pruned(room, scene, splits), scene)
-    room = _extended(room, scene, splits, config, seed)
+    room = _extended(room, scene, some, splits, config)
     room = _with_order(room, splits, config.max_order)
     return judged(train, scene, room.refined(scene), score, config.reach)
 
@@ -191,10 +192,9 @@ def _settled(room: Planes, scene: Scene) -> Planes:
 
 
 def _extended(
-    room: Planes, scene: Scene, splits: list[tuple[Scene, Scene]], config: GeometryConfig, seed: int
+    room: Planes, scene: Scene, some: Scene, splits: list[tuple[Scene, Scene]], config: GeometryConfig
 ) -> Planes:
-    """With further planes of any orientation, as long as held-out spectra need them."""
-    some = _some(scene, config.positions, seed)
+    """With further planes of any orientation, sought with some positions, as long as held-out spectra need them."""
     for _ in range(config.further):
         if float(some.score(room.field(some))) < PERFECT:
             break

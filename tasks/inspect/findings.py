@@ -14,6 +14,7 @@ from swiftwrf.beamforming import PHASE
 from swiftwrf.calibration import calibrate
 from swiftwrf.data import Reading, Rssi, Snapshots, Spectra
 from swiftwrf.data.splits import MIN_TRAINING
+from swiftwrf.errors import listed
 from swiftwrf.frames import FEW, check_frames, check_law
 from swiftwrf.positions import distance
 
@@ -244,7 +245,7 @@ def _rssi(data: Rssi, findings: Findings) -> None:
     count = heard.sum(dim=0)
     few = [name for name, n in zip(data.receiver_names, count.tolist(), strict=True) if n < MIN_TRAINING]
     if few:
-        findings.warn(f"Heard in fewer than {MIN_TRAINING} rows, too few to learn from: {_listed(few)}.")
+        findings.warn(f"Heard in fewer than {MIN_TRAINING} rows, too few to learn from: {listed(few)}.")
     _columns(data, heard, findings)
     _law(data, findings)
     _splits(data, findings)
@@ -258,9 +259,9 @@ def _columns(data: Rssi, heard: Tensor, findings: Findings) -> None:
         return [name for name, values in columns if len(values) >= MIN_TRAINING and suspicious(values)]
 
     if constant := those(lambda v: bool(v.min() == v.max())):
-        findings.warn(f"Receivers with one value everywhere: {_listed(constant)}.")
+        findings.warn(f"Receivers with one value everywhere: {listed(constant)}.")
     if positive := those(lambda v: bool(v.min() < v.max() and v.max() >= 0)):
-        findings.warn(f"Receivers with values of 0 dBm and more, which few hear: {_listed(positive)}.")
+        findings.warn(f"Receivers with values of 0 dBm and more, which few hear: {listed(positive)}.")
 
     def edged(values: Tensor) -> bool:
         weakest = values == values.min()
@@ -269,7 +270,7 @@ def _columns(data: Rssi, heard: Tensor, findings: Findings) -> None:
 
     if repeated := those(edged):
         findings.warn(
-            f"The weakest value is frequent and stands apart; does it mean not heard? Receivers: {_listed(repeated)}."
+            f"The weakest value is frequent and stands apart; does it mean not heard? Receivers: {listed(repeated)}."
         )
     filled = data.rssi_dbm.nan_to_num(0.0)
     same = [
@@ -279,7 +280,7 @@ def _columns(data: Rssi, heard: Tensor, findings: Findings) -> None:
         if bool((filled[:, i] == filled[:, j]).all())
     ] if len(data.receiver_names) <= 200 else []  # fmt: skip
     if same:
-        findings.warn(f"Receivers with the same values: {_listed(same)}.")
+        findings.warn(f"Receivers with the same values: {listed(same)}.")
 
 
 def _law(data: Rssi, findings: Findings) -> None:
@@ -299,7 +300,3 @@ def _law(data: Rssi, findings: Findings) -> None:
         findings.warn(
             f"{report.level_dbm:.0f} dBm at 1 m is more than usual transmitters give; are positions in millimetres?"
         )
-
-
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")

@@ -6,7 +6,6 @@ import fnmatch
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,7 +20,7 @@ from swiftwrf.data.reading import Reading
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import read_split, split_names
 from swiftwrf.data.tables import SUFFIXES, column_of_numbers, parsed, read_frame
-from swiftwrf.errors import InputError
+from swiftwrf.errors import InputError, listed
 
 RECEIVERS = "receivers.csv"  # beside the table: receiver,x,y,z
 SENTINELS = (NOT_HEARD, -200.0, 100.0)  # that tables write for a receiver that heard nothing
@@ -102,21 +101,21 @@ def _roles(file: Path, table: pd.DataFrame, asked: Mapping[str, str]) -> dict[st
     for role, name in asked.items():
         pattern = role == "rssi" and fnmatch.filter(table.columns, name)
         if role not in roles and not pattern:
-            raise InputError(f"{file} has no column {name!r} for {role}; there are {_listed(table.columns)}")
+            raise InputError(f"{file} has no column {name!r} for {role}; there are {listed(table.columns)}")
     for role, known in ROLES.items():
         if role in asked:
             continue
         found = [name for name in table.columns if known.fullmatch(_plain(name)) and name not in roles.values()]
         if len(found) > 1:
             raise InputError(
-                f"{file} has {len(found)} columns that may be {role} ({_listed(found)}); say which: columns {role}=NAME"
+                f"{file} has {len(found)} columns that may be {role} ({listed(found)}); say which: columns {role}=NAME"
             )
         if found:
             roles[role] = found[0]
     for role in ("x", "y"):
         if role not in roles:
             raise InputError(
-                f"{file} has no column for {role}; there are {_listed(table.columns)}; say which: columns {role}=NAME"
+                f"{file} has no column for {role}; there are {listed(table.columns)}; say which: columns {role}=NAME"
             )
     if "receiver" in roles and "rssi" not in roles:
         raise InputError(
@@ -128,11 +127,6 @@ def _roles(file: Path, table: pd.DataFrame, asked: Mapping[str, str]) -> dict[st
 def _plain(name: str) -> str:
     """The name in small letters and underscores: `Position X [m]` is position_x_m."""
     return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
-
-
-def _listed(names: Any) -> str:
-    names = list(map(str, names))
-    return ", ".join(names[:12]) + (f" and {len(names) - 12} more" if len(names) > 12 else "")
 
 
 def _positions(file: Path, table: pd.DataFrame, roles: dict[str, str], notes: list[str]) -> Tensor:
@@ -205,10 +199,10 @@ def _wide(
         names = [name for name in others if _is_rssi(table[name])]
         unused = [name for name in others if name not in names]
         if unused:
-            notes.append(f"columns that hold no RSSI in dBm are not used: {_listed(unused)}")
+            notes.append(f"columns that hold no RSSI in dBm are not used: {listed(unused)}")
     if not names:
         raise InputError(
-            f"{file} has no column of RSSI in dBm (numbers below 0) besides positions; there are {_listed(table.columns)}; "
+            f"{file} has no column of RSSI in dBm (numbers below 0) besides positions; there are {listed(table.columns)}; "
             "say which: columns rssi=NAME or rssi='PREFIX*'"
         )
     _check_size(file, len(table), len(names))

@@ -83,7 +83,7 @@ _MAP_CAPTION = (
     "known. At the median height of the measurements."
 )
 _WIDER = "Wider away from measurements."
-_EVEN = "Equally wide everywhere: these receivers' RSSI follows from their laws, and no field about them was found."
+_EVEN = "Equally wide everywhere: held-out measurements call for no field around these receivers."
 _WHERE_CAPTION = (
     "Predicted against measured, and the absolute error (dots; line: running median) against the distance from the "
     "receiver, where its place is known, and from the nearest training position. SwiftWRF, all receivers."

@@ -63,8 +63,9 @@ def _against(run: RssiRecords, best: str) -> str:
 def _next_steps(run: RssiRecords) -> list[str]:
     maps = run.arrays("maps")
     width = maps["width"].mean(axis=0)
+    uneven = varies(maps["width"])
     steps = []
-    if varies(maps["width"]):
+    if uneven:
         row, column = np.unravel_index(np.argmax(width), width.shape)
         steps.append(
             f"Measure around x = {maps['x'][column]:.1f} m, y = {maps['y'][row]:.1f} m: the 80 % interval is widest there "
@@ -73,7 +74,7 @@ def _next_steps(run: RssiRecords) -> list[str]:
     steps.append("predictions.csv has every test row with its prediction and interval.")
     interval = run.metrics["interval"]
     if abs(interval["coverage"] - interval["nominal"]) > MISCALIBRATED:
-        ranking = "take their widths as a ranking, not as a promise" if varies(maps["width"]) else "do not rely on them"
+        ranking = "take their widths as a ranking, not as a promise" if uneven else "do not rely on them"
         steps.append(f"The intervals are not calibrated on these rows; {ranking}.")
     if run.metrics["split"] == "random":
         steps.append("Run --split block: it shows the error in a region where nothing was measured.")
