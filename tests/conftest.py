@@ -77,6 +77,13 @@ def small_published() -> Iterator[None]:
 
 
 @pytest.fixture
+def glances() -> Iterator[None]:
+    """No long search for rooms, for the time of a test."""
+    with quick.glances():
+        yield
+
+
+@pytest.fixture
 def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 

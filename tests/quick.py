@@ -10,10 +10,11 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from typing import Any
 from unittest import mock
 
 from augment import SYNTHESIZERS
-from swiftwrf import AngularGrid, FitConfig, ModelConfig, RssiConfig, rssi_room, simulated_room
+from swiftwrf import AngularGrid, FitConfig, GeometryModel, ModelConfig, RssiConfig, Spectra, rssi_room, simulated_room
 from swiftwrf.comparison import (
     Config,
     DcganConfig,
@@ -28,6 +29,8 @@ from swiftwrf.comparison import (
     WrfGsSize,
 )
 from swiftwrf.errors import LONGEST
+from swiftwrf.geometry import GeometryConfig, fit_geometry
+from swiftwrf.geometry.search import Search
 from tasks.aoa import experiment as aoa
 from tasks.aoa.arms import NETWORK
 from tasks.aoa.config import AoaConfig
@@ -59,6 +62,7 @@ PUBLISHED: dict[str, Config] = {  # methods of comparison, as small as they can 
     "dcgan": DcganConfig(size=DcganSize(noise=2, width=2, hidden=8, bands=2), **LONGER),
 }
 PUBLISHED_RSSI = NeRF2RssiConfig(size=NeRF2RssiSize(width=8, bands=2, samples=4, azimuths=4, elevations=2), **LONGER)
+GLANCE = GeometryConfig(reach=0.5, positions=10, width=1, max_order=1, further=0)  # finds little, and soon
 TASKS = {
     "aoa": (AoaConfig, aoa.run),
     "rssi": (rssi.RssiTaskConfig, rssi.run),
@@ -96,6 +100,21 @@ def small_published() -> Iterator[None]:
 
 
 @contextmanager
+def glances() -> Iterator[None]:
+    """No long search for rooms, which has tests of its own."""
+
+    def glance(train: Spectra, **given: Any) -> GeometryModel:
+        return fit_geometry(train, GLANCE, **given)
+
+    with (
+        mock.patch("augment.synthesizers.geometry.fit_geometry", glance),
+        mock.patch("swiftwrf.geometry.fit.ENOUGH", 1),
+        mock.patch.object(Search, "improve", lambda search, room: room),
+    ):
+        yield
+
+
+@contextmanager
 def quick() -> Iterator[None]:
     """Few spectra, few steps, few methods."""
     spectra = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
@@ -103,6 +122,7 @@ def quick() -> Iterator[None]:
     network = replace(ESTIMATORS[NETWORK], make=QuickNetwork)
     with (
         small_published(),
+        glances(),
         mock.patch.object(aoa, "simulated_room", return_value=spectra),
         mock.patch.object(rssi, "rssi_room", return_value=floor),
         mock.patch("augment.synthesizers.swiftwrf.FitConfig", return_value=FIT),

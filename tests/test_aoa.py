@@ -284,7 +284,7 @@ def test_a_new_estimator_is_in_help_metrics_report_and_colours(small, registered
     assert "nearest: the spectrum of the nearest" in shown
     assert arms.palette().colour("northern") == "#123456"
     assert arms.palette().line("northern") == "--"
-    assert run("--mix", 0.5, "--synthesizer", "nearest", "--out", tmp_path / "run") == 0
+    assert run("--mix", 0.5, "--synthesizer", "nearest", "--extra", 0, "--out", tmp_path / "run") == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["mixes"]["0.5"]["methods"]["northern"]["elevation_deg"]["median"] > 0
     html = (tmp_path / "run" / "report.html").read_text()
@@ -307,7 +307,7 @@ def test_a_name_without_colour_has_one_that_depends_on_the_name_alone():
 
 
 def test_interrupted_run_goes_on_to_the_same_numbers(small, tmp_path, monkeypatch):
-    arguments = ("--mix", 0.5, "--out")
+    arguments = ("--mix", 0.5, "--extra", 20, "--out")
     assert run(*arguments, tmp_path / "whole") == 0
 
     honest, calls = AANN.fit, []

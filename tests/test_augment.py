@@ -82,7 +82,7 @@ def test_mix_refuses_a_wrong_number_of_spectra():
 
 
 @pytest.mark.parametrize("name", [name for name in SYNTHESIZERS if name not in PUBLISHED])  # they have their own
-def test_synthesizers_draw_unseen_spectra_better_than_the_mean_spectrum(name, monkeypatch):
+def test_synthesizers_draw_unseen_spectra_better_than_the_mean_spectrum(name, glances, monkeypatch):
     monkeypatch.setattr("augment.synthesizers.swiftwrf.FitConfig", lambda: SHORT)
     synthesizer = make_synthesizer(name)
     synthesizer.fit(TRAIN)

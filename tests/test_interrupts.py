@@ -18,7 +18,7 @@ import pandas as pd
 import pytest
 
 HERE = Path(__file__).parent
-AOA = ("aoa", "--mix", "0.5")
+AOA = ("aoa", "--mix", "0.5", "--extra", "20")
 RSSI = ("rssi", "--rx", "1")
 TABLES = {"aoa": ("errors.csv", "synthesis.csv"), "rssi": ("errors.csv", "predictions.csv")}
 TIMES = ["seconds", "elapsed"]  # columns of the history that no two runs share

@@ -35,7 +35,7 @@ def moved(spectra, shift):
 
 
 @pytest.mark.parametrize("name", [name for name in SYNTHESIZERS if name != "swiftwrf"])
-def test_synthesizers_do_not_depend_on_the_origin(room, small_published, name):
+def test_synthesizers_do_not_depend_on_the_origin(room, small_published, glances, name):
     """Map coordinates lie thousands of kilometres from theirs."""
     train, test = room.split("random")
     drawn = []

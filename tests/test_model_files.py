@@ -160,7 +160,7 @@ def test_an_interrupted_fit_has_its_whole_history(room, tmp_path):
 
 @pytest.mark.parametrize("far", [1e12, 1e20, 1e200, 1e308])
 @pytest.mark.parametrize("name", list(SYNTHESIZERS))
-def test_far_positions_draw_finite_spectra(room, models, small_published, name, far):
+def test_far_positions_draw_finite_spectra(room, models, small_published, glances, name, far):
     if name in ("swiftwrf", "coarray"):
         synthesize = load(models / name).synthesize
     else:

@@ -9,7 +9,7 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-from quick import PREDICTORS_KEPT, TASKS, QuickNetwork
+from quick import PREDICTORS_KEPT, TASKS, QuickNetwork, glances
 
 from swiftwrf import RssiConfig
 from tasks.aoa.arms import NETWORK
@@ -34,7 +34,10 @@ def test_every_block_runs(part, tmp_path, monkeypatch):
         assert [python, dash_m] == ["python", "-m"]
         name = module.removeprefix("tasks.")
         config, function = TASKS[name]
+        if name == "aoa":
+            arguments += ["--extra", "20"]
         with (
+            glances(),
             mock.patch.dict(ESTIMATORS._entries, {NETWORK: quick}),
             mock.patch(
                 "tasks.rssi.predictors.swiftwrf.RssiConfig",

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -72,19 +73,22 @@ class Scene:
         """What each element hears from sources (..., n or 1, 3) [m]: exp(-j k d) / d, complex64 (..., n, K)."""
         ray = (source - self.receiver).float()
         length = ray.norm(dim=-1, keepdim=True)
-        phase = (ray / length) @ self.element.T - self.wavenumber * length
-        return torch.polar((1 / length).expand_as(phase), phase)
+        return spherical((ray / length) @ self.element.T - self.wavenumber * length, length)
 
     def coherence(self, field: Tensor) -> Tensor:
         """|x^H h|^2 / K^2 of the observed and the given phases, (..., n, K) to (..., n), in [0, 1]; the better of the two
         channels that the spectrum cannot tell apart counts."""
-        unit = field / field.abs().clamp_min(1e-12)
-        match = unit[..., None, :] @ self.channel.conj().transpose(-1, -2)
-        return match[..., 0, :].abs().square().amax(-1) / field.shape[-1] ** 2
+        match = torch.einsum("...nk,nfk->...nf", field.sgn(), self.channel.conj())
+        return match.abs().square().amax(-1) / field.shape[-1] ** 2
 
     def score(self, field: Tensor) -> Tensor:
         """1 - the mean coherence: 0 where all phases agree, (..., n, K) to (...)."""
         return 1 - self.coherence(field).mean(-1)
+
+
+def spherical(phase: Tensor, length: Tensor) -> Tensor:
+    """exp(j phase) / length, complex64; cosine and sine are vectorised, torch.polar is not."""
+    return torch.complex(phase.cos() / length, phase.sin() / length)
 
 
 def sequences(normal: Tensor, order: int) -> list[Sequence]:
@@ -106,6 +110,34 @@ def sequences(normal: Tensor, order: int) -> list[Sequence]:
     return found
 
 
+@dataclass(frozen=True)
+class Tree:
+    """Sequences, and all that they begin with, by their lengths, so that all images of one order follow at once.
+
+    Args:
+        levels: for each length the rows of the sequences without their last plane among those of the length before, and the
+            last planes.
+        rows: of the sequences among those of all lengths, one after the other.
+    """
+
+    levels: list[tuple[Tensor, Tensor]]
+    rows: Tensor
+
+
+@lru_cache(maxsize=1024)
+def tree_of(sequence: tuple[Sequence, ...]) -> Tree:
+    """The tree of these sequences."""
+    before: dict[Sequence, int] = {(): 0}
+    row: dict[Sequence, int] = {}
+    levels = []
+    for length in range(1, max(map(len, sequence)) + 1):
+        these = list(dict.fromkeys(s[:length] for s in sequence if len(s) >= length))
+        levels.append((torch.tensor([before[s[:-1]] for s in these]), torch.tensor([s[-1] for s in these])))
+        before = {s: number for number, s in enumerate(these)}
+        row |= {s: number + len(row) for s, number in before.items()}
+    return Tree(levels, torch.tensor([row[s] for s in sequence]))
+
+
 def mirror(source: Tensor, normal: Tensor, offset: Tensor) -> Tensor:
     """Sources (..., 3) [m] mirrored in planes normal . x = offset; the shapes (..., 3) and (...) broadcast."""
     distance = (source * normal).sum(-1, keepdim=True) - offset[..., None]
@@ -114,13 +146,11 @@ def mirror(source: Tensor, normal: Tensor, offset: Tensor) -> Tensor:
 
 def images(scene: Scene, normal: Tensor, offset: Tensor, sequence: list[Sequence]) -> Tensor:
     """Where the images are, float64 (B, S, n or 1, 3) [m], in planes (B, P, 3) and (B, P) [m]."""
-    found: dict[Sequence, Tensor] = {(): scene.transmitter.expand(len(normal), -1, -1)}
-    for s in sequence:
-        for end in range(1, len(s) + 1):
-            if s[:end] not in found:
-                i = s[end - 1]
-                found[s[:end]] = mirror(found[s[: end - 1]], normal[:, i, None], offset[:, i, None])
-    return torch.stack([found[s] for s in sequence], dim=1)
+    tree, last, found = tree_of(tuple(sequence)), scene.transmitter.expand(len(normal), 1, -1, -1), []
+    for parent, plane in tree.levels:
+        last = mirror(last[:, parent], normal[:, plane, None], offset[:, plane, None])
+        found.append(last)
+    return torch.cat(found, dim=1)[:, tree.rows]
 
 
 def turn_of(scene: Scene, normal: Tensor, offset: Tensor, plane: int) -> float:
@@ -144,7 +174,11 @@ def field(scene: Scene, normal: Tensor, offset: Tensor, gain: Tensor, sequence: 
 
 def image_gain(gain: Tensor, sequence: list[Sequence]) -> Tensor:
     """Product of the gains (B, P) along each sequence, (B, S)."""
-    return torch.stack([gain[:, list(s)].prod(dim=1) for s in sequence], dim=1)
+    tree, last, found = tree_of(tuple(sequence)), torch.ones(len(gain), 1), []
+    for parent, plane in tree.levels:
+        last = last[:, parent] * gain[:, plane]
+        found.append(last)
+    return torch.cat(found, dim=1)[:, tree.rows]
 
 
 def visibility(scene: Scene, normal: Tensor, offset: Tensor, sequence: list[Sequence], source: Tensor) -> Tensor:
@@ -153,7 +187,8 @@ def visibility(scene: Scene, normal: Tensor, offset: Tensor, sequence: list[Sequ
     Between planes that are parallel or perpendicular all do, since the region is inside of all planes. Elsewhere the path
     is followed back from the receiver: it must meet its last plane coming from the inside, and so on.
     """
-    cosine = (normal @ normal.mT).abs()
+    facing = normal[:1] if normal.stride(0) == 0 else normal  # rooms that are expanded from one share their normals
+    cosine = (facing @ facing.mT).abs()
     if not bool(((cosine > RIGHT) & (cosine < 1 - RIGHT**2)).any()):
         return torch.ones(source.shape[:2])[..., None]
     row = {s: number for number, s in enumerate(sequence)}

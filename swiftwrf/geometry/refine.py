@@ -5,68 +5,65 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from swiftwrf.geometry.images import Scene, Sequence, image_gain, images, visibility
+from swiftwrf.geometry.images import Scene, Sequence, image_gain, images, spherical, tree_of, visibility
 
 
 def derivatives(
     scene: Scene, normal: Tensor, offset: Tensor, gain: Tensor, sequence: list[Sequence], tilt: bool
 ) -> tuple[Tensor, Tensor]:
     """The field with the direct wave, (B, n, K), and what it changes by with each plane's offset [m], gain and, with
-    `tilt`, the two angles by which its normal turns [rad], (B, Q, P, n, K)."""
+    `tilt`, the two angles by which its normal turns [rad], (B, Q, P, n, K); of all `sequences` up to an order."""
     source = images(scene, normal, offset, sequence)
     ray = (source - scene.receiver).float()
     length = ray.norm(dim=-1, keepdim=True)
     unit = ray / length
     phase = unit @ scene.element.T - scene.wavenumber * length
     strength = image_gain(gain, sequence)[..., None] * visibility(scene, normal, offset, sequence, source)
-    wave = torch.polar((1 / length).expand_as(phase), phase) * strength[..., None]
-    direct = scene.wave(scene.transmitter)
-    total = direct + wave.sum(1)
-    moves = tangents(normal, offset, scene.transmitter, sequence, tilt)
+    wave = spherical(phase, length) * strength[..., None]
+    total = scene.wave(scene.transmitter) + wave.sum(1)
     change = torch.zeros(len(normal), 4 if tilt else 2, normal.shape[1], *total.shape[1:], dtype=total.dtype)
-    for member in range(max(map(len, sequence))):
-        rows = [row for row, s in enumerate(sequence) if len(s) > member]
-        owner = torch.tensor([sequence[row][member] for row in rows])
-        part = wave[:, rows]
-        safe = torch.where(gain.abs() < 1e-6, torch.full_like(gain, 1e-6), gain)
+    safe = torch.where(gain.abs() < 1e-6, torch.full_like(gain, 1e-6), gain)
+    for owner, steps in tangents(normal, offset, scene.transmitter, sequence, tilt):
+        part, ray, far = (t[:, -len(owner) :] for t in (wave, unit, length))  # the longest sequences are the last ones
         change[:, 1].index_add_(1, owner, part / safe[:, owner, None, None])
-        for q, move in zip([0, 2, 3] if tilt else [0], moves, strict=True):
-            step = torch.stack([move[row][member] for row in rows], dim=1).float()  # (B, rows, n or 1, 3)
-            along = (unit[:, rows] * step).sum(-1, keepdim=True)
-            turned = (step - unit[:, rows] * along) / length[:, rows]
+        for q, step in zip([0, 2, 3] if tilt else [0], steps, strict=True):
+            along = (ray * step.float()).sum(-1, keepdim=True)
+            turned = (step.float() - ray * along) / far
             advance = turned @ scene.element.T - scene.wavenumber * along
-            change[:, q].index_add_(
-                1, owner, part * torch.complex((-along / length[:, rows]).expand_as(advance), advance)
-            )
+            change[:, q].index_add_(1, owner, part * torch.complex((-along / far).expand_as(advance), advance))
     return total, change
 
 
 def tangents(
     normal: Tensor, offset: Tensor, transmitter: Tensor, sequence: list[Sequence], tilt: bool
-) -> list[list[list[Tensor]]]:
-    """By how much each image moves with the offset and tilts of each plane that made it: for each of the 1 or 3
-    parameters and each sequence, one (B, n or 1, 3) a member."""
+) -> list[tuple[Tensor, list[Tensor]]]:
+    """By how much images move with the offset and the tilts of the planes that made them: for the first plane of each
+    sequence, the second of those that have one and so on, its number (R,) and, for the 1 or 3 parameters, how far the
+    image goes, (B, R, n or 1, 3); these R are the last ones of `sequences`."""
     across = torch.linalg.svd(normal[:, :, None]).Vh[:, :, 1:] if tilt else normal[:, :, :0, None]
-    found: list[list[list[Tensor]]] = []
-    for q in range(3 if tilt else 1):
-        rows: list[list[Tensor]] = []
-        for s in sequence:
-            point = transmitter.expand(len(normal), -1, -1)
-            steps: list[Tensor] = []
-            for i in s:
-                n, o = normal[:, i, None], offset[:, i, None, None]
-                distance = (point * n).sum(-1, keepdim=True) - o
-                steps = [step - 2 * (step * n).sum(-1, keepdim=True) * n for step in steps]
-                if q == 0:
-                    own = 2 * n.expand_as(point)
-                else:
-                    turn = across[:, i, q - 1, None]
-                    own = -2 * (point * turn).sum(-1, keepdim=True) * n - 2 * distance * turn
-                steps.append(own)
-                point = point - 2 * distance * n
-            rows.append(steps)
-        found.append(rows)
-    return found
+    point = transmitter.expand(len(normal), 1, -1, -1)
+    last: list[tuple[Tensor, list[Tensor]]] = []
+    found: list[list[tuple[Tensor, list[Tensor]]]] = []
+    for parent, plane in tree_of(tuple(sequence)).levels:
+        n, o, point = normal[:, plane, None], offset[:, plane, None, None], point[:, parent]
+        distance = (point * n).sum(-1, keepdim=True) - o
+        last = [(owner[parent], [_turned(step[:, parent], n) for step in steps]) for owner, steps in last]
+        own = [2 * n.expand_as(point)]
+        for turn in across[:, plane].unbind(2) if tilt else ():
+            turn = turn[:, :, None]
+            own.append(-2 * (point * turn).sum(-1, keepdim=True) * n - 2 * distance * turn)
+        last, point = [*last, (plane, own)], point - 2 * distance * n
+        found.append(last)
+    whole = []
+    for member in range(len(found)):
+        owners, steps = zip(*[level[member] for level in found[member:]], strict=True)
+        whole.append((torch.cat(owners), [torch.cat(q, dim=1) for q in zip(*steps, strict=True)]))
+    return whole
+
+
+def _turned(step: Tensor, normal: Tensor) -> Tensor:
+    """A displacement as a mirror shows it."""
+    return step - 2 * (step * normal).sum(-1, keepdim=True) * normal
 
 
 def normal_equations(scene: Scene, total: Tensor, change: Tensor, exact: bool = False) -> tuple[Tensor, Tensor, Tensor]:
@@ -78,8 +75,7 @@ def normal_equations(scene: Scene, total: Tensor, change: Tensor, exact: bool = 
     """
     change = change.flatten(1, 2)
     safe = torch.where(total.abs() < 1e-9, torch.full_like(total, 1e-9), total)
-    unit = safe / safe.abs()
-    match = torch.einsum("bnk,nfk->bnfk", unit, scene.channel.conj())
+    match = torch.einsum("bnk,nfk->bnfk", safe.sgn(), scene.channel.conj())
     sum_ = match.sum(-1)
     better = sum_.abs().argmax(-1)
     pick = better[..., None, None].expand(*better.shape, 1, match.shape[-1])
@@ -87,7 +83,8 @@ def normal_equations(scene: Scene, total: Tensor, change: Tensor, exact: bool = 
     mean = chosen.mean(-1)
     score = 1 - mean.abs().square().mean(-1)
     error = chosen * torch.polar(torch.ones_like(mean.abs()), -mean.angle())[..., None]
-    turn = (change / safe[:, None]).imag.clamp(-1e3, 1e3)
+    inverse = (1 / safe)[:, None]
+    turn = (change.real * inverse.imag + change.imag * inverse.real).clamp(-1e3, 1e3)
     turn = turn - turn.mean(-1, keepdim=True)
     weight = mean.abs()[:, None, :, None] / match.shape[-1]
     slope = (turn * weight * error.imag[:, None]).sum(-1)

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from dataclasses import field as of
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -138,6 +139,8 @@ class Search:
                     for v, o in self.minima(room, side, order, 4):
                         new = Room(v, {**room.offset, side: o}, {**room.gain, side: 0.7 * self.sign})
                         pool.setdefault(new.key(2 * self.step), new)
+            if not pool:  # no side left has a minimum within reach
+                break
             best = sorted(pool.values(), key=lambda r: r.score)[: 3 * width]
             distinct: dict[tuple[tuple[int, int], ...], Room] = {}
             for r in self.refined(best, order):
@@ -204,7 +207,7 @@ class Search:
             value = torch.stack([self.scene.score(t) for t in total])
             for index in value.flatten().argsort()[:keep]:
                 choice = [0] * 6
-                for i, options, at in zip(which, tried, torch.unravel_index(index, value.shape), strict=True):
+                for i, options, at in zip(which, tried, np.unravel_index(int(index), value.shape), strict=True):
                     choice[i] = options[int(at)]
                 pool.append((float(value.flatten()[index]), tuple(choice)))
         rooms = []

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 import torch
 from PIL import Image
-from quick import PUBLISHED, PUBLISHED_RSSI
+from quick import GLANCE, PUBLISHED, PUBLISHED_RSSI
 from samples import snapshots as made_snapshots
 from samples import survey_rows, write_deepmimo, write_dichasus, write_espargos, write_snapshots, write_survey
 
@@ -121,11 +121,11 @@ def model_coarray(folder: Path) -> None:
 
 
 def model_geometry(folder: Path) -> None:
-    fit_geometry(_room(), progress=False).save(folder / "model")
+    fit_geometry(_room(), GLANCE, progress=False).save(folder / "model")
 
 
 def model_hybrid(folder: Path) -> None:
-    geometry = fit_geometry(_room(), progress=False)
+    geometry = fit_geometry(_room(), GLANCE, progress=False)
     strengths = fit_strengths(geometry, observe(_room())[0], Smoothness(Kernel(), misfit=1.0))
     replace(fit_hybrid(_room(), geometry), strengths=strengths).save(folder / "model")
 

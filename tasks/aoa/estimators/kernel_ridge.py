@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.linalg import solve
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.metrics.pairwise import euclidean_distances, rbf_kernel
-from sklearn.model_selection import GridSearchCV, KFold
+from sklearn.model_selection import KFold
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 from torch.nn import functional
@@ -55,16 +56,17 @@ class KernelRegression(SavedEstimator):
         apart = euclidean_distances(feature[:, ::7], squared=True) * 7  # every seventh pixel will do
         width = 1 / max(float(np.median(apart[~np.eye(len(feature), dtype=bool)])), 1e-9)
         folds = KFold(min(5, len(feature)), shuffle=True, random_state=self.settings.seed)
-        found = []
+        errors: dict[tuple[float, float], float] = {}
         with threadpool_limits(1):  # many small problems: several threads would mostly wait for each other
             for gamma in (factor * width for factor in WIDTHS):
-                ridge = KernelRidge(kernel="precomputed")  # one kernel matrix serves all folds and penalties
-                search = GridSearchCV(
-                    ridge, {"alpha": PENALTIES}, cv=folds, scoring="neg_mean_absolute_error", refit=False
-                )
-                search.fit(rbf_kernel(feature, gamma=gamma), offset)
-                found.append((search.best_score_, gamma, search.best_params_["alpha"]))
-        return max(found)[1:]
+                kernel = rbf_kernel(feature, gamma=gamma)  # serves all folds and penalties, as GridSearchCV's would not
+                for kept, out in folds.split(kernel):
+                    known, held = kernel[np.ix_(kept, kept)], kernel[np.ix_(out, kept)]
+                    for alpha in PENALTIES:
+                        weight = solve(known + alpha * np.eye(len(kept)), offset[kept], assume_a="pos")
+                        error = float(np.abs(held @ weight - offset[out]).mean())
+                        errors[gamma, alpha] = errors.get((gamma, alpha), 0.0) + error
+        return min(errors, key=errors.__getitem__)
 
     def estimate(self, spectrum: Tensor) -> Tensor:
         pointing = rbf_kernel(self._feature(spectrum), self._known, self._gamma) @ self._weight + self._mean
