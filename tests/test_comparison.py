@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 
 import pytest
@@ -394,6 +395,12 @@ def test_the_compiled_field_is_the_field(room, monkeypatch):
     torch.testing.assert_close(plain, compiled)
 
 
+@pytest.fixture(scope="module")
+def fitted(room):
+    """A fitted model of each name, once."""
+    return cache(lambda name: fit(room, PUBLISHED[name], progress=False))
+
+
 @every
 @pytest.mark.parametrize(
     "change",
@@ -408,9 +415,9 @@ def test_the_compiled_field_is_the_field(room, monkeypatch):
         {"moving": "both"},
     ],
 )
-def test_damaged_models_are_refused(room, tmp_path, name, change):
-    fit(room, PUBLISHED[name], progress=False).save(tmp_path / "model")
-    kind, tensors, header = read(tmp_path / "model", type(fit(room, PUBLISHED[name], progress=False)).kind)
+def test_damaged_models_are_refused(fitted, tmp_path, name, change):
+    fitted(name).save(tmp_path / "model")
+    kind, tensors, header = read(tmp_path / "model", type(fitted(name)).kind)
     if change == {"moving": "both"} and "moving" not in header:
         pytest.skip("has no ends")
     damaged = {k: header[k] | v if isinstance(v, dict) and v else v for k, v in change.items()}

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
 import pytest
 from pandas import DataFrame
 
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, write_page
+from tasks.page.palette import Palette
 from tasks.records import read_table
 
 
@@ -66,6 +68,14 @@ def test_what_is_wide_takes_the_whole_page():
     assert not Table(["a", "b"], [["x", "y"]]).wide
     assert Table(["a", "b"], [["x" * 60, "y" * 60]]).wide
     assert Table(["a", "b"], [["x", "y"]], long=True).wide
+
+
+def test_no_curve_hides_another():
+    _, axes = figures.new_figure(1, 1, 3, 2)
+    values = np.linspace(0, 1, 50)
+    figures.cdf(axes[0], Palette(), {"a": values, "b": 0.5 * values, "c": values + 1e-4}, "error")
+    wide, apart, over = axes[0].get_lines()[:3]
+    assert wide.get_linewidth() > over.get_linewidth() == apart.get_linewidth()
 
 
 def test_two_figures_of_one_name_are_refused(tmp_path):

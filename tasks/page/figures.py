@@ -96,10 +96,14 @@ def _columns(figure: Figure, labels: Sequence[str]) -> int:
 
 
 def cdf(axes: Axes, palette: Palette, errors: Mapping[str, ArrayLike], label: str, limit: float | None = None) -> None:
-    """Empirical distribution of each method's errors, with the median marked by the line at 0.5."""
-    for name, values in errors.items():
+    """Empirical distribution of each method's errors, with the median marked by the line at 0.5; one that a later one would
+    cover is drawn wider."""
+    curves = [np.quantile(np.asarray(values), np.linspace(0, 1, 21)) for values in errors.values()]
+    near = 0.005 * (limit or max(curve[-1] for curve in curves))
+    for number, (name, values) in enumerate(errors.items()):
+        covered = any(np.allclose(curves[number], later, rtol=0, atol=near) for later in curves[number + 1 :])
         style: dict[str, Any] = {"color": palette.colour(name), "linestyle": palette.line(name)}
-        axes.ecdf(np.asarray(values), label=name, linewidth=1.4, **style)
+        axes.ecdf(np.asarray(values), label=name, linewidth=4 if covered else 1.4, **style)
     axes.axhline(0.5, color=RULE, linewidth=0.8)
     axes.set(xlabel=label, ylabel="share of test spectra", ylim=(0, 1), xlim=(0, limit))
 
