@@ -162,7 +162,8 @@ class Run:
         here = environment(device, source)
         versions = self._environment.get("packages")
         if versions != here["packages"]:
-            other = ", ".join(f"{n} {v}" for n, v in (versions or {}).items() if here["packages"].get(n) != v)
+            versions = versions if isinstance(versions, dict) else {}
+            other = ", ".join(f"{n} {v}" for n, v in versions.items() if here["packages"].get(n) != v)
             raise InputError(
                 f"{self.folder} began with {other or 'other libraries'}; go on with these or start a new run"
             )

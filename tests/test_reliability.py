@@ -118,6 +118,9 @@ def test_resume_refuses_other_versions(stopped, capsys):
     file.write_text(json.dumps(content | {"packages": content["packages"] | {"torch": "0.1"}}))
     assert run("rssi", "--resume", stopped) == 2
     assert "began with torch 0.1; go on with these" in said(capsys)
+    file.write_text(json.dumps(content | {"packages": 3}))
+    assert run("rssi", "--resume", stopped) == 2
+    assert "began with other libraries" in said(capsys)
     assert (stopped / "steps" / "mean.json").exists()
 
 
@@ -237,6 +240,7 @@ def test_names_are_text_and_no_formulas(tmp_path):
     assert not [line for line in lines if line[0] in "=+-@"]
 
 
+@pytest.mark.filterwarnings("error:constrained_layout")
 def test_a_receiver_may_have_any_name(tmp_path, monkeypatch):
     from dataclasses import replace
 

@@ -22,6 +22,7 @@ from tasks.summarise import pareto
 RULE, LINES, PAPER = "#aeb7c6", "#e4e8ef", "#fffffe"  # marks of reference, grid, background
 THEMED = {"#000000": "currentColor", LINES: "var(--lines)", PAPER: "none"}  # what the page's own colours replace
 LONGEST = 100  # characters of a line of text
+NAME = 24  # characters of a name among others
 LABEL = 7  # size of a point's name [pt]
 BESIDE = (((5, 3), "left"), ((5, -9), "left"), ((-5, 3), "right"), ((-5, -9), "right"))  # where it may stand [pt]
 STYLE: dict[str, Any] = {
@@ -55,10 +56,15 @@ def in_space(figure: Figure, axes: Axes) -> Any:
         return figure.add_subplot(place, projection="3d")
 
 
-def plain(name: str) -> str:
-    """A name as text of a figure: dollars in it begin no formula, and a line of it leaves room for the figure."""
-    lines = (line if len(line) <= LONGEST else f"{line[: LONGEST - 1]}…" for line in name.split("\n"))
+def plain(text: str, most: int = LONGEST) -> str:
+    """Text of a figure: dollars in it begin no formula, and a line of it leaves room for the figure."""
+    lines = (line if len(line) <= most else f"{line[: most - 1]}…" for line in text.split("\n"))
     return "\n".join(lines).replace("$", r"\$")
+
+
+def label(name: str) -> str:
+    """A name that stands among others: on an axis, in a legend, over one of several maps."""
+    return plain(name, NAME)
 
 
 def as_svg(figure: Figure) -> str:
@@ -205,14 +211,14 @@ def speed(
     taken: list[Bbox] = []
     for name, point in points.items():
         if name in front or name in also:
-            taken.append(_label(axes, name, point, taken))
+            taken.append(_annotated(axes, name, point, taken))
     low, high = axes.get_ylim()
     if high < 30 * low:  # plain numbers where powers of ten would be few
         axes.yaxis.set_major_formatter("{x:g}")
         axes.yaxis.set_minor_formatter("{x:g}")
 
 
-def _label(axes: Axes, name: str, point: tuple[float, float], taken: Sequence[Bbox]) -> Bbox:
+def _annotated(axes: Axes, name: str, point: tuple[float, float], taken: Sequence[Bbox]) -> Bbox:
     """Names a point where that covers none of the boxes taken, if there is such a place, and returns its own box."""
     figure = axes.get_figure(root=True)
     assert figure is not None  # an axes outside of a figure has no places
