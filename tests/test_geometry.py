@@ -12,7 +12,7 @@ from swiftwrf.arrays import PlanarArray
 from swiftwrf.geometry import GeometryConfig, GeometryModel, fit_geometry
 from swiftwrf.geometry.fit import observe
 from swiftwrf.geometry.hybrid import HybridModel, _strengths, fit_hybrid
-from swiftwrf.geometry.images import Scene, field, mirror, sequences
+from swiftwrf.geometry.images import Scene, field, image_gain, images, mirror, sequences
 from swiftwrf.geometry.observe import autocorrelation, correlations, element_phases
 from swiftwrf.geometry.refine import derivatives
 from swiftwrf.geometry.strengths import Smoothness, Strengths, fit_strengths
@@ -167,6 +167,24 @@ def test_a_tilted_plane_is_found_to_a_millimetre():
     torch.testing.assert_close(
         torch.tensor(model.planes[0].normal), torch.tensor([0.8433, 0.5270, 0.1054]), atol=1e-3, rtol=0
     )
+
+
+def test_images_are_mirrored_in_one_plane_after_another():
+    """Of any sequences, also without those that they begin with."""
+    generator = torch.Generator().manual_seed(0)
+    normal = torch.nn.functional.normalize(torch.randn(2, 3, 3, generator=generator, dtype=torch.float64), dim=-1)
+    offset, gain = torch.rand(2, 3, generator=generator, dtype=torch.float64), torch.rand(2, 3, generator=generator)
+    position = torch.rand(5, 3, generator=generator, dtype=torch.float64)
+    scene = Scene.of(position, torch.zeros(3), "transmitter", ARRAY, torch.eye(3), torch.ones(5, 16))
+    chain = [(1, 0, 2), (2,), (0, 1)]
+    found, strength = images(scene, normal, offset, chain), image_gain(gain, chain)
+    for row, sequence in enumerate(chain):
+        point, product = position, torch.ones(2)
+        for plane in sequence:
+            point = mirror(point, normal[:, plane, None], offset[:, plane, None])
+            product = product * gain[:, plane]
+        torch.testing.assert_close(found[:, row], point)
+        torch.testing.assert_close(strength[:, row], product)
 
 
 def test_nothing_to_find_is_no_plane():
