@@ -82,8 +82,7 @@ def flipped(scene: Scene, room: Planes, plane: int = -1) -> list[Planes]:
 
 def correlation_score(scene: Scene, room: Planes, array: PlanarArray) -> float:
     """1 - correlation of predicted and observed co-array numbers, both scaled freely."""
-    h = room.field(scene)
-    predicted = autocorrelation(h / h.abs().clamp_min(1e-12), array)
+    predicted = autocorrelation(room.field(scene).sgn(), array)
     seen = autocorrelation(scene.channel[:, 0], array)
     power = float(predicted.abs().square().sum() * seen.abs().square().sum())
     return 1 - float((predicted * seen.conj()).real.sum()) / math.sqrt(power)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from swiftwrf.geometry.images import Scene, Sequence, image_gain, images, spherical, tree_of, visibility
+from swiftwrf.geometry.images import Scene, Sequence, image_gain, images, mirror, spherical, tree_of, visibility
 
 
 def derivatives(
@@ -40,18 +40,18 @@ def tangents(
     """By how much images move with the offset and the tilts of the planes that made them: for the first plane of each
     sequence, the second of those that have one and so on, its number (R,) and, for the 1 or 3 parameters, how far the
     image goes, (B, R, n or 1, 3); these R are the last ones of `sequences`."""
-    across = torch.linalg.svd(normal[:, :, None]).Vh[:, :, 1:] if tilt else normal[:, :, :0, None]
+    across = torch.linalg.svd(normal[:, :, None]).Vh[:, :, 1:].unbind(2) if tilt else ()
+    here = offset.new_zeros(())  # displacements are mirrored as points are in planes through the origin
     point = transmitter.expand(len(normal), 1, -1, -1)
     last: list[tuple[Tensor, list[Tensor]]] = []
     found: list[list[tuple[Tensor, list[Tensor]]]] = []
     for parent, plane in tree_of(tuple(sequence)).levels:
         n, o, point = normal[:, plane, None], offset[:, plane, None, None], point[:, parent]
         distance = (point * n).sum(-1, keepdim=True) - o
-        last = [(owner[parent], [_turned(step[:, parent], n) for step in steps]) for owner, steps in last]
-        own = [2 * n.expand_as(point)]
-        for turn in across[:, plane].unbind(2) if tilt else ():
-            turn = turn[:, :, None]
-            own.append(-2 * (point * turn).sum(-1, keepdim=True) * n - 2 * distance * turn)
+        last = [(owner[parent], [mirror(step[:, parent], n, here) for step in steps]) for owner, steps in last]
+        turns = [tilted[:, plane, None] for tilted in across]
+        own = [-2 * (point * turn).sum(-1, keepdim=True) * n - 2 * distance * turn for turn in turns]
+        own = [2 * n.expand_as(point), *own]
         last, point = [*last, (plane, own)], point - 2 * distance * n
         found.append(last)
     whole = []
@@ -59,11 +59,6 @@ def tangents(
         owners, steps = zip(*[level[member] for level in found[member:]], strict=True)
         whole.append((torch.cat(owners), [torch.cat(q, dim=1) for q in zip(*steps, strict=True)]))
     return whole
-
-
-def _turned(step: Tensor, normal: Tensor) -> Tensor:
-    """A displacement as a mirror shows it."""
-    return step - 2 * (step * normal).sum(-1, keepdim=True) * normal
 
 
 def normal_equations(scene: Scene, total: Tensor, change: Tensor, exact: bool = False) -> tuple[Tensor, Tensor, Tensor]:

@@ -81,17 +81,13 @@ def residual_statistics(
         direct: share of the positions with a line of sight.
     """
     mean = scene.wave(scene.transmitter) + field(scene, normal, offset, gain, sequence)[0]
-    aim = float(scene.coherence(mean).mean())
+    aim, phase = float(scene.coherence(mean).mean()), mean.sgn()
     still = torch.zeros(offset.shape[1], offset.shape[1], dtype=torch.float64)
     low, high = 0.0, 4.0
     for _ in range(CALIBRATION):
         middle = (low + high) / 2
         generator = torch.Generator().manual_seed(SEED)
         drawn = draw(scene, normal, offset, gain, sequence, still, Residual(direct, middle), generator)
-        match = (_phase(drawn).conj() * _phase(mean)).mean(-1).abs().square().mean()
+        match = (drawn.sgn().conj() * phase).mean(-1).abs().square().mean()
         low, high = (middle, high) if float(match) > aim else (low, middle)
     return Residual(direct, (low + high) / 2)
-
-
-def _phase(field: Tensor) -> Tensor:
-    return field / field.abs().clamp_min(1e-12)

@@ -143,7 +143,7 @@ def _floor(data: Rssi) -> Plot:
     for name, at in zip(data.receiver_names, data.receiver_position.tolist(), strict=True):
         if data.located:
             axes[0].plot(*at[:2], "x", color="#ee6677", markersize=8, markeredgewidth=2)
-            axes[0].annotate(figures.label(name), at[:2], fontsize=7, xytext=(3, 3), textcoords="offset points")
+            axes[0].annotate(figures.short(name), at[:2], fontsize=7, xytext=(3, 3), textcoords="offset points")
     axes[0].set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     caption = "Positions, coloured by the strongest RSSI; crosses: receivers, where they are known."
     return Plot("plan", figure, caption, _places(place, strongest_dbm=strongest))
@@ -153,7 +153,7 @@ def _against_distance(data: Rssi) -> Plot:
     figure, axes = figures.new_figure(1, 1, 6, 3.6)
     apart = distance(data.transmitter_position, data.receiver_position)
     for c, name in enumerate(data.receiver_names[:MOST_RECEIVERS]):
-        axes[0].plot(apart[:, c], data.rssi_dbm[:, c], ".", markersize=2, label=figures.label(name))
+        axes[0].plot(apart[:, c], data.rssi_dbm[:, c], ".", markersize=2, label=figures.short(name))
     axes[0].set(xlabel="distance from the receiver [m]", ylabel="RSSI [dBm]", xscale="log")
     row, column = (~data.rssi_dbm.isnan()).nonzero(as_tuple=True)
     table = DataFrame(
@@ -169,7 +169,7 @@ def _against_distance(data: Rssi) -> Plot:
 def _heard(data: Rssi) -> Plot:
     share = (~data.rssi_dbm.isnan()).double().mean(dim=0)
     order = share.argsort(descending=True)[:MOST_RECEIVERS].tolist()
-    names = [figures.label(data.receiver_names[i]) for i in order]
+    names = [figures.short(data.receiver_names[i]) for i in order]
     figure, axes = figures.new_figure(1, 1, max(4.0, 0.3 * len(order) + 2), 3)
     axes[0].bar(np.arange(len(order)), share[order].numpy(), color=DOTS)
     axes[0].set(xticks=range(len(order)), xticklabels=names, ylabel="share heard", ylim=(0, 1))

@@ -62,7 +62,7 @@ def plain(text: str, most: int = LONGEST) -> str:
     return "\n".join(lines).replace("$", r"\$")
 
 
-def label(name: str) -> str:
+def short(name: str) -> str:
     """A name that stands among others: on an axis, in a legend, over one of several maps."""
     return plain(name, NAME)
 

@@ -295,7 +295,7 @@ class RssiScene:
         for number, (x, y) in enumerate(self.floor.receiver[:, :2]):
             if number == shown.receiver or shown.kind == "best receiver":
                 ax.plot(x, y, "x", color="#ee6677", markersize=9, markeredgewidth=2)
-                ax.annotate(figures.label(self.receivers[number]), (x, y), (6, 6), textcoords="offset points")
+                ax.annotate(figures.short(self.receivers[number]), (x, y), (6, 6), textcoords="offset points")
         ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", xlim=extent[:2], ylim=extent[2:])
         ax.grid(visible=False)
         title = textwrap.fill(f"{self.sentence(shown)} Height {shown.height:.2f} m.", figures.LONGEST)

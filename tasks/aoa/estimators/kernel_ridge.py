@@ -59,7 +59,7 @@ class KernelRegression(SavedEstimator):
         errors: dict[tuple[float, float], float] = {}
         with threadpool_limits(1):  # many small problems: several threads would mostly wait for each other
             for gamma in (factor * width for factor in WIDTHS):
-                kernel = rbf_kernel(feature, gamma=gamma)  # serves all folds and penalties, as GridSearchCV's would not
+                kernel = rbf_kernel(feature, gamma=gamma)  # one serves all folds and penalties
                 for kept, out in folds.split(kernel):
                     known, held = kernel[np.ix_(kept, kept)], kernel[np.ix_(out, kept)]
                     for alpha in PENALTIES:

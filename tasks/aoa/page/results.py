@@ -94,7 +94,7 @@ def over_shares(shares: list[Share], name: str) -> Plot:
     )
     labels = [share.percent for share in shares]
     if len({share.run.place for share in shares}) > 1:
-        labels = [figures.label(f"{s.percent}\n{s.run.metrics['data']}\n{s.run.metrics['split']}") for s in shares]
+        labels = [figures.short(f"{s.percent}\n{s.run.metrics['data']}\n{s.run.metrics['split']}") for s in shares]
     heights = {arm: [_median_and_interval(share, arm) for share in shares] for arm in names}
     figure, axes = figures.new_figure(1, 1, 7.2, 4)
     figures.bars(axes[0], arms.palette(), labels, heights, "median great-circle error [deg]")

@@ -137,7 +137,7 @@ def _heights(run: RssiRecords) -> dict[str, list[tuple[float, float, float]]]:
 def _bars(run: RssiRecords, heights: dict[str, list[tuple[float, float, float]]]) -> Figure:
     receivers = _receivers(run)
     figure, axes = figures.new_figure(1, 1, max(6, 1.1 * len(receivers)), 3.8)
-    figures.bars(axes[0], palette(), [figures.label(name) for name in receivers], heights, "median absolute error [dB]")
+    figures.bars(axes[0], palette(), [figures.short(name) for name in receivers], heights, "median absolute error [dB]")
     axes[0].tick_params(axis="x", labelrotation=30 if len(receivers) > 6 else 0)
     figures.legend_below(figure, axes[0])
     return figure
@@ -209,7 +209,7 @@ def _maps(run: RssiRecords, field: str, label: str, most: int = MOST_MAPS) -> Fi
             }
             ax.scatter(x, y, s=9, c=maps["measured"][heard, i], zorder=2, rasterized=len(x) >= MANY, **dots)
         ax.plot(*maps["receiver"][i, :2], "x", color="#ee6677", markersize=9, markeredgewidth=2, zorder=3)
-        ax.set_title(figures.label(str(maps["receiver_names"][i])), fontsize=9)
+        ax.set_title(figures.short(str(maps["receiver_names"][i])), fontsize=9)
         ax.grid(visible=False)
     axes[0].set(xlabel="x [m]", ylabel="y [m]")
     figure.colorbar(drawn, ax=axes[:n], label=label, fraction=0.03, pad=0.02)
