@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pandas as pd
@@ -155,6 +156,23 @@ def test_pointwise_convolutions_are_matrix_products(circular):
     assert sum(isinstance(m, _Pointwise) for m in network.modules()) == 36
     torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-7)
     assert list(network.state_dict()) == list(definition.state_dict())
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+@pytest.mark.parametrize("size", [(1, 1), (1, 4), (2, 2), (2, 8), (3, 5), (4, 1)])
+def test_convolutions_over_few_pixels_are_matrix_products(size, stride):
+    """The convolution, in value and gradient, whatever rows of the kernel meet nothing but padding."""
+    from tasks.aoa.estimators.aann import _Neighbours
+
+    definition = torch.nn.Conv2d(64, 64, 3, stride, padding=1, bias=False).double()
+    product = _Neighbours(definition)
+    x = torch.rand(2, 64, *size, dtype=torch.float64, requires_grad=True)
+    with mock.patch.object(torch.nn.functional, "conv2d") as convolution:
+        actual = product(x)
+    convolution.assert_not_called()
+    expected = definition(x)
+    wanted = [torch.autograd.grad(value.square().sum(), [x, definition.weight]) for value in (actual, expected)]
+    torch.testing.assert_close([actual, *wanted[0]], [expected, *wanted[1]])
 
 
 def test_aann_is_seeded_and_leaves_the_global_generator_alone(room):

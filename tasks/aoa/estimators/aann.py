@@ -90,7 +90,36 @@ class _Pointwise(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         rows, columns = self.stride
         pixels = x[:, :, ::rows, ::columns].permute(0, 2, 3, 1)
-        return functional.linear(pixels, self.weight[:, :, 0, 0]).permute(0, 3, 1, 2)
+        return functional.linear(pixels, self.weight.flatten(1)).permute(0, 3, 1, 2)
+
+
+class _Neighbours(nn.Module):
+    """A convolution that is a matrix product over the neighbours of each pixel where pixels are few, as in the last layers.
+
+    A convolution rearranges its weights for every batch, which there takes longer than to apply them.
+    """
+
+    def __init__(self, inner: nn.Conv2d) -> None:
+        super().__init__()
+        self.weight = inner.weight
+        self.size, self.stride, self.around = inner.kernel_size[0], inner.stride[0], int(inner.padding[0])
+
+    def forward(self, x: Tensor) -> Tensor:
+        size, stride, around = self.size, self.stride, self.around
+        height, width = ((pixels + 2 * around - size) // stride + 1 for pixels in x.shape[2:])
+        if len(x) * height * width > len(self.weight):
+            return functional.conv2d(x, self.weight, stride=stride, padding=around)
+        # rows of the kernel that meet the image, not its padding alone
+        first, end = max(0, around - stride * (height - 1)), min(size, x.shape[2] + around)
+        padded = functional.pad(x.permute(0, 2, 3, 1), (0, 0, around, around, around, around))
+        down, across = stride * (height - 1) + 1, stride * (width - 1) + 1
+        neighbours = [
+            padded[:, row : row + down : stride, column : column + across : stride]
+            for row in range(first, end)
+            for column in range(size)
+        ]
+        weight = self.weight.permute(0, 2, 3, 1)[:, first:end].flatten(1)
+        return functional.linear(torch.cat(neighbours, dim=-1), weight).permute(0, 3, 1, 2)
 
 
 class _SharedNorm(nn.BatchNorm2d):
@@ -130,7 +159,7 @@ def _backbone(circular: bool, products: bool) -> nn.Module:
 
     Args:
         circular: pads the azimuth circularly.
-        products: computes its pointwise convolutions, two thirds of all, as matrix products.
+        products: computes its pointwise convolutions, two thirds of all, as matrix products, and those over few pixels.
     """
     network: nn.Module = torchvision.models.resnet50(weights=None)
     network.conv1 = nn.Conv2d(1, 64, kernel_size=7, stride=2, padding=3, bias=False)
@@ -146,6 +175,8 @@ def _backbone(circular: bool, products: bool) -> nn.Module:
                 setattr(module, name, _Pointwise(child))
             elif circular and child.padding != (0, 0):
                 setattr(module, name, _CircularConv(child))
+            elif products:
+                setattr(module, name, _Neighbours(child))
     return network
 
 
