@@ -12,7 +12,7 @@ from samples import WAVELENGTH, write_snapshots, write_survey
 
 from swiftwrf import AngularGrid, simulated_room
 from swiftwrf.data.writing import write_spectra
-from tasks.inspect.findings import nearest
+from tasks.inspect.findings.positions import nearest
 
 
 def run(*arguments):
@@ -59,7 +59,7 @@ def test_the_nearest_other_position():
 
 
 def test_more_positions_than_are_looked_at(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("tasks.inspect.findings.MOST_POSITIONS", 20)
+    monkeypatch.setattr("tasks.inspect.findings.positions.MOST_POSITIONS", 20)
     room = simulated_room(n=15, grid=AngularGrid.hemisphere(8, 32))
     (tmp_path / "source").mkdir()
     write_spectra(room.subset(torch.arange(15).repeat(2)), tmp_path / "source")

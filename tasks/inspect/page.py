@@ -12,7 +12,8 @@ from torch import Tensor
 from swiftwrf.angles import great_circle, to_direction
 from swiftwrf.data import Rssi, Spectra
 from swiftwrf.positions import distance
-from tasks.inspect.findings import Findings, nearest
+from tasks.inspect.findings.base import Findings
+from tasks.inspect.findings.positions import nearest
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table
 

@@ -1,0 +1,30 @@
+"""What measurements hold, and what about them may be wrong, in sentences."""
+
+from __future__ import annotations
+
+from swiftwrf.beamforming import PHASE
+from swiftwrf.data import Reading, Rssi, Snapshots, Spectra
+from tasks.inspect.findings.base import Findings
+from tasks.inspect.findings.rssi import check_rssi
+from tasks.inspect.findings.snapshots import check_calibration, check_snapshots
+from tasks.inspect.findings.spectra import check_peaks, check_spectra
+
+
+def inspect(data: Spectra | Snapshots | Rssi, how: Reading) -> tuple[Findings, Spectra | Rssi]:
+    """Findings, and the spectra of snapshots."""
+    findings = Findings()
+    for note in data.notes:
+        findings.say(f"{note}.")
+    if isinstance(data, Rssi):
+        check_rssi(data, findings)
+        return findings, data
+    spectra = data
+    if isinstance(data, Snapshots):
+        check_snapshots(data, findings)
+        spectra = data.spectra(how.grid, how.beamformer or PHASE)
+    assert isinstance(spectra, Spectra)
+    check_spectra(spectra, findings)
+    check_peaks(spectra, findings)
+    if isinstance(data, Snapshots):
+        check_calibration(data, findings)
+    return findings, spectra

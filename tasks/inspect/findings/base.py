@@ -1,0 +1,34 @@
+"""What is found, in sentences and numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+Level = Literal["is", "warning"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sentence: what is so, or a warning."""
+
+    level: Level
+    text: str
+
+
+@dataclass
+class Findings:
+    """Sentences and numbers, in the order in which they were found."""
+
+    sentences: list[Finding] = field(default_factory=list)
+    numbers: dict[str, Any] = field(default_factory=dict)
+
+    def say(self, text: str, **numbers: Any) -> None:
+        """What is so."""
+        self.sentences.append(Finding("is", text))
+        self.numbers |= numbers
+
+    def warn(self, text: str, **numbers: Any) -> None:
+        """What may be wrong."""
+        self.sentences.append(Finding("warning", text))
+        self.numbers |= numbers

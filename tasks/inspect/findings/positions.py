@@ -1,0 +1,64 @@
+"""Where was measured, and in which parts."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from swiftwrf.data import Rssi, Snapshots, Spectra
+from swiftwrf.positions import distance
+from tasks.inspect.findings.base import Findings
+
+MOST_POSITIONS = 3000  # whose neighbours are looked for at once
+SMOOTH, ROUGH = 0.25, 0.5  # [wavelengths] between neighbours: below, fields are smooth; above, fringes are lost
+WIDE = 1000.0  # [m] beyond which coordinates may be millimetres
+
+
+def check_positions(position: Tensor, findings: Findings, wavelength: float | None = None) -> None:
+    """Extent and density of positions (n, 3) [m]; against the wavelength [m], where it is known."""
+    low, high = position.amin(dim=0), position.amax(dim=0)
+    extent = (high - low).tolist()
+    ranges = ", ".join(
+        f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", low.tolist(), high.tolist(), strict=True)
+    )
+    findings.say(f"{len(position)} positions, {ranges} m.", n=len(position), extent_m=extent)
+    if max(extent) > WIDE:
+        findings.warn(f"Positions extend over {max(extent):.0f} m; are they millimetres? The toolkit takes metres.")
+    flat = [axis for axis, size in zip("xyz", extent, strict=True) if size < 1e-9]
+    if {"x", "y"} & set(flat):
+        findings.warn(
+            f"All positions have one {' and one '.join(flat)}; directions and planes cannot be told from them."
+        )
+    _, near = nearest(position)
+    _, times = position.unique(dim=0, return_counts=True)
+    same = int(times[times > 1].sum())
+    if same:
+        findings.warn(f"{same} positions occur more than once; a random split puts the same place into both parts.")
+    middle = float(near.median())
+    findings.numbers["nearest_m"] = middle
+    if wavelength is None:
+        findings.say(f"The nearest other position is {middle:.3f} m away (median).")
+        return
+    waves = middle / wavelength
+    findings.numbers["nearest_wavelengths"] = waves
+    text = f"The nearest other position is {middle:.3f} m, {waves:.2f} wavelengths away (median)"
+    if waves <= SMOOTH:
+        findings.say(f"{text}: interpolation between positions will work.")
+    elif waves <= ROUGH:
+        findings.say(f"{text}: interpolation will work in part; half a wavelength is the limit.")
+    else:
+        findings.warn(f"{text}: interpolators see no fringes between such positions; geometry needs none.")
+
+
+def nearest(position: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows of positions (n, 3), all or, of many, some, and the distance from each to the nearest other one [m]."""
+    some = torch.linspace(0, len(position) - 1, min(MOST_POSITIONS, len(position))).round().long()
+    apart = torch.cat([distance(position[rows], position) for rows in some.split(500)])
+    apart[torch.arange(len(some)), some] = torch.inf
+    return some, apart.amin(dim=1)
+
+
+def say_splits(data: Spectra | Snapshots | Rssi, findings: Findings) -> None:
+    """The splits that come with the measurements."""
+    for name, (train, test) in data.named_splits.items():
+        findings.say(f"Split {name}: {len(train)} for training, {len(test)} for testing.")

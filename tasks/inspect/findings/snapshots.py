@@ -1,0 +1,58 @@
+"""What array snapshots hold, and whether the array is calibrated."""
+
+from __future__ import annotations
+
+import torch
+
+from swiftwrf import InputError
+from swiftwrf.calibration import calibrate
+from swiftwrf.data import Snapshots
+from swiftwrf.positions import distance
+from tasks.inspect.findings.base import Findings
+from tasks.inspect.findings.positions import ROUGH
+
+HELPS = 0.1  # in the share along the line of sight, that a calibration must gain to be recommended
+
+
+def check_snapshots(data: Snapshots, findings: Findings) -> None:
+    """What snapshots hold."""
+    count, elements = data.channel.shape[1:]
+    apart = distance(*(2 * [torch.nn.functional.pad(data.array.element, (0, 1))])).fill_diagonal_(torch.inf).amin(dim=1)
+    spacing = float(apart.median() / data.array.wavelength)
+    findings.say(
+        f"{len(data)} array snapshots of {count} subcarriers or packets x {elements} elements, {spacing:.2f} wavelengths "
+        f"apart, at {data.array.frequency_hz / 1e9:.4g} GHz.",
+        snapshots=count,
+        elements=elements,
+        spacing_wavelengths=spacing,
+    )
+    if spacing > ROUGH + 0.01:
+        findings.warn(
+            "Elements are more than half a wavelength apart, so spectra have several peaks for one direction."
+        )
+    if data.time is not None and len(data) > 1:
+        step = data.time.diff()
+        findings.say(
+            f"Taken over {float(data.time.max() - data.time.min()):.1f} s, {float(step.median()):.3f} s apart (median)."
+        )
+        if bool((step < 0).any()):
+            findings.warn("Times are not in order; a block split by position does not mind.")
+
+
+def check_calibration(data: Snapshots, findings: Findings) -> None:
+    """Whether the array needs a calibration."""
+    try:
+        found = calibrate(data)
+    except InputError as error:
+        findings.say(f"No calibration: {error}.")
+        return
+    gain = f"from {found.before:.0%} to {found.after:.0%} of what is heard, at positions held out"
+    text = f"a calibration of phases and orientation brings what comes along the line of sight {gain}"
+    if found.after - found.before >= HELPS:
+        findings.warn(
+            f"The array is not calibrated: {text} (turned by {float(found.turn.rad2deg().norm()):.1f} degrees). Use "
+            "python -m tasks.convert SOURCE OUT --calibrate.",
+            calibration=found.to_json(),
+        )
+    else:
+        findings.say(f"The array needs no calibration: {text}.", calibration=found.to_json())
