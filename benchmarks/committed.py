@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tasks.metrics import AoaMetrics, ErrorSummary, RssiMetrics
+from tasks.metrics import AoaMetrics, ErrorSummary, MixMetrics, RssiMetrics
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
@@ -18,9 +18,23 @@ def load(name: str) -> dict[str, Any]:
     return content
 
 
-def aoa_runs() -> list[AoaMetrics]:
-    """Metrics of all runs of tasks.aoa, by file name."""
-    return [load(file.stem)["metrics"] for file in sorted(RESULTS.glob("aoa_*.json"))]
+def aoa_shares() -> list[tuple[str, MixMetrics, dict[str, Any]]]:
+    """Every share that tasks.aoa measured of a scene, what it found there, and the whole result, by file name and share.
+
+    A share that was measured again counts in its newest run.
+    """
+    scenes: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {}
+    for file in sorted(RESULTS.glob("aoa_*.json")):
+        result = load(file.stem)
+        metrics: AoaMetrics = result["metrics"]
+        shares = scenes.setdefault((metrics["data"], metrics["split"], metrics["moving"]), {})
+        for share in metrics["mixes"]:
+            shares[share] = max(shares.get(share, result), result, key=lambda run: str(run["environment"]["end"]))
+    return [
+        (share, result["metrics"]["mixes"][share], result)
+        for shares in scenes.values()
+        for share, result in sorted(shares.items())
+    ]
 
 
 def rssi_runs() -> list[RssiMetrics]:

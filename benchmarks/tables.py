@@ -6,7 +6,7 @@ import json
 import re
 from typing import Any
 
-from committed import RESULTS, ROOT, aoa_runs, interval, load, markdown, rssi_runs
+from committed import RESULTS, ROOT, aoa_shares, interval, load, markdown, rssi_runs
 from comparison_tables import comparison, comparison_counts, comparison_turbo
 from geometry import SIDES, WALLS, nearest
 from targets import aoa_targets, rssi_targets, synthesis_targets
@@ -39,13 +39,13 @@ def aoa() -> str:
         "synthesizer",
     ]
     rows = []
-    for metrics in aoa_runs():
+    for share, mix, result in aoa_shares():
+        metrics = result["metrics"]
         scene = f"{metrics['data']}, {metrics['split']}, {metrics['moving']}"
-        for share, mix in metrics["mixes"].items():
-            arms, turbo = mix["methods"], taken(mix["methods"])
-            names = (*fixed, turbo, f"kernel_ridge_{turbo}", "measured_all")
-            cells = [interval(arms[name]["great_circle_deg"]) if name in arms else "" for name in names]
-            rows.append([scene, f"{float(share):.0%}", *cells, _drawn_by(turbo)])
+        arms, turbo = mix["methods"], taken(mix["methods"])
+        names = (*fixed, turbo, f"kernel_ridge_{turbo}", "measured_all")
+        cells = [interval(arms[name]["great_circle_deg"]) if name in arms else "" for name in names]
+        rows.append([scene, f"{float(share):.0%}", *cells, _drawn_by(turbo)])
     return markdown(columns, rows)
 
 
@@ -78,10 +78,10 @@ def reliability() -> str:
 def headline() -> str:
     """What turbo learning gains in each scene with 30 % of the positions measured."""
     rows = []
-    for metrics in aoa_runs():
-        if "0.3" not in metrics["mixes"]:
+    for share, mix, result in aoa_shares():
+        if share != "0.3":
             continue
-        methods = metrics["mixes"]["0.3"]["methods"]
+        metrics, methods = result["metrics"], mix["methods"]
         turbo = taken(methods)
         error = {name: methods[name]["great_circle_deg"] for name in ("measured_only", turbo, "measured_all")}
         lower, own, _ = error.values()
@@ -95,20 +95,16 @@ def headline() -> str:
 def room() -> str:
     """The planes that each run found, whose true places are known."""
     rows = []
-    for name in sorted(file.stem for file in RESULTS.glob("aoa_*.json")):
-        content = load(name)
-        for share, found in content.get("geometry", {}).items():
-            walls = WALLS.get(content["metrics"]["data"])
-            if walls is None:
-                continue
-            own = [nearest(found["planes"], *wall) for wall in zip(SIDES, walls, strict=True)]
-            cells = [_millimetres(plane) for plane in own]
-            certain = sum(plane["certain"] for plane in found["planes"])
-            scene = f"{content['metrics']['data']}, {content['metrics']['moving']}"
-            n = content["metrics"]["mixes"][share]["n_measured"]
-            psnr = content["metrics"]["mixes"][share]["synthesis"]
-            quality = [f"{psnr[s]['psnr_db']['median']:.1f}" for s in ("geometry", "hybrid", "coarray", "gp")]
-            rows.append([scene, str(n), *cells, f"{certain} of {len(found['planes'])}", *quality])
+    for share, mix, result in aoa_shares():
+        found, walls = result.get("geometry", {}).get(share), WALLS.get(result["metrics"]["data"])
+        if found is None or walls is None:
+            continue
+        own = [nearest(found["planes"], *wall) for wall in zip(SIDES, walls, strict=True)]
+        cells = [_millimetres(plane) for plane in own]
+        certain = sum(plane["certain"] for plane in found["planes"])
+        scene = f"{result['metrics']['data']}, {result['metrics']['moving']}"
+        quality = [f"{mix['synthesis'][s]['psnr_db']['median']:.1f}" for s in ("geometry", "hybrid", "coarray", "gp")]
+        rows.append([scene, str(mix["n_measured"]), *cells, f"{certain} of {len(found['planes'])}", *quality])
     methods = ("geometry", "hybrid", "coarray", "gp")
     return markdown(["scene, moving end", "spectra", *(f"{s} [mm]" for s in SIDES), "certain", *methods], rows)
 
