@@ -29,7 +29,7 @@ from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator, Settings
 
 LEAST_ROWS = 8  # a prime number of rows can only be averaged to one, which leaves nothing to learn from
 MANY = 400  # spectra of a scene, above which a quick training is longer, in larger batches
-LOOKS = 30  # that it then takes at each of them
+LOOKS = 60  # that it then takes at each of them; a training set with synthetic spectra gets several times fewer
 MOST_STEPS = 1000  # of a quick training
 STATISTICS = 512  # spectra that the batch norms' statistics are taken from
 
