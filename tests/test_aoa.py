@@ -218,8 +218,8 @@ def test_a_training_is_as_long_as_the_scene_needs():
     assert [(config.steps, config.batch) for config in quick] == [
         (250, 32),
         (250, 32),
-        (366, 64),
-        (715, 64),
+        (731, 64),
+        (1000, 64),
         (1000, 64),
     ]
 
