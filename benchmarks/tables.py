@@ -94,7 +94,7 @@ def headline() -> str:
 
 def room() -> str:
     """The planes that each run found, whose true places are known."""
-    rows = []
+    methods, rows = ("geometry", "hybrid", "coarray", "gp"), []
     for share, mix, result in aoa_shares():
         found, walls = result.get("geometry", {}).get(share), WALLS.get(result["metrics"]["data"])
         if found is None or walls is None:
@@ -103,9 +103,8 @@ def room() -> str:
         cells = [_millimetres(plane) for plane in own]
         certain = sum(plane["certain"] for plane in found["planes"])
         scene = f"{result['metrics']['data']}, {result['metrics']['moving']}"
-        quality = [f"{mix['synthesis'][s]['psnr_db']['median']:.1f}" for s in ("geometry", "hybrid", "coarray", "gp")]
+        quality = [f"{mix['synthesis'][s]['psnr_db']['median']:.1f}" for s in methods]
         rows.append([scene, str(mix["n_measured"]), *cells, f"{certain} of {len(found['planes'])}", *quality])
-    methods = ("geometry", "hybrid", "coarray", "gp")
     return markdown(["scene, moving end", "spectra", *(f"{s} [mm]" for s in SIDES), "certain", *methods], rows)
 
 

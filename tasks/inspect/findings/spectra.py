@@ -28,8 +28,7 @@ def check_spectra(data: Spectra, findings: Findings) -> None:
         findings.say(
             "The antenna array and its carrier are not described (--array tells them); coarray and geometry need them."
         )
-    peak = torch.cat([part.flatten(1).amax(dim=1) for part in data.store.batches()])
-    least = torch.cat([part.flatten(1).amin(dim=1) for part in data.store.batches()])
+    least, peak = torch.cat([torch.stack(part.flatten(1).aminmax(dim=1)) for part in data.store.batches()], dim=1)
     if float(peak.min()) < 0.05:
         findings.warn(f"{int((peak < 0.05).sum())} spectra are nearly empty, below 0.05 everywhere.")
     if bool((least == peak).any()):
