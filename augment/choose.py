@@ -78,11 +78,12 @@ def choose_synthesizer(measured: Spectra, settings: Settings, names: Iterable[st
     trials: dict[str, list[Trial]] = {}
     seconds: dict[str, float] = {}
     for name in names or candidates(measured):
-        began, found, trials[name] = time.perf_counter(), [], []
+        found, trials[name], seconds[name] = [], [], 0.0
         for number in range(int(fold.max()) + 1):
             rows = (fold == number).nonzero()[:, 0]
             kept, out = measured.subset((fold != number).nonzero()[:, 0]), measured.subset(*thinned(rows, rows=JUDGES))
             synthesizer = make_synthesizer(name, quiet)
+            began = time.perf_counter()
             try:
                 if trials[name]:
                     synthesizer.fit_like(trials[name][0].synthesizer, kept)
@@ -91,12 +92,11 @@ def choose_synthesizer(measured: Spectra, settings: Settings, names: Iterable[st
                 drawn = synthesizer.synthesize(out.position)
             except (InputError, FitError):  # one that cannot be fitted here is no candidate
                 break
+            seconds[name] += time.perf_counter() - began + synthesizer.shared_seconds
             trials[name].append(Trial(synthesizer, kept, out))
             found.append(psnr(drawn, out.spectrum))
         else:
             score[name] = float(torch.cat(found).median())
-        shared = sum(trial.synthesizer.shared_seconds for trial in trials[name])
-        seconds[name] = time.perf_counter() - began + shared
     if not score:
         raise InputError(f"no synthesizer can be fitted to {len(measured)} measured spectra of {measured.name}")
     best = max(score, key=lambda name: score[name])

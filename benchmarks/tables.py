@@ -337,10 +337,21 @@ def scaling_quality() -> str:
     return markdown(["spectra", *names], rows)
 
 
+def busy() -> str:
+    """Seconds of a step of the network, idle and beside other work, by how long threads wait busily."""
+    steps = {(row["spins"], row["neighbour"]): row["step_s"] for row in load("busy")["rows"]}
+    rows = [
+        [f"{spins:,}", f"{steps[spins, False]:.2f} s", f"{steps[spins, True]:.2f} s"]
+        for spins in dict.fromkeys(spins for spins, _ in steps)
+    ]
+    return markdown(["GOMP_SPINCOUNT", "idle", "beside a loop on one core"], rows)
+
+
 TABLES = {
     "scaling": scaling,
     "scaling_quality": scaling_quality,
     "scaling_rssi": scaling_rssi,
+    "busy": busy,
     "headline": headline,
     "reliability": reliability,
     "synthesis": synthesis,
@@ -377,6 +388,7 @@ FILES = (
     "docs/comparison.md",
     "docs/targets.md",
     "docs/raytracing.md",
+    "docs/scale.md",
 )
 
 

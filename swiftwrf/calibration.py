@@ -33,6 +33,7 @@ from swiftwrf.beamforming import covariance
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.splits import FOLDS, MIN_TRAINING, slabs
 from swiftwrf.errors import InputError
+from swiftwrf.threads import single_thread
 
 LARGEST = math.radians(45)  # turn that is looked for: a larger one is an error of frames, not of mounting
 STEP = math.radians(9)  # of the scan: a third of the beam of a 4 x 4 array
@@ -86,6 +87,7 @@ class Calibration:
         }
 
 
+@single_thread()
 def calibrate(train: Snapshots) -> Calibration:
     """Estimates the phases of the elements and the orientation of the array.
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -60,3 +62,13 @@ def test_unreadable_data_are_told_from_unwritable_directories(tmp_path, capsys):
     (tmp_path / "data").mkdir(mode=0)
     assert run("rssi", "--rx", "1", "--data", tmp_path / "data") == 2
     assert "write" not in said(capsys)
+
+
+@pytest.mark.parametrize(
+    ("given", "spins"), [({}, "30000"), ({"GOMP_SPINCOUNT": "5"}, "5"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "None")]
+)
+def test_threads_wait_for_each_other_as_the_user_says(given, spins):
+    code = "import os, sys, tasks; print(os.environ.get('GOMP_SPINCOUNT'), 'torch' in sys.modules)"
+    own = {key: value for key, value in os.environ.items() if key not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}
+    done = subprocess.run([sys.executable, "-c", code], env=own | given, stdout=subprocess.PIPE, text=True, check=True)
+    assert done.stdout == f"{spins} False\n"  # libgomp reads it when torch is loaded

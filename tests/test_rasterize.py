@@ -148,3 +148,22 @@ def test_magnitude_has_no_gradient_at_zero():
     field = torch.zeros(2, 3, 4, dtype=torch.float64, requires_grad=True)
     magnitude(field).sum().backward()
     assert torch.equal(field.grad, torch.zeros_like(field))
+
+
+def test_who_is_timed_has_compiled_before():
+    code = """
+from augment import Settings as OfSynthesizers, make_synthesizer
+from swiftwrf import rssi_room, simulated_room
+from swiftwrf.rasterize import cpu
+from tasks.rssi.predictors import PREDICTORS, Settings
+
+predictor = PREDICTORS["swiftwrf"].make(Settings())
+synthesizer = make_synthesizer("swiftwrf", OfSynthesizers(progress=False))
+print(len(cpu._draw.signatures))
+room = simulated_room(n=30)
+predictor.fit(rssi_room(30)), synthesizer.fit(room)
+predictor.predict(room.position), synthesizer.synthesize(room.position)
+print(len(cpu._draw.signatures))
+"""
+    done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True)
+    assert done.stdout.split() == ["1", "1"]

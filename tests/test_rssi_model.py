@@ -217,6 +217,17 @@ def test_same_data_same_model_and_any_batch():
     torch.testing.assert_close(fit_rssi(data).predict(data.transmitter_position, batch=7)[0], a)
 
 
+def test_any_number_of_threads_gives_the_same_model():
+    data, here, before = with_field(), with_field(seed=1).transmitter_position, torch.get_num_threads()
+    predicted = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        predicted.append(fit_rssi(data).predict(here))
+        assert torch.get_num_threads() == threads
+    torch.set_num_threads(before)
+    assert all(map(torch.equal, *predicted))
+
+
 def test_many_rows_are_gathered_by_place():
     data = law_only(n=4000)
     data.rssi_dbm[::7, 1] = torch.nan

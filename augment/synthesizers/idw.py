@@ -10,6 +10,7 @@ from swiftwrf import Spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import EXACT, inner_products, squared_errors, thinned
 from swiftwrf.positions import nearest
+from swiftwrf.threads import single_thread
 
 CANDIDATES = (1, 2, 3, 5, 8, 13, 20, 30)
 
@@ -27,6 +28,7 @@ class InverseDistance(Synthesizer):
         gram = inner_products(some.spectrum)
         self.k = min(candidates, key=lambda k: _held_out_loss(k, some.position, gram, fold))
 
+    @single_thread()
     def synthesize(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
         number, weight = weights(position, self._train.position, self.k)
         drawn = torch.empty(len(position), *self._train.grid.shape)

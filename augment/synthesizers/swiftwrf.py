@@ -7,8 +7,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from augment.synthesizers.base import SYNTHESIZERS, Synthesizer
+from augment.synthesizers.base import SYNTHESIZERS, Settings, Synthesizer
 from swiftwrf import FitConfig, Spectra, SwiftWRF, fit
+from swiftwrf.rasterize import prepare
 
 
 @SYNTHESIZERS.register("swiftwrf", meaning="2D Gaussians that move with the position", colour="#4477aa")
@@ -16,6 +17,10 @@ class SwiftWRFSynthesizer(Synthesizer):
     """2D Gaussians that change with the position, as many as the scene needs."""
 
     shared = True
+
+    def __init__(self, settings: Settings) -> None:
+        super().__init__(settings)
+        prepare(settings.device)
 
     def fit(self, train: Spectra) -> None:
         self._fit(train, FitConfig.paper() if self.settings.preset == "paper" else FitConfig())

@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Literal, get_args
 
 import torch
@@ -85,6 +86,13 @@ def rasterize_magnitude(
     return drawn.reshape(*mean.shape[:-2], *grid.shape)
 
 
+@lru_cache
+def prepare(device: torch.device | str) -> None:
+    """Compiles the fast maker for a device, which else is part of the time of whatever is drawn first."""
+    one = torch.ones(1, 1, 2, device=device)
+    rasterize_magnitude(one, torch.ones(1, 3, device=device), one, AngularGrid(0.0, 1.0, 1, 0.0, 1))
+
+
 def _flattened(mean: Tensor, cholesky: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """All positions in one leading dimension."""
     n_position, n = mean.shape[:-2].numel(), mean.shape[-2]
@@ -136,4 +144,4 @@ def _check(mean: Tensor, cholesky: Tensor, weight: Tensor, cutoff: float | None)
             )
 
 
-__all__ = ["Maker", "rasterize", "rasterize_magnitude"]
+__all__ = ["Maker", "prepare", "rasterize", "rasterize_magnitude"]

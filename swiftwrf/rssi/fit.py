@@ -22,11 +22,13 @@ from swiftwrf.rssi.prepare import Setting, check, prepare
 from swiftwrf.rssi.solve import Fitted, Group, solve
 from swiftwrf.rssi.state import State, fingerprint
 from swiftwrf.rssi.uncertainty import known
+from swiftwrf.threads import single_thread
 
 GROUP = 4  # receivers a task: a state is kept after each, and a cluster's workers take one each
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
+@single_thread()
 def fit_rssi(
     train: Rssi,
     config: RssiConfig | None = None,

@@ -23,6 +23,7 @@ from swiftwrf.positions import check_positions
 from swiftwrf.rssi.head import Table
 from swiftwrf.rssi.law import harmonics, log_distance
 from swiftwrf.rssi.uncertainty import Known
+from swiftwrf.threads import single_thread
 
 FARTHEST = 1e9  # [m] from the measurements: beyond, single precision ends, and so does any receiver's reach
 
@@ -82,6 +83,7 @@ class RssiModel(Saved):
         return self.kernel(position, self.anchor) @ self.coefficient
 
     @torch.no_grad()
+    @single_thread()
     def predict(self, position: Tensor, batch: int = 512) -> tuple[Tensor, Tensor, Tensor]:
         """RSSI at any positions, with an interval for a measurement there.
 

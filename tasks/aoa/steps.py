@@ -140,6 +140,7 @@ class Synthesis(Step[Setting]):
             group=group() if self.shared else None,
         )
         synthesizer = make_synthesizer(self.synthesizer, settings)
+        fit.begin()
         synthesizer.fit(measured)
         fitted = time.perf_counter()
         generator = torch.Generator().manual_seed(settings.seed)
@@ -262,7 +263,11 @@ class _FitHistory:
 
     def __init__(self) -> None:
         self.records: list[Row] = []
-        self.began, self.earlier = time.perf_counter(), 0.0
+        self.began = self.earlier = 0.0
+
+    def begin(self) -> None:
+        """Its time counts from now on."""
+        self.began = time.perf_counter()
 
     def add(self, record: Row) -> None:
         """One record; those of earlier sessions come first."""

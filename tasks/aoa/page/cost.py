@@ -63,12 +63,12 @@ def sizes(runs: list[AoaRecords]) -> list[Plot]:
         by_size = search.sort_values("n_primitives")
         axes[0].plot(by_size["n_primitives"], by_size["validation"], "o-", markersize=4)
         n = int(final["n_primitives"].iloc[0])
-        axes[0].axvline(n, color="#aeb7c6", linewidth=1)
+        axes[0].axvline(n, color=figures.RULE, linewidth=1)
         axes[0].set_xscale("log", base=2)
         axes[0].xaxis.set_major_formatter("{x:g}")
         axes[0].set(xlabel="primitives", ylabel="loss on held-out spectra")
         caption = (
-            f"{run.scene}, first share. Loss on measured spectra that each size did not see, at coarse resolution; the "
+            f"First share of {run.scene}. Loss on measured spectra that each size did not see, at coarse resolution; the "
             f"model took the smallest within {GAIN:.1%} of the best: {n} primitives (line)."
         )
         data = by_size[["n_primitives", "validation"]]
@@ -92,7 +92,7 @@ def trainings(runs: list[AoaRecords]) -> list[Plot]:
         figure, axes = figures.new_figure(1, max(len(panels), 1), 6 * max(len(panels), 1), 3.2)
         for ax, (label, lines) in zip(axes, panels.items(), strict=False):
             figures.curves(ax, arms.palette(), lines, "step", label)
-        caption = f"{run.scene}, first share and repeat: the networks, and synthesizers that are fitted by gradient."
+        caption = f"First share and repeat of {run.scene}: the networks, and synthesizers that are fitted by gradient."
         curves = {f"network, {name}": line for name, line in networks.items()}
         curves |= {f"synthesizer, {name}": line for name, line in fitted.items()}
         parts = [DataFrame({"what": what, "step": steps, "loss": loss}) for what, (steps, loss) in curves.items()]

@@ -158,7 +158,7 @@ def _room_figure(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) 
     for plane in planes:
         _draw_in_plan(plan, plane, low, high)
     first = points["order"] == 1
-    plan.plot(*points["measured"][:, :2].T, ".", color=MEASURED, markersize=2.5, label="measured positions")
+    plan.plot(*points["measured"][:, :2].T, "o", color=MEASURED, markersize=2, label="measured positions")
     plan.plot(*points["fixed"][:2], "*", color=FIXED, markersize=11, label="fixed end")
     plan.plot(*points["image"][first][:, :2].T, "o", color=IMAGE, markersize=4, label="its images, first order")
     plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")

@@ -20,9 +20,7 @@ from tasks.summarise import SHORTEST, paired_difference, running_median
 
 MOST_MAPS = 24  # receivers with a map in the report; all are in the tables
 _FIELDS = {"predicted": "predicted_dbm", "width": "width_db"}
-MANY = (
-    300  # dots, from which on white edges would hide their colours, and each drawn by itself makes a page of megabytes
-)
+MANY = 300  # dots: white edges would hide the colours of so many, and each drawn by itself makes a page of megabytes
 
 
 def palette() -> Palette:

@@ -39,9 +39,10 @@ def summary(run: RssiRecords, picture: Plot) -> Summary:
             f"of the test measurements lie in the {interval['nominal']:.0%} interval that comes with each prediction",
         ),
     ]
+    receivers = len(run.metrics["receivers"])
     meaning = [
         f"On {run.scene}, {run.metrics['n_train']} rows teach and {run.metrics['n_test']} test: {own['n']} heard pairs at "
-        f"{len(run.metrics['receivers'])} receiver(s).",
+        f"{receivers} {'receiver' if receivers == 1 else 'receivers'}.",
         _against(run, best),
     ]
     return Summary(numbers, picture, meaning, _next_steps(run))

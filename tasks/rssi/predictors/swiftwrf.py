@@ -5,6 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from swiftwrf import Rssi, RssiConfig, RssiModel, fit_rssi
+from swiftwrf.rasterize import prepare
 from tasks.rssi.predictors.base import PREDICTORS, Settings
 
 
@@ -19,6 +20,7 @@ class SwiftWRFPredictor:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
+        prepare(settings.device)
 
     def fit(self, train: Rssi) -> None:
         given = self._settings

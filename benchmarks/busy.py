@@ -1,0 +1,78 @@
+"""What other work on the same machine costs: steps of the network and a fit of RSSI, idle and beside a loop on one core, for
+several times that threads wait for each other busily before they sleep (GOMP_SPINCOUNT).
+
+python benchmarks/busy.py
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from subprocess import PIPE, Popen, run
+
+from record import write_result
+
+SPINS = ("300000", "30000", "3000")  # the first is libgomp's own
+ROUNDS, STEPS = 2, 20
+
+
+def measure() -> dict[str, float]:
+    """Seconds of a step of 64 spectra and of a fit of twelve receivers, in this process."""
+    from augment import Mixed
+    from swiftwrf import fit_rssi, rssi_room, simulated_room
+    from tasks.aoa.estimators.aann import AANN, AANNConfig
+    from tasks.aoa.estimators.base import Settings
+
+    room, floor = simulated_room(128), rssi_room()
+    network = AANN(Settings(room.grid), AANNConfig(steps=STEPS, batch=64))
+    network.fit(Mixed.measured(room))
+    first, last = network.history[0], network.history[-1]
+    began = time.perf_counter()
+    fit_rssi(floor, progress=False)
+    return {
+        "step_s": (last["seconds"] - first["seconds"]) / (last["step"] - first["step"]),
+        "rssi_s": time.perf_counter() - began,
+    }
+
+
+@contextmanager
+def neighbour(there: bool) -> Iterator[None]:
+    """A process that computes on one core, if there is one."""
+    loop = Popen([sys.executable, "-c", "while True: pass"]) if there else None
+    try:
+        yield
+    finally:
+        if loop:
+            loop.kill()
+            loop.wait()
+
+
+def main() -> None:
+    taken: dict[tuple[bool, str], list[dict[str, float]]] = {}
+    for _ in range(ROUNDS):
+        for busy in (False, True):
+            for spins in SPINS:
+                with neighbour(busy):
+                    environment = os.environ | {"GOMP_SPINCOUNT": spins}
+                    done = run(
+                        [sys.executable, __file__, "measure"], env=environment, stdout=PIPE, text=True, check=True
+                    )
+                taken.setdefault((busy, spins), []).append(json.loads(done.stdout.splitlines()[-1]))
+                print("busy" if busy else "idle", spins, taken[busy, spins][-1], flush=True)
+    rows = [
+        {"neighbour": busy, "spins": int(spins), **{key: statistics.median(m[key] for m in each) for key in each[0]}}
+        for (busy, spins), each in taken.items()
+    ]
+    write_result("busy", {"rounds": ROUNDS, "rows": rows})
+
+
+if __name__ == "__main__":
+    if sys.argv[1:] == ["measure"]:
+        print(json.dumps(measure()))
+    else:
+        main()
