@@ -17,17 +17,17 @@ from subprocess import PIPE, Popen, run
 
 from record import write_result
 
+from augment import Mixed
+from swiftwrf import fit_rssi, rssi_room, simulated_room
+from tasks.aoa.estimators.aann import AANN, AANNConfig
+from tasks.aoa.estimators.base import Settings
+
 SPINS = ("300000", "30000", "3000")  # the first is libgomp's own
 ROUNDS, STEPS = 2, 20
 
 
 def measure() -> dict[str, float]:
     """Seconds of a step of 64 spectra and of a fit of twelve receivers, in this process."""
-    from augment import Mixed
-    from swiftwrf import fit_rssi, rssi_room, simulated_room
-    from tasks.aoa.estimators.aann import AANN, AANNConfig
-    from tasks.aoa.estimators.base import Settings
-
     room, floor = simulated_room(128), rssi_room()
     network = AANN(Settings(room.grid), AANNConfig(steps=STEPS, batch=64))
     network.fit(Mixed.measured(room))

@@ -16,6 +16,7 @@ from swiftwrf.rssi.head import Head, Table, pooled
 from swiftwrf.rssi.law import Law, fit_law, harmonics, log_distance
 from swiftwrf.rssi.sites import gather
 from swiftwrf.rssi.solve import DIRECTIVITY_DB, LAW_DB, Group, solve
+from swiftwrf.threads import threads_kept
 
 KERNEL = Kernel(long=4.0, short=1.0, share=0.6, noise=1.0)
 FIELD_DB, NOISE_DB = 3.0, 2.0
@@ -218,13 +219,13 @@ def test_same_data_same_model_and_any_batch():
 
 
 def test_any_number_of_threads_gives_the_same_model():
-    data, here, before = with_field(), with_field(seed=1).transmitter_position, torch.get_num_threads()
+    data, here = with_field(), with_field(seed=1).transmitter_position
     predicted = []
     for threads in (1, 2):
-        torch.set_num_threads(threads)
-        predicted.append(fit_rssi(data).predict(here))
-        assert torch.get_num_threads() == threads
-    torch.set_num_threads(before)
+        with threads_kept():
+            torch.set_num_threads(threads)
+            predicted.append(fit_rssi(data).predict(here))
+            assert torch.get_num_threads() == threads
     assert all(map(torch.equal, *predicted))
 
 
