@@ -213,6 +213,7 @@ def row(method: str, train: Spectra, test: Spectra, split: str, quick: bool, sta
     else:
         settings = Settings(validation=validation_for(split), checkpoint=state, on_record=told)
         synthesizer = make_synthesizer(method, settings)
+        began = time.perf_counter()  # who draws has compiled by now
         if quick and isinstance(synthesizer, Published):
             full = synthesizer.config()
             synthesizer.config = lambda: replace(full, steps=full.steps // QUICKER)

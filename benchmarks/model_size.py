@@ -16,6 +16,7 @@ from synthesis import SCENES
 from swiftwrf import FitConfig, ModelConfig, Spectra, fit, load_spectra, simulated_room
 from swiftwrf.data.splits import Validation, validation_for
 from swiftwrf.metrics import psnr, ssim, summary
+from swiftwrf.rasterize import prepare
 from swiftwrf.rssi import Map
 from tasks.cluster import connected
 
@@ -62,6 +63,7 @@ def fitted(train: Spectra, test: Spectra, validation: Validation, seed: int, n: 
     config = FitConfig(
         model=ModelConfig() if n is None else ModelConfig(n_primitives=n), validation=validation, seed=seed
     )
+    prepare("cpu")
     began, busy = time.perf_counter(), time.process_time()
     model = fit(train, config, progress=False)
     seconds, busy = time.perf_counter() - began, time.process_time() - busy

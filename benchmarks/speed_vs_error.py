@@ -33,7 +33,7 @@ from swiftwrf import (
 from swiftwrf.arrays import PlanarArray
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import psnr
-from swiftwrf.rasterize import Maker, rasterize_magnitude
+from swiftwrf.rasterize import Maker, prepare, rasterize_magnitude
 from tasks.page import figures
 from tasks.page.palette import Palette
 
@@ -88,6 +88,7 @@ class Study:
         self.validation = validation
         self.seed = config.seed
         self.config = FitConfig(validation=validation, seed=config.seed)
+        prepare("cpu")
         began = time.perf_counter()
         self.model = fit(train, self.config, progress=False)
         self.fit_seconds = time.perf_counter() - began
