@@ -167,3 +167,11 @@ print(len(cpu._draw.signatures))
 """
     done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True)
     assert done.stdout.split() == ["1", "1"]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU's rasterizer speaks to torch's compiler")
+def test_importing_leaves_torchs_compiler_alone():
+    """It would be a third of the seconds before a command says anything."""
+    code = "import sys, swiftwrf, tasks.rssi.__main__\nprint('torch._dynamo' in sys.modules)"
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert child.stdout.strip() == "False"

@@ -148,6 +148,14 @@ def test_whole_run(small, tmp_path, monkeypatch):
     assert list(predictions) == ["x", "y", "z", "receiver", "measured", "predicted", "low", "high"]
     assert (predictions.low <= predictions.predicted).all()
     assert "What this does not show" in (out / "report.html").read_text()
+    assert list((out / "figures").glob("map-*.svg"))
+
+
+def test_the_map_of_a_lone_receiver_is_drawn_once(small, tmp_path):
+    assert run("--rx", "1", "--out", tmp_path / "run") == 0
+    drawn = {file.stem.partition("-")[0] for file in (tmp_path / "run" / "figures").glob("*.svg")}
+    assert drawn == {"summary", "bars", "cdf", "width", "where", "speed"}
+    assert list((tmp_path / "run" / "figures").glob("summary*.csv"))
 
 
 @pytest.mark.parametrize(

@@ -74,7 +74,13 @@ def kernels(device: torch.device) -> Kernels:
     return Kernels(SOURCE.read_text(), device)
 
 
-@torch.compiler.assume_constant_result  # asked while torch.compile traces
+def _constant(function: Callable[[torch.device], bool]) -> Callable[[torch.device], bool]:
+    """Asked while torch.compile traces, it is not traced itself. To say so imports torch's compiler, a third of what it
+    takes to import this package: not where no GPU can be asked about."""
+    return torch.compiler.assume_constant_result(function) if torch.cuda.is_available() else function
+
+
+@_constant
 def available(device: torch.device) -> bool:
     """Whether the kernels can be built for the GPU; warns, once, where they cannot."""
     return _available(device)

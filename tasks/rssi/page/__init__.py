@@ -51,6 +51,16 @@ def _run(run: RssiRecords, several: bool) -> list[Section]:
         ),
         Plot(f"cdf-{name}", _cdf(errors), "Distribution of the absolute errors over all receivers.", pairs),
     ]
+    maps = [
+        Plot(
+            f"width-{name}",
+            _maps(run, "width", "width of the 80 % interval [dB]"),
+            _WIDER if varies(run.arrays("maps")["width"]) else _EVEN,
+            cells,
+        )
+    ]
+    if several or len(_receivers(run)) > 1:  # else it is the picture of the summary
+        maps.insert(0, Plot(f"map-{name}", _maps(run, "predicted", "predicted RSSI [dBm]"), _MAP_CAPTION, cells))
     return [
         Section(
             f"Errors{suffix}",
@@ -59,18 +69,7 @@ def _run(run: RssiRecords, several: bool) -> list[Section]:
             plots,
             {entry.name: entry.meaning for entry in PREDICTORS.entries()},
         ),
-        Section(
-            f"Maps{suffix}",
-            plots=[
-                Plot(f"map-{name}", _maps(run, "predicted", "predicted RSSI [dBm]"), _MAP_CAPTION, cells),
-                Plot(
-                    f"width-{name}",
-                    _maps(run, "width", "width of the 80 % interval [dB]"),
-                    _WIDER if varies(run.arrays("maps")["width"]) else _EVEN,
-                    cells,
-                ),
-            ],
-        ),
+        Section(f"Maps{suffix}", plots=maps),
         Section(f"Where the errors are{suffix}", plots=[_where(run)]),
         Section(f"Speed against error{suffix}", plots=[_speed(run)]),
     ]
