@@ -35,7 +35,7 @@ def find_room(train: Spectra, settings: Settings) -> tuple[GeometryModel, float]
     "geometry",
     meaning="paths by way of the room's walls, which it finds from the spectra",
     needs=(ARRAY, FIXED_END),
-    colour="#228833",
+    colour="#3366ff",
 )
 class Geometry(Synthesizer):
     """Image sources of the known fixed end in mirror planes found from the training spectra."""
