@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from typing import TypeVar
 
 import torch
 from threadpoolctl import threadpool_limits
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 def set_threads(number: int) -> None:
@@ -43,3 +48,13 @@ def single_thread() -> Iterator[None]:
     with threads_kept():
         torch.set_num_threads(1)
         yield
+
+
+def side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+    """The function of each item, as many at once as torch has threads, each on one of its own.
+
+    These meet but once, so other work on the machine costs them only what it takes, and results are those of one thread.
+    """
+    at_once = torch.get_num_threads()
+    with single_thread(), threadpool_limits(1), ThreadPoolExecutor(at_once) as threads:
+        return list(threads.map(function, items))

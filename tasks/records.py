@@ -77,9 +77,10 @@ def as_table(rows: Iterable[Row]) -> str:
     """The text of such a table."""
     rows = list(rows)
     stream = io.StringIO(newline="")
-    writer = csv.DictWriter(stream, list(dict.fromkeys(key for row in rows for key in row)))
-    writer.writeheader()
-    writer.writerows({key: _escaped(value) for key, value in row.items()} for row in rows)
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    writer = csv.writer(stream)
+    writer.writerow(columns)
+    writer.writerows([_escaped(row.get(name, "")) for name in columns] for row in rows)
     return stream.getvalue()
 
 

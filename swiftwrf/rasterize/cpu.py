@@ -12,6 +12,8 @@ depends on how work was spread, so the bits are the same for any number of threa
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numba
 import numpy as np
@@ -229,7 +231,20 @@ def _threads() -> int:
     return number
 
 
-@torch.library.custom_op("swiftwrf::rasterize_cpu", mutates_args=(), device_types="cpu")
+def _operator(name: str) -> Callable[[Callable[..., Any]], Any]:
+    """A function as an operator of torch: what `torch.library.custom_op` does, whose operators import torch's compiler when
+    they first run. That takes three seconds, more than most fits of RSSI."""
+
+    def register(function: Callable[..., Any]) -> Any:
+        schema = torch.library.infer_schema(function, mutates_args=())
+        torch.library.define(f"swiftwrf::{name}", schema, tags=torch.Tag.pt2_compliant_tag)
+        torch.library.impl(f"swiftwrf::{name}", "cpu", function)
+        return getattr(torch.ops.swiftwrf, name).default
+
+    return register
+
+
+@_operator("rasterize_cpu")
 def _rasterize(
     mean: Tensor, cholesky: Tensor, weight: Tensor, n_elevation: int, n_azimuth: int, cutoff: float | None
 ) -> Tensor:
@@ -241,7 +256,7 @@ def _rasterize(
     return out
 
 
-@torch.library.custom_op("swiftwrf::rasterize_cpu_backward", mutates_args=(), device_types="cpu")
+@_operator("rasterize_cpu_backward")
 def _rasterize_backward(
     grad: Tensor, mean: Tensor, cholesky: Tensor, weight: Tensor, cutoff: float | None
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -256,14 +271,14 @@ def _rasterize_backward(
     return d_mean, d_cholesky if cholesky.dim() == 3 else d_cholesky.sum(0), d_weight
 
 
-@_rasterize.register_fake
-def _(mean: Tensor, cholesky: Tensor, weight: Tensor, n_elevation: int, n_azimuth: int, cutoff: float | None) -> Tensor:
-    return weight.new_empty(mean.shape[0], 2, n_elevation, n_azimuth)
-
-
-@_rasterize_backward.register_fake
-def _(grad: Tensor, mean: Tensor, cholesky: Tensor, weight: Tensor, cutoff: float | None) -> tuple[Tensor, ...]:
-    return torch.empty_like(mean), torch.empty_like(cholesky), torch.empty_like(weight)
+torch.library.register_fake(
+    "swiftwrf::rasterize_cpu",
+    lambda mean, cholesky, weight, rows, columns, cutoff: weight.new_empty(mean.shape[0], 2, rows, columns),
+)
+torch.library.register_fake(
+    "swiftwrf::rasterize_cpu_backward",
+    lambda grad, mean, cholesky, weight, cutoff: tuple(torch.empty_like(x) for x in (mean, cholesky, weight)),
+)
 
 
 def _setup_context(ctx, inputs, output) -> None:
@@ -275,7 +290,7 @@ def _backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
     return (*_rasterize_backward(grad, *ctx.saved_tensors, ctx.cutoff), None, None, None)
 
 
-_rasterize.register_autograd(_backward, setup_context=_setup_context)
+torch.library.register_autograd("swiftwrf::rasterize_cpu", _backward, setup_context=_setup_context)
 
 
 def rasterize(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None) -> Tensor:

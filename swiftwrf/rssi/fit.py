@@ -28,7 +28,6 @@ GROUP = 4  # receivers a task: a state is kept after each, and a cluster's worke
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
-@single_thread()
 def fit_rssi(
     train: Rssi,
     config: RssiConfig | None = None,
@@ -100,6 +99,7 @@ def _record(number: int, fitted: Fitted, group: Group, setting: Setting, seconds
     }
 
 
+@single_thread()
 def _assemble(train: Rssi, setting: Setting, fitted: Fitted, config: RssiConfig) -> RssiModel:
     """The model: the mixture worked into its tensors, and the interval's width."""
     predictions = torch.cat([fitted.held_out[None], setting.held_out])

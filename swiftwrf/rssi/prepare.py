@@ -16,6 +16,7 @@ from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.law import Law, fit_law, log_distance
 from swiftwrf.rssi.sites import Sites, gather
 from swiftwrf.rssi.solve import Group
+from swiftwrf.threads import single_thread
 
 LOWEST = -100.0  # [dBm] of the plain head where nothing is received
 
@@ -70,6 +71,7 @@ def check(train: Rssi, pool: Rssi) -> None:
         raise InputError("the pool must hold the same rows as the training part, at more receivers")
 
 
+@single_thread()
 def prepare(train: Rssi, pool: Rssi, config: RssiConfig) -> Setting:
     """Sites, folds, laws and the kernel; arguments as of `fit_rssi`."""
     sites, among = gather(train), gather(pool)

@@ -19,6 +19,7 @@ from swiftwrf.gp import Kernel
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import Head, Table
 from swiftwrf.rssi.law import Law, harmonics, log_distance
+from swiftwrf.threads import side_by_side
 
 LAW_DB = 30.0  # prior deviation of level and slope from their least squares: as good as none
 DIRECTIVITY_DB = 2.0  # prior deviation of each harmonic of a receiver's antenna and surroundings
@@ -85,10 +86,11 @@ def solve(group: Group, kernel: Kernel, config: RssiConfig, n_primitives: int, d
     left = (group.rssi - group.law(log_distance(group.position, group.receiver))).to(device)
     coefficient, error = torch.zeros_like(left), torch.full_like(left, torch.nan)
     linear = torch.zeros(left.shape[1], feature.shape[2], dtype=torch.float64)
-    for r in range(left.shape[1]):
+
+    def fit(r: int) -> None:  # the others' columns are theirs
         heard = (~left[:, r].isnan()).nonzero()[:, 0]
         if not len(heard):
-            continue
+            return
         one = _Receiver(
             left=left[heard, r],
             feature=feature[heard, r],
@@ -105,6 +107,8 @@ def solve(group: Group, kernel: Kernel, config: RssiConfig, n_primitives: int, d
             ) from None
         coefficient[heard, r] = float(group.field_db[r]) ** 2 * slope * dual
         linear[r] = (dual @ feature[heard, r]).cpu()
+
+    side_by_side(fit, range(left.shape[1]))
     return Fitted(
         level=group.law.level + LAW_DB * linear[:, 0],
         slope=group.law.slope + LAW_DB * linear[:, 1],

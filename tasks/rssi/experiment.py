@@ -150,6 +150,12 @@ def _read_floor_plan(config: RssiTaskConfig) -> dict[str, Any]:
         raise InputError(f"--floor-plan {config.floor_plan} is not a readable image, PNG or JPEG ({error})") from None
 
 
+def _rows(**columns: torch.Tensor | list[str]) -> list[Row]:
+    """The rows of a table with these columns."""
+    values = (c.tolist() if isinstance(c, torch.Tensor) else c for c in columns.values())
+    return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
+
+
 class _Tables:
     """Fits and tests every predictor, each a step of the run's directory, and gathers the tables of the run."""
 
@@ -187,19 +193,18 @@ class _Tables:
         self.seconds[name] = {"fit": value["fit"], "predict": value["predict"]}
         predicted = torch.tensor(value["predicted"], dtype=torch.float64)
         measured = self.test.rssi_dbm
-        for row, column in (~measured.isnan()).nonzero().tolist():
-            self.errors.append(
-                {
-                    "method": name,
-                    "receiver": self.test.receiver_names[column],
-                    "index": int(self.test.index[row]),
-                    "measured_dbm": float(measured[row, column]),
-                    "predicted_dbm": float(predicted[row, column]),
-                    "abs_error_db": abs(float(predicted[row, column] - measured[row, column])),
-                    "from_receiver_m": float(self.from_receiver[row, column]),
-                    "from_training_m": float(self.from_training[row]),
-                }
-            )
+        heard = ~measured.isnan()
+        row, column = heard.nonzero(as_tuple=True)
+        self.errors += _rows(
+            method=[name] * len(row),
+            receiver=[self.test.receiver_names[number] for number in column.tolist()],
+            index=self.test.index[row],
+            measured_dbm=measured[heard],
+            predicted_dbm=predicted[heard],
+            abs_error_db=(predicted - measured)[heard].abs(),
+            from_receiver_m=self.from_receiver[heard],
+            from_training_m=self.from_training[row],
+        )
         if name == "swiftwrf":
             self._predict_rows(predicted, torch.tensor(value["low"]), torch.tensor(value["high"]))
             self.n_primitives = value["n_primitives"]
@@ -207,16 +212,18 @@ class _Tables:
     def _predict_rows(self, predicted: torch.Tensor, low: torch.Tensor, high: torch.Tensor) -> None:
         measured, heard = self.test.rssi_dbm, ~self.test.rssi_dbm.isnan()
         self.coverage = float(((measured >= low) & (measured <= high))[heard].double().mean())
-        for row, column in heard.nonzero().tolist():
-            x, y, z = self.test.transmitter_position[row].tolist()
-            values = (measured, predicted, low, high)
-            self.predictions.append(
-                {"x": x, "y": y, "z": z, "receiver": self.test.receiver_names[column]}
-                | {
-                    k: float(v[row, column])
-                    for k, v in zip(("measured", "predicted", "low", "high"), values, strict=True)
-                }
-            )
+        row, column = heard.nonzero(as_tuple=True)
+        x, y, z = self.test.transmitter_position[row].unbind(dim=1)
+        self.predictions += _rows(
+            x=x,
+            y=y,
+            z=z,
+            receiver=[self.test.receiver_names[number] for number in column.tolist()],
+            measured=measured[heard],
+            predicted=predicted[heard],
+            low=low[heard],
+            high=high[heard],
+        )
 
     def _keep_maps(self, predictor: SwiftWRFPredictor) -> None:
         """Predicted field and width of the interval over the floor, at the median height of the measurements."""

@@ -14,11 +14,11 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 from sklearn.neighbors import KNeighborsRegressor, NearestNeighbors
-from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from swiftwrf import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
+from swiftwrf.threads import side_by_side
 from tasks.rssi.predictors.base import PREDICTORS, RECEIVERS, Predictor, Settings
 from tasks.rssi.predictors.laws import LogDistance, Mean
 
@@ -46,20 +46,21 @@ class _PerReceiver(ABC):
             residual = residual - self._base.predict(train.transmitter_position)
         fold = folds(train.transmitter_position, self._validation, self._seed).numpy()
         position = train.transmitter_position.numpy()
-        self._regressors = []
         typical = float(residual.nanmean())
-        for values in residual.numpy().T:
+
+        def fit(values: NDArray[Any]) -> Any:
             heard = ~np.isnan(values)
             if heard.sum() < MIN_TRAINING:  # too few to choose anything: their mean, or that of all
                 level = float(values[heard].mean()) if heard.any() else typical
-                self._regressors.append(
-                    DummyRegressor(strategy="constant", constant=level).fit(position, 0 * position[:, 0])
-                )
-                continue
+                return DummyRegressor(strategy="constant", constant=level).fit(position, 0 * position[:, 0])
             own = fold[heard]
             if np.bincount(own).max() == len(own):  # heard in one region alone: no region is left to learn from
                 own = np.arange(len(own)) % (fold.max() + 1)
-            self._regressors.append(self._regressor(position[heard], values[heard], own))
+            return self._regressor(position[heard], values[heard], own)
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)  # a bound that is reached is the answer
+            self._regressors = side_by_side(fit, residual.numpy().T)
 
     @abstractmethod
     def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
@@ -128,8 +129,5 @@ class GaussianProcess(_PerReceiver):
         kernel = kernel + WhiteKernel(scale / 2, (scale * 1e-3, scale * 10))
         order = np.random.default_rng(self._seed).permutation(len(y))
         tuned, kept = order[:TUNED_ROWS], order[:KEPT_ROWS]
-        # many small systems, for which threads mostly wait for each other
-        with threadpool_limits(1), warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)  # a bound that is reached is the answer
-            fitted = GaussianProcessRegressor(kernel, random_state=self._seed).fit(x[tuned], y[tuned])
-            return GaussianProcessRegressor(fitted.kernel_, optimizer=None).fit(x[kept], y[kept])
+        fitted = GaussianProcessRegressor(kernel, random_state=self._seed).fit(x[tuned], y[tuned])
+        return GaussianProcessRegressor(fitted.kernel_, optimizer=None).fit(x[kept], y[kept])
