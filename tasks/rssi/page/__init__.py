@@ -171,15 +171,19 @@ def _maps(run: RssiRecords, field: str, label: str, most: int = MOST_MAPS) -> Fi
     shown = _heard_most(maps, most)
     n = len(shown)
     columns = min(3, n)
+    rows = -(-n // columns)
     width = 6.8 if n == 1 else 12
     across, down = np.ptp(maps["x"]), np.ptp(maps["y"])
-    height = (width - 0.8) / columns * min(max(down / max(across, 1e-9), 0.4), 1.6) + 0.6
-    figure, axes = figures.new_figure(-(-n // columns), columns, width, max(height * -(-n // columns), 3.6))
+    height = (width - 0.8) / columns * min(max(down / max(across, 1e-9), 0.4), 1.6)
+    figure, axes = figures.new_figure(rows, columns, width, max(rows * (height + 0.3) + 0.3, 3.6))
     low, high = np.nanpercentile(maps["measured"] if field == "predicted" else maps["width"], (1, 99))
     extent = (maps["x"][0], maps["x"][-1], maps["y"][0], maps["y"][-1])
     for ax in axes[n:]:
         ax.set_visible(False)
-    for i, ax in zip(shown, axes, strict=False):
+    for panel, (i, ax) in enumerate(zip(shown, axes, strict=False)):
+        left, bottom = panel % columns == 0, panel + columns >= n  # one ruler serves all panels above and beside it
+        ax.tick_params(labelleft=left, labelbottom=bottom)
+        ax.set(xlabel="x [m]" if bottom else "", ylabel="y [m]" if left else "")
         if "plan" in maps:
             ax.imshow(maps["plan"], extent=tuple(maps["plan_extent"]), aspect="equal", zorder=0)
         see_through = 0.75 if "plan" in maps else 1.0
@@ -208,7 +212,6 @@ def _maps(run: RssiRecords, field: str, label: str, most: int = MOST_MAPS) -> Fi
         ax.plot(*maps["receiver"][i, :2], "x", color="#ee6677", markersize=9, markeredgewidth=2, zorder=3)
         ax.set_title(figures.short(str(maps["receiver_names"][i])), fontsize=9)
         ax.grid(visible=False)
-    axes[0].set(xlabel="x [m]", ylabel="y [m]")
     figure.colorbar(drawn, ax=axes[:n], label=label, fraction=0.03, pad=0.02)
     return figure
 
