@@ -151,10 +151,13 @@ def test_whole_run(small, tmp_path, monkeypatch):
     assert list((out / "figures").glob("map-*.svg"))
 
 
-def test_the_map_of_a_lone_receiver_is_drawn_once(small, tmp_path):
+def test_a_lone_receiver_has_one_map_and_no_average(tmp_path):
     assert run("--rx", "1", "--out", tmp_path / "run") == 0
     drawn = {file.stem.partition("-")[0] for file in (tmp_path / "run" / "figures").glob("*.svg")}
     assert drawn == {"summary", "bars", "cdf", "width", "where", "speed"}
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "the 80 % interval is widest there" in page
+    assert "on average over the receivers" not in page
     assert list((tmp_path / "run" / "figures").glob("summary*.csv"))
 
 

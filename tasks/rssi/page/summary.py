@@ -68,9 +68,10 @@ def _next_steps(run: RssiRecords) -> list[str]:
     steps = []
     if uneven:
         row, column = np.unravel_index(np.argmax(width), width.shape)
+        of_several = " on average over the receivers" if len(maps["width"]) > 1 else ""
         steps.append(
             f"Measure around x = {maps['x'][column]:.1f} m, y = {maps['y'][row]:.1f} m: the 80 % interval is widest there "
-            f"({width[row, column]:.0f} dB on average over the receivers)."
+            f"({width[row, column]:.0f} dB{of_several})."
         )
     steps.append("predictions.csv has every test row with its prediction and interval.")
     interval = run.metrics["interval"]
