@@ -19,7 +19,7 @@ from swiftwrf.gp import Kernel
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import Head, Table
 from swiftwrf.rssi.law import Law, harmonics, log_distance
-from swiftwrf.threads import side_by_side
+from swiftwrf.threads import side_by_side, single_thread
 
 LAW_DB = 30.0  # prior deviation of level and slope from their least squares: as good as none
 DIRECTIVITY_DB = 2.0  # prior deviation of each harmonic of a receiver's antenna and surroundings
@@ -71,19 +71,20 @@ def solve(group: Group, kernel: Kernel, config: RssiConfig, n_primitives: int, d
     Raises:
         FitError: a system that cannot be solved, as positions or values are not of this world.
     """
-    head = Head(len(group.receiver), n_primitives, config.seed).requires_grad_(False)
-    drawn = head.draw()
-    local = group.local.to(device)
-    covariance = kernel(local, local)
-    feature = torch.cat(
-        [
-            LAW_DB * torch.ones_like(group.rssi)[..., None],
-            LAW_DB * log_distance(group.position, group.receiver)[..., None],
-            DIRECTIVITY_DB * harmonics(group.position, group.receiver),
-        ],
-        dim=-1,
-    ).to(device)
-    left = (group.rssi - group.law(log_distance(group.position, group.receiver))).to(device)
+    with single_thread():  # in several, sums are added up in another order
+        head = Head(len(group.receiver), n_primitives, config.seed).requires_grad_(False)
+        drawn = head.draw()
+        local = group.local.to(device)
+        covariance = kernel(local, local)
+        feature = torch.cat(
+            [
+                LAW_DB * torch.ones_like(group.rssi)[..., None],
+                LAW_DB * log_distance(group.position, group.receiver)[..., None],
+                DIRECTIVITY_DB * harmonics(group.position, group.receiver),
+            ],
+            dim=-1,
+        ).to(device)
+        left = (group.rssi - group.law(log_distance(group.position, group.receiver))).to(device)
     coefficient, error = torch.zeros_like(left), torch.full_like(left, torch.nan)
     linear = torch.zeros(left.shape[1], feature.shape[2], dtype=torch.float64)
 

@@ -168,6 +168,9 @@ class _Tables:
         self.seconds: dict[str, PredictorSeconds] = {}
         self.coverage = float("nan")
         self.n_primitives = 0
+        self.heard = ~test.rssi_dbm.isnan()
+        self.row, column = self.heard.nonzero(as_tuple=True)
+        self.receiver = [test.receiver_names[number] for number in column.tolist()]
         test_position = test.transmitter_position
         self.from_receiver = distance(test_position, data.receiver_position)
         self.from_training = distance(test_position, train.transmitter_position).min(dim=1).values
@@ -193,32 +196,29 @@ class _Tables:
         self.seconds[name] = {"fit": value["fit"], "predict": value["predict"]}
         predicted = torch.tensor(value["predicted"], dtype=torch.float64)
         measured = self.test.rssi_dbm
-        heard = ~measured.isnan()
-        row, column = heard.nonzero(as_tuple=True)
         self.errors += _rows(
-            method=[name] * len(row),
-            receiver=[self.test.receiver_names[number] for number in column.tolist()],
-            index=self.test.index[row],
-            measured_dbm=measured[heard],
-            predicted_dbm=predicted[heard],
-            abs_error_db=(predicted - measured)[heard].abs(),
-            from_receiver_m=self.from_receiver[heard],
-            from_training_m=self.from_training[row],
+            method=[name] * len(self.row),
+            receiver=self.receiver,
+            index=self.test.index[self.row],
+            measured_dbm=measured[self.heard],
+            predicted_dbm=predicted[self.heard],
+            abs_error_db=(predicted - measured)[self.heard].abs(),
+            from_receiver_m=self.from_receiver[self.heard],
+            from_training_m=self.from_training[self.row],
         )
         if name == "swiftwrf":
             self._predict_rows(predicted, torch.tensor(value["low"]), torch.tensor(value["high"]))
             self.n_primitives = value["n_primitives"]
 
     def _predict_rows(self, predicted: torch.Tensor, low: torch.Tensor, high: torch.Tensor) -> None:
-        measured, heard = self.test.rssi_dbm, ~self.test.rssi_dbm.isnan()
+        measured, heard = self.test.rssi_dbm, self.heard
         self.coverage = float(((measured >= low) & (measured <= high))[heard].double().mean())
-        row, column = heard.nonzero(as_tuple=True)
-        x, y, z = self.test.transmitter_position[row].unbind(dim=1)
+        x, y, z = self.test.transmitter_position[self.row].unbind(dim=1)
         self.predictions += _rows(
             x=x,
             y=y,
             z=z,
-            receiver=[self.test.receiver_names[number] for number in column.tolist()],
+            receiver=self.receiver,
             measured=measured[heard],
             predicted=predicted[heard],
             low=low[heard],

@@ -58,7 +58,7 @@ class _PerReceiver(ABC):
                 own = np.arange(len(own)) % (fold.max() + 1)
             return self._regressor(position[heard], values[heard], own)
 
-        with warnings.catch_warnings():
+        with warnings.catch_warnings():  # around all: threads share the filters
             warnings.simplefilter("ignore", ConvergenceWarning)  # a bound that is reached is the answer
             self._regressors = side_by_side(fit, residual.numpy().T)
 
