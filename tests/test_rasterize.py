@@ -159,11 +159,11 @@ from tasks.rssi.predictors import PREDICTORS, Settings
 
 predictor = PREDICTORS["swiftwrf"].make(Settings())
 synthesizer = make_synthesizer("swiftwrf", OfSynthesizers(progress=False))
-print(len(cpu._draw.signatures))
+print(len(cpu.draw.signatures))
 room = simulated_room(n=30)
 predictor.fit(rssi_room(30)), synthesizer.fit(room)
 predictor.predict(room.position), synthesizer.synthesize(room.position)
-print(len(cpu._draw.signatures))
+print(len(cpu.draw.signatures))
 """
     done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True)
     assert done.stdout.split() == ["1", "1"]

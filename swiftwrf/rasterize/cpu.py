@@ -1,13 +1,7 @@
-"""The fast maker for CPUs: each primitive visits only the pixels its kernel reaches, and the processor's lanes share a row.
+"""The fast maker for CPUs: its kernels as operators of torch, with their gradient."""
 
-Along a row the exponent is a parabola in the column about the row's own centre, so a row needs no exponential of its own:
-each lane computes 2^t of its column by a polynomial. Work is spread over positions and, where there are few, over bands of
-rows (forward) or blocks of primitives (backward); sums are put in the lanes' order when the kernels are compiled and no sum
-depends on how work was spread, so the bits are the same for any number of threads and any batch size.
-"""
-
-# mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, call-arg, no-any-return"
-# (the jitted functions take NumPy arrays and scalars; numba types them itself)
+# mypy: disable-error-code="no-untyped-def"
+# (of the context that autograd hands over)
 
 from __future__ import annotations
 
@@ -18,202 +12,11 @@ from typing import Any
 import numba
 import numpy as np
 import torch
-from numba import njit, prange
 from torch import Tensor
 
 from swiftwrf.angles import AngularGrid
+from swiftwrf.rasterize.cpu_kernels import draw, draw_backward
 from swiftwrf.threads import threads_kept
-
-BASE2 = np.float32(-0.5 / math.log(2))  # of half a squared distance: exp(-x / 2) = 2^(BASE2 x)
-
-_FAST = {"contract", "nsz", "arcp", "reassoc"}  # not nnan or ninf: what is not finite stays visible
-_inline = njit(inline="always", fastmath=_FAST)
-
-
-def _jit(function):
-    """Compiled at first use, and kept for the next process where there is a place to keep it: neither an installation that
-    may not be written nor a user without a home is one."""
-    try:
-        return njit(parallel=True, fastmath=_FAST, cache=True)(function)
-    except RuntimeError:
-        return njit(parallel=True, fastmath=_FAST)(function)
-
-
-@_inline
-def _rows(y, l2, l3, reach2, top, bottom):
-    """First row and one past the last of [top, bottom) that a kernel centred on row `y` reaches."""
-    extent = math.sqrt(reach2 * (l2 * l2 + l3 * l3))
-    first = max(top, math.ceil(max(y - extent, -1.0)))
-    last = min(bottom - 1, math.floor(min(y + extent, float(bottom))))
-    return (int(first), int(last) + 1) if last >= first else (0, 0)
-
-
-@_inline
-def _shape(l1, l2, l3):
-    """What turns differences into exponents: u = inv1 dx and v = inv3 dy - shear dx, and, the square completed,
-    u^2 + v^2 = steepness dy^2 + curvature (dx - lean dy)^2."""
-    inv1, inv3 = np.float32(1) / l1, np.float32(1) / l3
-    shear = l2 * inv1 * inv3
-    curvature = inv1 * inv1 + shear * shear
-    return inv1, inv3, shear, curvature, shear * inv3 / curvature, np.float32(1) / (l2 * l2 + l3 * l3)
-
-
-@_inline
-def _columns(x, dy, curvature, lean, steepness, reach2, n_azimuth):
-    """First column and one past the last that a kernel centred on column `x` reaches on the row `dy` above its centre, and
-    how far the first is from the row's own centre.
-
-    Never more than the turn centred on the mean (the nearest image), and a direction half a turn away is drawn once.
-    """
-    remain = reach2 - steepness * dy * dy
-    if remain < 0:
-        return 0, 0, np.float32(0)
-    half, middle = math.sqrt(remain / curvature), x + lean * dy
-    low, high = middle - half, middle + half
-    half_turn = 0.5 * n_azimuth
-    if low < x - half_turn:
-        low = x - half_turn
-    if high > x + half_turn:
-        high = x + half_turn
-    first = np.int64(np.ceil(low))
-    return first, min(np.int64(np.floor(high)) + 1, first + n_azimuth), np.float32(first - middle)
-
-
-@_inline
-def _exp2(t):
-    """2^t to 3e-7 of itself; what is below the smallest normal number is that number."""
-    t = np.float32(-126) if t < np.float32(-126) else t  # written so that nan stays nan
-    whole = np.floor(t + np.float32(0.5))
-    x = t - whole
-    power = np.float32(1.3276470e-3)  # least relative error on [-1/2, 1/2]
-    power = power * x + np.float32(9.6755410e-3)
-    power = power * x + np.float32(5.5507135e-2)
-    power = power * x + np.float32(2.4022120e-1)
-    power = power * x + np.float32(6.9314694e-1)
-    power = power * x + np.float32(1.0000001)
-    exponent = np.int32((np.int32(whole) + 127) << 23)
-    return power * np.int32(exponent).view(np.float32)
-
-
-@_inline
-def _kernel(start, n_columns, drop, bend, kernel):
-    """2^(drop + bend d^2) at the distances d = start, start + 1, ... from the row's centre."""
-    for k in range(n_columns):
-        d = start + np.float32(np.int32(k))
-        kernel[k] = _exp2(drop + bend * d * d)
-
-
-@_inline
-def _add(kernel, begin, end, weight_re, weight_im, re, im, pixel):
-    """Adds a part of a row of kernel values, from `pixel` on."""
-    for k in range(end - begin):
-        g = kernel[begin + k]
-        re[pixel + k] += weight_re * g
-        im[pixel + k] += weight_im * g
-
-
-@_inline
-def _sums(kernel, begin, end, start, weight_re, weight_im, re, im, pixel):
-    """Over a part of a row: kernel times derivative, real and imaginary; z, their weighted sum, times d and times d^2."""
-    zero = np.float32(0)
-    d_re, d_im, z_d, z_dd = zero, zero, zero, zero
-    for k in range(end - begin):
-        g = kernel[begin + k]
-        g_re, g_im = g * re[pixel + k], g * im[pixel + k]
-        d_re += g_re
-        d_im += g_im
-        d = start + np.float32(np.int32(begin + k))
-        z = d * (weight_re * g_re + weight_im * g_im)
-        z_d += z
-        z_dd += d * z
-    return d_re, d_im, z_d, z_dd
-
-
-@_jit
-def _draw(mean, cholesky, weight, reach2, n_elevation, n_azimuth, n_bands, out):
-    n_position, n = mean.shape[0], mean.shape[1]
-    shared = cholesky.shape[0] == 1
-    band = (n_elevation + n_bands - 1) // n_bands
-    for task in prange(n_position * n_bands):
-        kernel = np.empty(n_azimuth, np.float32)
-        b = task // n_bands
-        top = min((task % n_bands) * band, n_elevation)
-        bottom = min(top + band, n_elevation)
-        re, im = out[b, 0], out[b, 1]
-        re[top * n_azimuth : bottom * n_azimuth] = np.float32(0)
-        im[top * n_azimuth : bottom * n_azimuth] = np.float32(0)
-        c = 0 if shared else b
-        for i in range(n):
-            l1, l2, l3 = cholesky[c, i, 0], cholesky[c, i, 1], cholesky[c, i, 2]
-            x, y = mean[b, i, 0], mean[b, i, 1]
-            weight_re, weight_im = weight[b, i, 0], weight[b, i, 1]
-            _, _, _, curvature, lean, steepness = _shape(l1, l2, l3)
-            whole = np.int64(math.floor(x))
-            fraction = x - whole  # in float64: a kernel may be far narrower than a pixel
-            first_row, end_row = _rows(y, l2, l3, reach2, top, bottom)
-            for row in range(first_row, end_row):
-                dy = np.float32(row - y)
-                first, end, start = _columns(fraction, dy, curvature, lean, steepness, reach2, n_azimuth)
-                if end <= first:
-                    continue
-                _kernel(start, end - first, BASE2 * steepness * dy * dy, BASE2 * curvature, kernel)
-                column = (whole + first) % n_azimuth
-                wrap = min(end - first, n_azimuth - column)
-                _add(kernel, 0, wrap, weight_re, weight_im, re, im, row * n_azimuth + column)
-                _add(kernel, wrap, end - first, weight_re, weight_im, re, im, row * n_azimuth)
-
-
-@_jit
-def _draw_backward(grad, mean, cholesky, weight, reach2, n_elevation, n_azimuth, block, d_mean, d_cholesky, d_weight):
-    n_position, n = mean.shape[0], mean.shape[1]
-    shared = cholesky.shape[0] == 1
-    n_blocks = (n + block - 1) // block
-    for task in prange(n_position * n_blocks):
-        kernel = np.empty(n_azimuth, np.float32)
-        b = task // n_blocks
-        begin = (task % n_blocks) * block
-        re, im = grad[b, 0], grad[b, 1]
-        c = 0 if shared else b
-        for i in range(begin, min(begin + block, n)):
-            l1, l2, l3 = cholesky[c, i, 0], cholesky[c, i, 1], cholesky[c, i, 2]
-            x, y = mean[b, i, 0], mean[b, i, 1]
-            weight_re, weight_im = weight[b, i, 0], weight[b, i, 1]
-            inv1, inv3, shear, curvature, lean, steepness = _shape(l1, l2, l3)
-            whole = np.int64(math.floor(x))
-            fraction = x - whole  # in float64: a kernel may be far narrower than a pixel
-            d_re, d_im = 0.0, 0.0
-            # sums of z, the kernel times the derivative by it, over the footprint with u, v, u^2, u v, v^2
-            z_u, z_v, z_uu, z_uv, z_vv = 0.0, 0.0, 0.0, 0.0, 0.0
-            first_row, end_row = _rows(y, l2, l3, reach2, 0, n_elevation)
-            for row in range(first_row, end_row):
-                dy = np.float32(row - y)
-                first, end, start = _columns(fraction, dy, curvature, lean, steepness, reach2, n_azimuth)
-                if end <= first:
-                    continue
-                _kernel(start, end - first, BASE2 * steepness * dy * dy, BASE2 * curvature, kernel)
-                column = (whole + first) % n_azimuth
-                wrap = min(end - first, n_azimuth - column)
-                near = _sums(kernel, 0, wrap, start, weight_re, weight_im, re, im, row * n_azimuth + column)
-                far = _sums(kernel, wrap, end - first, start, weight_re, weight_im, re, im, row * n_azimuth)
-                s_re, s_im, z_d, z_dd = near[0] + far[0], near[1] + far[1], near[2] + far[2], near[3] + far[3]
-                d_re += s_re
-                d_im += s_im
-                # along the row u and v are straight lines in d: u + inv1 d, v - shear d
-                z = weight_re * s_re + weight_im * s_im
-                u = lean * dy * inv1
-                v = (dy - l2 * u) * inv3
-                z_u += u * z + inv1 * z_d
-                z_v += v * z - shear * z_d
-                z_uu += u * u * z + 2 * u * inv1 * z_d + inv1 * inv1 * z_dd
-                z_uv += u * v * z + (v * inv1 - u * shear) * z_d - inv1 * shear * z_dd
-                z_vv += v * v * z - 2 * v * shear * z_d + shear * shear * z_dd
-            d_mean[b, i, 0] = inv1 * z_u - shear * z_v
-            d_mean[b, i, 1] = inv3 * z_v
-            d_cholesky[b, i, 0] = inv1 * z_uu - shear * z_uv
-            d_cholesky[b, i, 1] = inv3 * z_uv
-            d_cholesky[b, i, 2] = inv3 * z_vv
-            d_weight[b, i, 0] = d_re
-            d_weight[b, i, 1] = d_im
 
 
 def _arguments(mean: Tensor, cholesky: Tensor, weight: Tensor, cutoff: float | None) -> tuple[object, ...]:
@@ -252,7 +55,7 @@ def _rasterize(
     threads = _threads()
     n_bands = 1 if mean.shape[0] >= threads else min(threads, n_elevation)
     with threads_kept():
-        _draw(*_arguments(mean, cholesky, weight, cutoff), n_elevation, n_azimuth, n_bands, out.flatten(2).numpy())
+        draw(*_arguments(mean, cholesky, weight, cutoff), n_elevation, n_azimuth, n_bands, out.flatten(2).numpy())
     return out
 
 
@@ -267,7 +70,7 @@ def _rasterize_backward(
     arguments = _arguments(mean, cholesky, weight, cutoff)
     derivatives = (d_mean.numpy(), d_cholesky.numpy(), d_weight.numpy())
     with threads_kept():
-        _draw_backward(grad.contiguous().flatten(2).numpy(), *arguments, *grad.shape[2:], block, *derivatives)
+        draw_backward(grad.contiguous().flatten(2).numpy(), *arguments, *grad.shape[2:], block, *derivatives)
     return d_mean, d_cholesky if cholesky.dim() == 3 else d_cholesky.sum(0), d_weight
 
 
@@ -304,4 +107,5 @@ def rasterize(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid,
     pixel = pixel - torch.cat([turns, torch.zeros_like(turns)], dim=-1)
     columns, rows = (float(x) for x in step)
     factor = cholesky / cholesky.new_tensor([columns, rows, rows])
-    return _rasterize(pixel, factor, weight, *grid.shape, cutoff)
+    drawn: Tensor = _rasterize(pixel, factor, weight, *grid.shape, cutoff)
+    return drawn
