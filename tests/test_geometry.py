@@ -10,10 +10,11 @@ import torch
 from swiftwrf import AngularGrid, InputError, Spectra, simulated_room
 from swiftwrf.arrays import PlanarArray
 from swiftwrf.geometry import GeometryConfig, GeometryModel, fit_geometry
-from swiftwrf.geometry.fit import observe
+from swiftwrf.geometry.fit import _settled, observe
 from swiftwrf.geometry.hybrid import HybridModel, _strengths, fit_hybrid
 from swiftwrf.geometry.images import Scene, field, image_gain, images, mirror, sequences
 from swiftwrf.geometry.observe import autocorrelation, correlations, element_phases
+from swiftwrf.geometry.planes import Planes, flipped
 from swiftwrf.geometry.refine import derivatives
 from swiftwrf.geometry.strengths import Smoothness, Strengths, fit_strengths
 from swiftwrf.gp import Kernel
@@ -36,7 +37,8 @@ SIX = {
 def spectra(
     planes, gain=-0.6, moving="receiver", n=30, noise=0.0, low=(1.5, 1.2, 0.9), high=(3.5, 3.2, 1.6), array=ARRAY
 ):
-    """Spectra in a room of the given planes (normal to offset), with images up to the second order and phase noise."""
+    """Spectra in a room of the given planes (normal to offset) of one gain or one each, with images up to the second order
+    and phase noise."""
     generator = torch.Generator().manual_seed(0)
     low, high = torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64)
     position = low + (high - low) * torch.rand(n, 3, dtype=torch.float64, generator=generator)
@@ -46,7 +48,9 @@ def spectra(
     normal = torch.nn.functional.normalize(torch.tensor(list(planes), dtype=torch.float64).reshape(-1, 3), dim=1)[None]
     offset = torch.tensor([list(planes.values())], dtype=torch.float64)
     chain = sequences(normal[0], 2) if planes else []
-    channel = scene.wave(scene.transmitter) + field(scene, normal, offset, torch.full(offset.shape, gain), chain)[0]
+    channel = (
+        scene.wave(scene.transmitter) + field(scene, normal, offset, torch.tensor(gain).expand(offset.shape), chain)[0]
+    )
     turn = noise * torch.randn(channel.shape, generator=generator)
     return Spectra(
         name="closed form",
@@ -149,15 +153,27 @@ def test_mirroring_twice_returns():
         ({(1, 0, 0): 4.6}, -0.7, "receiver"),
         ({(1, 0, 0): 4.6, (0, 0, -1): 0.0}, 0.8, "transmitter"),
         (SIX, -0.6, "transmitter"),
+        (SIX, (-0.6, -0.6, -0.6, -0.6, 0.4, 0.4), "receiver"),
     ],
-    ids=["one", "two", "six"],
+    ids=["one", "two", "six", "floor and ceiling of the other sign"],
 )
 def test_rooms_without_noise_are_found_to_a_millimetre(planes, gain, moving):
     model = fit(spectra(planes, gain, moving, n=40))
     assert len(model.planes) == len(planes)
     assert max(e for e, _ in errors(model, planes)) < 1
-    assert all(abs(p.gain - gain) < 0.02 and p.certain for p in model.planes)
+    true = torch.tensor(gain).expand(len(planes)).tolist()
+    assert all(abs(p.gain - g) < 0.02 and p.certain for p, g in zip(model.planes, true, strict=True))
     assert model.order == (1 if len(planes) == 1 else 2)
+
+
+def test_a_sign_does_not_change_for_a_little():
+    """Half a turn away the wrong sign explains a weak wall better by chance, but not clearly."""
+    scene, _ = observe(spectra({(1, 0, 0): 4.6, (0, 0, -1): 0.0}, (-0.6, -0.2), n=40, noise=0.5))
+    normal, offset = torch.tensor([[[1, 0, 0], [0, 0, -1]]]).double(), torch.tensor([[4.6, 0.0]]).double()
+    room = Planes(normal, offset, torch.tensor([[-0.6, -0.2]]), 2).refined(scene)
+    other = flipped(scene, room)[0]
+    assert float(scene.score(other.field(scene))) < 0.99 * float(scene.score(room.field(scene)))
+    assert _settled(room, scene) is room
 
 
 def test_a_tilted_plane_is_found_to_a_millimetre():

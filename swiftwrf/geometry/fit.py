@@ -14,15 +14,15 @@ from swiftwrf.geometry.images import Scene
 from swiftwrf.geometry.model import GeometryModel
 from swiftwrf.geometry.observe import correlations, element_phases
 from swiftwrf.geometry.orient import GAIN, candidates
-from swiftwrf.geometry.planes import Planes, advantage, clearly, correlation_score, flipped
-from swiftwrf.geometry.search import BETTER, PERFECT, STARTS, Search, find_room
+from swiftwrf.geometry.planes import Planes, advantage, clearly, correlation_score, flipped, in_step
+from swiftwrf.geometry.search import PERFECT, STARTS, Search, find_room
 from swiftwrf.geometry.verdict import judged
 from swiftwrf.gp import thinned
 from swiftwrf.progress import progress_bar
 from swiftwrf.threads import single_thread
 
 SOLVED = 0.1  # relative error of a spectrum's autocorrelation up to which its phases are used
-NEEDED = 2.5  # standard errors by which held-out spectra must be better for a plane or an order
+NEEDED = 2.5  # standard errors by which held-out spectra must be better for a plane or an order, all for a sign
 FURTHER = 4.0  # the same for a plane of any orientation, of which far more are tried
 TRIED = 8  # candidates of any orientation that are refined
 MOST = 2000  # spectra that are looked at: a room is a few dozen numbers
@@ -179,16 +179,14 @@ def _pruned(room: Planes, scene: Scene, splits: list[tuple[Scene, Scene]]) -> Pl
 
 
 def _settled(room: Planes, scene: Scene) -> Planes:
-    """With the other sign of a plane's gain, its wave in step again, where that explains the spectra better: a few planes
-    are explained nearly as well by the wrong sign, and the search takes one sign for all."""
-    score = float(scene.score(room.field(scene)))
-    for plane in range(room.normal.shape[1]):
-        for other in flipped(scene, room, plane):
-            other = other.refined(scene, 12)
-            value = float(scene.score(other.field(scene)))
-            if value < BETTER * score:
-                room, score = other, value
-    return room
+    """With other signs of some planes' gains where the spectra clearly say so.
+
+    The search takes one sign for all planes, as a room of one material has it; half a turn away the wrong one explains
+    planes that are often hidden nearly as well, hence a lower score alone does not count.
+    """
+    here = scene.coherence(room.field(scene))
+    others = (r for r in flipped(scene, room) if clearly(scene.coherence(r.field(scene)), here) > NEEDED)
+    return next(others, room)
 
 
 def _extended(
@@ -205,7 +203,7 @@ def _extended(
             gains = torch.cat([room.gain, torch.full((1, 1), GAIN * sign)], dim=1)
             wider.append(Planes(normals, offsets, gains, room.order).refined(some, 8, tilt=True))
         wider.sort(key=lambda r: float(some.score(r.field(some))))
-        wider = [r.refined(some, 20, tilt=True) for other in wider[:2] for r in (other, *flipped(scene, other))]
+        wider = [r.refined(some, 20, tilt=True) for other in wider[:2] for r in (other, *in_step(scene, other))]
         best = min(wider, key=lambda r: float(some.score(r.field(some)))).refined(scene, 15, tilt=True)
         if advantage(scene.coherence(best.field(scene)), scene.coherence(room.field(scene))) < FURTHER:
             break

@@ -19,6 +19,7 @@ from swiftwrf.arrays import PlanarArray
 from swiftwrf.data.spectra import Moving
 
 RIGHT = 0.02  # |cosine| below which two planes count as perpendicular, above 1 - RIGHT**2 as parallel
+FEW = 36  # positions that many rooms are scored at
 
 Sequence = tuple[int, ...]
 
@@ -68,6 +69,10 @@ class Scene:
         moving = self.moving[rows]
         ends = (moving, self.receiver) if self.end == "transmitter" else (self.transmitter, moving)
         return replace(self, transmitter=ends[0], receiver=ends[1], channel=self.channel[rows])
+
+    def few(self) -> Scene:
+        """At most 36 of the positions, evenly chosen, to score many rooms at."""
+        return self.subset(torch.linspace(0, len(self) - 1, min(FEW, len(self))).long())
 
     def wave(self, source: Tensor) -> Tensor:
         """What each element hears from sources (..., n or 1, 3) [m]: exp(-j k d) / d, complex64 (..., n, K)."""

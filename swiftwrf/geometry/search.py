@@ -23,7 +23,6 @@ from swiftwrf.geometry.refine import refine
 SIDES = torch.tensor(
     [[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], dtype=torch.float64
 )  # outward normals
-FEW = 36  # positions that moves of all sides are scored with first
 BETTER = 0.997  # of the score, for a move to count
 PERFECT = 2e-6  # a score that needs no further moves
 STARTS = 4  # of a search
@@ -251,8 +250,7 @@ class Search:
         single, double = self.table(alternatives)
         for k in MOVES:
             yield self.refined(self._moved(alternatives, single, double, k, keep), self.order)[0]
-        rows = torch.linspace(0, len(self.scene) - 1, min(FEW, len(self.scene))).long()
-        few = Search(self.scene.subset(rows), self.reach, self.sign, self.order)
+        few = Search(self.scene.few(), self.reach, self.sign, self.order)
         yield self.refined(few.moves(self.wraps(room), 6, keep), self.order)[0]
 
 

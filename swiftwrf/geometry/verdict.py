@@ -10,7 +10,7 @@ import torch
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.geometry.images import Scene, field, turn_of
 from swiftwrf.geometry.model import GeometryModel, Plane
-from swiftwrf.geometry.planes import Planes, advantage, correlation_score, explained, flipped
+from swiftwrf.geometry.planes import Planes, advantage, correlation_score, explained, flipped, in_step
 from swiftwrf.geometry.refine import deviations
 from swiftwrf.geometry.sample import Residual, residual_statistics
 
@@ -39,7 +39,8 @@ def judged(train: Spectra, scene: Scene, room: Planes, score: float, reach: floa
         residual = residual_statistics(scene, room.normal, room.offset, room.gain, room.sequence, direct)
         doubt = _flat(scene) or _other_carrier(scene, room)
         std = covariance.diagonal().clamp_min(0).sqrt().tolist()
-        rivals = [_rival(scene, room, i) for i in range(len(std))]
+        twins = flipped(scene, room)
+        rivals = [_rival(scene, room, i, twins) for i in range(len(std))]
         lost = [rival <= CERTAIN or s * scene.wavenumber > VAGUE for s, (rival, _) in zip(std, rivals, strict=True)]
         # rooms most of whose planes could stand elsewhere may be wrong as a whole, each plane holding the others
         all_lost = bool(doubt) or sum(lost) > len(lost) / 2
@@ -69,11 +70,11 @@ def judged(train: Spectra, scene: Scene, room: Planes, score: float, reach: floa
     )
 
 
-def _rival(scene: Scene, room: Planes, plane: int) -> tuple[float, float]:
+def _rival(scene: Scene, room: Planes, plane: int, twins: list[Planes]) -> tuple[float, float]:
     """By how many standard errors the plane's place is better than the best rival's, and how far that is away [m].
 
-    Rivals are the best place of a scan around the plane, and the places where a wave of the other sign is in step; each is
-    refined together with all other planes.
+    Rivals are the best place of a scan around the plane, and the places where a wave of the other sign is in step, each
+    refined together with all other planes; and the rooms in which several planes are `flipped`.
     """
     turn = turn_of(scene, room.normal, room.offset, plane)
     step = torch.arange(turn / 2, 3.5 * turn, 0.4 / scene.wavenumber, dtype=torch.float64)
@@ -88,8 +89,8 @@ def _rival(scene: Scene, room: Planes, plane: int) -> tuple[float, float]:
     moved[:, plane] += beside[value.argmin()]
     here = explained(scene.coherence(room.field(scene)))
     nearest = math.inf, 0.0
-    for rival in (replace(room, offset=moved), *flipped(scene, room, plane)):
-        other = rival.refined(scene, 5)
+    beside_it = [other.refined(scene, 5) for other in (replace(room, offset=moved), *in_step(scene, room, plane))]
+    for other in (*beside_it, *twins):
         distance = abs(float(other.offset[0, plane] - room.offset[0, plane]))
         if distance > turn / 4:
             nearest = min(nearest, (advantage(here, explained(scene.coherence(other.field(scene)))), distance))
