@@ -203,6 +203,18 @@ def test_images_are_mirrored_in_one_plane_after_another():
         torch.testing.assert_close(strength[:, row], product)
 
 
+@pytest.mark.parametrize("moving", ["receiver", "transmitter"])
+def test_the_field_is_the_sum_over_any_parts_of_its_images(moving):
+    """Also where planes are oblique, so that paths are followed through images that the part does not have."""
+    scene, _ = observe(spectra({}, moving=moving, n=10))
+    normal = torch.nn.functional.normalize(torch.tensor([[1, 0.3, 0], [-0.2, 1, 0.1], [0, 0, -1]]).double(), dim=1)
+    offset, gain = torch.tensor([[5.2, 4.1, 0.0]]).double(), torch.tensor([[-0.6, 0.5, -0.4]])
+    chain = sequences(normal, 2)
+    whole = field(scene, normal[None], offset, gain, chain)
+    parts = sum(field(scene, normal[None], offset, gain, [s]) for s in chain)
+    torch.testing.assert_close(parts, whole)
+
+
 def test_nothing_to_find_is_no_plane():
     model = fit(spectra({}))
     assert model.planes == []

@@ -172,7 +172,7 @@ def field(scene: Scene, normal: Tensor, offset: Tensor, gain: Tensor, sequence: 
         shape = (len(normal), len(scene), len(scene.element))
         return torch.zeros(shape, dtype=torch.complex64)
     source = images(scene, normal, offset, sequence)
-    strength = image_gain(gain, sequence)[..., None] * visibility(scene, normal, offset, sequence, source)
+    strength = image_gain(gain, sequence)[..., None] * visibility(scene, normal, offset, sequence)
     wave = scene.wave(source)
     return torch.einsum("bsnk,bsn->bnk", wave, strength.to(wave.dtype).expand(wave.shape[:3]))
 
@@ -186,8 +186,8 @@ def image_gain(gain: Tensor, sequence: list[Sequence]) -> Tensor:
     return torch.cat(found, dim=1)[:, tree.rows]
 
 
-def visibility(scene: Scene, normal: Tensor, offset: Tensor, sequence: list[Sequence], source: Tensor) -> Tensor:
-    """Whether the path of each image (B, S, n or 1, 3) exists, float32 (B, S, n or 1).
+def visibility(scene: Scene, normal: Tensor, offset: Tensor, sequence: list[Sequence]) -> Tensor:
+    """Whether the path of each image exists, float32 (B, S, n or 1).
 
     Between planes that are parallel or perpendicular all do, since the region is inside of all planes. Elsewhere the path
     is followed back from the receiver: it must meet its last plane coming from the inside, and so on.
@@ -195,14 +195,15 @@ def visibility(scene: Scene, normal: Tensor, offset: Tensor, sequence: list[Sequ
     facing = normal[:1] if normal.stride(0) == 0 else normal  # rooms that are expanded from one share their normals
     cosine = (facing @ facing.mT).abs()
     if not bool(((cosine > RIGHT) & (cosine < 1 - RIGHT**2)).any()):
-        return torch.ones(source.shape[:2])[..., None]
-    row = {s: number for number, s in enumerate(sequence)}
-    there = torch.ones(*source.shape[:2], len(scene))
+        return torch.ones(len(normal), len(sequence), 1)
+    begun = list(dict.fromkeys(s[:end] for s in sequence for end in range(1, len(s) + 1)))
+    source = dict(zip(begun, images(scene, normal, offset, begun).unbind(1), strict=True))
+    there = torch.ones(len(normal), len(sequence), len(scene))
     for number, s in enumerate(sequence):
         point = scene.receiver.expand(len(normal), -1, -1)
         for end in range(len(s), 0, -1):
             n, o = normal[:, s[end - 1], None], offset[:, s[end - 1], None]
-            towards = source[:, row[s[:end]]] - point
+            towards = source[s[:end]] - point
             before, slope = o - (point * n).sum(-1), (towards * n).sum(-1)
             share = before / slope
             there[:, number] *= ((share > 0) & (share < 1)).float()

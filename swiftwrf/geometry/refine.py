@@ -18,7 +18,7 @@ def derivatives(
     length = ray.norm(dim=-1, keepdim=True)
     unit = ray / length
     phase = unit @ scene.element.T - scene.wavenumber * length
-    strength = image_gain(gain, sequence)[..., None] * visibility(scene, normal, offset, sequence, source)
+    strength = image_gain(gain, sequence)[..., None] * visibility(scene, normal, offset, sequence)
     wave = spherical(phase, length) * strength[..., None]
     total = scene.wave(scene.transmitter) + wave.sum(1)
     change = torch.zeros(len(normal), 4 if tilt else 2, normal.shape[1], *total.shape[1:], dtype=total.dtype)

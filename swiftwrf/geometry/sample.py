@@ -48,7 +48,7 @@ def draw(
         spread = root.eigenvectors * root.eigenvalues.clamp_min(0).sqrt()
         moved = offset + spread @ torch.randn(offset.shape[1], dtype=torch.float64, generator=generator)
         source = images(scene, normal, moved, sequence)
-        wave = scene.wave(source)[0] * visibility(scene, normal, moved, sequence, source)[0, ..., None]
+        wave = scene.wave(source)[0] * visibility(scene, normal, moved, sequence)[0, ..., None]
         full, share = _visibility(gain)
         there = torch.rand(len(sequence), n, generator=generator) < image_gain(share, sequence)[0][:, None]
         strength = image_gain(full, sequence)[0][:, None] * there

@@ -84,7 +84,7 @@ def paths(geometry: GeometryModel, scene: Scene) -> tuple[Tensor, Tensor]:
     wave, strength = [scene.wave(scene.transmitter)[None]], [torch.ones(1)]
     if sequence:
         source = images(scene, normal, offset, sequence)
-        reflected = scene.wave(source) * visibility(scene, normal, offset, sequence, source)[..., None]
+        reflected = scene.wave(source) * visibility(scene, normal, offset, sequence)[..., None]
         wave.append(reflected[0])
         strength.append(image_gain(gain, sequence)[0])
     return torch.cat([part.expand(-1, len(scene), -1) for part in wave]).transpose(0, 1), torch.cat(strength)
