@@ -18,7 +18,7 @@ from swiftwrf.geometry.search import Room
 FLOOR = 1e-6  # of what is missing: rounding
 SIX = 6  # planes that may flip together: one for each side of a room
 FLIPS = 8  # rooms with flipped planes that are refined
-CHUNK = 64  # of them at a time
+CHUNK = 64  # rooms with flipped planes that are scored at a time
 
 
 @dataclass(frozen=True)
@@ -100,10 +100,11 @@ def flipped(scene: Scene, room: Planes) -> list[Planes]:
     alone = 3 * torch.eye(planes, dtype=together.dtype)
     half_turns = torch.cat([together, -alone, alone])
     offset, gain = room.offset + half_turns * turn / 2, room.gain * (1 - 2 * (half_turns % 2))
-    few, score = scene.few(), []
+    few = scene.few()
+    direct, score = few.wave(few.transmitter), []
     for o, g in zip(offset.split(CHUNK), gain.split(CHUNK), strict=True):
         waves = field(few, room.normal.expand(len(o), -1, -1), o, g, room.sequence)
-        score.append(few.score(few.wave(few.transmitter) + waves))
+        score.append(few.score(direct + waves))
     best = torch.cat(score).argsort()[:FLIPS].tolist()
     rooms = [replace(room, offset=offset[[i]], gain=gain[[i]]).refined(scene, 12) for i in best]
     return sorted(rooms, key=lambda r: float(scene.score(r.field(scene))))

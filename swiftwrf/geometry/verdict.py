@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.geometry.images import Scene, field, turn_of
@@ -39,7 +40,7 @@ def judged(train: Spectra, scene: Scene, room: Planes, score: float, reach: floa
         residual = residual_statistics(scene, room.normal, room.offset, room.gain, room.sequence, direct)
         doubt = _flat(scene) or _other_carrier(scene, room)
         std = covariance.diagonal().clamp_min(0).sqrt().tolist()
-        twins = flipped(scene, room)
+        twins = [(twin, explained(scene.coherence(twin.field(scene)))) for twin in flipped(scene, room)]
         rivals = [_rival(scene, room, i, twins) for i in range(len(std))]
         lost = [rival <= CERTAIN or s * scene.wavenumber > VAGUE for s, (rival, _) in zip(std, rivals, strict=True)]
         # rooms most of whose planes could stand elsewhere may be wrong as a whole, each plane holding the others
@@ -70,11 +71,12 @@ def judged(train: Spectra, scene: Scene, room: Planes, score: float, reach: floa
     )
 
 
-def _rival(scene: Scene, room: Planes, plane: int, twins: list[Planes]) -> tuple[float, float]:
+def _rival(scene: Scene, room: Planes, plane: int, twins: list[tuple[Planes, Tensor]]) -> tuple[float, float]:
     """By how many standard errors the plane's place is better than the best rival's, and how far that is away [m].
 
     Rivals are the best place of a scan around the plane, and the places where a wave of the other sign is in step, each
-    refined together with all other planes; and the rooms in which several planes are `flipped`.
+    refined together with all other planes; and `twins`, the rooms in which several planes are flipped, with how
+    well each explains the spectra.
     """
     turn = turn_of(scene, room.normal, room.offset, plane)
     step = torch.arange(turn / 2, 3.5 * turn, 0.4 / scene.wavenumber, dtype=torch.float64)
@@ -89,11 +91,11 @@ def _rival(scene: Scene, room: Planes, plane: int, twins: list[Planes]) -> tuple
     moved[:, plane] += beside[value.argmin()]
     here = explained(scene.coherence(room.field(scene)))
     nearest = math.inf, 0.0
-    beside_it = [other.refined(scene, 5) for other in (replace(room, offset=moved), *in_step(scene, room, plane))]
-    for other in (*beside_it, *twins):
+    near = [other.refined(scene, 5) for other in (replace(room, offset=moved), *in_step(scene, room, plane))]
+    for other, there in [*((other, explained(scene.coherence(other.field(scene)))) for other in near), *twins]:
         distance = abs(float(other.offset[0, plane] - room.offset[0, plane]))
         if distance > turn / 4:
-            nearest = min(nearest, (advantage(here, explained(scene.coherence(other.field(scene)))), distance))
+            nearest = min(nearest, (advantage(here, there), distance))
     return nearest
 
 
