@@ -14,9 +14,11 @@ from swiftwrf.geometry.fit import _settled, observe
 from swiftwrf.geometry.hybrid import HybridModel, _strengths, fit_hybrid
 from swiftwrf.geometry.images import Scene, field, image_gain, images, mirror, sequences
 from swiftwrf.geometry.observe import autocorrelation, correlations, element_phases
-from swiftwrf.geometry.planes import Planes, flipped
+from swiftwrf.geometry.planes import Planes
 from swiftwrf.geometry.refine import derivatives
 from swiftwrf.geometry.strengths import Smoothness, Strengths, fit_strengths
+from swiftwrf.geometry.turns import _Table, turned
+from swiftwrf.geometry.waves import Waves
 from swiftwrf.gp import Kernel
 from swiftwrf.metrics import psnr
 from swiftwrf.store import Store
@@ -171,9 +173,37 @@ def test_a_sign_does_not_change_for_a_little():
     scene, _ = observe(spectra({(1, 0, 0): 4.6, (0, 0, -1): 0.0}, (-0.6, -0.2), n=40, noise=0.5))
     normal, offset = torch.tensor([[[1, 0, 0], [0, 0, -1]]]).double(), torch.tensor([[4.6, 0.0]]).double()
     room = Planes(normal, offset, torch.tensor([[-0.6, -0.2]]), 2).refined(scene)
-    other = flipped(scene, room)[0]
+    other = turned(scene, room)[0]
     assert float(scene.score(other.field(scene))) < 0.99 * float(scene.score(room.field(scene)))
     assert _settled(room, scene) is room
+
+
+@pytest.mark.parametrize("away", [(8, 8, 6, 6, 0, 2), (3, 3, 4, 4, 0, 3)], ids=["whole turns", "half turns"])
+def test_planes_that_are_turns_away_together_return(away):
+    """Images of images hold planes at wrong places together, from where no one to three of them find back."""
+    gain = (-0.4, -0.3, -0.65, -0.75, 0.25, 0.4)
+    scene, _ = observe(spectra(SIX, gain, "transmitter", n=40))
+    normal, offset = torch.tensor([list(SIX)]).double(), torch.tensor([list(SIX.values())]).double()
+    true = Planes(normal, offset, torch.tensor([gain]), 2)
+    wrong = _Table(scene, true).room(away).refined(scene, 20)
+    assert float((wrong.offset - offset).abs().max()) > 0.2
+    assert float(scene.score(wrong.field(scene))) < 0.02  # explains nearly all
+    assert float((_settled(wrong, scene).offset - offset).abs().max()) < 1e-3
+
+
+def test_scores_of_combinations_are_those_of_their_rooms():
+    scene, _ = observe(spectra(SIX, n=12))
+    normal = torch.tensor(list(SIX)).double()
+    offset = [o + 0.05 * torch.arange(1 + i % 3, dtype=torch.float64) for i, o in enumerate(SIX.values())]
+    gain = [torch.linspace(-0.6, 0.4, len(o)) for o in offset]
+    direct, waves = scene.wave(scene.transmitter), Waves.of(scene, normal, offset, gain)
+    score = waves.scores(scene, direct)
+    base, moving = waves.moved(direct, (1, 2, 4, 5))
+    torch.testing.assert_close(moving.scores(scene, base), score[0, :, :, 0])
+    for choice in ((0, 0, 0, 0, 0, 0), (0, 1, 2, 0, 1, 2), (0, 1, 0, 0, 0, 1)):
+        own = ([t[c] for t, c in zip(table, choice, strict=True)] for table in (offset, gain))
+        room = Planes(normal[None], *(torch.stack(row)[None] for row in own), 2)
+        torch.testing.assert_close(score[choice], scene.score(room.field(scene)), atol=1e-5, rtol=0)
 
 
 def test_a_tilted_plane_is_found_to_a_millimetre():

@@ -14,8 +14,9 @@ from swiftwrf.geometry.images import Scene
 from swiftwrf.geometry.model import GeometryModel
 from swiftwrf.geometry.observe import correlations, element_phases
 from swiftwrf.geometry.orient import GAIN, candidates
-from swiftwrf.geometry.planes import Planes, advantage, clearly, correlation_score, flipped, in_step
+from swiftwrf.geometry.planes import Planes, advantage, clearly, correlation_score, in_step
 from swiftwrf.geometry.search import PERFECT, STARTS, Search, find_room
+from swiftwrf.geometry.turns import turned
 from swiftwrf.geometry.verdict import judged
 from swiftwrf.gp import thinned
 from swiftwrf.progress import progress_bar
@@ -23,6 +24,7 @@ from swiftwrf.threads import single_thread
 
 SOLVED = 0.1  # relative error of a spectrum's autocorrelation up to which its phases are used
 NEEDED = 2.5  # standard errors by which held-out spectra must be better for a plane or an order, all of them for a sign
+ROUNDS = 3  # in which planes move by turns
 FURTHER = 4.0  # the same for a plane of any orientation, of which far more are tried
 TRIED = 8  # candidates of any orientation that are refined
 MOST = 2000  # spectra that are looked at: a room is a few dozen numbers
@@ -77,15 +79,15 @@ def fit_geometry(
     kept, held = scene.subset((fold != 0).nonzero()[:, 0]), scene.subset((fold == 0).nonzero()[:, 0])
     with progress_bar(progress) as bar:
         task = bar.add_task("finding the room", total=STARTS)
-        sign, found = find_room(
+        signs, found = find_room(
             _some(kept, config.positions, seed), config.reach, width=config.width, tick=lambda: bar.advance(task)
         )
     score = correlation_score(held, Planes.of(found).refined(kept), train.array)
     some = _some(scene, config.positions, seed)
-    found = Search(some, config.reach, sign).improve(found)
+    found = Search(some, config.reach, signs).improve(found)
     room = Planes.of(found).refined(scene)
     splits = split(scene, fold)
-    room = _settled(_pruned(room, scene, splits), scene)
+    room = _pruned(_settled(room, scene), scene, splits)
     room = _extended(room, scene, some, splits, config)
     room = _with_order(room, splits, config.max_order)
     return judged(train, scene, room.refined(scene), score, config.reach)
@@ -179,14 +181,19 @@ def _pruned(room: Planes, scene: Scene, splits: list[tuple[Scene, Scene]]) -> Pl
 
 
 def _settled(room: Planes, scene: Scene) -> Planes:
-    """With other signs of some planes' gains where the spectra clearly say so.
+    """With planes whole and half turns away where the spectra clearly say so.
 
-    The search takes one sign for all planes, as a room of one material has it; half a turn away the wrong one explains
-    planes that are often hidden nearly as well, hence a lower score alone does not count.
+    The search moves few planes at once, and takes one sign for all walls and one for floor and ceiling. Half a turn away a
+    wrong one explains planes that are often hidden nearly as well, hence a lower score alone does not count.
     """
-    here = scene.coherence(room.field(scene))
-    others = (r for r in flipped(scene, room) if clearly(scene.coherence(r.field(scene)), here) > NEEDED)
-    return next(others, room)
+    for _ in range(ROUNDS):
+        here = scene.coherence(room.field(scene))
+        others = (r for r in turned(scene, room) if clearly(scene.coherence(r.field(scene)), here) > NEEDED)
+        other = next(others, None)
+        if other is None:
+            break
+        room = other
+    return room
 
 
 def _extended(

@@ -70,9 +70,9 @@ class Scene:
         ends = (moving, self.receiver) if self.end == "transmitter" else (self.transmitter, moving)
         return replace(self, transmitter=ends[0], receiver=ends[1], channel=self.channel[rows])
 
-    def few(self) -> Scene:
-        """At most 36 of the positions, evenly chosen, to score many rooms at."""
-        return self.subset(torch.linspace(0, len(self) - 1, min(FEW, len(self))).long())
+    def few(self, most: int = FEW) -> Scene:
+        """At most so many of the positions, evenly chosen, to score many rooms at."""
+        return self.subset(torch.linspace(0, len(self) - 1, min(most, len(self))).long())
 
     def wave(self, source: Tensor) -> Tensor:
         """What each element hears from sources (..., n or 1, 3) [m]: exp(-j k d) / d, complex64 (..., n, K)."""

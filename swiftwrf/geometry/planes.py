@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass, replace
 
-import torch
 from torch import Tensor
 
 from swiftwrf.arrays import PlanarArray
@@ -16,9 +14,6 @@ from swiftwrf.geometry.refine import refine
 from swiftwrf.geometry.search import Room
 
 FLOOR = 1e-6  # of what is missing: rounding
-SIX = 6  # planes that may flip together: one for each side of a room
-FLIPS = 8  # rooms with flipped planes that are refined
-CHUNK = 64  # rooms with flipped planes that are scored at a time
 
 
 @dataclass(frozen=True)
@@ -83,31 +78,6 @@ def in_step(scene: Scene, room: Planes, plane: int = -1) -> list[Planes]:
         gain[:, plane] *= -1
         rooms.append(replace(room, offset=offset, gain=gain))
     return rooms
-
-
-def flipped(scene: Scene, room: Planes) -> list[Planes]:
-    """Rooms in which some planes reflect with the other sign: those that explain the spectra best, refined, the best first.
-
-    What several planes reflect one after another stays in step when all of them flip and move by half a turn, hence all
-    combinations are tried; of more than six planes the first six flip, those of the sides. One alone may move further.
-    """
-    planes = room.normal.shape[1]
-    if not planes:
-        return []
-    turn = torch.tensor([turn_of(scene, room.normal, room.offset, i) for i in range(planes)], dtype=torch.float64)
-    choices = itertools.product(*[(0, -1, 1) if i < SIX else (0,) for i in range(planes)])
-    together = torch.tensor(list(choices)[1:])  # without the room as it is
-    alone = 3 * torch.eye(planes, dtype=together.dtype)
-    half_turns = torch.cat([together, -alone, alone])
-    offset, gain = room.offset + half_turns * turn / 2, room.gain * (1 - 2 * (half_turns % 2))
-    few = scene.few()
-    direct, score = few.wave(few.transmitter), []
-    for o, g in zip(offset.split(CHUNK), gain.split(CHUNK), strict=True):
-        waves = field(few, room.normal.expand(len(o), -1, -1), o, g, room.sequence)
-        score.append(few.score(direct + waves))
-    best = torch.cat(score).argsort()[:FLIPS].tolist()
-    rooms = [replace(room, offset=offset[[i]], gain=gain[[i]]).refined(scene, 12) for i in best]
-    return sorted(rooms, key=lambda r: float(scene.score(r.field(scene))))
 
 
 def correlation_score(scene: Scene, room: Planes, array: PlanarArray) -> float:

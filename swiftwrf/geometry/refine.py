@@ -96,13 +96,13 @@ def refine(
     *,
     steps: int = 8,
     tilt: bool = False,
-    sign: float = 0.0,
+    signs: Tensor | None = None,
     limit: float = 0.03,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Score (B,), normals (B, P, 3), offsets and gains (B, P) after some steps.
 
     Args:
-        sign: of all gains; 0 where they are free.
+        signs: of the gains, (P,); free without them.
         limit: how far a plane may go in one step [m].
     """
     damping = torch.full((len(normal),), 1e-2)
@@ -116,8 +116,8 @@ def refine(
         step = step.reshape(len(normal), -1, planes)
         trial_offset = offset + step[:, 0].clamp(-limit, limit).double()
         trial_gain = gain + step[:, 1].clamp(-0.3, 0.3)
-        if sign:
-            trial_gain = sign * (sign * trial_gain).clamp(0.02, 1.5)
+        if signs is not None:
+            trial_gain = signs * (signs * trial_gain).clamp(0.02, 1.5)
         trial_normal = normal
         if tilt:
             across = torch.linalg.svd(normal[:, :, None]).Vh[:, :, 1:]

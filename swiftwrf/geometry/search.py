@@ -19,13 +19,18 @@ from torch import Tensor
 
 from swiftwrf.geometry.images import Scene, field, sequences, turn_of
 from swiftwrf.geometry.refine import refine
+from swiftwrf.geometry.waves import Waves
 
 SIDES = torch.tensor(
     [[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], dtype=torch.float64
 )  # outward normals
+SIGNS = torch.tensor(
+    [[-1, -1, -1, -1, -1, -1], [-1, -1, -1, -1, 1, 1], [1, 1, 1, 1, 1, 1]]
+)  # of the gains: one material, vertical fields (walls turn them round, floor and ceiling do not), anything else
+USUAL = 0.7  # modulus of a gain that is not known yet
 BETTER = 0.997  # of the score, for a move to count
 PERFECT = 2e-6  # a score that needs no further moves
-STARTS = 4  # of a search
+STARTS = 2 * len(SIGNS)  # of a search
 HOPELESS = 1.4  # a start with so many times the best score is given up
 Alternatives = list[list[tuple[float, float]]]  # offset [m] and gain, for each side
 CHUNK = 256  # candidates at a time
@@ -57,12 +62,13 @@ class Search:
     Args:
         scene: with the positions to search with.
         reach: how far beyond the region planes are looked for [m].
-        sign: of all gains, -1 or 1.
+        signs: of the gains on the six sides, -1 or 1 each, (6,).
         order: of the images while planes move together.
     """
 
-    def __init__(self, scene: Scene, reach: float, sign: float, order: int = 2) -> None:
-        self.scene, self.reach, self.sign, self.order = scene, reach, sign, order
+    def __init__(self, scene: Scene, reach: float, signs: Tensor, order: int = 2) -> None:
+        self.scene, self.reach, self.signs, self.order = scene, reach, signs, order
+        self.usual: list[float] = (USUAL * signs).tolist()
         both = torch.cat([scene.transmitter, scene.receiver])
         near = (both @ SIDES.T).amax(0)
         self.step = 0.5 / scene.wavenumber
@@ -85,7 +91,7 @@ class Search:
     def landscape(self, room: Room, side: int, order: int) -> Tensor:
         """The score over the offsets of a side, its own plane taken away, (C,)."""
         rest = Room(0.0, {i: o for i, o in room.offset.items() if i != side}, room.gain)
-        base, gain = self.total(rest, order), room.gain.get(side, 0.7 * self.sign)
+        base, gain = self.total(rest, order), room.gain.get(side, self.usual[side])
         sides = sorted([*rest.offset, side])
         own = sides.index(side)
         chain = [s for s in sequences(SIDES[sides], order) if own in s and len(s) > 1]
@@ -122,7 +128,7 @@ class Search:
             normal, offset, gain = (torch.cat(t) for t in zip(*[r.tensors() for r in group], strict=True))
             chain = sequences(SIDES[list(sides)], order)
             score, _, offset, gain = refine(
-                self.scene, normal, offset, gain, chain, steps=steps, sign=self.sign, limit=2 * self.step
+                self.scene, normal, offset, gain, chain, steps=steps, signs=self.signs[list(sides)], limit=2 * self.step
             )
             for v, o, g in zip(score.tolist(), offset.tolist(), gain.tolist(), strict=True):
                 done.append(Room(v, dict(zip(sides, o, strict=True)), dict(zip(sides, g, strict=True))))
@@ -136,7 +142,7 @@ class Search:
             for room in rooms:
                 for side in set(range(6)) - set(room.offset):
                     for v, o in self.minima(room, side, order, 4):
-                        new = Room(v, {**room.offset, side: o}, {**room.gain, side: 0.7 * self.sign})
+                        new = Room(v, {**room.offset, side: o}, {**room.gain, side: self.usual[side]})
                         pool.setdefault(new.key(2 * self.step), new)
             if not pool:  # no side left has a minimum within reach
                 break
@@ -152,7 +158,7 @@ class Search:
         second-order images."""
         found = []
         for side in range(6):
-            gain = room.gain.get(side, 0.7 * self.sign) if side in room.offset else 0.7 * self.sign
+            gain = room.gain[side] if side in room.offset else self.usual[side]
             own = [(room.offset[side], gain), (room.offset[side], 0.0)] if side in room.offset else [(0.0, 0.0)]
             offsets = [o for order in (1, self.order) for _, o in self.minima(room, side, order, top)]
             far: list[float] = []
@@ -162,52 +168,23 @@ class Search:
             found.append(own + [(o, gain) for o in far])
         return found
 
-    def table(self, alternatives: Alternatives) -> tuple[list[Tensor], dict[tuple[int, int], Tensor]]:
-        """Waves of single reflections, (A, n, K) a side, and of double ones, (A, B, n, K) a pair of sides."""
+    def table(self, alternatives: Alternatives) -> Waves:
+        """The waves of all alternatives."""
         offset = [torch.tensor([o for o, _ in a], dtype=torch.float64) for a in alternatives]
         gain = [torch.tensor([g for _, g in a]) for a in alternatives]
-        single = [self._waves(SIDES[i : i + 1], o[:, None]) * gain[i][:, None, None] for i, o in enumerate(offset)]
-        double = {}
-        for i, j in itertools.combinations(range(6), 2):
-            pair = torch.cartesian_prod(offset[i], offset[j])
-            gains = torch.cartesian_prod(gain[i], gain[j])
-            normal = SIDES[[i, j]]
-            chain = [s for s in sequences(normal, self.order) if len(s) > 1]
-            waves = field(self.scene, normal.expand(len(pair), 2, 3), pair, gains, chain)
-            double[i, j] = waves.reshape(len(offset[i]), len(offset[j]), *waves.shape[1:])
-        return single, double
+        return Waves.of(self.scene, SIDES, offset, gain, self.order)
 
-    def moves(self, alternatives: Alternatives, k: int, keep: int) -> list[Room]:
+    def moves(self, alternatives: Alternatives, waves: Waves, k: int, keep: int) -> list[Room]:
         """The best rooms in which k sides take other alternatives, of which the more are tried the fewer sides move."""
-        return self._moved(alternatives, *self.table(alternatives), k, keep)
-
-    def _moved(
-        self,
-        alternatives: Alternatives,
-        single: list[Tensor],
-        double: dict[tuple[int, int], Tensor],
-        k: int,
-        keep: int,
-    ) -> list[Room]:
         pool: list[tuple[float, tuple[int, ...]]] = []
         for which in itertools.combinations(range(6), k):
-            tried = [list(range(len(alternatives[i])))[: MOVES.get(k)] for i in which]
-            rest = [i for i in range(6) if i not in which]
-            total = self.direct + sum(single[i][0] for i in rest)
-            for i, j in itertools.combinations(rest, 2):
-                total = total + double[i, j][0, 0]
-            for place, i in enumerate(which):
-                own = single[i][tried[place]]
-                for j in rest:
-                    own = own + (double[i, j][tried[place], 0] if i < j else double[j, i][0, tried[place]])
-                total = total + _placed(own, [place], k)
-            for (p, i), (q, j) in itertools.combinations(enumerate(which), 2):
-                total = total + _placed(double[i, j][tried[p]][:, tried[q]], [p, q], k)
-            value = torch.stack([self.scene.score(t) for t in total])
+            base, moving = waves.moved(self.direct, which)
+            tried = [torch.arange(len(alternatives[i]))[: MOVES.get(k)] for i in which]
+            value = moving.at(tried).scores(self.scene, base)
             for index in value.flatten().argsort()[:keep]:
                 choice = [0] * 6
-                for i, options, at in zip(which, tried, np.unravel_index(int(index), value.shape), strict=True):
-                    choice[i] = options[int(at)]
+                for i, at in zip(which, np.unravel_index(int(index), value.shape), strict=True):
+                    choice[i] = int(at)
                 pool.append((float(value.flatten()[index]), tuple(choice)))
         rooms = []
         for value_, choice_ in sorted(set(pool))[:keep]:
@@ -247,25 +224,17 @@ class Search:
         if room.score < PERFECT:
             return
         alternatives = self.alternatives(room, top)
-        single, double = self.table(alternatives)
+        waves = self.table(alternatives)
         for k in MOVES:
-            yield self.refined(self._moved(alternatives, single, double, k, keep), self.order)[0]
-        few = Search(self.scene.few(), self.reach, self.sign, self.order)
-        yield self.refined(few.moves(self.wraps(room), 6, keep), self.order)[0]
-
-
-def _placed(waves: Tensor, axes: list[int], k: int) -> Tensor:
-    """Waves (A, [B,] n, K) with their first dimensions put on the given ones of k."""
-    shape = [1] * k
-    for axis, size in zip(axes, waves.shape, strict=False):
-        shape[axis] = size
-    return waves.reshape(*shape, *waves.shape[-2:])
+            yield self.refined(self.moves(alternatives, waves, k, keep), self.order)[0]
+        few, wraps = Search(self.scene.few(), self.reach, self.signs, self.order), self.wraps(room)
+        yield self.refined(few.moves(wraps, few.table(wraps), 6, keep), self.order)[0]
 
 
 def find_room(
     scene: Scene, reach: float, order: int = 2, width: int = 8, tick: Callable[[], None] | None = None
-) -> tuple[float, Room]:
-    """The sign of the gains and the best room over both signs, from beams with and without second-order images.
+) -> tuple[Tensor, Room]:
+    """The signs of the gains and the best room over all SIGNS, from beams with and without second-order images.
 
     Args:
         scene: with the positions to search with, best no more than a hundred.
@@ -277,16 +246,16 @@ def find_room(
     starts = []
     nothing = Room(float(scene.score(scene.wave(scene.transmitter))))
     if nothing.score < PERFECT:
-        return 1.0, nothing
-    for sign in (-1.0, 1.0):
-        search = Search(scene, reach, sign, order)
+        return SIGNS[0], nothing
+    for signs in SIGNS:
+        search = Search(scene, reach, signs, order)
         starts += [(search.beam(width, first)[0], search) for first in (order, 1)]
-    best: tuple[float, Room] | None = None
+    best: tuple[Tensor, Room] | None = None
     for start, search in sorted(starts, key=lambda s: s[0].score):
         if best is None or PERFECT < start.score < HOPELESS * best[1].score:
             room = search.improve(start)
             if best is None or room.score < best[1].score:
-                best = search.sign, room
+                best = search.signs, room
         if tick:
             tick()
     assert best is not None

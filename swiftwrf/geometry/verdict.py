@@ -11,9 +11,10 @@ from torch import Tensor
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.geometry.images import Scene, field, turn_of
 from swiftwrf.geometry.model import GeometryModel, Plane
-from swiftwrf.geometry.planes import Planes, advantage, correlation_score, explained, flipped, in_step
+from swiftwrf.geometry.planes import Planes, advantage, correlation_score, explained, in_step
 from swiftwrf.geometry.refine import deviations
 from swiftwrf.geometry.sample import Residual, residual_statistics
+from swiftwrf.geometry.turns import turned
 
 CERTAIN = 3.0  # the same against a rival place, for a plane to be certain
 VAGUE = 0.5  # deviation [rad of phase] beyond which a plane is not certain
@@ -40,7 +41,7 @@ def judged(train: Spectra, scene: Scene, room: Planes, score: float, reach: floa
         residual = residual_statistics(scene, room.normal, room.offset, room.gain, room.sequence, direct)
         doubt = _flat(scene) or _other_carrier(scene, room)
         std = covariance.diagonal().clamp_min(0).sqrt().tolist()
-        twins = [(twin, explained(scene.coherence(twin.field(scene)))) for twin in flipped(scene, room)]
+        twins = [(twin, explained(scene.coherence(twin.field(scene)))) for twin in turned(scene, room)]
         rivals = [_rival(scene, room, i, twins) for i in range(len(std))]
         lost = [rival <= CERTAIN or s * scene.wavenumber > VAGUE for s, (rival, _) in zip(std, rivals, strict=True)]
         # rooms most of whose planes could stand elsewhere may be wrong as a whole, each plane holding the others
