@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import statistics
 from typing import Any
 
 from committed import RESULTS, ROOT, aoa_shares, interval, load, markdown, rssi_runs
@@ -122,6 +123,25 @@ def walls() -> str:
         rows.append([what, str(found["positions"]), *cells, certain, *quality, f"{found['cpu_seconds']:.0f} s"])
     columns = ["scene, moving end", "spectra", *(f"{side} [mm]" for side in SIDES), "certain ones within 3 deviations"]
     return markdown([*columns, "geometry", "hybrid", "processor time"], rows)
+
+
+def random_rooms() -> str:
+    """How many of the random rooms are found, and what is called certain of them."""
+    rows = []
+    for case, rooms in load("random_rooms")["rooms"].items():
+        kind, noise = case.split(", ")
+        found, near = sum(room["near"] == 6 for room in rooms), sum(room["near"] for room in rooms)
+        certain, wrong = (sum(room[key] for room in rooms) for key in ("certain", "certain_and_wrong"))
+        seconds = statistics.mean(room["cpu_seconds"] for room in rooms)
+        cells = [
+            f"{found} of {len(rooms)}",
+            f"{near} of {6 * len(rooms)}",
+            str(certain),
+            str(wrong),
+            f"{seconds:.0f} s",
+        ]
+        rows.append([kind, noise, *cells])
+    return markdown(["gains", "phase noise", "rooms", "planes", "certain", "of them wrong", "processor time"], rows)
 
 
 def _millimetres(plane: dict[str, Any] | None) -> str:
@@ -358,6 +378,7 @@ TABLES = {
     "aoa": aoa,
     "room": room,
     "walls": walls,
+    "random_rooms": random_rooms,
     "rssi": rssi,
     "floor": floor,
     "size": size,

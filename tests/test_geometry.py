@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from swiftwrf import AngularGrid, InputError, Spectra, simulated_room
+from swiftwrf import InputError, simulated_room
 from swiftwrf.arrays import PlanarArray
 from swiftwrf.geometry import GeometryConfig, GeometryModel, fit_geometry
 from swiftwrf.geometry.fit import _settled, observe
@@ -22,9 +22,8 @@ from swiftwrf.geometry.waves import Waves
 from swiftwrf.gp import Kernel
 from swiftwrf.metrics import psnr
 from swiftwrf.store import Store
+from swiftwrf.testing.rooms import ARRAY, GRID, mirror_room
 
-GRID = AngularGrid.hemisphere(10, 40)
-ARRAY = PlanarArray.square(4, 915e6)
 QUICK = GeometryConfig(reach=2.0, width=2)
 SIX = {
     (-1, 0, 0): 0.0,
@@ -34,39 +33,6 @@ SIX = {
     (0, 0, -1): 0.0,
     (0, 0, 1): 2.8,
 }
-
-
-def spectra(
-    planes, gain=-0.6, moving="receiver", n=30, noise=0.0, low=(1.5, 1.2, 0.9), high=(3.5, 3.2, 1.6), array=ARRAY
-):
-    """Spectra in a room of the given planes (normal to offset) of one gain or one each, with images up to the second order
-    and phase noise."""
-    generator = torch.Generator().manual_seed(0)
-    low, high = torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64)
-    position = low + (high - low) * torch.rand(n, 3, dtype=torch.float64, generator=generator)
-    fixed = torch.tensor([2.6, 2.2, 2.4 if moving == "receiver" else 0.3], dtype=torch.float64)
-    rotation = torch.eye(3, dtype=torch.float64)
-    scene = Scene.of(position, fixed, moving, array, rotation, torch.ones(n, len(array.element)))
-    normal = torch.nn.functional.normalize(torch.tensor(list(planes), dtype=torch.float64).reshape(-1, 3), dim=1)[None]
-    offset = torch.tensor([list(planes.values())], dtype=torch.float64)
-    chain = sequences(normal[0], 2) if planes else []
-    channel = (
-        scene.wave(scene.transmitter) + field(scene, normal, offset, torch.tensor(gain).expand(offset.shape), chain)[0]
-    )
-    turn = noise * torch.randn(channel.shape, generator=generator)
-    return Spectra(
-        name="closed form",
-        position=position,
-        store=Store(array.spectrum(channel * torch.polar(torch.ones_like(turn), turn), GRID)),
-        grid=GRID,
-        label=torch.zeros(n, 2, dtype=torch.float64),
-        line_of_sight=torch.ones(n, dtype=torch.bool),
-        moving=moving,
-        index=torch.arange(n),
-        array=array,
-        fixed_position=fixed,
-        rotation=rotation,
-    )
 
 
 def fit(data, **changes):
@@ -85,7 +51,7 @@ def errors(model, planes):
 
 @pytest.fixture(scope="module")
 def noisy():
-    return spectra(SIX, noise=0.1)
+    return mirror_room(SIX, noise=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -100,17 +66,17 @@ def test_elements_may_be_listed_in_any_order():
     normal = torch.tensor([list(SIX)], dtype=torch.float64)
     offset = torch.tensor([list(SIX.values())], dtype=torch.float64)
     for array in (plain, shuffled):
-        scene, _ = observe(spectra(SIX, array=array))
+        scene, _ = observe(mirror_room(SIX, array=array))
         waves = field(scene, normal, offset, torch.full((1, 6), -0.6), sequences(normal[0], 2))[0]
         assert float(scene.score(scene.wave(scene.transmitter) + waves)) < 1e-3
     assert PlanarArray(ARRAY.element[:7], ARRAY.wavelength).opposite is None
 
 
-def test_phases_of_the_elements_follow_from_the_spectra():
+def test_phases_of_the_elements_follow_from_the_mirror_room():
     generator = torch.Generator().manual_seed(0)
     angle = 3 * torch.randn(30, 16, dtype=torch.float64, generator=generator)
     channel = torch.polar(torch.ones_like(angle), angle)
-    data = replace(spectra({}, n=30), store=Store(ARRAY.spectrum(channel, GRID)))
+    data = replace(mirror_room({}, n=30), store=Store(ARRAY.spectrum(channel, GRID)))
     torch.testing.assert_close(correlations(data), autocorrelation(channel, ARRAY), atol=1e-5, rtol=0)
     found, error = element_phases(correlations(data), ARRAY)
     match = torch.stack([(channel.conj() * f).mean(1).abs() for f in (found, found.conj().flip(1))]).amax(0)
@@ -119,7 +85,7 @@ def test_phases_of_the_elements_follow_from_the_spectra():
 
 
 def test_derivatives_of_the_field_are_its_differences():
-    data = spectra(SIX, n=5)
+    data = mirror_room(SIX, n=5)
     scene = Scene.of(data.position, data.fixed_position, "receiver", ARRAY, data.rotation, torch.ones(5, 16))
     normal = torch.tensor([list(SIX)], dtype=torch.float64)
     offset, gain = torch.tensor([list(SIX.values())], dtype=torch.float64), torch.full((1, 6), -0.6)
@@ -160,7 +126,7 @@ def test_mirroring_twice_returns():
     ids=["one", "two", "six", "floor and ceiling of the other sign"],
 )
 def test_rooms_without_noise_are_found_to_a_millimetre(planes, gain, moving):
-    model = fit(spectra(planes, gain, moving, n=40))
+    model = fit(mirror_room(planes, gain, moving, n=40))
     assert len(model.planes) == len(planes)
     assert max(e for e, _ in errors(model, planes)) < 1
     true = torch.tensor(gain).expand(len(planes)).tolist()
@@ -170,7 +136,7 @@ def test_rooms_without_noise_are_found_to_a_millimetre(planes, gain, moving):
 
 def test_a_sign_does_not_change_for_a_little():
     """Half a turn away the wrong sign explains a weak wall better by chance, but not clearly."""
-    scene, _ = observe(spectra({(1, 0, 0): 4.6, (0, 0, -1): 0.0}, (-0.6, -0.2), n=40, noise=0.5))
+    scene, _ = observe(mirror_room({(1, 0, 0): 4.6, (0, 0, -1): 0.0}, (-0.6, -0.2), n=40, noise=0.5))
     normal, offset = torch.tensor([[[1, 0, 0], [0, 0, -1]]]).double(), torch.tensor([[4.6, 0.0]]).double()
     room = Planes(normal, offset, torch.tensor([[-0.6, -0.2]]), 2).refined(scene)
     other = turned(scene, room)[0]
@@ -182,7 +148,7 @@ def test_a_sign_does_not_change_for_a_little():
 def test_planes_that_are_turns_away_together_return(away):
     """Images of images hold planes at wrong places together, from where no one to three of them find back."""
     gain = (-0.4, -0.3, -0.65, -0.75, 0.25, 0.4)
-    scene, _ = observe(spectra(SIX, gain, "transmitter", n=40))
+    scene, _ = observe(mirror_room(SIX, gain, "transmitter", n=40))
     normal, offset = torch.tensor([list(SIX)]).double(), torch.tensor([list(SIX.values())]).double()
     true = Planes(normal, offset, torch.tensor([gain]), 2)
     wrong = _Table(scene, true).room(away).refined(scene, 20)
@@ -192,7 +158,7 @@ def test_planes_that_are_turns_away_together_return(away):
 
 
 def test_scores_of_combinations_are_those_of_their_rooms():
-    scene, _ = observe(spectra(SIX, n=12))
+    scene, _ = observe(mirror_room(SIX, n=12))
     normal = torch.tensor(list(SIX)).double()
     offset = [o + 0.05 * torch.arange(1 + i % 3, dtype=torch.float64) for i, o in enumerate(SIX.values())]
     gain = [torch.linspace(-0.6, 0.4, len(o)) for o in offset]
@@ -207,7 +173,7 @@ def test_scores_of_combinations_are_those_of_their_rooms():
 
 
 def test_a_tilted_plane_is_found_to_a_millimetre():
-    model = fit(spectra({(0.8, 0.5, 0.1): 5.0}, -0.7, n=60), width=1)
+    model = fit(mirror_room({(0.8, 0.5, 0.1): 5.0}, -0.7, n=60), width=1)
     assert len(model.planes) == 1
     assert errors(model, {(0.8, 0.5, 0.1): 5.0})[0][0] < 1
     torch.testing.assert_close(
@@ -236,7 +202,7 @@ def test_images_are_mirrored_in_one_plane_after_another():
 @pytest.mark.parametrize("moving", ["receiver", "transmitter"])
 def test_the_field_is_the_sum_over_any_parts_of_its_images(moving):
     """Also where planes are oblique, so that paths are followed through images that the part does not have."""
-    scene, _ = observe(spectra({}, moving=moving, n=10))
+    scene, _ = observe(mirror_room({}, moving=moving, n=10))
     normal = torch.nn.functional.normalize(torch.tensor([[1, 0.3, 0], [-0.2, 1, 0.1], [0, 0, -1]]).double(), dim=1)
     offset, gain = torch.tensor([[5.2, 4.1, 0.0]]).double(), torch.tensor([[-0.6, 0.5, -0.4]])
     chain = sequences(normal, 2)
@@ -246,14 +212,14 @@ def test_the_field_is_the_sum_over_any_parts_of_its_images(moving):
 
 
 def test_nothing_to_find_is_no_plane():
-    model = fit(spectra({}))
+    model = fit(mirror_room({}))
     assert model.planes == []
     assert "no plane" in model.verdict
     assert len(model.image_sources()[0]) == 1
 
 
 def test_a_reach_without_walls_ends_without_them():
-    assert not any(p.certain for p in fit(spectra(SIX, n=12), reach=0.3, width=1, further=0).planes)
+    assert not any(p.certain for p in fit(mirror_room(SIX, n=12), reach=0.3, width=1, further=0).planes)
 
 
 def test_noise_stays_within_the_deviations(room):
@@ -262,14 +228,14 @@ def test_noise_stays_within_the_deviations(room):
 
 
 def test_positions_in_a_plane_leave_no_plane_certain():
-    model = fit(spectra(SIX, noise=0.1, n=24, low=(1.5, 1.2, 1.2), high=(3.5, 3.2, 1.2)), further=0, width=1)
+    model = fit(mirror_room(SIX, noise=0.1, n=24, low=(1.5, 1.2, 1.2), high=(3.5, 3.2, 1.2)), further=0, width=1)
     assert not any(p.certain for p in model.planes)
     assert all(error < 3 * std for error, std in errors(model, SIX) if model.planes)
 
 
 def test_pure_noise_has_no_certain_plane():
     generator = torch.Generator().manual_seed(0)
-    data = spectra({}, n=30)
+    data = mirror_room({}, n=30)
     channel = torch.randn(30, 16, dtype=torch.complex128, generator=generator)
     model = fit(replace(data, store=Store(ARRAY.spectrum(channel, GRID))), further=0, width=1)
     assert not any(p.certain for p in model.planes)
@@ -286,15 +252,15 @@ def test_pure_noise_has_no_certain_plane():
 )
 def test_refusals_say_what_is_missing(change, message):
     with pytest.raises(InputError, match=message):
-        fit(replace(spectra(SIX, n=12), **change))
+        fit(replace(mirror_room(SIX, n=12), **change))
 
 
 def test_few_spectra_are_refused():
     with pytest.raises(InputError, match="at least 10"):
-        fit(spectra(SIX, n=9))
+        fit(mirror_room(SIX, n=9))
 
 
-def test_the_same_seed_finds_the_same_room_and_draws_the_same_spectra(noisy, room):
+def test_the_same_seed_finds_the_same_room_and_draws_the_same_mirror_room(noisy, room):
     few = noisy.subset(torch.arange(12))
     quick = {"reach": 0.5, "width": 1, "further": 0}
     assert fit(few, **quick).to_json() == fit(few, **quick).to_json()
@@ -339,7 +305,7 @@ def test_hybrid_is_not_worse_than_geometry():
 
 def test_strengths_follow_a_shadow():
     """A wall that does not reflect to one half of the region: its amplitude is known where the phases say so."""
-    whole, bare = spectra(SIX, n=140), spectra({n: o for n, o in SIX.items() if n != (0, 0, 1)}, n=140)
+    whole, bare = mirror_room(SIX, n=140), mirror_room({n: o for n, o in SIX.items() if n != (0, 0, 1)}, n=140)
     hidden = whole.position[:, 0] > 2.5
     spectrum = torch.where(hidden[:, None, None], bare.spectrum, whole.spectrum)
     data = replace(whole, store=Store(spectrum))
@@ -366,7 +332,7 @@ def test_strengths_follow_a_shadow():
 def test_strengths_are_held_out_from_spectra_that_were_not_observed_too(monkeypatch):
     """What stands for predictions of one fold follows from the observed spectra of the other folds."""
     monkeypatch.setattr("swiftwrf.geometry.fit.MOST", 40)
-    data, fold = spectra(SIX, n=80), torch.arange(80) % 3
+    data, fold = mirror_room(SIX, n=80), torch.arange(80) % 3
     room = fit(data, further=0, width=1)
     smoothness = Smoothness(Kernel(long=0.5, short=1.0, share=1.0, noise=1e-3), misfit=0.3)
     chosen = Strengths(smoothness, data.position, torch.zeros(80, 1))
@@ -381,5 +347,5 @@ def test_strengths_are_held_out_from_spectra_that_were_not_observed_too(monkeypa
 
 
 def test_strengths_stay_constant_where_nothing_is_hidden():
-    data = spectra(SIX, n=120)
+    data = mirror_room(SIX, n=120)
     assert fit_hybrid(data, fit(data, further=0, width=1)).strengths is None

@@ -1,0 +1,72 @@
+"""Spectra of rooms in closed form: planes that mirror, each with a gain of its own, and phase noise at every element."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from swiftwrf.angles import AngularGrid
+from swiftwrf.arrays import PlanarArray
+from swiftwrf.data.spectra import Moving, Spectra
+from swiftwrf.geometry.images import Scene, field, sequences
+from swiftwrf.store import Store
+
+Normal = tuple[float, float, float]
+GRID = AngularGrid.hemisphere(10, 40)
+ARRAY = PlanarArray.square(4, 915e6)
+
+
+def mirror_room(
+    planes: Mapping[Normal, float],
+    gain: float | tuple[float, ...] = -0.6,
+    moving: Moving = "receiver",
+    n: int = 30,
+    noise: float = 0.0,
+    low: Normal = (1.5, 1.2, 0.9),
+    high: Normal = (3.5, 3.2, 1.6),
+    array: PlanarArray = ARRAY,
+    seed: int = 0,
+) -> Spectra:
+    """Spectra with images up to the second order.
+
+    Args:
+        planes: outward normal, of any length, to offset [m].
+        gain: of all planes or of each.
+        moving: the end that is anywhere between `low` and `high` [m]; the other one hangs below the ceiling or, if it is the
+            receiver, stands on the floor.
+        n: positions.
+        noise: standard deviation of the phases [rad].
+        low: corner of the region.
+        high: the opposite one.
+        array: at the receiver, level.
+        seed: of positions and noise.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    least, most = torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64)
+    position = least + (most - least) * torch.rand(n, 3, dtype=torch.float64, generator=generator)
+    fixed = torch.tensor([2.6, 2.2, 2.4 if moving == "receiver" else 0.3], dtype=torch.float64)
+    rotation = torch.eye(3, dtype=torch.float64)
+    scene = Scene.of(position, fixed, moving, array, rotation, torch.ones(n, len(array.element)))
+    channel = scene.wave(scene.transmitter)
+    if planes:
+        normal = torch.tensor(list(planes), dtype=torch.float64)
+        normal = torch.nn.functional.normalize(normal, dim=1)[None]
+        offset = torch.tensor([list(planes.values())], dtype=torch.float64)
+        gains = torch.tensor(gain).expand(offset.shape)
+        channel = channel + field(scene, normal, offset, gains, sequences(normal[0], 2))[0]
+    turn: Tensor = noise * torch.randn(channel.shape, generator=generator)
+    return Spectra(
+        name="closed form",
+        position=position,
+        store=Store(array.spectrum(channel * torch.polar(torch.ones_like(turn), turn), GRID)),
+        grid=GRID,
+        label=torch.zeros(n, 2, dtype=torch.float64),
+        line_of_sight=torch.ones(n, dtype=torch.bool),
+        moving=moving,
+        index=torch.arange(n),
+        array=array,
+        fixed_position=fixed,
+        rotation=rotation,
+    )
