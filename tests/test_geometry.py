@@ -271,7 +271,7 @@ def test_the_same_seed_finds_the_same_room_and_draws_the_same_mirror_room(noisy,
 
 def test_draws_differ_from_the_mean_as_much_as_measurements_do(noisy, room):
     mean = room.synthesize(noisy.position)
-    drawn = [room.synthesize(noisy.position, torch.Generator().manual_seed(seed)) for seed in range(8)]
+    drawn = [room.synthesize(noisy.position, torch.Generator().manual_seed(seed)) for seed in range(32)]
     assert mean.shape == drawn[0].shape == noisy.spectrum.shape
     apart = torch.cat([psnr(one, mean) for one in drawn]).median() - psnr(noisy.spectrum, mean).median()
     assert abs(float(apart)) < 4

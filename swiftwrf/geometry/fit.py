@@ -73,9 +73,11 @@ def fit_geometry(
             array cannot have produced; all positions at one place.
     """
     config, (train, _) = config or GeometryConfig(), _evenly(train)
-    scene, _ = observe(train, seed)
-    fold = folds(scene.moving, validation, seed)
+    observed, _ = observe(train, seed)
     assert train.array is not None
+    assert train.fixed_position is not None
+    scene = observed.around(train.fixed_position)
+    fold = folds(scene.moving, validation, seed)
     kept, held = scene.subset((fold != 0).nonzero()[:, 0]), scene.subset((fold == 0).nonzero()[:, 0])
     with progress_bar(progress) as bar:
         task = bar.add_task("finding the room", total=STARTS)
@@ -90,7 +92,7 @@ def fit_geometry(
     room = _pruned(_settled(room, scene), scene, splits)
     room = _extended(room, scene, some, splits, config)
     room = _with_order(room, splits, config.max_order)
-    return judged(train, scene, room.refined(scene), score, config.reach)
+    return judged(train, observed, room.shifted(train.fixed_position).refined(observed), score, config.reach)
 
 
 @single_thread()

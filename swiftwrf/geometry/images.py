@@ -19,6 +19,7 @@ from swiftwrf.arrays import PlanarArray
 from swiftwrf.data.spectra import Moving
 
 RIGHT = 0.02  # |cosine| below which two planes count as perpendicular, above 1 - RIGHT**2 as parallel
+ROUNDED = 1e-3  # of phase [rad]
 FEW = 36  # positions that many rooms are scored at
 
 Sequence = tuple[int, ...]
@@ -73,6 +74,13 @@ class Scene:
     def few(self, most: int = FEW) -> Scene:
         """At most so many of the positions, evenly chosen, to score many rooms at."""
         return self.subset(torch.linspace(0, len(self) - 1, min(most, len(self))).long())
+
+    def around(self, origin: Tensor) -> Scene:
+        """The scene in coordinates from an origin (3,) [m], rounded to a thousandth of a radian of phase: near ties of a
+        search must not hang on digits that another origin would have rounded otherwise."""
+        step = ROUNDED / self.wavenumber
+        transmitter, receiver = (((end - origin) / step).round() * step for end in (self.transmitter, self.receiver))
+        return replace(self, transmitter=transmitter, receiver=receiver)
 
     def wave(self, source: Tensor) -> Tensor:
         """What each element hears from sources (..., n or 1, 3) [m]: exp(-j k d) / d, complex64 (..., n, K)."""

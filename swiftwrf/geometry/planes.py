@@ -13,7 +13,7 @@ from swiftwrf.geometry.observe import autocorrelation
 from swiftwrf.geometry.refine import refine
 from swiftwrf.geometry.search import Room
 
-FLOOR = 1e-6  # of what is missing: rounding
+FLOOR = 1e-5  # of what is missing: rounding of spectra, and of the phases that follow from them
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,10 @@ class Planes:
     def field(self, scene: Scene) -> Tensor:
         """(n, K)."""
         return scene.wave(scene.transmitter) + field(scene, self.normal, self.offset, self.gain, self.sequence)[0]
+
+    def shifted(self, by: Tensor) -> Planes:
+        """In coordinates from an origin at `-by` (3,) [m]."""
+        return replace(self, offset=self.offset + self.normal @ by)
 
     def without(self, plane: int) -> Planes:
         keep = [i for i in range(self.normal.shape[1]) if i != plane]

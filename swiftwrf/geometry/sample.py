@@ -45,7 +45,8 @@ def draw(
     total = direct * scene.wave(scene.transmitter)
     if sequence:
         root = torch.linalg.eigh(covariance)
-        spread = root.eigenvectors * root.eigenvalues.clamp_min(0).sqrt()
+        # the symmetric root, which does not turn with eigenvectors that rounding turns
+        spread = (root.eigenvectors * root.eigenvalues.clamp_min(0).sqrt()) @ root.eigenvectors.T
         moved = offset + spread @ torch.randn(offset.shape[1], dtype=torch.float64, generator=generator)
         source = images(scene, normal, moved, sequence)
         wave = scene.wave(source)[0] * visibility(scene, normal, moved, sequence)[0, ..., None]
