@@ -10,12 +10,13 @@ import torch
 from swiftwrf import InputError, simulated_room
 from swiftwrf.arrays import PlanarArray
 from swiftwrf.geometry import GeometryConfig, GeometryModel, fit_geometry
-from swiftwrf.geometry.fit import _settled, observe
+from swiftwrf.geometry.fit import _completed, _settled, observe, split
 from swiftwrf.geometry.hybrid import HybridModel, _strengths, fit_hybrid
 from swiftwrf.geometry.images import Scene, field, image_gain, images, mirror, sequences
 from swiftwrf.geometry.observe import autocorrelation, correlations, element_phases
 from swiftwrf.geometry.planes import Planes
 from swiftwrf.geometry.refine import derivatives
+from swiftwrf.geometry.search import SIGNS
 from swiftwrf.geometry.strengths import Smoothness, Strengths, fit_strengths
 from swiftwrf.geometry.turns import _Table, turned
 from swiftwrf.geometry.waves import Waves
@@ -157,6 +158,19 @@ def test_planes_that_are_turns_away_together_return(away):
     assert float((_settled(wrong, scene).offset - offset).abs().max()) < 1e-3
 
 
+def test_a_weak_wall_beside_strong_ones_is_added():
+    gain = (-0.6, -0.6, -0.12, -0.6, -0.6, -0.6)
+    scene, _ = observe(mirror_room(SIX, gain, n=60, noise=0.1))
+    normal, offset = torch.tensor([list(SIX)]).double(), torch.tensor([list(SIX.values())]).double()
+    rest = Planes(normal, offset, torch.tensor([gain]), 2).without(2).refined(scene)
+    folds = split(scene, torch.arange(60) % 5)
+    whole = _completed(rest, scene, scene, folds, SIGNS[0], reach=2.0)
+    assert whole.normal.shape[1] == 6
+    assert float((whole.offset - offset).abs().max()) < 0.02
+    assert abs(float(whole.gain[0, 2]) + 0.12) < 0.05
+    assert _completed(whole, scene, scene, folds, SIGNS[0], reach=2.0) is whole
+
+
 def test_scores_of_combinations_are_those_of_their_rooms():
     scene, _ = observe(mirror_room(SIX, n=12))
     normal = torch.tensor(list(SIX)).double()
@@ -260,7 +274,7 @@ def test_few_spectra_are_refused():
         fit(mirror_room(SIX, n=9))
 
 
-def test_the_same_seed_finds_the_same_room_and_draws_the_same_mirror_room(noisy, room):
+def test_the_same_seed_finds_the_same_room_and_draws_the_same_spectra(noisy, room):
     few = noisy.subset(torch.arange(12))
     quick = {"reach": 0.5, "width": 1, "further": 0}
     assert fit(few, **quick).to_json() == fit(few, **quick).to_json()

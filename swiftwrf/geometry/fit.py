@@ -14,8 +14,8 @@ from swiftwrf.geometry.images import Scene
 from swiftwrf.geometry.model import GeometryModel
 from swiftwrf.geometry.observe import correlations, element_phases
 from swiftwrf.geometry.orient import GAIN, candidates
-from swiftwrf.geometry.planes import Planes, advantage, clearly, correlation_score, in_step
-from swiftwrf.geometry.search import PERFECT, STARTS, Search, find_room
+from swiftwrf.geometry.planes import FLOOR, Planes, advantage, clearly, correlation_score, in_step
+from swiftwrf.geometry.search import PERFECT, SIDES, STARTS, WEAK, Room, Search, find_room
 from swiftwrf.geometry.turns import turned
 from swiftwrf.geometry.verdict import judged
 from swiftwrf.gp import thinned
@@ -90,6 +90,7 @@ def fit_geometry(
     room = Planes.of(found).refined(scene)
     splits = split(scene, fold)
     room = _pruned(_settled(room, scene), scene, splits)
+    room = _completed(room, scene, some, splits, signs, config.reach)
     room = _extended(room, scene, some, splits, config)
     room = _with_order(room, splits, config.max_order)
     return judged(train, observed, room.shifted(train.fixed_position).refined(observed), score, config.reach)
@@ -196,6 +197,23 @@ def _settled(room: Planes, scene: Scene) -> Planes:
             break
         room = other
     return room
+
+
+def _completed(
+    room: Planes, scene: Scene, some: Scene, splits: list[tuple[Scene, Scene]], signs: Tensor, reach: float
+) -> Planes:
+    """With weak planes on sides that have none, sought with some positions and kept if held-out spectra need them.
+
+    The search looks for strong planes: one that is hidden from most positions makes the score worse where it stands.
+    """
+    sides = (room.normal[0] @ SIDES.T).argmax(1)
+    if not 0 < len(sides) < len(SIDES) or float(some.score(room.field(some))) < FLOOR:
+        return room
+    known = signs.clone()
+    known[sides] = room.gain[0].sgn().to(signs.dtype)
+    found = Room(0.0, *(dict(zip(sides.tolist(), t[0].tolist(), strict=True)) for t in (room.offset, room.gain)))
+    found = Search(some, reach, known, usual=WEAK).improve(found)
+    return _pruned(_settled(Planes.of(found).refined(scene), scene), scene, splits)
 
 
 def _extended(

@@ -27,7 +27,7 @@ SIDES = torch.tensor(
 SIGNS = torch.tensor(
     [[-1, -1, -1, -1, -1, -1], [-1, -1, -1, -1, 1, 1], [1, 1, 1, 1, 1, 1]]
 )  # of the gains: one material, vertical fields (walls turn them round, floor and ceiling do not), anything else
-USUAL = 0.7  # modulus of a gain that is not known yet
+USUAL, WEAK = 0.7, 0.3  # modulus of a gain that is not known yet, and of a plane that is hidden at times
 BETTER = 0.997  # of the score, for a move to count
 PERFECT = 2e-6  # a score that needs no further moves
 STARTS = 2 * len(SIGNS)  # of a search
@@ -64,11 +64,12 @@ class Search:
         reach: how far beyond the region planes are looked for [m].
         signs: of the gains on the six sides, -1 or 1 each, (6,).
         order: of the images while planes move together.
+        usual: modulus of a gain that is not known yet.
     """
 
-    def __init__(self, scene: Scene, reach: float, signs: Tensor, order: int = 2) -> None:
+    def __init__(self, scene: Scene, reach: float, signs: Tensor, order: int = 2, usual: float = USUAL) -> None:
         self.scene, self.reach, self.signs, self.order = scene, reach, signs, order
-        self.usual: list[float] = (USUAL * signs).tolist()
+        self.usual: list[float] = (usual * signs).tolist()
         both = torch.cat([scene.transmitter, scene.receiver])
         near = (both @ SIDES.T).amax(0)
         self.step = 0.5 / scene.wavenumber
