@@ -73,7 +73,7 @@ def test_elements_may_be_listed_in_any_order():
     assert PlanarArray(ARRAY.element[:7], ARRAY.wavelength).opposite is None
 
 
-def test_phases_of_the_elements_follow_from_the_mirror_room():
+def test_phases_of_the_elements_follow_from_the_spectra():
     generator = torch.Generator().manual_seed(0)
     angle = 3 * torch.randn(30, 16, dtype=torch.float64, generator=generator)
     channel = torch.polar(torch.ones_like(angle), angle)
