@@ -148,7 +148,7 @@ class Cluster:
             except TimeoutError:
                 if not self._workers_come():
                     raise FitError(f"all workers of the Dask scheduler at {self._address} went away; {GO_ON}") from None
-            except CancelledError:
+            except (CancelledError, OSError):  # the connection's: what a call raised is returned above
                 raise FitError(f"the Dask scheduler at {self._address} went away; {GO_ON}") from None
             else:
                 if error is not None:
