@@ -224,6 +224,17 @@ def test_workers_that_go_for_good(monkeypatch):
         left.close()
 
 
+def test_a_connection_that_breaks_while_a_result_is_fetched(cluster, monkeypatch):
+    def broken(future, timeout=None):
+        raise ConnectionResetError(104, "Connection reset by peer")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(distributed.Future, "result", broken)
+        with pytest.raises(FitError, match="went away"):
+            list(cluster.map(abs, [-1]))
+    assert list(cluster.map(abs, [-2])) == [2]
+
+
 def test_rssi_survives_a_lost_connection(local, tmp_path, monkeypatch, capsys):
     def lose():
         distributed.default_client().scheduler_comm.comm.abort()
