@@ -23,7 +23,7 @@ from swiftwrf.progress import progress_bar
 from swiftwrf.threads import single_thread
 
 SOLVED = 0.1  # relative error of a spectrum's autocorrelation up to which its phases are used
-NEEDED = 2.5  # standard errors by which held-out spectra must be better for a plane or an order, all of them for a sign
+NEEDED = 2.5  # standard errors by which held-out spectra must be better for a plane or an order, all of them for turns
 ROUNDS = 3  # in which planes move by turns
 FURTHER = 4.0  # the same for a plane of any orientation, of which far more are tried
 TRIED = 8  # candidates of any orientation that are refined
