@@ -14,6 +14,7 @@ from record import write_result
 
 from swiftwrf.data.spectra import Moving
 from swiftwrf.geometry import fit_geometry
+from swiftwrf.geometry.search import SIDES
 from swiftwrf.testing.rooms import mirror_room
 
 POSITIONS = 72
@@ -21,7 +22,6 @@ ROOMS = 4  # of each kind and noise, either end moving in half of them
 NOISE = (0.0, 0.2, 0.5)  # standard deviation of the phases [rad]
 KINDS = ("one sign", "vertical fields", "any signs")
 NEAR = 20.0  # mm
-SIDES = ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1))
 
 
 def drawn(kind: str, generator: torch.Generator) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -41,12 +41,12 @@ def drawn(kind: str, generator: torch.Generator) -> tuple[tuple[float, ...], tup
 
 def measure(offset: tuple[float, ...], gain: tuple[float, ...], moving: Moving, noise: float) -> dict[str, Any]:
     """What is found of one room."""
-    data = mirror_room(dict(zip(SIDES, offset, strict=True)), gain, moving, POSITIONS, noise)
+    data = mirror_room(dict(zip(map(tuple, SIDES.tolist()), offset, strict=True)), gain, moving, POSITIONS, noise)
     began = time.process_time()
     model = fit_geometry(data, progress=False)
     seconds, planes = time.process_time() - began, []
     for plane in model.planes:
-        side = max(range(6), key=lambda i: sum(a * b for a, b in zip(SIDES[i], plane.normal, strict=True)))
+        side = int((SIDES @ torch.tensor(plane.normal, dtype=SIDES.dtype)).argmax())
         off = 1000 * abs(plane.offset_m - offset[side])
         planes.append({"side": side, "error_mm": off, "std_mm": plane.std_mm, "certain": plane.certain})
     near = {plane["side"] for plane in planes if plane["error_mm"] < NEAR}

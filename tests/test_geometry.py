@@ -17,7 +17,7 @@ from swiftwrf.geometry.observe import autocorrelation, correlations, element_pha
 from swiftwrf.geometry.planes import Planes
 from swiftwrf.geometry.refine import derivatives
 from swiftwrf.geometry.search import SIGNS
-from swiftwrf.geometry.strengths import Smoothness, Strengths, fit_strengths
+from swiftwrf.geometry.strengths import Strengths, fit_strengths
 from swiftwrf.geometry.turns import _Table, turned
 from swiftwrf.geometry.waves import Waves
 from swiftwrf.gp import Kernel
@@ -337,10 +337,10 @@ def test_strengths_follow_a_shadow():
     assert torch.equal(again.synthesize(test.position), hybrid.synthesize(test.position))
     tensors, header = hybrid.state()
     with pytest.raises(InputError, match=r"strengths\.readout has shape"):
-        HybridModel.from_state({**tensors, "strengths.readout": tensors["strengths.readout"][:, 1:]}, header)
+        HybridModel.from_state({**tensors, "strengths.readout": tensors["strengths.readout"][:, :, 1:]}, header)
     like = fit_hybrid(train.subset(torch.arange(60)), room, like=hybrid)  # too few to choose, enough to go on from
     assert like.strengths is not None
-    assert like.strengths.smoothness == hybrid.strengths.smoothness
+    assert like.strengths.kernel == hybrid.strengths.kernel
 
 
 def test_strengths_are_held_out_from_spectra_that_were_not_observed_too(monkeypatch):
@@ -348,14 +348,14 @@ def test_strengths_are_held_out_from_spectra_that_were_not_observed_too(monkeypa
     monkeypatch.setattr("swiftwrf.geometry.fit.MOST", 40)
     data, fold = mirror_room(SIX, n=80), torch.arange(80) % 3
     room = fit(data, further=0, width=1)
-    smoothness = Smoothness(Kernel(long=0.5, short=1.0, share=1.0, noise=1e-3), misfit=0.3)
-    chosen = Strengths(smoothness, data.position, torch.zeros(80, 1))
-    like = HybridModel(room, chosen, 1.0, smoothness.kernel, data.position, torch.zeros(80, 0), torch.zeros(1, 1))
+    kernel = Kernel(long=0.5, short=1.0, share=1.0, noise=1e-3)
+    chosen = Strengths(kernel, data.position, torch.zeros(80, 1, 1, 2))
+    like = HybridModel(room, chosen, 1.0, kernel, data.position, torch.zeros(80, 0), torch.zeros(1, 1))
     _, known = _strengths(data, room, fold, 0, like)
     scene, rows = observe(data)
     assert len(rows) <= 40
     for number in range(3):
-        fitted = fit_strengths(room, scene.subset((fold[rows] != number).nonzero()[:, 0]), smoothness)
+        fitted = fit_strengths(room, scene.subset((fold[rows] != number).nonzero()[:, 0]), kernel)
         expected = ARRAY.spectrum(fitted.channel(room, data.position[fold == number]), GRID)
         torch.testing.assert_close(known[fold == number], expected)
 

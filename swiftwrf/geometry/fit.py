@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,7 +16,7 @@ from swiftwrf.geometry.model import GeometryModel
 from swiftwrf.geometry.observe import correlations, element_phases
 from swiftwrf.geometry.orient import GAIN, candidates
 from swiftwrf.geometry.planes import FLOOR, Planes, advantage, clearly, correlation_score, in_step
-from swiftwrf.geometry.search import PERFECT, SIDES, STARTS, WEAK, Room, Search, find_room
+from swiftwrf.geometry.search import PERFECT, STARTS, WEAK, Search, find_room
 from swiftwrf.geometry.turns import turned
 from swiftwrf.geometry.verdict import judged
 from swiftwrf.gp import thinned
@@ -206,12 +207,12 @@ def _completed(
 
     The search looks for strong planes: one that is hidden from most positions makes the score worse where it stands.
     """
-    sides = (room.normal[0] @ SIDES.T).argmax(1)
-    if not 0 < len(sides) < len(SIDES) or float(some.score(room.field(some))) < FLOOR:
+    found = room.by_side()
+    if not 0 < len(found.gain) < len(signs) or float(some.score(room.field(some))) < FLOOR:
         return room
     known = signs.clone()
-    known[sides] = room.gain[0].sgn().to(signs.dtype)
-    found = Room(0.0, *(dict(zip(sides.tolist(), t[0].tolist(), strict=True)) for t in (room.offset, room.gain)))
+    for side, gain in found.gain.items():
+        known[side] = math.copysign(1, gain)
     found = Search(some, reach, known, usual=WEAK).improve(found)
     return _pruned(_settled(Planes.of(found).refined(scene), scene), scene, splits)
 

@@ -2,9 +2,9 @@
 
     spectrum(s) = a geometry(s; strengths(s)) + mean + k(s, training positions) w
 
-Strengths vary where held-out spectra call for it. Where the paths explain only a part, their fringes are worth their share
-a: the least-squares share at training spectra that are held out from the strengths and from the process, hence never worse
-there than the better of the two parts.
+Strengths vary where held-out spectra come out better with it. Where the paths explain only a part, their fringes are worth
+their share a: the least-squares share at training spectra that are held out from the strengths and from the process, hence
+never worse there than the better of the two parts.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from swiftwrf.checkpoint import Header, Saved, expect
 from swiftwrf.data.spectra import Spectra, check_training
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
-from swiftwrf.geometry.fit import observe, split
+from swiftwrf.geometry.fit import observe
 from swiftwrf.geometry.model import GeometryModel
-from swiftwrf.geometry.strengths import Smoothness, Strengths, choose_smoothness, fit_strengths, may_vary
+from swiftwrf.geometry.strengths import Strengths, fit_strengths, prior
 from swiftwrf.gp import Kernel, choose_kernel, held_out_weights
+from swiftwrf.metrics import psnr
 from swiftwrf.positions import check_batch, check_drawn, check_positions
 from swiftwrf.threads import single_thread
 
@@ -80,10 +81,10 @@ class HybridModel(Saved):
         """All there is to save: tensors and plain values."""
         tensors, values = self.geometry.state()
         own = {"anchor": self.anchor, "readout": self.readout, "component": self.component}
-        values |= {"share": self.share, "kernel": asdict(self.kernel), "smoothness": None}
+        values |= {"share": self.share, "kernel": asdict(self.kernel), "strengths": None}
         if self.strengths is not None:
             own |= {"strengths.anchor": self.strengths.anchor, "strengths.readout": self.strengths.readout}
-            values["smoothness"] = asdict(self.strengths.smoothness)
+            values["strengths"] = asdict(self.strengths.kernel)
         return tensors | own, values
 
     @classmethod
@@ -91,12 +92,12 @@ class HybridModel(Saved):
         """The model that `state` described."""
         own = {name: tensors[name] for name in ("anchor", "readout", "component")}
         geometry = GeometryModel.from_state(tensors, header)
-        strengths, smoothness = None, header.get("smoothness")  # files of before have none
-        if smoothness is not None:
-            n, paths = len(tensors.get("strengths.anchor", ())), len(geometry.image_sources()[0])
-            expect(tensors, {"strengths.anchor": (n, 3), "strengths.readout": (n, paths)})
-            prior = Smoothness(Kernel(**smoothness["kernel"]), smoothness["misfit"])
-            strengths = Strengths(prior, tensors["strengths.anchor"], tensors["strengths.readout"])
+        strengths = None
+        if header["strengths"] is not None:
+            anchor, readout = (tensors.get(f"strengths.{name}", torch.empty(0, 0)) for name in ("anchor", "readout"))
+            shape = (len(anchor), *readout.shape[1:2], len(geometry.image_sources()[0]), 2)
+            expect(tensors, {"strengths.anchor": (len(anchor), 3), "strengths.readout": shape})
+            strengths = Strengths(Kernel(**header["strengths"]), anchor, readout)
         return cls(geometry, strengths, header["share"], Kernel(**header["kernel"]), **own)
 
 
@@ -122,7 +123,7 @@ def fit_hybrid(
         geometry: found from the same spectra.
         validation: how they are held out to choose kernel and share.
         seed: of what is held out.
-        like: a model of the same room from other spectra, whose smoothness of the strengths is taken.
+        like: a model of the same room from other spectra, whose kernel of the strengths is taken.
 
     Raises:
         InputError: fewer than 10 spectra or more than 10,000, or something not finite.
@@ -166,20 +167,20 @@ def _strengths(
     train: Spectra, geometry: GeometryModel, fold: Tensor, seed: int, like: HybridModel | None
 ) -> tuple[Strengths | None, Tensor]:
     """Strengths from all training spectra, and the spectra (n, H, W) that follow at each one's position from the others."""
-    smoothness = like.strengths.smoothness if like and like.strengths else None
-    if smoothness is None and (like or not may_vary(geometry, len(train))):
+    if not geometry.planes or (like and not like.strengths):
         return None, geometry.synthesize(train.position)
     scene, rows = observe(train, seed)
-    smoothness = smoothness or choose_smoothness(geometry, split(scene, fold[rows]))
-    if smoothness is None:
-        return None, geometry.synthesize(train.position)
-    strengths = fit_strengths(geometry, scene, smoothness)
-    known = torch.empty(len(train), *geometry.grid.shape)
+    kernel = like.strengths.kernel if like and like.strengths else prior(scene.moving)
+    known, gained = torch.empty(len(train), *geometry.grid.shape), torch.empty(len(train))
     for number in fold.unique():
         out = (fold == number).nonzero()[:, 0]  # those of which nothing was observed, too
         kept = scene.subset((fold[rows] != number).nonzero()[:, 0])
-        known[out] = _room(geometry, fit_strengths(geometry, kept, smoothness), train.position[out])
-    return strengths, known
+        known[out] = _room(geometry, fit_strengths(geometry, kept, kernel), train.position[out])
+        seen = train.spectrum[out]
+        gained[out] = psnr(known[out], seen) - psnr(geometry.synthesize(train.position[out]), seen)
+    if not like and gained.mean() < 0:
+        return None, geometry.synthesize(train.position)
+    return fit_strengths(geometry, scene, kernel), known
 
 
 def _share(position: Tensor, seen: Tensor, known: Tensor, fold: Tensor, kernel: Kernel) -> tuple[float, bool]:

@@ -11,7 +11,7 @@ from swiftwrf.arrays import PlanarArray
 from swiftwrf.geometry.images import Scene, Sequence, field, sequences, turn_of
 from swiftwrf.geometry.observe import autocorrelation
 from swiftwrf.geometry.refine import refine
-from swiftwrf.geometry.search import Room
+from swiftwrf.geometry.search import SIDES, Room
 
 FLOOR = 1e-5  # of what is missing: rounding of spectra, and of the phases that follow from them
 
@@ -29,6 +29,12 @@ class Planes:
     def of(cls, found: Room) -> Planes:
         normal, offset, gain = found.tensors()
         return cls(normal, offset, gain, 2)
+
+    def by_side(self) -> Room:
+        """As a search has them, each on the side of the region that it faces most, without a score."""
+        sides = (self.normal[0] @ SIDES.T).argmax(1).tolist()
+        offset, gain = (dict(zip(sides, values[0].tolist(), strict=True)) for values in (self.offset, self.gain))
+        return Room(0.0, offset, gain)
 
     @property
     def sequence(self) -> list[Sequence]:

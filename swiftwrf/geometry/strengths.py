@@ -1,19 +1,20 @@
-"""How strong each path is where: furniture hides image sources from parts of a room, and surfaces end.
+"""How strong each path is where: furniture hides image sources from parts of a room, surfaces end, and walls are no perfect
+mirrors.
 
-The direct wave and those of the image sources keep their directions and phases; their amplitudes are smooth functions of
+The direct wave and those of the image sources keep their directions and lengths; their amplitudes are smooth functions of
 the position s of the moving end,
 
-    h_k(s) = sum_i a_i(s) exp(-j k d_i + j phi_k(u_i)) / d_i,    a_i(s) = gain_i + DEVIATION f_i(s),
+    h_k(s) = sum_i a_i(s) exp(-j k d_i + j phi_k(u_i)) / d_i,    a_i(s) = gain_i + f_i(s) + j g_i(s),
 
-with d_i, u_i length and direction of path i, phi_k the phase it gains at element k, and f_i a Gaussian process: primitives
-anchored to the image sources, of which geometry tells everything but the amplitude. Spectra tell phases only, so the
-amplitudes are a maximum a posteriori, of all training positions at once.
+with d_i, u_i length and direction of path i, phi_k the phase it gains at element k, and f_i, g_i Gaussian processes:
+primitives anchored to the image sources, of which geometry tells everything but the amplitude. Spectra tell phases only, so
+several fields explain the training spectra equally well, and the mean of their spectra is closer to a new one than any of
+theirs. Each is a maximum a posteriori around a draw from the prior (randomised maximum likelihood, D. S. Oliver, N. He and
+A. C. Reynolds, "Conditioning permeability fields to pressure data", ECMOR 1996), of all training positions at once.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,58 +23,49 @@ from torch import Tensor
 
 from swiftwrf.geometry.images import Scene, image_gain, images, sequences, visibility
 from swiftwrf.geometry.model import GeometryModel
-from swiftwrf.geometry.planes import clearly
 from swiftwrf.gp import GaussianProcess, Kernel
 
-DEVIATION = 0.6  # of an amplitude from its plane's gain
-LENGTHS = (2, 4, 8)  # parts of the region over which amplitudes are alike
-MISFITS = (0.3, 1.0)  # twice the coherence that a spectrum may well miss
+DEVIATION = torch.tensor([0.6, 0.3])  # of an amplitude from its plane's gain, in phase and in quadrature
+PART = 4  # of the region's extent, over which amplitudes are alike
+MISFIT = 0.05  # twice the coherence that a spectrum may well miss
 NUGGET = 1e-3  # variance of an amplitude that is no function of position
-STEPS, RATE = 80, 0.1  # of Adam, on standard normal variables
-LEAST = 100  # positions; fewer do not tell where a shadow ends
-NEEDED = 1.5  # standard errors by which held-out spectra must be better; hybrid judges once more
-
-
-@dataclass(frozen=True)
-class Smoothness:
-    """The prior of the amplitudes.
-
-    Args:
-        kernel: how alike they are at two positions, lengths in [m].
-        misfit: of a spectrum, by which its coherence may miss 1.
-    """
-
-    kernel: Kernel
-    misfit: float
+FIELDS = 8  # whose spectra are averaged
+DRAWN = 0.5  # of the prior's deviation: draws of the whole explain held-out spectra worse
+STEPS, RATE = 30, 0.2  # of Adam, on standard normal variables
 
 
 @dataclass(frozen=True, eq=False)
 class Strengths:
-    """Amplitudes of the direct path and of each image as functions of position.
+    """Amplitudes of the direct path and of each image as functions of position, in several equally plausible fields.
 
     Args:
-        smoothness: their prior.
+        kernel: how alike an amplitude is at two positions, lengths in [m].
         anchor: training positions, float64 (n, 3) [m].
-        readout: kernel weights to what each amplitude differs from its gain by, float32 (n, 1 + S).
+        readout: kernel weights to what each amplitude differs from its gain by, real and imaginary part, float32
+            (n, F, 1 + S, 2).
     """
 
-    smoothness: Smoothness
+    kernel: Kernel
     anchor: Tensor
     readout: Tensor
 
     @cached_property
     def _process(self) -> GaussianProcess:
-        return GaussianProcess(self.smoothness.kernel, self.anchor)
+        return GaussianProcess(self.kernel, self.anchor)
 
     def channel(self, geometry: GeometryModel, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """What each element hears at positions (n, 3) [m], complex64 (n, K); with a generator amplitudes are drawn as if
-        those at the training positions were known."""
-        change = self.smoothness.kernel(position.double(), self.anchor).float() @ self.readout
+        """What each element hears in each field at positions (n, 3) [m], complex64 (n, F, K), as if in as many snapshots;
+        with a generator in one of the fields, whose amplitudes are drawn as if those at the training positions were known,
+        (n, 1, K)."""
+        change = self.kernel(position.double(), self.anchor).float() @ self.readout.flatten(1)
+        change = change.reshape(-1, *self.readout.shape[1:])
         if generator is not None:
-            spread = DEVIATION * self._process.variance(position).sqrt().float()
-            change = change + spread[:, None] * torch.randn(change.shape, generator=generator)
+            field = torch.randint(change.shape[1], (len(change),), generator=generator)
+            change = change[torch.arange(len(change)), field, None]
+            spread = self._process.variance(position).sqrt().float()[:, None, None, None] * DEVIATION
+            change = change + spread * torch.randn(change.shape, generator=generator)
         wave, gain = paths(geometry, geometry.scene(position))
-        return _sum(gain + change, wave)
+        return (gain + torch.view_as_complex(change)) @ wave
 
 
 def paths(geometry: GeometryModel, scene: Scene) -> tuple[Tensor, Tensor]:
@@ -91,55 +83,30 @@ def paths(geometry: GeometryModel, scene: Scene) -> tuple[Tensor, Tensor]:
 
 
 @torch.enable_grad()
-def fit_strengths(geometry: GeometryModel, scene: Scene, smoothness: Smoothness) -> Strengths:
-    """The most plausible amplitudes, given the phases that the scene observed."""
+def fit_strengths(geometry: GeometryModel, scene: Scene, kernel: Kernel) -> Strengths:
+    """The most plausible amplitudes around several draws, given the phases that the scene observed."""
     wave, gain = paths(geometry, scene)
     anchor = scene.moving.double()
-    root = torch.linalg.cholesky(smoothness.kernel.noisy_gram(anchor))
-    spread, normal = DEVIATION * root.float(), torch.zeros(len(scene), len(gain), requires_grad=True)
+    root = torch.linalg.cholesky(kernel.noisy_gram(anchor))
+    smooth = root.float()
+    draw = DRAWN * torch.randn(len(scene), FIELDS, len(gain), 2, generator=torch.Generator().manual_seed(0))
+    normal = draw.clone().requires_grad_()
     optimiser = torch.optim.Adam([normal], lr=RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
     for _ in range(STEPS):
-        missing = 1 - scene.coherence(_sum(gain + spread @ normal, wave))
-        loss = missing.sum() / smoothness.misfit + normal.square().sum() / 2
+        change = DEVIATION * (smooth @ normal.flatten(1)).view_as(normal)
+        field = (gain + torch.view_as_complex(change)) @ wave
+        missing = 1 - scene.coherence(field.transpose(0, 1))
+        loss = missing.sum() / MISFIT + (normal - draw).square().sum() / 2
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
         schedule.step()
-    readout = DEVIATION * torch.linalg.solve_triangular(root.T, normal.detach().double(), upper=True)
-    return Strengths(smoothness, anchor, readout.float())
+    weight = torch.linalg.solve_triangular(root.T, normal.detach().flatten(1).double(), upper=True)
+    return Strengths(kernel, anchor, DEVIATION * weight.float().view_as(normal))
 
 
-def may_vary(geometry: GeometryModel, positions: int) -> bool:
-    """Whether so many training positions could tell that strengths vary."""
-    return bool(geometry.planes) and positions >= LEAST
-
-
-def choose_smoothness(geometry: GeometryModel, splits: list[tuple[Scene, Scene]]) -> Smoothness | None:
-    """The prior under which held-out spectra are explained best, None where constant amplitudes do as well.
-
-    Args:
-        splits: kept and held-out positions.
-    """
-    constant = torch.cat([held.coherence(geometry.channel(held.moving)) for _, held in splits])
-    best, most = None, constant
-    for smoothness in _candidates(torch.cat([scene.moving for scene in splits[0]])):
-        found = [
-            held.coherence(fit_strengths(geometry, kept, smoothness).channel(geometry, held.moving))
-            for kept, held in splits
-        ]
-        if float(torch.cat(found).mean()) > float(most.mean()):
-            best, most = smoothness, torch.cat(found)
-    return best if clearly(most, constant) > NEEDED else None
-
-
-def _candidates(position: Tensor) -> Iterator[Smoothness]:
+def prior(position: Tensor) -> Kernel:
+    """How alike an amplitude is at two positions of the region of these (n, 3) [m]."""
     extent = float((position.max(0).values - position.min(0).values).max())
-    for part, misfit in itertools.product(LENGTHS, MISFITS):
-        yield Smoothness(Kernel(long=extent / part, short=extent, share=1.0, noise=NUGGET), misfit)
-
-
-def _sum(amplitude: Tensor, wave: Tensor) -> Tensor:
-    """Of the paths: amplitudes (n, P), waves (n, P, K) to (n, K)."""
-    parts = torch.view_as_real(wave).flatten(2)  # amplitudes are real, which saves half of the products
-    return torch.view_as_complex((amplitude[:, None] @ parts).reshape(len(wave), -1, 2))
+    return Kernel(long=extent / PART, short=extent, share=1.0, noise=NUGGET)

@@ -42,7 +42,7 @@ from swiftwrf import (
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.geometry import fit_geometry, fit_hybrid
 from swiftwrf.geometry.fit import observe
-from swiftwrf.geometry.strengths import Smoothness, fit_strengths
+from swiftwrf.geometry.strengths import fit_strengths
 from swiftwrf.gp import Kernel
 from swiftwrf.model import SwiftWRF
 from tasks.aoa.estimators import Settings
@@ -126,7 +126,7 @@ def model_geometry(folder: Path) -> None:
 
 def model_hybrid(folder: Path) -> None:
     geometry = fit_geometry(_room(), GLANCE, progress=False)
-    strengths = fit_strengths(geometry, observe(_room())[0], Smoothness(Kernel(), misfit=1.0))
+    strengths = fit_strengths(geometry, observe(_room())[0], Kernel())
     replace(fit_hybrid(_room(), geometry), strengths=strengths).save(folder / "model")
 
 
