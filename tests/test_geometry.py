@@ -339,7 +339,7 @@ def test_strengths_follow_a_shadow():
     tensors, header = hybrid.state()
     with pytest.raises(InputError, match=r"strengths\.readout has shape"):
         HybridModel.from_state({**tensors, "strengths.readout": tensors["strengths.readout"][:, :, 1:]}, header)
-    like = fit_hybrid(train.subset(torch.arange(60)), room, like=hybrid)  # too few to choose, enough to go on from
+    like = fit_hybrid(train.subset(torch.arange(60)), room, like=hybrid)
     assert like.strengths is not None
     assert like.strengths.kernel == hybrid.strengths.kernel
 
