@@ -176,7 +176,7 @@ def _strengths(
         out = (fold == number).nonzero()[:, 0]  # those of which nothing was observed, too
         kept = scene.subset((fold[rows] != number).nonzero()[:, 0])
         known[out] = _room(geometry, fit_strengths(geometry, kept, kernel), train.position[out])
-        seen = train.spectrum[out]
+        seen = train.store[out]
         gained[out] = psnr(known[out], seen) - psnr(geometry.synthesize(train.position[out]), seen)
     if not like and gained.mean() < 0:
         return None, geometry.synthesize(train.position)
