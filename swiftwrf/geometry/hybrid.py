@@ -171,15 +171,15 @@ def _strengths(
         return None, geometry.synthesize(train.position)
     scene, rows = observe(train, seed)
     kernel = like.strengths.kernel if like and like.strengths else prior(scene.moving)
-    known, gained = torch.empty(len(train), *geometry.grid.shape), torch.empty(len(train))
+    known = torch.empty(len(train), *geometry.grid.shape)
     for number in fold.unique():
         out = (fold == number).nonzero()[:, 0]  # those of which nothing was observed, too
         kept = scene.subset((fold[rows] != number).nonzero()[:, 0])
         known[out] = _room(geometry, fit_strengths(geometry, kept, kernel), train.position[out])
-        seen = train.store[out]
-        gained[out] = psnr(known[out], seen) - psnr(geometry.synthesize(train.position[out]), seen)
-    if not like and gained.mean() < 0:
-        return None, geometry.synthesize(train.position)
+    if not like:
+        constant, seen = geometry.synthesize(train.position), train.spectrum
+        if (psnr(known, seen) - psnr(constant, seen)).mean() < 0:
+            return None, constant
     return fit_strengths(geometry, scene, kernel), known
 
 
