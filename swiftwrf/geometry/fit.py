@@ -27,6 +27,7 @@ SOLVED = 0.1  # relative error of a spectrum's autocorrelation up to which its p
 NEEDED = 2.5  # standard errors by which held-out spectra must be better for a plane or an order, all of them for turns
 ROUNDS = 3  # in which planes move by turns
 FURTHER = 4.0  # the same for a plane of any orientation, of which far more are tried
+FAINT = 0.01  # gain below which a plane is none: a ten-thousandth of the power is what rounding and misfits look like
 TRIED = 8  # candidates of any orientation that are refined
 MOST = 2000  # spectra that are looked at: a room is a few dozen numbers
 ENOUGH = 300  # held-out positions to decide by: as many parts are held out in turn as that takes
@@ -172,11 +173,12 @@ def _held_out(room: Planes, splits: list[tuple[Scene, Scene]], steps: int = 4) -
 
 
 def _pruned(room: Planes, scene: Scene, splits: list[tuple[Scene, Scene]]) -> Planes:
-    """Without the planes that held-out spectra do not need, the least needed first."""
+    """Without the planes that held-out spectra do not need, or that hardly reflect, the least needed first."""
     while room.normal.shape[1]:
         full = _held_out(room, splits)
         rest = [room.without(i).refined(scene, 4) for i in range(room.normal.shape[1])]
-        needed = [clearly(full, _held_out(r, splits)) for r in rest]
+        faint = (room.gain[0].abs() < FAINT).tolist()
+        needed = [0.0 if f else clearly(full, _held_out(r, splits)) for f, r in zip(faint, rest, strict=True)]
         least = min(range(len(rest)), key=needed.__getitem__)
         if needed[least] > NEEDED:
             break

@@ -18,7 +18,8 @@ from tasks.records import Row, read_json
 from tasks.rssi.experiment import MODEL
 from tasks.run import configured
 from tasks.view.fitted import Fitted, planes_of
-from tasks.view.rssi import Floor, RssiScene
+from tasks.view.floor import Floor
+from tasks.view.rssi import RssiScene
 from tasks.view.spectra import SpectraScene
 
 

@@ -9,9 +9,10 @@ from matplotlib import colormaps
 from matplotlib.colors import to_hex
 from nicegui import events, run, ui
 
+from tasks.view.floor import LEVEL
 from tasks.view.pictures import address, as_png, png
 from tasks.view.plan import text
-from tasks.view.rssi import LEVEL, MOST_COLOURS, RECEIVER_COLOURS, Heard, Layer, RssiScene, Shown
+from tasks.view.rssi import MOST_COLOURS, RECEIVER_COLOURS, Heard, Layer, RssiScene, Shown
 from tasks.view.widgets import Latest, canvas, colour_bar, header
 
 CROSS = "#ee6677"
