@@ -2,7 +2,7 @@
 
     spectrum(s) = a geometry(s; strengths(s)) + mean + k(s, training positions) w
 
-Strengths vary where held-out spectra come out better with it. Where the paths explain only a part, their fringes are worth
+Strengths vary unless held-out spectra come out clearly better without. Where the paths explain only a part, their fringes are worth
 their share a: the least-squares share at training spectra that are held out from the strengths and from the process, hence
 never worse there than the better of the two parts.
 """
@@ -21,6 +21,7 @@ from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
 from swiftwrf.geometry.fit import observe
 from swiftwrf.geometry.model import GeometryModel
+from swiftwrf.geometry.planes import advantage
 from swiftwrf.geometry.strengths import Strengths, fit_strengths, prior
 from swiftwrf.gp import Kernel, choose_kernel, held_out_weights
 from swiftwrf.metrics import psnr
@@ -31,6 +32,7 @@ COMPONENTS = 64  # principal components of the difference that are kept at most
 PIXELS = 4000  # of a spectrum that are enough to choose kernel and share
 MOST = 10_000  # spectra: all their inner products are computed
 BATCH = 256  # spectra at a time
+NEEDED = 1.0  # standard errors by which constant strengths must be better: those that vary are judged from fewer spectra
 FIRST = 0.7  # share with which the kernel is chosen
 
 
@@ -178,7 +180,7 @@ def _strengths(
         known[out] = _room(geometry, fit_strengths(geometry, kept, kernel), train.position[out])
     if not like:
         constant, seen = geometry.synthesize(train.position), train.spectrum
-        if (psnr(known, seen) - psnr(constant, seen)).mean() < 0:
+        if advantage(psnr(constant, seen), psnr(known, seen)) > NEEDED:
             return None, constant
     return fit_strengths(geometry, scene, kernel), known
 
