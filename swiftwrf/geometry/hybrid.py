@@ -2,9 +2,9 @@
 
     spectrum(s) = a geometry(s; strengths(s)) + mean + k(s, training positions) w
 
-Strengths vary unless held-out spectra come out clearly better without. Where the paths explain only a part, their fringes are worth
-their share a: the least-squares share at training spectra that are held out from the strengths and from the process, hence
-never worse there than the better of the two parts.
+Strengths vary unless held-out spectra come out clearly better without. Where the paths explain only a part, their fringes
+are worth their share a: the least-squares share at training spectra that are held out from the strengths and from the
+process, hence never worse there than the better of the two parts.
 """
 
 from __future__ import annotations
