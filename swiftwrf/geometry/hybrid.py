@@ -32,9 +32,7 @@ COMPONENTS = 64  # principal components of the difference that are kept at most
 PIXELS = 4000  # of a spectrum that are enough to choose kernel and share
 MOST = 10_000  # spectra: all their inner products are computed
 BATCH = 256  # spectra at a time
-NEEDED = (
-    1.0  # standard errors by which constant strengths must be better: those that vary are judged from fewer spectra
-)
+NEEDED = 1.0  # standard errors by which constant strengths must be ahead of others, judged from fewer spectra
 FIRST = 0.7  # share with which the kernel is chosen
 
 
