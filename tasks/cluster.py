@@ -38,7 +38,7 @@ PATIENCE = 30  # seconds to wait for workers, at the start and when all have gon
 LOOK = 2  # seconds between two looks whether there are any
 FETCH = 600  # seconds that a result may take from the worker to here
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of mallopt (malloc.h)
-GO_ON = "go on with --resume DIR here, or with --resume DIR --scheduler ADDRESS on a cluster"
+GO_ON = "go on with --resume DIR.partial here, with --scheduler ADDRESS on a cluster"
 
 
 @contextmanager

@@ -23,8 +23,8 @@ EXTRA = 3000  # further positions unless told otherwise
 class AoaConfig(SpectraSource):
     """Angle of arrival with few measured spectra: turbo learning against its bounds and baselines.
 
-    Without --data the built-in simulated room is used. An interrupted run goes on with --resume DIR, here or where a
-    --scheduler beside it says.
+    Without --data the built-in simulated room is used. An interrupted run goes on with --resume DIR.partial, here or where
+    a --scheduler beside it says.
     """
 
     mix: tuple[float, ...]

@@ -35,8 +35,8 @@ MOST_PLAN_PIXELS = 2**24
 class RssiTaskConfig(TableSource):
     """RSSI of a moving transmitter at fixed receivers, against baselines.
 
-    Without --data the built-in simulated floor is used. An interrupted run goes on with --resume DIR, here or where a
-    --scheduler beside it says.
+    Without --data the built-in simulated floor is used. An interrupted run goes on with --resume DIR.partial, here or where
+    a --scheduler beside it says.
     """
 
     rx: tuple[str, ...]
