@@ -94,6 +94,20 @@ def test_aann_learns_a_toy(circular):
     assert errors[0] < 0.5 * errors[1]
 
 
+def test_every_spectrum_counts_alike_in_the_batch_norms():
+    """65: in parts of 64 the last one would be a single spectrum, which a network of one pixel cannot normalise."""
+    spectrum = torch.rand(65, 8, 32, generator=torch.Generator().manual_seed(0))
+    spectrum[-20:] *= 0.1
+    label = torch.stack([torch.linspace(0, 3, 65), torch.full((65,), 0.5)], dim=1).double()
+    network = AANN(Settings(AngularGrid.hemisphere(8, 32)), AANNConfig(steps=2, batch=4))
+    network.fit(Mixed((Store(spectrum),), label, torch.arange(65), torch.zeros(65).bool()))
+    first = network._network.conv1(network._prepare(spectrum))
+    spread = first.std(dim=(0, 2, 3))
+    torch.testing.assert_close(
+        network._network.bn1.running_mean / spread, first.mean(dim=(0, 2, 3)) / spread, atol=0.02, rtol=0
+    )
+
+
 def test_circular_padding_makes_rolled_spectra_alike():
     from tasks.aoa.estimators.aann import _CircularConv
 

@@ -69,6 +69,13 @@ def best_gain(gains: Sequence[GainMetrics], sampled: bool) -> GainMetrics | None
     return min(taken, key=lambda gain: gain["median_deg"], default=None)
 
 
+def gains_from(advice: AdviceMetrics, extra: int) -> bool:
+    """Whether held-out spectra come out better with this number of further positions, of those that were compared."""
+    return any(
+        gain["change"] < 0 for gain in advice["gains"] if (gain["extra"], gain["sampled"]) == (extra, advice["sampled"])
+    )
+
+
 def _errors(trial: Trial, extra: int, sampled: bool, settings: Settings) -> NDArray[np.float64]:
     """Great-circle errors of the stand-in on the held-out spectra [deg], trained with so many synthetic ones."""
     mixed = Mixed.measured(trial.kept)

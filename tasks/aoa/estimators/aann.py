@@ -8,6 +8,7 @@ labels' spread, so that training starts from the constant estimator.
 from __future__ import annotations
 
 import copy
+import math
 import time
 from dataclasses import asdict, dataclass
 from typing import cast
@@ -247,7 +248,7 @@ class AANN(SavedEstimator):
         # a short training leaves the batch norms' running statistics behind the weights, so they are taken anew
         some = torch.randperm(len(train), generator=self._generator)[:STATISTICS]
         with self._autocast:
-            update_bn(spectrum[some].split(64), network)
+            update_bn(spectrum[some].tensor_split(math.ceil(len(some) / 64)), network)  # each part counts alike
         network.eval()
 
     def _point(self, prepared: Tensor, network: nn.Module) -> Tensor:
