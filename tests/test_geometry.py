@@ -145,6 +145,13 @@ def test_a_sign_does_not_change_for_a_little():
     assert _settled(room, scene) is room
 
 
+def test_a_plane_among_the_positions_has_no_turns():
+    """Wavelengths inside of the furthest one, where refinement may leave an oblique plane."""
+    scene, _ = observe(mirror_room({(1, 0, 0): 4.6}, n=12, array=PlanarArray.square(4, 60e9)))
+    normal, offset = torch.tensor([[[1.0, 0, 0]]]).double(), torch.tensor([[2.0]]).double()
+    assert turned(scene, Planes(normal, offset, torch.tensor([[-0.6]]), 1)) == []
+
+
 @pytest.mark.parametrize("away", [(8, 8, 6, 6, 0, 2), (3, 3, 4, 4, 0, 3)], ids=["whole turns", "half turns"])
 def test_planes_that_are_turns_away_together_return(away):
     """Images of images hold planes at wrong places together, from where no one to three of them find back."""

@@ -8,7 +8,7 @@ import pytest
 import quick
 import torch
 from quick import said
-from samples import WAVELENGTH, write_snapshots, write_survey
+from samples import WAVELENGTH, snapshots, write_snapshots, write_survey
 
 from swiftwrf import AngularGrid, simulated_room
 from swiftwrf.data.writing import write_spectra
@@ -41,6 +41,14 @@ def test_snapshots(tmp_path, capsys):
     html = (tmp_path / "page" / "report.html").read_text()
     assert html.count("<svg") == 3
     assert all(finding["text"][:20] in html for finding in content["findings"])
+
+
+def test_a_single_position(tmp_path, capsys):
+    write_snapshots(tmp_path / "source", data=snapshots(n=1))
+    assert run(tmp_path / "source", "--grid", 24, 96, "--out", tmp_path / "page") == 0
+    text = capsys.readouterr().out
+    assert "1 positions" in text
+    assert "inf m away" not in text
 
 
 def test_survey(tmp_path, capsys):

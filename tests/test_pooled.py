@@ -9,7 +9,9 @@ import pandas as pd
 from quick import run
 
 from tasks.aoa.pooled import pooled
+from tasks.aoa.results import mix_metrics
 from tasks.aoa.steps import choose_synthesizer
+from tasks.metrics import ANGLES, SCORES
 
 
 def rows(*repeats):
@@ -45,6 +47,24 @@ def test_named_synthesizers_add_nothing_where_nothing_is_advised():
     found = pooled(rows(("turbo_gp",), ("turbo_gp", "turbo_gp_extra")), auto=False)
     assert values(found, "turbo_gp") == [1, 11]
     assert values(found, "turbo_gp_extra") == [1, 12]
+
+
+def test_all_networks_count_where_the_time_went():
+    """Those of arms that are not taken and the one that stands for two, too."""
+    trained = rows(("turbo_gp",), ("turbo_idw", "turbo_idw_extra"))
+    training = [row | {"train": 10.0, "estimate": 1.0} for row in trained]
+    drawn = [{"mix": 0.3, "repeat": repeat, "synthesizer": "gp"} for repeat in range(2)]
+    for auto in (True, False):
+        table = {
+            "errors": [row | {"index": 0} | dict.fromkeys(ANGLES, 1.0) for row in pooled(trained, auto)],
+            "training_seconds": training,
+            "arm_seconds": pooled(training, auto),
+            "synthesis": [row | {"index": 0} | dict.fromkeys(SCORES, 1.0) for row in drawn],
+            "synthesis_seconds": [row | {"fit": 2.0, "synthesize": 1.0, "draw": 3.0, "trains": True} for row in drawn],
+        }
+        metrics = mix_metrics(0.3, 10, {}, None, None, table)
+        assert metrics["seconds"] == {"fit": 4.0, "synthesize": 6.0, "train": 50.0}
+        assert metrics["synthesis"]["gp"]["seconds"] == {"fit": 2.0, "synthesize": 1.0}
 
 
 def test_a_run_whose_repeats_choose_differently(tmp_path):

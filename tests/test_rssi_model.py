@@ -360,6 +360,28 @@ def test_refuses():
         fit_rssi(replace(data, rssi_dbm=data.rssi_dbm * torch.inf))
     with pytest.raises(InputError, match="same rows"):
         fit_rssi(data, pool=law_only(seed=1))
+    for batch in (0, -1):
+        with pytest.raises(InputError, match="batch must be at least 1"):
+            model.predict(data.transmitter_position, batch=batch)
+
+
+def test_a_receiver_alone_heard_in_one_slab_only_is_refused():
+    """Nothing tells how wrong a model is there; with a pool of others something does."""
+    both = rssi_room(n=200).columns([0, 5])
+    both.rssi_dbm[both.transmitter_position[:, 0] >= 4, 0] = torch.nan
+    alone = both.columns([0])
+    with pytest.raises(InputError, match="in one part of the region"):
+        fit_rssi(alone, RssiConfig(validation="block"))
+    assert fit_rssi(alone, RssiConfig(validation="block"), pool=both).widening.isfinite()
+
+
+def test_a_fit_does_not_go_on_with_another_pool(tmp_path):
+    data = with_field(n=60)
+    alone, moved = data.columns([0]), data.receiver_position.clone()
+    moved[1] += 5
+    fit_rssi(alone, pool=data, checkpoint=tmp_path / "state")
+    with pytest.raises(InputError, match="another fit"):
+        fit_rssi(alone, pool=replace(data, receiver_position=moved), checkpoint=tmp_path / "state")
 
 
 def test_law_of_a_receiver_heard_at_one_distance():

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -10,6 +13,9 @@ from swiftwrf import AngularGrid, InputError, fit, simulated_room
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import choose_kernel, most_informative
 from swiftwrf.metrics import psnr
+from tasks.aoa.experiment import _Tables
+from tasks.aoa.setting import At
+from tasks.aoa.steps import Suggestion
 
 
 def test_suggestions_lie_in_the_region_and_lower_the_variance(room):
@@ -22,6 +28,20 @@ def test_suggestions_lie_in_the_region_and_lower_the_variance(room):
     assert (
         nearest.median() > torch.cdist(*2 * (room.position,)).kthvalue(2).values.median() / 2
     )  # not where it is known
+
+
+def test_suggested_positions_keep_the_digits_of_maps(room):
+    """Coordinates on a map have more digits than single precision."""
+    measured = replace(room, position=room.position.double() + torch.tensor([712345.678, 5412345.678, 0]).double())
+    found, kept = suggest(measured, 3), {}
+    directory = SimpleNamespace(
+        write_csv=lambda name, rows: kept.update({name: rows}), write_npz=lambda name, arrays: None
+    )
+    tables = _Tables(SimpleNamespace(test=measured, withhold=lambda at: (measured, None)), directory)
+    step = Suggestion(At(0.5, 0))
+    tables.add(step, {"position": found.position.tolist(), "left": found.left.tolist()})
+    rows = kept["suggested-mix0.5.csv"]
+    assert [[row["x_m"], row["y_m"], row["z_m"]] for row in rows] == found.position.tolist()
 
 
 def test_measuring_at_suggested_positions_beats_random_ones():

@@ -26,7 +26,7 @@ from swiftwrf.threads import single_thread
 SOLVED = 0.1  # relative error of a spectrum's autocorrelation up to which its phases are used
 NEEDED = 2.5  # standard errors by which held-out spectra must be better for a plane or an order, all of them for turns
 ROUNDS = 3  # in which planes move by turns
-FURTHER = 4.0  # the same for a plane of any orientation, of which far more are tried
+FURTHER = 4.0  # standard errors for a plane of any orientation, of which far more are tried
 FAINT = 0.01  # gain below which a plane is none: a ten-thousandth of the power is what rounding and misfits look like
 TRIED = 8  # candidates of any orientation that are refined
 MOST = 2000  # spectra that are looked at: a room is a few dozen numbers

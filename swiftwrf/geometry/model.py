@@ -56,7 +56,8 @@ class GeometryModel(Saved):
         order: of the images.
         score_held_out: 1 - correlation of predicted and observed co-array numbers of training spectra that were held out
             from the search for planes along the sides, its first stage.
-        unexplained: share of the power of all training spectra's co-array numbers that the prediction leaves.
+        unexplained: share of the power of the co-array numbers, of the training spectra that were looked at, that the
+            prediction leaves.
         verdict: the finding in a sentence.
         covariance: of the offsets [m^2], (P, P).
         residual: statistics of what the planes leave, for draws.

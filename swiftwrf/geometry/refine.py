@@ -103,7 +103,7 @@ def refine(
 
     Args:
         signs: of the gains, (P,); free without them.
-        limit: how far a plane may go in one step [m].
+        limit: how far a plane may go [m], or tilt [rad], in one step.
     """
     damping = torch.full((len(normal),), 1e-2)
     total, change = derivatives(scene, normal, offset, gain, sequence, tilt)

@@ -21,7 +21,7 @@ class Residual:
 
     Args:
         direct: share of the positions with a line of sight.
-        diffuse: amplitude of further paths, relative to the field of the planes.
+        diffuse: amplitude of further paths, relative to that of the direct wave and the planes' together.
     """
 
     direct: float = 1.0

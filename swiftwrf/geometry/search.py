@@ -2,8 +2,8 @@
 
 The score of a plane has many minima, about half a wavelength / cosine of incidence apart, and planes at wrong ones hold
 each other in place. Hence several planes move at once: each side keeps a list of alternatives, the minima of its own scans
-and "no plane", and the best of all combinations of up to three sides' alternatives is taken, from tables of the waves of
-all single and double reflections, until none is better.
+and "no plane", and the best of all combinations of two to four sides' alternatives is taken, from tables of the waves of
+all single and double reflections, until none is better; all six sides move at once by whole turns.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from dataclasses import field as of
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -35,6 +36,10 @@ HOPELESS = 1.4  # a start with so many times the best score is given up
 Alternatives = list[list[tuple[float, float]]]  # offset [m] and gain, for each side
 CHUNK = 256  # candidates at a time
 MOVES = {2: 99, 3: 7, 4: 4}  # so many sides move at once, each to so many alternatives
+ORDER = 2  # of the images while planes move together
+TOP = 8  # alternatives of a side
+KEEP = 8  # combinations that are refined
+SWEEPS = 20  # moves at most
 
 
 @dataclass
@@ -63,19 +68,22 @@ class Search:
         scene: with the positions to search with.
         reach: how far beyond the region planes are looked for [m].
         signs: of the gains on the six sides, -1 or 1 each, (6,).
-        order: of the images while planes move together.
         usual: modulus of a gain that is not known yet.
     """
 
-    def __init__(self, scene: Scene, reach: float, signs: Tensor, order: int = 2, usual: float = USUAL) -> None:
-        self.scene, self.reach, self.signs, self.order = scene, reach, signs, order
+    def __init__(self, scene: Scene, reach: float, signs: Tensor, usual: float = USUAL) -> None:
+        self.scene, self.reach, self.signs = scene, reach, signs
         self.usual: list[float] = (usual * signs).tolist()
         both = torch.cat([scene.transmitter, scene.receiver])
         near = (both @ SIDES.T).amax(0)
         self.step = 0.5 / scene.wavenumber
         self.offsets = [n + torch.arange(self.step, reach, self.step, dtype=torch.float64) for n in near]
         self.direct = scene.wave(scene.transmitter)
-        self.single = [self._waves(SIDES[i : i + 1], o[:, None]) for i, o in enumerate(self.offsets)]
+
+    @cached_property
+    def single(self) -> list[Tensor]:
+        """Waves of a plane on each side, at all its offsets."""
+        return [self._waves(SIDES[i : i + 1], o[:, None]) for i, o in enumerate(self.offsets)]
 
     def _waves(self, normal: Tensor, offset: Tensor) -> Tensor:
         """Unscaled waves of single reflections (C, n, K) at offsets (C, 1)."""
@@ -135,7 +143,7 @@ class Search:
                 done.append(Room(v, dict(zip(sides, o, strict=True)), dict(zip(sides, g, strict=True))))
         return sorted(done, key=lambda r: r.score)
 
-    def beam(self, width: int, order: int = 1) -> list[Room]:
+    def beam(self, width: int, order: int) -> list[Room]:
         """Partial rooms of growing number of planes, the best few of each number kept."""
         rooms = [Room(float(self.scene.score(self.direct)))]
         for _ in SIDES:
@@ -161,7 +169,7 @@ class Search:
         for side in range(6):
             gain = room.gain[side] if side in room.offset else self.usual[side]
             own = [(room.offset[side], gain), (room.offset[side], 0.0)] if side in room.offset else [(0.0, 0.0)]
-            offsets = [o for order in (1, self.order) for _, o in self.minima(room, side, order, top)]
+            offsets = [o for order in (1, ORDER) for _, o in self.minima(room, side, order, top)]
             far: list[float] = []
             for o in offsets:
                 if all(abs(o - p) > 2 * self.step for p in far):
@@ -173,7 +181,7 @@ class Search:
         """The waves of all alternatives."""
         offset = [torch.tensor([o for o, _ in a], dtype=torch.float64) for a in alternatives]
         gain = [torch.tensor([g for _, g in a]) for a in alternatives]
-        return Waves.of(self.scene, SIDES, offset, gain, self.order)
+        return Waves.of(self.scene, SIDES, offset, gain, ORDER)
 
     def moves(self, alternatives: Alternatives, waves: Waves, k: int, keep: int) -> list[Room]:
         """The best rooms in which k sides take other alternatives, of which the more are tried the fewer sides move."""
@@ -208,11 +216,11 @@ class Search:
             found.append([(o, room.gain[side]) for o in steps if o >= low - self.step])
         return found
 
-    def improve(self, room: Room, *, top: int = 8, sweeps: int = 20, keep: int = 8) -> Room:
+    def improve(self, room: Room) -> Room:
         """Moves several planes at a time, with second-order images, until nothing is better."""
-        best = self.refined([room], self.order)[0]
-        for _ in range(sweeps):
-            for tried in self._trials(best, top, keep):
+        best = self.refined([room], ORDER)[0]
+        for _ in range(SWEEPS):
+            for tried in self._trials(best):
                 if tried.score < BETTER * best.score:
                     best = tried
                     break
@@ -220,27 +228,26 @@ class Search:
                 break
         return best
 
-    def _trials(self, room: Room, top: int, keep: int) -> Iterator[Room]:
+    def _trials(self, room: Room) -> Iterator[Room]:
         """The best of each kind of move, the cheap ones first."""
         if room.score < PERFECT:
             return
-        alternatives = self.alternatives(room, top)
+        alternatives = self.alternatives(room, TOP)
         waves = self.table(alternatives)
         for k in MOVES:
-            yield self.refined(self.moves(alternatives, waves, k, keep), self.order)[0]
-        few, wraps = Search(self.scene.few(), self.reach, self.signs, self.order), self.wraps(room)
-        yield self.refined(few.moves(wraps, few.table(wraps), 6, keep), self.order)[0]
+            yield self.refined(self.moves(alternatives, waves, k, KEEP), ORDER)[0]
+        few, wraps = Search(self.scene.few(), self.reach, self.signs), self.wraps(room)
+        yield self.refined(few.moves(wraps, few.table(wraps), 6, KEEP), ORDER)[0]
 
 
 def find_room(
-    scene: Scene, reach: float, order: int = 2, width: int = 8, tick: Callable[[], None] | None = None
+    scene: Scene, reach: float, width: int = 8, tick: Callable[[], None] | None = None
 ) -> tuple[Tensor, Room]:
     """The signs of the gains and the best room over all SIGNS, from beams with and without second-order images.
 
     Args:
         scene: with the positions to search with, best no more than a hundred.
         reach: how far beyond the region of both ends planes are looked for [m].
-        order: of the images while planes move together.
         width: of the beam.
         tick: called after each of the STARTS starts.
     """
@@ -249,8 +256,8 @@ def find_room(
     if nothing.score < PERFECT:
         return SIGNS[0], nothing
     for signs in SIGNS:
-        search = Search(scene, reach, signs, order)
-        starts += [(search.beam(width, first)[0], search) for first in (order, 1)]
+        search = Search(scene, reach, signs)
+        starts += [(search.beam(width, order)[0], search) for order in (ORDER, 1)]
     best: tuple[Tensor, Room] | None = None
     for start, search in sorted(starts, key=lambda s: s[0].score):
         if best is None or PERFECT < start.score < HOPELESS * best[1].score:

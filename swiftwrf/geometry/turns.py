@@ -57,6 +57,8 @@ def _places(scene: Scene, room: Planes, plane: int) -> dict[int, float]:
     nearest = float((torch.cat([scene.transmitter, scene.receiver]) @ normal).max())
     wavelength = 2 * math.pi / scene.wavenumber
     farthest = TURNS * wavelength  # twice as far as at normal incidence
+    if nearest >= here + farthest:  # it stands among the positions, where no turn leads to a place for it
+        return {0: here}
     grid = torch.arange(max(nearest, here - farthest), here + farthest, GRID * wavelength, dtype=torch.float64)
     source = images(scene, normal.expand(len(grid), 1, 3), grid[:, None], [(0,)])[:, 0]
     now = images(scene, room.normal, room.offset, [(plane,)])[0, 0]

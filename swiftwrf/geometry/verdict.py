@@ -16,7 +16,7 @@ from swiftwrf.geometry.refine import deviations
 from swiftwrf.geometry.sample import Residual, residual_statistics
 from swiftwrf.geometry.turns import turned
 
-CERTAIN = 3.0  # the same against a rival place, for a plane to be certain
+CERTAIN = 3.0  # standard errors by which a plane must be better than in a rival place to be certain
 VAGUE = 0.5  # deviation [rad of phase] beyond which a plane is not certain
 FLAT = 0.8  # spread of the positions in any direction [rad of phase] up to which they count as flat
 SCALES = (0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05)  # of the carrier that rivals the given one

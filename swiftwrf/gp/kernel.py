@@ -57,7 +57,7 @@ class Kernel:
     def noisy_gram(self, position: Tensor) -> Tensor:
         """Covariance of noisy values at positions (n, 3), float64 (n, n)."""
         position = position.double()
-        noisy: Tensor = self(position, position) + self.noise * torch.eye(len(position), dtype=torch.float64)
+        noisy: Tensor = self(position, position) + self.noise * torch.eye(len(position)).to(position)
         return noisy
 
 

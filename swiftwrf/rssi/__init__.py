@@ -4,5 +4,6 @@ from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.fit import Map, fit_rssi
 from swiftwrf.rssi.law import Law, fit_law, log_distance
 from swiftwrf.rssi.model import RssiModel
+from swiftwrf.rssi.uncertainty import LEVEL
 
-__all__ = ["Law", "Map", "RssiConfig", "RssiModel", "fit_law", "fit_rssi", "log_distance"]
+__all__ = ["LEVEL", "Law", "Map", "RssiConfig", "RssiModel", "fit_law", "fit_rssi", "log_distance"]

@@ -31,9 +31,7 @@ def choose_kernel(position: Tensor, residual: Tensor, fold: Tensor) -> tuple[Ker
     left = [_Left(values, fold) for values in residual[:, columns].T]
 
     def missed(kernel: Kernel) -> float:
-        covariance = kernel(position, position)
-        covariance.diagonal().add_(kernel.noise)
-        precision = torch.linalg.inv(covariance)
+        precision = torch.linalg.inv(kernel.noisy_gram(position))
         return float(torch.cat([error for values in left for error in values.errors(precision)]).abs().mean())
 
     # rough fields alone: a choice among mixtures with a smooth part follows chance, and its errors are no smaller

@@ -17,8 +17,6 @@ class RssiConfig:
     huber: float = 1.345
     """errors beyond so many standard deviations of the noise count linearly (Huber's constant: 95 % efficient where the
     noise is Gaussian), for packets have outliers"""
-    coverage: float = 0.8
-    """share of measurements that the interval should cover"""
     validation: Validation = "random"
     """what is held out inside the training part: single rows, or a region"""
     plain: bool = False

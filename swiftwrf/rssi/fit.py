@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
+from swiftwrf.errors import InputError
 from swiftwrf.progress import progress_bar
 from swiftwrf.rssi.choose import mixing_weights
 from swiftwrf.rssi.config import RssiConfig
@@ -21,7 +22,7 @@ from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.prepare import Setting, check, prepare
 from swiftwrf.rssi.solve import Fitted, Group, solve
 from swiftwrf.rssi.state import State, fingerprint
-from swiftwrf.rssi.uncertainty import known
+from swiftwrf.rssi.uncertainty import LEVEL, known
 from swiftwrf.threads import single_thread
 
 GROUP = 4  # receivers a task: a state is kept after each, and a cluster's workers take one each
@@ -59,8 +60,8 @@ def fit_rssi(
         progress: show a progress bar on a terminal.
 
     Raises:
-        InputError: fewer than 10 measurements in all, something not finite, a pool of other rows, or a checkpoint of
-            another fit.
+        InputError: fewer than 10 measurements in all, something not finite, a pool of other rows, a checkpoint of another
+            fit, or all measurements in one part of the region, where other parts are held out.
         FitError: a fit that broke.
     """
     config, pool, began = config or RssiConfig(), pool or train, time.perf_counter()
@@ -105,6 +106,11 @@ def _assemble(train: Rssi, setting: Setting, fitted: Fitted, config: RssiConfig)
     predictions = torch.cat([fitted.held_out[None], setting.held_out])
     row, group, kernel = setting.sites.of_row, setting.whole, setting.kernel
     weight = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
+    if not (predictions[:, row].isfinite().all(dim=0) & train.rssi_dbm.isfinite()).any():
+        raise InputError(
+            "nothing can be held out to tell how wrong the model is: all measurements are in one part of the region; "
+            'measure elsewhere, too, give a pool of more receivers, or take validation="random"'
+        )
     if not config.plain:
         weight = mixing_weights(predictions[:, row], train.rssi_dbm)
     level, slope = (
@@ -135,7 +141,7 @@ def _assemble(train: Rssi, setting: Setting, fitted: Fitted, config: RssiConfig)
         known_root=somewhere.root.float(),
         field_db=group.field_db.float(),
         noise_db=group.noise_db.float(),
-        widening=score[score.isfinite()].quantile(config.coverage).float()[None],
+        widening=score[score.isfinite()].quantile(LEVEL).float()[None],
     )
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from swiftwrf.checkpoint import Header, Saved
 from swiftwrf.errors import InputError
 from swiftwrf.gp import Kernel
-from swiftwrf.positions import check_positions
+from swiftwrf.positions import check_batch, check_positions
 from swiftwrf.rssi.head import Table
 from swiftwrf.rssi.law import harmonics, log_distance
 from swiftwrf.rssi.uncertainty import Known
@@ -95,9 +95,10 @@ class RssiModel(Saved):
             Prediction, lower and upper end of the interval, each float32 (n, R) [dBm].
 
         Raises:
-            InputError: positions of another shape, not finite, or more than a million kilometres away.
+            InputError: positions of another shape, not finite, or more than a million kilometres away; a batch below 1.
         """
         position = check_positions(position)
+        check_batch(batch)
         away = (position - self.centre).abs().amax() if len(position) else torch.zeros(())
         if away > FARTHEST:
             raise InputError(

@@ -63,6 +63,9 @@ def _with_gaps(tensors: dict[str, Tensor], name: str) -> Tensor:
 def fingerprint(config: Any, train: Rssi, pool: Rssi) -> str:
     """Says whether a saved state belongs to this configuration (a dataclass) and these measurements."""
     digest = hashlib.sha256(json.dumps([asdict(config), train.receiver_names]).encode())
-    for tensor in (train.transmitter_position, train.receiver_position, train.rssi_dbm, pool.rssi_dbm):
+    for tensor in (
+        *(train.transmitter_position, train.receiver_position, train.rssi_dbm),
+        *(pool.receiver_position, pool.rssi_dbm),
+    ):
         digest.update(tensor.contiguous().numpy().tobytes())
     return digest.hexdigest()

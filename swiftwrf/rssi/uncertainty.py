@@ -9,6 +9,7 @@ from torch import Tensor
 
 from swiftwrf.gp import Kernel, thinned
 
+LEVEL = 0.8  # of measurements that an interval should cover
 ENOUGH = 200  # positions tell measured regions from others, at a fraction of the cost of all
 
 
@@ -26,8 +27,6 @@ class Known(NamedTuple):
 def known(position: Tensor, kernel: Kernel) -> Known:
     """What measurements at positions (n, 3) tell."""
     (some,) = thinned(position, rows=ENOUGH)
-    covariance = kernel(some, some)
-    covariance.diagonal().add_(kernel.noise)
-    lower = torch.linalg.cholesky(covariance)
+    lower = torch.linalg.cholesky(kernel.noisy_gram(some))
     eye = torch.eye(len(some), dtype=lower.dtype, device=lower.device)
     return Known(some, torch.linalg.solve_triangular(lower, eye, upper=False))

@@ -111,6 +111,7 @@ class _Tables:
         self.synthesis: list[Row] = []
         self.history: list[Row] = []
         self.training_seconds: list[Row] = []
+        self.arm_seconds: list[Row] = []  # the same, pooled
         self.synthesis_seconds: list[Row] = []
         self.chosen: dict[float, Row] = {}  # by share, of the first repeat
         self.counts: dict[float, dict[str, dict[str, int]]] = {}
@@ -134,7 +135,7 @@ class _Tables:
         """Gives each arm all repeats, once all steps are added."""
         auto = self.setting.config.synthesizer == (AUTO,)
         self.errors = pooled(self.errors, auto)
-        self.training_seconds = pooled(self.training_seconds, auto)
+        self.arm_seconds = pooled(self.training_seconds, auto)
 
     def _add_arm(self, step: Arm, value: Row) -> None:
         self.counts.setdefault(step.at.share, {})[step.training] = value["counts"]
@@ -172,7 +173,7 @@ class _Tables:
     def _add_suggestion(self, step: Suggestion, value: Row) -> None:
         """A table for those who go there."""
         name, (measured, _) = f"suggested-mix{step.at.share:g}", self.setting.withhold(step.at)
-        position, left = torch.tensor(value["position"]), torch.tensor(value["left"])
+        position, left = (torch.tensor(value[key], dtype=torch.float64) for key in ("position", "left"))
         columns = {"x_m": position[:, 0], "y_m": position[:, 1], "z_m": position[:, 2], "variance_left": left[1:]}
         self.directory.write_csv(f"{name}.csv", _rows({}, columns))
         places = {"measured": measured.position.numpy(), "suggested": position.numpy(), "left": left.numpy()}
@@ -210,6 +211,7 @@ class _Tables:
         rows = {
             "errors": self.errors,
             "training_seconds": self.training_seconds,
+            "arm_seconds": self.arm_seconds,
             "synthesis": self.synthesis,
             "synthesis_seconds": self.synthesis_seconds,
         }

@@ -25,8 +25,8 @@ def mix_metrics(
         n_measured: spectra.
         counts: of spectra by origin in each training set.
         choice, advice: of the first repeat, where there are any.
-        rows: `errors`, `training_seconds`, `synthesis` and `synthesis_seconds` of all shares, the last with whether
-            the spectra train an arm.
+        rows: `errors` and `arm_seconds` of pooled arms, `training_seconds` of what was trained, `synthesis` and
+            `synthesis_seconds` of all shares, the last with whether the spectra train an arm.
     """
     own = {name: DataFrame([row for row in table if row["mix"] == share]) for name, table in rows.items()}
     training, fits = own["training_seconds"], own["synthesis_seconds"]
@@ -38,10 +38,10 @@ def mix_metrics(
         "choice": choice,
         "advice": advice,
         "synthesis": _synthesis_metrics(own["synthesis"], fits),
-        "methods": _arm_metrics(own["errors"], training),
+        "methods": _arm_metrics(own["errors"], own["arm_seconds"]),
         "seconds": {
             "fit": float(asked_for["fit"].sum()),
-            "synthesize": float(asked_for["synthesize"].sum()),
+            "synthesize": float(asked_for["draw"].sum()),
             "train": float(networks["train"].sum()),
         },
     }

@@ -146,6 +146,7 @@ class Synthesis(Step[Setting]):
         generator = torch.Generator().manual_seed(settings.seed)
         test = setting.test.position
         drawn = {"test": _as_bytes_at(test, synthesizer.synthesize)}
+        tested = time.perf_counter()  # what every synthesizer draws, whether it trains or not
         if synthesizer.deviation(test[:1]) is not None:
             drawn["test deviation"] = _as_bytes_at(test, synthesizer.deviation)
         if synthesizer.samples:
@@ -158,7 +159,8 @@ class Synthesis(Step[Setting]):
             drawn["further"] = _as_bytes_at(places.position, lambda some: synthesizer.synthesize(some, own))
         seconds = {
             "fit": fitted - fit.began + fit.earlier + synthesizer.shared_seconds,
-            "synthesize": time.perf_counter() - fitted,
+            "synthesize": tested - fitted,
+            "draw": time.perf_counter() - fitted,
         }
         write(folder / self.file, KIND, drawn, {})
         if self.trains and self.at.repeat == 0:

@@ -58,7 +58,7 @@ def page(data: Spectra | Rssi, kind: str, findings: Findings) -> Page:
 
 
 def _spectra(data: Spectra) -> list[Plot]:
-    return [_plan(data), _directions(data), _neighbours(data)]
+    return [_plan(data), _directions(data), *([_neighbours(data)] if len(data) > 1 else [])]
 
 
 def _rssi(data: Rssi) -> list[Plot]:

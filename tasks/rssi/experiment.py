@@ -16,6 +16,7 @@ from swiftwrf import InputError, Rssi, load_rssi, rssi_room
 from swiftwrf.data.files import sha256
 from swiftwrf.data.splits import validation_for
 from swiftwrf.positions import distance
+from swiftwrf.rssi import LEVEL
 from tasks.cluster import connected
 from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
 from tasks.page.page import reporting
@@ -111,7 +112,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             "left_out": left_out,
             "receivers": tables.receivers(),
             "seconds": tables.seconds["swiftwrf"],
-            "interval": {"nominal": 0.8, "coverage": tables.coverage},
+            "interval": {"nominal": LEVEL, "coverage": tables.coverage},
             "chosen": {"n_primitives": tables.n_primitives},
         }
         final = directory.finish(metrics, reporting(page))

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from swiftwrf import RssiModel
+from swiftwrf.rssi import LEVEL
 
-LEVEL = 0.8  # of the model's intervals
 DEVIATIONS = ndtri((1 + LEVEL) / 2)  # half of an interval, of a normal variable
 Corners = tuple[float, float, float, float]
 

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from swiftwrf import RssiModel
+from swiftwrf.rssi import LEVEL
 from tasks.page import figures
 from tasks.records import as_table
-from tasks.view.floor import DEVIATIONS, LEVEL, Floor, Maps
+from tasks.view.floor import DEVIATIONS, Floor, Maps
 from tasks.view.plan import Plan
 
 CELLS = 120  # of a map, along its longer side

@@ -9,7 +9,7 @@ from matplotlib import colormaps
 from matplotlib.colors import to_hex
 from nicegui import events, run, ui
 
-from tasks.view.floor import LEVEL
+from swiftwrf.rssi import LEVEL
 from tasks.view.pictures import address, as_png, png
 from tasks.view.plan import text
 from tasks.view.rssi import MOST_COLOURS, RECEIVER_COLOURS, Heard, Layer, RssiScene, Shown

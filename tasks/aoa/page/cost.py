@@ -33,7 +33,7 @@ def speed_section(share: Share) -> Section:
         figures.speed(ax, palette, points, f"seconds to {stage}", "RMS error of a spectrum", also=["swiftwrf"])
     figures.speed(axes[2], palette, estimators, "seconds to train and estimate", "median great-circle error [deg]")
     caption = (
-        "Left and middle: synthesizers, seconds to fit and to draw the withheld and the test spectra. Right: estimators, "
+        "Left and middle: synthesizers, seconds to fit and to draw the test spectra. Right: estimators, "
         "the synthesizer's time not counted. The line is the Pareto front: what is not on it is beaten in both."
     )
     figures.legend_of(figure, palette, [*synthesis, *methods])

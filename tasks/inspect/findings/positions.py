@@ -29,6 +29,8 @@ def check_positions(position: Tensor, findings: Findings, wavelength: float | No
         findings.warn(
             f"All positions have one {' and one '.join(flat)}; directions and planes cannot be told from them."
         )
+    if len(position) < 2:
+        return
     _, near = nearest(position)
     _, times = position.unique(dim=0, return_counts=True)
     same = int(times[times > 1].sum())
