@@ -33,9 +33,11 @@ def main(config: Config) -> None:
     """Measures every synthesizer on every scene."""
     chosen = [(name, split) for name, split in SCENES if not config.scenes or name in config.scenes]
     results = {f"{name} {split}": measure(load(config.data / name), split, config.seed) for name, split in chosen}
+    slabs = {}
     if not config.scenes:
-        results["simulated-room random"] = measure(simulated_room(), "random", config.seed)
-    slabs = {data.name: covered_slabs(data) for data in (load(config.data / "s23-200"), simulated_room())}
+        room = simulated_room()
+        results["simulated-room random"] = measure(room, "random", config.seed)
+        slabs = {data.name: covered_slabs(data) for data in (load(config.data / "s23-200"), room)}
     write_result("synthesis", {"seed": config.seed, "scenes": results, "slabs_covered_by_80": slabs})
 
 

@@ -58,6 +58,12 @@ class _Left:
         return [torch.linalg.solve(b, dual[out])[:n] for b, (n, out) in zip(blocks, self.parts, strict=True)]
 
 
+def comparable(held_out: Tensor, measured: Tensor) -> Tensor:
+    """Which measurements (rows, R) there are and all predictors (predictors, rows, R) say something of where they were held
+    out, bool (rows, R); what is missing is nan."""
+    return (~held_out.isnan()).all(dim=0) & ~measured.isnan()
+
+
 def mixing_weights(held_out: Tensor, measured: Tensor) -> Tensor:
     """Weights, none negative and 1 in sum, of the mean of predictors that has the least absolute error where they were held
     out ("stacking": L. Breiman, Machine Learning 24, 1996).
@@ -69,7 +75,7 @@ def mixing_weights(held_out: Tensor, measured: Tensor) -> Tensor:
     Returns:
         float64 (predictors,).
     """
-    usable = (~held_out.isnan()).all(dim=0) & ~measured.isnan()
+    usable = comparable(held_out, measured)
     predicted, target = thinned(held_out[:, usable].T.double(), measured[usable].double(), rows=MAX_PAIRS)
     error = (predicted - target[:, None]).numpy()  # of a mean with weights that sum to 1: the mean of the errors
     n = error.shape[1]

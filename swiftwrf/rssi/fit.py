@@ -14,7 +14,7 @@ from torch import Tensor
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import InputError
 from swiftwrf.progress import progress_bar
-from swiftwrf.rssi.choose import mixing_weights
+from swiftwrf.rssi.choose import comparable, mixing_weights
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import pooled
 from swiftwrf.rssi.learn import learn
@@ -106,7 +106,7 @@ def _assemble(train: Rssi, setting: Setting, fitted: Fitted, config: RssiConfig)
     predictions = torch.cat([fitted.held_out[None], setting.held_out])
     row, group, kernel = setting.sites.of_row, setting.whole, setting.kernel
     weight = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
-    if not (predictions[:, row].isfinite().all(dim=0) & train.rssi_dbm.isfinite()).any():
+    if not comparable(predictions[: 1 if config.plain else None, row], train.rssi_dbm).any():
         raise InputError(
             "nothing can be held out to tell how wrong the model is: all measurements are in one part of the region; "
             'measure elsewhere, too, give a pool of more receivers, or take validation="random"'
