@@ -230,8 +230,8 @@ def test_draws_train_only_where_they_are_better_than_means_beyond_doubt(room, ri
 def test_a_training_is_as_long_as_the_scene_needs():
     quick = [AANNConfig.quick(n) for n in (0, 240, 780, 1525, 100_000)]
     assert [(config.steps, config.batch) for config in quick] == [
-        (250, 32),
-        (250, 32),
+        (250, 64),
+        (250, 64),
         (731, 64),
         (1000, 64),
         (1000, 64),
