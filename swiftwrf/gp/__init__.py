@@ -3,7 +3,7 @@
 from swiftwrf.gp.choice import choose_kernel, choose_rank, inner_products, most_informative, squared_errors, thinned
 from swiftwrf.gp.field import NearbyField, SmoothField
 from swiftwrf.gp.kernel import Kernel, candidates
-from swiftwrf.gp.process import EXACT, GaussianProcess, NearbyProcess, held_out, held_out_weights
+from swiftwrf.gp.process import EXACT, GaussianProcess, NearbyProcess, held_out, held_out_weights, missed
 
 __all__ = [
     "EXACT",
@@ -18,6 +18,7 @@ __all__ = [
     "held_out",
     "held_out_weights",
     "inner_products",
+    "missed",
     "most_informative",
     "squared_errors",
     "thinned",

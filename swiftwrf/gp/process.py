@@ -78,6 +78,19 @@ class NearbyProcess:
         return self.weights(position)[2]
 
 
+def missed(precision: Tensor, dual: Tensor, part: Tensor) -> Tensor:
+    """Errors of what all other rows say of some, without another fit: P_part^-1 (P y)_part for a Gaussian vector y with
+    precision P, whatever the part's own values and noise (Rasmussen and Williams 2006, eq. 5.12, for more than one row).
+
+    Args:
+        precision: of the noisy values, (n, n).
+        dual: precision @ values, (n,).
+        part: numbers of the rows, (k,).
+    """
+    error: Tensor = torch.linalg.solve(precision.index_select(0, part).index_select(1, part), dual[part])
+    return error
+
+
 def held_out(kernel: Kernel, position: Tensor, fold: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
     """What regression with mean 0 predicts of values whose fold is left out, all folds from one inverse (Rasmussen and
     Williams 2006, section 5.4.2; Golub, Heath and Wahba 1979).

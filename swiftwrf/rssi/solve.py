@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.errors import FitError
-from swiftwrf.gp import Kernel
+from swiftwrf.gp import Kernel, missed
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import Head, Table
 from swiftwrf.rssi.law import Law, harmonics, log_distance
@@ -156,14 +156,10 @@ class _Receiver:
         return dual, slope
 
     def held_out(self, dual: Tensor, fold: Tensor) -> Tensor:
-        """Error of what all other folds say of each site, (n,), without another fit.
-
-        For a Gaussian vector with precision P, what the rest leaves of a part is P_part^-1 (P y)_part, whatever the part's
-        own values and weights (Rasmussen and Williams, 2006, eq. 5.12, for more than one).
-        """
+        """Error of what all other folds say of each site, (n,)."""
         precision = torch.cholesky_inverse(self.factor)
         error = torch.empty_like(dual)
         for number in fold.unique():
             part = (fold == number).nonzero()[:, 0]
-            error[part] = torch.linalg.solve(precision[part][:, part], dual[part])
+            error[part] = missed(precision, dual, part)
         return error
