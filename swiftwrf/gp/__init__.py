@@ -3,7 +3,7 @@
 from swiftwrf.gp.choice import choose_kernel, choose_rank, inner_products, most_informative, squared_errors, thinned
 from swiftwrf.gp.field import NearbyField, SmoothField
 from swiftwrf.gp.kernel import Kernel, candidates
-from swiftwrf.gp.process import EXACT, GaussianProcess, NearbyProcess, held_out, held_out_weights, missed
+from swiftwrf.gp.process import EXACT, GaussianProcess, NearbyProcess, held_out, held_out_errors, held_out_weights
 
 __all__ = [
     "EXACT",
@@ -16,9 +16,9 @@ __all__ = [
     "choose_kernel",
     "choose_rank",
     "held_out",
+    "held_out_errors",
     "held_out_weights",
     "inner_products",
-    "missed",
     "most_informative",
     "squared_errors",
     "thinned",

@@ -78,7 +78,7 @@ class NearbyProcess:
         return self.weights(position)[2]
 
 
-def missed(precision: Tensor, dual: Tensor, part: Tensor) -> Tensor:
+def held_out_errors(precision: Tensor, dual: Tensor, part: Tensor) -> Tensor:
     """Errors of what all other rows say of some, without another fit: P_part^-1 (P y)_part for a Gaussian vector y with
     precision P, whatever the part's own values and noise (Rasmussen and Williams 2006, eq. 5.12, for more than one row).
 

@@ -7,7 +7,7 @@ import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
-from swiftwrf.gp import Kernel, candidates, missed, thinned
+from swiftwrf.gp import Kernel, candidates, held_out_errors, thinned
 
 NOISES = (0.3, 1.0, 2.0, 3.0)  # variance of a packet relative to that of the field: fading is as large as shadowing
 MAX_ROWS, MAX_RECEIVERS = 300, 12  # more do not change the choice
@@ -30,13 +30,13 @@ def choose_kernel(position: Tensor, residual: Tensor, fold: Tensor) -> tuple[Ker
     (columns,) = thinned(torch.arange(residual.shape[1]), rows=MAX_RECEIVERS)
     left = [_Left(values, fold) for values in residual[:, columns].T]
 
-    def mean_error(kernel: Kernel) -> float:
+    def missed(kernel: Kernel) -> float:
         precision = torch.linalg.inv(kernel.noisy_gram(position))
         return float(torch.cat([error for values in left for error in values.errors(precision)]).abs().mean())
 
     # rough fields alone: a choice among mixtures with a smooth part follows chance, and its errors are no smaller
     rough = (kernel for kernel in candidates(position, NOISES) if kernel.share == 1)
-    score, best = min(((mean_error(kernel), kernel) for kernel in rough), key=lambda pair: pair[0])
+    score, best = min(((missed(kernel), kernel) for kernel in rough), key=lambda pair: pair[0])
     return best, score < float(residual[:, columns].abs().nanmean())
 
 
@@ -54,7 +54,7 @@ class _Left:
     def errors(self, precision: Tensor) -> list[Tensor]:
         """By fold [dB], with the precision (n, n) of all sites."""
         dual = precision @ self.filled
-        return [missed(precision, dual, out)[:n] for n, out in self.parts]
+        return [held_out_errors(precision, dual, out)[:n] for n, out in self.parts]
 
 
 def comparable(held_out: Tensor, measured: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.errors import FitError
-from swiftwrf.gp import Kernel, missed
+from swiftwrf.gp import Kernel, held_out_errors
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import Head, Table
 from swiftwrf.rssi.law import Law, harmonics, log_distance
@@ -161,5 +161,5 @@ class _Receiver:
         error = torch.empty_like(dual)
         for number in fold.unique():
             part = (fold == number).nonzero()[:, 0]
-            error[part] = missed(precision, dual, part)
+            error[part] = held_out_errors(precision, dual, part)
         return error
