@@ -189,6 +189,17 @@ def test_convolutions_over_few_pixels_are_matrix_products(size, stride):
     torch.testing.assert_close([actual, *wanted[0]], [expected, *wanted[1]])
 
 
+@pytest.mark.parametrize(("spectra", "batch", "sizes"), [(11, 64, [5, 5, 5]), (11, 4, [4, 4, 4]), (3, 64, [1, 1, 1])])
+def test_batches_are_at_most_half_of_what_trains(room, monkeypatch, spectra, batch, sizes):
+    network, seen, point = AANN(Settings(room.grid), AANNConfig(steps=3, batch=batch)), [], AANN._point
+    monkeypatch.setattr(
+        AANN, "_point", lambda self, prepared, *how: seen.append(prepared) or point(self, prepared, *how)
+    )
+    network.fit(Mixed.measured(room.subset(torch.arange(spectra))))
+    assert [len(rows) for rows in seen] == sizes
+    assert not torch.equal(seen[0], seen[1])
+
+
 def test_aann_is_seeded_and_leaves_the_global_generator_alone(room):
     state = torch.get_rng_state()
     estimates = []
