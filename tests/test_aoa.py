@@ -15,6 +15,7 @@ import torch
 import augment
 from augment import SYNTHESIZERS, Mixed, Synthesizer, Trial, choose, lacks, make_synthesizer
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, load, simulated_room
+from swiftwrf.angles import to_angles
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.store import Store
@@ -22,7 +23,7 @@ from tasks.aoa import arms, experiment, steps
 from tasks.aoa.advice import advise
 from tasks.aoa.config import AoaConfig
 from tasks.aoa.estimators import ESTIMATORS, Settings
-from tasks.aoa.estimators.aann import AANN, AANNConfig
+from tasks.aoa.estimators.aann import AANN, FEATURES, AANNConfig
 from tasks.aoa.estimators.baselines import Constant, NearestSpectrum, Peak
 from tasks.page.palette import Palette
 from tasks.report import merge
@@ -135,12 +136,12 @@ def test_kernel_ridge_regression_chooses_as_a_plain_grid_search_does(room):
     from sklearn.kernel_ridge import KernelRidge
     from sklearn.model_selection import GridSearchCV, KFold
 
-    from tasks.aoa.estimators.kernel_ridge import PENALTIES, WIDTHS, KernelRegression
+    from tasks.aoa.estimators.radial import PENALTIES, WIDTHS, choose
 
     generator = np.random.default_rng(0)
     feature, offset = generator.normal(size=(60, 21)), generator.normal(size=(60, 3))
     offset[:, 0] += feature[:, 0]
-    gamma, alpha = KernelRegression(Settings(room.grid, seed=3))._choose(feature, offset)
+    gamma, alpha = choose(feature, offset, seed=3)
     some = feature[:, ::7]
     apart = [7 * np.square(some[i] - some[j]).sum() for i in range(60) for j in range(60) if i != j]
     grid = {"gamma": [width / np.median(apart) for width in WIDTHS], "alpha": PENALTIES}
@@ -200,6 +201,19 @@ def test_batches_are_at_most_half_of_what_trains(room, monkeypatch, spectra, bat
     assert not torch.equal(seen[0], seen[1])
 
 
+def test_what_a_short_training_misses_is_learnt_from_its_features():
+    """On spectra that neither the head nor the regression has seen."""
+    room = simulated_room(n=300, grid=AngularGrid.hemisphere(10, 40))
+    train, test = room.split("random")
+    network = AANN(Settings(room.grid), AANNConfig(steps=10))
+    network.fit(Mixed.measured(train))
+    feature, pointed = network._seen(network._prepare(test.spectrum))
+    assert feature.shape == (len(test), FEATURES)
+    head = torch.stack(to_angles(torch.from_numpy(pointed)), dim=-1)
+    own, alone = (angle_errors(e, test.label)["great_circle"].median() for e in (network.estimate(test.spectrum), head))
+    assert own < 0.8 * alone
+
+
 def test_aann_is_seeded_and_leaves_the_global_generator_alone(room):
     state = torch.get_rng_state()
     estimates = []
@@ -241,10 +255,10 @@ def test_draws_train_only_where_they_are_better_than_means_beyond_doubt(room, ri
 def test_a_training_is_as_long_as_the_scene_needs():
     quick = [AANNConfig.quick(n) for n in (0, 240, 780, 1525, 100_000)]
     assert [(config.steps, config.batch) for config in quick] == [
-        (250, 64),
-        (250, 64),
-        (731, 64),
-        (1000, 64),
+        (125, 64),
+        (125, 64),
+        (366, 64),
+        (715, 64),
         (1000, 64),
     ]
 

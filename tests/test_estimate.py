@@ -52,16 +52,16 @@ def test_kernel_ridge_comes_back(small, tmp_path):
     assert float(apart.max()) < 1e-5
 
 
-def test_the_network_comes_back_in_half_precision(small, network):
+def test_the_network_comes_back_as_it_was(small, network):
     estimator, file = network
     again = load(file)
     assert again.settings.grid == GRID
     apart = angle_errors(again.estimate(small.spectrum), estimator.estimate(small.spectrum))["great_circle"]
-    assert float(apart.rad2deg().max()) < 0.5  # of bfloat16, in which it computes: 8 bits
+    assert float(apart.rad2deg().max()) < 1e-4  # it was rounded before its last step was found
     assert file.stat().st_size < 60e6
 
 
-@pytest.mark.parametrize("change", ["missing", "shape", "config", "grid"])
+@pytest.mark.parametrize("change", ["missing", "shape", "features", "config", "grid", "width"])
 def test_a_damaged_network_is_refused(network, tmp_path, change):
     kind, tensors, header = read(network[1], AANN.kind)
     match change:
@@ -69,6 +69,10 @@ def test_a_damaged_network_is_refused(network, tmp_path, change):
             del tensors["mean"]
         case "shape":
             tensors["network.fc.0.weight"] = torch.zeros(3, 3)
+        case "features":
+            tensors["known"] = tensors["known"][:, :100]
+        case "width":
+            header["gamma"] = -1.0
         case "config":
             header["config"]["layers"] = 3
         case "grid":
