@@ -61,7 +61,7 @@ def test_the_network_comes_back_as_it_was(small, network):
     assert file.stat().st_size < 60e6
 
 
-@pytest.mark.parametrize("change", ["missing", "shape", "features", "config", "grid", "width"])
+@pytest.mark.parametrize("change", ["missing", "shape", "features", "config", "grid", "width", "scale"])
 def test_a_damaged_network_is_refused(network, tmp_path, change):
     kind, tensors, header = read(network[1], AANN.kind)
     match change:
@@ -71,6 +71,8 @@ def test_a_damaged_network_is_refused(network, tmp_path, change):
             tensors["network.fc.0.weight"] = torch.zeros(3, 3)
         case "features":
             tensors["known"] = tensors["known"][:, :100]
+        case "scale":
+            tensors["scale"] = torch.zeros(2)
         case "width":
             header["gamma"] = -1.0
         case "config":

@@ -1,9 +1,10 @@
 """The angular neural network: ResNet-50 and a small head that points to the transmitter (paper, section 6; iArk 2020).
 
-The paper leaves head, loss and schedule open. Here the head gives a unit vector, so that azimuths of 359 and 1 degree are
-neighbours and the pole is no special place, as an offset from the mean training direction in units of the training
-labels' spread, so that training starts from the constant estimator. By how much a short training still misses is learnt from
-the backbone's features in closed form, by kernel ridge regression.
+The paper leaves head, loss and schedule open. Here the head that trains the network gives a unit vector, so that azimuths of
+359 and 1 degree are neighbours and the pole is no special place, as an offset from the mean training direction in units of
+the training labels' spread, so that training starts from the constant estimator. Then kernel ridge regression takes the
+head's place, from what the network sees in a spectrum and the spectrum itself: in closed form, where a short training leaves
+a head half-learnt.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import update_bn
 
 from augment import Mixed
+from swiftwrf import InputError
 from swiftwrf.angles import AngularGrid, to_angles, to_direction
 from swiftwrf.checkpoint import Header, expect
 from swiftwrf.data.spectra import coarsening
@@ -36,8 +38,9 @@ LOOKS = 30  # at each spectrum of a scene in a quick training; a training set wi
 MOST_STEPS = 1000  # of a quick training
 RISING = 0.11  # share of the steps over which the learning rate rises; at one in a whole number torch would divide by 0
 STATISTICS = 512  # spectra that the batch norms' statistics are taken from
-FEATURES = 2048  # of a spectrum behind the last convolution
-CHOSEN = 1000  # spectra that choose how the misses follow from them: fewer would choose too large a penalty
+FEATURES = 2048  # that the network sees in a spectrum, behind its last convolution
+AZIMUTHS = 60  # columns of the spectra that stand beside them
+CHOSEN = 1000  # spectra that choose width and penalty: fewer would choose too large a penalty
 
 
 @dataclass(frozen=True)
@@ -252,45 +255,51 @@ class AANN(SavedEstimator):
         some = torch.randperm(len(train), generator=self._generator)[:STATISTICS]
         with self._autocast:
             update_bn(spectrum[some].tensor_split(math.ceil(len(some) / 64)), network)  # each part counts alike
-        network.half().float().eval()  # as a file keeps it
+        network.eval()
+        with torch.no_grad():
+            for value in network.state_dict().values():
+                value.copy_(_as_kept(value))
         rows = torch.from_numpy(kept_rows(len(train), self.settings.seed))
-        feature, pointed = self._seen(spectrum[rows])
-        missed = direction[rows].double().cpu().numpy() - pointed
-        self._missed = RadialRegression.fit(feature, missed, CHOSEN, self.settings.seed)
+        seen = self._seen(spectrum[rows])
+        self._scale = torch.stack([(part - part.mean(dim=0)).square().sum(dim=1).mean().sqrt() for part in seen])
+        self._scale.clamp_min_(1e-6)
+        offset = (direction[rows] - self._mean).double().cpu().numpy()
+        self._offset = RadialRegression.fit(self._feature(seen), offset, CHOSEN, self.settings.seed)
 
     def _point(self, prepared: Tensor, network: nn.Module) -> Tensor:
         """Unit vectors (n, 3) of prepared spectra, as the head gives them."""
         with self._autocast:
-            return self._directed(network(prepared))
-
-    def _directed(self, offset: Tensor) -> Tensor:
-        """Unit vectors of what the head gives, (n, 3)."""
+            offset = network(prepared)
         return functional.normalize(self._mean + self._spread * offset.float(), dim=1)
 
     @torch.no_grad()
-    def _seen(self, prepared: Tensor) -> tuple[NDArray[Any], NDArray[Any]]:
-        """The features (n, 2048) of prepared spectra, and the unit vectors (n, 3) that the head makes of them."""
-        *backbone, head = self._network.children()
-        features, vectors = [], []
-        for part in prepared.split(64):
-            with self._autocast:
-                feature = nn.Sequential(*backbone)(part).flatten(1)
-                vectors.append(self._directed(head(feature)))
-            features.append(feature.half())  # as a file keeps them, too
-        return torch.cat(features).double().cpu().numpy(), torch.cat(vectors).double().cpu().numpy()
+    def _seen(self, prepared: Tensor) -> tuple[Tensor, Tensor]:
+        """What the network sees in prepared spectra, (n, 2048), and their own coarse pixels, (n, p), on the CPU."""
+        backbone = nn.Sequential(*list(self._network.children())[:-1])
+        with self._autocast:
+            seen = torch.cat([backbone(part).flatten(1).float() for part in prepared.split(64)])
+        pixels = functional.avg_pool2d(prepared, coarsening(prepared.shape[2:], AZIMUTHS)).flatten(1)
+        return seen.cpu(), pixels.float().cpu()
+
+    def _feature(self, seen: tuple[Tensor, Tensor]) -> NDArray[Any]:
+        """Both, each in units of its spread over the training spectra, (n, 2048 + p), with the digits that a file keeps."""
+        scaled = torch.cat([part / scale for part, scale in zip(seen, self._scale, strict=True)], dim=1)
+        rounded: NDArray[Any] = _as_kept(scaled).double().numpy()
+        return rounded
 
     def estimate(self, spectrum: Tensor) -> Tensor:
-        feature, pointed = self._seen(self._prepare(spectrum))
-        return torch.stack(to_angles(torch.from_numpy(pointed + self._missed(feature))), dim=-1)
+        offset = torch.from_numpy(self._offset(self._feature(self._seen(self._prepare(spectrum)))))
+        return torch.stack(to_angles(self._mean.double().cpu() + offset), dim=-1)
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """Weights and features in half precision, to which `fit` has rounded them."""
         weights = {f"network.{name}": value for name, value in self._network.state_dict().items()}
-        missed, header = self._missed.state()
-        own = weights | {"known": missed.pop("known")}
-        halved = {name: value.half() if value.is_floating_point() else value for name, value in own.items()}
+        offset, header = self._offset.state()
+        own = weights | {"known": offset.pop("known")}
+        halved = {name: _as_kept(value) for name, value in own.items()}
+        exact = {"mean": self._mean, "scale": self._scale}
         header |= {"config": asdict(self._config), "grid": asdict(self.settings.grid)}
-        return {**halved, **missed, "mean": self._mean, "spread": self._spread}, header
+        return halved | offset | exact, header
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> AANN:
@@ -298,15 +307,27 @@ class AANN(SavedEstimator):
         weights = own._network.state_dict()
         expect(
             tensors,
-            {**{f"network.{name}": tuple(value.shape) for name, value in weights.items()}, "mean": (3,), "spread": ()},
+            {
+                **{f"network.{name}": tuple(value.shape) for name, value in weights.items()},
+                "mean": (3,),
+                "scale": (2,),
+            },
         )
         own._network.load_state_dict(
             {name: tensors[f"network.{name}"].to(value.dtype) for name, value in weights.items()}
         )
         own._network.eval()
-        own._missed = RadialRegression.from_state(tensors, header, FEATURES, 3)
-        own._mean, own._spread = tensors["mean"], tensors["spread"]
+        own._mean, own._scale = tensors["mean"], tensors["scale"]
+        if not bool((own._scale > 0).all()):
+            raise InputError(f"scales must be positive, got {own._scale.tolist()}")
+        pixels = own._seen(own._prepare(torch.zeros(1, *own.settings.grid.shape)))[1].shape[1]
+        own._offset = RadialRegression.from_state(tensors, header, FEATURES + pixels, 3)
         return own
+
+
+def _as_kept(value: Tensor) -> Tensor:
+    """With the digits of a file: half of them, but for whole numbers."""
+    return value.half() if value.is_floating_point() else value
 
 
 def _gains_from_bfloat16(device: torch.device) -> bool:
