@@ -214,6 +214,19 @@ def test_regression_takes_the_place_of_the_head_that_a_short_training_leaves():
     assert own < 0.5 * alone
 
 
+@pytest.mark.parametrize("value", [0.0, 0.5])
+def test_spectra_that_are_all_alike_are_in_the_mean_direction(value):
+    label = torch.tensor([[0.0, 30], [90, 30]]).deg2rad().repeat(6, 1).double()
+    alike = torch.full((12, 8, 32), value)
+    settings = Settings(AngularGrid.hemisphere(8, 32))
+    network, constant = AANN(settings, AANNConfig(steps=2, batch=4)), Constant(settings)
+    estimates = []
+    for estimator in (network, constant):
+        estimator.fit(Mixed((Store(alike),), label, torch.arange(12), torch.zeros(12).bool()))
+        estimates.append(estimator.estimate(alike[:1]))
+    torch.testing.assert_close(*estimates, atol=0.05, rtol=0)
+
+
 def test_aann_is_seeded_and_leaves_the_global_generator_alone(room):
     state = torch.get_rng_state()
     estimates = []

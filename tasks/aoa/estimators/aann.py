@@ -39,6 +39,7 @@ MOST_STEPS = 1000  # of a quick training
 RISING = 0.11  # share of the steps over which the learning rate rises; at one in a whole number torch would divide by 0
 STATISTICS = 512  # spectra that the batch norms' statistics are taken from
 FEATURES = 2048  # that the network sees in a spectrum, behind its last convolution
+LOUDEST = 1e4  # feature that is believed; others are a thousandth of that
 AZIMUTHS = 60  # columns of the spectra that stand beside them
 CHOSEN = 1000  # spectra that choose width and penalty: fewer would choose too large a penalty
 
@@ -260,10 +261,13 @@ class AANN(SavedEstimator):
             for value in network.state_dict().values():
                 value.copy_(_as_kept(value))
         rows = torch.from_numpy(kept_rows(len(train), self.settings.seed))
-        seen = self._seen(spectrum[rows])
-        self._scale = torch.stack([(part - part.mean(dim=0)).square().sum(dim=1).mean().sqrt() for part in seen])
-        self._scale.clamp_min_(1e-6)
-        offset = (direction[rows] - self._mean).double().cpu().numpy()
+        self._replace_head(spectrum[rows], direction[rows])
+
+    def _replace_head(self, prepared: Tensor, direction: Tensor) -> None:
+        """From now on regression tells directions (n, 3) as it does of these."""
+        seen = self._seen(prepared)
+        self._scale = torch.stack([_spread(part) for part in seen])
+        offset = (direction - self._mean).double().cpu().numpy()
         self._offset = RadialRegression.fit(self._feature(seen), offset, CHOSEN, self.settings.seed)
 
     def _point(self, prepared: Tensor, network: nn.Module) -> Tensor:
@@ -279,7 +283,8 @@ class AANN(SavedEstimator):
         with self._autocast:
             seen = torch.cat([backbone(part).flatten(1).float() for part in prepared.split(64)])
         pixels = functional.avg_pool2d(prepared, coarsening(prepared.shape[2:], AZIMUTHS)).flatten(1)
-        return seen.cpu(), pixels.float().cpu()
+        # where all spectra are alike, batch norms have nothing to divide by and blow up rounding
+        return torch.nan_to_num(seen).clamp(max=LOUDEST).cpu(), pixels.float().cpu()
 
     def _feature(self, seen: tuple[Tensor, Tensor]) -> NDArray[Any]:
         """Both, each in units of its spread over the training spectra, (n, 2048 + p), with the digits that a file keeps."""
@@ -323,6 +328,12 @@ class AANN(SavedEstimator):
         pixels = own._seen(own._prepare(torch.zeros(1, *own.settings.grid.shape)))[1].shape[1]
         own._offset = RadialRegression.from_state(tensors, header, FEATURES + pixels, 3)
         return own
+
+
+def _spread(rows: Tensor) -> Tensor:
+    """Root mean square distance of rows (n, p) from their mean, or a thousandth of that from 0 where they are alike."""
+    apart, size = ((rows - origin).square().sum(dim=1).mean().sqrt() for origin in (rows.mean(dim=0), 0))
+    return torch.maximum(apart, 1e-3 * size).clamp_min(1e-6)
 
 
 def _as_kept(value: Tensor) -> Tensor:
