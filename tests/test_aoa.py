@@ -110,9 +110,9 @@ def test_every_spectrum_counts_alike_in_the_batch_norms():
 
 
 def test_circular_padding_makes_rolled_spectra_alike():
-    from tasks.aoa.estimators.aann import _CircularConv
+    from tasks.aoa.estimators.resnet import CircularConv
 
-    convolution = _CircularConv(torch.nn.Conv2d(1, 3, 5, padding=2))
+    convolution = CircularConv(torch.nn.Conv2d(1, 3, 5, padding=2))
     x = torch.rand(1, 1, 9, 12)
     torch.testing.assert_close(convolution(x).roll(4, dims=-1), convolution(x.roll(4, dims=-1)))
 
@@ -155,20 +155,20 @@ def test_kernel_ridge_regression_chooses_as_a_plain_grid_search_does(room):
 @pytest.mark.parametrize("circular", [False, True])
 def test_pointwise_convolutions_are_matrix_products(circular):
     """The same function with the same weights, in value and gradient."""
-    from tasks.aoa.estimators.aann import _backbone, _Pointwise
+    from tasks.aoa.estimators.resnet import Pointwise, backbone
 
     spectrum = torch.rand(4, 1, 9, 40, dtype=torch.float64)
     found = {}
     for products in (False, True):
         torch.manual_seed(0)
-        network = _backbone(circular, products).double()
+        network = backbone(circular, products).double()
         torch.nn.init.normal_(network.fc[2].weight)
         x = spectrum.clone().requires_grad_()
         value = network(x)
         gradient = torch.autograd.grad(value.square().sum(), [x, *network.parameters()])
         found[products] = network, value, gradient
     (definition, *expected), (network, *actual) = found[False], found[True]
-    assert sum(isinstance(m, _Pointwise) for m in network.modules()) == 36
+    assert sum(isinstance(m, Pointwise) for m in network.modules()) == 36
     torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-7)
     assert list(network.state_dict()) == list(definition.state_dict())
 
@@ -177,10 +177,10 @@ def test_pointwise_convolutions_are_matrix_products(circular):
 @pytest.mark.parametrize("size", [(1, 1), (1, 4), (2, 2), (2, 8), (3, 5), (4, 1)])
 def test_convolutions_over_few_pixels_are_matrix_products(size, stride):
     """The convolution, in value and gradient, whatever rows of the kernel meet nothing but padding."""
-    from tasks.aoa.estimators.aann import _Neighbours
+    from tasks.aoa.estimators.resnet import Neighbours
 
     definition = torch.nn.Conv2d(64, 64, 3, stride, padding=1, bias=False).double()
-    product = _Neighbours(definition)
+    product = Neighbours(definition)
     x = torch.rand(2, 64, *size, dtype=torch.float64, requires_grad=True)
     with mock.patch.object(torch.nn.functional, "conv2d") as convolution:
         actual = product(x)

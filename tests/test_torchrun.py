@@ -63,8 +63,8 @@ def learnt(group=None):
     room = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
     records = []
     model = fit(room, replace(CONFIG, batch=7), progress=False, on_record=records.append, group=group)
-    backbone = aann._backbone
-    with mock.patch.object(aann, "_backbone", lambda *how: backbone(*how).double()):
+    backbone = aann.backbone
+    with mock.patch.object(aann, "backbone", lambda *how: backbone(*how).double()):
         network = AANN(Settings(room.grid, group=group), AANNConfig(steps=2, batch=5))
     network.fit(Mixed.measured(replace(room, store=Store(room.spectrum.double()))))
     estimate = network.estimate(room.spectrum.double())

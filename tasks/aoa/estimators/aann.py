@@ -9,14 +9,12 @@ a head half-learnt.
 
 from __future__ import annotations
 
-import copy
 import math
 import time
 from dataclasses import asdict, dataclass
-from typing import Any, cast
+from typing import Any
 
 import torch
-import torchvision
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
@@ -32,13 +30,13 @@ from swiftwrf.processes import Processes
 from swiftwrf.progress import progress
 from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator, Settings
 from tasks.aoa.estimators.radial import RadialRegression, kept_rows
+from tasks.aoa.estimators.resnet import FEATURES, backbone, shared_by
 
 LEAST_ROWS = 8  # a prime number of rows can only be averaged to one, which leaves nothing to learn from
 LOOKS = 30  # at each spectrum of a scene in a quick training; a training set with synthetic spectra gets several times fewer
 MOST_STEPS = 1000  # of a quick training
 RISING = 0.11  # share of the steps over which the learning rate rises; at one in a whole number torch would divide by 0
 STATISTICS = 512  # spectra that the batch norms' statistics are taken from
-FEATURES = 2048  # that the network sees in a spectrum, behind its last convolution
 LOUDEST = 1e4  # feature that is believed; others are a thousandth of that
 AZIMUTHS = 60  # columns of the spectra that stand beside them
 CHOSEN = 1000  # spectra that choose width and penalty: fewer would choose too large a penalty
@@ -71,120 +69,6 @@ class AANNConfig:
         return cls(steps=6000, batch=16, rate=1e-3, max_azimuths=0)
 
 
-class _CircularConv(nn.Module):
-    """A convolution that wraps around in azimuth and pads with zeros in elevation."""
-
-    def __init__(self, inner: nn.Conv2d) -> None:
-        super().__init__()
-        self.columns = inner.kernel_size[1] // 2
-        inner.padding = (inner.kernel_size[0] // 2, 0)
-        self.inner = inner
-
-    def forward(self, x: Tensor) -> Tensor:
-        wrapped = functional.pad(x, (self.columns, self.columns, 0, 0), mode="circular")
-        return cast(Tensor, self.inner(wrapped))
-
-
-class _Pointwise(nn.Module):
-    """A convolution of 1 x 1 as the matrix product that it is, over channels that lie side by side."""
-
-    def __init__(self, inner: nn.Conv2d) -> None:
-        super().__init__()
-        self.weight, self.stride = inner.weight, inner.stride
-
-    def forward(self, x: Tensor) -> Tensor:
-        rows, columns = self.stride
-        pixels = x[:, :, ::rows, ::columns].permute(0, 2, 3, 1)
-        return functional.linear(pixels, self.weight.flatten(1)).permute(0, 3, 1, 2)
-
-
-class _Neighbours(nn.Module):
-    """A convolution that is a matrix product over the neighbours of each pixel where pixels are few, as in the last layers.
-
-    A convolution rearranges its weights for every batch, which there takes longer than to apply them.
-    """
-
-    def __init__(self, inner: nn.Conv2d) -> None:
-        super().__init__()
-        self.weight = inner.weight
-        self.size, self.stride, self.around = inner.kernel_size[0], inner.stride[0], int(inner.padding[0])
-
-    def forward(self, x: Tensor) -> Tensor:
-        size, stride, around = self.size, self.stride, self.around
-        height, width = ((pixels + 2 * around - size) // stride + 1 for pixels in x.shape[2:])
-        if len(x) * height * width > len(self.weight):
-            return functional.conv2d(x, self.weight, stride=stride, padding=around)
-        # rows of the kernel that meet the image, not its padding alone
-        first, end = max(0, around - stride * (height - 1)), min(size, x.shape[2] + around)
-        padded = functional.pad(x.permute(0, 2, 3, 1), (0, 0, around, around, around, around))
-        down, across = stride * (height - 1) + 1, stride * (width - 1) + 1
-        neighbours = [
-            padded[:, row : row + down : stride, column : column + across : stride]
-            for row in range(first, end)
-            for column in range(size)
-        ]
-        weight = self.weight.permute(0, 2, 3, 1)[:, first:end].flatten(1)
-        return functional.linear(torch.cat(neighbours, dim=-1), weight).permute(0, 3, 1, 2)
-
-
-class _SharedNorm(nn.BatchNorm2d):
-    """What `nn.SyncBatchNorm` is on GPUs, for CPUs, where torch has none: statistics of the batch of all processes."""
-
-    def __init__(self, inner: nn.BatchNorm2d, processes: Processes) -> None:
-        super().__init__(inner.num_features, eps=inner.eps)
-        self.load_state_dict(inner.state_dict())
-        self.processes = processes
-
-    def forward(self, x: Tensor) -> Tensor:
-        wide, pixels = x.to(torch.promote_types(x.dtype, torch.float32)), (0, 2, 3)
-        rows = self.processes.total(wide.new_tensor(len(x)))
-        n = rows * x.shape[2] * x.shape[3]
-        mean = self.processes.total(wide.sum(pixels)) / n
-        centred = wide - mean[:, None, None]
-        variance = self.processes.total(centred.square().sum(pixels)) / n
-        scale = self.weight * (variance + self.eps).rsqrt()
-        return (centred * scale[:, None, None] + self.bias[:, None, None]).to(x.dtype)
-
-
-def _shared(network: nn.Module, processes: Processes) -> nn.Module:
-    """A copy to be trained by several processes, whose batch norms see the whole batch."""
-    copied = copy.deepcopy(network)
-    if next(copied.parameters()).is_cuda:
-        copied = nn.SyncBatchNorm.convert_sync_batchnorm(copied, processes.group)
-    else:
-        for module in list(copied.modules()):
-            for name, child in module.named_children():
-                if isinstance(child, nn.BatchNorm2d):
-                    setattr(module, name, _SharedNorm(child, processes))
-    return DistributedDataParallel(copied, process_group=processes.group)
-
-
-def _backbone(circular: bool, products: bool) -> nn.Module:
-    """ResNet-50 with one input channel and the head.
-
-    Args:
-        circular: pads the azimuth circularly.
-        products: computes its pointwise convolutions, two thirds of all, as matrix products, and those over few pixels.
-    """
-    network: nn.Module = torchvision.models.resnet50(weights=None)
-    network.conv1 = nn.Conv2d(1, 64, kernel_size=7, stride=2, padding=3, bias=False)
-    last = nn.Linear(256, 3)
-    network.fc = nn.Sequential(nn.Linear(FEATURES, 256), nn.ReLU(), last)
-    nn.init.zeros_(last.weight)
-    nn.init.zeros_(last.bias)
-    for module in list(network.modules()):
-        for name, child in module.named_children():
-            if not isinstance(child, nn.Conv2d):
-                continue
-            if products and child.kernel_size == (1, 1):
-                setattr(module, name, _Pointwise(child))
-            elif circular and child.padding != (0, 0):
-                setattr(module, name, _CircularConv(child))
-            elif products:
-                setattr(module, name, _Neighbours(child))
-    return network
-
-
 @ESTIMATORS.register("aann", meaning="the angular neural network, trained in every arm that is no baseline")
 class AANN(SavedEstimator):
     """ResNet-50 with one input channel and an MLP head, from a seeded start; weights are not downloaded.
@@ -208,7 +92,7 @@ class AANN(SavedEstimator):
         self._config, self._device = config, device
         with torch.random.fork_rng(devices=[]):  # torchvision draws its weights from the global generator
             torch.manual_seed(seed)
-            network = _backbone(config.circular, device.type == "cpu")
+            network = backbone(config.circular, device.type == "cpu")
         self._network = network.to(device).to(memory_format=torch.channels_last)
         self._generator = torch.Generator().manual_seed(seed)
         self._autocast = torch.autocast(device.type, torch.bfloat16, enabled=bfloat16)
@@ -220,7 +104,7 @@ class AANN(SavedEstimator):
 
     def fit(self, train: Mixed) -> None:
         config, processes = self._config, Processes(self.settings.group)
-        network = self._network if processes.group is None else _shared(self._network, processes)
+        network = self._network if processes.group is None else shared_by(self._network, processes)
         size = min(config.batch, max(len(train) // 2, 1))
         weight = processes.weight(size)
         spectrum = torch.cat([self._prepare(part) for part in train.batches()])
@@ -279,9 +163,9 @@ class AANN(SavedEstimator):
     @torch.no_grad()
     def _seen(self, prepared: Tensor) -> tuple[Tensor, Tensor]:
         """What the network sees in prepared spectra, (n, 2048), and their own coarse pixels, (n, p), on the CPU."""
-        backbone = nn.Sequential(*list(self._network.children())[:-1])
+        without_head = nn.Sequential(*list(self._network.children())[:-1])
         with self._autocast:
-            seen = torch.cat([backbone(part).flatten(1).float() for part in prepared.split(64)])
+            seen = torch.cat([without_head(part).flatten(1).float() for part in prepared.split(64)])
         pixels = functional.avg_pool2d(prepared, coarsening(prepared.shape[2:], AZIMUTHS)).flatten(1)
         # where all spectra are alike, batch norms have nothing to divide by and blow up rounding
         return torch.nan_to_num(seen).clamp(max=LOUDEST).cpu(), pixels.float().cpu()

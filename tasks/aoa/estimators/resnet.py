@@ -1,0 +1,130 @@
+"""ResNet-50 for spectra: one input channel, a small head, and what makes it fast on CPUs and shared by several processes."""
+
+from __future__ import annotations
+
+import copy
+from typing import cast
+
+import torch
+import torchvision
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.nn.parallel import DistributedDataParallel
+
+from swiftwrf.processes import Processes
+
+FEATURES = 2048  # that the network sees in a spectrum, behind its last convolution
+
+
+class CircularConv(nn.Module):
+    """A convolution that wraps around in azimuth and pads with zeros in elevation."""
+
+    def __init__(self, inner: nn.Conv2d) -> None:
+        super().__init__()
+        self.columns = inner.kernel_size[1] // 2
+        inner.padding = (inner.kernel_size[0] // 2, 0)
+        self.inner = inner
+
+    def forward(self, x: Tensor) -> Tensor:
+        wrapped = functional.pad(x, (self.columns, self.columns, 0, 0), mode="circular")
+        return cast(Tensor, self.inner(wrapped))
+
+
+class Pointwise(nn.Module):
+    """A convolution of 1 x 1 as the matrix product that it is, over channels that lie side by side."""
+
+    def __init__(self, inner: nn.Conv2d) -> None:
+        super().__init__()
+        self.weight, self.stride = inner.weight, inner.stride
+
+    def forward(self, x: Tensor) -> Tensor:
+        rows, columns = self.stride
+        pixels = x[:, :, ::rows, ::columns].permute(0, 2, 3, 1)
+        return functional.linear(pixels, self.weight.flatten(1)).permute(0, 3, 1, 2)
+
+
+class Neighbours(nn.Module):
+    """A convolution that is a matrix product over the neighbours of each pixel where pixels are few, as in the last layers.
+
+    A convolution rearranges its weights for every batch, which there takes longer than to apply them.
+    """
+
+    def __init__(self, inner: nn.Conv2d) -> None:
+        super().__init__()
+        self.weight = inner.weight
+        self.size, self.stride, self.around = inner.kernel_size[0], inner.stride[0], int(inner.padding[0])
+
+    def forward(self, x: Tensor) -> Tensor:
+        size, stride, around = self.size, self.stride, self.around
+        height, width = ((pixels + 2 * around - size) // stride + 1 for pixels in x.shape[2:])
+        if len(x) * height * width > len(self.weight):
+            return functional.conv2d(x, self.weight, stride=stride, padding=around)
+        # rows of the kernel that meet the image, not its padding alone
+        first, end = max(0, around - stride * (height - 1)), min(size, x.shape[2] + around)
+        padded = functional.pad(x.permute(0, 2, 3, 1), (0, 0, around, around, around, around))
+        down, across = stride * (height - 1) + 1, stride * (width - 1) + 1
+        neighbours = [
+            padded[:, row : row + down : stride, column : column + across : stride]
+            for row in range(first, end)
+            for column in range(size)
+        ]
+        weight = self.weight.permute(0, 2, 3, 1)[:, first:end].flatten(1)
+        return functional.linear(torch.cat(neighbours, dim=-1), weight).permute(0, 3, 1, 2)
+
+
+class SharedNorm(nn.BatchNorm2d):
+    """What `nn.SyncBatchNorm` is on GPUs, for CPUs, where torch has none: statistics of the batch of all processes."""
+
+    def __init__(self, inner: nn.BatchNorm2d, processes: Processes) -> None:
+        super().__init__(inner.num_features, eps=inner.eps)
+        self.load_state_dict(inner.state_dict())
+        self.processes = processes
+
+    def forward(self, x: Tensor) -> Tensor:
+        wide, pixels = x.to(torch.promote_types(x.dtype, torch.float32)), (0, 2, 3)
+        rows = self.processes.total(wide.new_tensor(len(x)))
+        n = rows * x.shape[2] * x.shape[3]
+        mean = self.processes.total(wide.sum(pixels)) / n
+        centred = wide - mean[:, None, None]
+        variance = self.processes.total(centred.square().sum(pixels)) / n
+        scale = self.weight * (variance + self.eps).rsqrt()
+        return (centred * scale[:, None, None] + self.bias[:, None, None]).to(x.dtype)
+
+
+def shared_by(network: nn.Module, processes: Processes) -> nn.Module:
+    """A copy to be trained by several processes, whose batch norms see the whole batch."""
+    copied = copy.deepcopy(network)
+    if next(copied.parameters()).is_cuda:
+        copied = nn.SyncBatchNorm.convert_sync_batchnorm(copied, processes.group)
+    else:
+        for module in list(copied.modules()):
+            for name, child in module.named_children():
+                if isinstance(child, nn.BatchNorm2d):
+                    setattr(module, name, SharedNorm(child, processes))
+    return DistributedDataParallel(copied, process_group=processes.group)
+
+
+def backbone(circular: bool, products: bool) -> nn.Module:
+    """ResNet-50 with one input channel and the head.
+
+    Args:
+        circular: pads the azimuth circularly.
+        products: computes its pointwise convolutions, two thirds of all, as matrix products, and those over few pixels.
+    """
+    network: nn.Module = torchvision.models.resnet50(weights=None)
+    network.conv1 = nn.Conv2d(1, 64, kernel_size=7, stride=2, padding=3, bias=False)
+    last = nn.Linear(256, 3)
+    network.fc = nn.Sequential(nn.Linear(FEATURES, 256), nn.ReLU(), last)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    for module in list(network.modules()):
+        for name, child in module.named_children():
+            if not isinstance(child, nn.Conv2d):
+                continue
+            if products and child.kernel_size == (1, 1):
+                setattr(module, name, Pointwise(child))
+            elif circular and child.padding != (0, 0):
+                setattr(module, name, CircularConv(child))
+            elif products:
+                setattr(module, name, Neighbours(child))
+    return network
