@@ -29,7 +29,7 @@ from swiftwrf.data.spectra import coarsening
 from swiftwrf.processes import Processes
 from swiftwrf.progress import progress
 from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator, Settings
-from tasks.aoa.estimators.radial import RadialRegression, kept_rows
+from tasks.aoa.estimators.radial import RadialRegression, coarse_pixels, kept_rows
 from tasks.aoa.estimators.resnet import FEATURES, backbone, shared_by
 
 LEAST_ROWS = 8  # a prime number of rows can only be averaged to one, which leaves nothing to learn from
@@ -38,7 +38,6 @@ MOST_STEPS = 1000  # of a quick training
 RISING = 0.11  # share of the steps over which the learning rate rises; at one in a whole number torch would divide by 0
 STATISTICS = 512  # spectra that the batch norms' statistics are taken from
 LOUDEST = 1e4  # feature that is believed; others are a thousandth of that
-AZIMUTHS = 60  # columns of the spectra that stand beside them
 CHOSEN = 1000  # spectra that choose width and penalty: fewer would choose too large a penalty
 
 
@@ -150,7 +149,7 @@ class AANN(SavedEstimator):
     def _replace_head(self, prepared: Tensor, direction: Tensor) -> None:
         """From now on regression tells directions (n, 3) as it does of these."""
         seen = self._seen(prepared)
-        self._scale = torch.stack([_spread(part) for part in seen])
+        self._scale = torch.stack([_scale_of(part) for part in seen])
         offset = (direction - self._mean).double().cpu().numpy()
         self._offset = RadialRegression.fit(self._feature(seen), offset, CHOSEN, self.settings.seed)
 
@@ -166,9 +165,8 @@ class AANN(SavedEstimator):
         without_head = nn.Sequential(*list(self._network.children())[:-1])
         with self._autocast:
             seen = torch.cat([without_head(part).flatten(1).float() for part in prepared.split(64)])
-        pixels = functional.avg_pool2d(prepared, coarsening(prepared.shape[2:], AZIMUTHS)).flatten(1)
         # where all spectra are alike, batch norms have nothing to divide by and blow up rounding
-        return torch.nan_to_num(seen).clamp(max=LOUDEST).cpu(), pixels.float().cpu()
+        return torch.nan_to_num(seen).clamp(max=LOUDEST).cpu(), coarse_pixels(prepared[:, 0]).float().cpu()
 
     def _feature(self, seen: tuple[Tensor, Tensor]) -> NDArray[Any]:
         """Both, each in units of its spread over the training spectra, (n, 2048 + p), with the digits that a file keeps."""
@@ -209,12 +207,12 @@ class AANN(SavedEstimator):
         own._mean, own._scale = tensors["mean"], tensors["scale"]
         if not bool((own._scale > 0).all()):
             raise InputError(f"scales must be positive, got {own._scale.tolist()}")
-        pixels = own._seen(own._prepare(torch.zeros(1, *own.settings.grid.shape)))[1].shape[1]
+        pixels = coarse_pixels(own._prepare(torch.zeros(1, *own.settings.grid.shape))[:, 0]).shape[1]
         own._offset = RadialRegression.from_state(tensors, header, FEATURES + pixels, 3)
         return own
 
 
-def _spread(rows: Tensor) -> Tensor:
+def _scale_of(rows: Tensor) -> Tensor:
     """Root mean square distance of rows (n, p) from their mean, or a thousandth of that from 0 where they are alike."""
     apart, size = ((rows - origin).square().sum(dim=1).mean().sqrt() for origin in (rows.mean(dim=0), 0))
     return torch.maximum(apart, 1e-3 * size).clamp_min(1e-6)

@@ -9,14 +9,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional
 
 from augment import Mixed
 from swiftwrf.angles import AngularGrid, to_angles, to_direction
 from swiftwrf.checkpoint import Header, expect
-from swiftwrf.data.spectra import coarsening
 from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator, Settings
-from tasks.aoa.estimators.radial import RadialRegression, kept_rows
+from tasks.aoa.estimators.radial import RadialRegression, coarse_pixels, kept_rows
 
 
 @ESTIMATORS.register(
@@ -26,7 +24,6 @@ class KernelRegression(SavedEstimator):
     """Kernel ridge regression from coarse spectra to unit vectors: strong where spectra are few."""
 
     kind = "kernel ridge regression"
-    AZIMUTHS = 60  # the array's beams are wider than these columns
     CHOSEN = 400  # spectra that choose width and penalty
 
     def fit(self, train: Mixed) -> None:
@@ -55,6 +52,5 @@ class KernelRegression(SavedEstimator):
         return own
 
     def _feature(self, spectrum: Tensor) -> NDArray[Any]:
-        factor = coarsening(spectrum.shape[1:], self.AZIMUTHS)
-        coarse: NDArray[Any] = functional.avg_pool2d(spectrum[:, None], factor).flatten(1).double().numpy()
+        coarse: NDArray[Any] = coarse_pixels(spectrum).double().numpy()
         return coarse

@@ -15,18 +15,26 @@ from sklearn.metrics.pairwise import euclidean_distances, rbf_kernel
 from sklearn.model_selection import KFold
 from threadpoolctl import threadpool_limits
 from torch import Tensor
+from torch.nn import functional
 
 from swiftwrf import InputError
 from swiftwrf.checkpoint import Header, expect
+from swiftwrf.data.spectra import coarsening
 
 WIDTHS = (0.1, 0.3, 1.0, 3.0)  # of the kernel, as gamma times the median squared distance
 PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 KEPT_ROWS = 4000  # its cost grows with their cube
+AZIMUTHS = 60  # an array's beams are wider than these columns
 
 
 def kept_rows(n: int, seed: int) -> NDArray[np.int64]:
     """The rows of so many that a regression is fitted to, in the order in which it looks at them."""
     return np.random.default_rng(seed).permutation(n)[:KEPT_ROWS]
+
+
+def coarse_pixels(spectrum: Tensor) -> Tensor:
+    """Of spectra (n, H, W), as features (n, p) of them."""
+    return functional.avg_pool2d(spectrum[:, None], coarsening(spectrum.shape[1:], AZIMUTHS)).flatten(1)
 
 
 @dataclass(frozen=True, eq=False)
