@@ -66,7 +66,7 @@ def test_a_damaged_network_is_refused(network, tmp_path, change):
     kind, tensors, header = read(network[1], AANN.kind)
     match change:
         case "missing":
-            del tensors["mean"]
+            del tensors["says"]
         case "shape":
             tensors["network.fc.0.weight"] = torch.zeros(3, 3)
         case "features":

@@ -4,7 +4,8 @@ The paper leaves head, loss and schedule open. Here the head that trains the net
 359 and 1 degree are neighbours and the pole is no special place, as an offset from the mean training direction in units of
 the training labels' spread, so that training starts from the constant estimator. Then kernel ridge regression takes the
 head's place, from what the network sees in a spectrum and the spectrum itself: in closed form, where a short training leaves
-a head half-learnt.
+a head half-learnt. What the network sees was fitted to the labels of its training spectra: it tells more between two of
+these than between one of them and a new one, the more so the fewer they are, and counts the less for it.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ MOST_STEPS = 1000  # of a quick training
 RISING = 0.11  # share of the steps over which the learning rate rises; at one in a whole number torch would divide by 0
 STATISTICS = 512  # spectra that the batch norms' statistics are taken from
 LOUDEST = 1e4  # feature that is believed; others are a thousandth of that
-CHOSEN = 1000  # spectra that choose width and penalty: fewer would choose too large a penalty
+TRUSTED = 1000  # spectra after which what the network sees in one counts half as much as the spectrum itself
 
 
 @dataclass(frozen=True)
@@ -144,14 +145,15 @@ class AANN(SavedEstimator):
             for value in network.state_dict().values():
                 value.copy_(_as_kept(value))
         rows = torch.from_numpy(kept_rows(len(train), self.settings.seed))
-        self._replace_head(spectrum[rows], direction[rows])
+        self._replace_head(spectrum[rows], direction[rows], 1 / (1 + TRUSTED / len(train)))
 
-    def _replace_head(self, prepared: Tensor, direction: Tensor) -> None:
-        """From now on regression tells directions (n, 3) as it does of these."""
+    def _replace_head(self, prepared: Tensor, direction: Tensor, trust: float) -> None:
+        """From now on regression tells directions (n, 3) as it does of these; trust: in squared distances of features."""
         seen = self._seen(prepared)
         self._scale = torch.stack([_scale_of(part) for part in seen])
-        offset = (direction - self._mean).double().cpu().numpy()
-        self._offset = RadialRegression.fit(self._feature(seen), offset, CHOSEN, self.settings.seed)
+        self._scale[0] /= math.sqrt(trust)
+        known = direction.double().cpu().numpy()
+        self._direction = RadialRegression.fit(self._feature(seen), known, self.settings.seed)
 
     def _point(self, prepared: Tensor, network: nn.Module) -> Tensor:
         """Unit vectors (n, 3) of prepared spectra, as the head gives them."""
@@ -169,46 +171,38 @@ class AANN(SavedEstimator):
         return torch.nan_to_num(seen).clamp(max=LOUDEST).cpu(), coarse_pixels(prepared[:, 0]).float().cpu()
 
     def _feature(self, seen: tuple[Tensor, Tensor]) -> NDArray[Any]:
-        """Both, each in units of its spread over the training spectra, (n, 2048 + p), with the digits that a file keeps."""
+        """Both, in units of their spreads or wider ones, (n, 2048 + p), with the digits that a file keeps."""
         scaled = torch.cat([part / scale for part, scale in zip(seen, self._scale, strict=True)], dim=1)
         rounded: NDArray[Any] = _as_kept(scaled).double().numpy()
         return rounded
 
     def estimate(self, spectrum: Tensor) -> Tensor:
-        offset = torch.from_numpy(self._offset(self._feature(self._seen(self._prepare(spectrum)))))
-        return torch.stack(to_angles(self._mean.double().cpu() + offset), dim=-1)
+        direction = torch.from_numpy(self._direction(self._feature(self._seen(self._prepare(spectrum)))))
+        return torch.stack(to_angles(direction), dim=-1)
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """Weights and features in half precision, to which `fit` has rounded them."""
         weights = {f"network.{name}": value for name, value in self._network.state_dict().items()}
-        offset, header = self._offset.state()
-        own = weights | {"known": offset.pop("known")}
+        regression, header = self._direction.state()
+        own = weights | {"known": regression.pop("known")}
         halved = {name: _as_kept(value) for name, value in own.items()}
-        exact = {"mean": self._mean, "scale": self._scale}
         header |= {"config": asdict(self._config), "grid": asdict(self.settings.grid)}
-        return halved | offset | exact, header
+        return halved | regression | {"scale": self._scale}, header
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> AANN:
         own = cls(Settings(AngularGrid(**header["grid"])), AANNConfig(**header["config"]))
         weights = own._network.state_dict()
-        expect(
-            tensors,
-            {
-                **{f"network.{name}": tuple(value.shape) for name, value in weights.items()},
-                "mean": (3,),
-                "scale": (2,),
-            },
-        )
+        expect(tensors, {f"network.{name}": tuple(value.shape) for name, value in weights.items()} | {"scale": (2,)})
         own._network.load_state_dict(
             {name: tensors[f"network.{name}"].to(value.dtype) for name, value in weights.items()}
         )
         own._network.eval()
-        own._mean, own._scale = tensors["mean"], tensors["scale"]
+        own._scale = tensors["scale"]
         if not bool((own._scale > 0).all()):
             raise InputError(f"scales must be positive, got {own._scale.tolist()}")
         pixels = coarse_pixels(own._prepare(torch.zeros(1, *own.settings.grid.shape))[:, 0]).shape[1]
-        own._offset = RadialRegression.from_state(tensors, header, FEATURES + pixels, 3)
+        own._direction = RadialRegression.from_state(tensors, header, FEATURES + pixels, 3)
         return own
 
 

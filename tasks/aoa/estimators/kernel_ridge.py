@@ -12,7 +12,7 @@ from torch import Tensor
 
 from augment import Mixed
 from swiftwrf.angles import AngularGrid, to_angles, to_direction
-from swiftwrf.checkpoint import Header, expect
+from swiftwrf.checkpoint import Header
 from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator, Settings
 from tasks.aoa.estimators.radial import RadialRegression, coarse_pixels, kept_rows
 
@@ -21,34 +21,28 @@ from tasks.aoa.estimators.radial import RadialRegression, coarse_pixels, kept_ro
     "kernel_ridge", meaning="kernel ridge regression from the spectrum to the direction", colour="#44aa99"
 )
 class KernelRegression(SavedEstimator):
-    """Kernel ridge regression from coarse spectra to unit vectors: strong where spectra are few."""
+    """Kernel ridge regression from coarse spectra to directions: strong where spectra are few."""
 
     kind = "kernel ridge regression"
-    CHOSEN = 400  # spectra that choose width and penalty
 
     def fit(self, train: Mixed) -> None:
         rows, seed = kept_rows(len(train), self.settings.seed), self.settings.seed
         feature = np.concatenate([self._feature(part) for part in train.batches()])[rows]
         direction = to_direction(*train.label.unbind(-1)).numpy()[rows]
-        self._mean = direction.mean(axis=0)
-        self._offset = RadialRegression.fit(feature, direction - self._mean, self.CHOSEN, seed)
+        self._direction = RadialRegression.fit(feature, direction, seed)
 
     def estimate(self, spectrum: Tensor) -> Tensor:
-        pointing = self._offset(self._feature(spectrum)) + self._mean
-        return torch.stack(to_angles(torch.from_numpy(pointing)), dim=-1)
+        return torch.stack(to_angles(torch.from_numpy(self._direction(self._feature(spectrum)))), dim=-1)
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
-        tensors, header = self._offset.state()
-        mean = torch.from_numpy(self._mean.astype(np.float32))
-        return tensors | {"mean": mean}, header | {"grid": asdict(self.settings.grid)}
+        tensors, header = self._direction.state()
+        return tensors, header | {"grid": asdict(self.settings.grid)}
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> KernelRegression:
         own = cls(Settings(AngularGrid(**header["grid"])))
         pixels = own._feature(torch.zeros(1, *own.settings.grid.shape)).shape[1]
-        own._offset = RadialRegression.from_state(tensors, header, pixels, 3)
-        expect(tensors, {"mean": (3,)})
-        own._mean = tensors["mean"].double().numpy()
+        own._direction = RadialRegression.from_state(tensors, header, pixels, 3)
         return own
 
     def _feature(self, spectrum: Tensor) -> NDArray[Any]:

@@ -1,4 +1,9 @@
-"""Kernel ridge regression (Saunders et al. 1998) with a Gaussian kernel, its width and penalty by cross-validation."""
+"""Kernel ridge regression (Saunders et al. 1998) with a normalised Gaussian kernel, width and penalty by cross-validation.
+
+A measured spectrum differs from every synthetic one by noise and by what the synthesizer does not know, which adds much the
+same to all its distances. A Gaussian kernel shrinks by it, and what a regression has balanced between many rows no longer
+holds. Normalised (Nadaraya 1964, Watson 1964; Moody and Darken 1989) it is as it was, and a narrow one looks at few rows.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +15,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.linalg import solve
-from sklearn.kernel_ridge import KernelRidge
-from sklearn.metrics.pairwise import euclidean_distances, rbf_kernel
+from scipy.special import softmax
+from sklearn.metrics.pairwise import euclidean_distances
 from sklearn.model_selection import KFold
 from threadpoolctl import threadpool_limits
 from torch import Tensor
@@ -21,8 +26,9 @@ from swiftwrf import InputError
 from swiftwrf.checkpoint import Header, expect
 from swiftwrf.data.spectra import coarsening
 
-WIDTHS = (0.1, 0.3, 1.0, 3.0)  # of the kernel, as gamma times the median squared distance
+WIDTHS = (10.0, 20.0, 40.0, 80.0)  # of the kernel, as gamma times the median squared distance: narrow ones alone
 PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
+CHOSEN_ROWS = 600  # choose both; where there are more rows, fewer would choose too large a penalty
 KEPT_ROWS = 4000  # its cost grows with their cube
 AZIMUTHS = 60  # an array's beams are wider than these columns
 
@@ -39,39 +45,37 @@ def coarse_pixels(spectrum: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class RadialRegression:
-    """A function of features that `fit` found.
+    """A function of features that `fit` found: a mean over the rows that it knows, the near ones above all.
 
     Args:
-        known: features of the rows that it was fitted to, (n, p).
-        weight: of each of them in each of k values, (n, k).
+        known: features of those rows, (n, p).
+        says: what each of them says, (n, k).
         gamma: of the kernel exp(-gamma |a - b|^2).
     """
 
     known: NDArray[Any]
-    weight: NDArray[Any]
+    says: NDArray[Any]
     gamma: float
 
     @classmethod
-    def fit(cls, feature: NDArray[Any], target: NDArray[Any], chosen: int, seed: int) -> RadialRegression:
+    def fit(cls, feature: NDArray[Any], target: NDArray[Any], seed: int) -> RadialRegression:
         """From features (n, p) to values (n, k).
 
         Args:
-            feature, target: of at least two rows.
-            chosen: how many of them, the first, choose width and penalty.
+            feature, target: of at least two rows; the first of many choose width and penalty.
             seed: of the folds.
         """
-        gamma, alpha = choose(feature[:chosen], target[:chosen], seed)
-        regression = KernelRidge(kernel="rbf", alpha=alpha, gamma=gamma).fit(feature, target)
-        return cls(feature, regression.dual_coef_, gamma)
+        apart = euclidean_distances(feature, squared=True)
+        gamma, alpha = choose(apart[:CHOSEN_ROWS, :CHOSEN_ROWS], target[:CHOSEN_ROWS], seed)
+        return cls(feature, _says(np.exp(-gamma * apart), target, alpha), gamma)
 
     def __call__(self, feature: NDArray[Any]) -> NDArray[Any]:
         """Values (m, k) of features (m, p)."""
-        values: NDArray[Any] = rbf_kernel(feature, self.known, self.gamma) @ self.weight
-        return values
+        return _mean(euclidean_distances(feature, self.known, squared=True), self.says, self.gamma)
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """What a file keeps: tensors in single precision, and plain values."""
-        arrays = {"known": self.known, "weight": self.weight}
+        arrays = {"known": self.known, "says": self.says}
         return {name: torch.from_numpy(array.astype(np.float32)) for name, array in arrays.items()}, {
             "gamma": self.gamma
         }
@@ -87,27 +91,47 @@ class RadialRegression:
         Raises:
             InputError: they do not fit together.
         """
-        n = len(tensors["known"])
-        expect(tensors, {"known": (n, features), "weight": (n, values)})
+        expect(tensors, {"known": (n := len(tensors["known"]), features), "says": (n, values)})
         gamma = float(header["gamma"])
         if not (gamma > 0 and math.isfinite(gamma)):
             raise InputError(f"gamma must be positive and finite, got {gamma}")
-        return cls(tensors["known"].double().numpy(), tensors["weight"].double().numpy(), gamma)
+        return cls(tensors["known"].double().numpy(), tensors["says"].double().numpy(), gamma)
 
 
-def choose(feature: NDArray[Any], target: NDArray[Any], seed: int) -> tuple[float, float]:
-    """Width gamma and penalty alpha with the least mean absolute error on held-out rows."""
-    apart = euclidean_distances(feature[:, ::7], squared=True) * 7  # every seventh feature will do
-    width = 1 / max(float(np.median(apart[~np.eye(len(feature), dtype=bool)])), 1e-9)
-    folds = KFold(min(5, len(feature)), shuffle=True, random_state=seed)
+def choose(apart: NDArray[Any], target: NDArray[Any], seed: int) -> tuple[float, float]:
+    """Width gamma and penalty alpha with the least mean absolute error on held-out rows.
+
+    Args:
+        apart: squared distances of rows from each other, (n, n).
+        target: their values, (n, k).
+        seed: of the folds.
+    """
+    width = 1 / max(float(np.median(apart[~np.eye(len(apart), dtype=bool)])), 1e-9)
+    folds = KFold(min(5, len(apart)), shuffle=True, random_state=seed)
     errors: dict[tuple[float, float], float] = {}
     with threadpool_limits(1):  # many small problems: several threads would mostly wait for each other
         for gamma in (factor * width for factor in WIDTHS):
-            kernel = rbf_kernel(feature, gamma=gamma)  # one serves all folds and penalties
+            kernel = np.exp(-gamma * apart)
             for kept, out in folds.split(kernel):
-                known, held = kernel[np.ix_(kept, kept)], kernel[np.ix_(out, kept)]
                 for alpha in PENALTIES:
-                    weight = solve(known + alpha * np.eye(len(kept)), target[kept], assume_a="pos")
-                    error = float(np.abs(held @ weight - target[out]).mean())
+                    says = _says(kernel[np.ix_(kept, kept)], target[kept], alpha)
+                    error = float(np.abs(_mean(apart[np.ix_(out, kept)], says, gamma) - target[out]).mean())
                     errors[gamma, alpha] = errors.get((gamma, alpha), 0.0) + error
     return min(errors, key=errors.__getitem__)
+
+
+def _mean(apart: NDArray[Any], says: NDArray[Any], gamma: float) -> NDArray[Any]:
+    """Of what known rows say (n, k), by squared distances (m, n) from them."""
+    mean: NDArray[Any] = softmax(-gamma * apart, axis=1) @ says
+    return mean
+
+
+def _says(kernel: NDArray[Any], target: NDArray[Any], alpha: float) -> NDArray[Any]:
+    """What rows have to say, (n, k), for means of it to come to their values.
+
+    With K, the kernel (n, n) divided by the sums of its rows, these are (1 + alpha) (K + alpha)^-1 times the values: where
+    the penalty is small means go through all values, where it is large rows say their values, and constants stay anyway.
+    """
+    sums = kernel.sum(axis=1)
+    says: NDArray[Any] = solve(kernel + np.diag(alpha * sums), sums[:, None] * target, assume_a="pos")
+    return (1 + alpha) * says
