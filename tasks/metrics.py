@@ -101,7 +101,8 @@ class GainMetrics(ChangeMetrics):
 
 
 class AdviceMetrics(TypedDict):
-    """What turbo learning gains on measured spectra that were held out: `helps` where the interval excludes no gain."""
+    """What turbo learning gains on measured spectra that were held out: further positions are recommended where each number
+    of them gains, and it `helps` where the interval excludes no gain, too."""
 
     stand_in: str
     n_held_out: int

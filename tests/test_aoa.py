@@ -20,8 +20,7 @@ from swiftwrf.angles import to_angles
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.store import Store
-from tasks.aoa import arms, experiment, steps
-from tasks.aoa.advice import advise
+from tasks.aoa import advice, arms, experiment, steps
 from tasks.aoa.config import AoaConfig
 from tasks.aoa.estimators import ESTIMATORS, Settings, radial
 from tasks.aoa.estimators.aann import AANN, AANNConfig
@@ -280,9 +279,22 @@ def test_draws_train_only_where_they_are_better_than_means_beyond_doubt(room, ri
 
     synthesizer = Told(augment.Settings())
     synthesizer.fit(kept)
-    advice = advise([Trial(synthesizer, kept, out)], Settings(room.grid), extra=100)
-    assert advice["sampled"] is sampled
-    assert [gain["sampled"] for gain in advice["gains"]] == [False, True]
+    given = advice.advise([Trial(synthesizer, kept, out)], Settings(room.grid), extra=100)
+    assert given["sampled"] is sampled
+    assert [gain["sampled"] for gain in given["gains"]] == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("factors", "recommended"),
+    [((0.9, 0.8, 0.5), 3000), ((0.9, 1.1, 0.5), 0), ((0.9, 0.5, 0.8), 1000), ((1.2, 1.1, 1.3), 0)],
+)
+def test_further_positions_are_recommended_where_each_number_of_them_gains(monkeypatch, room, factors, recommended):
+    """With few held-out spectra one number alone gains by chance."""
+    factor = dict(zip((0, *advice.NUMBERS), (1, *factors), strict=True))
+    monkeypatch.setattr(advice, "_errors", lambda trial, extra, *_: factor[extra] * np.linspace(1, 1.01, 20))
+    given = advice.advise([Trial(make_synthesizer("idw"), room, room)], Settings(room.grid), extra=3000)
+    assert given["recommended_extra"] == recommended
+    assert given["helps"] == (recommended > 0)
 
 
 def test_a_training_is_as_long_as_the_scene_needs():

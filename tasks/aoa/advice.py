@@ -52,14 +52,16 @@ def advise(trials: Sequence[Trial], settings: Settings, extra: int) -> AdviceMet
         others = sorted({*(n for n in NUMBERS if n < extra), extra} - {middle})
         gains += [gain(number, sampled, errors(number, sampled)) for number in others]
     best = best_gain(gains, sampled)
+    # a gain from one number of positions alone is chance, of which few held-out spectra have much
+    throughout = all(gain["change"] < 0 for gain in gains if gain["sampled"] == sampled)
     return {
         "stand_in": STAND_IN,
         "n_held_out": len(alone),
         "measured_only_deg": float(np.median(alone)),
         "gains": gains,
         "sampled": sampled,
-        "recommended_extra": best["extra"] if best and best["change"] < 0 else 0,
-        "helps": bool(best and best["high"] < 0),
+        "recommended_extra": best["extra"] if best and throughout else 0,
+        "helps": bool(best and throughout and best["high"] < 0),
     }
 
 
@@ -67,13 +69,6 @@ def best_gain(gains: Sequence[GainMetrics], sampled: bool) -> GainMetrics | None
     """The number of further positions with the lowest error, of draws or of means; None where nothing was compared."""
     taken = (gain for gain in gains if gain["sampled"] == sampled)
     return min(taken, key=lambda gain: gain["median_deg"], default=None)
-
-
-def gains_from(advice: AdviceMetrics, extra: int) -> bool:
-    """Whether held-out spectra come out better with this number of further positions, of those that were compared."""
-    return any(
-        gain["change"] < 0 for gain in advice["gains"] if (gain["extra"], gain["sampled"]) == (extra, advice["sampled"])
-    )
 
 
 def _errors(trial: Trial, extra: int, sampled: bool, settings: Settings) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from swiftwrf import FitError, InputError
 from swiftwrf.checkpoint import read, write
 from swiftwrf.store import Store
 from tasks.aoa import arms
-from tasks.aoa.advice import advise, gains_from
+from tasks.aoa.advice import advise
 from tasks.aoa.config import AUTO
 from tasks.aoa.estimators import ESTIMATORS, Estimator, SavedEstimator, learners
 from tasks.aoa.keep import keep
@@ -50,7 +50,7 @@ def _syntheses(setting: Setting, at: At, asked_for: list[str], advice: AdviceMet
     """Of the synthesizers whose spectra train, and of those that are compared with them."""
     sampled = bool(advice and advice["sampled"])
     # unless told how many, only where held-out measured spectra gain from them
-    wanted = setting.config.extra is not None or bool(advice and gains_from(advice, setting.extra))
+    wanted = setting.config.extra is not None or bool(advice and advice["recommended_extra"])
     further = bool(setting.extra) and wanted
     names = dict.fromkeys((*asked_for, *candidates(setting.train)))
     return [Synthesis(at, name, name in asked_for, name in asked_for and further, sampled) for name in names]

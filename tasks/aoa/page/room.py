@@ -41,7 +41,7 @@ def advice_sentence(share: Share) -> str | None:
         return f"{found} Turbo learning helps here: use --extra {advice['recommended_extra']} with this share."
     if best["low"] > 0:
         return f"{found} Turbo learning harms here: measure more instead, or use another synthesizer."
-    return f"{found} The interval includes no gain: more measured positions are the safer way."
+    return f"{found} That is not beyond doubt: more measured positions are the safer way."
 
 
 def choice_section(share: Share) -> Section | None:
