@@ -71,7 +71,8 @@ class RadialRegression:
 
     def __call__(self, feature: NDArray[Any]) -> NDArray[Any]:
         """Values (m, k) of features (m, p)."""
-        return _mean(euclidean_distances(feature, self.known, squared=True), self.says, self.gamma)
+        values: NDArray[Any] = _near(euclidean_distances(feature, self.known, squared=True), self.gamma) @ self.says
+        return values
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """What a file keeps: tensors in single precision, and plain values."""
@@ -113,17 +114,17 @@ def choose(apart: NDArray[Any], target: NDArray[Any], seed: int) -> tuple[float,
         for gamma in (factor * width for factor in WIDTHS):
             kernel = np.exp(-gamma * apart)
             for kept, out in folds.split(kernel):
+                known, near = kernel[np.ix_(kept, kept)], _near(apart[np.ix_(out, kept)], gamma)  # for all penalties
                 for alpha in PENALTIES:
-                    says = _says(kernel[np.ix_(kept, kept)], target[kept], alpha)
-                    error = float(np.abs(_mean(apart[np.ix_(out, kept)], says, gamma) - target[out]).mean())
+                    error = float(np.abs(near @ _says(known, target[kept], alpha) - target[out]).mean())
                     errors[gamma, alpha] = errors.get((gamma, alpha), 0.0) + error
     return min(errors, key=errors.__getitem__)
 
 
-def _mean(apart: NDArray[Any], says: NDArray[Any], gamma: float) -> NDArray[Any]:
-    """Of what known rows say (n, k), by squared distances (m, n) from them."""
-    mean: NDArray[Any] = softmax(-gamma * apart, axis=1) @ says
-    return mean
+def _near(apart: NDArray[Any], gamma: float) -> NDArray[Any]:
+    """How much each known row counts, (m, n), by squared distances from it: the kernel divided by the sums of its rows."""
+    near: NDArray[Any] = softmax(-gamma * apart, axis=1)
+    return near
 
 
 def _says(kernel: NDArray[Any], target: NDArray[Any], alpha: float) -> NDArray[Any]:
