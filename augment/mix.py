@@ -11,7 +11,7 @@ from torch import Tensor
 from augment.places import FURTHER, Places
 from swiftwrf import InputError, Spectra
 from swiftwrf.data.splits import MIN_TRAINING
-from swiftwrf.store import Store
+from swiftwrf.data.store import Store
 
 
 @dataclass(frozen=True, eq=False)

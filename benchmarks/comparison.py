@@ -30,9 +30,9 @@ from augment import SYNTHESIZERS, Settings, Synthesizer, lacks, make_synthesizer
 from augment.synthesizers.published import Published
 from swiftwrf import Spectra, simulated_room
 from swiftwrf.data.splits import validation_for
-from swiftwrf.durable import write_text
 from swiftwrf.gp import thinned
 from swiftwrf.metrics import l1, psnr, ssim, summary
+from swiftwrf.runtime.durable import write_text
 from tasks.aoa.config import AoaConfig
 from tasks.aoa.experiment import run
 from tasks.cluster import Cluster, connected

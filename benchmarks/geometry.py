@@ -15,9 +15,9 @@ from record import write_result
 
 from swiftwrf import Spectra, load_spectra, simulated_room
 from swiftwrf.data.spectra import Moving
-from swiftwrf.geometry import fit_geometry
-from swiftwrf.geometry.hybrid import fit_hybrid
 from swiftwrf.metrics import psnr, summary
+from swiftwrf.models.geometry import fit_geometry
+from swiftwrf.models.geometry.hybrid import fit_hybrid
 
 SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")  # of a room
 WALLS = {  # where they are on each side [m]

@@ -13,8 +13,8 @@ import torch
 from record import write_result
 
 from swiftwrf.data.spectra import Moving
-from swiftwrf.geometry import fit_geometry
-from swiftwrf.geometry.search import SIDES
+from swiftwrf.models.geometry import fit_geometry
+from swiftwrf.models.geometry.search import SIDES
 from swiftwrf.testing.rooms import mirror_room
 
 POSITIONS = 72

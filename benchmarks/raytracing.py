@@ -19,8 +19,8 @@ from augment import Settings, make_synthesizer
 from swiftwrf import AngularGrid, Spectra, load_spectra
 from swiftwrf.data.raytraced import ROOMS
 from swiftwrf.data.spectra import Moving
-from swiftwrf.durable import write_text
 from swiftwrf.metrics import psnr, ssim, summary
+from swiftwrf.runtime.durable import write_text
 from tasks.scenes import ScenesConfig, run
 
 GRID = AngularGrid.hemisphere(30, 120)

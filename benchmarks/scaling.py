@@ -30,9 +30,9 @@ from record import write_result
 from augment import Mixed, Settings, make_synthesizer
 from swiftwrf import AngularGrid, Spectra, load_spectra, simulated_room
 from swiftwrf.data.simulated.spectra import REGION
+from swiftwrf.data.store import stored
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import psnr
-from swiftwrf.store import stored
 from tasks.aoa.estimators import Settings as EstimatorSettings
 from tasks.aoa.estimators.aann import AANN, AANNConfig
 from tasks.page import figures

@@ -30,7 +30,7 @@ from swiftwrf import (
     project,
     simulated_room,
 )
-from swiftwrf.arrays import PlanarArray
+from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import psnr
 from swiftwrf.rasterize import Maker, prepare, rasterize_magnitude

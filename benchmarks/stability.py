@@ -28,10 +28,10 @@ from swiftwrf import (
     rasterize,
     simulated_room,
 )
+from swiftwrf.data.store import Store
 from swiftwrf.gp import Kernel
 from swiftwrf.metrics import psnr
 from swiftwrf.rasterize import Maker, rasterize_magnitude
-from swiftwrf.store import Store
 from swiftwrf.testing.hard_cases import HARD_CASES, field_errors, magnitude_errors
 from swiftwrf.testing.tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
 

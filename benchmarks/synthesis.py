@@ -12,7 +12,7 @@ from record import write_result
 
 from augment import Settings, make_synthesizer
 from swiftwrf import Spectra, load_spectra, project, simulated_room
-from swiftwrf.arrays import PlanarArray
+from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.splits import TEST_SHARE, block_split, validation_for
 from swiftwrf.metrics import covered, l1, psnr, ssim, summary
 

@@ -10,18 +10,17 @@ Gaussian Splatting for Efficient Wireless Radiance Field Rendering", 2025.
 """
 
 from swiftwrf import comparison
-from swiftwrf.angles import AngularGrid, ArrayPose
-from swiftwrf.calibration import Calibration, calibrate
-from swiftwrf.checkpoint import load
-from swiftwrf.coarray import CoarrayModel, fit_coarray, project
+from swiftwrf.array.angles import AngularGrid, ArrayPose
 from swiftwrf.data import Rssi, Snapshots, Spectra, load_rssi, load_snapshots, load_spectra
 from swiftwrf.data.simulated import rssi_room, simulated_room
+from swiftwrf.diagnostics.calibration import Calibration, calibrate
 from swiftwrf.errors import FitError, InputError
-from swiftwrf.fitting import FitConfig, fit
-from swiftwrf.geometry import GeometryModel, fit_geometry
-from swiftwrf.model import ModelConfig, SwiftWRF
+from swiftwrf.models.coarray import CoarrayModel, fit_coarray, project
+from swiftwrf.models.geometry import GeometryModel, fit_geometry
+from swiftwrf.models.swiftwrf import FitConfig, ModelConfig, SwiftWRF, fit
 from swiftwrf.rasterize import rasterize, rasterize_magnitude
 from swiftwrf.rssi import RssiConfig, RssiModel, fit_rssi
+from swiftwrf.runtime.checkpoint import load
 
 __all__ = [
     "AngularGrid",

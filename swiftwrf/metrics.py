@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 from torch import Tensor
 
-from swiftwrf.angles import great_circle, to_direction, wrap
+from swiftwrf.array.angles import great_circle, to_direction, wrap
 from swiftwrf.errors import InputError
 
 WINDOW = 7

@@ -24,7 +24,7 @@ from uuid import uuid4
 import torch
 
 from swiftwrf import FitError, InputError
-from swiftwrf.threads import set_threads
+from swiftwrf.runtime.threads import set_threads
 from tasks.directory import console
 from tasks.environment import machine, packages
 from tasks.run import choose_device

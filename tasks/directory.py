@@ -21,8 +21,8 @@ import torch
 from rich.console import Console
 
 from swiftwrf import InputError
-from swiftwrf.durable import rename
-from swiftwrf.threads import set_threads
+from swiftwrf.runtime.durable import rename
+from swiftwrf.runtime.threads import set_threads
 from tasks.claim import CONFIG, ENVIRONMENT, LOCK, STEPS, Claim
 from tasks.environment import environment, now
 from tasks.records import Row, read_json, strict, write_json, write_npz, write_table

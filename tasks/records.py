@@ -20,7 +20,7 @@ import pandas as pd
 import torch
 
 from swiftwrf import InputError
-from swiftwrf.durable import replacing, write_text
+from swiftwrf.runtime.durable import replacing, write_text
 
 Row = dict[str, Any]
 NAMES = (

@@ -18,7 +18,7 @@ import tyro
 
 from swiftwrf import FitError, InputError
 from swiftwrf.errors import one_line
-from swiftwrf.registry import Registry
+from swiftwrf.runtime.registry import Registry
 from tasks.directory import Run, console, saved_config
 from tasks.records import Row
 from tasks.torchrun import check_gpus, together

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from swiftwrf import AngularGrid, InputError
-from swiftwrf.arrays import PlanarArray
-from swiftwrf.beamforming import BEAMFORMERS
+from swiftwrf.array.beamforming import BEAMFORMERS
+from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import Reading
 from tasks.run import choice
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from swiftwrf.durable import write_bytes
+from swiftwrf.runtime.durable import write_bytes
 from tasks.claim import STEPS
 from tasks.cluster import Cluster
 from tasks.directory import Run, console

@@ -13,7 +13,7 @@ import torch
 from torch import distributed as dist
 
 from swiftwrf import FitError, InputError
-from swiftwrf.threads import set_threads
+from swiftwrf.runtime.threads import set_threads
 
 PATIENCE = timedelta(days=30)  # that the others have while the first one computes alone
 

@@ -29,8 +29,8 @@ from swiftwrf.comparison import (
     WrfGsSize,
 )
 from swiftwrf.errors import LONGEST
-from swiftwrf.geometry import GeometryConfig, fit_geometry
-from swiftwrf.geometry.search import Search
+from swiftwrf.models.geometry import GeometryConfig, fit_geometry
+from swiftwrf.models.geometry.search import Search
 from tasks.aoa import experiment as aoa
 from tasks.aoa.arms import NETWORK
 from tasks.aoa.config import AoaConfig
@@ -108,7 +108,7 @@ def glances() -> Iterator[None]:
 
     with (
         mock.patch("augment.synthesizers.geometry.fit_geometry", glance),
-        mock.patch("swiftwrf.geometry.fit.ENOUGH", 1),
+        mock.patch("swiftwrf.models.geometry.fit.ENOUGH", 1),
         mock.patch.object(Search, "improve", lambda search, room: room),
     ):
         yield

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from swiftwrf import rssi_room
-from swiftwrf.arrays import LIGHT_SPEED, PlanarArray
+from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data import Snapshots
 from swiftwrf.data.simulated.room import Room
 

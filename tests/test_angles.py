@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swiftwrf import AngularGrid, ArrayPose, InputError
-from swiftwrf.angles import great_circle, to_angles, to_direction, wrap
+from swiftwrf.array.angles import great_circle, to_angles, to_direction, wrap
 
 ANGLE = st.floats(-50, 50, allow_nan=False)
 

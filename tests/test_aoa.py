@@ -16,10 +16,10 @@ from sklearn.model_selection import KFold
 import augment
 from augment import SYNTHESIZERS, Mixed, Synthesizer, Trial, choose, lacks, make_synthesizer
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, load, simulated_room
-from swiftwrf.angles import to_angles
+from swiftwrf.array.angles import to_angles
+from swiftwrf.data.store import Store
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
-from swiftwrf.store import Store
 from tasks.aoa import advice, arms, experiment, steps
 from tasks.aoa.config import AoaConfig
 from tasks.aoa.estimators import ESTIMATORS, Settings, radial

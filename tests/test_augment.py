@@ -24,9 +24,9 @@ from augment.choose import candidates
 from augment.places import draw_positions
 from augment.synthesizers.idw import weights
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, simulated_room
+from swiftwrf.data.store import Store
 from swiftwrf.metrics import psnr
-from swiftwrf.registry import Entry
-from swiftwrf.store import Store
+from swiftwrf.runtime.registry import Entry
 
 ROOM = simulated_room(n=60, seed=3, grid=AngularGrid.hemisphere(15, 60))
 TRAIN, TEST = ROOM.split("random", 0)

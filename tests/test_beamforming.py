@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from swiftwrf import AngularGrid, InputError
-from swiftwrf.arrays import PlanarArray
-from swiftwrf.beamforming import BEAMFORMERS, LOADING
+from swiftwrf.array.beamforming import BEAMFORMERS, LOADING
+from swiftwrf.array.planar import PlanarArray
 
 ARRAY = PlanarArray.grid(2, 3, 0.06, 2.4e9)
 GRID = AngularGrid.hemisphere(6, 24)

@@ -12,8 +12,8 @@ from samples import snapshots
 from scipy.spatial.transform import Rotation
 
 from swiftwrf import InputError, calibrate
-from swiftwrf.angles import AngularGrid, wrap
-from swiftwrf.arrays import PlanarArray
+from swiftwrf.array.angles import AngularGrid, wrap
+from swiftwrf.array.planar import PlanarArray
 
 
 def spoilt(data, degrees=20.0, seed=0):

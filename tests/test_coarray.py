@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from swiftwrf import AngularGrid, CoarrayModel, InputError, fit_coarray, load, load_spectra, project, simulated_room
-from swiftwrf.arrays import PlanarArray
-from swiftwrf.coarray import basis, differences
+from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data.store import Store
 from swiftwrf.metrics import psnr, ssim
-from swiftwrf.store import Store
+from swiftwrf.models.coarray import basis, differences
 
 GRID = AngularGrid.hemisphere(15, 60)
 

@@ -13,7 +13,6 @@ from quick import PUBLISHED, PUBLISHED_RSSI
 from torch.nn import functional
 
 from swiftwrf import AngularGrid, FitError, InputError, Spectra, load, rasterize_magnitude, rssi_room, simulated_room
-from swiftwrf.checkpoint import read, write
 from swiftwrf.comparison import (
     DcganConfig,
     DcganSize,
@@ -37,9 +36,10 @@ from swiftwrf.comparison.nerf2 import Field, received
 from swiftwrf.comparison.sphere import on_sphere
 from swiftwrf.comparison.vae import Normal
 from swiftwrf.comparison.volume import FIRST_PHASE, PATH_GAIN, Medium, integrate
+from swiftwrf.data.store import Store
 from swiftwrf.metrics import psnr
-from swiftwrf.model.encoding import encode
-from swiftwrf.store import Store
+from swiftwrf.models.swiftwrf.encoding import encode
+from swiftwrf.runtime.checkpoint import read, write
 
 GRID = AngularGrid.hemisphere(90, 360)
 LEARNS = {

@@ -22,7 +22,7 @@ from samples import (
 from test_calibration import spoilt
 
 from swiftwrf import AngularGrid, InputError, load_rssi, load_spectra, simulated_room
-from swiftwrf.arrays import PlanarArray
+from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import Reading
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.data.writing import write_rssi, write_spectra

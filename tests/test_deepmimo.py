@@ -10,7 +10,7 @@ import torch
 from samples import FREQUENCY, WAVELENGTH, write_deepmimo
 
 from swiftwrf import AngularGrid, InputError, load_spectra
-from swiftwrf.arrays import PlanarArray
+from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.simulated.room import Room
 
 GRID = AngularGrid.hemisphere(24, 96)

@@ -10,9 +10,9 @@ from quick import run, said
 
 from augment import Mixed
 from swiftwrf import AngularGrid, InputError, load, simulated_room
-from swiftwrf.checkpoint import read, write
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
+from swiftwrf.runtime.checkpoint import read, write
 from tasks.aoa.estimators import Settings
 from tasks.aoa.estimators.aann import AANN, AANNConfig
 from tasks.aoa.estimators.kernel_ridge import KernelRegression

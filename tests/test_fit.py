@@ -9,12 +9,12 @@ import torch
 
 from swiftwrf import AngularGrid, FitConfig, FitError, InputError, ModelConfig, Spectra, SwiftWRF, fit
 from swiftwrf.data.splits import folds
-from swiftwrf.fitting.optimise import Optimisation
-from swiftwrf.fitting.search import doubling_search
+from swiftwrf.data.store import Store
 from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel
 from swiftwrf.metrics import covered, psnr
+from swiftwrf.models.swiftwrf.optimise import Optimisation
+from swiftwrf.models.swiftwrf.search import doubling_search
 from swiftwrf.rasterize import reference
-from swiftwrf.store import Store
 
 QUICK = FitConfig(model=ModelConfig(n_primitives=24), steps=80, check_every=20)  # by gradient
 

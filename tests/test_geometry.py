@@ -8,21 +8,21 @@ import pytest
 import torch
 
 from swiftwrf import InputError, simulated_room
-from swiftwrf.arrays import PlanarArray
-from swiftwrf.geometry import GeometryConfig, GeometryModel, fit_geometry
-from swiftwrf.geometry.fit import _completed, _settled, observe, split
-from swiftwrf.geometry.hybrid import HybridModel, _strengths, fit_hybrid
-from swiftwrf.geometry.images import Scene, field, image_gain, images, mirror, sequences
-from swiftwrf.geometry.observe import autocorrelation, correlations, element_phases
-from swiftwrf.geometry.planes import Planes
-from swiftwrf.geometry.refine import derivatives
-from swiftwrf.geometry.search import SIGNS
-from swiftwrf.geometry.strengths import Strengths, fit_strengths
-from swiftwrf.geometry.turns import _Table, turned
-from swiftwrf.geometry.waves import Waves
+from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data.store import Store
 from swiftwrf.gp import Kernel
 from swiftwrf.metrics import psnr
-from swiftwrf.store import Store
+from swiftwrf.models.geometry import GeometryConfig, GeometryModel, fit_geometry
+from swiftwrf.models.geometry.fit import _completed, _settled, observe, split
+from swiftwrf.models.geometry.hybrid import HybridModel, _strengths, fit_hybrid
+from swiftwrf.models.geometry.images import Scene, field, image_gain, images, mirror, sequences
+from swiftwrf.models.geometry.observe import autocorrelation, correlations, element_phases
+from swiftwrf.models.geometry.planes import Planes
+from swiftwrf.models.geometry.refine import derivatives
+from swiftwrf.models.geometry.search import SIGNS
+from swiftwrf.models.geometry.strengths import Strengths, fit_strengths
+from swiftwrf.models.geometry.turns import _Table, turned
+from swiftwrf.models.geometry.waves import Waves
 from swiftwrf.testing.rooms import ARRAY, GRID, mirror_room
 
 QUICK = GeometryConfig(reach=2.0, width=2)
@@ -354,7 +354,7 @@ def test_strengths_follow_a_shadow():
 
 def test_strengths_are_held_out_from_spectra_that_were_not_observed_too(monkeypatch):
     """What stands for predictions of one fold follows from the observed spectra of the other folds."""
-    monkeypatch.setattr("swiftwrf.geometry.fit.MOST", 40)
+    monkeypatch.setattr("swiftwrf.models.geometry.fit.MOST", 40)
     data, fold = mirror_room(SIX, n=80), torch.arange(80) % 3
     room = fit(data, further=0, width=1)
     kernel = Kernel(long=0.5, short=1.0, share=1.0, noise=1e-3)

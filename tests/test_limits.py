@@ -19,7 +19,7 @@ from swiftwrf import (
     fit,
     rssi_room,
 )
-from swiftwrf.arrays import PlanarArray
+from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.spectra import coarsening
 from swiftwrf.gp import Kernel
 from tasks.rssi.predictors import PREDICTORS

@@ -7,9 +7,9 @@ import torch
 
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, SwiftWRF, fit, load
 from swiftwrf.gp import Kernel
-from swiftwrf.model.deformation.base import COMPONENTS
-from swiftwrf.model.deformation.per_primitive_mlp import PerPrimitiveMLP, encode
-from swiftwrf.model.primitives import FLOOR, Primitives
+from swiftwrf.models.swiftwrf.deformation.base import COMPONENTS
+from swiftwrf.models.swiftwrf.deformation.per_primitive_mlp import PerPrimitiveMLP, encode
+from swiftwrf.models.swiftwrf.primitives import FLOOR, Primitives
 
 GRID = AngularGrid.hemisphere(15, 60)
 KERNEL = Kernel(long=1.0, short=0.3, share=0.6, noise=1e-2)
@@ -110,7 +110,7 @@ def test_a_saved_model_synthesizes_the_same_bits(tmp_path, deformation):
 
 
 def test_load_refuses_other_files(tmp_path):
-    from swiftwrf import checkpoint
+    from swiftwrf.runtime import checkpoint
 
     with pytest.raises(InputError, match="not a readable"):
         load(tmp_path / "nothing")

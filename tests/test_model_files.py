@@ -17,7 +17,7 @@ from swiftwrf import (
     fit_coarray,
     load,
 )
-from swiftwrf.checkpoint import read, write
+from swiftwrf.runtime.checkpoint import read, write
 
 TINY = FitConfig(model=ModelConfig(n_primitives=4, rank=2), steps=10, check_every=5)
 

@@ -10,7 +10,7 @@ import torch
 from samples import record_source, tensor_message, write_dichasus, write_espargos, write_records
 
 from swiftwrf import AngularGrid, InputError, load_snapshots, load_spectra
-from swiftwrf.angles import great_circle, to_direction
+from swiftwrf.array.angles import great_circle, to_direction
 from swiftwrf.data.tfrecords import records, tensor
 
 GRID = AngularGrid.hemisphere(45, 180)

@@ -13,7 +13,8 @@ import quick
 import torch
 from quick import run, said
 
-from swiftwrf import InputError, durable
+from swiftwrf import InputError
+from swiftwrf.runtime import durable
 from tasks.claim import Claim
 from tasks.page.records import Records
 from tasks.records import read_table, write_table

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from swiftwrf import AngularGrid, InputError, simulated_room
-from swiftwrf.angles import great_circle, to_direction
-from swiftwrf.arrays import LIGHT_SPEED, PlanarArray
+from swiftwrf.array.angles import great_circle, to_direction
+from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.simulated.room import Room
 
 FINE = AngularGrid.hemisphere(90, 360)

@@ -16,7 +16,7 @@ from swiftwrf.rssi.head import Head, Table, pooled
 from swiftwrf.rssi.law import Law, fit_law, harmonics, log_distance
 from swiftwrf.rssi.sites import gather
 from swiftwrf.rssi.solve import DIRECTIVITY_DB, LAW_DB, Group, solve
-from swiftwrf.threads import threads_kept
+from swiftwrf.runtime.threads import threads_kept
 
 KERNEL = Kernel(long=4.0, short=1.0, share=0.6, noise=1.0)
 FIELD_DB, NOISE_DB = 3.0, 2.0

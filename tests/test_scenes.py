@@ -20,13 +20,13 @@ from quick import run, said
 from augment import Settings, make_synthesizer
 from augment.synthesizers.raytrace import planes
 from swiftwrf import AngularGrid, GeometryModel, InputError, load_spectra, simulated_room
-from swiftwrf.arrays import LIGHT_SPEED
+from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.data.raytraced import ROOMS, FurnishedRoom, Material, Scene, Surface, Tracing, outline, sionna, trace
 from swiftwrf.data.raytraced.surfaces import box
 from swiftwrf.data.raytraced.trace import _first
 from swiftwrf.data.simulated.room import Room
-from swiftwrf.geometry import Plane
-from swiftwrf.geometry.sample import Residual
+from swiftwrf.models.geometry import Plane
+from swiftwrf.models.geometry.sample import Residual
 from tasks.scenes import draw_positions
 
 FREQUENCY = 2.4e9

@@ -11,7 +11,7 @@ import torch
 from samples import FREQUENCY, WAVELENGTH, snapshot_arrays, snapshots, write_snapshots
 
 from swiftwrf import AngularGrid, InputError, load_snapshots, load_spectra
-from swiftwrf.angles import great_circle, to_direction
+from swiftwrf.array.angles import great_circle, to_direction
 from swiftwrf.data.archives import read_arrays
 
 GRID = AngularGrid.hemisphere(24, 96)

@@ -11,7 +11,7 @@ import torch
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, rasterize
 from swiftwrf.gp import Kernel, SmoothField
 from swiftwrf.metrics import ssim
-from swiftwrf.model.deformation import Setting, deformation_type
+from swiftwrf.models.swiftwrf.deformation import Setting, deformation_type
 from swiftwrf.rasterize.magnitude import magnitude
 from swiftwrf.testing.hard_cases import HARD_CASES
 from swiftwrf.testing.scenes import random_scene

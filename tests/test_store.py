@@ -14,17 +14,19 @@ from PIL import Image
 
 from augment import SYNTHESIZERS, Settings
 from augment.synthesizers import gp as pixels
-from swiftwrf import AngularGrid, InputError, coarray, fit_coarray, load, load_spectra, positions, simulated_room, store
-from swiftwrf.components import principal_components
+from swiftwrf import AngularGrid, InputError, fit_coarray, load, load_spectra, positions, simulated_room
+from swiftwrf.data import store
 from swiftwrf.data.formats import nerf2
 from swiftwrf.data.spectra import check_training, fingerprint
+from swiftwrf.data.store import Store, stored
 from swiftwrf.data.writing import write_spectra
-from swiftwrf.fitting import regression
-from swiftwrf.geometry import fit_hybrid, hybrid
 from swiftwrf.gp import GaussianProcess, Kernel, NearbyProcess
+from swiftwrf.gp.pca import principal_components
 from swiftwrf.metrics import psnr
+from swiftwrf.models import coarray
+from swiftwrf.models.geometry import fit_hybrid, hybrid
+from swiftwrf.models.swiftwrf import regression
 from swiftwrf.positions import distance, nearest
-from swiftwrf.store import Store, stored
 
 N = 30
 BYTES = torch.arange(N * 4 * 8, dtype=torch.int64).remainder(256).to(torch.uint8).reshape(N, 4, 8)

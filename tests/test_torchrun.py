@@ -21,10 +21,10 @@ from torch import distributed as dist
 
 from augment import Mixed
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, fit, simulated_room
-from swiftwrf.fitting.state import Session
-from swiftwrf.processes import Processes
-from swiftwrf.store import Store
-from swiftwrf.threads import set_threads
+from swiftwrf.data.store import Store
+from swiftwrf.runtime.processes import Processes
+from swiftwrf.runtime.session import Session
+from swiftwrf.runtime.threads import set_threads
 from tasks import torchrun
 from tasks.aoa.estimators import Settings, aann
 from tasks.aoa.estimators.aann import AANN, AANNConfig

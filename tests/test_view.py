@@ -20,9 +20,9 @@ from fuzz import kinds
 from PIL import Image
 
 from swiftwrf import AngularGrid, GeometryModel, InputError, fit_coarray, load
-from swiftwrf.geometry import HybridModel
-from swiftwrf.geometry.model import Plane
-from swiftwrf.geometry.sample import Residual
+from swiftwrf.models.geometry import HybridModel
+from swiftwrf.models.geometry.model import Plane
+from swiftwrf.models.geometry.sample import Residual
 from tasks.run import command_line
 from tasks.view import ViewConfig, fitted, run, spectra
 from tasks.view.opening import opened

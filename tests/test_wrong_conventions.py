@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from swiftwrf import AngularGrid, InputError, load_rssi, load_snapshots, load_spectra, rssi_room
 from swiftwrf.data import Reading
-from swiftwrf.store import Store
+from swiftwrf.data.store import Store
 from tasks.inspect.findings import inspect
 
 GRID = AngularGrid.hemisphere(24, 96)

@@ -13,9 +13,9 @@ from torch import Tensor
 from torch.distributed import ProcessGroup
 
 from swiftwrf import Spectra
-from swiftwrf.checkpoint import Saved
 from swiftwrf.data.splits import Validation
-from swiftwrf.registry import Registry
+from swiftwrf.runtime.checkpoint import Saved
+from swiftwrf.runtime.registry import Registry
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from torch import Tensor
 from augment.synthesizers.base import ARRAY, FIXED_END, SYNTHESIZERS, Settings, Synthesizer
 from swiftwrf import GeometryModel, Spectra, fit_geometry
 from swiftwrf.data.spectra import fingerprint
-from swiftwrf.geometry import refit_geometry
+from swiftwrf.models.geometry import refit_geometry
 
 _ROOMS: OrderedDict[str, tuple[GeometryModel, float]] = OrderedDict()  # the last ones found, with the seconds that took
 _KEPT = 4

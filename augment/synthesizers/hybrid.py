@@ -8,7 +8,7 @@ from torch import Tensor
 from augment.synthesizers.base import ARRAY, FIXED_END, SYNTHESIZERS, Synthesizer
 from augment.synthesizers.geometry import find_room
 from swiftwrf import Spectra
-from swiftwrf.geometry import HybridModel, fit_hybrid, refit_geometry
+from swiftwrf.models.geometry import HybridModel, fit_hybrid, refit_geometry
 
 
 @SYNTHESIZERS.register(

@@ -10,7 +10,7 @@ from swiftwrf import Spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import EXACT, inner_products, squared_errors, thinned
 from swiftwrf.positions import nearest
-from swiftwrf.threads import single_thread
+from swiftwrf.runtime.threads import single_thread
 
 CANDIDATES = (1, 2, 3, 5, 8, 13, 20, 30)
 

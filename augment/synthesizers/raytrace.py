@@ -12,7 +12,7 @@ from augment.synthesizers.geometry import find_room
 from swiftwrf import GeometryModel, Spectra
 from swiftwrf.data.raytraced import ROOMS, SCENE_FILE, Material, Scene, Surface, Tracing, sionna, trace
 from swiftwrf.data.raytraced.surfaces import rectangle
-from swiftwrf.geometry import refit_geometry
+from swiftwrf.models.geometry import refit_geometry
 
 BEYOND = 10.0  # times as far as anything known do the walls of a found room reach: they have no edges
 FARTHEST = 1e4  # [m] from the fixed end: beyond, single precision loses the phase

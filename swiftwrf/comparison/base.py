@@ -13,9 +13,9 @@ import torch
 
 from swiftwrf.data.spectra import Spectra, check_training, fingerprint
 from swiftwrf.errors import InputError
-from swiftwrf.fitting.descent import Descent, Model, Schedule, warm_cosine
-from swiftwrf.fitting.state import Record, Session
-from swiftwrf.progress import progress_bar
+from swiftwrf.runtime.descent import Descent, Model, Schedule, warm_cosine
+from swiftwrf.runtime.progress import progress_bar
+from swiftwrf.runtime.session import Record, Session
 
 LARGEST, MOST_LAYERS = 2**24, 64  # of a model: what a file claims is believed only so far
 

@@ -10,13 +10,13 @@ from typing import Any, ClassVar, get_args
 import torch
 from torch import Tensor, nn
 
-from swiftwrf.angles import AngularGrid
-from swiftwrf.checkpoint import Header, Saved, expect
+from swiftwrf.array.angles import AngularGrid
 from swiftwrf.comparison.base import Size
 from swiftwrf.data.spectra import Moving, Spectra
 from swiftwrf.errors import InputError
-from swiftwrf.fitting.descent import Model
 from swiftwrf.positions import check_batch, check_drawn, check_positions, frame, normalise
+from swiftwrf.runtime.checkpoint import Header, Saved, expect
+from swiftwrf.runtime.descent import Model
 
 
 def restored(make: Callable[[], Model], tensors: dict[str, Tensor]) -> Model:

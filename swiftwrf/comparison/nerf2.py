@@ -23,13 +23,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from swiftwrf.angles import AngularGrid
+from swiftwrf.array.angles import AngularGrid
 from swiftwrf.comparison.base import Config, Size, Training
 from swiftwrf.comparison.drawing import Link, LinkDrawing, chunks, draw_parameters
 from swiftwrf.comparison.layers import Layers
 from swiftwrf.comparison.volume import Medium, integrate
 from swiftwrf.data.spectra import Moving, Spectra
-from swiftwrf.model.encoding import encode
+from swiftwrf.models.swiftwrf.encoding import encode
 
 SAMPLES_AT_ONCE = 2**19  # samples of the field evaluated at a time, which bounds the memory
 

@@ -23,16 +23,16 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from swiftwrf.angles import AngularGrid
-from swiftwrf.checkpoint import Header, Saved
+from swiftwrf.array.angles import AngularGrid
 from swiftwrf.comparison.base import Config, Training, descend
 from swiftwrf.comparison.drawing import chunks, draw_parameters, restored
 from swiftwrf.comparison.nerf2 import SAMPLES_AT_ONCE, Field, NeRF2Size, received
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.fitting.state import Record
 from swiftwrf.positions import check_drawn, check_positions, frame, normalise
 from swiftwrf.rssi.prepare import check
 from swiftwrf.rssi.state import fingerprint
+from swiftwrf.runtime.checkpoint import Header, Saved
+from swiftwrf.runtime.session import Record
 
 
 @dataclass(frozen=True)

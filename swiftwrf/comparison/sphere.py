@@ -15,8 +15,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from swiftwrf.angles import to_angles
-from swiftwrf.model.primitives import WIDEST
+from swiftwrf.array.angles import to_angles
+from swiftwrf.models.swiftwrf.primitives import WIDEST
 
 NEAREST = 1e-6  # of the distance: closer to the axis, azimuth turns no faster
 

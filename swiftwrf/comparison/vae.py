@@ -17,12 +17,12 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from swiftwrf.angles import AngularGrid
+from swiftwrf.array.angles import AngularGrid
 from swiftwrf.comparison.base import Config, Size, Training
 from swiftwrf.comparison.convolution import decoder, encoder
 from swiftwrf.comparison.drawing import Drawing, Frame, draw_parameters
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.model.encoding import encode
+from swiftwrf.models.swiftwrf.encoding import encode
 
 
 @dataclass(frozen=True)

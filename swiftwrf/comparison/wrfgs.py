@@ -28,17 +28,17 @@ from scipy.spatial import KDTree
 from torch import Tensor, nn
 from torch.nn import functional
 
-from swiftwrf.angles import AngularGrid
+from swiftwrf.array.angles import AngularGrid
 from swiftwrf.comparison.base import Config, Size, Training
 from swiftwrf.comparison.drawing import Link, LinkDrawing, draw_parameters
 from swiftwrf.comparison.layers import Layers
 from swiftwrf.comparison.sphere import on_sphere
 from swiftwrf.data.spectra import Moving, Spectra
-from swiftwrf.fitting.loss import spectrum_loss
-from swiftwrf.fitting.state import State
-from swiftwrf.model.encoding import encode
-from swiftwrf.model.primitives import FLOOR
+from swiftwrf.models.swiftwrf.encoding import encode
+from swiftwrf.models.swiftwrf.loss import spectrum_loss
+from swiftwrf.models.swiftwrf.primitives import FLOOR
 from swiftwrf.rasterize import rasterize_magnitude
+from swiftwrf.runtime.session import State
 
 FIRST_OPACITY = 0.1
 SSIM_WEIGHT = 0.2

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from swiftwrf.angles import AngularGrid
-from swiftwrf.arrays import PlanarArray
-from swiftwrf.beamforming import PHASE
+from swiftwrf.array.angles import AngularGrid
+from swiftwrf.array.beamforming import PHASE
+from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
 from swiftwrf.data.reading import Reading
 from swiftwrf.data.rssi import Rssi

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from swiftwrf.angles import to_angles
-from swiftwrf.arrays import LIGHT_SPEED, PlanarArray
+from swiftwrf.array.angles import to_angles
+from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.files import sha256
 from swiftwrf.data.reading import Reading
 from swiftwrf.data.spectra import GRID, Moving, Spectra, array_spectra, check_pixels

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
-from swiftwrf.angles import AngularGrid
-from swiftwrf.arrays import PlanarArray
+from swiftwrf.array.angles import AngularGrid
+from swiftwrf.array.planar import PlanarArray
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from swiftwrf.angles import AngularGrid, to_angles
-from swiftwrf.arrays import PlanarArray
-from swiftwrf.beamforming import PHASE
+from swiftwrf.array.angles import AngularGrid, to_angles
+from swiftwrf.array.beamforming import PHASE
+from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.spectra import GRID, Spectra, array_spectra, check_pixels
 from swiftwrf.data.splits import choose_split
 from swiftwrf.errors import InputError
@@ -84,7 +84,7 @@ class Snapshots:
 
         Args:
             grid: directions; 90 x 360 unless given.
-            beamformer: phase, bartlett or capon, see `swiftwrf.beamforming`.
+            beamformer: phase, bartlett or capon, see `swiftwrf.array.beamforming`.
 
         Raises:
             InputError: an unknown beamformer, too few snapshots for it, or spectra of too many pixels.

@@ -13,13 +13,13 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from swiftwrf.angles import AngularGrid, to_angles
-from swiftwrf.arrays import PlanarArray
-from swiftwrf.beamforming import PHASE
+from swiftwrf.array.angles import AngularGrid, to_angles
+from swiftwrf.array.beamforming import PHASE
+from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.splits import MIN_TRAINING, choose_split
+from swiftwrf.data.store import AT_ONCE, MOST_PIXELS, Store, stored, too_many
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
-from swiftwrf.store import AT_ONCE, MOST_PIXELS, Store, stored, too_many
 
 Moving = Literal["transmitter", "receiver"]
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed

@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf.arrays import LIGHT_SPEED, PlanarArray
+from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import MOST_BYTES
 from swiftwrf.data.files import FARTHEST, check_carrier, read_text, sha256
 from swiftwrf.data.snapshots import Snapshots, check_spacing

@@ -12,14 +12,14 @@ import yaml
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from swiftwrf.angles import AngularGrid
+from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.formats.nerf2_rssi import NOT_HEARD
 from swiftwrf.data.raytraced import TracedPaths
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Moving, Spectra
-from swiftwrf.durable import replacing, write_bytes, write_text
+from swiftwrf.data.store import write_npy
 from swiftwrf.errors import InputError
-from swiftwrf.store import write_npy
+from swiftwrf.runtime.durable import replacing, write_bytes, write_text
 
 
 def write_spectra(data: Spectra, folder: Path) -> None:

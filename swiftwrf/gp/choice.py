@@ -12,10 +12,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from swiftwrf.data.store import Store
 from swiftwrf.gp.kernel import Kernel, candidates
 from swiftwrf.gp.process import held_out, held_out_weights
-from swiftwrf.store import Store
-from swiftwrf.threads import single_thread
+from swiftwrf.runtime.threads import single_thread
 
 NOISES = (1e-3, 1e-2, 1e-1)  # of spectra: little of a measured one is not a function of position
 NEGLIGIBLE = 5e-4  # share of the error at held-out positions that components may add which are left out

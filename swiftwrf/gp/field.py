@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from swiftwrf.gp.kernel import Kernel
 from swiftwrf.gp.process import NearbyProcess
-from swiftwrf.threads import single_thread
+from swiftwrf.runtime.threads import single_thread
 
 
 class SmoothField(nn.Module):

@@ -16,7 +16,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from swiftwrf.angles import AngularGrid
+from swiftwrf.array.angles import AngularGrid
 from swiftwrf.errors import InputError
 from swiftwrf.rasterize import cuda, reference
 from swiftwrf.rasterize.magnitude import magnitude

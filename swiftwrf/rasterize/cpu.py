@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from swiftwrf.angles import AngularGrid
+from swiftwrf.array.angles import AngularGrid
 from swiftwrf.rasterize.cpu_kernels import draw, draw_backward
-from swiftwrf.threads import threads_kept
+from swiftwrf.runtime.threads import threads_kept
 
 
 def _arguments(mean: Tensor, cholesky: Tensor, weight: Tensor, cutoff: float | None) -> tuple[object, ...]:

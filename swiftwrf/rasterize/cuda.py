@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from swiftwrf.angles import AngularGrid
+from swiftwrf.array.angles import AngularGrid
 from swiftwrf.errors import InputError
 from swiftwrf.rasterize.nvrtc import CudaUnavailable, Kernels
 

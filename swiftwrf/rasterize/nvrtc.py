@@ -18,8 +18,8 @@ from pathlib import Path
 
 import torch
 
-from swiftwrf.durable import cache_folder
 from swiftwrf.errors import InputError
+from swiftwrf.runtime.durable import cache_folder
 
 # with subnormals flushed exp2f is one instruction; divisions and roots to 2 units in the last place, without a subroutine
 OPTIONS = ("--std=c++17", "--ftz=true", "--prec-div=false", "--prec-sqrt=false")

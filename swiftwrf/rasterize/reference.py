@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from swiftwrf.angles import AngularGrid, wrap
+from swiftwrf.array.angles import AngularGrid, wrap
 
 
 def rasterize(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None) -> Tensor:

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import InputError
-from swiftwrf.progress import progress_bar
 from swiftwrf.rssi.choose import comparable, mixing_weights
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import pooled
@@ -23,7 +22,8 @@ from swiftwrf.rssi.prepare import Setting, check, prepare
 from swiftwrf.rssi.solve import Fitted, Group, solve
 from swiftwrf.rssi.state import State, fingerprint
 from swiftwrf.rssi.uncertainty import LEVEL, known
-from swiftwrf.threads import single_thread
+from swiftwrf.runtime.progress import progress_bar
+from swiftwrf.runtime.threads import single_thread
 
 GROUP = 4  # receivers a task: a state is kept after each, and a cluster's workers take one each
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]

@@ -12,8 +12,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from swiftwrf.angles import AngularGrid
-from swiftwrf.model.primitives import Primitives
+from swiftwrf.array.angles import AngularGrid
+from swiftwrf.models.swiftwrf.primitives import Primitives
 from swiftwrf.rasterize import rasterize
 from swiftwrf.rasterize.magnitude import magnitude
 

@@ -14,7 +14,7 @@ from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import Head, pooled
 from swiftwrf.rssi.law import HARMONICS
 from swiftwrf.rssi.solve import Fitted, Group
-from swiftwrf.threads import single_thread
+from swiftwrf.runtime.threads import single_thread
 
 JITTER = 1e-3  # of the motion's prior where sites nearly coincide
 HELD_OUT = 0  # the one fold that is held out: a fit costs minutes

@@ -16,14 +16,14 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from swiftwrf.checkpoint import Header, Saved
 from swiftwrf.errors import InputError
 from swiftwrf.gp import Kernel
 from swiftwrf.positions import check_batch, check_positions
 from swiftwrf.rssi.head import Table
 from swiftwrf.rssi.law import harmonics, log_distance
 from swiftwrf.rssi.uncertainty import Known
-from swiftwrf.threads import single_thread
+from swiftwrf.runtime.checkpoint import Header, Saved
+from swiftwrf.runtime.threads import single_thread
 
 FARTHEST = 1e9  # [m] from the measurements: beyond, single precision ends, and so does any receiver's reach
 

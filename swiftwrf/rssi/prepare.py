@@ -16,7 +16,7 @@ from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.law import Law, fit_law, log_distance
 from swiftwrf.rssi.sites import Sites, gather
 from swiftwrf.rssi.solve import Group
-from swiftwrf.threads import single_thread
+from swiftwrf.runtime.threads import single_thread
 
 LOWEST = -100.0  # [dBm] of the plain head where nothing is received
 

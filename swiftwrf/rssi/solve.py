@@ -19,7 +19,7 @@ from swiftwrf.gp import Kernel, held_out_errors
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import Head, Table
 from swiftwrf.rssi.law import Law, harmonics, log_distance
-from swiftwrf.threads import side_by_side, single_thread
+from swiftwrf.runtime.threads import side_by_side, single_thread
 
 LAW_DB = 30.0  # prior deviation of level and slope from their least squares: as good as none
 DIRECTIVITY_DB = 2.0  # prior deviation of each harmonic of a receiver's antenna and surroundings

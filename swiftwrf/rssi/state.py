@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from swiftwrf import checkpoint as files
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import InputError
 from swiftwrf.rssi.solve import Fitted
+from swiftwrf.runtime import checkpoint as files
 
 KIND = "rssi fit state"
 GAPS = ".gaps"  # after the name of a tensor with nan for what was not heard, which files do not hold: where it is

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from swiftwrf.angles import AngularGrid
+from swiftwrf.array.angles import AngularGrid
 from swiftwrf.rasterize import reference
 from swiftwrf.rasterize.magnitude import magnitude
 

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from swiftwrf.angles import AngularGrid
-from swiftwrf.arrays import PlanarArray
+from swiftwrf.array.angles import AngularGrid
+from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.spectra import Moving, Spectra
-from swiftwrf.geometry.images import Scene, field, sequences
-from swiftwrf.store import Store
+from swiftwrf.data.store import Store
+from swiftwrf.models.geometry.images import Scene, field, sequences
 
 Normal = tuple[float, float, float]
 GRID = AngularGrid.hemisphere(10, 40)

@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from swiftwrf.angles import AngularGrid
-from swiftwrf.model.primitives import FLOOR
+from swiftwrf.array.angles import AngularGrid
+from swiftwrf.models.swiftwrf.primitives import FLOOR
 
 GRID = AngularGrid.hemisphere(30, 120)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from augment import Mixed, Trial, draw_places
 from swiftwrf.metrics import angle_errors
-from swiftwrf.threads import single_thread
+from swiftwrf.runtime.threads import single_thread
 from tasks.aoa.estimators import ESTIMATORS, Settings
 from tasks.metrics import AdviceMetrics, ChangeMetrics, GainMetrics
 

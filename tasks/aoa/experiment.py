@@ -12,8 +12,8 @@ from augment import withhold
 from swiftwrf import InputError, Spectra, simulated_room
 from swiftwrf.data import read_spectra
 from swiftwrf.data.files import sha256
+from swiftwrf.data.store import Store
 from swiftwrf.metrics import angle_errors, covered, l1, psnr, ssim
-from swiftwrf.store import Store
 from tasks.aoa.config import AUTO, AoaConfig, check, check_data, further_positions
 from tasks.aoa.page import page
 from tasks.aoa.pooled import pooled

@@ -7,8 +7,8 @@ from pathlib import Path
 from augment.choose import SLOW
 from augment.synthesizers import Synthesizer
 from swiftwrf import Spectra, SwiftWRF
-from swiftwrf.checkpoint import Saved
-from swiftwrf.geometry import room_of
+from swiftwrf.models.geometry import room_of
+from swiftwrf.runtime.checkpoint import Saved
 from tasks.aoa.field import motion, strongest_direction
 from tasks.records import write_json, write_npz
 

@@ -16,8 +16,8 @@ from augment.choose import SLOW, candidates
 from augment.suggest import suggest
 from augment.synthesizers import Synthesizer
 from swiftwrf import FitError, InputError
-from swiftwrf.checkpoint import read, write
-from swiftwrf.store import Store
+from swiftwrf.data.store import Store
+from swiftwrf.runtime.checkpoint import read, write
 from tasks.aoa import arms
 from tasks.aoa.advice import advise
 from tasks.aoa.config import AUTO

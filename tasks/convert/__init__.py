@@ -12,11 +12,11 @@ import torch
 import tyro
 
 from swiftwrf import InputError
-from swiftwrf.beamforming import PHASE
-from swiftwrf.calibration import Calibration, calibrate
+from swiftwrf.array.beamforming import PHASE
 from swiftwrf.data import Reading, Rssi, Snapshots, Spectra
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
 from swiftwrf.data.writing import write_rssi, write_spectra
+from swiftwrf.diagnostics.calibration import Calibration, calibrate
 from tasks.directory import console, new_directory
 from tasks.records import write_json
 from tasks.source import SpectraSource, TableSource, reading

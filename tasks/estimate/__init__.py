@@ -13,8 +13,8 @@ from torch import Tensor
 
 from swiftwrf import InputError, Spectra, load
 from swiftwrf.data import read_spectra
+from swiftwrf.data.store import Store
 from swiftwrf.metrics import angle_errors
-from swiftwrf.store import Store
 from tasks.aoa.estimators import SavedEstimator
 from tasks.records import write_table
 from tasks.source import SpectraSource, reading

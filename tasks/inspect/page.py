@@ -9,7 +9,7 @@ from matplotlib.patches import Circle
 from pandas import DataFrame
 from torch import Tensor
 
-from swiftwrf.angles import great_circle, to_direction
+from swiftwrf.array.angles import great_circle, to_direction
 from swiftwrf.data import Rssi, Spectra
 from swiftwrf.positions import distance
 from tasks.inspect.findings.base import Findings

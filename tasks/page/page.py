@@ -12,7 +12,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from pandas import DataFrame
 
-from swiftwrf.durable import write_text
+from swiftwrf.runtime.durable import write_text
 from tasks.page.figures import as_svg, for_page
 from tasks.page.records import Metrics, Records
 from tasks.records import write_table

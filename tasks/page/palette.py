@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from swiftwrf.registry import Entry
+from swiftwrf.runtime.registry import Entry
 
 # colour-blind safe (P. Tol, "bright"), for names without a colour of their own
 OTHERS = ("#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")

@@ -15,7 +15,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from pandas import DataFrame
 from torch import Tensor
 
-from swiftwrf.angles import to_angles
+from swiftwrf.array.angles import to_angles
 from swiftwrf.data.raytraced import Scene, Surface, TracedPaths, outline
 from swiftwrf.data.spectra import Moving
 from tasks.page import figures

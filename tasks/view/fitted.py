@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from swiftwrf import AngularGrid, CoarrayModel, GeometryModel, InputError, SwiftWRF
-from swiftwrf.checkpoint import Saved
 from swiftwrf.comparison.dcgan import Dcgan
 from swiftwrf.comparison.drawing import LinkDrawing
 from swiftwrf.comparison.vae import Vae
 from swiftwrf.data.spectra import Moving
-from swiftwrf.geometry import HybridModel, room_of
+from swiftwrf.models.geometry import HybridModel, room_of
+from swiftwrf.runtime.checkpoint import Saved
 
 QUICK = 0.02  # [s] that a spectrum may take while the moving end is dragged
 Link = tuple[Tensor, Tensor, Moving]

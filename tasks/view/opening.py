@@ -10,7 +10,7 @@ import numpy as np
 
 from augment import SYNTHESIZERS, withhold
 from swiftwrf import InputError, RssiModel, Spectra, load
-from swiftwrf.checkpoint import Saved, refusing
+from swiftwrf.runtime.checkpoint import Saved, refusing
 from tasks.aoa.config import AoaConfig
 from tasks.aoa.experiment import measurements
 from tasks.claim import CONFIG, ENVIRONMENT

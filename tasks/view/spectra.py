@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from swiftwrf import AngularGrid, Spectra
-from swiftwrf.angles import great_circle, to_direction
+from swiftwrf.array.angles import great_circle, to_direction
 from swiftwrf.data.spectra import direction_of_link
 from swiftwrf.positions import distance
 from tasks.aoa.page.room import MARGIN, extent

@@ -40,11 +40,11 @@ from swiftwrf import (
     simulated_room,
 )
 from swiftwrf.data.writing import write_spectra
-from swiftwrf.geometry import fit_geometry, fit_hybrid
-from swiftwrf.geometry.fit import observe
-from swiftwrf.geometry.strengths import fit_strengths
 from swiftwrf.gp import Kernel
-from swiftwrf.model import SwiftWRF
+from swiftwrf.models.geometry import fit_geometry, fit_hybrid
+from swiftwrf.models.geometry.fit import observe
+from swiftwrf.models.geometry.strengths import fit_strengths
+from swiftwrf.models.swiftwrf import SwiftWRF
 from tasks.aoa.estimators import Settings
 from tasks.aoa.estimators.kernel_ridge import KernelRegression
 
@@ -198,7 +198,7 @@ def read_estimator(folder: Path) -> torch.Tensor:
 
 def go_on(folder: Path) -> SwiftWRF:
     """A fit from its state; the choice of the kernel, which takes longest, is left out."""
-    with mock.patch.object(sys.modules["swiftwrf.fitting.fit"], "choose_kernel", return_value=Kernel()):
+    with mock.patch.object(sys.modules["swiftwrf.models.swiftwrf.fit"], "choose_kernel", return_value=Kernel()):
         return fit(_few(), TINY, progress=False, checkpoint=folder / "state")
 
 

@@ -19,10 +19,10 @@ from fuzz.commands import command_lines, right_command_lines
 from fuzz.kinds import KINDS
 from fuzz.mutate import spoil
 from swiftwrf import FitError, InputError
-from swiftwrf.checkpoint import Saved
 from swiftwrf.data.files import read_table, read_yaml
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.errors import LONGEST
+from swiftwrf.runtime.checkpoint import Saved
 
 SHORT = 200  # mutations a kind
 LONG = -(-10_000 // len(KINDS))

@@ -12,7 +12,7 @@ from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
-from swiftwrf.registry import Entry, Registry
+from swiftwrf.runtime.registry import Entry, Registry
 
 Data = TypeVar("Data")
 

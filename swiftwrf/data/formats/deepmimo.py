@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from swiftwrf.arrays import LIGHT_SPEED
+from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.data.archives import read_arrays
 from swiftwrf.data.files import FARTHEST, check_carrier, read_text
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format

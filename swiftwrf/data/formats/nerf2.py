@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
-from swiftwrf.angles import AngularGrid, ArrayPose
-from swiftwrf.arrays import LIGHT_SPEED, PlanarArray
+from swiftwrf.array.angles import AngularGrid, ArrayPose
+from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import array_header, array_names, read_arrays, read_rows
 from swiftwrf.data.files import (
     FARTHEST,
@@ -40,8 +40,8 @@ from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format
 from swiftwrf.data.reading import Reading
 from swiftwrf.data.spectra import Moving, Spectra, check_pixels
 from swiftwrf.data.splits import read_split, split_names
+from swiftwrf.data.store import AT_ONCE, MOST_EACH, MOST_PIXELS, Store, stored, too_many
 from swiftwrf.errors import InputError
-from swiftwrf.store import AT_ONCE, MOST_EACH, MOST_PIXELS, Store, stored, too_many
 
 # what Pillow raises on broken files
 BROKEN = (

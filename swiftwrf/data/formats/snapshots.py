@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf.angles import ArrayPose
-from swiftwrf.arrays import LIGHT_SPEED, PlanarArray
+from swiftwrf.array.angles import ArrayPose
+from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import ARCHIVES, Arrays, array_names, read_arrays
 from swiftwrf.data.files import FARTHEST, check_carrier, sha256
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.raytraced.surfaces import Material, Surface, box, rectangle
-from swiftwrf.registry import Registry
+from swiftwrf.runtime.registry import Registry
 
 Point = tuple[float, float, float]
 THICKNESS_M = {  # of panels, walls and sheets of each material

@@ -18,10 +18,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf.arrays import LIGHT_SPEED
+from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.data.raytraced.scene import Scene, sionna
 from swiftwrf.data.spectra import Moving
-from swiftwrf.progress import progress_bar
+from swiftwrf.runtime.progress import progress_bar
 
 RAYS = 100_000  # that look for chains of surfaces
 SCATTERED_RAYS = 300  # each is a path wherever it scatters

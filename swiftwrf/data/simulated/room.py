@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from swiftwrf.arrays import LIGHT_SPEED
+from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.errors import InputError
 
 MAX_ORDER = 2

@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from swiftwrf.angles import AngularGrid, ArrayPose
-from swiftwrf.arrays import PlanarArray
+from swiftwrf.array.angles import AngularGrid, ArrayPose
+from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.simulated.room import Room
 from swiftwrf.data.spectra import Moving, Spectra, array_spectra
 

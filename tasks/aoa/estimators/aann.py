@@ -24,11 +24,11 @@ from torch.optim.swa_utils import update_bn
 
 from augment import Mixed
 from swiftwrf import InputError
-from swiftwrf.angles import AngularGrid, to_angles, to_direction
-from swiftwrf.checkpoint import Header, expect
+from swiftwrf.array.angles import AngularGrid, to_angles, to_direction
 from swiftwrf.data.spectra import coarsening
-from swiftwrf.processes import Processes
-from swiftwrf.progress import progress
+from swiftwrf.runtime.checkpoint import Header, expect
+from swiftwrf.runtime.processes import Processes
+from swiftwrf.runtime.progress import progress
 from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator, Settings
 from tasks.aoa.estimators.radial import RadialRegression, coarse_pixels, kept_rows
 from tasks.aoa.estimators.resnet import FEATURES, backbone, shared_by

@@ -12,8 +12,8 @@ from torch.distributed import ProcessGroup
 
 from augment import Mixed
 from swiftwrf import AngularGrid
-from swiftwrf.checkpoint import Saved
-from swiftwrf.registry import Registry
+from swiftwrf.runtime.checkpoint import Saved
+from swiftwrf.runtime.registry import Registry
 from tasks.run import Preset
 
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from augment import Mixed
-from swiftwrf.angles import to_angles, to_direction
+from swiftwrf.array.angles import to_angles, to_direction
 from tasks.aoa.estimators.base import ESTIMATORS, Estimator
 
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from augment import Mixed
-from swiftwrf.angles import AngularGrid, to_angles, to_direction
-from swiftwrf.checkpoint import Header
+from swiftwrf.array.angles import AngularGrid, to_angles, to_direction
+from swiftwrf.runtime.checkpoint import Header
 from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator, Settings
 from tasks.aoa.estimators.radial import RadialRegression, coarse_pixels, kept_rows
 

@@ -23,8 +23,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from swiftwrf import InputError
-from swiftwrf.checkpoint import Header, expect
 from swiftwrf.data.spectra import coarsening
+from swiftwrf.runtime.checkpoint import Header, expect
 
 WIDTHS = (10.0, 20.0, 40.0, 80.0)  # of the kernel, as gamma times the median squared distance: narrow ones alone
 PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)

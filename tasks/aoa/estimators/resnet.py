@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.parallel import DistributedDataParallel
 
-from swiftwrf.processes import Processes
+from swiftwrf.runtime.processes import Processes
 
 FEATURES = 2048  # that the network sees in a spectrum, behind its last convolution
 

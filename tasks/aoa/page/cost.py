@@ -5,7 +5,7 @@ from __future__ import annotations
 from pandas import DataFrame, concat
 
 from augment import SYNTHESIZERS
-from swiftwrf.fitting.search import GAIN
+from swiftwrf.models.swiftwrf.search import GAIN
 from tasks.aoa import arms
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.share import AoaRecords, Share, first_history, fits

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from swiftwrf.beamforming import PHASE
+from swiftwrf.array.beamforming import PHASE
 from swiftwrf.data import Reading, Rssi, Snapshots, Spectra
 from tasks.inspect.findings.base import Findings
 from tasks.inspect.findings.rssi import check_rssi

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from swiftwrf.data import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
+from swiftwrf.diagnostics.frames import check_law
 from swiftwrf.errors import listed
-from swiftwrf.frames import check_law
 from tasks.inspect.findings.base import Findings
 from tasks.inspect.findings.positions import check_positions, say_splits
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 
 from swiftwrf import InputError
-from swiftwrf.calibration import calibrate
 from swiftwrf.data import Snapshots
+from swiftwrf.diagnostics.calibration import calibrate
 from swiftwrf.positions import distance
 from tasks.inspect.findings.base import Findings
 from tasks.inspect.findings.positions import ROUGH

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from swiftwrf.data import Spectra
-from swiftwrf.frames import FEW, check_frames
+from swiftwrf.diagnostics.frames import FEW, check_frames
 from tasks.inspect.findings.base import Findings
 from tasks.inspect.findings.positions import check_positions, say_splits
 

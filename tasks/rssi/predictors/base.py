@@ -10,8 +10,8 @@ from torch import Tensor
 
 from swiftwrf import Rssi
 from swiftwrf.data.splits import Validation
-from swiftwrf.registry import Registry
 from swiftwrf.rssi import Map
+from swiftwrf.runtime.registry import Registry
 
 RECEIVERS = "positions of the receivers"  # what predictors of the log-distance law need of the data
 SLOW = ("nerf2", "blend")  # compared only where they are asked for

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from swiftwrf import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
-from swiftwrf.threads import side_by_side
+from swiftwrf.runtime.threads import side_by_side
 from tasks.rssi.predictors.base import PREDICTORS, RECEIVERS, Predictor, Settings
 from tasks.rssi.predictors.laws import LogDistance, Mean
 

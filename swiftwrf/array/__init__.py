@@ -1,0 +1,1 @@
+"""Directions, element positions, beamforming and poses of an antenna array."""

@@ -1,0 +1,207 @@
+"""Spectra as they were measured, and as float32 by the batch.
+
+100,000 spectra of 90 x 360 pixels are 3 GB in the eight bits of images and 13 GB in float32, which no step of a fit needs at
+once. So they stay as they came, few in memory and many in a file of the cache that the operating system reads where it is
+looked at (memory-mapped), and become float32 where they are computed with.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.lib.format import dtype_to_descr, write_array_header_2_0
+from torch import Tensor
+from torch.nn import functional
+
+from swiftwrf.errors import InputError
+from swiftwrf.runtime.durable import cache_folder, replacing
+from swiftwrf.runtime.progress import progress_bar
+
+MANY = 20_000  # spectra from which on they lie in a file
+MOST_PIXELS = 2**29  # in memory: 2 GiB of float32
+MOST_STORED, MOST_EACH = 2**34, 2**20  # in a file, where they are many and not few in all too fine a grid
+AT_ONCE = 2**26  # pixels that become float32 at a time: 256 MiB
+KEPT_DAYS = 30  # without use, after which a file of the cache goes
+TYPES = {torch.uint8: np.uint8, torch.float16: np.float16, torch.float32: np.float32}
+
+
+class Store:
+    """n spectra (n, H, W): indexing gives float32 magnitudes in [0, 1]; nothing is converted or copied before.
+
+    Args:
+        values: bytes, which count 255 as 1, or float16 or float32 magnitudes, (m, H, W); in memory or mapped from a file.
+        rows: which of the values these spectra are, in order, int64 (n,); all unless given.
+        factor: they are averaged over squares of so many pixels.
+    """
+
+    def __init__(self, values: Tensor, rows: Tensor | None = None, factor: int = 1) -> None:
+        self.values, self.rows, self.factor = values, rows, factor
+
+    def __len__(self) -> int:
+        return len(self.values if self.rows is None else self.rows)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """n, H, W."""
+        rows, columns = self.values.shape[1:]
+        return len(self), rows // self.factor, columns // self.factor
+
+    def __getitem__(self, rows: Tensor | slice) -> Tensor:
+        """Some of the spectra, float32; of float64 values float64, for those who compute in it."""
+        measured = self.measured(rows)
+        spectrum = measured if measured.dtype == torch.float64 else measured.float()
+        if measured.dtype == torch.uint8:
+            spectrum = spectrum / 255
+        return spectrum if self.factor == 1 else functional.avg_pool2d(spectrum[:, None], self.factor)[:, 0]
+
+    def measured(self, rows: Tensor | slice) -> Tensor:
+        """Some of the spectra as they were measured, before any averaging."""
+        return self.values[rows if self.rows is None else self.rows[rows]]
+
+    def exact(self) -> tuple[torch.dtype, Iterator[Tensor]]:
+        """All spectra in order, by the batch, in the smallest type that loses nothing, and that type."""
+        if self.factor == 1 and self.values.dtype in TYPES:
+            return self.values.dtype, (self.measured(rows) for rows in self.parts())
+        return torch.float32, (batch.float() for batch in self.batches())
+
+    def subset(self, rows: Tensor) -> Store:
+        """The given rows, in the given order."""
+        if rows.dtype == torch.bool:
+            rows = rows.nonzero()[:, 0]
+        return Store(self.values, rows if self.rows is None else self.rows[rows], self.factor)
+
+    def coarsen(self, factor: int) -> Store:
+        """The same spectra averaged over squares of factor x factor pixels."""
+        return Store(self.values, self.rows, self.factor * factor)
+
+    def parts(self) -> Iterator[slice]:
+        """Rows that may become float32 at once: all, where they are few."""
+        step = max(1, AT_ONCE // math.prod(self.values.shape[1:]))
+        return (slice(start, min(start + step, len(self))) for start in range(0, len(self), step))
+
+    def batches(self) -> Iterator[Tensor]:
+        """All spectra in order, float32, so many at once as `parts` says."""
+        return (self[rows] for rows in self.parts())
+
+    def mean(self) -> Tensor:
+        """Of all spectra, (H, W)."""
+        if len(parts := list(self.parts())) == 1:
+            return self[:].mean(dim=0)
+        total = sum(
+            (self[rows].sum(dim=0, dtype=torch.float64) for rows in parts), torch.zeros((), dtype=torch.float64)
+        )
+        return (total / len(self)).float()
+
+    def digest(self) -> str:
+        """Of what was measured, however it is kept, and of what these spectra take from it."""
+        digest = hashlib.sha256(repr((str(self.values.dtype), self.shape, self.factor)).encode())
+        for rows in self.parts():
+            digest.update(self.measured(rows).contiguous().numpy().data)
+        return digest.hexdigest()
+
+
+def too_many(shape: tuple[int, int, int]) -> bool:
+    """Whether spectra (n, H, W) are more than anybody measures, and rather a wrong size."""
+    pixels, each = math.prod(shape), math.prod(shape[1:])
+    return pixels > MOST_STORED or (pixels > MOST_PIXELS and each > MOST_EACH)
+
+
+def in_file(shape: tuple[int, int, int]) -> bool:
+    """Whether so many spectra (n, H, W) lie in a file."""
+    return shape[0] >= MANY or math.prod(shape) > MOST_PIXELS
+
+
+def stored(
+    shape: tuple[int, int, int], dtype: torch.dtype, key: Callable[[], str], make: Callable[[], Iterable[Tensor]]
+) -> Store:
+    """A store of spectra that come by the batch: in memory, or where there are many in a file.
+
+    The file lies in the cache directory, `$XDG_CACHE_HOME/swiftwrf` or `~/.cache/swiftwrf`, and is called after its content,
+    so that the same data are read or computed once. It goes when it was not used for a month.
+
+    Args:
+        shape: of all, (n, H, W).
+        dtype: of the batches: uint8, float16 or float32.
+        key: digest of what the spectra follow from, asked for where there is a file.
+        make: the batches in order; called unless they are there already.
+
+    Raises:
+        InputError: the cache directory cannot be written or has not enough room.
+    """
+    if not in_file(shape):
+        values, start = torch.empty(shape, dtype=dtype), 0
+        for batch in make():
+            values[start : start + len(batch)] = batch
+            start += len(batch)
+        return Store(values)
+    owner = hashlib.sha256(f"{key()} {shape} {dtype}".encode()).hexdigest()
+    file = cache_folder() / f"spectra-{owner}.npy"
+    if (found := _mapped(file, shape, dtype)) is None:
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            _prune(file.parent)
+            _write(file, shape, dtype, make)
+        except OSError as error:
+            raise InputError(
+                f"{shape[0]} spectra are kept in {file.parent}, which cannot be written ({error.strerror}); set "
+                "XDG_CACHE_HOME to another directory"
+            ) from None
+        found = _mapped(file, shape, dtype)
+    assert found is not None
+    return Store(found)
+
+
+def _mapped(file: Path, shape: tuple[int, int, int], dtype: torch.dtype) -> Tensor | None:
+    """The spectra in a file, read where they are looked at; None where it is not there or not whole."""
+    try:
+        values = np.load(file, mmap_mode="c")  # copy on write, for torch knows no read-only memory
+        os.utime(file)
+    except (OSError, ValueError, EOFError):
+        return None
+    return torch.from_numpy(values) if values.shape == shape and values.dtype == TYPES[dtype] else None
+
+
+def _write(file: Path, shape: tuple[int, int, int], dtype: torch.dtype, make: Callable[[], Iterable[Tensor]]) -> None:
+    """Written and not mapped: where the disk is full, that is an error and not a signal that ends the process."""
+    size, free = math.prod(shape) * dtype.itemsize, shutil.disk_usage(file.parent).free
+    if size > free:
+        raise InputError(
+            f"{shape[0]} spectra take {size / 1e9:.1f} GB in {file.parent}, where {free / 1e9:.1f} GB are free; set "
+            "XDG_CACHE_HOME to a directory with room"
+        )
+    with replacing(file) as temporary, temporary.open("wb") as stream, progress_bar() as bar:
+        task = bar.add_task("storing spectra", total=shape[0])
+        write_npy(stream, shape, dtype, make(), lambda count: bar.advance(task, count))
+
+
+def write_npy(
+    stream: Any,
+    shape: tuple[int, int, int],
+    dtype: torch.dtype,
+    batches: Iterable[Tensor],
+    advance: Callable[[int], None] = lambda count: None,
+) -> None:
+    """An npy file of spectra (n, H, W) that come by the batch; `advance` hears how many were written."""
+    header = {"shape": shape, "fortran_order": False, "descr": dtype_to_descr(np.dtype(TYPES[dtype]))}
+    write_array_header_2_0(stream, header)
+    for batch in batches:
+        stream.write(batch.contiguous().numpy().data)
+        advance(len(batch))
+
+
+def _prune(folder: Path) -> None:
+    """Removes what nobody used for a month, and what a process that was killed left behind."""
+    for file in folder.glob("*spectra-*"):
+        with suppress(OSError):  # another process may be faster
+            if time.time() - file.stat().st_mtime > KEPT_DAYS * 86_400:
+                file.unlink()

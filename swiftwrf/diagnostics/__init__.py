@@ -1,0 +1,1 @@
+"""Checks of measured data: coordinate frames and the calibration of an array."""

@@ -1,0 +1,1 @@
+"""Field models: each predicts spectra at any position."""

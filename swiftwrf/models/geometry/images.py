@@ -1,0 +1,219 @@
+"""Image sources: where paths that mirror planes reflect seem to come from, and the waves they bring to the array.
+
+A path reflected by planes one after another arrives as if from the transmitter mirrored in them one after another, along a
+straight line (J. B. Allen and D. A. Berkley, J. Acoust. Soc. Am. 65, 1979). Everything is batched over rooms that have
+equally many planes; B rooms, P planes, S images, n positions, K elements.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data.spectra import Moving
+
+RIGHT = 0.02  # |cosine| below which two planes count as perpendicular, above 1 - RIGHT**2 as parallel
+ROUNDED = 1e-3  # of phase [rad]
+FEW = 36  # positions that many rooms are scored at
+
+Sequence = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the waves depend on besides the planes, and what was observed.
+
+    Args:
+        transmitter, receiver: positions, float64 (n, 3) or, of the fixed end, (1, 3) [m].
+        end: which of them moves.
+        element: phase that a wave from unit vector u gains at each element is element @ u, float32 (K, 3) [rad].
+        wavenumber: [rad / m].
+        channel: observed phases, complex64 (n, 2, K): of unit modulus, and the same seen by an array turned by half a turn,
+            which the spectra cannot tell apart where each element has an opposite one.
+    """
+
+    transmitter: Tensor
+    receiver: Tensor
+    end: Moving
+    element: Tensor
+    wavenumber: float
+    channel: Tensor
+
+    @classmethod
+    def of(
+        cls, position: Tensor, fixed: Tensor, moving: Moving, array: PlanarArray, rotation: Tensor, channel: Tensor
+    ) -> Scene:
+        """The scene of a moving end at `position` (n, 3) [m] and a fixed one (3,) [m]; `channel` (n, K) of modulus 1."""
+        transmitter, receiver = (position, fixed[None]) if moving == "transmitter" else (fixed[None], position)
+        wavenumber = 2 * math.pi / array.wavelength
+        element = wavenumber * array.element.double() @ rotation[:, :2].T.double()
+        opposite = array.opposite
+        both = torch.stack([channel, channel if opposite is None else channel.conj()[:, opposite]], dim=1)
+        return cls(transmitter, receiver, moving, element.float(), wavenumber, both.to(torch.complex64))
+
+    def __len__(self) -> int:
+        return len(self.moving)
+
+    @property
+    def moving(self) -> Tensor:
+        """Positions of the end that moves, (n, 3) [m]."""
+        return self.transmitter if self.end == "transmitter" else self.receiver
+
+    def subset(self, rows: Tensor) -> Scene:
+        """The given positions only."""
+        moving = self.moving[rows]
+        ends = (moving, self.receiver) if self.end == "transmitter" else (self.transmitter, moving)
+        return replace(self, transmitter=ends[0], receiver=ends[1], channel=self.channel[rows])
+
+    def few(self, most: int = FEW) -> Scene:
+        """At most so many of the positions, evenly chosen, to score many rooms at."""
+        return self.subset(torch.linspace(0, len(self) - 1, min(most, len(self))).long())
+
+    def around(self, origin: Tensor) -> Scene:
+        """The scene in coordinates from an origin (3,) [m], rounded to a thousandth of a radian of phase: near ties of a
+        search must not hang on digits that another origin would have rounded otherwise."""
+        step = ROUNDED / self.wavenumber
+        transmitter, receiver = (((end - origin) / step).round() * step for end in (self.transmitter, self.receiver))
+        return replace(self, transmitter=transmitter, receiver=receiver)
+
+    def wave(self, source: Tensor) -> Tensor:
+        """What each element hears from sources (..., n or 1, 3) [m]: exp(-j k d) / d, complex64 (..., n, K)."""
+        ray = (source - self.receiver).float()
+        length = ray.norm(dim=-1, keepdim=True)
+        return spherical((ray / length) @ self.element.T - self.wavenumber * length, length)
+
+    def coherence(self, field: Tensor) -> Tensor:
+        """|x^H h|^2 / K^2 of the observed and the given phases, (..., n, K) to (..., n), in [0, 1]; the better of the two
+        channels that the spectrum cannot tell apart counts."""
+        match = torch.einsum("...nk,nfk->...nf", field.sgn(), self.channel.conj())
+        return match.abs().square().amax(-1) / field.shape[-1] ** 2
+
+    def score(self, field: Tensor) -> Tensor:
+        """1 - the mean coherence: 0 where all phases agree, (..., n, K) to (...)."""
+        return 1 - self.coherence(field).mean(-1)
+
+
+def spherical(phase: Tensor, length: Tensor) -> Tensor:
+    """exp(j phase) / length, complex64; cosine and sine are vectorised, torch.polar is not."""
+    return torch.complex(phase.cos() / length, phase.sin() / length)
+
+
+def sequences(normal: Tensor, order: int) -> list[Sequence]:
+    """Which planes, one after another, make the images up to `order`, of planes with outward normals (P, 3).
+
+    Planes that face alike cannot reflect each other's images, and of perpendicular ones both orders give one image.
+    """
+    cosine = (normal @ normal.T).tolist()
+    planes = range(len(normal))
+    found: list[Sequence] = [(i,) for i in planes]
+    last = found
+    for _ in range(order - 1):
+        last = [
+            (*s, i)
+            for s, i in itertools.product(last, planes)
+            if cosine[s[-1]][i] < 1 - RIGHT**2 and i != s[-1] and not (abs(cosine[s[-1]][i]) < RIGHT and i < s[-1])
+        ]
+        found = found + last
+    return found
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Sequences, and all that they begin with, by their lengths, so that all images of one order follow at once.
+
+    Args:
+        levels: for each length the rows of the sequences without their last plane among those of the length before, and the
+            last planes.
+        rows: of the sequences among those of all lengths, one after the other.
+    """
+
+    levels: list[tuple[Tensor, Tensor]]
+    rows: Tensor
+
+
+@lru_cache(maxsize=1024)
+def tree_of(sequence: tuple[Sequence, ...]) -> Tree:
+    """The tree of these sequences."""
+    before: dict[Sequence, int] = {(): 0}
+    row: dict[Sequence, int] = {}
+    levels = []
+    for length in range(1, max(map(len, sequence)) + 1):
+        these = list(dict.fromkeys(s[:length] for s in sequence if len(s) >= length))
+        levels.append((torch.tensor([before[s[:-1]] for s in these]), torch.tensor([s[-1] for s in these])))
+        before = {s: number for number, s in enumerate(these)}
+        row |= {s: number + len(row) for s, number in before.items()}
+    return Tree(levels, torch.tensor([row[s] for s in sequence]))
+
+
+def mirror(source: Tensor, normal: Tensor, offset: Tensor) -> Tensor:
+    """Sources (..., 3) [m] mirrored in planes normal . x = offset; the shapes (..., 3) and (...) broadcast."""
+    distance = (source * normal).sum(-1, keepdim=True) - offset[..., None]
+    return source - 2 * distance * normal
+
+
+def images(scene: Scene, normal: Tensor, offset: Tensor, sequence: list[Sequence]) -> Tensor:
+    """Where the images are, float64 (B, S, n or 1, 3) [m], in planes (B, P, 3) and (B, P) [m]."""
+    tree, last, found = tree_of(tuple(sequence)), scene.transmitter.expand(len(normal), 1, -1, -1), []
+    for parent, plane in tree.levels:
+        last = mirror(last[:, parent], normal[:, plane, None], offset[:, plane, None])
+        found.append(last)
+    return torch.cat(found, dim=1)[:, tree.rows]
+
+
+def turn_of(scene: Scene, normal: Tensor, offset: Tensor, plane: int) -> float:
+    """By how much a plane of the room (1, P, 3), (1, P) moves to turn the phase of its reflection by a full turn, on
+    average [m]."""
+    ray = images(scene, normal, offset, [(plane,)])[0, 0] - scene.receiver
+    cosine = float((ray @ normal[0, plane] / ray.norm(dim=-1)).abs().mean().clamp_min(0.3))
+    return math.pi / (scene.wavenumber * cosine)
+
+
+def field(scene: Scene, normal: Tensor, offset: Tensor, gain: Tensor, sequence: list[Sequence]) -> Tensor:
+    """Sum of the waves of the given images, complex64 (B, n, K); gains (B, P), real or complex."""
+    if not sequence:
+        shape = (len(normal), len(scene), len(scene.element))
+        return torch.zeros(shape, dtype=torch.complex64)
+    source = images(scene, normal, offset, sequence)
+    strength = image_gain(gain, sequence)[..., None] * visibility(scene, normal, offset, sequence)
+    wave = scene.wave(source)
+    return torch.einsum("bsnk,bsn->bnk", wave, strength.to(wave.dtype).expand(wave.shape[:3]))
+
+
+def image_gain(gain: Tensor, sequence: list[Sequence]) -> Tensor:
+    """Product of the gains (B, P) along each sequence, (B, S)."""
+    tree, last, found = tree_of(tuple(sequence)), torch.ones(len(gain), 1), []
+    for parent, plane in tree.levels:
+        last = last[:, parent] * gain[:, plane]
+        found.append(last)
+    return torch.cat(found, dim=1)[:, tree.rows]
+
+
+def visibility(scene: Scene, normal: Tensor, offset: Tensor, sequence: list[Sequence]) -> Tensor:
+    """Whether the path of each image exists, float32 (B, S, n or 1).
+
+    Between planes that are parallel or perpendicular all do, since the region is inside of all planes. Elsewhere the path
+    is followed back from the receiver: it must meet its last plane coming from the inside, and so on.
+    """
+    facing = normal[:1] if normal.stride(0) == 0 else normal  # rooms that are expanded from one share their normals
+    cosine = (facing @ facing.mT).abs()
+    if not bool(((cosine > RIGHT) & (cosine < 1 - RIGHT**2)).any()):
+        return torch.ones(len(normal), len(sequence), 1)
+    begun = list(dict.fromkeys(s[:end] for s in sequence for end in range(1, len(s) + 1)))
+    source = dict(zip(begun, images(scene, normal, offset, begun).unbind(1), strict=True))
+    there = torch.ones(len(normal), len(sequence), len(scene))
+    for number, s in enumerate(sequence):
+        point = scene.receiver.expand(len(normal), -1, -1)
+        for end in range(len(s), 0, -1):
+            n, o = normal[:, s[end - 1], None], offset[:, s[end - 1], None]
+            towards = source[s[:end]] - point
+            before, slope = o - (point * n).sum(-1), (towards * n).sum(-1)
+            share = before / slope
+            there[:, number] *= ((share > 0) & (share < 1)).float()
+            point = point + share[..., None] * towards
+    return there

@@ -1,0 +1,103 @@
+"""What the spectra say of the channel: the phase of each element, up to one phase a spectrum.
+
+A spectrum's square is the Fourier transform of the channel's autocorrelation over the co-array, and the channel that it
+was made from has elements of modulus 1. A 4 x 4 array gives 48 real numbers for 15 unknown phases, so the phases can be
+found: two-dimensional phase retrieval (R. H. T. Bates, "Fourier phase problems are uniquely solvable in more than one
+dimension", Optik 61, 1982). What stays unknown is the phase of the whole, and whether the array was turned by half a turn
+with all phases reversed, which leaves every spectrum as it is.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from swiftwrf.array.planar import PlanarArray, basis, pairs
+from swiftwrf.data.spectra import Spectra
+
+PIXELS = 6000  # of a spectrum that are enough for its few dozen coefficients
+STEPS = 40
+STARTS = 20
+SOLVED = 5e-3  # relative error of the autocorrelation below which a start counts as the solution
+
+
+def autocorrelation(channel: Tensor, array: PlanarArray) -> Tensor:
+    """r(l) = sum of h_a conj(h_b) over the pairs with difference l, over K^2, (..., K) to (..., P)."""
+    a, b, lag = pairs(array)
+    r = torch.zeros(*channel.shape[:-1], int(lag.max()) + 1, dtype=channel.dtype)
+    return r.index_add(-1, lag, channel[..., a] * channel[..., b].conj()) / channel.shape[-1] ** 2
+
+
+def correlations(spectra: Spectra) -> Tensor:
+    """r(l) of each spectrum by least squares on its square, complex128 (n, P); pixels are left out where there are many."""
+    assert spectra.array is not None
+    functions = basis(spectra.array, spectra.grid)
+    stride = max(1, functions.shape[1] // PIXELS)
+    stride += 1 - stride % 2  # odd: an even one would keep to every other column
+    inverse = torch.linalg.pinv(functions[:, ::stride])
+    some = (part.flatten(1)[:, ::stride] for part in spectra.store.batches())
+    coefficient = torch.cat([part.double().square() @ inverse for part in some])
+    half = (coefficient.shape[1] - 1) // 2
+    return torch.complex(coefficient[:, 1 : 1 + half], coefficient[:, 1 + half :]) / 2
+
+
+def element_phases(observed: Tensor, array: PlanarArray, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Unit-modulus channels with the observed autocorrelation, by Gauss-Newton steps from several starts.
+
+    Args:
+        observed: r(l) of each spectrum, complex128 (n, P).
+        array: which took them.
+        seed: of the random starts.
+
+    Returns:
+        Channels, complex128 (n, K), and the relative error of each one's autocorrelation, (n,).
+    """
+    a, b, lag = pairs(array)
+    n, k = len(observed), len(array.element)
+    generator = torch.Generator().manual_seed(seed)
+    scale = observed.abs().square().sum(1).sqrt().clamp_min(1e-12)
+    toeplitz = torch.eye(k, dtype=torch.complex128).repeat(n, 1, 1) / k
+    count = torch.bincount(lag).double()
+    toeplitz[:, a, b] = observed[:, lag] * k**2 / count[lag] / k
+    toeplitz[:, b, a] = toeplitz[:, a, b].conj()
+    phase = torch.linalg.eigh(toeplitz).eigenvectors[..., -1].angle()  # close where one path dominates
+    best, error = phase.clone(), torch.full((n,), math.inf, dtype=torch.float64)
+    for start in range(STARTS):
+        rows = (error > SOLVED).nonzero()[:, 0]
+        if not len(rows):
+            break
+        x = phase[rows] + min(0.7 * start, 2.1) * torch.randn(len(rows), k, dtype=torch.float64, generator=generator)
+        x, miss = _descend(x, observed[rows], a, b, lag)
+        better = miss / scale[rows] < error[rows]
+        best[rows[better]], error[rows[better]] = x[better], (miss / scale[rows])[better]
+    return torch.polar(torch.ones_like(best), best), error
+
+
+def _descend(phase: Tensor, observed: Tensor, a: Tensor, b: Tensor, lag: Tensor) -> tuple[Tensor, Tensor]:
+    """Levenberg-Marquardt on the phases (n, K); returns them and the length of each one's residual, (n,)."""
+    n, k = phase.shape
+    difference = torch.zeros(len(a), k, dtype=torch.float64)
+    difference[torch.arange(len(a)), a], difference[torch.arange(len(a)), b] = 1, -1
+    gather = torch.zeros(int(lag.max()) + 1, len(a), dtype=torch.float64)
+    gather[lag, torch.arange(len(a))] = 1 / k**2
+
+    def residual(x: Tensor) -> tuple[Tensor, Tensor]:
+        product = torch.polar(torch.ones(n, len(a), dtype=torch.float64), x @ difference.T)
+        return product, torch.view_as_real(product @ gather.T.to(product.dtype) - observed).flatten(1)
+
+    damping = torch.full((n,), 1e-2, dtype=torch.float64)
+    product, missed = residual(phase)
+    for _ in range(STEPS):
+        jacobian = torch.einsum("lp,np,pk->nlk", gather.to(product.dtype), 1j * product, difference.to(product.dtype))
+        jacobian = torch.view_as_real(jacobian).permute(0, 1, 3, 2).flatten(1, 2)
+        normal = jacobian.mT @ jacobian
+        normal = normal + (damping * normal.diagonal(dim1=1, dim2=2).mean(1) + 1e-15)[:, None, None] * torch.eye(k)
+        step = -torch.linalg.solve(normal, (jacobian.mT @ missed[..., None]))[..., 0]
+        trial, after = residual(phase + step)
+        better = after.square().sum(1) < missed.square().sum(1)
+        phase = torch.where(better[:, None], phase + step, phase)
+        missed, product = torch.where(better[:, None], after, missed), torch.where(better[:, None], trial, product)
+        damping = torch.where(better, damping * 0.3, damping * 5).clamp(1e-9, 1e4)
+    return phase, missed.norm(dim=1)

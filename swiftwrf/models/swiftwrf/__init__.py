@@ -1,0 +1,7 @@
+"""SwiftWRF: 2D Gaussians that deform with the position, and their fit."""
+
+from swiftwrf.models.swiftwrf.config import FitConfig, ModelConfig
+from swiftwrf.models.swiftwrf.fit import fit
+from swiftwrf.models.swiftwrf.model import SwiftWRF
+
+__all__ = ["FitConfig", "ModelConfig", "SwiftWRF", "fit"]
