@@ -35,22 +35,20 @@ def covariance(channel: Tensor) -> Tensor:
     return channel.mT @ channel.conj() / channel.shape[1]
 
 
-@BEAMFORMERS.register(PHASE, meaning="sum of phases, as the paper has it; power is ignored")
+@BEAMFORMERS.register(PHASE)
 def phase(channel: Tensor, responses: Responses) -> Tensor:
     """Squared spectra (n, ...) of the phases of channels (n, S, K)."""
     heard = torch.polar(torch.ones((), dtype=torch.float64), channel.angle().double())
     return responses(covariance(heard) / channel.shape[2] ** 2)
 
 
-@BEAMFORMERS.register("bartlett", meaning="share of the received power in a beam")
+@BEAMFORMERS.register("bartlett")
 def bartlett(channel: Tensor, responses: Responses) -> Tensor:
     """Squared spectra (n, ...) of channels (n, S, K)."""
     return responses(_of_unit_power(channel) / channel.shape[2] ** 2)
 
 
-@BEAMFORMERS.register(
-    "capon", meaning="power of the beam that suppresses all else (minimum variance), relative to its maximum"
-)
+@BEAMFORMERS.register("capon")
 def capon(channel: Tensor, responses: Responses) -> Tensor:
     """Squared spectra (n, ...) of channels (n, S, K).
 

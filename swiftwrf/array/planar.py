@@ -105,7 +105,7 @@ class PlanarArray:
             InputError: an unknown beamformer, or too few snapshots for it.
         """
         snapshots = channel[:, None] if channel.dim() == 2 else channel
-        make = BEAMFORMERS[beamformer].make
+        make = BEAMFORMERS[beamformer]
         drawn = torch.empty(len(channel), *grid.shape)
         for rows in torch.arange(len(channel)).split(max(1, min(AT_ONCE, MOST_PAIRS // len(self.element) ** 2))):
             squared = make(snapshots[rows], lambda matrix: self.responses(matrix, grid))

@@ -1,1 +1,5 @@
-"""Field models: each predicts spectra at any position."""
+"""Field models: each is fitted to measured spectra and predicts spectra at any position. One file, one model."""
+
+from swiftwrf.models.base import ARRAY, FIELD_MODELS, FIXED_END, FieldConfig, FieldModel, Prediction, make_model
+
+__all__ = ["ARRAY", "FIELD_MODELS", "FIXED_END", "FieldConfig", "FieldModel", "Prediction", "make_model"]

@@ -1,93 +1,93 @@
-"""One registry for each kind of thing that comes in several makes: synthesizers, predictors, deformations, formats, ...
+"""Registries of implementations by name: field models, estimators, readers, beamformers.
 
-Help texts, reports, colours and benchmarks read the registry; adding a make is one new file in the folder of its kind.
+An implementation of this package registers itself when its module is imported. An implementation of another package is
+found by an entry point of the registry's group and is imported at first use.
 """
 
 from __future__ import annotations
 
 import importlib
+import inspect
 import pkgutil
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Generic, TypeVar
+from collections.abc import Callable, Iterator, Mapping
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, TypeVar
 
 from swiftwrf.errors import InputError
 
 Made = TypeVar("Made")
-Factory = TypeVar("Factory", bound=Callable[..., object])
+Registered = TypeVar("Registered", bound=Callable[..., Any])
 
 
-@dataclass(frozen=True)
-class Entry(Generic[Made]):
-    """One make of a kind.
-
-    Args:
-        name: what users call it.
-        make: builds one.
-        meaning: in one line.
-        needs: what the data must tell for it, in words (`array`, `positions of the receivers`).
-        colour: in figures, `#rrggbb`; None leaves the choice to the figure.
-    """
-
-    name: str
-    make: Callable[..., Made]
-    meaning: str
-    needs: tuple[str, ...] = ()
-    colour: str | None = None
-
-
-class Registry(Generic[Made]):
-    """The makes of one kind by name, in the order of their registration.
+class Registry(Mapping[str, type[Made]]):
+    """Implementations of one kind by name, in the order of their registration.
 
     Args:
-        kind: what they are, for messages.
+        kind: Kind of the implementations, for messages.
+        group: Group of entry points by which other packages add implementations. None for a closed registry.
+
+    Example:
+        >>> shapes: Registry[object] = Registry("shape")
+        >>> @shapes.register("circle")
+        ... class Circle:
+        ...     '''A round shape.'''
+        >>> shapes["circle"].__name__, shapes.summary("circle")
+        ('Circle', 'A round shape')
     """
 
-    def __init__(self, kind: str) -> None:
-        self.kind = kind
-        self._entries: dict[str, Entry[Made]] = {}
+    def __init__(self, kind: str, group: str | None = None) -> None:
+        self.kind, self.group = kind, group
+        self._registered: dict[str, Any] = {}
 
-    def register(
-        self, name: str, *, meaning: str, needs: tuple[str, ...] = (), colour: str | None = None
-    ) -> Callable[[Factory], Factory]:
-        """Decorator of a class or function that builds what `name` stands for.
+    def register(self, name: str) -> Callable[[Registered], Registered]:
+        """Return a decorator that registers a class or function under a name.
 
         Raises:
-            ValueError: the name is taken.
+            ValueError: The name is taken.
         """
 
-        def decorate(factory: Factory) -> Factory:
-            if name in self._entries:
+        def decorate(implementation: Registered) -> Registered:
+            if self._registered.setdefault(name, implementation) is not implementation:
                 raise ValueError(f"{self.kind} {name!r} is registered already")
-            self._entries[name] = Entry(name, factory, meaning, needs, colour)  # type: ignore[arg-type]
-            return factory
+            return implementation
 
         return decorate
 
     def discover(self, package: str, path: list[str], first: tuple[str, ...] = ()) -> None:
-        """Imports every module of a package, those named `first` before the others, so that each registers what it holds."""
+        """Import every module of a package, the modules named `first` before the others, so that each registers itself."""
         for module in (*first, *sorted(module.name for module in pkgutil.iter_modules(path))):
             importlib.import_module(f"{package}.{module}")
 
-    def __getitem__(self, name: str) -> Entry[Made]:
-        """The entry of that name.
+    def summary(self, name: str) -> str:
+        """Return the first line of an implementation's docstring, without its full stop."""
+        return (inspect.getdoc(self[name]) or "").partition("\n")[0].removesuffix(".")
+
+    def _external(self) -> dict[str, EntryPoint]:
+        found = entry_points(group=self.group) if self.group else ()
+        return {point.name: point for point in found if point.name not in self._registered}
+
+    def __getitem__(self, name: str) -> Any:
+        """Return the implementation of that name.
 
         Raises:
-            InputError: there is none.
+            InputError: There is none, or the package that provides it cannot be imported.
         """
-        if name not in self._entries:
+        if name in self._registered:
+            return self._registered[name]
+        point = self._external().get(name)
+        if point is None:
             raise InputError(f"unknown {self.kind} {name!r}; choose from {', '.join(self)}")
-        return self._entries[name]
+        try:
+            implementation = point.load()
+        except Exception as error:  # code of another package may raise anything
+            raise InputError(f"{self.kind} {name!r} of {point.value} cannot be imported ({error})") from error
+        return self._registered.setdefault(name, implementation)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._entries)
+        return iter((*self._registered, *self._external()))
 
     def __contains__(self, name: object) -> bool:
-        return name in self._entries
+        return name in self._registered or name in self._external()
 
     def __len__(self) -> int:
-        return len(self._entries)
-
-    def entries(self) -> list[Entry[Made]]:
-        """All of them, in order."""
-        return list(self._entries.values())
+        return len(tuple(iter(self)))

@@ -149,7 +149,7 @@ def where(config: ScenesConfig) -> tuple[FurnishedRoom | None, Tensor, Tensor]:
     Raises:
         InputError: either is outside the room, or the fixed end is in its furniture.
     """
-    room = None if config.room.endswith(SCENE_FILE) else ROOMS[config.room].make()
+    room = None if config.room.endswith(SCENE_FILE) else ROOMS[config.room]()
     corners = (config.region[:3], config.region[3:]) if config.region else room.region if room else ()
     region = torch.tensor(corners, dtype=torch.float64).sort(dim=0).values
     fixed = torch.tensor(config.fixed or (room.fixed if room else ()), dtype=torch.float64)

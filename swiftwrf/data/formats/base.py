@@ -12,7 +12,7 @@ from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
-from swiftwrf.runtime.registry import Entry, Registry
+from swiftwrf.runtime.registry import Registry
 
 Data = TypeVar("Data")
 
@@ -35,9 +35,9 @@ class Format(ABC, Generic[Data]):
         """
 
 
-SPECTRA_FORMATS: Registry[Format[Spectra]] = Registry("format of spectra")
-SNAPSHOT_FORMATS: Registry[Format[Snapshots]] = Registry("format of array snapshots")
-RSSI_FORMATS: Registry[Format[Rssi]] = Registry("format of RSSI")
+SPECTRA_FORMATS: Registry[Format[Spectra]] = Registry("format of spectra", "swiftwrf.readers.spectra")
+SNAPSHOT_FORMATS: Registry[Format[Snapshots]] = Registry("format of array snapshots", "swiftwrf.readers.snapshots")
+RSSI_FORMATS: Registry[Format[Rssi]] = Registry("format of RSSI", "swiftwrf.readers.rssi")
 
 
 def read(path: str | Path, how: Reading, *registries: Registry[Format[Any]]) -> Any:
@@ -52,26 +52,24 @@ def read(path: str | Path, how: Reading, *registries: Registry[Format[Any]]) -> 
     if not os.path.isdir(source) and not os.path.isfile(source):  # Path.is_dir raises where a name is too long
         raise InputError(f"{source} is not a folder or file; expected measurements (formats: {known})")
     try:
-        entry, reader = _find(source, known, registries)
-        for name in how.given:
-            if name not in reader.takes:
-                raise InputError(
-                    f"{source} is read as {entry.name} ({entry.meaning}), which takes no {name}; leave it out"
-                )
+        name, reader = _find(source, known, registries)
+        for option in how.given:
+            if option not in reader.takes:
+                raise InputError(f"{source} is read as {name}, which takes no {option}; leave it out")
         return reader.read(source, how)
     except OSError as error:
         reason = "no permission to read it" if isinstance(error, PermissionError) else error.strerror
         raise InputError(f"{error.filename or source} cannot be read ({reason})") from None
 
 
-def _find(source: Path, known: str, registries: tuple[Registry[Any], ...]) -> tuple[Entry[Any], Format[Any]]:
+def _find(source: Path, known: str, registries: tuple[Registry[Any], ...]) -> tuple[str, Format[Any]]:
     """The one format that recognises the source: of two, either would be a guess."""
-    readers = [(entry, entry.make()) for registry in registries for entry in registry.entries()]
-    found = [(entry, reader) for entry, reader in readers if reader.recognises(source)]
+    readers = [(name, registry[name]()) for registry in registries for name in registry]
+    found = [(name, reader) for name, reader in readers if reader.recognises(source)]
     if not found:
         kinds = " or ".join(registry.kind for registry in registries)
         raise InputError(f"{source} holds no {kinds} that is known ({known}); docs/formats.md describes them")
     if len(found) > 1:
-        names = " and ".join(entry.name for entry, _ in found)
+        names = " and ".join(name for name, _ in found)
         raise InputError(f"{source} holds several formats ({names}); keep one in the folder, or name the file itself")
     return found[0]

@@ -39,7 +39,7 @@ OFF = 15.0  # [deg] that direct paths may come from beside the line of sight
 FEW = 10  # direct paths that tell the conventions
 
 
-@SPECTRA_FORMATS.register("deepmimo", meaning="DeepMIMO v4 folder with power_t000_tx000_r000.npz, ... and params.json")
+@SPECTRA_FORMATS.register("deepmimo")
 class DeepMimo(Format[Spectra]):
     """Paths of a ray tracer, turned into spectra; of several pairs of transmitter and receivers, the one asked for."""
 

@@ -28,7 +28,7 @@ from swiftwrf.data.tfrecords import tensor
 from swiftwrf.errors import InputError
 
 
-@SNAPSHOT_FORMATS.register("dichasus", meaning="DICHASUS *.tfrecords with the JSON that describes the arrays")
+@SNAPSHOT_FORMATS.register("dichasus")
 class Dichasus(Format[Snapshots]):
     """`csi` float32 (antennas, subcarriers, 2) of real and imaginary parts, `pos-tachy` (3,) [m]."""
 

@@ -22,7 +22,7 @@ from swiftwrf.errors import InputError
 SHAPE = (2, 4)  # rows and columns of an array
 
 
-@SNAPSHOT_FORMATS.register("espargos", meaning="ESPARGOS *.tfrecords with the JSON that describes the arrays")
+@SNAPSHOT_FORMATS.register("espargos")
 class Espargos(Format[Snapshots]):
     """`csi` complex (arrays, 2, 4, subcarriers), `pos` (3,) [m]."""
 

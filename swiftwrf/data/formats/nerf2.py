@@ -59,10 +59,7 @@ BROKEN = (
 )
 
 
-@SPECTRA_FORMATS.register(
-    "nerf2",
-    meaning="gateway_info.yml, tx_pos.csv or rx_pos.csv, and spectrum/00001.png, ... or spectrum.npy, spectrum.npz",
-)
+@SPECTRA_FORMATS.register("nerf2")
 class Nerf2(Format[Spectra]):
     """Images; row i of the positions belongs to the image numbered i from 1, or to row i of the array."""
 

@@ -18,10 +18,7 @@ NOT_HEARD = -100.0  # what the files write for a receiver that did not hear the 
 LOWEST, HIGHEST = -150.0, 30.0  # [dBm] beyond which a value cannot be a received power
 
 
-@RSSI_FORMATS.register(
-    "nerf2",
-    meaning="tx_pos.csv, gateway_rssi.csv with -100 for not heard, gateway_position.yml where positions are known",
-)
+@RSSI_FORMATS.register("nerf2")
 class Nerf2Rssi(Format[Rssi]):
     """One row a position of the transmitter, one column a receiver."""
 

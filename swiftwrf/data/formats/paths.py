@@ -30,7 +30,7 @@ NEAREST = 1e-9  # [m]: closer points are one
 LARGEST_GAIN = 1e100  # sums of larger ones overflow
 
 
-@SPECTRA_FORMATS.register("paths", meaning="ray paths in paths.npz")
+@SPECTRA_FORMATS.register("paths")
 class Paths(Format[Spectra]):
     """Traced paths, turned into spectra."""
 

@@ -25,7 +25,7 @@ OPTIONAL = ("element_position", "rows", "columns", "spacing_m", "line_of_sight",
 FLAT = 1e-3  # [wavelengths] that elements may leave their plane
 
 
-@SNAPSHOT_FORMATS.register("snapshots", meaning="csi of each antenna element in snapshots.npz or snapshots.h5")
+@SNAPSHOT_FORMATS.register("snapshots")
 class SnapshotArrays(Format[Snapshots]):
     """Arrays by name, one row a position of the transmitter."""
 

@@ -40,7 +40,7 @@ ASKED = tuple(role for role in ROLES if role != "floor")  # that --columns takes
 DEGREES = {"longitude", "lon", "latitude", "lat"}
 
 
-@RSSI_FORMATS.register("survey", meaning="a table of positions and RSSI, long or wide, in CSV or Parquet")
+@RSSI_FORMATS.register("survey")
 class Survey(Format[Rssi]):
     """A table of a walk test, with the receivers' positions beside it or unknown."""
 

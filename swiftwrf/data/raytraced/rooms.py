@@ -97,9 +97,7 @@ def itu(material: str) -> Material:
 ROOMS: Registry[FurnishedRoom] = Registry("room")
 
 
-@ROOMS.register(
-    "conference", meaning="conference room, 8 x 5 x 2.8 m: a table with ten chairs, screen, whiteboard, sideboard"
-)
+@ROOMS.register("conference")
 def conference() -> FurnishedRoom:
     """Concrete walls, carpet on the floor, a ceiling of boards; the fixed end under the ceiling in a corner."""
     chairs = [(x, y, side) for x in (2.6, 3.4, 4.2, 5.0, 5.8) for y, side in ((1.4, "front"), (3.15, "back"))]
@@ -124,9 +122,7 @@ def conference() -> FurnishedRoom:
     )
 
 
-@ROOMS.register(
-    "office", meaning="office, 6 x 5 x 2.7 m: four desks with screens, a partition, metal cabinets, shelves"
-)
+@ROOMS.register("office")
 def office() -> FurnishedRoom:
     """Plasterboard walls, concrete floor, a ceiling of boards; the fixed end under the ceiling."""
     desks = [(x, y) for x in (1.6, 3.4) for y in (1.6, 2.45)]
@@ -156,7 +152,7 @@ def office() -> FurnishedRoom:
     )
 
 
-@ROOMS.register("bedroom", meaning="bedroom, 4.2 x 3.6 x 2.5 m: a double bed, wardrobe, chest of drawers, nightstands")
+@ROOMS.register("bedroom")
 def bedroom() -> FurnishedRoom:
     """Brick walls, wooden floor, a ceiling of plasterboard; the fixed end on the wardrobe."""
     return FurnishedRoom(

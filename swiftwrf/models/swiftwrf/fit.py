@@ -15,9 +15,9 @@ from torch.distributed import ProcessGroup
 from swiftwrf.data.spectra import Spectra, check_training, fingerprint
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import Kernel, choose_kernel
-from swiftwrf.models.swiftwrf.model import SwiftWRF
 from swiftwrf.models.swiftwrf.config import FitConfig
 from swiftwrf.models.swiftwrf.deformation import deformation_type
+from swiftwrf.models.swiftwrf.model import SwiftWRF
 from swiftwrf.models.swiftwrf.optimise import Optimisation
 from swiftwrf.models.swiftwrf.regression import TRIAL_STEPS, Regression
 from swiftwrf.models.swiftwrf.search import doubling_search

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.gp import Kernel, thinned
-from swiftwrf.models.swiftwrf.model import SwiftWRF
 from swiftwrf.models.swiftwrf.config import FitConfig
 from swiftwrf.models.swiftwrf.loss import spectrum_loss
+from swiftwrf.models.swiftwrf.model import SwiftWRF
 from swiftwrf.runtime.descent import Descent, Schedule, warm_cosine
 from swiftwrf.runtime.processes import Processes
 from swiftwrf.runtime.session import Record, Size

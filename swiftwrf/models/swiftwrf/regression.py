@@ -20,13 +20,12 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.gp import EXACT, Kernel, NearbyField, SmoothField, held_out, thinned
 from swiftwrf.metrics import NORMAL_80
-from swiftwrf.models.swiftwrf.config import ModelConfig
-from swiftwrf.models.swiftwrf.model import SwiftWRF
-from swiftwrf.models.swiftwrf.config import FitConfig
+from swiftwrf.models.swiftwrf.config import FitConfig, ModelConfig
 from swiftwrf.models.swiftwrf.deformation import COMPONENTS, Deformation
 from swiftwrf.models.swiftwrf.deformation.motion_basis import MotionBasis
 from swiftwrf.models.swiftwrf.deformation.static import Static
 from swiftwrf.models.swiftwrf.loss import spectrum_loss
+from swiftwrf.models.swiftwrf.model import SwiftWRF
 from swiftwrf.models.swiftwrf.primitives import Primitives
 from swiftwrf.positions import frame, normalise
 from swiftwrf.rasterize.reference import kernels

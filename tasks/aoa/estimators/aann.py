@@ -69,7 +69,7 @@ class AANNConfig:
         return cls(steps=6000, batch=16, rate=1e-3, max_azimuths=0)
 
 
-@ESTIMATORS.register("aann", meaning="the angular neural network, trained in every arm that is no baseline")
+@ESTIMATORS.register("aann")
 class AANN(SavedEstimator):
     """ResNet-50 with one input channel and an MLP head, from a seeded start; weights are not downloaded.
 

@@ -10,7 +10,7 @@ from swiftwrf.array.angles import to_angles, to_direction
 from tasks.aoa.estimators.base import ESTIMATORS, Estimator
 
 
-@ESTIMATORS.register("peak", meaning="the strongest direction", colour="#bbbbbb")
+@ESTIMATORS.register("peak")
 class Peak(Estimator):
     """The strongest direction: what one has without learning. Multipath is often stronger than the line of sight."""
 
@@ -23,7 +23,7 @@ class Peak(Estimator):
         return self.settings.grid.strongest(spectrum)
 
 
-@ESTIMATORS.register("constant", meaning="the mean direction of the measured labels", colour="#999999")
+@ESTIMATORS.register("constant")
 class Constant(Estimator):
     """The mean direction of the training labels, whatever the spectrum: what an estimator must beat to have learnt."""
 
@@ -37,7 +37,7 @@ class Constant(Estimator):
         return self._angles.expand(len(spectrum), 2)
 
 
-@ESTIMATORS.register("nearest_spectrum", meaning="the label of the most similar measured spectrum", colour="#666666")
+@ESTIMATORS.register("nearest_spectrum")
 class NearestSpectrum(Estimator):
     """The label of the training spectrum with the least squared difference: look-up, hard to beat on a dense path."""
 

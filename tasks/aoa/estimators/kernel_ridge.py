@@ -17,9 +17,7 @@ from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator, Settings
 from tasks.aoa.estimators.radial import RadialRegression, coarse_pixels, kept_rows
 
 
-@ESTIMATORS.register(
-    "kernel_ridge", meaning="kernel ridge regression from the spectrum to the direction", colour="#44aa99"
-)
+@ESTIMATORS.register("kernel_ridge")
 class KernelRegression(SavedEstimator):
     """Kernel ridge regression from coarse spectra to directions: strong where spectra are few."""
 

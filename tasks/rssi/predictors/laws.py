@@ -47,26 +47,16 @@ class LogDistance:
         return self._law(log_distance(position, self._receiver))
 
 
-@PREDICTORS.register("mean", meaning="the mean of the receiver's training values", colour="#bbbbbb")
+@PREDICTORS.register("mean")
 def _mean(settings: Settings) -> Predictor:
     return Mean()
 
 
-@PREDICTORS.register(
-    "mri_pooled",
-    meaning="one log-distance law for all receivers of the data",
-    needs=(RECEIVERS,),
-    colour="#ee6677",
-)
+@PREDICTORS.register("mri_pooled")
 def _mri_pooled(settings: Settings) -> Predictor:
     return LogDistance(pooled=True, pool=settings.pool)
 
 
-@PREDICTORS.register(
-    "mri_receiver",
-    meaning="a log-distance law for each receiver",
-    needs=(RECEIVERS,),
-    colour="#ee8866",
-)
+@PREDICTORS.register("mri_receiver")
 def _mri_receiver(settings: Settings) -> Predictor:
     return LogDistance(pooled=False)

@@ -8,15 +8,10 @@ from torch import Tensor
 
 from swiftwrf import Rssi, comparison
 from swiftwrf.comparison import NeRF2RssiConfig
-from tasks.rssi.predictors.base import PREDICTORS, RECEIVERS, Settings
+from tasks.rssi.predictors.base import PREDICTORS, Settings
 
 
-@PREDICTORS.register(
-    "nerf2",
-    meaning="a neural field for all receivers, its rays averaged (NeRF2)",
-    needs=(RECEIVERS,),
-    colour="#44aa99",
-)
+@PREDICTORS.register("nerf2")
 class NeRF2Predictor:
     """A neural field that all receivers share."""
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from swiftwrf import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.runtime.threads import side_by_side
-from tasks.rssi.predictors.base import PREDICTORS, RECEIVERS, Predictor, Settings
+from tasks.rssi.predictors.base import PREDICTORS, Predictor, Settings
 from tasks.rssi.predictors.laws import LogDistance, Mean
 
 # scikit-learn's own choice for many neighbours takes distances from squares and a product, which map coordinates cancel
@@ -72,7 +72,7 @@ class _PerReceiver(ABC):
         return predicted if self._base is None else predicted + self._base.predict(position)
 
 
-@PREDICTORS.register("knn", meaning="inverse-distance mean of the nearest measurements", colour="#66ccee")
+@PREDICTORS.register("knn")
 class NearestNeighbours(_PerReceiver):
     """Inverse-distance mean of the k nearest measurements of RSSI; k by cross-validation in the training rows."""
 
@@ -96,12 +96,7 @@ class NearestNeighbours(_PerReceiver):
         return KNeighborsRegressor(k, weights=weights, algorithm=SEARCH).fit(x, y)
 
 
-@PREDICTORS.register(
-    "mri_residual",
-    meaning="a log-distance law for each receiver, and what it leaves interpolated from the nearest measurements",
-    needs=(RECEIVERS,),
-    colour="#ccbb44",
-)
+@PREDICTORS.register("mri_residual")
 class NearestResiduals(NearestNeighbours):
     """The same of what the log-distance law of the receiver leaves (near to the published MRI: Shin et al., IEEE TMC 14(6),
     2015)."""
@@ -110,11 +105,7 @@ class NearestResiduals(NearestNeighbours):
         return LogDistance(pooled=False)
 
 
-@PREDICTORS.register(
-    "gp",
-    meaning="a Gaussian process on what the log-distance law leaves (the mean, where receivers have no position)",
-    colour="#228833",
-)
+@PREDICTORS.register("gp")
 class GaussianProcess(_PerReceiver):
     """A Gaussian process on what the log-distance law of the receiver leaves, or its mean where the receiver's position is
     unknown: Matern 3/2 and white noise, hyper-parameters by marginal likelihood in the training rows (C. E. Rasmussen and

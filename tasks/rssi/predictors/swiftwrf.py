@@ -9,12 +9,7 @@ from swiftwrf.rasterize import prepare
 from tasks.rssi.predictors.base import PREDICTORS, Settings
 
 
-@PREDICTORS.register(
-    "swiftwrf",
-    meaning="50 primitives a receiver on a 16 x 16 grid, averaged, on a log-distance law; "
-    "mixed with the laws and the mean as held-out rows say",
-    colour="#4477aa",
-)
+@PREDICTORS.register("swiftwrf")
 class SwiftWRFPredictor:
     """The model of this package; all receivers at once."""
 

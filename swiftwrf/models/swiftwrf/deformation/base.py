@@ -112,4 +112,4 @@ def deformation_type(name: str) -> type[Deformation]:
     Raises:
         InputError: there is none.
     """
-    return cast(type[Deformation], DEFORMATIONS[name].make)
+    return cast(type[Deformation], DEFORMATIONS[name])

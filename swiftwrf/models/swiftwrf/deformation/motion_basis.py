@@ -17,7 +17,7 @@ from swiftwrf.models.swiftwrf.deformation.base import COMPONENTS, DEFORMATIONS, 
 from swiftwrf.runtime.checkpoint import Header, expect
 
 
-@DEFORMATIONS.register("motion_basis", meaning="low-rank motion, smooth by a Gaussian-process prior; fast")
+@DEFORMATIONS.register("motion_basis")
 class MotionBasis(Deformation):
     """All primitives move by one basis, mixed by smooth functions of position.
 

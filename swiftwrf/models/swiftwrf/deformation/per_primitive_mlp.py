@@ -17,7 +17,7 @@ MEAN_BANDS, POSITION_BANDS = 10, 6  # frequency bands of the paper's encodings
 WIDTH, DEPTH = 156, 8  # of the paper's network
 
 
-@DEFORMATIONS.register("per_primitive_mlp", meaning="the paper's network, evaluated for each primitive and position")
+@DEFORMATIONS.register("per_primitive_mlp")
 class PerPrimitiveMLP(Deformation):
     """Eight layers of width 156, from the encodings of the mean and the position.
 

@@ -11,7 +11,7 @@ from swiftwrf.models.swiftwrf.deformation.base import DEFORMATIONS, Deformation,
 from swiftwrf.runtime.checkpoint import Header
 
 
-@DEFORMATIONS.register("none", meaning="the primitives do not move")
+@DEFORMATIONS.register("none")
 class Static(Deformation):
     """Leaves the primitives canonical."""
 

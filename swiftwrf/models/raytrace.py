@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
-from torch import Tensor
-
 from augment.synthesizers.base import ARRAY, FIXED_END, SYNTHESIZERS, Synthesizer
 from augment.synthesizers.geometry import find_room
+from torch import Tensor
+
 from swiftwrf import GeometryModel, Spectra
 from swiftwrf.data.raytraced import ROOMS, SCENE_FILE, Material, Scene, Surface, Tracing, sionna, trace
 from swiftwrf.data.raytraced.surfaces import rectangle
@@ -93,7 +93,7 @@ def open_scene(name: str, frequency_hz: float) -> Scene:
     """
     if name.endswith(SCENE_FILE):
         return Scene.read(Path(name), frequency_hz)
-    return Scene(ROOMS[name].make().surfaces(), frequency_hz)
+    return Scene(ROOMS[name]().surfaces(), frequency_hz)
 
 
 def planes(room: GeometryModel, position: Tensor) -> list[Surface]:

@@ -1,0 +1,356 @@
+"""The interface of every field model: fit to measured spectra, then predict spectra at any position."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from statistics import NormalDist
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from swiftwrf.array.angles import AngularGrid
+from swiftwrf.data.spectra import Spectra, check_training
+from swiftwrf.data.splits import Validation
+from swiftwrf.errors import InputError
+from swiftwrf.positions import check_positions
+from swiftwrf.runtime.checkpoint import Header, Saved
+from swiftwrf.runtime.registry import Registry
+from swiftwrf.runtime.validation import NonNegativeInt, configuration
+
+ARRAY, FIXED_END = "array", "fixed end"  # requirements that a model can declare
+CPU = torch.device("cpu")
+Record = dict[str, Any]  # one evaluation of a fit
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """A predicted quantity with its uncertainty.
+
+    Args:
+        mean: Predictive mean, e.g. magnitudes (n, n_elevation, n_azimuth) or RSSI (n, R) [dBm].
+        std: Predictive standard deviation of one measurement, of the same shape. None if the model has none.
+
+    Example:
+        >>> prediction = Prediction(torch.zeros(2), torch.ones(2))
+        >>> low, high = prediction.interval(0.8)
+        >>> round(float(high[0]), 2)
+        1.28
+    """
+
+    mean: Tensor
+    std: Tensor | None = None
+
+    def interval(self, level: float = 0.8) -> tuple[Tensor, Tensor]:
+        """Return the lower and upper end of the central interval that contains a measurement with probability `level`.
+
+        Raises:
+            InputError: The model has no standard deviation, or the level is outside (0, 1).
+        """
+        if self.std is None:
+            raise InputError("this model predicts no standard deviation, so there is no interval")
+        if not 0 < level < 1:
+            raise InputError(f"level must be between 0 and 1, got {level}")
+        half = NormalDist().inv_cdf((1 + level) / 2) * self.std
+        return self.mean - half, self.mean + half
+
+
+@configuration
+class FieldConfig:
+    """Options of every field model."""
+
+    validation: Validation = "random"
+    """training spectra held out to choose settings: single ones at random, or one region at a time"""
+    seed: NonNegativeInt = 0
+    """seed of everything random"""
+
+
+@dataclass(frozen=True)
+class FitContext:
+    """Arguments of `FieldModel.fit` other than the data; see there."""
+
+    like: FieldModel | None = None
+    device: torch.device = CPU
+    checkpoint: Path | None = None
+    on_record: Callable[[Record], None] | None = None
+    progress: bool = False
+
+
+class FieldModel(Saved):
+    """Base class of all field models.
+
+    A subclass sets `name`, `kind` and `config_type`, and implements `_fit`, `_predict`, `state` and `_restore`. Options are
+    keyword arguments of the constructor; `config_type` declares their ranges.
+
+    Args:
+        config: Options as one object. Defaults to `config_type()`.
+        options: Single options, which replace those of `config`.
+
+    Raises:
+        InputError: An unknown option, or a value outside its range.
+    """
+
+    name: ClassVar[str]
+    """name in the registry, on the command line and in reports"""
+    config_type: ClassVar[type[Any]] = FieldConfig
+    """dataclass of the options"""
+    requires: ClassVar[tuple[str, ...]] = ()
+    """properties of the data that the model needs: ARRAY, FIXED_END"""
+    samples: ClassVar[bool] = False
+    """whether `sample` is available"""
+    slow: ClassVar[bool] = False
+    """whether a fit takes minutes, so that it is compared only on request"""
+    any_grid: ClassVar[bool] = False
+    """whether `predict` takes other grids than that of the training spectra"""
+    batch: ClassVar[int] = 64
+    """positions evaluated at a time, which bounds the memory"""
+
+    grid: AngularGrid
+    """grid of the training spectra, set by `fit`"""
+
+    def __init__(self, config: Any = None, **options: Any) -> None:
+        known = [field.name for field in fields(self.config_type)]
+        unknown = [name for name in options if name not in known]
+        if unknown:
+            raise InputError(f"{type(self).__name__} has no option {unknown[0]!r}; it has {', '.join(known)}")
+        self.config = replace(config or self.config_type(), **options)
+
+    @classmethod
+    def lacking(cls, data: Spectra) -> list[str]:
+        """Return the requirements of the model that the data do not meet."""
+        known = {
+            ARRAY: data.array is not None,
+            FIXED_END: data.fixed_position is not None and data.rotation is not None,
+        }
+        return [need for need in cls.requires if not known[need]]
+
+    @classmethod
+    def accepts_like(cls, model: FieldModel) -> bool:
+        """Return True if `fit` can reuse the structure of this fitted model."""
+        return type(model) is cls
+
+    def fit(
+        self,
+        train: Spectra,
+        *,
+        like: FieldModel | None = None,
+        device: torch.device | str = "cpu",
+        checkpoint: Path | None = None,
+        on_record: Callable[[Record], None] | None = None,
+        progress: bool = False,
+    ) -> Self:
+        """Fit the model to measured spectra and return it.
+
+        Args:
+            train: Training spectra, at least 10.
+            like: Fitted model of the same scene whose structure (planes, number of primitives) is reused, not searched.
+            device: Device to compute on.
+            checkpoint: File for the state of a long fit. If it exists, the fit continues from it.
+            on_record: Called with each evaluation: stage, steps, loss, seconds.
+            progress: Show a progress bar on a terminal.
+
+        Raises:
+            InputError: Too few spectra, values that are not finite, a missing requirement, or a checkpoint of another fit.
+            FitError: The loss diverged.
+        """
+        check_training(train)
+        if lacking := self.lacking(train):
+            raise InputError(f"{self.name} needs the {' and the '.join(lacking)}, which {train.name} does not describe")
+        if like is not None and not self.accepts_like(like):
+            raise InputError(f"{self.name} cannot reuse the structure of a {like.kind}")
+        self.grid = train.grid
+        self._fit(train, FitContext(like, torch.device(device), checkpoint, on_record, progress))
+        return self
+
+    @abstractmethod
+    def _fit(self, train: Spectra, context: FitContext) -> None:
+        """Fit to checked data."""
+
+    @abstractmethod
+    def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
+        """Return magnitudes (b, H, W) and their standard deviation for one batch of positions (b, 3), float64 [m].
+
+        Differentiable where the mathematics is. Magnitudes need not be clipped. The standard deviation may be None.
+        """
+
+    def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
+        """Return one posterior sample (b, H, W) for each of a batch of positions."""
+        raise NotImplementedError
+
+    def predict(self, position: Tensor, grid: AngularGrid | None = None) -> Prediction:
+        """Predict spectra.
+
+        Gradients flow to the positions, and to parameters of the model that require them, unless torch.no_grad is active.
+
+        Args:
+            position: Positions of the moving end, (n, 3) [m].
+            grid: Directions. Defaults to the grid of the training spectra.
+
+        Returns:
+            Magnitudes in [0, 1], float32 (n, n_elevation, n_azimuth), on the model's device, and standard deviations.
+
+        Raises:
+            InputError: Positions of another shape or not finite, a grid that the model cannot predict, or a model that is
+                not fitted.
+        """
+        return self._predicted(position, grid, with_std=True)
+
+    def synthesize(self, position: Tensor, grid: AngularGrid | None = None) -> Tensor:
+        """Return the mean of `predict` alone, without the cost of the standard deviation."""
+        return self._predicted(position, grid, with_std=False).mean
+
+    def _predicted(self, position: Tensor, grid: AngularGrid | None, with_std: bool) -> Prediction:
+        grid = self._checked_grid(grid)
+
+        def evaluate(some: Tensor) -> tuple[Tensor, Tensor | None]:
+            mean, std = self._predict(some, grid, with_std)
+            return mean.clamp(0, 1), std
+
+        mean, std = self._in_batches(evaluate, self._checked(position), grid)
+        return Prediction(mean, std)
+
+    def sample(self, position: Tensor, *, generator: torch.Generator, grid: AngularGrid | None = None) -> Tensor:
+        """Return one sample of the predictive distribution at each position.
+
+        Args:
+            position: Positions of the moving end, (n, 3) [m].
+            generator: Source of randomness.
+            grid: Directions. Defaults to the grid of the training spectra.
+
+        Returns:
+            Magnitudes in [0, 1], float32 (n, n_elevation, n_azimuth).
+
+        Raises:
+            InputError: As `predict`, or a model that cannot be sampled.
+        """
+        if not self.samples:
+            raise InputError(f"{self.name} predicts means only and cannot be sampled")
+        grid = self._checked_grid(grid)
+        with torch.no_grad():
+            return self._in_batches(
+                lambda some: (self._sample(some, grid, generator).clamp(0, 1), None), self._checked(position), grid
+            )[0]
+
+    def parameters(self) -> Iterable[Tensor]:
+        """Return the tensors that can require gradients; none by default."""
+        return ()
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the fitted tensors."""
+        return next((tensor.device for tensor in self.parameters()), torch.device("cpu"))
+
+    def _checked(self, position: Tensor) -> Tensor:
+        return check_positions(position).to(self.device)
+
+    def _checked_grid(self, grid: AngularGrid | None) -> AngularGrid:
+        if not hasattr(self, "grid"):
+            raise InputError(f"this {self.kind} is not fitted; call fit first")
+        if grid is not None and grid != self.grid and not self.any_grid:
+            raise InputError(f"{self.name} predicts spectra on the grid of its training spectra only")
+        return grid or self.grid
+
+    def _in_batches(
+        self, evaluate: Callable[[Tensor], tuple[Tensor, Tensor | None]], position: Tensor, grid: AngularGrid
+    ) -> tuple[Tensor, Tensor | None]:
+        """Evaluate some positions at a time, with gradients only where something requires them."""
+        with_gradient = position.requires_grad or any(tensor.requires_grad for tensor in self.parameters())
+        if torch.is_grad_enabled() and with_gradient:
+            parts = [evaluate(some) for some in position.split(self.batch)]
+            stds = [std for _, std in parts if std is not None]
+            return check_finite(torch.cat([mean for mean, _ in parts])), torch.cat(stds) if stds else None
+        out = torch.empty(len(position), *grid.shape, device=position.device)
+        spread: Tensor | None = None
+        with torch.no_grad():
+            for start in range(0, len(position), self.batch):
+                rows = slice(start, start + self.batch)
+                out[rows], std = evaluate(position[rows])
+                if std is not None:
+                    spread = torch.empty_like(out) if spread is None else spread
+                    spread[rows] = std
+        return check_finite(out), spread
+
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        """Return the fitted tensors by name, and plain values.
+
+        Raises:
+            InputError: The model is not fitted.
+        """
+        grid = self._checked_grid(None)
+        tensors, header = self._state()
+        return tensors, {"options": asdict(self.config), "grid": asdict(grid)} | header
+
+    @abstractmethod
+    def _state(self) -> tuple[dict[str, Tensor], Header]:
+        """Return the fitted tensors by name, and plain values beside options and grid."""
+
+    @classmethod
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
+        model = cls(cls._restored_config(header.get("options", {})))
+        model.grid = AngularGrid(**header["grid"])
+        model._restore(tensors, header)
+        return model
+
+    @classmethod
+    def _restored_config(cls, options: Mapping[str, Any]) -> Any:
+        """Return the configuration of a saved model; JSON has lists where options have tuples."""
+        return cls.config_type(**{k: tuple(v) if isinstance(v, list) else v for k, v in options.items()})
+
+    @abstractmethod
+    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
+        """Take the fitted state over from `_state`, checking every shape first."""
+
+    def __repr__(self) -> str:
+        fitted = (
+            f"fitted, {self.grid.shape[0]} x {self.grid.shape[1]} directions" if hasattr(self, "grid") else "not fitted"
+        )
+        return f"{type(self).__name__}({fitted})"
+
+
+def check_finite(spectrum: Tensor) -> Tensor:
+    """Return the spectra unchanged if they are finite.
+
+    Raises:
+        InputError: The parameters are so large that their sums overflow.
+    """
+    if not bool(spectrum.detach().isfinite().all()):
+        raise InputError("the model predicts values that are not finite; its parameters overflow, so fit it again")
+    return spectrum
+
+
+FIELD_MODELS: Registry[FieldModel] = Registry("field model", "swiftwrf.models")
+
+
+def make_model(name: str, **options: Any) -> FieldModel:
+    """Return a field model by its name, with those of the options that it has.
+
+    Args:
+        name: Name in the registry, e.g. "hybrid".
+        options: Options such as seed and validation. A model ignores options that it does not have.
+
+    Raises:
+        InputError: An unknown name, or a value outside its range.
+
+    Example:
+        >>> make_model("idw", seed=3).config.seed
+        3
+    """
+    model_type = FIELD_MODELS[name]
+    known = {field.name for field in fields(model_type.config_type)}
+    return model_type(**{option: value for option, value in options.items() if option in known})
+
+
+def model_types(names: Iterable[str] | None = None) -> dict[str, type[FieldModel]]:
+    """Return the classes of the given field models, of all registered ones by default.
+
+    Raises:
+        InputError: An unknown name.
+    """
+    return {name: FIELD_MODELS[name] for name in (FIELD_MODELS if names is None else names)}
+
+
+__all__ = ["ARRAY", "FIELD_MODELS", "FIXED_END", "FieldConfig", "FieldModel", "FitContext", "Prediction", "Record"]
+__all__ += ["check_finite", "make_model", "model_types"]

@@ -1,0 +1,80 @@
+"""Inverse-distance weighting (D. Shepard, "A two-dimensional interpolation function for irregularly-spaced data", 1968)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from swiftwrf.array.angles import AngularGrid
+from swiftwrf.data.spectra import Spectra
+from swiftwrf.data.splits import folds
+from swiftwrf.gp import EXACT, inner_products, squared_errors, thinned
+from swiftwrf.models.base import FIELD_MODELS, FitContext
+from swiftwrf.models.nearest import MemoryModel
+from swiftwrf.positions import distance, nearest
+from swiftwrf.runtime.checkpoint import Header
+
+NEIGHBOUR_CANDIDATES = (1, 2, 3, 5, 8, 13, 20, 30)
+MIN_DISTANCE_M = 1e-9
+
+
+@FIELD_MODELS.register("idw")
+class IDWModel(MemoryModel):
+    """Inverse-distance weighting of the k nearest spectra; cross-validation chooses k.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.simulated_room(n=50).split()
+        >>> IDWModel(seed=1).fit(train).predict(test.position).mean.shape
+        torch.Size([10, 90, 360])
+    """
+
+    name = "idw"
+    kind = "inverse-distance model"
+
+    k: int
+    """number of neighbours"""
+
+    def _fit(self, train: Spectra, context: FitContext) -> None:
+        super()._fit(train, context)
+        (rows,) = thinned(torch.arange(len(train)), rows=EXACT)
+        fold = folds(train.position, self.config.validation, self.config.seed)[rows]
+        candidates = [k for k in NEIGHBOUR_CANDIDATES if k <= len(rows) - int(fold.bincount().max())]
+        some = train.subset(rows)
+        gram = inner_products(some.spectrum)
+        self.k = min(candidates, key=lambda k: _held_out_loss(k, some.position, gram, fold))
+
+    def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
+        number, weight = weights(position, self.position, self.k)
+        rows, column = number.unique(return_inverse=True)
+        dense = torch.zeros(len(position), len(rows)).scatter(1, column, weight)
+        return torch.tensordot(dense, self.store[rows], dims=1), None
+
+    def _state(self) -> tuple[dict[str, Tensor], Header]:
+        return super()._state()[0], {"k": self.k}
+
+    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
+        super()._restore(tensors, header)
+        self.k = min(int(header["k"]), len(self.position))
+
+
+def _held_out_loss(k: int, position: Tensor, gram: Tensor, fold: Tensor) -> float:
+    loss = 0.0
+    for number in fold.unique():
+        out, kept = fold == number, fold != number
+        near, share = weights(position[out], position[kept], k)
+        weight = torch.zeros(len(near), int(kept.sum()), dtype=gram.dtype).scatter_(1, near, share.to(gram.dtype))
+        loss += float(squared_errors(gram, out, kept, weight).sum())
+    return loss
+
+
+def weights(position: Tensor, known: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Return the indices of the k nearest known positions and their weights, (n, k); a known position gets all its weight.
+
+    Differentiable in `position` (n, 3) [m].
+    """
+    apart, number = nearest(position, known, k)
+    if position.requires_grad:  # the search for neighbours is not differentiable, their distances are
+        apart = distance(position[:, None], known[number])[:, 0]
+    inverse = 1 / apart.clamp_min(MIN_DISTANCE_M)
+    return number, (inverse / inverse.sum(dim=1, keepdim=True)).float()

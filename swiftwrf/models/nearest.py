@@ -1,0 +1,53 @@
+"""Look-up of the nearest measured spectrum."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from swiftwrf.array.angles import AngularGrid
+from swiftwrf.data.spectra import Spectra
+from swiftwrf.data.store import Store
+from swiftwrf.models.base import FIELD_MODELS, FieldModel, FitContext
+from swiftwrf.positions import nearest
+from swiftwrf.runtime.checkpoint import Header, expect
+
+
+class MemoryModel(FieldModel):
+    """Base class of models that keep the measured spectra."""
+
+    position: Tensor
+    """training positions, float64 (n, 3) [m]"""
+    store: Store
+    """training spectra (n, H, W)"""
+
+    def _fit(self, train: Spectra, context: FitContext) -> None:
+        self.position, self.store = train.position, train.store
+
+    def _state(self) -> tuple[dict[str, Tensor], Header]:
+        return {
+            "position": self.position,
+            "spectrum": self.store.values if self.store.rows is None else self.store[:],
+        }, {}
+
+    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
+        n = len(tensors["position"])
+        expect(tensors, {"position": (n, 3), "spectrum": (n, *self.grid.shape)})
+        self.position, self.store = tensors["position"].double(), Store(tensors["spectrum"])
+
+
+@FIELD_MODELS.register("nearest")
+class NearestModel(MemoryModel):
+    """The spectrum of the nearest measured position, a baseline that dense positions make hard to beat.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.simulated_room(n=50).split()
+        >>> NearestModel().fit(train).predict(test.position).mean.shape
+        torch.Size([10, 90, 360])
+    """
+
+    name = "nearest"
+    kind = "nearest-spectrum model"
+
+    def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
+        return self.store[nearest(position, self.position, 1)[1][:, 0]], None

@@ -1,0 +1,163 @@
+"""Declared ranges: annotations of configurations and arguments, checked when a value is given.
+
+`Literal` lists the allowed values, `Annotated[int, Ge(1)]` gives a range (package annotated-types). Type checkers read the
+same annotations; this module enforces them at run time, where a user's value arrives.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import math
+import types
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
+
+from annotated_types import Ge, Gt, Le, Lt
+
+from swiftwrf.errors import InputError
+
+NonNegativeInt = Annotated[int, Ge(0)]
+PositiveInt = Annotated[int, Ge(1)]
+NonNegativeFloat = Annotated[float, Ge(0)]
+PositiveFloat = Annotated[float, Gt(0)]
+Fraction = Annotated[float, Ge(0), Le(1)]
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+Class = TypeVar("Class")
+NUMBERS: dict[type, tuple[type, ...]] = {int: (int,), float: (int, float)}
+RANGES = {Ge: ("at least", "ge"), Gt: ("above", "gt"), Le: ("at most", "le"), Lt: ("below", "lt")}
+
+
+def check_value(name: str, value: object, annotation: Any) -> None:
+    """Refuse a value that its annotation does not allow.
+
+    Understands `Literal`, `Annotated` with ranges, unions, tuples, int, float, bool and str; other annotations pass.
+
+    Args:
+        name: Name of the value, for the message.
+        value: Value to check.
+        annotation: Resolved type annotation.
+
+    Raises:
+        InputError: The value is not allowed.
+
+    Example:
+        >>> check_value("end", "receiver", Literal["transmitter", "receiver"])
+    """
+    if not _allowed(value, annotation):
+        raise InputError(f"{name} must be {_described(annotation)}, got {value!r}")
+
+
+def _allowed(value: object, annotation: Any) -> bool:
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return _allowed(value, arguments[0]) and all(_in_range(value, bound) for bound in arguments[1:])
+    if origin is Literal:
+        return any(value == item and type(value) is type(item) for item in arguments)
+    if origin in (Union, types.UnionType):
+        return any(_allowed(value, item) for item in arguments)
+    if origin is tuple:
+        if not isinstance(value, tuple):
+            return False
+        if arguments[-1] is ...:
+            return all(_allowed(item, arguments[0]) for item in value)
+        return len(value) == len(arguments) and all(map(_allowed, value, arguments))
+    if annotation in NUMBERS:
+        is_number = isinstance(value, NUMBERS[annotation]) and not isinstance(value, bool)
+        return is_number and not (isinstance(value, float) and math.isnan(value))
+    if annotation in (bool, str):
+        return isinstance(value, annotation)
+    if annotation in (None, type(None)):
+        return value is None
+    return True
+
+
+def _in_range(value: Any, bound: object) -> bool:
+    match bound:
+        case Ge(ge):
+            return bool(value >= ge)
+        case Gt(gt):
+            return bool(value > gt)
+        case Le(le):
+            return bool(value <= le)
+        case Lt(lt):
+            return bool(value < lt)
+    return True
+
+
+def _described(annotation: Any) -> str:
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        bounds = [f"{RANGES[type(b)][0]} {getattr(b, RANGES[type(b)][1])}" for b in arguments[1:] if type(b) in RANGES]
+        return " ".join([_described(arguments[0]), *bounds[:1], *(f"and {bound}" for bound in bounds[1:])])
+    if origin is Literal:
+        return " or ".join(map(repr, arguments))
+    if origin in (Union, types.UnionType):
+        return " or ".join(map(_described, arguments))
+    if origin is tuple:
+        return (
+            f"a tuple of {_described(arguments[0])}" if arguments[-1] is ... else f"a tuple of {len(arguments)} values"
+        )
+    names = {int: "a whole number", float: "a number", bool: "True or False", str: "a text", type(None): "None"}
+    return names.get(annotation, getattr(annotation, "__name__", str(annotation)))
+
+
+@dataclass_transform(frozen_default=True)
+def configuration(cls: type[Class]) -> type[Class]:
+    """Make a class a frozen dataclass whose fields are checked against their annotations.
+
+    A `check(self)` method, if the class defines one, runs afterwards for conditions between fields.
+
+    Raises:
+        InputError: At construction, for the first field with a value that its annotation does not allow.
+
+    Example:
+        >>> @configuration
+        ... class Search:
+        ...     width: PositiveInt = 8
+        >>> Search(width=4)
+        Search(width=4)
+    """
+
+    def check_fields(self: Any) -> None:
+        hints = _hints(cls)
+        for field in fields(self):
+            check_value(field.name, getattr(self, field.name), hints[field.name])
+        if hasattr(self, "check"):
+            self.check()
+
+    cls.__post_init__ = check_fields  # type: ignore[attr-defined]
+    return dataclass(frozen=True)(cls)
+
+
+@functools.cache
+def _hints(annotated: Any) -> dict[str, Any]:
+    return get_type_hints(annotated, include_extras=True)
+
+
+def checked(function: Function) -> Function:
+    """Check the arguments of a function against their annotations.
+
+    Raises:
+        InputError: At a call, for the first argument with a value that its annotation does not allow.
+
+    Example:
+        >>> @checked
+        ... def room(n: PositiveInt = 1) -> int:
+        ...     return n
+        >>> room(3)
+        3
+    """
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def wrapped(*arguments: Any, **options: Any) -> Any:
+        hints = _hints(function)
+        for name, value in signature.bind(*arguments, **options).arguments.items():
+            if name in hints:
+                check_value(name, value, hints[name])
+        return function(*arguments, **options)
+
+    return wrapped  # type: ignore[return-value]

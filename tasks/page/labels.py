@@ -1,0 +1,85 @@
+"""One-line meanings and colours of methods, for help texts and reports."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from swiftwrf.runtime.registry import Registry
+
+# colour-blind safe (P. Tol, "bright"), for methods of other packages
+OTHER_COLOURS = ("#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")
+
+
+@dataclass(frozen=True)
+class Label:
+    """How a method is shown.
+
+    Args:
+        meaning: One line.
+        colour: `#rrggbb`. None for one that follows from the name.
+    """
+
+    meaning: str
+    colour: str | None = None
+
+
+FIELD_MODELS = {
+    "swiftwrf": Label("2D Gaussians that deform with the position", "#4477aa"),
+    "gp": Label("a Gaussian process on the pixels", "#ee8866"),
+    "coarray": Label("a Gaussian process in the space that the array's spectra can lie in", "#aa3377"),
+    "geometry": Label("image sources of the room's walls, found from the spectra", "#3366ff"),
+    "hybrid": Label("geometry with position-dependent path gains, and a Gaussian process on the residual", "#332288"),
+    "raytrace": Label("rays traced by Sionna RT, in --scene or in the room found (extra: raytrace)", "#994455"),
+    "idw": Label("inverse-distance mean of the nearest spectra", "#66ccee"),
+    "nearest": Label("the spectrum of the nearest measured position", "#ccbb44"),
+    "nerf2": Label("a neural field summed along rays (NeRF2)", "#44aa99"),
+    "wrfgs": Label("3D Gaussians drawn on the array's sphere (WRF-GS)", "#882255"),
+    "vae": Label("a convolutional decoder of position and latent variables (VAE)", "#999933"),
+    "dcgan": Label("a convolutional generator trained against a discriminator (DCGAN)", "#661100"),
+}
+
+ESTIMATORS = {
+    "aann": Label("the angular neural network (ResNet-50), its head replaced by kernel regression"),
+    "kernel_ridge": Label("kernel regression from the spectrum to the direction", "#44aa99"),
+    "nearest_spectrum": Label("the label of the most similar training spectrum", "#666666"),
+    "constant": Label("the mean direction of the training labels", "#999999"),
+    "peak": Label("the strongest direction", "#bbbbbb"),
+}
+
+PREDICTORS = {
+    "swiftwrf": Label(
+        "50 primitives a receiver on a 16 x 16 grid, averaged, on a log-distance path-loss model; mixed with simpler "
+        "predictors by cross-validation",
+        "#4477aa",
+    ),
+    "gp": Label(
+        "a Gaussian process on the residual of the path-loss model (or of the mean)",
+        "#228833",
+    ),
+    "mri_pooled": Label("one log-distance path-loss model for all receivers of the data", "#ee6677"),
+    "mri_receiver": Label("a log-distance path-loss model for each receiver", "#ee8866"),
+    "mri_residual": Label("mri_receiver, its residual interpolated from the nearest measurements", "#ccbb44"),
+    "knn": Label("inverse-distance mean of the nearest measurements", "#66ccee"),
+    "mean": Label("the mean of the receiver's training values", "#bbbbbb"),
+    "nerf2": Label("a neural field for all receivers, its rays averaged (NeRF2)", "#44aa99"),
+    "blend": Label("a weighted mean of other predictors, weights by cross-validation", "#aa3377"),
+}
+
+
+def labels(registry: Registry[object], known: dict[str, Label], names: Iterable[str] | None = None) -> dict[str, Label]:
+    """Return the labels of registered methods; a method of another package has the first line of its docstring.
+
+    Args:
+        registry: Registry of the methods.
+        known: Labels of the methods of this package.
+        names: Methods, all registered ones by default. Names that are not registered are left out.
+    """
+    found = registry if names is None else [name for name in names if name in registry]
+    return {name: known.get(name) or Label(registry.summary(name)) for name in found}
+
+
+def colour_of(name: str, known: dict[str, Label]) -> str:
+    """Return the colour of a method, for an unlabelled one a colour that follows from its name."""
+    label = known.get(name)
+    return (label and label.colour) or OTHER_COLOURS[sum(name.encode()) % len(OTHER_COLOURS)]
