@@ -29,14 +29,12 @@ class ViewConfig:
     """address to listen on; other machines see the page, without a password, at any but this"""
 
 
-def run(config: ViewConfig, resume: Path | None = None) -> None:
+def run(config: ViewConfig) -> None:
     """Serves the page until it is interrupted.
 
     Raises:
         InputError: nothing there to be looked at, a port that is in use, or the optional extra is not installed.
     """
-    if resume is not None:
-        raise InputError("a page is quick and cannot be resumed; start it again")
     if not 0 <= config.port <= MOST_PORT:
         raise InputError(f"--port must be from 0 to {MOST_PORT}, got {config.port}")
     try:
