@@ -13,7 +13,7 @@ import copy
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
@@ -24,20 +24,20 @@ from committed import ROOT
 from committed import load as committed
 from record import write_result
 from synthesis import load
-from torch import Tensor, nn
+from torch import Tensor
 
-from augment import SYNTHESIZERS, Settings, Synthesizer, lacks, make_synthesizer
-from augment.synthesizers.published import Published
 from swiftwrf import Spectra, simulated_room
 from swiftwrf.data.splits import validation_for
 from swiftwrf.gp import thinned
 from swiftwrf.metrics import l1, psnr, ssim, summary
+from swiftwrf.models.base import FIELD_MODELS, FieldModel, make_model
+from swiftwrf.models.nearest import MemoryModel
 from swiftwrf.runtime.durable import write_text
 from tasks.aoa.config import AoaConfig
 from tasks.aoa.experiment import run
 from tasks.cluster import Cluster, connected
 from tasks.environment import machine
-from tasks.page import figures
+from tasks.page import figures, labels
 from tasks.page.palette import Palette
 
 MEASURED = (("s23-200", "random"), ("s23-200", "block"), ("newrf-bedroom", "random"), ("newrf-office", "random"))
@@ -48,7 +48,7 @@ COUNTS = (20, 40, 80)  # training spectra of s23-200 random; all of them are in 
 SHARES = (0.1, 0.3, 0.5, 0.7)
 TURBO = ("swiftwrf", "nerf2", "wrfgs")
 JUDGES = 50  # test spectra of a scene, evenly chosen: a neural field takes seconds to draw one
-QUICKER = 5  # by how much --quick shortens fits by gradient
+QUICK_DIVISOR = 5  # of the steps of a fit by gradient under --quick
 BATCH, REPEATS = 8, 3  # spectra a call, and calls, of which a rate is the median
 CPU = torch.device("cpu")
 Row = dict[str, Any]
@@ -149,7 +149,9 @@ def jobs(config: Config, rows: Path) -> Iterator[tuple[Spectra, Spectra, list[Jo
             continue
         train, test = data.split(split)
         test = test.subset(*thinned(torch.arange(len(test)), rows=JUDGES))
-        methods = [method for method in (*BASELINES, *LEARNT) if method == MEAN or not lacks(method, data)]
+        methods = [
+            method for method in (*BASELINES, *LEARNT) if method == MEAN or not FIELD_MODELS[method].lacking(data)
+        ]
         wanted = [
             Job(rows / f"{scene} {n} {method}", method, n, split, config.quick)
             for n in numbers(scene, len(train), config)
@@ -196,11 +198,11 @@ def gathered(rows: Path, earlier: Table) -> Table:
 
 
 def row(method: str, train: Spectra, test: Spectra, split: str, quick: bool, state: Path) -> Row:
-    """Scores of a method at the test positions, the seconds of its fit and of a spectrum, and its size."""
+    """Return the scores of a method at the test positions, the seconds of its fit and of a spectrum, and its size."""
     began, earlier = time.perf_counter(), 0.0
 
-    def told(record: Row) -> None:
-        """A fit that goes on begins with the records of its earlier sessions."""
+    def on_record(record: Row) -> None:
+        """Add the seconds of earlier sessions, whose records a resumed fit repeats first."""
         nonlocal earlier
         earlier = max(earlier, record.get("elapsed", 0.0) - (time.perf_counter() - began))
 
@@ -211,33 +213,29 @@ def row(method: str, train: Spectra, test: Spectra, split: str, quick: bool, sta
         def synthesize(position: Tensor) -> Tensor:
             return mean.repeat(len(position), 1, 1)
     else:
-        settings = Settings(validation=validation_for(split), checkpoint=state, on_record=told)
-        synthesizer = make_synthesizer(method, settings)
-        began = time.perf_counter()  # who draws has compiled by now
-        if quick and isinstance(synthesizer, Published):
-            full = synthesizer.config()
-            synthesizer.config = lambda: replace(full, steps=full.steps // QUICKER)
-        synthesizer.fit(train)
-        synthesize, size = synthesizer.synthesize, weight(synthesizer, train, state.with_suffix(".model"))
+        model = make_model(method, validation=validation_for(split))
+        if quick and getattr(model.config, "steps", 0):
+            model = type(model)(model.config, steps=model.config.steps // QUICK_DIVISOR)
+        model.fit(train, checkpoint=state, on_record=on_record)
+        synthesize, size = model.synthesize, weight(model, train, state.with_suffix(".model"))
     fit_seconds = time.perf_counter() - began + earlier
-    drawn = synthesize(test.position)
+    predicted = synthesize(test.position)
     scores = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
-    found: Row = {name: summary(score(drawn, test.spectrum)) for name, score in scores.items()}
+    found: Row = {name: summary(score(predicted, test.spectrum)) for name, score in scores.items()}
     return (
         found | {"fit_seconds": fit_seconds, "ms": milliseconds(synthesize, test.position), "n_test": len(test)} | size
     )
 
 
-def weight(synthesizer: Synthesizer, train: Spectra, file: Path) -> Row:
-    """Numbers that were fitted and megabytes on disk; those that keep all training spectra weigh as much as these."""
-    model = synthesizer.model
-    if model is None:
+def weight(model: FieldModel, train: Spectra, file: Path) -> Row:
+    """Return the number of fitted values and the megabytes on disk; a model that stores the spectra has their size."""
+    if isinstance(model, MemoryModel):
         return {"parameters": train.spectrum.numel(), "megabytes": 4e-6 * train.spectrum.numel()}
     model.save(file)
     megabytes = file.stat().st_size / 1e6
     file.unlink()
-    fitted = model.parameters() if isinstance(model, nn.Module) else model.state()[0].values()
-    return {"parameters": sum(t.numel() for t in fitted), "megabytes": megabytes}
+    fitted = tuple(model.parameters()) or tuple(model.state()[0].values())
+    return {"parameters": sum(tensor.numel() for tensor in fitted), "megabytes": megabytes}
 
 
 def milliseconds(synthesize: Callable[[Tensor], Tensor], position: Tensor) -> dict[str, float]:
@@ -280,7 +278,10 @@ def turbo(work: Path) -> Row | None:
 
 def draw(found: Table) -> None:
     """Speed against error on each scene, and SSIM against the number of training spectra."""
-    folder, palette = ROOT / "docs" / "figures", Palette.of(SYNTHESIZERS.entries())
+    folder, palette = (
+        ROOT / "docs" / "figures",
+        Palette({name: label.colour for name, label in labels.FIELD_MODELS.items() if label.colour}),
+    )
     panels, axes = figures.new_figure(-(-len(found) // 2), min(2, len(found)), 10, 3.4 * -(-len(found) // 2))
     for ax, (scene, by_count) in zip(axes, found.items(), strict=False):
         rows = next(iter(by_count.values()))  # all training spectra

@@ -27,19 +27,20 @@ import tyro
 from committed import RESULTS, ROOT
 from record import write_result
 
-from augment import Mixed, Settings, make_synthesizer
+from augment import Mixed
 from swiftwrf import AngularGrid, Spectra, load_spectra, simulated_room
 from swiftwrf.data.simulated.spectra import REGION
 from swiftwrf.data.store import stored
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import psnr
+from swiftwrf.models.base import make_model
 from tasks.aoa.estimators import Settings as EstimatorSettings
 from tasks.aoa.estimators.aann import AANN, AANNConfig
 from tasks.page import figures
 
 GRID = AngularGrid.hemisphere(90, 360)
 SIZES = (300, 1_000, 10_000, 100_000)
-SYNTHESIZERS = ("swiftwrf", "coarray", "gp")
+MODELS = ("swiftwrf", "coarray", "gp")
 STEP = 0.01  # [m] between two spectra: a person who walks, a hundred spectra a second
 TURNS = (0.91, 0.37, 0.73)  # [rad / m] of the walk along x, y and z, which never comes back to its beginning
 AT_ONCE = 2048  # spectra that are simulated together
@@ -179,17 +180,17 @@ def load(folder: Path, n: int, found: dict[str, float]) -> None:
         assert len(load_spectra(folder / "walk")) == n
 
 
-def synthesizing(name: str) -> Callable[[Path, int, dict[str, float]], None]:
-    """The stage of one synthesizer."""
+def predicting(name: str) -> Callable[[Path, int, dict[str, float]], None]:
+    """Return the stage that fits one field model and predicts with it."""
 
     def stage(folder: Path, n: int, found: dict[str, float]) -> None:
         data, unseen = load_spectra(folder / "walk"), load_spectra(folder / "between")
-        synthesizer = make_synthesizer(name, Settings(progress=False))
+        model = make_model(name)
         with measuring(found, "fit "):
-            synthesizer.fit(data)
+            model.fit(data)
         with measuring(found, "synthesize "):
-            drawn = synthesizer.synthesize(unseen.position)
-        found["psnr_db"] = float(psnr(drawn, unseen.spectrum).median())
+            predicted = model.synthesize(unseen.position)
+        found["psnr_db"] = float(psnr(predicted, unseen.spectrum).median())
 
     return stage
 
@@ -206,7 +207,7 @@ STAGES: dict[str, Callable[[Path, int, dict[str, float]], None]] = {
     "generate": generate,
     "load first": load,
     "load again": load,
-    **{name: synthesizing(name) for name in SYNTHESIZERS},
+    **{name: predicting(name) for name in MODELS},
     "train": train,
 }
 

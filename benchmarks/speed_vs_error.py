@@ -18,23 +18,23 @@ from record import write_result
 from synthesis import load
 from torch import Tensor
 
-from augment import SYNTHESIZERS, Settings, make_synthesizer
 from swiftwrf import (
     AngularGrid,
+    CoarrayModel,
     FitConfig,
     ModelConfig,
     Spectra,
     SwiftWRF,
     fit,
-    fit_coarray,
     project,
     simulated_room,
 )
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import psnr
+from swiftwrf.models.base import make_model
 from swiftwrf.rasterize import Maker, prepare, rasterize_magnitude
-from tasks.page import figures
+from tasks.page import figures, labels
 from tasks.page.palette import Palette
 
 CUTOFFS = (None, 1e-5, 1e-4, 1e-3, 1e-2)
@@ -109,7 +109,7 @@ class Study:
         return {"median": taken[repeats // 2], "low": taken[0], "high": taken[-1]}
 
     def point(self, setting: str, synthesize: Callable[[Tensor], Tensor], fit_seconds: float, **more: Any) -> Point:
-        """Of a synthesizer on the grid of the data."""
+        """Return time and error of a model on the grid of the data."""
         drawn = synthesize(self.test.position)
         result = {
             "setting": setting,
@@ -205,21 +205,20 @@ class Study:
         return points
 
     def others(self) -> list[Point]:
-        """The other synthesizers, and projections onto what the array can produce."""
+        """Return the other field models, and projections onto the spectra that the array can produce."""
         array, grid, points = self.train.array, self.train.grid, []
-        for name in ("nearest", "idw", "gp"):
-            synthesizer = make_synthesizer(name, Settings(validation=self.validation, seed=self.seed))
+        models = {}
+        for name in ("nearest", "idw", "gp", *(("coarray",) if array else ())):
+            model = models[name] = make_model(name, validation=self.validation, seed=self.seed)
             began = time.perf_counter()
-            synthesizer.fit(self.train)
-            points.append(self.point(name, synthesizer.synthesize, time.perf_counter() - began))
+            model.fit(self.train)
+            seconds = time.perf_counter() - began
+            more = {"parameters": model.n_parameters} if isinstance(model, CoarrayModel) else {}
+            points.append(self.point(name, model.synthesize, seconds, **more))
         if array is None:
             return points
-        began = time.perf_counter()
-        coarray = fit_coarray(self.train, validation=self.validation, seed=self.seed)
-        seconds = time.perf_counter() - began
-        points.append(self.point("coarray", coarray.synthesize, seconds, parameters=coarray.n_parameters))
-        stretched = float(coarray.offset) > 1e-3
-        for name, synthesize in (("swiftwrf, default", self.model.synthesize), ("gp", synthesizer.synthesize)):
+        stretched = float(models["coarray"].offset) > 1e-3
+        for name, synthesize in (("swiftwrf, default", self.model.synthesize), ("gp", models["gp"].synthesize)):
 
             def projected(position: Tensor, synthesize: Callable[[Tensor], Tensor] = synthesize) -> Tensor:
                 return project(synthesize(position), array, grid, stretched=stretched)
@@ -236,7 +235,7 @@ def rms(drawn: Tensor, truth: Tensor) -> float:
 def draw(content: dict[str, Any], file: Path) -> None:
     """Numerical and held-out error against seconds a spectrum, log-log, with the fronts."""
     figure, axes = figures.new_figure(1, 2, 10.5, 4.2)
-    palette = Palette.of(SYNTHESIZERS.entries())
+    palette = Palette({name: label.colour for name, label in labels.FIELD_MODELS.items() if label.colour})
     own = [p for p in content["drawing"] if p["own_grid"]]
     short = {p["setting"]: p["setting"].rsplit(", ", 1)[0] for p in own}
     numerical = {short[p["setting"]]: (p["seconds"]["median"], max(p["numerical"], 1e-9)) for p in own}
