@@ -1,10 +1,9 @@
-"""The paper's comparison on public data: every method on every scene, SSIM against the number of training spectra, and turbo
-learning with the spectra of several methods.
+"""Repeat the paper's comparison on public data: every method on every scene, few training spectra, and turbo learning.
 
-Hours of work that can be stopped at any time: each row is kept in the folder `--work` once it is measured, unfinished fits
-and runs go on from their state. The result holds those rows, and of the committed result those that were not measured
-again, so that a scene can be added to it. With `--scheduler` the rows are measured on the workers of a Dask cluster; each
-says on which machine, for seconds of different machines do not compare.
+The hours of work can be stopped at any time: each measured row is kept in the folder `--work`, and unfinished fits and
+runs continue from their state. Rows of the committed result that were not measured again stay in the result, so that a
+scene can be added. With `--scheduler` the workers of a Dask cluster measure the rows; each row contains its machine,
+because seconds of different machines do not compare.
 """
 
 from __future__ import annotations
@@ -75,7 +74,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Measures what is not there yet and writes `results/comparison.json` (`comparison_quick.json`) and the figures."""
+    """Measure the missing rows and write `results/comparison.json` (`comparison_quick.json`) and the figures."""
     rows = config.work / ("quick" if config.quick else "rows")
     rows.mkdir(parents=True, exist_ok=True)
     began = time.perf_counter()
@@ -96,7 +95,7 @@ def main(config: Config) -> None:
 
 
 def scenes(config: Config) -> Iterator[tuple[str, Spectra, str]]:
-    """Name, spectra and split of each scene."""
+    """Yield name, spectra and split of each scene."""
     measured = MEASURED[:1] if config.quick else MEASURED
     yield from ((f"{name} {split}", load(config.data / name), split) for name, split in measured)
     yield "simulated-room random", simulated_room(), "random"
@@ -106,7 +105,7 @@ def scenes(config: Config) -> Iterator[tuple[str, Spectra, str]]:
 
 
 def numbers(scene: str, everything: int, config: Config) -> list[int]:
-    """Of training spectra to learn from."""
+    """Return the numbers of training spectra to measure."""
     found = [everything] if "scenes" in config.parts else []
     if scene == "s23-200 random" and "counts" in config.parts:
         found += COUNTS[1:2] if config.quick else COUNTS
@@ -115,14 +114,14 @@ def numbers(scene: str, everything: int, config: Config) -> list[int]:
 
 @dataclass(frozen=True)
 class Job:
-    """A row that is to be measured.
+    """A row to measure.
 
     Args:
-        file: where it is kept, without suffix.
-        method: its name.
-        n: number of training spectra.
-        split: of the scene.
-        quick: whether fits by gradient are shortened.
+        file: File of the row, without suffix.
+        method: Name of the method.
+        n: Number of training spectra.
+        split: Split of the scene.
+        quick: Whether fits by gradient are shortened.
     """
 
     file: Path
@@ -133,17 +132,17 @@ class Job:
 
     @property
     def state(self) -> Path:
-        """Of its fit, as long as that is unfinished."""
+        """File with the state of an unfinished fit."""
         return Path(f"{self.file}.state")
 
     def measure(self, train: Spectra, test: Spectra, state: Path) -> Row:
-        """The row, and where it was measured."""
+        """Return the row and the machine that measured it."""
         some = train.subset(torch.randperm(len(train), generator=torch.Generator().manual_seed(0))[: self.n])
         return row(self.method, some, test, self.split, self.quick, state) | {"machine": machine(CPU)}
 
 
 def jobs(config: Config, rows: Path) -> Iterator[tuple[Spectra, Spectra, list[Job]]]:
-    """Training and test spectra of each scene, with its rows that are not there yet."""
+    """Yield training and test spectra of each scene, with its missing rows."""
     for scene, data, split in scenes(config):
         if config.only and not scene.startswith(config.only):
             continue
@@ -161,7 +160,7 @@ def jobs(config: Config, rows: Path) -> Iterator[tuple[Spectra, Spectra, list[Jo
 
 
 def measured(jobs: Iterable[tuple[Spectra, Spectra, list[Job]]], cluster: Cluster | None) -> Iterator[tuple[Job, Row]]:
-    """Each row as it gets done, here or on a cluster, where an unfinished fit begins anew."""
+    """Yield each row when it is measured, here or on a cluster, where an interrupted fit starts from the beginning."""
     if cluster is None:
         for train, test, some in jobs:
             yield from ((job, job.measure(train, test, job.state)) for job in some)
@@ -176,13 +175,13 @@ def measured(jobs: Iterable[tuple[Spectra, Spectra, list[Job]]], cluster: Cluste
 
 
 def measure_away(job: Job, scene: tuple[Spectra, Spectra]) -> Row:
-    """On a worker."""
+    """Measure a row on a worker."""
     with TemporaryDirectory(prefix="swiftwrf-") as folder:
         return job.measure(*scene, Path(folder) / "fit.state")
 
 
 def gathered(rows: Path, earlier: Table) -> Table:
-    """All rows that are there, and the earlier ones that were not measured again."""
+    """Return all measured rows, and the earlier rows that were not measured again."""
     found = copy.deepcopy(earlier)
     for file in rows.glob("*.json"):
         scene, n, method = file.stem.rsplit(" ", 2)
@@ -239,7 +238,7 @@ def weight(model: FieldModel, train: Spectra, file: Path) -> Row:
 
 
 def milliseconds(synthesize: Callable[[Tensor], Tensor], position: Tensor) -> dict[str, float]:
-    """A spectrum, from position to magnitudes: median, least and most of the repeats."""
+    """Return the milliseconds of a spectrum from position to magnitudes: median, minimum and maximum of the repeats."""
     position = position.repeat(-(-BATCH // len(position)), 1)[:BATCH]
     taken = []
     for _ in range(1 + REPEATS):  # the first one warms up
@@ -251,7 +250,7 @@ def milliseconds(synthesize: Callable[[Tensor], Tensor], position: Tensor) -> di
 
 
 def train_networks(config: Config) -> None:
-    """Turbo learning with the spectra of several methods, unless that is done."""
+    """Run turbo learning with the spectra of several methods, unless the run is finished."""
     out = config.work / "turbo"
     stopped = out.with_name("turbo.partial")
     if not out.exists():
@@ -262,7 +261,7 @@ def train_networks(config: Config) -> None:
 
 
 def turbo(work: Path) -> Row | None:
-    """Errors of the network on each training set at each share, if that is done."""
+    """Return the errors of the network on each training set by measured fraction. None if the run is not finished."""
     file = work / "turbo" / "metrics.json"
     if not file.exists():
         return None
@@ -277,7 +276,7 @@ def turbo(work: Path) -> Row | None:
 
 
 def draw(found: Table) -> None:
-    """Speed against error on each scene, and SSIM against the number of training spectra."""
+    """Draw speed against error on each scene, and SSIM against the number of training spectra."""
     folder, palette = (
         ROOT / "docs" / "figures",
         Palette({name: label.colour for name, label in labels.FIELD_MODELS.items() if label.colour}),
