@@ -1,4 +1,4 @@
-"""Gradient descent with guards, whose state survives interruptions: what the fits of all learnt models share."""
+"""Gradient descent that refuses to diverge and continues after an interruption, for all learnt models."""
 
 from __future__ import annotations
 
@@ -20,37 +20,39 @@ from swiftwrf.runtime.session import Record, Session, State
 
 Model = TypeVar("Model", bound=nn.Module)
 
-KEPT = {"step": int, "seconds": float, "first_loss": float, "last_loss": float}  # what is saved beside the tensors
+SAVED_FIELDS = {"step": int, "seconds": float, "first_loss": float, "last_loss": float}  # with their types
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How long a descent is and how it steps.
+    """Length and step rule of a descent.
 
     Args:
-        steps: their number.
-        check_every: steps between two evaluations, at which progress is recorded and the state kept.
-        averaging: by how much a step's weight in the averaged parameters decays a step; 0 keeps the last ones.
-        clip: largest norm of the gradient.
-        betas, weight_decay: of Adam.
+        steps: Number of steps.
+        check_every: Number of steps between two evaluations, at which progress is recorded and the state is saved.
+        averaging: Decay per step of a step's weight in the averaged parameters, which predict better than the last ones.
+            0 keeps the last parameters.
+        clip: Largest norm of the gradient.
+        betas: Decay rates of Adam's moments.
+        weight_decay: Weight decay of Adam.
     """
 
     steps: int
     check_every: int
-    averaging: float = 0.98  # averaged parameters predict better than the last ones
+    averaging: float = 0.98
     clip: float = 1.0
     betas: tuple[float, float] = (0.9, 0.99)
     weight_decay: float = 0.0
 
 
 class Descent(ABC, Generic[Model]):
-    """Adam from a seeded start; the result is the running average of the parameters.
+    """Adam descent of `objective`, which subclasses define. The result is the running average of the parameters.
 
     Args:
-        name: of the run within its fit.
-        model: to train, on its device.
-        groups: Adam's parameter groups, each with its largest learning rate, `peak`.
-        schedule: how long and how.
+        name: Name of the descent within its fit, shown on the progress bar.
+        model: Model to train, on its device.
+        groups: Adam's parameter groups, each with its largest learning rate as `peak`.
+        schedule: Length and step rule.
     """
 
     def __init__(self, name: str, model: Model, groups: Iterable[dict[str, Any]], schedule: Schedule) -> None:
@@ -63,31 +65,27 @@ class Descent(ABC, Generic[Model]):
         self.broken_at = torch.tensor(schedule.steps, device=device)  # the first step whose loss was not finite
 
     def averaged(self) -> AveragedModel:
-        """The running average, which begins with the parameters as they are."""
+        """Return a running average that starts from the present parameters."""
         return AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(self.schedule.averaging))
-
-    @property
-    def label(self) -> str:
-        """Its name on the progress bar."""
-        return self.name
 
     @abstractmethod
     def objective(self) -> Tensor:
-        """What the next step descends, a scalar."""
+        """Return the loss of the next step, a scalar."""
 
     @abstractmethod
     def rate(self, step: int) -> float:
-        """Share of the largest learning rates at a step."""
+        """Return the factor of the largest learning rates at a step."""
 
     def advance(self) -> Tensor:
-        """One step; its loss.
+        """Take one step and return its loss.
 
         Raises:
-            FitError: a loss or gradient that is not finite. A GPU is only asked at each evaluation, for asking waits for it.
+            FitError: The loss or the gradient is not finite. On a GPU this is checked at evaluations only, because each
+                check waits for the GPU.
         """
         try:
             loss = self.objective()
-        except InputError as error:  # parameters ran away, so that the model can no longer be drawn
+        except InputError as error:  # the parameters diverged, so that the model cannot be evaluated
             raise FitError(f"the fit broke at step {self.step}: {error}; {self._advice()}") from None
         self.optimiser.zero_grad()
         loss.backward()
@@ -98,9 +96,9 @@ class Descent(ABC, Generic[Model]):
             raise FitError(
                 f"the fit broke at step {broken}: its loss or gradient is not a finite number; {self._advice()}"
             )
-        share = self.rate(self.step)
+        factor = self.rate(self.step)
         for group in self.optimiser.param_groups:
-            group["lr"] = group["peak"] * share
+            group["lr"] = group["peak"] * factor
         self.optimiser.step()
         self.average.update_parameters(self.model)
         self.step += 1
@@ -114,21 +112,20 @@ class Descent(ABC, Generic[Model]):
 
     @property
     def result(self) -> Model:
-        """The model with averaged parameters."""
+        """Model with averaged parameters."""
         return cast(Model, self.average.module)
 
     def run(self, session: Session) -> None:
-        """Takes all steps, from where the session's saved state stands if that is of this run; keeps the state at each
-        evaluation.
+        """Take all steps, from the session's saved state if it is of this descent, and save the state at each evaluation.
 
         Raises:
-            FitError: it ended worse than it began.
+            FitError: The last loss is larger than the first one.
         """
         if session.saved is not None and session.saved.header.get("run") == self.name:
-            with refusing(f"{session.path} is no state that a fit can go on from"):
+            with refusing(f"{session.path} holds no state from which a fit can continue"):
                 self._restore(session.saved)
         steps = self.schedule.steps
-        task = session.bar.add_task(self.label, total=steps, completed=self.step)
+        task = session.bar.add_task(self.name, total=steps, completed=self.step)
         began = time.perf_counter() - self.seconds
         while self.step < steps:
             loss = self.advance()
@@ -139,14 +136,14 @@ class Descent(ABC, Generic[Model]):
                 self.seconds, self.last_loss = time.perf_counter() - began, float(loss)
                 session.evaluated(self.record(loss), *self._state())
         session.bar.remove_task(task)
-        if self.last_loss > self.first_loss:  # also where a kept state had ended so
+        if self.last_loss > self.first_loss:
             raise FitError(
                 f"the fit ended with a loss of {self.last_loss:.3g}, worse than the {self.first_loss:.3g} it began with; "
                 f"{self._advice()}"
             )
 
     def record(self, loss: Tensor) -> Record:
-        """What is told at an evaluation."""
+        """Return the record of an evaluation."""
         return {
             "stage": "final",
             "steps": self.schedule.steps,
@@ -161,12 +158,12 @@ class Descent(ABC, Generic[Model]):
         tensors |= {f"average.{name}": value for name, value in self.average.state_dict().items()}
         for number, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{number}.{name}": torch.as_tensor(value) for name, value in moments.items()}
-        header = {name: getattr(self, name) for name in KEPT}
+        header = {name: getattr(self, name) for name in SAVED_FIELDS}
         return tensors, header | {"run": self.name}
 
     def _restore(self, saved: State) -> None:
         header, tensors = saved.header, saved.tensors
-        for name, kind in KEPT.items():
+        for name, kind in SAVED_FIELDS.items():
             setattr(self, name, kind(header[name]))
         if not 0 <= self.step <= self.schedule.steps:
             raise InputError(f"its step {self.step} is none of {self.schedule.steps}")
@@ -181,6 +178,11 @@ class Descent(ABC, Generic[Model]):
 
 
 def warm_cosine(step: int, steps: int, warm_up: int, final: float) -> float:
-    """Share of a rate that rises over `warm_up` steps and decays to `final` along a cosine."""
+    """Return the factor of a learning rate that rises over `warm_up` steps and decays to `final` along a cosine.
+
+    Example:
+        >>> [round(warm_cosine(step, steps=10, warm_up=2, final=0.0), 2) for step in (0, 5, 10)]
+        [0.5, 0.5, 0.0]
+    """
     cosine = 0.5 * (1 + math.cos(math.pi * step / steps))
     return min(1.0, (step + 1) / max(warm_up, 1)) * (final + (1 - final) * cosine)

@@ -1,4 +1,4 @@
-"""Where an interrupted fit stands: what its runs share, kept in one file."""
+"""The state of a fit in one file, so that an interrupted fit can continue."""
 
 from __future__ import annotations
 
@@ -19,31 +19,8 @@ KIND = "fit state"
 
 
 @dataclass(frozen=True)
-class Size:
-    """What identifies a run of a fit.
-
-    Args:
-        final: on all spectra, or with some held out for the search.
-        n_primitives, steps: how large and how long.
-    """
-
-    final: bool
-    n_primitives: int
-    steps: int
-
-    @property
-    def key(self) -> str:
-        """Its name in a saved state."""
-        return f"{'final' if self.final else 'search'} {self.n_primitives} {self.steps}"
-
-    def __str__(self) -> str:
-        steps = f", {self.steps} steps" if self.steps else ""
-        return f"{'final' if self.final else 'search'}, {self.n_primitives} primitives{steps}"
-
-
-@dataclass(frozen=True)
 class State:
-    """Where a run stood."""
+    """Saved state of one optimisation: plain values and tensors."""
 
     header: dict[str, Any]
     tensors: dict[str, Tensor]
@@ -51,36 +28,41 @@ class State:
 
 @dataclass
 class Session:
-    """What the runs of one fit share: where their state is kept, and who is informed.
+    """The file of a fit's state, shared by all optimisations of the fit.
 
     Args:
-        path: of the state; None keeps none.
-        owner: fingerprint of configuration and spectra.
-        bar: shows progress.
-        on_record: is called at each evaluation.
-        saved: the state of an earlier session of the same fit.
-        losses: on held-out spectra, of runs that are done, by their key.
-        records: of all evaluations of the fit, those of earlier sessions first.
-        earlier: seconds that earlier sessions took, as far as their work was kept.
+        path: File of the state. With None nothing is saved.
+        owner: Fingerprint of configuration and training data. It identifies the fit.
+        bar: Progress bar.
+        on_record: Called with the record of each evaluation, those of earlier sessions first.
 
     Raises:
-        InputError: a saved state that is damaged or of another fit.
+        InputError: The saved state is damaged or of another fit.
+
+    Example:
+        >>> from swiftwrf.runtime.progress import progress_bar
+        >>> session = Session(None, "fingerprint", progress_bar(False), on_record=None)
+        >>> session.evaluated({"step": 10, "loss": 0.5}, {}, {})
+        >>> session.records[0]["loss"]
+        0.5
     """
 
     path: Path | None
     owner: str
     bar: Progress
     on_record: Callable[[Record], None] | None
-    saved: State | None = None
-    losses: dict[str, float] = field(default_factory=dict)
-    records: list[Record] = field(default_factory=list)
-    earlier: float = 0.0
-    began: float = field(default_factory=time.perf_counter)
+    saved: State | None = field(init=False)
+    """state of the optimisation that an earlier session interrupted"""
+    losses: dict[str, float] = field(init=False, default_factory=dict)
+    """loss on held-out spectra of finished optimisations, by name"""
+    records: list[Record] = field(init=False, default_factory=list)
+    """records of all evaluations of the fit, those of earlier sessions first"""
 
     def __post_init__(self) -> None:
+        self._earlier, self._began = 0.0, time.perf_counter()
         self.saved = self._read()
         for record in self.records:
-            self._inform(record)
+            self._send(record)
 
     def _read(self) -> State | None:
         if self.path is None or not self.path.exists():
@@ -88,21 +70,28 @@ class Session:
         _, tensors, header = checkpoint.read(self.path, KIND)
         if header.get("fingerprint") != self.owner:
             raise InputError(
-                f"{self.path} is the state of another fit (other spectra or settings); remove it or give another path"
+                f"{self.path} is the state of another fit (other spectra or options); remove it or give another path"
             )
-        with checkpoint.refusing(f"{self.path} is no state that a fit can go on from"):
+        with checkpoint.refusing(f"{self.path} holds no state from which a fit can continue"):
             self.losses, self.records = dict(header["losses"]), list(header["records"])
-            self.earlier = float(header["elapsed"])
+            self._earlier = float(header["elapsed"])
         return State(header, tensors)
 
     @property
     def elapsed(self) -> float:
-        """Seconds that the fit took so far, over all its sessions."""
-        return self.earlier + time.perf_counter() - self.began
+        """Duration of the fit over all its sessions [s]."""
+        return self._earlier + time.perf_counter() - self._began
 
     def evaluated(self, record: Record, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
-        """Keeps the record of an evaluation with the state of the run under way, then informs: a history that is read
-        after an interruption has it once."""
+        """Save an evaluation with the state of the optimisation, then send its record.
+
+        Saving comes first, so that a history that continues after an interruption contains each record once.
+
+        Args:
+            record: Plain values, e.g. step and loss.
+            tensors: Tensors of the state.
+            header: Plain values of the state.
+        """
         record = record | {"elapsed": self.elapsed}
         self.records.append(record)
         if self.path is not None:
@@ -113,8 +102,8 @@ class Session:
                 "elapsed": self.elapsed,
             }
             checkpoint.write(self.path, KIND, tensors, header | shared)
-        self._inform(record)
+        self._send(record)
 
-    def _inform(self, record: Record) -> None:
+    def _send(self, record: Record) -> None:
         if self.on_record is not None:
             self.on_record(record)
