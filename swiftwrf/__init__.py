@@ -16,7 +16,7 @@ from swiftwrf.data.simulated import rssi_room, simulated_room
 from swiftwrf.diagnostics.calibration import Calibration, calibrate
 from swiftwrf.errors import FitError, InputError
 from swiftwrf.models.coarray import CoarrayModel, fit_coarray, project
-from swiftwrf.models.geometry import GeometryModel, fit_geometry
+from swiftwrf.models.geometry import GeometryModel, HybridModel, fit_geometry, fit_hybrid
 from swiftwrf.models.swiftwrf import FitConfig, ModelConfig, SwiftWRF, fit
 from swiftwrf.rasterize import rasterize, rasterize_magnitude
 from swiftwrf.rssi import RssiConfig, RssiModel, fit_rssi
@@ -30,6 +30,7 @@ __all__ = [
     "FitConfig",
     "FitError",
     "GeometryModel",
+    "HybridModel",
     "InputError",
     "ModelConfig",
     "Rssi",
@@ -43,6 +44,7 @@ __all__ = [
     "fit",
     "fit_coarray",
     "fit_geometry",
+    "fit_hybrid",
     "fit_rssi",
     "load",
     "load_rssi",
