@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from swiftwrf import AngularGrid, Spectra
-from swiftwrf.array.angles import great_circle, to_direction
+from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.data.spectra import direction_of_link
 from swiftwrf.positions import distance
 from tasks.aoa.page.room import MARGIN, extent
@@ -156,13 +156,13 @@ class SpectraScene:
 
 def strongest(spectrum: Tensor, grid: AngularGrid) -> Direction:
     """Direction of the largest magnitude of a spectrum (n_elevation, n_azimuth)."""
-    return _degrees(grid.strongest(spectrum[None])[0])
+    return _degrees(grid.peak_direction(spectrum[None])[0])
 
 
 def angle_between(a: Direction, b: Direction) -> float:
     """Great-circle angle of two directions [deg]."""
     first, second = (to_direction(*torch.tensor(direction, dtype=torch.float64).deg2rad()) for direction in (a, b))
-    return float(great_circle(first, second).rad2deg())
+    return float(angular_distance(first, second).rad2deg())
 
 
 def _degrees(direction: Tensor) -> Direction:

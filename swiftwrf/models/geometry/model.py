@@ -248,7 +248,9 @@ def fit_geometry(
         >>> fit_geometry(data, GeometryConfig(width=1, further=0), progress=False).order
         2
     """
-    given = {name: value for name, value in (("validation", validation), ("seed", seed)) if value is not None}
+    given: dict[str, Any] = {
+        name: value for name, value in (("validation", validation), ("seed", seed)) if value is not None
+    }
     return GeometryModel(config, **given).fit(train, progress=progress)
 
 
@@ -264,5 +266,5 @@ def refit_geometry(model: FieldModel, train: Spectra, *, seed: int | None = None
         InputError: As `fit_geometry`, or a model without a room.
     """
     config = model.room.config if model.room is not None else None
-    given = {} if seed is None else {"seed": seed}
+    given: dict[str, Any] = {} if seed is None else {"seed": seed}
     return GeometryModel(config, **given).fit(train, like=model)
