@@ -15,15 +15,12 @@ Result = TypeVar("Result")
 
 
 def set_threads(number: int) -> None:
-    """So many threads from now on: of torch, of numba, and of the linear algebra behind NumPy and SciPy.
+    """Set the number of threads of torch, which numba follows, and of the linear algebra behind NumPy and SciPy.
 
     Sums over threads are added up in another order, so the number belongs to what makes a result repeatable. This also
     keeps MKL from choosing one by itself, which shows in the last bits.
     """
-    import numba  # by those who use it
-
     torch.set_num_threads(number)
-    numba.set_num_threads(min(number, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
     threadpool_limits(number)
 
 
