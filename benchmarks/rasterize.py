@@ -1,8 +1,8 @@
 """Spectra per second: each backend alone and the whole model, on the machine's GPU where there is one, else on its CPU.
 
-Rates are of magnitudes |A|: medians over repeats with the least and the most, backends compared within one run. On a GPU every
-rate also comes as a share of two bounds: the exponentials of the pixels inside the cutoff (16 a clock and multiprocessor),
-and the writing of the magnitude at the speed of a measured copy.
+Rates are of magnitudes |A|: medians over repeats with minimum and maximum. Backends are compared within one run. On a GPU
+every rate is also given as a share of two bounds: the exponentials of the pixels inside the cutoff (16 a clock and
+multiprocessor), and the writing of the magnitude at the speed of a measured copy.
 """
 
 from __future__ import annotations

@@ -173,7 +173,7 @@ def test_refuses_unknown_backends_and_cutoffs_out_of_range():
     inputs = [x.detach() for x in random_scene()]
     with pytest.raises(InputError, match="backend must be 'auto' or 'reference' or 'cpu' or 'cuda', got 'opengl'"):
         rasterize(*inputs, GRID, backend="opengl")
-    with pytest.raises(InputError, match="cutoff must be a number above 0 and below 1 or None, got 1.0"):
+    with pytest.raises(InputError, match=r"cutoff must be a number above 0 and below 1 or None, got 1\.0"):
         rasterize(*inputs, GRID, cutoff=1.0)
     with pytest.raises(InputError, match="float32 tensors on cpu"):
         rasterize(*(x.double() for x in inputs), GRID, backend="cpu")

@@ -33,7 +33,7 @@ def test_cpu_backend_stays_within_its_tolerance(case, cutoff):
 
 
 def test_float32_reference_is_finite_in_every_case():
-    """Its rounding is that of angles in float32, coarser than that of the fast backends. The reference is exact in float64."""
+    """It rounds angles in float32, more coarsely than the fast backends. It is the definition in float64."""
     for name in HARD_CASES:
         found = stability.render_case(name, "reference", None, torch.device("cpu"))
         assert found["value"] < 1e-3

@@ -1,11 +1,11 @@
 """Rasterization of primitives to spectra: one interface, several backends.
 
-| backend     | tensors                      | method                                                        |
-|-------------|------------------------------|---------------------------------------------------------------|
-| `reference` | any device, float32, float64 | the definition, dense                                         |
-| `cpu`       | CPU, float32                 | culled rows, compiled by numba at the first use               |
-| `cuda`      | NVIDIA GPU, float32          | culled tiles, compiled by NVRTC at the first use              |
-| `auto`      |                              | the fast one for the tensors' device and dtype if it is available, else `reference` |
+| backend     | tensors                      | method                                                       |
+|-------------|------------------------------|--------------------------------------------------------------|
+| `reference` | any device, float32, float64 | the definition, dense                                        |
+| `cpu`       | CPU, float32                 | culled rows, compiled by numba at the first use              |
+| `cuda`      | NVIDIA GPU, float32          | culled tiles, compiled by NVRTC at the first use             |
+| `auto`      |                              | the fast backend of device and dtype if available, else `reference` |
 """
 
 from __future__ import annotations
@@ -68,8 +68,7 @@ def rasterize(
         >>> rasterize(mean, factor, weight, AngularGrid.hemisphere(9, 36)).shape
         torch.Size([2, 9, 36])
     """
-    fast = _fast(mean, cholesky, weight, backend, cutoff)
-    if not fast:
+    if not _fast(mean, cholesky, weight, backend, cutoff):
         return reference.field(mean, cholesky, weight, grid, cutoff)
     rendered = operators.field(*_flattened(mean, cholesky, weight), grid, cutoff)
     return rendered.reshape(*mean.shape[:-2], 2, *grid.shape)
@@ -97,8 +96,7 @@ def rasterize_magnitude(
         >>> round(spectrum[0, 0].item(), 3)
         1.0
     """
-    fast = _fast(mean, cholesky, weight, backend, cutoff)
-    if not fast:
+    if not _fast(mean, cholesky, weight, backend, cutoff):
         return magnitude(reference.field(mean, cholesky, weight, grid, cutoff))
     rendered = operators.magnitude(*_flattened(mean, cholesky, weight), grid, cutoff)
     return rendered.reshape(*mean.shape[:-2], *grid.shape)

@@ -46,7 +46,7 @@ def field(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cut
 def field_gradients(
     grad: Tensor, mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the gradients of mean, Cholesky factor and weight for a gradient (B, 2, n_elevation, n_azimuth) of the field."""
+    """Return the gradients of mean, factor and weight for a gradient (B, 2, n_elevation, n_azimuth) of the field."""
     batch, n = mean.shape[:2]
     derivatives = mean.new_empty(batch, n, 2), cholesky.new_empty(batch, n, 3), weight.new_empty(batch, n, 2)
     threads = _threads()

@@ -42,7 +42,7 @@ def _pixels(mean, cholesky, origin, step, n_azimuth):
 
 @_inline
 def _rows(y, l2, l3, reach2, top, bottom):
-    """Return the first row, and the row after the last, of [top, bottom) within the cutoff of a kernel centred on row `y`."""
+    """Return the first row, and the row after the last, of [top, bottom) within the cutoff of a kernel on row `y`."""
     extent = math.sqrt(reach2 * (l2 * l2 + l3 * l3))
     first = max(top, math.ceil(max(y - extent, -1.0)))
     last = min(bottom - 1, math.floor(min(y + extent, float(bottom))))
@@ -117,7 +117,7 @@ def _add(kernel, begin, end, weight_re, weight_im, re, im, pixel):
 
 @_inline
 def _sums(kernel, begin, end, start, weight_re, weight_im, re, im, pixel):
-    """Return sums over a part of a row: kernel times the derivative (real, imaginary), and their weighted sum z times d, d^2."""
+    """Return sums over a part of a row: kernel times derivative (real, imaginary), and their weighted sum times d, d^2."""
     zero = np.float32(0)
     d_re, d_im, z_d, z_dd = zero, zero, zero, zero
     for k in range(end - begin):

@@ -41,7 +41,7 @@ def magnitude(
 def field_gradients(
     grad: Tensor, mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the gradients of mean, Cholesky factor and weight for a gradient (B, 2, n_elevation, n_azimuth) of the field."""
+    """Return the gradients of mean, factor and weight for a gradient (B, 2, n_elevation, n_azimuth) of the field."""
     return _gradients("rasterize_backward", [grad], mean, cholesky, weight, grid, cutoff)
 
 

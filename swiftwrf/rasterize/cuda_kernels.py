@@ -6,7 +6,7 @@ Neither a CUDA toolkit nor a C++ compiler is needed. Compilation takes about 0.2
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from torch import Tensor
 from swiftwrf.errors import InputError
 
 SOURCE = Path(__file__).with_name("rasterize.cu")
-# With subnormals flushed to zero exp2f is a single instruction. Divisions and roots are accurate to two units in the last place.
+# With subnormals flushed to zero exp2f is one instruction. Divisions and roots are accurate to two units in the last place.
 OPTIONS = ("--std=c++17", "--ftz=true", "--prec-div=false", "--prec-sqrt=false")
 MIN_CAPABILITY = 75  # Ten times compute capability 7.5 (Turing), the oldest that NVRTC 13 compiles for.
 REMEDY = "use backend='reference' or tensors on the CPU"
@@ -129,7 +129,7 @@ class Kernels:
             self._context = _call(self._driver.cuDevicePrimaryCtxRetain, ordinal)
             _call(self._driver.cuCtxSetCurrent, self._context)
             self._module = _call(self._driver.cuModuleLoadData, np.frombuffer(image, np.uint8).ctypes.data)
-        self._function = cache(lambda name: _call(self._driver.cuModuleGetFunction, self._module, name.encode()))
+        self._function = cache(partial(_call, self._driver.cuModuleGetFunction, self._module))
 
     def launch(self, kernel: str, blocks: int, threads: int, *arguments: Tensor | int | np.ndarray | None) -> None:
         """Queue a kernel on torch's current stream of the device, without waiting for it.
@@ -146,17 +146,21 @@ class Kernels:
             _call(self._driver.cuCtxSetCurrent, self._context)  # A new thread may have no context yet.
             stream = self._driver.CUstream(torch.cuda.current_stream().cuda_stream)
             size = (blocks, 1, 1, threads, 1, 1)
-            _call(self._driver.cuLaunchKernel, self._function(kernel), *size, 0, stream, pointers.ctypes.data, 0)
+            _call(
+                self._driver.cuLaunchKernel, self._function(kernel.encode()), *size, 0, stream, pointers.ctypes.data, 0
+            )
 
 
 def packed(*arguments: Tensor | int | np.ndarray | None) -> list[np.ndarray]:
     """Return the bytes of kernel arguments: pointers of tensors (null if None or empty), 32-bit integers, structures."""
     values = []
     for argument in arguments:
-        if argument is None or isinstance(argument, Tensor):
-            is_null = argument is None or argument.numel() == 0
-            argument = np.array(0 if is_null else argument.data_ptr(), np.uint64)
-        values.append(argument if isinstance(argument, np.ndarray) else np.array(argument, np.int32))
+        if isinstance(argument, Tensor):
+            values.append(np.array(argument.data_ptr() if argument.numel() else 0, np.uint64))
+        elif isinstance(argument, np.ndarray):
+            values.append(argument)
+        else:
+            values.append(np.array(argument or 0, np.uint64 if argument is None else np.int32))
     return values
 
 

@@ -1,4 +1,4 @@
-"""Render with the CUDA backend through `cuda.bindings` and a stand-in driver, which the library path of the process finds."""
+"""Render with the CUDA backend through `cuda.bindings` and a stand-in driver that lies in the library path."""
 
 import contextlib
 from types import SimpleNamespace
