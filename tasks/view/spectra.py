@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from swiftwrf import AngularGrid, Spectra
-from swiftwrf.array.angles import great_circle, to_direction
+from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.data.spectra import Moving, direction_of_link
 from swiftwrf.models.base import FieldModel
 from swiftwrf.positions import distance
@@ -178,13 +178,13 @@ class SpectraView:
 
 def peak(spectrum: Tensor, grid: AngularGrid) -> Direction:
     """Return the direction of the largest magnitude of a spectrum (n_elevation, n_azimuth)."""
-    return _degrees(grid.strongest(spectrum[None])[0])
+    return _degrees(grid.peak_direction(spectrum[None])[0])
 
 
 def angle_between(a: Direction, b: Direction) -> float:
     """Return the angle between two directions [deg]."""
     first, second = (to_direction(*torch.tensor(direction, dtype=torch.float64).deg2rad()) for direction in (a, b))
-    return float(great_circle(first, second).rad2deg())
+    return float(angular_distance(first, second).rad2deg())
 
 
 def _degrees(direction: Tensor) -> Direction:
