@@ -20,7 +20,7 @@ import torch
 from fuzz import kinds
 from PIL import Image
 
-from swiftwrf import AngularGrid, GeometryModel, InputError, fit_coarray, load
+from swiftwrf import AngularGrid, GeometryModel, InputError, load
 from swiftwrf.models.geometry import Plane, fit_hybrid
 from tasks.run import command_line
 from tasks.view import ViewConfig, run, spectra
