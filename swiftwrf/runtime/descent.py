@@ -1,4 +1,4 @@
-"""Gradient descent that refuses to diverge and continues after an interruption, for all learnt models."""
+"""Gradient descent with checks of the loss and a state that survives interruptions, for every network and module."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from swiftwrf.runtime.session import Record, Session, State
 
 Model = TypeVar("Model", bound=nn.Module)
 
-SAVED_FIELDS = {"step": int, "seconds": float, "first_loss": float, "last_loss": float}  # with their types
+SAVED_VALUES = {"step": int, "seconds": float, "first_loss": float, "last_loss": float}  # attributes in a checkpoint
 
 
 @dataclass(frozen=True)
@@ -29,29 +29,27 @@ class Schedule:
 
     Args:
         steps: Number of steps.
-        check_every: Number of steps between two evaluations, at which progress is recorded and the state is saved.
-        averaging: Decay per step of a step's weight in the averaged parameters, which predict better than the last ones.
-            0 keeps the last parameters.
-        clip: Largest norm of the gradient.
-        betas: Decay rates of Adam's moments.
-        weight_decay: Weight decay of Adam.
+        check_every: Steps between two evaluations, at which a record is sent and the state is saved.
+        averaging: Decay per step of the weights in the averaged parameters; 0 takes the last parameters.
+        clip: Maximum norm of the gradient.
+        betas, weight_decay: Options of Adam.
     """
 
     steps: int
     check_every: int
-    averaging: float = 0.98
+    averaging: float = 0.98  # averaged parameters predict better than the last ones
     clip: float = 1.0
     betas: tuple[float, float] = (0.9, 0.99)
     weight_decay: float = 0.0
 
 
 class Descent(ABC, Generic[Model]):
-    """Adam descent of `objective`, which subclasses define. The result is the running average of the parameters.
+    """Adam with a running average of the parameters.
 
     Args:
-        name: Name of the descent within its fit, shown on the progress bar.
-        model: Model to train, on its device.
-        groups: Adam's parameter groups, each with its largest learning rate as `peak`.
+        name: Name of the run within its fit, also on the progress bar.
+        model: Module to train, on its device.
+        groups: Parameter groups of Adam, each with its peak learning rate, `peak`.
         schedule: Length and step rule.
     """
 
@@ -65,7 +63,7 @@ class Descent(ABC, Generic[Model]):
         self.broken_at = torch.tensor(schedule.steps, device=device)  # the first step whose loss was not finite
 
     def averaged(self) -> AveragedModel:
-        """Return a running average that starts from the present parameters."""
+        """The running average, which begins with the parameters as they are."""
         return AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(self.schedule.averaging))
 
     @abstractmethod
@@ -74,18 +72,18 @@ class Descent(ABC, Generic[Model]):
 
     @abstractmethod
     def rate(self, step: int) -> float:
-        """Return the factor of the largest learning rates at a step."""
+        """Return the learning rates at a step as a fraction of their peaks."""
 
     def advance(self) -> Tensor:
         """Take one step and return its loss.
 
         Raises:
-            FitError: The loss or the gradient is not finite. On a GPU this is checked at evaluations only, because each
-                check waits for the GPU.
+            FitError: The loss or gradient is not finite. On a GPU this is checked at evaluations only, because the check
+                waits for the device.
         """
         try:
             loss = self.objective()
-        except InputError as error:  # the parameters diverged, so that the model cannot be evaluated
+        except InputError as error:  # the parameters diverged, so that the rasterizer refuses them
             raise FitError(f"the fit broke at step {self.step}: {error}; {self._advice()}") from None
         self.optimiser.zero_grad()
         loss.backward()
@@ -96,9 +94,9 @@ class Descent(ABC, Generic[Model]):
             raise FitError(
                 f"the fit broke at step {broken}: its loss or gradient is not a finite number; {self._advice()}"
             )
-        factor = self.rate(self.step)
+        fraction = self.rate(self.step)
         for group in self.optimiser.param_groups:
-            group["lr"] = group["peak"] * factor
+            group["lr"] = group["peak"] * fraction
         self.optimiser.step()
         self.average.update_parameters(self.model)
         self.step += 1
@@ -112,17 +110,17 @@ class Descent(ABC, Generic[Model]):
 
     @property
     def result(self) -> Model:
-        """Model with averaged parameters."""
+        """Model with the averaged parameters."""
         return cast(Model, self.average.module)
 
     def run(self, session: Session) -> None:
-        """Take all steps, from the session's saved state if it is of this descent, and save the state at each evaluation.
+        """Take all steps, from the saved state if it belongs to this run, and save the state at each evaluation.
 
         Raises:
-            FitError: The last loss is larger than the first one.
+            FitError: The loss ends above its first value.
         """
         if session.saved is not None and session.saved.header.get("run") == self.name:
-            with refusing(f"{session.path} holds no state from which a fit can continue"):
+            with refusing(f"{session.path} is no state that a fit can continue from"):
                 self._restore(session.saved)
         steps = self.schedule.steps
         task = session.bar.add_task(self.name, total=steps, completed=self.step)
@@ -136,7 +134,7 @@ class Descent(ABC, Generic[Model]):
                 self.seconds, self.last_loss = time.perf_counter() - began, float(loss)
                 session.evaluated(self.record(loss), *self._state())
         session.bar.remove_task(task)
-        if self.last_loss > self.first_loss:
+        if self.last_loss > self.first_loss:  # also if the checkpoint is that of a completed run
             raise FitError(
                 f"the fit ended with a loss of {self.last_loss:.3g}, worse than the {self.first_loss:.3g} it began with; "
                 f"{self._advice()}"
@@ -158,15 +156,15 @@ class Descent(ABC, Generic[Model]):
         tensors |= {f"average.{name}": value for name, value in self.average.state_dict().items()}
         for number, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{number}.{name}": torch.as_tensor(value) for name, value in moments.items()}
-        header = {name: getattr(self, name) for name in SAVED_FIELDS}
+        header = {name: getattr(self, name) for name in SAVED_VALUES}
         return tensors, header | {"run": self.name}
 
     def _restore(self, saved: State) -> None:
         header, tensors = saved.header, saved.tensors
-        for name, kind in SAVED_FIELDS.items():
+        for name, kind in SAVED_VALUES.items():
             setattr(self, name, kind(header[name]))
         if not 0 <= self.step <= self.schedule.steps:
-            raise InputError(f"its step {self.step} is none of {self.schedule.steps}")
+            raise InputError(f"its step {self.step} is not one of {self.schedule.steps}")
         for prefix, module in (("model.", self.model), ("average.", self.average)):
             module.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
         state: dict[str, Any] = copy.deepcopy(self.optimiser.state_dict())
@@ -178,11 +176,6 @@ class Descent(ABC, Generic[Model]):
 
 
 def warm_cosine(step: int, steps: int, warm_up: int, final: float) -> float:
-    """Return the factor of a learning rate that rises over `warm_up` steps and decays to `final` along a cosine.
-
-    Example:
-        >>> [round(warm_cosine(step, steps=10, warm_up=2, final=0.0), 2) for step in (0, 5, 10)]
-        [0.5, 0.5, 0.0]
-    """
+    """Return the fraction of a rate that rises over `warm_up` steps and decays to `final` along a cosine."""
     cosine = 0.5 * (1 + math.cos(math.pi * step / steps))
     return min(1.0, (step + 1) / max(warm_up, 1)) * (final + (1 - final) * cosine)

@@ -1,4 +1,4 @@
-"""The state of a fit in one file, so that an interrupted fit can continue."""
+"""The state of a long fit, which one file keeps so that an interrupted fit can continue."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ KIND = "fit state"
 
 @dataclass(frozen=True)
 class State:
-    """Saved state of one optimisation: plain values and tensors."""
+    """Saved state of one run: plain values and tensors."""
 
     header: dict[str, Any]
     tensors: dict[str, Tensor]
@@ -28,80 +28,66 @@ class State:
 
 @dataclass
 class Session:
-    """The file of a fit's state, shared by all optimisations of the fit.
+    """State shared by the runs of one fit: their checkpoint, records and callback.
 
     Args:
-        path: File of the state. With None nothing is saved.
-        owner: Fingerprint of configuration and training data. It identifies the fit.
+        path: Checkpoint. None keeps no state.
+        owner: Fingerprint of configuration and spectra.
         bar: Progress bar.
-        on_record: Called with the record of each evaluation, those of earlier sessions first.
+        on_record: Called at each evaluation; at first with the records of the checkpoint.
+
+    Attributes:
+        saved: State of the interrupted run, if the checkpoint exists.
+        losses: Held-out losses of completed runs by name.
+        records: Records of all evaluations, including those of the checkpoint.
+        earlier: Seconds that the checkpoint has taken.
 
     Raises:
-        InputError: The saved state is damaged or of another fit.
-
-    Example:
-        >>> from swiftwrf.runtime.progress import progress_bar
-        >>> session = Session(None, "fingerprint", progress_bar(False), on_record=None)
-        >>> session.evaluated({"step": 10, "loss": 0.5}, {}, {})
-        >>> session.records[0]["loss"]
-        0.5
+        InputError: The checkpoint is damaged or belongs to another fit.
     """
 
     path: Path | None
     owner: str
     bar: Progress
     on_record: Callable[[Record], None] | None
-    saved: State | None = field(init=False)
-    """state of the optimisation that an earlier session interrupted"""
-    losses: dict[str, float] = field(init=False, default_factory=dict)
-    """loss on held-out spectra of finished optimisations, by name"""
-    records: list[Record] = field(init=False, default_factory=list)
-    """records of all evaluations of the fit, those of earlier sessions first"""
+    saved: State | None = None
+    losses: dict[str, float] = field(default_factory=dict)
+    records: list[Record] = field(default_factory=list)
+    earlier: float = 0.0
+    began: float = field(default_factory=time.perf_counter)
 
     def __post_init__(self) -> None:
-        self._earlier, self._began = 0.0, time.perf_counter()
-        self.saved = self._read()
+        if self.path is not None and self.path.exists():
+            self.saved = self._read(self.path)
         for record in self.records:
             self._send(record)
 
-    def _read(self) -> State | None:
-        if self.path is None or not self.path.exists():
-            return None
-        _, tensors, header = checkpoint.read(self.path, KIND)
+    def _read(self, path: Path) -> State:
+        _, tensors, header = checkpoint.read(path, KIND)
         if header.get("fingerprint") != self.owner:
             raise InputError(
-                f"{self.path} is the state of another fit (other spectra or options); remove it or give another path"
+                f"{path} is the state of another fit (other spectra or settings); remove it or give another path"
             )
-        with checkpoint.refusing(f"{self.path} holds no state from which a fit can continue"):
+        with checkpoint.refusing(f"{path} is no state that a fit can continue from"):
             self.losses, self.records = dict(header["losses"]), list(header["records"])
-            self._earlier = float(header["elapsed"])
+            self.earlier = float(header["elapsed"])
         return State(header, tensors)
 
     @property
     def elapsed(self) -> float:
-        """Duration of the fit over all its sessions [s]."""
-        return self._earlier + time.perf_counter() - self._began
+        """Seconds of the fit, including those before an interruption."""
+        return self.earlier + time.perf_counter() - self.began
 
     def evaluated(self, record: Record, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
-        """Save an evaluation with the state of the optimisation, then send its record.
+        """Save the record of an evaluation with the state of the current run, then send it.
 
-        Saving comes first, so that a history that continues after an interruption contains each record once.
-
-        Args:
-            record: Plain values, e.g. step and loss.
-            tensors: Tensors of the state.
-            header: Plain values of the state.
+        The record is saved first, so that the history after an interruption contains it once.
         """
         record = record | {"elapsed": self.elapsed}
         self.records.append(record)
         if self.path is not None:
-            shared = {
-                "losses": self.losses,
-                "fingerprint": self.owner,
-                "records": self.records,
-                "elapsed": self.elapsed,
-            }
-            checkpoint.write(self.path, KIND, tensors, header | shared)
+            shared = {"losses": self.losses, "fingerprint": self.owner, "records": self.records}
+            checkpoint.write(self.path, KIND, tensors, header | shared | {"elapsed": self.elapsed})
         self._send(record)
 
     def _send(self, record: Record) -> None:
