@@ -93,7 +93,7 @@ class Study:
         began = time.perf_counter()
         self.model = fit(train, self.config, progress=False)
         self.fit_seconds = time.perf_counter() - began
-        self.config = replace(self.config, model=self.model.config)
+        self.config = replace(self.config, model=self.model.field.config)
 
     def rate(self, synthesize: Callable[[Tensor], Tensor]) -> dict[str, float]:
         """Return the seconds of a spectrum from positions to magnitudes: median, minimum and maximum of the repeats."""
@@ -161,7 +161,7 @@ class Study:
         self, grid: AngularGrid, backend: Backend, cutoff: float | None, dtype: torch.dtype
     ) -> Callable[[Tensor], Tensor]:
         """Return the rendering of the default model with weights rounded to `dtype`; float64 applies to all tensors."""
-        wide = dtype == torch.float64
+        wide, field = dtype == torch.float64, self.model.field
 
         @torch.no_grad()
         def synthesize(position: Tensor) -> Tensor:
@@ -169,10 +169,9 @@ class Study:
             step = 1 if backend == "reference" else BATCH
             for start in range(0, len(position), step):
                 rows = slice(start, start + step)
-                mean, cholesky, attenuation, response = self.model.gaussians(self.model.normalise(position[rows]))
-                weight = (attenuation[..., None] * response).to(dtype)
-                n = len(position[rows])
-                tensors = (mean.expand(n, -1, -1), cholesky, weight.expand(n, -1, -1))
+                gaussians = field.gaussians(field.normalise(position[rows]))
+                n, weight = len(position[rows]), gaussians.weight.to(dtype)
+                tensors = (gaussians.mean.expand(n, -1, -1), gaussians.cholesky, weight.expand(n, -1, -1))
                 tensors = tuple(x.double() if wide else x.float() for x in tensors)
                 spectrum[rows] = rasterize_magnitude(*tensors, grid, backend, cutoff)
             return spectrum.clamp_(0, 1)
@@ -181,7 +180,7 @@ class Study:
 
     def models(self) -> list[Point]:
         """Return the default model and variants of its size, deformation and covariance."""
-        size, rank = self.model.config.size
+        size, rank = self.model.field.config.size
         parameters = sum(p.numel() for p in self.model.parameters())
         points = [
             self.point(
@@ -198,7 +197,7 @@ class Study:
         for setting, changes in variants.items():
             slow = {"steps": 600, "rate": 1e-2, "deformation_rate": 2e-3} if "network" in setting else {}
             began = time.perf_counter()
-            changed: ModelConfig = replace(self.model.config, **changes)
+            changed: ModelConfig = replace(self.model.field.config, **changes)
             model: SwiftWRF = fit(self.train, replace(self.config, model=changed, **slow), progress=False)
             seconds = time.perf_counter() - began
             parameters = sum(p.numel() for p in model.parameters())
