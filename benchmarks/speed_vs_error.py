@@ -34,7 +34,7 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import psnr
 from swiftwrf.models.base import make_model
-from swiftwrf.rasterize import Maker, prepare, rasterize_magnitude
+from swiftwrf.rasterize import Backend, prepare, rasterize_magnitude
 from tasks.page import figures, labels
 from tasks.page.palette import Palette
 
@@ -130,26 +130,26 @@ class Study:
         others = [AngularGrid.hemisphere(*shape) for shape in GRIDS if shape != own_grid.shape]
         grids = [(own_grid, True), *((grid, False) for grid in others)]
         exact = {g: self._drawer(g, "reference", None, torch.float64)(self.test.position) for g, _ in grids}
-        for maker in ("reference", "cpu"):
+        for backend in ("reference", "cpu"):
             for cutoff in CUTOFFS:
                 for dtype in (torch.float32, torch.float16, torch.bfloat16):
                     for grid, own in grids:
                         if not own and (dtype != torch.float32 or cutoff not in (None, 1e-4)):
                             continue
-                        if maker == "reference" and (cutoff is not None or dtype != torch.float32):
+                        if backend == "reference" and (cutoff is not None or dtype != torch.float32):
                             continue  # as fast and as wrong as without
-                        points.append(self._drawn(grid, maker, cutoff, dtype, exact[grid], own))
+                        points.append(self._drawn(grid, backend, cutoff, dtype, exact[grid], own))
         return points
 
     def _drawn(
-        self, grid: AngularGrid, maker: Maker, cutoff: float | None, dtype: torch.dtype, exact: Tensor, own: bool
+        self, grid: AngularGrid, backend: Backend, cutoff: float | None, dtype: torch.dtype, exact: Tensor, own: bool
     ) -> Point:
         size = f"{grid.n_elevation} x {grid.n_azimuth}"
         weights = "" if dtype == torch.float32 else f", weights {str(dtype).removeprefix('torch.')}"
-        setting = f"{maker}, cutoff {'none' if cutoff is None else f'{cutoff:g}'}{weights}, {size}"
-        synthesize = self._drawer(grid, maker, cutoff, dtype)
+        setting = f"{backend}, cutoff {'none' if cutoff is None else f'{cutoff:g}'}{weights}, {size}"
+        synthesize = self._drawer(grid, backend, cutoff, dtype)
         drawn = synthesize(self.test.position)
-        result: Point = {"setting": setting, "maker": maker, "seconds": self.rate(synthesize), "own_grid": own}
+        result: Point = {"setting": setting, "backend": backend, "seconds": self.rate(synthesize), "own_grid": own}
         result |= {"numerical": rms(drawn, exact), "largest": float((drawn - exact).abs().max())}
         if own:
             result |= {"held_out": rms(drawn, self.test.spectrum)}
@@ -158,7 +158,7 @@ class Study:
 
     @torch.no_grad()
     def _drawer(
-        self, grid: AngularGrid, maker: Maker, cutoff: float | None, dtype: torch.dtype
+        self, grid: AngularGrid, backend: Backend, cutoff: float | None, dtype: torch.dtype
     ) -> Callable[[Tensor], Tensor]:
         """Return the rendering of the default model with weights rounded to `dtype`; float64 applies to all tensors."""
         wide, field = dtype == torch.float64, self.model.field
@@ -166,14 +166,14 @@ class Study:
         @torch.no_grad()
         def synthesize(position: Tensor) -> Tensor:
             spectrum = torch.empty(len(position), *grid.shape, dtype=torch.float64 if wide else torch.float32)
-            step = 1 if maker == "reference" else BATCH
+            step = 1 if backend == "reference" else BATCH
             for start in range(0, len(position), step):
                 rows = slice(start, start + step)
                 gaussians = field.gaussians(field.normalise(position[rows]))
                 n, weight = len(position[rows]), gaussians.weight.to(dtype)
                 tensors = (gaussians.mean.expand(n, -1, -1), gaussians.cholesky, weight.expand(n, -1, -1))
                 tensors = tuple(x.double() if wide else x.float() for x in tensors)
-                spectrum[rows] = rasterize_magnitude(*tensors, grid, maker, cutoff)
+                spectrum[rows] = rasterize_magnitude(*tensors, grid, backend, cutoff)
             return spectrum.clamp_(0, 1)
 
         return synthesize

@@ -26,7 +26,7 @@ _users = _Users()
 
 
 def set_threads(number: int) -> None:
-    """Set the number of threads of torch, of numba, and of the linear algebra of NumPy and SciPy.
+    """Set the number of threads of torch, which numba follows, and of the linear algebra of NumPy and SciPy.
 
     The number of threads is part of what makes a result repeatable, because it decides the order in which sums are added.
     A fixed number also keeps MKL from choosing one, which changes the last bits.
@@ -36,10 +36,7 @@ def set_threads(number: int) -> None:
         >>> torch.get_num_threads()
         1
     """
-    import numba  # slow to import, and needed by few commands
-
     torch.set_num_threads(number)
-    numba.set_num_threads(min(number, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
     threadpool_limits(number)
 
 
