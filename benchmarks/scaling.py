@@ -34,8 +34,7 @@ from swiftwrf.data.store import stored
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import psnr
 from swiftwrf.models.base import make_model
-from tasks.aoa.estimators import Settings as EstimatorSettings
-from tasks.aoa.estimators.aann import AANN, AANNConfig
+from tasks.aoa.estimators.aann import AANN
 from tasks.page import figures
 
 GRID = AngularGrid.hemisphere(90, 360)
@@ -198,7 +197,7 @@ def predicting(name: str) -> Callable[[Path, int, dict[str, float]], None]:
 def train(folder: Path, n: int, found: dict[str, float]) -> None:
     """Train the network for a few steps."""
     data = load_spectra(folder / "walk")
-    network = AANN(EstimatorSettings(data.grid), AANNConfig(steps=TRAINING_STEPS))
+    network = AANN(steps=TRAINING_STEPS)
     with measuring(found):
         network.fit(Mixed.measured(data))
 
