@@ -292,4 +292,5 @@ class RssiView:
 def probability_above(rssi: Prediction, selection: MapSelection) -> Tensor:
     """Return the probability that a measurement exceeds the threshold, of the shape of the prediction."""
     assert rssi.std is not None
-    return torch.special.ndtr((rssi.mean - selection.threshold) / rssi.std.clamp_min(MIN_STD_DB))
+    probability: Tensor = torch.special.ndtr((rssi.mean - selection.threshold) / rssi.std.clamp_min(MIN_STD_DB))
+    return probability
