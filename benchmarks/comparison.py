@@ -25,11 +25,10 @@ from record import write_result
 from synthesis import load
 from torch import Tensor
 
-from swiftwrf import Spectra, simulated_room
+from swiftwrf import FIELD_MODELS, FieldModel, Spectra, make_model, simulated_room
 from swiftwrf.data.splits import validation_for
 from swiftwrf.gp import thinned
 from swiftwrf.metrics import l1, psnr, ssim, summary
-from swiftwrf.models.base import FIELD_MODELS, FieldModel, make_model
 from swiftwrf.models.nearest import MemoryModel
 from swiftwrf.runtime.durable import write_text
 from tasks.aoa.condition import conditions_of

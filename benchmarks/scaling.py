@@ -28,12 +28,11 @@ from committed import RESULTS, ROOT
 from record import write_result
 
 from augment import Mixed
-from swiftwrf import AngularGrid, Spectra, load_spectra, simulated_room
+from swiftwrf import AngularGrid, Spectra, load_spectra, make_model, simulated_room
 from swiftwrf.data.simulated.spectra import REGION
 from swiftwrf.data.store import stored
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import psnr
-from swiftwrf.models.base import make_model
 from tasks.aoa.estimators.aann import AANN
 from tasks.page import figures
 

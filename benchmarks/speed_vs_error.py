@@ -27,13 +27,13 @@ from swiftwrf import (
     Spectra,
     SwiftWRF,
     fit,
+    make_model,
     project,
     simulated_room,
 )
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import psnr
-from swiftwrf.models.base import make_model
 from swiftwrf.rasterize import Backend, prepare, rasterize_magnitude
 from tasks.page import figures, labels
 from tasks.page.palette import Palette

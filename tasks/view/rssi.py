@@ -15,8 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf import RssiModel
-from swiftwrf.models.base import Prediction
+from swiftwrf import Prediction, RssiModel
 from swiftwrf.rssi import LEVEL
 from tasks.page import figures
 from tasks.records import as_table

@@ -12,10 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf import AngularGrid, Spectra
+from swiftwrf import AngularGrid, FieldModel, Spectra
 from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.data.spectra import Moving, direction_of_link
-from swiftwrf.models.base import FieldModel
 from swiftwrf.positions import distance
 from tasks.aoa.page.room import MARGIN, extent
 
