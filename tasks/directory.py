@@ -63,21 +63,26 @@ def _digest(config: Any) -> str:
 
 
 @contextmanager
-def new_directory(out: Path, what: str) -> Iterator[Path]:
+def new_directory(out: Path, what: str, argument: str = "--out") -> Iterator[Path]:
     """A directory to be filled in the block, under a name that nothing else has; it becomes `out` if nothing was raised.
+
+    Args:
+        out: Directory to make.
+        what: What it holds, for the message.
+        argument: Argument of the command that names it, for the message.
 
     Raises:
         InputError: `out` exists already, or was made by somebody else in the meantime.
     """
     if out.exists() or not out.name:
-        raise InputError(f"{out} exists already and {what} is never overwritten; choose another --out")
+        raise InputError(f"{out} exists already and {what} is never overwritten; choose another {argument}")
     out.parent.mkdir(parents=True, exist_ok=True)
     unfinished = out.with_name(f".{out.name}.{secrets.token_hex(4)}")
     unfinished.mkdir()
     try:
         yield unfinished
         if out.exists():
-            raise InputError(f"{out} was made by somebody else in the meantime; choose another --out")
+            raise InputError(f"{out} was made by somebody else in the meantime; choose another {argument}")
         rename(unfinished, out)
     finally:
         if unfinished.exists():

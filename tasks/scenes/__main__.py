@@ -8,8 +8,8 @@ from tasks.scenes import ScenesConfig, run
 
 
 def rooms() -> str:
-    """The built-in ones, for the help."""
-    return "\n\n".join(f"{entry.name}: {entry.meaning}" for entry in ROOMS.entries())
+    """Return the built-in rooms, for the help."""
+    return "\n\n".join(f"{name}: {room.summary}" for name, room in ROOMS.items())
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from swiftwrf.data import Spectra
-from swiftwrf.diagnostics.frames import FEW, check_frames
+from swiftwrf.diagnostics.frames import MIN_CLEAR_POSITIONS, check_frames
 from tasks.inspect.findings.base import Findings
 from tasks.inspect.findings.positions import check_positions, say_splits
 
@@ -41,7 +41,7 @@ def check_peaks(data: Spectra, findings: Findings) -> None:
     report = check_frames(data)
     if report is None:
         findings.warn(
-            f"Frames cannot be checked: that needs the fixed end, the orientation and {FEW} positions with line of sight."
+            f"Frames cannot be checked: that needs the fixed end, the orientation and {MIN_CLEAR_POSITIONS} positions with line of sight."
         )
         return
     numbers = {
