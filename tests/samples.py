@@ -72,13 +72,17 @@ def write_snapshots(
 
 
 def write_deepmimo(folder: Path, n: int = 30, tracer: str = "Remcom Wireless Insite", **changes: object) -> Path:
-    """Paths of the simulated room from a transmitter on the ceiling; a change is a function of the arrays, or None to omit one."""
+    """Paths of the simulated room from a transmitter on the ceiling; a change computes an array from all, None omits it."""
     generator = torch.Generator().manual_seed(0)
     receiver = torch.tensor([0.5, 0.5, 0.6]) + torch.tensor([5.0, 4.0, 1.0]) * torch.rand(n, 3, generator=generator)
     transmitter = torch.tensor([3.0, 2.5, 2.7])
     paths = ShoeboxRoom(frequency_hz=FREQUENCY).paths(transmitter[None], receiver)
-    direction, gain, length = (t.reshape(n, 25, *t.shape[1:]).numpy() for t in (paths.direction, paths.gain, paths.length))
-    blocked = np.zeros((n, 25)) + 4 * (~paths.line_of_sight).numpy()[:, None]  # a direct path through a box: transmission
+    direction, gain, length = (
+        t.reshape(n, 25, *t.shape[1:]).numpy() for t in (paths.direction, paths.gain, paths.length)
+    )
+    blocked = (
+        np.zeros((n, 25)) + 4 * (~paths.line_of_sight).numpy()[:, None]
+    )  # a direct path through a box: transmission
     arrays = {
         "power": 20 * np.log10(abs(gain)),
         "phase": np.rad2deg(np.angle(gain)),

@@ -151,7 +151,7 @@ def test_calibration_sees_the_training_part_alone(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("{source}", "{taken}"), "never overwritten; choose another OUT"),
+        (("{source}", "{taken}"), "never overwritten; choose another directory"),
         (("/nowhere", "{new}"), "is not a folder or file"),
         (("{source}", "{new}", "--columns", "x"), "x=NAME"),
         (("{source}", "{new}", "--columns", "x=a"), "takes no columns"),

@@ -63,9 +63,7 @@ def test_floor_reflection_has_the_mirror_length():
     found = (paths.length - mirror).abs() < 1e-9
     assert found.sum() == 2  # floor, and the wall y = 0, both 1 m away
     wavelength = LIGHT_SPEED / room.frequency_hz
-    assert abs(paths.gain[found][0]).item() == pytest.approx(
-        abs(room.reflection) * wavelength / (4 * math.pi * mirror)
-    )
+    assert abs(paths.gain[found][0]).item() == pytest.approx(abs(room.reflection) * wavelength / (4 * math.pi * mirror))
 
 
 def test_box_blocks_direct_path_but_not_the_way_round():

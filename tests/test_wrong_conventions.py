@@ -107,7 +107,7 @@ def test_inspection_names_nothing_where_all_is_right(data):
 def test_inspection_names_a_sign_of_not_heard_that_is_not_known():
     rssi = ROOM.rssi_dbm.clone()
     rssi[torch.rand(rssi.shape, generator=torch.Generator().manual_seed(0)) < 0.3] = torch.nan
-    assert "does it mean not heard" in warnings(replace(ROOM, rssi_dbm=rssi.nan_to_num(-127.0)))
+    assert "does it mean not detected" in warnings(replace(ROOM, rssi_dbm=rssi.nan_to_num(-127.0)))
 
 
 def _deepmimo(**changes):

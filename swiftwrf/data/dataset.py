@@ -55,7 +55,9 @@ class PositionedData:
         values |= {"name": name, "named_splits": dict(named_splits or {}), "source": dict(source or {}), "notes": notes}
         for field in self.row_fields:
             if values[field] is not None and len(values[field]) != n:
-                raise InputError(f"{name} has {n} positions, but {field} has {len(values[field])} rows; they must match")
+                raise InputError(
+                    f"{name} has {n} positions, but {field} has {len(values[field])} rows; they must match"
+                )
         for split, parts in values["named_splits"].items():
             if any(len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < n for rows in parts):
                 raise InputError(f"split {split!r} of {name} has a row outside 0 to {n - 1}")
@@ -77,7 +79,9 @@ class PositionedData:
             rows: Row numbers, int64, or a mask, bool (n,).
         """
         values = {field: getattr(self, field) for field in self.row_fields}
-        kept = {f: v[rows] if isinstance(v, Tensor) else v.subset(rows) for f, v in values.items() if v is not None}
+        kept: dict[str, Any] = {
+            f: v[rows] if isinstance(v, Tensor) else v.subset(rows) for f, v in values.items() if v is not None
+        }
         return replace(self, **kept, named_splits={})
 
     def split(self: Data, name: str = "random", seed: int = 0) -> tuple[Data, Data]:

@@ -206,7 +206,8 @@ def read_positions(file: Path) -> Tensor:
     if len(bad):
         row = int(bad[0])
         raise InputError(
-            f"{file} row {row + 1} is {position[row].tolist()}; positions must be finite numbers [m], at most {MAX_COORDINATE_M:g}"
+            f"{file} row {row + 1} is {position[row].tolist()}; positions must be finite numbers [m], at most "
+            f"{MAX_COORDINATE_M:g}"
         )
     return position
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -56,7 +57,8 @@ class PropagationPaths:
         """Return the links of all parts, which have one carrier and the same known fields."""
         first = parts[0]
         columns = [f.name for f in fields(cls) if isinstance(getattr(first, f.name), Tensor)]
-        return replace(first, **{name: torch.cat([getattr(part, name) for part in parts]) for name in columns})
+        joined: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts]) for name in columns}
+        return replace(first, **joined)
 
     @property
     def owner(self) -> Tensor:
@@ -79,7 +81,8 @@ class PropagationPaths:
         """The links that have a path."""
         some = self.count > 0
         per_link = ("transmitter", "receiver", "count", "line_of_sight")
-        return replace(self, **{name: getattr(self, name)[some] for name in per_link})
+        kept: dict[str, Any] = {name: getattr(self, name)[some] for name in per_link}
+        return replace(self, **kept)
 
     def last_point(self) -> Tensor:
         """Return the last point of each path before the receiver, float64 (P, 3) [m]."""

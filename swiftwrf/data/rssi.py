@@ -67,7 +67,9 @@ class Rssi(PositionedData):
         count = rssi.shape[1]
         names = tuple(receiver_names or (f"receiver{number}" for number in range(1, count + 1)))
         if len(names) != count or len(set(names)) < count:
-            raise InputError(f"{name} has {count} receivers, but the names {listed(names)}; give each receiver one of its own")
+            raise InputError(
+                f"{name} has {count} receivers, but the names {listed(names)}; give each receiver one of its own"
+            )
         places = torch.full((count, 3), torch.nan, dtype=torch.float64)
         if receiver_position is not None:
             places = torch.as_tensor(receiver_position, dtype=torch.float64)

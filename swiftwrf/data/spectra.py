@@ -101,7 +101,9 @@ class Spectra(PositionedData):
             raise InputError(f"spectra of shape {store.shape} do not fit a grid of {grid.shape} directions")
         if pose is not None:
             if rotation is not None or (fixed_position is not None and moving == "transmitter"):
-                raise InputError("pose gives the orientation and, if the transmitter moves, the fixed position; leave them out")
+                raise InputError(
+                    "pose gives the orientation and, if the transmitter moves, the fixed position; leave them out"
+                )
             rotation = pose.rotation
             fixed_position = pose.position if moving == "transmitter" else fixed_position
         if fixed_position is not None:

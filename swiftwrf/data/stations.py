@@ -147,7 +147,7 @@ class RecordFormat(Format[Snapshots]):
     ) -> Iterator[tuple[int, Record]]:
         """Yield number, channels (K, subcarriers) and position of every stride-th record of all files."""
         antennas = [antenna for _, _, antenna in cells]
-        for number, (file, features) in enumerate((file, f) for file in files for f in records(file)):
+        for number, (file, features) in enumerate((source, f) for source in files for f in records(source)):
             if number % stride == 0:
                 try:
                     csi, position = self.parse(features, file)

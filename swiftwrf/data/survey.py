@@ -100,7 +100,7 @@ def read_survey(label: object, table: pd.DataFrame, columns: Mapping[str, str]) 
         raise InputError(f"{label} holds no RSSI that a receiver detected")
     if not kept.all():
         notes.append(f"receivers that never detected the transmitter are left out: {int((~kept).sum())}")
-    return Survey([name for name, keep in zip(names, kept, strict=True) if keep], rssi[:, kept], position, tuple(notes))
+    return Survey([names[i] for i in np.flatnonzero(kept)], rssi[:, kept], position, tuple(notes))
 
 
 def column_of_numbers(label: object, table: pd.DataFrame, name: str) -> Floats:

@@ -51,7 +51,9 @@ def records(file: Path) -> Iterator[dict[str, bytes]]:
             if len(content) != length or len(tail) != 4:
                 raise InputError(f"{file} is no TFRecord file, or ends within record {number}")
             if head[8:] != checksum(head[:8]) or tail != checksum(content):
-                raise InputError(f"{file}: record {number} is damaged, its checksum does not match; copy the file again")
+                raise InputError(
+                    f"{file}: record {number} is damaged, its checksum does not match; copy the file again"
+                )
             try:
                 yield _features(content)
             except (ValueError, IndexError, UnicodeDecodeError) as error:

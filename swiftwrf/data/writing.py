@@ -33,9 +33,7 @@ def write_spectra(data: Spectra, folder: Path) -> None:
         InputError: Both ends move, the orientation is unknown, or the layout does not have the grid.
     """
     if data.fixed_position is None or data.rotation is None:
-        raise InputError(
-            f"{data.name} has no fixed end and orientation, which the layout needs; it cannot be written"
-        )
+        raise InputError(f"{data.name} has no fixed end and orientation, which the layout needs; it cannot be written")
     if data.grid != AngularGrid.hemisphere(*data.grid.shape):
         raise InputError(f"{data.name} has another grid than elevations up to 90 degrees and azimuths from 0 on")
     gateway: dict[str, Any] = {

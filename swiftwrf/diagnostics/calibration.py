@@ -153,7 +153,9 @@ class _Problem:
     @classmethod
     def of(cls, data: Snapshots) -> _Problem:
         received = covariance(_unit(data.channel.angle().double()))
-        return cls(data.array, data.position, data.direction, received, torch.linalg.eigh(received).eigenvectors[..., -1])
+        return cls(
+            data.array, data.position, data.direction, received, torch.linalg.eigh(received).eigenvectors[..., -1]
+        )
 
     def subset(self, rows: Tensor) -> _Problem:
         return _Problem(
@@ -162,12 +164,14 @@ class _Problem:
 
     def scan(self) -> _Found:
         """Return the best of the scanned rotations, with its phases."""
-        few = self.subset(torch.linspace(0, len(self.direction) - 1, min(SCANNED_POSITIONS, len(self.direction))).round().long())
+        few = self.subset(
+            torch.linspace(0, len(self.direction) - 1, min(SCANNED_POSITIONS, len(self.direction))).round().long()
+        )
         _, phase, turn = max(((*few._phases(turn), turn) for turn in _turns()), key=lambda found: found[0])
         return _Found(phase, turn)
 
     def _phases(self, turn: Tensor) -> tuple[float, Tensor]:
-        """Return the power along the line of sight at this rotation, over all positions, and the phases (K,) that maximise it."""
+        """Return the power along the line of sight at this rotation, and the phases (K,) that maximise it."""
         steering = self._steering(turn)
         total = torch.einsum("nab,na,nb->ab", self.covariance, steering.conj(), steering)
         value, vector = torch.linalg.eigh(total)

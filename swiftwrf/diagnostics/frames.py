@@ -26,7 +26,7 @@ from torch import Tensor
 from swiftwrf.array.angles import angular_distance, to_angles, to_direction
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.rssi.law import fit_law, log_distance
+from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
 
 SIGMA = math.radians(10)
 MAX_POSITIONS = 300
@@ -216,7 +216,9 @@ def _turned(frame: _Frame, turn: NDArray[np.float64]) -> Tensor:
 def _constant_turn(frame: _Frame, peak: Tensor) -> tuple[NDArray[np.float64], float]:
     """Return the rotation of the array with most agreement, as a rotation vector in its coordinates, and its angle."""
     away = _turned(frame, np.zeros(3)).float()
-    turns = Rotation.concatenate([Rotation.identity(), Rotation.random(SCANNED_ROTATIONS, rng=np.random.default_rng(0))])
+    turns = Rotation.concatenate(
+        [Rotation.identity(), Rotation.random(SCANNED_ROTATIONS, rng=np.random.default_rng(0))]
+    )
     matrices = torch.from_numpy(turns.as_matrix()).float()
     score = torch.cat([_mean_kernel(_folded(away @ part), peak.float()) for part in matrices.split(200)])
 
@@ -242,8 +244,8 @@ def _mean_kernel(direction: Tensor, peak: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class LawReport:
-    """Result of `check_law`.
+class PathLossReport:
+    """Result of `check_path_loss`.
 
     Args:
         explained: Fraction of the variance of RSSI that path-loss models of each receiver explain.
@@ -258,7 +260,7 @@ class LawReport:
     explanation: str
 
 
-def check_law(data: Rssi) -> LawReport | None:
+def check_path_loss(data: Rssi) -> PathLossReport | None:
     """Compare RSSI with the distances from the receivers, in the declared frame and in others.
 
     Returns:
@@ -274,11 +276,11 @@ def check_law(data: Rssi) -> LawReport | None:
     declared = _explained(place, data)
     found = {meaning: _explained(other, data) for meaning, other in others.items()}
     meaning, best = max(found.items(), key=lambda pair: pair[1])
-    law = fit_law(log_distance(place, data.receiver_position), data.rssi_dbm, pooled=True)
-    return LawReport(
+    model = fit_path_loss(log_distance(place, data.receiver_position), data.rssi_dbm, shared=True)
+    return PathLossReport(
         explained=declared,
-        level_dbm=float(law.level),
-        exponent=float(-law.slope / 10),
+        level_dbm=float(model.level),
+        exponent=float(-model.slope / 10),
         explanation=meaning if best - declared >= MIN_VARIANCE_GAIN else "",
     )
 
@@ -286,7 +288,7 @@ def check_law(data: Rssi) -> LawReport | None:
 def _explained(position: Tensor, data: Rssi) -> float:
     """Return the fraction of the variance of RSSI that path-loss models explain, if RSSI decreases with distance."""
     distance = log_distance(position, data.receiver_position)
-    law = fit_law(distance, data.rssi_dbm)
-    law = law._replace(level=law.level.where(law.slope < 0, data.rssi_dbm.nanmean(dim=0)), slope=law.slope.clamp(max=0))
-    left = (data.rssi_dbm - law(distance)).square().nansum()
-    return 1 - float(left / (data.rssi_dbm - data.rssi_dbm.nanmean(dim=0)).square().nansum().clamp_min(1e-12))
+    constant = PathLoss(data.rssi_dbm.nanmean(dim=0), torch.zeros(data.rssi_dbm.shape[1], dtype=torch.float64))
+    model = fit_path_loss(distance, data.rssi_dbm)
+    residual = data.rssi_dbm - model.where(model.slope < 0, constant)(distance)
+    return 1 - float(residual.square().nansum() / (data.rssi_dbm - constant.level).square().nansum().clamp_min(1e-12))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 import time
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Annotated
 
 import torch
+import tyro
 from torch import Tensor
 
 from swiftwrf import InputError
@@ -18,11 +18,15 @@ from swiftwrf.data.raytraced import ROOMS, SCENE_FILE, FurnishedRoom, Scene, Tra
 from swiftwrf.data.spectra import Moving
 from swiftwrf.data.writing import write_paths
 from tasks.directory import console, new_directory
+from tasks.environment import invocation
 from tasks.page.page import write_page
 from tasks.records import write_json
 from tasks.scenes.page import page
 
 MAX_POSITIONS, MAX_ORDER = 100_000, 8
+ROOM_HELP = "a Mitsuba scene with radio materials (FILE.xml), or a built-in room: " + "; ".join(
+    f"{name}: {room.summary}" for name, room in ROOMS.items()
+)
 MAX_ATTEMPTS = 100  # draws of all positions before the region counts as full
 
 
@@ -34,8 +38,7 @@ class ScenesConfig:
     paths of one position.
     """
 
-    room: str
-    """a room by its name (above), or a Mitsuba scene with radio materials (FILE.xml)"""
+    room: Annotated[str, tyro.conf.arg(help=ROOM_HELP)]
     moving: Moving
     """which end moves; the array lies level at the receiver"""
     positions: int
@@ -65,15 +68,13 @@ class ScenesConfig:
     """seed of positions, rays and scattered phases"""
 
 
-def run(config: ScenesConfig, resume: Path | None = None) -> None:
+def run(config: ScenesConfig) -> None:
     """Draw positions, trace the paths to them, and write paths, record and page.
 
     Raises:
         InputError: An option that makes no sense, no such room or scene, positions outside of it, a material that has no
             constants at the carrier, or no Sionna RT or LLVM.
     """
-    if resume is not None:
-        raise InputError("tracing takes minutes and cannot be resumed; start it again")
     check(config)
     room, fixed, region = where(config)
     with new_directory(Path(config.out), "a scene") as folder:
@@ -97,7 +98,7 @@ def run(config: ScenesConfig, resume: Path | None = None) -> None:
         write_paths(paths, folder)
         each = float(paths.count.double().mean())
         record = {
-            "command": shlex.join(["python", "-m", "tasks.scenes", *sys.argv[1:]]),
+            "command": invocation("scenes"),
             "options": asdict(config),
             "source_sha256": {Path(config.room).name: sha256(Path(config.room))} if room is None else {},
             "fixed": fixed.tolist(),

@@ -32,4 +32,5 @@ class Espargos(RecordFormat):
         return Record(csi, position)
 
     def select(self, csi: NDArray[Any], station: Station, antennas: list[int]) -> NDArray[Any]:
-        return csi[station.number].reshape(len(antennas), -1)
+        channel: NDArray[Any] = csi[station.number].reshape(len(antennas), -1)
+        return channel

@@ -60,7 +60,9 @@ class Nerf2(Format[Spectra]):
             raise InputError(f"{described} describes another array than was given; leave one of them out")
         tables = [file for file in (path / "tx_pos.csv", path / "rx_pos.csv") if file.is_file()]
         if len(tables) != 1:
-            raise InputError(f"{path} must hold one of tx_pos.csv (moving transmitter) and rx_pos.csv (moving receiver)")
+            raise InputError(
+                f"{path} must hold one of tx_pos.csv (moving transmitter) and rx_pos.csv (moving receiver)"
+            )
         moving: Moving = "transmitter" if tables[0].name == "tx_pos.csv" else "receiver"
         position = read_positions(tables[0])
         store, line_of_sight, read = _read_spectra(path, len(position))
@@ -93,8 +95,8 @@ def _read_pose(file: Path, gateway: dict[str, Any]) -> ArrayPose:
     position, orientation = numbers(gateway.get("position"), 3), numbers(gateway.get("orientation"), 4)
     if position is None or orientation is None or max(map(abs, position)) > MAX_COORDINATE_M:
         raise InputError(
-            f"{file}: the gateway needs a position of 3 numbers [m], at most {MAX_COORDINATE_M:g}, and an orientation (x, y, z, w) "
-            f"of 4, got {gateway.get('position')} and {gateway.get('orientation')}"
+            f"{file}: the gateway needs a position of 3 numbers [m], at most {MAX_COORDINATE_M:g}, and an orientation "
+            f"(x, y, z, w) of 4, got {gateway.get('position')} and {gateway.get('orientation')}"
         )
     try:
         return ArrayPose(position, orientation)  # type: ignore[arg-type]  # the lengths are checked

@@ -24,7 +24,9 @@ class Nerf2Rssi(Format[Rssi]):
         return (path / "gateway_rssi.csv").is_file() or (path / "gateway_position.yml").is_file()
 
     def read(self, path: Path, options: ReadOptions) -> Rssi:
-        table, positions, receivers = (path / name for name in ("gateway_rssi.csv", "tx_pos.csv", "gateway_position.yml"))
+        table, positions, receivers = (
+            path / name for name in ("gateway_rssi.csv", "tx_pos.csv", "gateway_position.yml")
+        )
         names, rssi = read_table(table)
         position = read_positions(positions)
         if len(rssi) != len(position):

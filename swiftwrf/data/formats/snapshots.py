@@ -54,7 +54,8 @@ class SnapshotArrays(Format[Snapshots]):
             name=file.stem if file.stem != "snapshots" else folder.resolve().name,
             named_splits=read_splits(folder, n, first=1) if options.every in (None, 1) else None,
             source=digests([file], folder),
-            **{name: _one_each(file, arrays, name, n) for name in ("line_of_sight", "time") if name in arrays},
+            line_of_sight=_one_each(file, arrays, "line_of_sight", n),
+            time=_one_each(file, arrays, "time", n),
         )
         return data if options.every in (None, 1) else data.subset(torch.arange(0, n, options.every))
 
@@ -73,12 +74,16 @@ def _points(file: Path, arrays: Arrays, name: str, columns: int) -> Tensor:
     if values.ndim != 2 or values.shape[1] != columns or len(values) == 0:
         raise InputError(f"{file}: {name} must have shape (n, {columns}) in metres, got {values.shape}")
     if float(np.abs(values).max()) > MAX_COORDINATE_M:
-        raise InputError(f"{file}: {name} holds a coordinate beyond {MAX_COORDINATE_M:g} m; give metres from a nearer origin")
+        raise InputError(
+            f"{file}: {name} holds a coordinate beyond {MAX_COORDINATE_M:g} m; give metres from a nearer origin"
+        )
     return torch.from_numpy(values.astype(np.float64))
 
 
-def _one_each(file: Path, arrays: Arrays, name: str, n: int) -> Tensor:
-    """Return one number a position, float64 (n,)."""
+def _one_each(file: Path, arrays: Arrays, name: str, n: int) -> Tensor | None:
+    """Return one number a position, float64 (n,), None if the file has none."""
+    if name not in arrays:
+        return None
     if arrays[name].shape != (n,):
         raise InputError(
             f"{file}: {name} must have one value for each of the {n} positions, got shape {arrays[name].shape}"
@@ -118,8 +123,8 @@ def _pose(file: Path, arrays: Arrays) -> ArrayPose:
         )
     if position.shape != (3,) or orientation.shape != (4,) or float(np.abs(position).max()) > MAX_COORDINATE_M:
         raise InputError(
-            f"{file}: expected array_position of shape (3,) in metres, at most {MAX_COORDINATE_M:g}, and array_orientation of "
-            f"shape (4,), got {position.shape} and {orientation.shape}"
+            f"{file}: expected array_position of shape (3,) in metres, at most {MAX_COORDINATE_M:g}, and array_orientation "
+            f"of shape (4,), got {position.shape} and {orientation.shape}"
         )
     try:
         return ArrayPose(tuple(map(float, position)), tuple(map(float, orientation)))  # type: ignore[arg-type]

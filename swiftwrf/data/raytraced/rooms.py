@@ -108,16 +108,13 @@ def _read_rooms(file: Path) -> dict[str, FurnishedRoom]:
             for material, low, high in content["pieces"][piece]
         ]
 
-    return {
-        name: FurnishedRoom(
-            **{key: tuple(value) if key in ("size", "fixed") else value for key, value in room.items()}
-            | {
-                "furniture": tuple(piece for entry in room["furniture"] for piece in boxes(entry)),
-                "region": tuple(map(tuple, room["region"])),
-            }
-        )
-        for name, room in content["rooms"].items()
-    }
+    def room(values: dict[str, Any]) -> FurnishedRoom:
+        furniture = tuple(piece for entry in values["furniture"] for piece in boxes(entry))
+        points: dict[str, Any] = {key: tuple(values[key]) for key in ("size", "fixed")}
+        region: Any = tuple(map(tuple, values["region"]))
+        return FurnishedRoom(**(values | points | {"furniture": furniture, "region": region}))
+
+    return {name: room(values) for name, values in content["rooms"].items()}
 
 
 ROOMS = _read_rooms(Path(__file__).with_name("rooms.yml"))

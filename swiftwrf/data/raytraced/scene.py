@@ -96,7 +96,11 @@ def open_scene(name: str, frequency_hz: float) -> Scene:
         InputError: As `Scene`, or an unknown room.
     """
     check_scene(name)
-    return Scene.read(Path(name), frequency_hz) if name.endswith(SCENE_FILE) else Scene(ROOMS[name].surfaces(), frequency_hz)
+    return (
+        Scene.read(Path(name), frequency_hz)
+        if name.endswith(SCENE_FILE)
+        else Scene(ROOMS[name].surfaces(), frequency_hz)
+    )
 
 
 def _at(held: Any, frequency_hz: float) -> Any:

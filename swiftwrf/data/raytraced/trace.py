@@ -140,7 +140,8 @@ def _solve(held: Any, tracing: Tracing, rays: int, diffuse: bool) -> Table:
     corner[kind[owner, path] == 0] = np.nan
 
     def chosen(values: Any) -> NDArray[np.float64]:
-        return values.numpy()[:, 0][owner, path].astype(np.float64)
+        found: NDArray[np.float64] = values.numpy()[:, 0][owner, path].astype(np.float64)
+        return found
 
     def direction(zenith: Any, azimuth: Any) -> NDArray[np.float64]:
         return to_direction(torch.from_numpy(chosen(azimuth)), math.pi / 2 - torch.from_numpy(chosen(zenith))).numpy()

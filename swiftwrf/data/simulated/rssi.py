@@ -1,4 +1,4 @@
-"""The built-in office floor for RSSI: a BLE beacon at random positions, twelve receivers, multipath, shadowing and misses."""
+"""The built-in office floor for RSSI: a BLE beacon, twelve receivers, multipath, shadowing and missed packets."""
 
 from __future__ import annotations
 
