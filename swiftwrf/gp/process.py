@@ -138,7 +138,7 @@ class LeaveGroupOut:
     """Prediction of a group of rows from all other rows without another fit.
 
     For a Gaussian vector y with precision P, the errors at the rows g are inv(P[g, g]) @ (P @ y)[g], with covariance
-    inv(P[g, g]) (C. E. Rasmussen and C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006, eq. 5.12 by blocks).
+    inv(P[g, g]) (C. E. Rasmussen and C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006, eq. 5.12).
 
     Args:
         precision: Inverse covariance of the noisy values (n, n).

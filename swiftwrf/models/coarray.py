@@ -1,10 +1,9 @@
-"""What a planar array can report at all: the linear space of its squared spectra, and a model that lives in it.
+"""The linear space of the squared spectra of a planar array, projection onto it, and a model in it.
 
     |S(k)|^2 = sum over element differences l of r(l) exp(j 2 pi l . k / wavelength),    r(-l) = conj(r(l))
 
 The differences form the array's *difference co-array* (Hoctor and Kassam 1990). A 4 x 4 array has 49 of them, so its squared
-spectrum is exactly 49 real numbers, at any resolution, at the pole and around the azimuth: a constant and, for each pair
-l, -l, a cosine and a sine. Gaussians need neither the array's geometry nor its carrier; this needs both.
+spectrum is exactly 49 real coefficients at any resolution: a constant and, for each pair l, -l, a cosine and a sine.
 """
 
 from __future__ import annotations
@@ -35,26 +34,32 @@ MAX_EXACT_ROWS = 2000  # spectra whose principal components are computed in memo
 @lru_cache(maxsize=4)
 @torch.inference_mode(False)
 def _inverse(array: PlanarArray, grid: AngularGrid) -> Tensor:
-    """Squared spectra to coefficients by least squares, float64 (pixels, 1 + 2 P)."""
+    """Return the matrix from squared spectra to coefficients by least squares, float64 (pixels, 1 + 2 P)."""
     inverse: Tensor = torch.linalg.pinv(basis(array, grid))
     return inverse
 
 
 def project(spectrum: Tensor, array: PlanarArray, grid: AngularGrid, *, stretched: bool = False) -> Tensor:
-    """The nearest spectra that the array can produce: least squares on the squares.
+    """Return the nearest spectra that the array can produce, by least squares on the squared magnitudes.
 
     Args:
-        spectrum: magnitudes in [0, 1], (n, n_elevation, n_azimuth), from any synthesizer.
-        array: with its geometry and carrier.
-        grid: of the spectra.
-        stretched: each spectrum was stretched to [0, 1] by itself, which took an offset from it; it is found, added for
-            the projection and taken off again.
+        spectrum: Magnitudes in [0, 1], (n, n_elevation, n_azimuth).
+        array: Antenna array with its carrier.
+        grid: Grid of the spectra.
+        stretched: Whether each spectrum was stretched to [0, 1], which removed an offset. The offset is estimated, added for
+            the projection and subtracted again.
 
     Returns:
-        float32, of the same shape, in [0, 1].
+        Magnitudes in [0, 1], float32 of the shape of `spectrum`.
 
     Raises:
-        InputError: spectra of another shape than the grid's.
+        InputError: Spectra of another shape than that of the grid.
+
+    Example:
+        >>> import swiftwrf
+        >>> data = swiftwrf.simulated_room(n=10)
+        >>> bool((project(data.spectrum, data.array, data.grid) - data.spectrum).abs().max() < 1e-2)
+        True
     """
     if spectrum.dim() != 3 or tuple(spectrum.shape[1:]) != grid.shape:
         raise InputError(
@@ -69,9 +74,9 @@ def project(spectrum: Tensor, array: PlanarArray, grid: AngularGrid, *, stretche
 
 
 def _offset(flat: Tensor, functions: Tensor, inverse: Tensor) -> Tensor:
-    """What has to be added to each spectrum (n, pixels) so that its square comes closest to the array's space, (n, 1).
+    """Return the offset (n, 1) that brings the square of each spectrum (n, pixels) closest to the array's space.
 
-    The residual of (s + c)^2 is that of s^2 plus 2 c times that of s: a line in c, whose shortest point is known.
+    The residual of (s + c)^2 is that of s^2 plus 2 c times that of s, linear in c.
     """
     residual, of_square = (x - x @ inverse @ functions for x in (flat, flat.square()))
     least = -(residual * of_square).sum(1) / (2 * residual.square().sum(1)).clamp_min(torch.finfo(flat.dtype).tiny)
@@ -224,7 +229,7 @@ def fit_coarray(
 
 
 def _quadratic_form(component: Tensor, inverse: Tensor) -> Tensor:
-    """Coefficients of the products of all pairs of components (K + 1, pixels), (coefficients, K + 1, K + 1)."""
+    """Return the coefficients of the products of all pairs of components (K + 1, pixels), (1 + 2 P, K + 1, K + 1)."""
     n = len(component)
     form = torch.empty(n, n, inverse.shape[1])
     for i in range(n):

@@ -107,7 +107,7 @@ class HybridModel(FieldModel):
         self.path_gains = None
         if not self.room.planes or (like and not like.path_gains):
             return self.room.synthesize(train.position)
-        scene, rows = observe(train, self.config.seed)
+        scene, rows = observe(train, self.config)
         kernel = like.path_gains.process.kernel if like and like.path_gains else prior(scene.moving)
         known = torch.empty(len(train), *train.grid.shape)
         for number in fold.unique():
