@@ -34,13 +34,13 @@ from swiftwrf import (
     load,
     load_rssi,
     load_spectra,
+    make_model,
     rssi_room,
     simulated_room,
 )
 from swiftwrf.comparison import NeRF2Rssi
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.gp import Kernel
-from swiftwrf.models.base import make_model
 from swiftwrf.models.geometry import fit_geometry, fit_hybrid
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.path_gains import fit_path_gains
