@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from augment import withhold
-from swiftwrf import InputError, RssiModel, Spectra, load
-from swiftwrf.models.base import FIELD_MODELS, FieldModel
+from swiftwrf import FIELD_MODELS, FieldModel, InputError, RssiModel, Spectra, load
 from swiftwrf.runtime.checkpoint import Saved, refusing
 from tasks.aoa.config import AoaConfig
 from tasks.aoa.experiment import measurements
