@@ -11,7 +11,7 @@ import torch
 from swiftwrf import AngularGrid, InputError, load, simulated_room
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.store import Store
-from swiftwrf.gp import Kernel
+from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.metrics import psnr
 from swiftwrf.models.geometry import GeometryConfig, GeometryModel, Plane, fit_geometry, refit_geometry
 from swiftwrf.models.geometry.ambiguity import _Table, turned
@@ -346,7 +346,9 @@ def test_path_gains_follow_a_shadow():
     assert hybrid.path_gains is not None
     gained = psnr(hybrid.synthesize(test.position), test.spectrum) - psnr(room.synthesize(test.position), test.spectrum)
     assert float(gained.median()) > 5
-    one = replace(hybrid.path_gains, readout=hybrid.path_gains.readout[:, :1])  # one of the fields that are averaged
+    process, paths = hybrid.path_gains.process, hybrid.path_gains.n_paths
+    first = process.coefficient[:, : 2 * paths]  # one of the fields that are averaged
+    one = PathGains(GaussianProcess(process.kernel, process.known, first), paths)
     sample = hybrid.sample(test.position, generator=torch.Generator().manual_seed(0))
     for worse in (with_path_gains(hybrid, one).synthesize(test.position), sample):
         assert float(psnr(worse, test.spectrum).median()) < float(
@@ -356,7 +358,7 @@ def test_path_gains_follow_a_shadow():
     assert torch.equal(again.synthesize(test.position), hybrid.synthesize(test.position))
     like = HybridModel().fit(train.subset(torch.arange(60)), like=hybrid)
     assert like.path_gains is not None
-    assert like.path_gains.kernel == hybrid.path_gains.kernel
+    assert like.path_gains.process.kernel == hybrid.path_gains.process.kernel
     assert [plane.normal for plane in like.room.planes] == [plane.normal for plane in room.planes]
 
 
@@ -367,7 +369,7 @@ def test_path_gains_are_held_out_from_spectra_without_observed_phases_too(monkey
     kernel = Kernel(long=0.5, short=1.0, share=1.0, noise=1e-3)
     hybrid, like = HybridModel(), HybridModel()
     hybrid._room, hybrid.grid = fit(data, further=0, width=1), data.grid
-    like.path_gains = PathGains(kernel, data.position, torch.zeros(80, 1, 1, 2))
+    like.path_gains = PathGains(GaussianProcess(kernel, data.position, torch.zeros(80, 2)), 1)
     known = hybrid._fit_path_gains(data, fold, like)
     scene, rows = observe(data)
     assert len(rows) <= 40
@@ -405,7 +407,7 @@ def test_spectra_are_differentiable_in_the_position(moving):
     room = GeometryModel.of_planes(data, walls)
     hybrid = fit_hybrid(data, room)
     assert hybrid.mixing_weight > 0
-    assert hybrid.readout.shape[1]
+    assert hybrid.process.coefficient.shape[1]
     position = data.position[:3] + 0.02
     for model in (room, hybrid):
         weight = torch.rand(3, *data.grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -426,11 +428,21 @@ def test_room_predicts_any_grid(noisy, room):
 
 @pytest.mark.parametrize(
     "name",
-    ["element", "rotation", "fixed_position", "covariance", "position", "readout", "component", "path_gains.readout"],
+    [
+        "element",
+        "rotation",
+        "fixed_position",
+        "covariance",
+        "position",
+        "coefficient",
+        "component",
+        "path_gains.coefficient",
+    ],
 )
 def test_states_of_wrong_sizes_are_refused(hybrid, name, tmp_path):
     """Also tensors that only `predict` would need."""
-    some = PathGains(hybrid.kernel, hybrid.position.clone(), torch.zeros(len(hybrid.position), 2, 25, 2))
+    known, kernel = hybrid.process.known.clone(), hybrid.process.kernel
+    some = PathGains(GaussianProcess(kernel, known, torch.zeros(len(known), 2 * 25 * 2)), 25)
     tensors, header = with_path_gains(hybrid, some).state()
     HybridModel.from_state(tensors, header)
     cut = tensors[name][:, :1] if name == "element" else tensors[name][:-1]

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 
 import torch
@@ -23,15 +22,14 @@ from swiftwrf.array.planar import PlanarArray, basis, differences
 from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
-from swiftwrf.gp import EXACT, GaussianProcess, Kernel, NearbyProcess, choose_kernel
-from swiftwrf.gp.pca import Components, principal_components
+from swiftwrf.gp import GaussianProcess, choose_kernel, principal_components
 from swiftwrf.models.base import ARRAY, FIELD_MODELS, FieldModel, FitContext, Record
 from swiftwrf.runtime.checkpoint import Header, expect, refusing, restore
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
 
 MAX_COMPONENTS = 64  # principal components of the training magnitudes
-MIN_VARIANCE = 1e-6  # fraction of the variance below which a component is left out
+MAX_EXACT_ROWS = 2000  # spectra whose principal components are computed in memory
 
 
 @lru_cache(maxsize=4)
@@ -103,12 +101,8 @@ class CoarrayModel(FieldModel):
     batch = 32  # spectra that stay in the processor's cache
 
     array: PlanarArray
-    kernel: Kernel
-    """kernel of the process, lengths in [m]"""
-    position: Tensor
-    """training positions, float64 (n, 3) [m]"""
-    readout: Tensor
-    """kernel weights to K component scores and the offset, or these values for a local process, float64 (n, K + 1)"""
+    process: GaussianProcess
+    """process of the K component scores and the offset"""
     offset: Tensor
     """mean offset that stretching removed from a spectrum, float32 (1,)"""
     form: Tensor
@@ -117,10 +111,11 @@ class CoarrayModel(FieldModel):
     @property
     def n_parameters(self) -> int:
         """Number of fitted values."""
-        return self.readout.numel() + self.form.numel()
+        assert self.process.coefficient is not None
+        return self.process.coefficient.numel() + self.form.numel()
 
     def region(self) -> Tensor:
-        return self.position
+        return self.process.known
 
     def _fit(self, train: Spectra, context: FitContext) -> None:
         assert train.array is not None
@@ -155,27 +150,14 @@ class CoarrayModel(FieldModel):
         def batches() -> Iterator[Tensor]:
             return (train.store[rows].flatten(1) + offset[rows] for rows in parts)
 
-        few = len(train) <= EXACT
-        if few:
-            mean, vector, component = _components(torch.cat(list(batches())))
-        else:
-            mean, vector, component = principal_components(batches, MAX_COMPONENTS, MIN_VARIANCE)
+        few = len(train) <= MAX_EXACT_ROWS
+        mean, score, component = principal_components(torch.cat(list(batches())) if few else batches, MAX_COMPONENTS)
         self.form = _quadratic_form(torch.cat([mean[None], component]), inverse)
         fold = folds(train.position, self.config.validation, self.config.seed)
-        self.kernel = choose_kernel(train.position, train.store, fold)
-        target = torch.cat([vector, (offset - offset.mean()).double()], dim=1)
-        self.readout = torch.linalg.solve(self.kernel.noisy_gram(train.position), target) if few else target
-        self.array, self.position, self.offset = array, train.position, offset.mean()[None]
-
-    @cached_property
-    def _process(self) -> GaussianProcess | NearbyProcess:
-        return (GaussianProcess if len(self.position) <= EXACT else NearbyProcess)(self.kernel, self.position)
-
-    def _scores(self, position: Tensor) -> Tensor:
-        """Return the mean of the component scores and the offset, float32 (n, K + 1)."""
-        if isinstance(self._process, NearbyProcess):
-            return self._process.mean(position, self.readout).float()
-        return (self.kernel(position, self.position) @ self.readout).float()
+        kernel = choose_kernel(train.position, train.store, fold)
+        target = torch.cat([score, (offset - offset.mean()).double()], dim=1)
+        self.process = GaussianProcess.regress(kernel, train.position, target)
+        self.array, self.offset = array, offset.mean()[None]
 
     def _spectra(self, score: Tensor, grid: AngularGrid) -> Tensor:
         """Return the spectra (b, H, W) of component scores with an offset (b, K + 1)."""
@@ -187,27 +169,26 @@ class CoarrayModel(FieldModel):
         return spectrum.reshape(-1, *grid.shape)
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
-        return self._spectra(self._scores(position), grid), None
+        return self._spectra(self.process.mean(position).float(), grid), None
 
     def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
-        score = self._scores(position)
+        score = self.process.mean(position).float()
         # a score's variance is 1 over the number of training positions
-        unknown = (self._process.variance(position) / len(self.position)).sqrt().float()
+        unknown = (self.process.variance(position) / len(self.process.known)).sqrt().float()
         score[:, :-1] += unknown[:, None] * torch.randn(len(position), score.shape[1] - 1, generator=generator)
         return self._spectra(score, grid)
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
-        tensors = {name: getattr(self, name) for name in ("position", "readout", "offset", "form")}
-        header = {"kernel": asdict(self.kernel), "wavelength": self.array.wavelength}
-        return tensors | {"element": self.array.element}, header
+        tensors, header = self.process.state()
+        tensors |= {"offset": self.offset, "form": self.form, "element": self.array.element}
+        return tensors, header | {"wavelength": self.array.wavelength}
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         self.array = PlanarArray(tensors["element"], header["wavelength"])
-        n, scores = len(tensors["position"]), tensors["readout"].shape[-1]
-        form = (1 + 2 * len(differences(self.array)), scores, scores)
-        expect(tensors, {"position": (n, 3), "readout": (n, scores), "offset": (1,), "form": form})
-        self.kernel = Kernel(**header["kernel"])
-        self.position, self.readout = tensors["position"].double(), tensors["readout"].double()
+        self.process = GaussianProcess.from_state(tensors, header, torch.float64)
+        n_scores = tensors["coefficient"].shape[-1]
+        form = (1 + 2 * len(differences(self.array)), n_scores, n_scores)
+        expect(tensors, {"offset": (1,), "form": form})
         self.offset, self.form = tensors["offset"].float(), tensors["form"].float()
 
 
@@ -240,14 +221,6 @@ def fit_coarray(
     """
     model = CoarrayModel(validation=validation, seed=seed)
     return model.fit(train, checkpoint=checkpoint, on_record=on_record, progress=progress)
-
-
-def _components(flat: Tensor) -> Components:
-    """Principal components from the rows' inner products, of which there are far fewer than pixels."""
-    mean = flat.mean(dim=0)
-    value, vector = torch.linalg.eigh(((flat - mean) @ (flat - mean).T).double())
-    vector = vector[:, value > MIN_VARIANCE * value.sum()][:, -MAX_COMPONENTS:]
-    return Components(mean, vector, vector.T.float() @ (flat - mean))
 
 
 def _quadratic_form(component: Tensor, inverse: Tensor) -> Tensor:

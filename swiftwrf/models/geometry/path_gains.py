@@ -15,17 +15,15 @@ A. C. Reynolds, "Conditioning permeability fields to pressure data", ECMOR 1996)
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import torch
 from torch import Tensor
 
+from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.models.geometry.images import Scene, image_gain, images, visibility
 from swiftwrf.models.geometry.model import GeometryModel
 
-DEVIATION = torch.tensor([0.6, 0.3])  # of an amplitude from its plane's gain, in phase and in quadrature
+GAIN_STD = torch.tensor([0.6, 0.3])  # of an amplitude from its plane's gain, in phase and in quadrature
 PART = 4  # of the region's extent, over which amplitudes are alike
 MISFIT = 0.05  # twice the coherence that a spectrum may well miss
 NUGGET = 1e-3  # variance of an amplitude that is no function of position
@@ -34,35 +32,34 @@ DRAWN = 0.5  # of the prior's deviation: draws of the whole explain held-out spe
 STEPS, RATE = 30, 0.2  # of Adam, on standard normal variables
 
 
-@dataclass(frozen=True, eq=False)
 class PathGains:
-    """Amplitudes of the direct path and of each image as functions of position, in several equally plausible fields.
+    """Gains of the direct path and of each image as functions of position, in F equally plausible fields.
 
     Args:
-        kernel: how alike an amplitude is at two positions, lengths in [m].
-        anchor: training positions, float64 (n, 3) [m].
-        readout: kernel weights to what each amplitude differs from its gain by, real and imaginary part, float32
-            (n, F, 1 + S, 2).
+        process: Process of the differences of each gain from that of its planes, real and imaginary part, with
+            coefficients float32 (n, F * S * 2).
+        n_paths: Number of paths S, the direct one included.
+
+    Raises:
+        InputError: Coefficients that do not fit the number of paths.
     """
 
-    kernel: Kernel
-    anchor: Tensor
-    readout: Tensor
-
-    @cached_property
-    def _process(self) -> GaussianProcess:
-        return GaussianProcess(self.kernel, self.anchor)
+    def __init__(self, process: GaussianProcess, n_paths: int) -> None:
+        assert process.coefficient is not None
+        self.process, self.n_paths = process, n_paths
+        if (size := process.coefficient.shape[1]) == 0 or size % (2 * n_paths):
+            raise InputError(f"path gains of {n_paths} paths need multiples of {2 * n_paths} coefficients, got {size}")
 
     def channel(self, geometry: GeometryModel, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """What each element hears in each field at positions (n, 3) [m], complex64 (n, F, K), as if in as many snapshots;
-        with a generator in one of the fields, whose amplitudes are drawn as if those at the training positions were known,
-        (n, 1, K)."""
-        change = self.kernel(position.double(), self.anchor).float() @ self.readout.flatten(1)
-        change = change.reshape(-1, *self.readout.shape[1:])
+        """Return the channel of each element in each field at positions (n, 3) [m], complex64 (n, F, K), as of F snapshots.
+
+        With a generator, return one field at random, complex64 (n, 1, K), with gains sampled from the posterior.
+        """
+        change = self.process.mean(position).reshape(len(position), -1, self.n_paths, 2)
         if generator is not None:
             field = torch.randint(change.shape[1], (len(change),), generator=generator)
             change = change[torch.arange(len(change)), field, None]
-            spread = self._process.variance(position).sqrt().float()[:, None, None, None] * DEVIATION
+            spread = self.process.variance(position).sqrt().float()[:, None, None, None] * GAIN_STD
             change = change + spread * torch.randn(change.shape, generator=generator)
         wave, gain = paths(geometry, geometry.scene(position))
         return (gain + torch.view_as_complex(change)) @ wave
@@ -87,14 +84,14 @@ def fit_path_gains(geometry: GeometryModel, scene: Scene, kernel: Kernel) -> Pat
     """The most plausible amplitudes around several draws, given the phases that the scene observed."""
     wave, gain = paths(geometry, scene)
     anchor = scene.moving.double()
-    root = torch.linalg.cholesky(kernel.noisy_gram(anchor))
+    root = torch.linalg.cholesky(kernel.covariance(anchor))
     smooth = root.float()
     draw = DRAWN * torch.randn(len(scene), FIELDS, len(gain), 2, generator=torch.Generator().manual_seed(0))
     normal = draw.clone().requires_grad_()
     optimiser = torch.optim.Adam([normal], lr=RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
     for _ in range(STEPS):
-        change = DEVIATION * (smooth @ normal.flatten(1)).view_as(normal)
+        change = GAIN_STD * (smooth @ normal.flatten(1)).view_as(normal)
         field = (gain + torch.view_as_complex(change)) @ wave
         missing = 1 - scene.coherence(field.transpose(0, 1))
         loss = missing.sum() / MISFIT + (normal - draw).square().sum() / 2
@@ -103,7 +100,8 @@ def fit_path_gains(geometry: GeometryModel, scene: Scene, kernel: Kernel) -> Pat
         optimiser.step()
         schedule.step()
     weight = torch.linalg.solve_triangular(root.T, normal.detach().flatten(1).double(), upper=True)
-    return PathGains(kernel, anchor, DEVIATION * weight.float().view_as(normal))
+    coefficient = (GAIN_STD * weight.float().view_as(normal)).flatten(1)
+    return PathGains(GaussianProcess(kernel, anchor, coefficient, exact=True), len(gain))
 
 
 def prior(position: Tensor) -> Kernel:
