@@ -4,26 +4,30 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_type_hints
 
 import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.data.spectra import Spectra, check_training
+from swiftwrf.data.spectra import Moving, Spectra, check_training
 from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.registry import Registry
-from swiftwrf.runtime.validation import NonNegativeInt, configuration
+from swiftwrf.runtime.validation import NonNegativeInt, checked, configuration
+
+if TYPE_CHECKING:
+    import swiftwrf.models.geometry.model
 
 ARRAY, FIXED_END = "array", "fixed end"  # requirements that a model can declare
 CPU = torch.device("cpu")
 Record = dict[str, Any]  # one evaluation of a fit
+Preset = Literal["quick", "paper"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +71,11 @@ class FieldConfig:
     seed: NonNegativeInt = 0
     """seed of everything random"""
 
+    @classmethod
+    def paper(cls, **changes: Any) -> FieldConfig:
+        """Return the settings of the model's publication; the defaults, for a model without published settings."""
+        return cls(**changes)
+
 
 @dataclass(frozen=True)
 class FitContext:
@@ -86,7 +95,8 @@ class FieldModel(Saved):
     keyword arguments of the constructor; `config_type` declares their ranges.
 
     Args:
-        config: Options as one object. Defaults to `config_type()`.
+        config: Options as one object. Defaults to those of the preset.
+        preset: "quick" for the defaults, sized for a desktop; "paper" for the settings of the model's publication.
         options: Single options, which replace those of `config`.
 
     Raises:
@@ -110,13 +120,21 @@ class FieldModel(Saved):
 
     grid: AngularGrid
     """grid of the training spectra, set by `fit`"""
+    bounds: Tensor
+    """corners of the box around the training positions, float64 (2, 3) [m], set by `fit`"""
 
-    def __init__(self, config: Any = None, **options: Any) -> None:
+    @checked
+    def __init__(self, config: Any = None, *, preset: Preset = "quick", **options: Any) -> None:
         known = [field.name for field in fields(self.config_type)]
         unknown = [name for name in options if name not in known]
         if unknown:
             raise InputError(f"{type(self).__name__} has no option {unknown[0]!r}; it has {', '.join(known)}")
-        self.config = replace(config or self.config_type(), **options)
+        if config is None:
+            self.config = (self.config_type.paper if preset == "paper" else self.config_type)(**options)
+        elif isinstance(config, self.config_type):
+            self.config = replace(config, **options)
+        else:
+            raise InputError(f"{type(self).__name__} takes a {self.config_type.__name__}, got {type(config).__name__}")
 
     @classmethod
     def lacking(cls, data: Spectra) -> list[str]:
@@ -161,8 +179,12 @@ class FieldModel(Saved):
             raise InputError(f"{self.name} needs the {' and the '.join(lacking)}, which {train.name} does not describe")
         if like is not None and not self.accepts_like(like):
             raise InputError(f"{self.name} cannot reuse the structure of a {like.kind}")
-        self.grid = train.grid
-        self._fit(train, FitContext(like, torch.device(device), checkpoint, on_record, progress))
+        self.grid, self.bounds = train.grid, bounding_box(train.position)
+        try:
+            self._fit(train, FitContext(like, torch.device(device), checkpoint, on_record, progress))
+        except BaseException:
+            del self.grid  # the model counts as not fitted
+            raise
         return self
 
     @abstractmethod
@@ -234,6 +256,26 @@ class FieldModel(Saved):
                 lambda some: (self._sample(some, grid, generator).clamp(0, 1), None), self._checked(position), grid
             )[0]
 
+    @property
+    def room(self) -> swiftwrf.models.geometry.model.GeometryModel | None:
+        """Room that the model found or uses; None for models without one."""
+        return None
+
+    @property
+    def fixed_end(self) -> tuple[Tensor, Tensor, Moving] | None:
+        """Position of the fixed end (3,) [m], rotation of the array (3, 3) and moving end; None if the model lacks them."""
+        room = self.room
+        return None if room is None else (room.fixed_position, room.rotation, room.moving)
+
+    def region(self) -> Tensor:
+        """Return positions (n, 3) [m] around which the model was fitted.
+
+        Defaults to centre and corners of the box around the training positions. Models that store the training positions
+        return these.
+        """
+        self._checked_grid(None)
+        return torch.cat([self.bounds.mean(dim=0, keepdim=True), self.bounds])
+
     def parameters(self) -> Iterable[Tensor]:
         """Return the tensors that can require gradients; none by default."""
         return ()
@@ -281,7 +323,7 @@ class FieldModel(Saved):
         """
         grid = self._checked_grid(None)
         tensors, header = self._state()
-        return tensors, {"options": asdict(self.config), "grid": asdict(grid)} | header
+        return tensors, {"options": asdict(self.config), "grid": asdict(grid), "bounds": self.bounds.tolist()} | header
 
     @abstractmethod
     def _state(self) -> tuple[dict[str, Tensor], Header]:
@@ -291,13 +333,13 @@ class FieldModel(Saved):
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         model = cls(cls._restored_config(header.get("options", {})))
         model.grid = AngularGrid(**header["grid"])
+        model.bounds = bounding_box(torch.tensor(header["bounds"], dtype=torch.float64))
         model._restore(tensors, header)
         return model
 
     @classmethod
     def _restored_config(cls, options: Mapping[str, Any]) -> Any:
-        """Return the configuration of a saved model; JSON has lists where options have tuples."""
-        return cls.config_type(**{k: tuple(v) if isinstance(v, list) else v for k, v in options.items()})
+        return from_plain(cls.config_type, options)
 
     @abstractmethod
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
@@ -308,6 +350,24 @@ class FieldModel(Saved):
             f"fitted, {self.grid.shape[0]} x {self.grid.shape[1]} directions" if hasattr(self, "grid") else "not fitted"
         )
         return f"{type(self).__name__}({fitted})"
+
+
+def bounding_box(position: Tensor) -> Tensor:
+    """Return the lower and upper corner (2, 3) of the box around positions (n, 3) [m]."""
+    position = check_positions(position)
+    return torch.stack([position.amin(dim=0), position.amax(dim=0)])
+
+
+def from_plain(config_type: type[Any], options: Mapping[str, Any]) -> Any:
+    """Return a configuration from values that JSON has stored: nested configurations as objects, tuples as lists."""
+    hints = get_type_hints(config_type)
+
+    def restored(name: str, value: Any) -> Any:
+        if is_dataclass(hints.get(name)):
+            return from_plain(hints[name], value)
+        return tuple(value) if isinstance(value, list) else value
+
+    return config_type(**{name: restored(name, value) for name, value in options.items()})
 
 
 def check_finite(spectrum: Tensor) -> Tensor:
@@ -324,11 +384,13 @@ def check_finite(spectrum: Tensor) -> Tensor:
 FIELD_MODELS: Registry[FieldModel] = Registry("field model", "swiftwrf.models")
 
 
-def make_model(name: str, **options: Any) -> FieldModel:
+@checked
+def make_model(name: str, preset: Preset = "quick", **options: Any) -> FieldModel:
     """Return a field model by its name, with those of the options that it has.
 
     Args:
         name: Name in the registry, e.g. "hybrid".
+        preset: "quick", or "paper" for published settings; a model without published settings ignores it.
         options: Options such as seed and validation. A model ignores options that it does not have.
 
     Raises:
@@ -340,7 +402,8 @@ def make_model(name: str, **options: Any) -> FieldModel:
     """
     model_type = FIELD_MODELS[name]
     known = {field.name for field in fields(model_type.config_type)}
-    return model_type(**{option: value for option, value in options.items() if option in known})
+    chosen = {option: value for option, value in options.items() if option in known}
+    return model_type(preset=preset, **chosen)
 
 
 def model_types(names: Iterable[str] | None = None) -> dict[str, type[FieldModel]]:
@@ -352,5 +415,15 @@ def model_types(names: Iterable[str] | None = None) -> dict[str, type[FieldModel
     return {name: FIELD_MODELS[name] for name in (FIELD_MODELS if names is None else names)}
 
 
-__all__ = ["ARRAY", "FIELD_MODELS", "FIXED_END", "FieldConfig", "FieldModel", "FitContext", "Prediction", "Record"]
-__all__ += ["check_finite", "make_model", "model_types"]
+__all__ = [
+    "ARRAY",
+    "FIELD_MODELS",
+    "FIXED_END",
+    "FieldConfig",
+    "FieldModel",
+    "FitContext",
+    "Prediction",
+    "Preset",
+    "Record",
+]
+__all__ += ["check_finite", "from_plain", "make_model", "model_types"]
