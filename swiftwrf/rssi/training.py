@@ -11,7 +11,7 @@ from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.gp import Kernel, LeaveGroupOut, candidates, thinned
 from swiftwrf.rssi.config import RssiConfig
-from swiftwrf.rssi.head import Head
+from swiftwrf.rssi.head import Head, render
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
 from swiftwrf.runtime.threads import single_thread
 
@@ -62,21 +62,20 @@ class RssiTraining:
     baselines: PathLoss
     baseline_held_out: Tensor
 
-    def column(self, r: int) -> RssiTraining:
-        """Return the part of receiver r that its fit needs."""
-        one = slice(r, r + 1)
+    def columns(self, some: slice) -> RssiTraining:
+        """Return the part that the fit of some receivers needs."""
         return replace(
             self,
-            receiver_names=self.receiver_names[one],
-            receiver=self.receiver[one],
-            rssi=self.rssi[:, one].clone(),
-            count=self.count[:, one].clone(),
-            rendered=self.rendered[one].clone(),
-            prior_mean=PathLoss(self.prior_mean.level[one], self.prior_mean.slope[one]),
-            field_db=self.field_db[one],
-            noise_db=self.noise_db[one],
-            baselines=PathLoss(self.baselines.level[:, one], self.baselines.slope[:, one]),
-            baseline_held_out=self.baseline_held_out[..., one].clone(),
+            receiver_names=self.receiver_names[some],
+            receiver=self.receiver[some],
+            rssi=self.rssi[:, some].clone(),
+            count=self.count[:, some].clone(),
+            rendered=self.rendered[some].clone(),
+            prior_mean=PathLoss(self.prior_mean.level[some], self.prior_mean.slope[some]),
+            field_db=self.field_db[some],
+            noise_db=self.noise_db[some],
+            baselines=PathLoss(self.baselines.level[:, some], self.baselines.slope[:, some]),
+            baseline_held_out=self.baseline_held_out[..., some].clone(),
         )
 
 
@@ -129,7 +128,7 @@ def prepare(train: Rssi, pool: Rssi, config: RssiConfig) -> RssiTraining:
         count=count,
         kernel=kernel,
         n_primitives=n_primitives,
-        rendered=torch.stack([Head(name, n_primitives, config.seed).requires_grad_(False).render() for name in names]),
+        rendered=render([Head(name, n_primitives, config.seed).requires_grad_(False) for name in names]),
         prior_mean=prior_mean,
         field_db=((1 - noise) * variance).sqrt(),
         noise_db=(noise * variance).sqrt(),
