@@ -19,7 +19,7 @@ from tasks.run import configured
 from tasks.view.rssi import MeasuredFloor, RssiView
 from tasks.view.spectra import LoadedModel, SpectraView
 
-EXPECTED = "give the directory of a run of tasks.aoa or tasks.rssi, or a saved model"
+EXPECTED = "give the directory of a run of tasks.aoa or tasks.rssi, or a saved field model or RSSI model"
 
 
 def open_source(source: Path) -> SpectraView | RssiView:
@@ -58,7 +58,7 @@ def _saved_model(file: Path) -> SpectraView | RssiView:
 
 def _field_model(model: Saved) -> FieldModel:
     if not isinstance(model, FieldModel):
-        raise InputError(f"a {model.kind} predicts neither spectra nor RSSI maps; {EXPECTED}")
+        raise InputError(f"a {model.kind} cannot be shown; {EXPECTED}")
     return model
 
 
