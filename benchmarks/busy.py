@@ -1,5 +1,6 @@
-"""What other work on the same machine costs: steps of the network and a fit of RSSI, idle and beside a loop on one core, for
-several times that threads wait for each other busily before they sleep (GOMP_SPINCOUNT).
+"""Measure the cost of other work on the same machine, for several busy-waiting times of threads (GOMP_SPINCOUNT).
+
+Steps of the network and a fit of RSSI are timed on an idle machine and beside a loop on one core.
 
 python benchmarks/busy.py
 """
@@ -19,18 +20,16 @@ from record import write_result
 
 from augment import Mixed
 from swiftwrf import fit_rssi, rssi_room, simulated_room
-from tasks.aoa.estimators.aann import AANN, AANNConfig
-from tasks.aoa.estimators.base import Settings
+from tasks.aoa.estimators.aann import AANN
 
 SPINS = ("300000", "30000", "3000")  # the first is libgomp's own
 ROUNDS, STEPS = 2, 20
 
 
 def measure() -> dict[str, float]:
-    """Seconds of a step of 64 spectra and of a fit of twelve receivers, in this process."""
+    """Return the seconds of a step of 64 spectra and of a fit of twelve receivers, in this process."""
     room, floor = simulated_room(128), rssi_room()
-    network = AANN(Settings(room.grid), AANNConfig(steps=STEPS, batch=64))
-    network.fit(Mixed.measured(room))
+    network = AANN(steps=STEPS, batch=64).fit(Mixed.measured(room))
     first, last = network.history[0], network.history[-1]
     began = time.perf_counter()
     fit_rssi(floor, progress=False)
@@ -42,7 +41,7 @@ def measure() -> dict[str, float]:
 
 @contextmanager
 def neighbour(there: bool) -> Iterator[None]:
-    """A process that computes on one core, if there is one."""
+    """Run a process that occupies one core during the context, if asked to."""
     loop = Popen([sys.executable, "-c", "while True: pass"]) if there else None
     try:
         yield

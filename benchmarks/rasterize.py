@@ -1,15 +1,15 @@
-"""Spectra per second: each maker alone and the whole model, on the machine's GPU where there is one, else on its CPU.
+"""Spectra per second: each backend alone and the whole model, on the machine's GPU where there is one, else on its CPU.
 
-Rates are of magnitudes |A|: medians over repeats with the least and the most, makers compared within one run. On a GPU every
-rate also comes as a share of two bounds: the exponentials of the pixels inside the cutoff (16 a clock and multiprocessor),
-and the writing of the magnitude at the speed of a measured copy.
+Rates are of magnitudes |A|: medians over repeats with minimum and maximum. Backends are compared within one run. On a GPU
+every rate is also given as a share of two bounds: the exponentials of the pixels inside the cutoff (16 a clock and
+multiprocessor), and the writing of the magnitude at the speed of a measured copy.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +22,8 @@ from torch import Tensor
 
 from swiftwrf import AngularGrid, ModelConfig, SwiftWRF, rasterize
 from swiftwrf.gp import Kernel
-from swiftwrf.rasterize import Maker, rasterize_magnitude
+from swiftwrf.models.swiftwrf.field import DeformableGaussians
+from swiftwrf.rasterize import Backend, rasterize_magnitude
 from tasks.run import choose_device
 
 Rate = dict[str, float]
@@ -67,30 +68,30 @@ def main(config: Config) -> None:
 def measure(
     grid: AngularGrid, n: int, batch: int, device: torch.device, machine: Rate | None, seconds: float
 ) -> dict[str, Any]:
-    """One row: every maker alone, forward and with gradients, and the model from positions to magnitudes."""
+    """Return one row: every backend alone, forward and with gradients, and the model from positions to magnitudes."""
     inputs = scene(n, batch, device)
     exact = exact_spectrum(inputs, grid)
-    makers: dict[str, Any] = {}
-    for maker in ("reference", "cuda" if device.type == "cuda" else "cpu"):
+    backends: dict[str, Any] = {}
+    for backend in ("reference", "cuda" if device.type == "cuda" else "cpu"):
         # the definition draws one position at a time: its rate does not grow with the batch
-        few = [x[:1] if x.dim() == 3 else x for x in inputs] if maker == "reference" else inputs
-        if maker == "reference" and exact is None:
+        few = [x[:1] if x.dim() == 3 else x for x in inputs] if backend == "reference" else inputs
+        if backend == "reference" and exact is None:
             continue
-        drawn = rasterize(*few, grid, maker, CUTOFF)
-        makers[maker] = {
+        drawn = rasterize(*few, grid, backend, CUTOFF)
+        backends[backend] = {
             "forward_per_s": rate(
-                lambda f=few, m=maker: rasterize_magnitude(*f, grid, m, CUTOFF), len(few[0]), device, seconds
+                lambda f=few, b=backend: rasterize_magnitude(*f, grid, b, CUTOFF), len(few[0]), device, seconds
             ),
             "forward_backward_per_s": rate(
-                lambda f=few, m=maker: with_gradients(f, grid, m), len(few[0]), device, seconds
+                lambda f=few, b=backend: with_gradients(f, grid, b), len(few[0]), device, seconds
             ),
             "error_of_sum_weight": None if exact is None else value_error(drawn[:1], exact, inputs[2][:1]),
         }
-    row: dict[str, Any] = {"grid": grid.shape, "n": n, "batch": batch, "makers": makers}
-    fast = makers["cuda" if device.type == "cuda" else "cpu"]
-    if "reference" in makers:
+    row: dict[str, Any] = {"grid": grid.shape, "n": n, "batch": batch, "backends": backends}
+    fast = backends["cuda" if device.type == "cuda" else "cpu"]
+    if "reference" in backends:
         row["over_reference"] = {
-            key: fast[key]["median"] / makers["reference"][key]["median"]
+            key: fast[key]["median"] / backends["reference"][key]["median"]
             for key in ("forward_per_s", "forward_backward_per_s")
         }
     row["end_to_end_per_s"] = end_to_end(n, batch, grid, device, seconds)
@@ -138,31 +139,34 @@ def kernel_values(inputs: list[Tensor], grid: AngularGrid) -> float:
     return float(total)
 
 
-def with_gradients(inputs: list[Tensor], grid: AngularGrid, maker: Maker) -> None:
+def with_gradients(inputs: list[Tensor], grid: AngularGrid, backend: Backend) -> None:
     """One drawing of |A| and the gradients of everything."""
     leaves = [x.detach().requires_grad_() for x in inputs]
-    drawn = rasterize_magnitude(*leaves, grid, maker, CUTOFF)
+    drawn = rasterize_magnitude(*leaves, grid, backend, CUTOFF)
     torch.autograd.grad(drawn, leaves, torch.ones_like(drawn))
 
 
 def end_to_end(n: int, batch: int, grid: AngularGrid, device: torch.device, seconds: float) -> Rate:
-    """Positions in, magnitudes out, with the motion basis."""
-    model = model_of(n, grid, device)
+    """Return the rate from positions to magnitudes, with the motion basis and without cached kernels."""
+    field = model_of(n, grid, device).field
     with torch.no_grad():
-        position = model.normalise(positions(batch).to(device))
-        return rate(lambda: model(position), batch, device, seconds)
+        position = field.normalise(positions(batch).to(device))
+        return rate(lambda: field(position), batch, device, seconds)
 
 
 def model_of(n: int, grid: AngularGrid, device: torch.device) -> SwiftWRF:
-    """With a motion basis of the responses, and the primitives of `scene`."""
+    """Return a model with a motion basis of the responses and the primitives of `scene`."""
     config = ModelConfig(n_primitives=n, rank=32, cutoff=CUTOFF)
     generator = torch.Generator().manual_seed(0)
-    model = SwiftWRF.make(config, grid, positions(200), Kernel(), generator=generator).to(device)
+    field = DeformableGaussians.initial(config, grid, positions(200), Kernel(), generator=generator)
     with torch.no_grad():
-        mean, cholesky, _ = scene(n, 1, device)
+        mean, cholesky, _ = scene(n, 1, torch.device("cpu"))
         l1, l2, l3 = cholesky.unbind(-1)
-        model.primitives.mean.copy_(mean[0])
-        model.primitives.cholesky.copy_(torch.stack([l1.log(), l2 / l3, l3.log()], dim=-1))
+        field.primitives.mean.copy_(mean[0])
+        field.primitives.cholesky.copy_(torch.stack([l1.log(), l2 / l3, l3.log()], dim=-1))
+    header = {"grid": asdict(grid), "config": asdict(config), "bounds": [[0.0] * 3, [1.0] * 3]}
+    model = SwiftWRF.from_state(field.state_dict(), header | field.deformation.header())
+    model.field.to(device)
     return model
 
 
@@ -206,7 +210,7 @@ def gpu_rates() -> Rate:
 def report(row: dict[str, Any]) -> None:
     """One line."""
     rates = {
-        name: {k: f"{v['median']:.4g}" for k, v in m.items() if k.endswith("_s")} for name, m in row["makers"].items()
+        name: {k: f"{v['median']:.4g}" for k, v in m.items() if k.endswith("_s")} for name, m in row["backends"].items()
     }
     print(row["grid"], "N", row["n"], "batch", row["batch"], rates, f"end to end {row['end_to_end_per_s']['median']:.4g}",
           row.get("share_of_bounds", ""), flush=True)  # fmt: skip

@@ -16,28 +16,29 @@ import numpy as np
 import pandas as pd
 import torch
 from PIL import Image
-from quick import GLANCE, PUBLISHED, PUBLISHED_RSSI
 from samples import snapshots as made_snapshots
 from samples import survey_rows, write_deepmimo, write_dichasus, write_espargos, write_snapshots, write_survey
+from small import GLANCE, PUBLISHED, PUBLISHED_RSSI
 
 from augment import Mixed
 from swiftwrf import (
+    FIELD_MODELS,
     AngularGrid,
     FitConfig,
     ModelConfig,
     Rssi,
-    RssiModel,
     Spectra,
-    comparison,
     fit,
     fit_coarray,
     fit_rssi,
     load,
     load_rssi,
     load_spectra,
+    make_model,
     rssi_room,
     simulated_room,
 )
+from swiftwrf.comparison import NeRF2Rssi
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.gp import Kernel
 from swiftwrf.models.geometry import fit_geometry, fit_hybrid
@@ -115,6 +116,10 @@ def model_swiftwrf(folder: Path) -> None:
     fit(_room(), TINY, progress=False).save(folder / "model")
 
 
+def model_of(name: str, folder: Path) -> None:
+    make_model(name).fit(_room()).save(folder / "model")
+
+
 def model_coarray(folder: Path) -> None:
     fit_coarray(_room(), progress=False).save(folder / "model")
 
@@ -131,12 +136,12 @@ def model_hybrid(folder: Path) -> None:
 
 
 def model_published(name: str, folder: Path) -> None:
-    comparison.fit(_room(), PUBLISHED[name], progress=False).save(folder / "model")
+    FIELD_MODELS[name](PUBLISHED[name]).fit(_room()).save(folder / "model")
 
 
 def model_nerf2_rssi(folder: Path) -> None:
     train = rssi_room(n=40).receivers(["1", "2"])
-    comparison.fit_rssi(train, PUBLISHED_RSSI, progress=False).save(folder / "model")
+    NeRF2Rssi(PUBLISHED_RSSI).fit(train).save(folder / "model")
 
 
 def model_rssi(folder: Path) -> None:
@@ -182,10 +187,10 @@ def read_rssi(folder: Path) -> Rssi:
 
 def read_model(folder: Path) -> object:
     model, position = load(folder / "model"), torch.tensor([[3.0, 2.5, 1.2]])
-    drawn = model.synthesize(position) if hasattr(model, "synthesize") else model.predict(position)
-    drawn = torch.cat(drawn) if isinstance(model, RssiModel) else drawn
-    assert drawn.isfinite().all()
-    return drawn
+    predicted = model.predict(position)
+    for values in (predicted.mean, predicted.std):
+        assert values is None or values.isfinite().all()
+    return predicted
 
 
 def read_estimator(folder: Path) -> torch.Tensor:
@@ -223,6 +228,9 @@ KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "co-array model": (model_coarray, read_model),
     "geometry model": (model_geometry, read_model),
     "hybrid model": (model_hybrid, read_model),
+    "pixel Gaussian process": (functools.partial(model_of, "gp"), read_model),
+    "inverse-distance model": (functools.partial(model_of, "idw"), read_model),
+    "nearest-spectrum model": (functools.partial(model_of, "nearest"), read_model),
     "rssi model": (model_rssi, read_model),
     "nerf2 model": (functools.partial(model_published, "nerf2"), read_model),
     "wrf-gs model": (functools.partial(model_published, "wrfgs"), read_model),
