@@ -403,7 +403,8 @@ def make_model(name: str, preset: Preset = "quick", **options: Any) -> FieldMode
     model_type = FIELD_MODELS[name]
     known = {field.name for field in fields(model_type.config_type)}
     chosen = {option: value for option, value in options.items() if option in known}
-    return model_type(preset=preset, **chosen)
+    model: FieldModel = model_type(preset=preset, **chosen)
+    return model
 
 
 def model_types(names: Iterable[str] | None = None) -> dict[str, type[FieldModel]]:
