@@ -26,7 +26,7 @@ from torch import Tensor
 from swiftwrf.array.angles import angular_distance, to_angles, to_direction
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.rssi.law import fit_law, log_distance
+from swiftwrf.rssi.path_loss import fit_path_loss, log_distance
 
 WIDTH = math.radians(10)
 MOST_POSITIONS = 300
@@ -269,7 +269,7 @@ def check_law(data: Rssi) -> LawReport | None:
     declared = _explained(place, data)
     found = {meaning: _explained(other, data) for meaning, other in others.items()}
     meaning, best = max(found.items(), key=lambda pair: pair[1])
-    law = fit_law(log_distance(place, data.receiver_position), data.rssi_dbm, pooled=True)
+    law = fit_path_loss(log_distance(place, data.receiver_position), data.rssi_dbm, shared=True)
     return LawReport(
         explained=declared,
         level_dbm=float(law.level),
@@ -281,7 +281,7 @@ def check_law(data: Rssi) -> LawReport | None:
 def _explained(position: Tensor, data: Rssi) -> float:
     """Share of the variance of RSSI that laws of the distance explain, where they fall with it."""
     distance = log_distance(position, data.receiver_position)
-    law = fit_law(distance, data.rssi_dbm)
+    law = fit_path_loss(distance, data.rssi_dbm)
     law = law._replace(level=law.level.where(law.slope < 0, data.rssi_dbm.nanmean(dim=0)), slope=law.slope.clamp(max=0))
     left = (data.rssi_dbm - law(distance)).square().nansum()
     return 1 - float(left / (data.rssi_dbm - data.rssi_dbm.nanmean(dim=0)).square().nansum().clamp_min(1e-12))
