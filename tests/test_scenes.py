@@ -345,7 +345,7 @@ def test_a_scene_that_cannot_be(tmp_path, capsys, monkeypatch, scene, synthesize
 
 def test_the_synthesizer_draws_the_spectra_of_its_scene(ray_tracer, tmp_path):
     """Traced twice, once as data and once from the scene's name, they are the same; so is the moving array, turned."""
-    run("scenes", *OPTIONS[:4], "--positions", 6, "--out", tmp_path / "scene")
+    run("scenes", *OPTIONS[:4], "--positions", 12, "--out", tmp_path / "scene")
     data = load_spectra(tmp_path / "scene", grid=AngularGrid.hemisphere(15, 60))
     model = RaytraceModel(scene="bedroom").fit(data)
     torch.testing.assert_close(model.synthesize(data.position), data.spectrum, rtol=0, atol=2e-3)

@@ -15,6 +15,7 @@ from swiftwrf.data.dataset import Numbers, PositionedData, Splits, to_positions
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.data.survey import read_survey
 from swiftwrf.errors import InputError, listed
+from swiftwrf.runtime.validation import checked
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -45,6 +46,7 @@ class Rssi(PositionedData):
 
     row_fields: ClassVar[tuple[str, ...]] = ("transmitter_position", "rssi_dbm", "index")
 
+    @checked
     def __init__(
         self,
         rssi_dbm: Numbers,

@@ -16,6 +16,7 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.dataset import Numbers, PositionedData, Splits, to_positions, to_tensor
 from swiftwrf.data.spectra import GRID, Spectra, array_spectra, check_pixels
 from swiftwrf.errors import InputError
+from swiftwrf.runtime.validation import checked
 
 SPACING_WAVELENGTHS = (0.01, 20.0)  # of neighbouring elements: beyond, positions are in another unit than metres
 
@@ -56,6 +57,7 @@ class Snapshots(PositionedData):
 
     row_fields: ClassVar[tuple[str, ...]] = ("position", "channel", "line_of_sight", "time", "index")
 
+    @checked
     def __init__(
         self,
         channel: Numbers,
@@ -125,7 +127,7 @@ class Snapshots(PositionedData):
         return time | {"line_of_sight": self.line_of_sight.numpy()}
 
     def _summary(self) -> str:
-        return f"{len(self)} channels of {self.channel.shape[1]} snapshots, {self.array}"
+        return f"{len(self)} channels of {self.channel.shape[1]} snapshots, {self.array.summary}"
 
 
 def check_spacing(file: Path, array: PlanarArray) -> None:

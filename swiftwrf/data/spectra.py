@@ -21,7 +21,7 @@ from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.data.store import AT_ONCE, MOST_PIXELS, Store, stored, too_many
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
-from swiftwrf.runtime.validation import check_value
+from swiftwrf.runtime.validation import checked
 
 Moving = Literal["transmitter", "receiver"]
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
@@ -71,6 +71,7 @@ class Spectra(PositionedData):
 
     row_fields: ClassVar[tuple[str, ...]] = ("position", "store", "label", "line_of_sight", "index")
 
+    @checked
     def __init__(
         self,
         spectra: Numbers | None = None,
@@ -91,7 +92,6 @@ class Spectra(PositionedData):
         source: Mapping[str, str] | None = None,
         notes: tuple[str, ...] = (),
     ) -> None:
-        check_value("moving", moving, Moving)
         if position is None or (spectra is None) == (store is None):
             raise InputError("Spectra takes spectra and their positions: Spectra(spectra, position, ...)")
         position = to_positions("position", position)
@@ -181,7 +181,8 @@ class Spectra(PositionedData):
 
     def _summary(self) -> str:
         rows, columns = self.grid.shape
-        return f"{len(self)} spectra of {rows} x {columns} directions, {self.array}, moving {self.moving}"
+        array = f", {self.array.summary}" if self.array else ""
+        return f"{len(self)} spectra of {rows} x {columns} directions{array}, moving {self.moving}"
 
 
 def _checked_store(spectra: Numbers) -> Store:

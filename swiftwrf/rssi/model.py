@@ -23,7 +23,7 @@ from torch import Tensor
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, thinned
-from swiftwrf.models.base import Record
+from swiftwrf.models.base import Record, from_plain
 from swiftwrf.rssi.base import Map, RssiFitContext, RssiPredictor, fingerprint, map_threads
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
@@ -54,6 +54,7 @@ class RssiModel(RssiPredictor, Saved):
 
     Args:
         config: Options as one object. Defaults to `RssiConfig()`.
+        preset: "quick" for the defaults, "paper" for `RssiConfig.paper()`.
         options: Single options, which replace those of `config`.
 
     Example:
@@ -105,7 +106,8 @@ class RssiModel(RssiPredictor, Saved):
             record: Record = {"stage": "search", "n_primitives": training.n_primitives}
             if not session.records:
                 session.evaluated(record | {"seconds": time.perf_counter() - began}, {}, {})
-            with files.refusing(f"{context.checkpoint} is no state that a fit can go on from"):
+            unusable = f"{context.checkpoint} is no state that a fit can continue from"
+            with files.refusing(unusable):
                 fitted = _saved_fits(session)
             fit_some, size = (learn_receivers, PAPER_RECEIVERS) if self.config.paper_head else (fit_receiver, 1)
             # compiled rasterizers are not safe in several threads, and only the paper's head needs them here
@@ -120,9 +122,9 @@ class RssiModel(RssiPredictor, Saved):
                 tensors = {f"{i}.{name}": value for i, found in fitted.items() for name, value in found.items()}
                 record |= {"validation": float(error.abs().nanmean()), "seconds": time.perf_counter() - began}
                 session.evaluated(record, tensors, {})
-        self._assemble(
-            train, training, {name: torch.cat([fitted[i][name] for i in sorted(fitted)]) for name in fitted[0]}
-        )
+            with files.refusing(unusable):
+                found = {name: torch.cat([fitted[i][name] for i in sorted(fitted)]) for name in fitted[0]}
+        self._assemble(train, training, found)
 
     @single_thread()
     def _assemble(self, train: Rssi, training: RssiTraining, found: dict[str, Tensor]) -> None:
@@ -151,7 +153,7 @@ class RssiModel(RssiPredictor, Saved):
         self.level = mixed(found["level"], training.baselines.level)
         self.slope = mixed(found["slope"], training.baselines.slope)
         self.directivity = (weight[0][:, None] * found["directivity"]).float()
-        self.anchor, self.coefficient = training.position.float(), found["coefficient"].T.float()
+        self.anchor, self.coefficient = training.position.float(), found["coefficient"].T.float().contiguous()
         self.rendered = found["rendered"]
         self.field_db, self.noise_db = (scale * training.field_db).float(), (scale * training.noise_db).float()
         self._precompute()
@@ -166,7 +168,7 @@ class RssiModel(RssiPredictor, Saved):
     @single_thread()
     def _predict(self, position: Tensor) -> tuple[Tensor, Tensor]:
         offset = position - self.centre
-        if len(offset) and (farthest := float(offset.abs().amax())) > MAX_DISTANCE_M:
+        if len(offset) and (farthest := float(offset.detach().abs().amax())) > MAX_DISTANCE_M:
             raise InputError(
                 f"a position is {farthest:.3g} m away from the measurements; at most {MAX_DISTANCE_M:g} m make sense"
             )
@@ -191,7 +193,7 @@ class RssiModel(RssiPredictor, Saved):
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
-        model = cls(RssiConfig(**header["options"]))
+        model = cls(from_plain(RssiConfig, header["options"]))
         model.receiver_names, model.n_primitives = (
             tuple(map(str, header["receiver_names"])),
             int(header["n_primitives"]),

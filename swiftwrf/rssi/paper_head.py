@@ -49,14 +49,14 @@ def _descend(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return predictions in all bins (n, R) [dBm], the normal numbers behind the field (n, R), and the rendered heads."""
     generator = torch.Generator().manual_seed(config.seed)
-    heads = nn.ModuleList(Head(name, data.n_primitives, config.seed) for name in data.receiver_names).to(device)
+    heads = [Head(name, data.n_primitives, config.seed).to(device) for name in data.receiver_names]
     white = nn.Parameter(torch.zeros(data.rssi.shape, device=device))
     level, field_db = (x.float().to(device) for x in (data.prior_mean.level, data.field_db))
     measured, root = data.rssi.float().to(device), root.to(device)
     noise_db = (data.noise_db / data.count.clamp_min(1).sqrt()).float().to(device)
     rows = kept.nonzero()[:, 0]
     n_detected = (~measured[rows.to(device)].isnan()).sum(dim=0).clamp_min(1)
-    optimiser = torch.optim.Adam([*heads.parameters(), white], lr=config.rate)
+    optimiser = torch.optim.Adam([*(p for head in heads for p in head.parameters()), white], lr=config.rate)
 
     def predict(at: Tensor) -> Tensor:
         return level + mean_magnitude(render(heads), field_db * (root[at] @ white))

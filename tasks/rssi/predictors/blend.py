@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import torch
 from scipy.optimize import linprog
@@ -10,21 +13,27 @@ from torch import Tensor
 
 from swiftwrf import Rssi
 from swiftwrf.data.splits import folds
-from swiftwrf.rssi import PredictorConfig, RssiFitContext, RssiPredictor
+from swiftwrf.models.base import FieldConfig, Preset
+from swiftwrf.rssi import RssiFitContext, RssiPredictor
 from swiftwrf.runtime.validation import configuration
-from tasks.rssi.predictors.base import PREDICTORS, Preset, make_predictor
+from tasks.rssi.predictors.base import PREDICTORS, make_predictor
 
 MAX_PAIRS = 5000  # that the weights of a blend are found on
 
 
 @configuration
-class BlendConfig(PredictorConfig):
+class BlendConfig(FieldConfig):
     """Options of `Blend`."""
 
     members: tuple[str, ...] = ("swiftwrf", "gp", "knn", "mri_residual")
     """names of the predictors; those whose requirements the data do not meet are left out"""
-    preset: Preset = "quick"
-    """configuration of the members"""
+    member_preset: Preset = "quick"
+    """preset of the members"""
+
+    @classmethod
+    def paper(cls, **changes: Any) -> BlendConfig:
+        """Return a blend of members with published settings."""
+        return replace(cls(member_preset="paper"), **changes)
 
 
 @PREDICTORS.register("blend")
@@ -60,7 +69,9 @@ class Blend(RssiPredictor):
     def _member(self, name: str, train: Rssi, context: RssiFitContext, kept: Tensor) -> RssiPredictor:
         """Return a member, fitted to the kept rows (rows,)."""
         rows = kept.nonzero()[:, 0]
-        member = make_predictor(name, self.config.preset, validation=self.config.validation, seed=self.config.seed)
+        member = make_predictor(
+            name, self.config.member_preset, validation=self.config.validation, seed=self.config.seed
+        )
         return member.fit(
             train.subset(rows), pool=context.pool.subset(rows), device=context.device, parallel=context.parallel
         )
