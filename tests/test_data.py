@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from swiftwrf import InputError, load_spectra
+from swiftwrf import InputError, load_spectra, simulated_room
 from swiftwrf.data.spectra import coarsening
 from swiftwrf.data.splits import block_split, random_split, slabs, split_names
 
