@@ -140,7 +140,7 @@ def choice(meaning: str, registry: Registry[Any]) -> Any:
     """Annotation of an option that takes names of a registry; its help lists what is registered when it is shown."""
 
     def entries(default: str) -> str:
-        return f"{'; '.join(f'{entry.name}: {entry.meaning}' for entry in registry.entries())} (default: {default})"
+        return f"{'; '.join(f'{name}: {registry.summary(name)}' for name in registry)} (default: {default})"
 
     return tyro.conf.arg(help=f"{meaning}:", help_behavior_hint=entries)
 
