@@ -5,12 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.distributed import ProcessGroup
 
 from swiftwrf.data.spectra import Spectra, check_training, fingerprint
 from swiftwrf.data.splits import folds
@@ -21,7 +19,6 @@ from swiftwrf.models.swiftwrf.model import SwiftWRF
 from swiftwrf.models.swiftwrf.optimise import Optimisation
 from swiftwrf.models.swiftwrf.regression import TRIAL_STEPS, Regression
 from swiftwrf.models.swiftwrf.search import doubling_search
-from swiftwrf.runtime.processes import Processes
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.session import Record, Session, Size
 
@@ -36,7 +33,6 @@ def fit(
     checkpoint: Path | None = None,
     on_record: Callable[[Record], None] | None = None,
     progress: bool = True,
-    group: ProcessGroup | None = None,
 ) -> SwiftWRF:
     """Fits a SwiftWRF model to spectra.
 
@@ -52,32 +48,27 @@ def fit(
             (of the search), seconds of that run and elapsed ones of the fit; a fit that goes on begins with the records
             of its earlier sessions.
         progress: show a progress bar on a terminal.
-        group: processes of `torch.distributed` that share the batches of a fit by gradient. Each of them makes this call
-            with the same spectra and configuration, and gets the model of one process but for the rounding of sums; only
-            the first keeps the checkpoint, is told records and shows progress.
 
     Raises:
-        InputError: fewer than 10 spectra, something not finite, a configuration that does not fit together, a
-            checkpoint of another fit, or more processes than spectra in a batch.
+        InputError: fewer than 10 spectra, something not finite, a configuration that does not fit together, or a
+            checkpoint of another fit.
         FitError: a loss or gradient that is not finite (the checkpoint holds the last good state), or a fit that ends
             worse than it began.
     """
     config = config or FitConfig()
     check_training(train)
     config.check()
-    processes = Processes(group)
     fold = folds(train.position, config.validation, config.seed)
     work = train.at_most(config.max_azimuths)
-    kernel = processes.from_first(partial(choose_kernel, work.position, work.store, fold))
+    kernel = choose_kernel(work.position, work.store, fold)
     if config.validation == "random":
         fold = torch.arange(len(train))  # regression leaves out one spectrum as easily as a fifth of them
     if config.model.rank == "auto":
-        rank = processes.from_first(partial(_rank, work, config, fold, kernel))
-        config = replace(config, model=replace(config.model, rank=rank))
-    with progress_bar(progress and processes.first) as bar:
-        session = Session(checkpoint, fingerprint(work, asdict(config)), bar, on_record, processes)
+        config = replace(config, model=replace(config.model, rank=_rank(work, config, fold, kernel)))
+    with progress_bar(progress) as bar:
+        session = Session(checkpoint, fingerprint(work, asdict(config)), bar, on_record)
         if config.steps:
-            optimisation = Optimisation(config, work, kernel, device, processes)
+            optimisation = Optimisation(config, work, kernel, device)
             optimisation.run(session)
             model = optimisation.result
         else:

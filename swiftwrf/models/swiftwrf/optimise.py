@@ -13,7 +13,6 @@ from swiftwrf.models.swiftwrf.config import FitConfig
 from swiftwrf.models.swiftwrf.loss import spectrum_loss
 from swiftwrf.models.swiftwrf.model import SwiftWRF
 from swiftwrf.runtime.descent import Descent, Schedule, warm_cosine
-from swiftwrf.runtime.processes import Processes
 from swiftwrf.runtime.session import Record, Size
 
 MAX_ANCHORS = 1000  # of the motion: a step costs their square
@@ -26,17 +25,9 @@ class Optimisation(Descent[SwiftWRF]):
         config: with numbers for everything that may be `auto`.
         train: spectra to fit.
         kernel: of the motion's prior, lengths in [m].
-        processes: that share each batch.
     """
 
-    def __init__(
-        self,
-        config: FitConfig,
-        train: Spectra,
-        kernel: Kernel,
-        device: torch.device | str,
-        processes: Processes | None = None,
-    ) -> None:
+    def __init__(self, config: FitConfig, train: Spectra, kernel: Kernel, device: torch.device | str) -> None:
         n, _ = config.model.size
         self.size, self.config, steps = Size(True, n, config.steps), config, config.steps
         self.coarse_steps = round(config.coarse_share * steps)
@@ -45,11 +36,10 @@ class Optimisation(Descent[SwiftWRF]):
         model = SwiftWRF.make(config.model, train.grid, anchor, kernel, generator=generator).to(device)
         groups = [{"params": list(model.primitives.parameters()), "peak": config.rate}]
         groups += model.deformation.parameter_groups(config.rate, config.deformation_rate)
-        super().__init__(self.size.key, model, groups, Schedule(steps, config.check_every), processes)
+        super().__init__(self.size.key, model, groups, Schedule(steps, config.check_every))
         self.position, self.spectrum = model.normalise(train.position.to(device)), train.spectrum.to(device)
         # everything random is drawn now: nothing is copied to the device between two evaluations
         batch = min(config.batch, len(train))
-        self.weight = self.processes.weight(batch)
         self.rows = torch.randint(len(train), (steps, batch), generator=generator).to(device)
         noisy = steps if config.smoothing else 0
         self.noise = torch.randn(noisy, batch, 3, generator=generator).to(device)
@@ -74,13 +64,13 @@ class Optimisation(Descent[SwiftWRF]):
 
     def objective(self) -> Tensor:
         config, model = self.config, self.model
-        rows = self.processes.own(self.rows[self.step])
+        rows = self.rows[self.step]
         position = self.position[rows]
         deform = self.step >= self.coarse_steps
         if deform and (scale := self.smoothing()):
-            position = position + scale * self.processes.own(self.noise[self.step])
+            position = position + scale * self.noise[self.step]
         drawn = model(position, deform=deform, stop_mean=config.stop_mean and deform)
-        loss = self.weight * self.loss(drawn, self.spectrum[rows])
+        loss = self.loss(drawn, self.spectrum[rows])
         prior = model.deformation.prior()
         return loss if prior is None else loss + config.prior_weight / len(self.position) * prior
 
