@@ -23,13 +23,17 @@ from swiftwrf import InputError
 from swiftwrf.runtime.durable import replacing, write_text
 
 Row = dict[str, Any]
-NAMES = (
+NAMES = (  # columns of text, whatever it looks like (NA, 1, 12:34)
     "method",
+    "estimator",
+    "training",
     "receiver",
     "synthesizer",
     "stage",
     "origin",
-)  # columns of text, whatever it looks like (NA, 1, 12:34)
+    "measured_fraction",  # a key: as a number it could lose a digit
+    "mix",
+)
 FORMULA = re.compile(r"^'*[=+\-@\t\r]")
 
 

@@ -9,6 +9,7 @@ from typing import Any, Literal, TypeVar, get_args
 
 from swiftwrf.models import FIELD_MODELS
 from tasks.aoa.estimators import ESTIMATORS
+from tasks.page import labels
 from tasks.run import Row
 
 Training = Literal["measured", "turbo", "turbo_extra", "all"]
@@ -207,5 +208,6 @@ def terms() -> dict[str, str]:
         "turbo_NAME": "trained on the measured spectra and on spectra that NAME predicts at the withheld positions",
         "turbo_NAME_extra": "turbo_NAME with synthetic spectra at further positions, their number by --extra",
         "turbo_auto": "the choice of each repeat by cross-validation, where repeats chose differently",
+        **{name: label.meaning for name, label in labels.labels(ESTIMATORS, labels.ESTIMATORS).items()},
         "no estimator's name": f"the network ({NETWORK}); the name of another estimator alone: trained on measured spectra",
     }
