@@ -65,7 +65,7 @@ def peak_map(model: FieldModel, measured: Spectra) -> dict[str, NDArray[Any]]:
     magnitude: list[Tensor] = []
     for part in position.split(BATCH_SPECTRA):
         spectrum = model.synthesize(part).cpu()
-        direction.append(measured.grid.strongest(spectrum))
+        direction.append(measured.grid.peak_direction(spectrum))
         magnitude.append(spectrum.amax(dim=(1, 2)))
     azimuth, elevation = torch.cat(direction).T.numpy()
     return {

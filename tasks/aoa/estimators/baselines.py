@@ -29,7 +29,7 @@ class Peak(Estimator):
         pass
 
     def predict(self, spectra: Tensor) -> Tensor:
-        return self.grid.strongest(spectra)
+        return self.grid.peak_direction(spectra)
 
 
 @ESTIMATORS.register("constant")
