@@ -21,9 +21,7 @@ from fuzz import kinds
 from PIL import Image
 
 from swiftwrf import AngularGrid, GeometryModel, InputError, fit_coarray, load
-from swiftwrf.models.geometry import HybridModel
-from swiftwrf.models.geometry.model import Plane
-from swiftwrf.models.geometry.sample import Residual
+from swiftwrf.models.geometry import Plane, fit_hybrid
 from tasks.run import command_line
 from tasks.view import ViewConfig, run, spectra
 from tasks.view.drawing import HemisphereProjection, PlanProjection, colour_image, data_url, text
@@ -132,11 +130,9 @@ def saved(kind, folder, room) -> Path:
     """A model of that kind, by itself; rooms are made, for finding one takes long."""
     if kind in ("geometry", "hybrid"):
         plane = Plane((1.0, 0.0, 0.0), 6.0, -0.5, 1.0, True)
-        link = room.array, room.grid, room.rotation, room.fixed_position, room.moving
-        model = GeometryModel(*link, [plane], 1, 0.1, 0.1, "made", torch.zeros(1, 1), Residual())
+        model = GeometryModel.of_planes(room, [plane], order=1)
         if kind == "hybrid":
-            kernel, rest = fit_coarray(room, progress=False).kernel, torch.zeros(1, room.spectrum[0].numel())
-            model = HybridModel(model, None, 1.0, kernel, room.position, torch.zeros(len(room), 0), rest)
+            model = fit_hybrid(room, model, progress=False)
         model.save(folder / "model")
     elif kind in quick.PUBLISHED:
         kinds.model_published(kind, folder)

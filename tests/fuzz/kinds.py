@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
@@ -43,7 +42,7 @@ from swiftwrf.data.writing import write_spectra
 from swiftwrf.gp import Kernel
 from swiftwrf.models.geometry import fit_geometry, fit_hybrid
 from swiftwrf.models.geometry.fit import observe
-from swiftwrf.models.geometry.strengths import fit_strengths
+from swiftwrf.models.geometry.path_gains import fit_path_gains
 from swiftwrf.models.swiftwrf import SwiftWRF
 from tasks.aoa.estimators import Settings
 from tasks.aoa.estimators.kernel_ridge import KernelRegression
@@ -126,8 +125,9 @@ def model_geometry(folder: Path) -> None:
 
 def model_hybrid(folder: Path) -> None:
     geometry = fit_geometry(_room(), GLANCE, progress=False)
-    strengths = fit_strengths(geometry, observe(_room())[0], Kernel())
-    replace(fit_hybrid(_room(), geometry), strengths=strengths).save(folder / "model")
+    model = fit_hybrid(_room(), geometry, progress=False)
+    model.path_gains = fit_path_gains(geometry, observe(_room())[0], Kernel())
+    model.save(folder / "model")
 
 
 def model_published(name: str, folder: Path) -> None:
