@@ -14,7 +14,9 @@ from swiftwrf import Spectra
 from swiftwrf.positions import nearest
 
 NO_INDEX = -1  # index of a position that is not in the data set
-MIN_RELATIVE_EXTENT = 1e-3  # extent of the region along an axis, relative to the largest, below which the axis is dropped
+MIN_RELATIVE_EXTENT = (
+    1e-3  # extent of the region along an axis, relative to the largest, below which the axis is dropped
+)
 MIN_HULL_FRACTION = 1e-3  # smallest fraction of the convex hull that the region covers
 SPACING_NEIGHBOURS = 8  # nearest neighbours that define the typical spacing; the first alone is the step along a path
 SPACING_QUANTILE = 0.95  # quantile over the positions of the distance to that neighbour

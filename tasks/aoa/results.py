@@ -18,7 +18,14 @@ from tasks.steps import Step
 from tasks.summarise import averaged, repeats_averaged
 
 SCORE = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
-EXAMPLE_QUANTILES = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)  # of the PSNR at the test positions, from the best spectrum to the worst
+EXAMPLE_QUANTILES = (
+    1.0,
+    0.8,
+    0.6,
+    0.4,
+    0.2,
+    0.0,
+)  # of the PSNR at the test positions, from the best spectrum to the worst
 
 
 class Results:
@@ -156,7 +163,9 @@ class Results:
         own = [(condition, value) for condition, value in self.pooled if condition.measured_fraction == fraction]
         conditions = {condition.method: condition for condition, _ in reversed(own)}  # of the first repeat
         errors = DataFrame([row for row in self.errors() if row["measured_fraction"] == fraction])
-        seconds = averaged(DataFrame([c.columns | value["seconds"] for c, value in own]), "method", ("train", "estimate"))
+        seconds = averaged(
+            DataFrame([c.columns | value["seconds"] for c, value in own]), "method", ("train", "estimate")
+        )
         return {
             method: {**conditions[method].description, **summaries, "seconds": seconds[method]}  # type: ignore[typeddict-item]
             for method, summaries in repeats_averaged(errors, "method", ANGLES).items()

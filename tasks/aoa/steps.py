@@ -20,10 +20,10 @@ from tasks.aoa.artifacts import save_artifacts
 from tasks.aoa.condition import AUTO, Condition, MeasuredSubset, Training, trainable
 from tasks.aoa.cross_validation import advise
 from tasks.aoa.estimators import ESTIMATORS, SavedEstimator, make_estimator
-from tasks.aoa.options import AoaConfig
+from tasks.aoa.options import RAYTRACE, AoaConfig
 from tasks.claim import STEPS
 from tasks.metrics import AdviceMetrics
-from tasks.run import Row
+from tasks.run import Preset, Row
 from tasks.steps import Step
 
 KIND = "synthetic spectra"
@@ -57,16 +57,15 @@ class Experiment:
         """Return the measured spectra, and the positions of the others."""
         return withhold(self.train, subset.measured_fraction, self.seed(subset))
 
-    def make_model(self, name: str, subset: MeasuredSubset, preset: str = "quick") -> FieldModel:
+    def make_model(self, name: str, subset: MeasuredSubset, preset: Preset = "quick") -> FieldModel:
         """Return a field model that is not fitted."""
         # validation at random: withheld positions lie among the measured ones, whatever the split of the test
-        options = {"validation": "random", "preset": preset, "scene": self.config.scene}
-        return make_model(name, seed=self.seed(subset), **options)
+        return make_model(name, preset, seed=self.seed(subset), validation="random", scene=self.config.scene)
 
     def finds_room(self, name: str) -> bool:
         """Return True if a field model is built on the room that the spectra show."""
         has_room = FIELD_MODELS[name].room is not FieldModel.room
-        return has_room and not (self.config.scene and "scene" in FIELD_MODELS[name].config_type.__dataclass_fields__)
+        return has_room and not (name == RAYTRACE and self.config.scene is not None)
 
 
 def first_steps(experiment: Experiment, subset: MeasuredSubset) -> list[Step[Experiment]]:
@@ -159,7 +158,9 @@ class RoomSearch(Step[Experiment]):
         measured, _ = experiment.withhold(self.subset)
         began = time.perf_counter()
         try:
-            model = experiment.make_model(ROOM_MODEL, self.subset).fit(measured, device=experiment.device, progress=True)
+            model = experiment.make_model(ROOM_MODEL, self.subset).fit(
+                measured, device=experiment.device, progress=True
+            )
         except (InputError, FitError) as error:
             return {"refused": str(error)}
         model.save(folder / self.file)
@@ -261,17 +262,14 @@ class Synthesis(Step[Experiment]):
     def _fitted(self, experiment: Experiment, measured: Spectra, history: _FitHistory, folder: Path) -> FieldModel:
         # models that are only compared are as small as in the choice
         preset = experiment.config.preset if self.trains else "quick"
-        model = experiment.make_model(self.synthesizer, self.subset, preset)
         room = load(folder / self.room.file) if self.room else None
+        assert room is None or isinstance(room, FieldModel)
         history.begin()
-        if type(room) is type(model):
-            return room
-        checkpoint = folder / STEPS / f"{self.name}-fit.safetensors"
-        return model.fit(
+        return experiment.make_model(self.synthesizer, self.subset, preset).fit(
             measured,
             like=room,
             device=experiment.device,
-            checkpoint=checkpoint,
+            checkpoint=folder / STEPS / f"{self.name}-fit.safetensors",
             on_record=history.add,
             progress=True,
         )

@@ -77,4 +77,3 @@ def labels(registry: Registry[object], known: dict[str, Label], names: Iterable[
     """
     found = registry if names is None else [name for name in names if name in registry]
     return {name: known.get(name) or Label(registry.summary(name)) for name in found}
-

@@ -229,7 +229,9 @@ def _train(
     shared = distributed(network) if number > 1 else None
     trained = shared or network
     optimiser = torch.optim.AdamW(trained.parameters(), lr=config.rate, weight_decay=1e-2, fused=True)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, config.rate, total_steps=config.steps, pct_start=WARM_UP_FRACTION)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, config.rate, total_steps=config.steps, pct_start=WARM_UP_FRACTION
+    )
     trained.train()
     began, history = time.perf_counter(), []
     for step, batch in enumerate(progress(list(batches), "AANN", shown=rank == 0), start=1):

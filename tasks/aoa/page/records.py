@@ -16,7 +16,11 @@ from tasks.page.palette import Palette
 from tasks.page.records import Records
 
 AoaRecords = Records[AoaMetrics]
-LOWER_REFERENCE, UPPER_REFERENCE, CHOSEN = "#ee6677", "#228833", "#332288"  # colours of conditions without a field model
+LOWER_REFERENCE, UPPER_REFERENCE, CHOSEN = (
+    "#ee6677",
+    "#228833",
+    "#332288",
+)  # colours of conditions without a field model
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,9 @@ OFF_SCALE = ("peak", "constant")  # with errors so large that they would hide th
 
 def results_section(fraction: FractionRecords, several: bool) -> Section:
     """Return the errors of all conditions, their training sets, and the distributions of the errors."""
-    title = f"{fraction.percent} measured" + (f" - {fraction.run.scene}, seed {fraction.run.metrics['seed']}" if several else "")
+    title = f"{fraction.percent} measured" + (
+        f" - {fraction.run.scene}, seed {fraction.run.metrics['seed']}" if several else ""
+    )
     rows = [
         [name, *(_with_interval(method[column]) for column in ERRORS), number(method["great_circle_deg"]["p90"])]
         for name, method in fraction.mix["methods"].items()
@@ -85,7 +87,12 @@ def _turbo_cdf(fraction: FractionRecords) -> list[Plot]:
 
 def over_fractions(fractions: list[FractionRecords], name: str) -> Plot:
     """Return the median error of each condition against the measured fraction."""
-    conditions = {name: fraction.conditions[name] for fraction in fractions for name in fraction.in_overviews if name not in OFF_SCALE}
+    conditions = {
+        name: fraction.conditions[name]
+        for fraction in fractions
+        for name in fraction.in_overviews
+        if name not in OFF_SCALE
+    }
     labels = [fraction.percent for fraction in fractions]
     if len({fraction.run.place for fraction in fractions}) > 1:
         labels = [figures.short(f"{s.percent}\n{s.run.metrics['data']}\n{s.run.metrics['split']}") for s in fractions]

@@ -30,8 +30,9 @@ def advice_of(fraction: FractionRecords) -> dict[str, AdviceMetrics]:
     return {name: entry for name, entry in advice.items() if entry["gains"]}
 
 
-def advice_sentence(fraction: FractionRecords) -> str | None:
-    """Return whether turbo learning helps; None if nothing was compared."""
+def advice_sentences(fraction: FractionRecords) -> list[str]:
+    """Return a text for each field model that was compared: does turbo learning help?"""
+    texts = []
     for name, advice in advice_of(fraction).items():
         gains = [gain for gain in advice["gains"] if gain["sampled"] == advice["sampled"]]
         best = min(gains, key=lambda gain: gain["median_deg"])
@@ -44,11 +45,13 @@ def advice_sentence(fraction: FractionRecords) -> str | None:
             f"held-out spectra. The best number is {best['extra']}."
         )
         if advice["helps"]:
-            return f"{found} Turbo learning helps here: use --extra {advice['recommended_extra']} with this fraction."
-        if rule["low"] > 0:
-            return f"{found} Turbo learning harms here: measure more instead, or use another synthesizer."
-        return f"{found} The change is not significant: more measured positions are the safer way."
-    return None
+            verdict = f"Turbo learning helps here: use --extra {advice['recommended_extra']} with this fraction."
+        elif rule["low"] > 0:
+            verdict = "Turbo learning harms here: measure more instead, or use another synthesizer."
+        else:
+            verdict = "The change is not significant: more measured positions are the safer way."
+        texts.append(f"{found} {verdict}")
+    return texts
 
 
 def choice_section(fraction: FractionRecords) -> Section | None:
@@ -69,10 +72,9 @@ def choice_section(fraction: FractionRecords) -> Section | None:
     name = choice["name"]
     meaning = labels.labels(FIELD_MODELS, labels.FIELD_MODELS, [name])
     text = f"{name} predicts held-out measured spectra best" + (f": {meaning[name].meaning}." if meaning else ".")
-    sentence = advice_sentence(fraction)
     plots = [_gain(fraction, *item) for item in advice_of(fraction).items()]
-    paragraphs = [text, *([sentence] if sentence else [])]
-    return Section(f"Which synthesizer, and does it help? ({fraction.percent} measured)", paragraphs, [table], plots)
+    title = f"Which synthesizer, and does it help? ({fraction.percent} measured)"
+    return Section(title, [text, *advice_sentences(fraction)], [table], plots)
 
 
 def _gain(fraction: FractionRecords, name: str, advice: AdviceMetrics) -> Plot:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from tasks.aoa.condition import headline
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.page.records import FractionRecords
-from tasks.aoa.page.room import advice_sentence
+from tasks.aoa.page.room import advice_sentences
 from tasks.page.page import Number, Plot, Summary
 
 
@@ -38,7 +38,7 @@ def summary(fraction: FractionRecords, picture: Plot) -> Summary:
         f"({fraction.percent}); the spectra at the other positions are synthesized, and the network learns from both. "
         f"It is tested on {metrics['n_test']} spectra that take no part in any fit.",
         f"The best of all methods is {best} with a median error of {error[best]['median']:.2f} degrees.",
-        *filter(None, [advice_sentence(fraction)]),
+        *advice_sentences(fraction),
     ]
     return Summary(numbers, picture, meaning, _next_steps(fraction, best))
 
