@@ -85,7 +85,8 @@ def deformation(model: SwiftWRF, measured: Spectra) -> dict[str, NDArray[Any]]:
         (steps, n), the magnitude of each primitive's weight.
     """
     walk = _walk(measured.position)
-    gaussians = model.gaussians(model.normalise(walk.to(model.centre.device)))
+    field = model.field
+    gaussians = field.gaussians(field.normalise(walk.to(model.device)))
     strength = gaussians.weight.norm(dim=-1).expand(len(walk), -1).cpu()
     mean = gaussians.mean.expand(len(walk), -1, -1).cpu()
     l1, l2, l3 = gaussians.cholesky.expand(len(walk), -1, -1)[0].cpu().unbind(-1)

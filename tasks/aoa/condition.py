@@ -61,8 +61,8 @@ class Condition:
 
     Args:
         estimator: Name of the estimator.
-        training: Training set. "measured": the measured spectra; "turbo": these and synthetic spectra at the withheld
-            positions; "turbo_extra": these and synthetic spectra at further positions; "all": all training spectra, measured.
+        training: Training set. "measured": the measured spectra. "turbo": these and synthetic spectra at the withheld
+            positions. "turbo_extra": these and synthetic spectra at further positions. "all": all spectra, measured.
         synthesizer: Name of the field model of the synthetic spectra, empty without any.
         n_synthetic: Number of further synthetic positions.
         measured_fraction: Fraction of the training spectra that is measured.

@@ -73,12 +73,12 @@ def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> AdviceMetrics:
             change = _change(measured_only, errors(every, number, with_samples))
             advice["gains"].append({"extra": number, "sampled": with_samples, **change})
     by_rule = [fold_errors(fold, *chosen([other for other in every if other != fold])) for fold in every]
-    advice["rule"] = _change(measured_only, np.concatenate(by_rule))
+    rule = advice["rule"] = _change(measured_only, np.concatenate(by_rule))
     advice["sampled"] = sampled
     # a gain at one number of positions alone is likely chance, because few spectra are held out
     if all(gain["change"] < 0 for gain in advice["gains"] if gain["sampled"] == sampled):
         advice["recommended_extra"] = best
-        advice["helps"] = advice["rule"]["high"] < 0
+        advice["helps"] = rule["high"] < 0
     return advice
 
 

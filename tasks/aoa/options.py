@@ -23,8 +23,8 @@ DEFAULT_EXTRA = 3000  # further synthetic positions where cross-validation recom
 class AoaConfig(SpectraSource):
     """Angle of arrival with few measured spectra: turbo learning against its references and baselines.
 
-    Without --data the built-in simulated room is used. --resume DIR.partial continues an interrupted run, with --scheduler on
-    a cluster.
+    Without --data the built-in simulated room is used. --resume DIR.partial continues an interrupted run, on a cluster with
+    --scheduler.
     """
 
     mix: tuple[float, ...]

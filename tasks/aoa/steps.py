@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -235,11 +236,14 @@ class Synthesis(Step[Experiment]):
         def sample(position: Tensor) -> Tensor:
             return model.sample(position, generator=generator)
 
+        def std(position: Tensor) -> Tensor:
+            return cast(Tensor, model.predict(position).std)
+
         test = experiment.test.position
         tensors = {"test": _as_bytes_at(test, model.synthesize)}
         tested = time.perf_counter()
         if model.predict(test[:1]).std is not None:
-            tensors["test_std"] = _as_bytes_at(test, lambda position: model.predict(position).std)
+            tensors["test_std"] = _as_bytes_at(test, std)
         if model.samples:
             tensors["test_sample"] = _as_bytes_at(test, sample)
         parts = {"withheld": withheld} if self.trains else {}

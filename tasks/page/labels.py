@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 from swiftwrf.runtime.registry import Registry
 
@@ -67,7 +68,7 @@ PREDICTORS = {
 }
 
 
-def labels(registry: Registry[object], known: dict[str, Label], names: Iterable[str] | None = None) -> dict[str, Label]:
+def labels(registry: Registry[Any], known: dict[str, Label], names: Iterable[str] | None = None) -> dict[str, Label]:
     """Return the labels of registered methods; a method of another package has the first line of its docstring.
 
     Args:

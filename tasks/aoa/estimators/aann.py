@@ -80,8 +80,8 @@ class AANNConfig(EstimatorConfig):
 class AANN(SavedEstimator):
     """ResNet-50 whose head is replaced by kernel regression after the training, from a seeded start without downloads.
 
-    The processes of torchrun share each batch and its statistics in the batch norms. They train the network of one process up
-    to the rounding of sums.
+    The processes of torchrun share each batch and its statistics in the batch norms. They train the network of one process,
+    up to the rounding of sums.
 
     Example:
         >>> import swiftwrf

@@ -28,8 +28,8 @@ class EstimatorConfig:
     def for_scene(cls, n_spectra: int, preset: Preset, **options: Any) -> Self:
         """Return the options for a scene with `n_spectra` training spectra if all of them are measured.
 
-        The length of a training depends on the scene alone, not on the training set. Otherwise the condition with the longest
-        training would win.
+        The length of a training depends on the scene alone, not on the training set. Otherwise the condition with the
+        longest training would win.
         """
         return cls(**options)
 
@@ -128,5 +128,5 @@ def make_estimator(name: str, n_spectra: int = 0, preset: Preset = "quick", **op
         >>> make_estimator("kernel_ridge", seed=3).config.seed
         3
     """
-    estimator = ESTIMATORS[name]
+    estimator: type[Estimator] = ESTIMATORS[name]
     return estimator(estimator.config_type.for_scene(n_spectra, preset, **options))

@@ -57,8 +57,8 @@ class Constant(Estimator):
 class NearestSpectrum(Estimator):
     """The label of the training spectrum with the least squared difference, hard to beat on a dense path.
 
-    Inner products find candidates fast, but lose the digits in which similar spectra differ. Among the candidates the float64
-    differences decide.
+    Inner products find candidates fast, but lose the digits in which similar spectra differ. Among the candidates, the
+    float64 differences decide.
 
     Example:
         >>> import swiftwrf

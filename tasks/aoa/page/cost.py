@@ -6,7 +6,6 @@ from pandas import DataFrame, concat
 
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.swiftwrf.search import GAIN
-from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.page.records import AoaRecords, FractionRecords, first_history, fits
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
@@ -67,8 +66,8 @@ def sizes(runs: list[AoaRecords]) -> list[Plot]:
         axes[0].xaxis.set_major_formatter("{x:g}")
         axes[0].set(xlabel="primitives", ylabel="loss on held-out spectra")
         caption = (
-            f"First measured fraction of {run.scene}. Loss on held-out measured spectra at coarse resolution. The model has the "
-            f"smallest number within {GAIN:.1%} of the best: {n} primitives (line)."
+            f"First measured fraction of {run.scene}. Loss on held-out measured spectra at coarse resolution. The model has "
+            f"the smallest number within {GAIN:.1%} of the best: {n} primitives (line)."
         )
         data = by_size[["n_primitives", "validation"]]
         plots.append(Plot(f"size-{FractionRecords.of(run)[0].file_name}", figure, caption, data))
@@ -92,7 +91,7 @@ def trainings(runs: list[AoaRecords]) -> list[Plot]:
         figure, axes = figures.new_figure(1, max(len(panels), 1), 6 * max(len(panels), 1), 3.2)
         for ax, (label, lines) in zip(axes, panels.items(), strict=False):
             figures.curves(ax, palette, lines, "step", label)
-        caption = f"First measured fraction and repeat of {run.scene}: networks, and synthesizers that are fitted by gradient."
+        caption = f"First measured fraction and repeat of {run.scene}: networks, and synthesizers fitted by gradient."
         curves = {f"network, {name}": line for name, line in networks.items()}
         curves |= {f"synthesizer, {name}": line for name, line in fitted.items()}
         parts = [DataFrame({"what": what, "step": steps, "loss": loss}) for what, (steps, loss) in curves.items()]

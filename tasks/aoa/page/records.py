@@ -93,7 +93,10 @@ def of_fraction(table: DataFrame, key: str) -> DataFrame:
 
 
 def palette(conditions: Iterable[Condition]) -> Palette:
-    """Return colours of all field models and of these conditions: dashed without the network, darker with further positions."""
+    """Return colours of all field models and of these conditions.
+
+    Conditions without the network are dashed, those with further positions are darker.
+    """
     models = Palette.of(labels.labels(FIELD_MODELS, labels.FIELD_MODELS))
     estimators = Palette.of(labels.ESTIMATORS)
     colours, dashed = dict(models.colours), set()
@@ -126,7 +129,7 @@ def first_history(run: AoaRecords) -> DataFrame:
 
 
 def fits(run: AoaRecords) -> tuple[DataFrame, DataFrame]:
-    """Return the history of the SwiftWRF fits of the first measured fraction: of every size that was tried, and the final one."""
+    """Return the history of the SwiftWRF fits of the first measured fraction: all sizes of the search, the final fit."""
     history = first_history(run)
     if "n_primitives" not in history:
         return history.iloc[:0].assign(steps=0), history.iloc[:0].assign(steps=0)

@@ -23,8 +23,9 @@ FIXED, MEASURED, IMAGE = "#cc3311", "#4477aa", "#ee8866"
 
 
 def advice_of(fraction: FractionRecords) -> dict[str, AdviceMetrics]:
-    """Return the cross-validation of each field model, for those with further positions. Older runs have the chosen one alone."""
-    advice, choice = fraction.mix["advice"] or {}, fraction.mix["choice"]
+    """Return the cross-validation of each field model, if it has further positions. Older runs have the chosen one alone."""
+    advice: dict[str, Any] = dict(fraction.mix["advice"] or {})
+    choice = fraction.mix["choice"]
     if "stand_in" in advice and choice is not None:
         advice = {choice["name"]: advice}
     return {name: entry for name, entry in advice.items() if entry["gains"]}
@@ -38,8 +39,8 @@ def advice_sentences(fraction: FractionRecords) -> list[str]:
         best = min(gains, key=lambda gain: gain["median_deg"])
         rule = advice.get("rule") or best
         found = (
-            f"Cross-validation inside the measured fraction ({advice['n_held_out']} spectra held out, {advice['stand_in']} as "
-            f"stand-in for the network): spectra {'sampled' if advice['sampled'] else 'predicted'} by {name} at further "
+            f"Cross-validation inside the measured fraction ({advice['n_held_out']} spectra held out, {advice['stand_in']} "
+            f"as stand-in for the network): spectra {'sampled' if advice['sampled'] else 'predicted'} by {name} at further "
             f"positions change the median error by {rule['change']:+.0%} [{rule['low']:+.0%}, {rule['high']:+.0%}], from "
             f"{advice['measured_only_deg']:.2f} to {rule['median_deg']:.2f} degrees, if their number is chosen on other "
             f"held-out spectra. The best number is {best['extra']}."
@@ -95,8 +96,8 @@ def _gain(fraction: FractionRecords, name: str, advice: AdviceMetrics) -> Plot:
     ax.set(xlabel="further positions with synthetic spectra", ylabel="change of the median error [%]")
     figures.legend_below(figure, ax)
     caption = (
-        f"Held-out measured spectra, {advice['stand_in']} trained on the other measured spectra and on spectra by {name}. Bands: "
-        "95 % bootstrap intervals of the change. Turbo learning helps below zero."
+        f"Held-out measured spectra, {advice['stand_in']} trained on the other measured spectra and on spectra by {name}. "
+        "Bands: 95 % bootstrap intervals of the change. Turbo learning helps below zero."
     )
     return Plot(f"gain-{name}-{fraction.file_name}", figure, caption, DataFrame(advice["gains"]))
 

@@ -29,9 +29,9 @@ def suggestion_section(fraction: FractionRecords) -> Section | None:
     gain.set(xlabel="suggested positions measured", ylabel="variance left in the region [%]", ylim=(0, None))
     text = (
         f"Measuring at {len(suggested)} more positions (suggested-mix{fraction.key}.csv, the most informative first) would "
-        f"reduce the predictive variance over the region from {left[0]:.0%} to {left[-1]:.0%} of the variance of the spectra. "
-        "The estimate is that of a Gaussian process on the measured spectra. If the variance hardly falls, spectra change "
-        "faster than this number of positions can resolve."
+        f"reduce the predictive variance over the region from {left[0]:.0%} to {left[-1]:.0%} of the variance of the "
+        "spectra. The estimate is that of a Gaussian process on the measured spectra. If the variance hardly falls, spectra "
+        "change faster than this number of positions can resolve."
     )
     caption = "Left: in plan, numbered by rank. Right: expected variance over the region, averaged."
     title = f"Where to measure next ({fraction.title})"

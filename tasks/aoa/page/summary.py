@@ -47,9 +47,8 @@ def _next_steps(fraction: FractionRecords, best: str) -> list[str]:
     metrics, key = fraction.run.metrics, fraction.key
     steps = []
     if best in fraction.conditions and not fraction.conditions[best].is_network:
-        steps.append(
-            f"Use {fraction.conditions[best].estimator} rather than the network here: it is more accurate and cheaper to train."
-        )
+        estimator = fraction.conditions[best].estimator
+        steps.append(f"Use {estimator} rather than the network here: it is more accurate and cheaper to train.")
     if metrics["repeats"] == 1:
         steps.append(
             "One draw of the measured fraction proves little: repeat with --repeats 3 before you rely on a difference."
