@@ -43,8 +43,8 @@ from tasks.estimate import EstimateConfig
 from tasks.estimate import run as estimate
 from tasks.inspect import InspectConfig
 from tasks.inspect import run as inspect
-from tasks.report.__main__ import ReportConfig
-from tasks.report.__main__ import run as report
+from tasks.report import ReportConfig
+from tasks.report import run as report
 from tasks.rssi import experiment as rssi
 from tasks.rssi.predictors import PREDICTORS
 from tasks.run import command_line

@@ -17,7 +17,6 @@ import pytest
 import torch
 from quick import run, said
 
-from augment import Settings, make_synthesizer
 from swiftwrf import AngularGrid, GeometryModel, InputError, load_spectra, simulated_room
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.data.raytraced import ROOMS, FurnishedRoom, Material, Scene, Surface, Tracing, outline, sionna, trace

@@ -60,7 +60,7 @@ def read(path: str | Path, *kinds: str) -> tuple[str, dict[str, Tensor], Header]
             for name, tensor in tensors.items():
                 if not bool(torch.isfinite(tensor).all()):
                     raise InputError(
-                        f"{path}: {name} holds a value that is not finite, so its predictions are invalid; create the file again"
+                        f"{path}: {name} holds a value that is not finite; create the file again"
                     )
     except InputError:
         raise

@@ -2,10 +2,7 @@
 
 import sys
 
-from tasks.aoa.condition import meaning
-from tasks.aoa.experiment import run
-from tasks.aoa.options import AoaConfig
-from tasks.run import command_line
+from tasks.command import run_command
 
 if __name__ == "__main__":
-    sys.exit(command_line("tasks.aoa", AoaConfig, run, sys.argv[1:], meaning))
+    sys.exit(run_command("aoa", sys.argv[1:]))

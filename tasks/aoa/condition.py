@@ -195,11 +195,6 @@ def pooled(results: list[tuple[Condition, Value]], auto: bool) -> list[tuple[Con
     return found
 
 
-def meaning() -> str:
-    """Return the explanation of the names of methods, for the command line."""
-    return "; ".join(f"{name}: {what}" for name, what in terms().items()) + "."
-
-
 def terms() -> dict[str, str]:
     """Return what the parts of the names of methods mean."""
     return {

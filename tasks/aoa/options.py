@@ -12,6 +12,7 @@ from swiftwrf.data.spectra import Moving
 from swiftwrf.metrics import WINDOW
 from swiftwrf.models import FIELD_MODELS
 from tasks.aoa.condition import AUTO, fraction_key
+from tasks.page import labels
 from tasks.run import SEEDS, Preset, choice
 from tasks.source import SpectraSource, reading
 
@@ -38,6 +39,7 @@ class AoaConfig(SpectraSource):
         choice(
             f"field models of the synthetic spectra; {AUTO} chooses the one that predicts held-out measured spectra best",
             FIELD_MODELS,
+            labels.FIELD_MODELS,
         ),
     ] = (AUTO,)
     scene: str | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pandas import DataFrame, concat
 
 from swiftwrf.models import FIELD_MODELS
-from swiftwrf.models.swiftwrf.search import GAIN
+from swiftwrf.models.swiftwrf.fit import MIN_GAIN
 from tasks.aoa.page.records import AoaRecords, FractionRecords, first_history, fits
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
@@ -67,7 +67,7 @@ def sizes(runs: list[AoaRecords]) -> list[Plot]:
         axes[0].set(xlabel="primitives", ylabel="loss on held-out spectra")
         caption = (
             f"First measured fraction of {run.scene}. Loss on held-out measured spectra at coarse resolution. The model has "
-            f"the smallest number within {GAIN:.1%} of the best: {n} primitives (line)."
+            f"the smallest number within {MIN_GAIN:.1%} of the best: {n} primitives (line)."
         )
         data = by_size[["n_primitives", "validation"]]
         plots.append(Plot(f"size-{FractionRecords.of(run)[0].file_name}", figure, caption, data))
