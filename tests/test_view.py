@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import quick
+import small
 import torch
 from fuzz import kinds
 from PIL import Image
@@ -134,14 +135,14 @@ def saved(kind, folder, room) -> Path:
         if kind == "hybrid":
             model = fit_hybrid(room, model, progress=False)
         model.save(folder / "model")
-    elif kind in quick.PUBLISHED:
+    elif kind in small.PUBLISHED:
         kinds.model_published(kind, folder)
     else:
         getattr(kinds, f"model_{kind}")(folder)
     return folder / "model"
 
 
-@pytest.mark.parametrize("kind", ["swiftwrf", "coarray", "geometry", "hybrid", *quick.PUBLISHED])
+@pytest.mark.parametrize("kind", ["swiftwrf", "coarray", "geometry", "hybrid", *small.PUBLISHED])
 def test_a_model_by_itself(tmp_path, room, kind):
     view = open_source(saved(kind, tmp_path, room))
     shown = view.predict(view.models[0], view.start, dragging=True)

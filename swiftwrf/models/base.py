@@ -378,6 +378,7 @@ def check_finite(spectrum: Tensor) -> Tensor:
 FIELD_MODELS: Registry[FieldModel] = Registry("field model", "swiftwrf.models")
 
 
+@checked
 def make_model(name: str, preset: Preset = "quick", **options: Any) -> FieldModel:
     """Return a field model by its name, with those of the options that it has.
 
