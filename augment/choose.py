@@ -4,27 +4,31 @@ Some models search for a structure (walls, number of primitives) before they fit
 so it is not repeated in every fold, but no fold is predicted with a structure that its spectra helped to find: one search
 leaves out folds 0 and 1, another leaves out folds 2 and 3. Each of these four folds is predicted by a model that reuses the
 structure of the search that left it out, with its parameters fitted to all other folds. Fold 4 takes part in both searches
-and is never predicted.
+and is never predicted. If a search without two folds had too few spectra, each fold has a search of its own.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
+from scipy.stats import trim_mean
+from torch import Tensor
 
 from swiftwrf import FitError, InputError, Spectra
 from swiftwrf.data.spectra import check_training
-from swiftwrf.data.splits import Validation, folds
+from swiftwrf.data.splits import FOLDS, MIN_TRAINING, Validation, folds
 from swiftwrf.gp import thinned
 from swiftwrf.metrics import psnr
 from swiftwrf.models import FIELD_MODELS, FieldModel, make_model
 
 MAX_TEST_SPECTRA = 1000  # predicted spectra of a fold; more do not change the choice
 BLIND_FOLDS = ((0, 1), (2, 3))  # pairs of folds that one structure search leaves out
+TRIMMED_FRACTION = 0.1  # of the held-out spectra with the lowest PSNR, and of those with the highest
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,7 @@ class ModelChoice:
 
     Args:
         name: Name of the best field model.
-        psnr_db: Median PSNR over held-out measured spectra [dB] of each candidate.
+        psnr_db: Trimmed mean of the PSNR over held-out measured spectra [dB] of each candidate.
         seconds: Time of the cross-validation of each candidate [s]. A shared search counts for each model that uses it.
         folds: Scored folds of each candidate.
     """
@@ -79,10 +83,13 @@ def choose_model(
     device: torch.device | str = "cpu",
     **options: Any,
 ) -> ModelChoice:
-    """Return the field model with the highest median PSNR on held-out measured spectra.
+    """Return the field model with the highest PSNR on held-out measured spectra.
+
+    The score is the mean without the lowest and the highest tenth. All candidates predict the same spectra, so differences
+    between their means are paired and have a smaller variance than differences between medians.
 
     Args:
-        measured: Measured spectra, at least 10.
+        measured: Measured spectra, at least 11.
         names: Candidates. Defaults to all field models that are fast and whose requirements the data meet.
         validation: Rule by which the spectra are divided into folds.
         seed: Seed of the folds and of the fits.
@@ -90,7 +97,7 @@ def choose_model(
         options: Further options of the models, see `swiftwrf.models.make_model`.
 
     Raises:
-        InputError: Fewer than 10 spectra, a value that is not finite, or no candidate that can be fitted.
+        InputError: Fewer than 11 spectra, a value that is not finite, or no candidate that can be fitted.
 
     Example:
         >>> import swiftwrf
@@ -99,16 +106,16 @@ def choose_model(
         ['idw', 'nearest']
     """
     check_training(measured)
-    fold = folds(measured.position, validation, seed)
+    fold, blind_folds = _blind_folds(measured, validation, seed)
     options |= {"validation": validation, "seed": seed}
-    searched: list[list[tuple[FieldModel, float]]] = [[] for _ in BLIND_FOLDS]
+    searched: list[list[tuple[FieldModel, float]]] = [[] for _ in blind_folds]
     psnr_db: dict[str, float] = {}
     found: dict[str, list[Fold]] = {}
     seconds: dict[str, float] = {}
     for name in candidates(measured) if names is None else names:
         scored, score, spent = [], [], 0.0
         try:
-            for blind, models in zip(BLIND_FOLDS, searched, strict=True):
+            for blind, models in zip(blind_folds, searched, strict=True):
                 structure, searching = _structure(name, measured, _without(fold, *blind), models, device, options)
                 spent += searching
                 for number in blind:
@@ -121,17 +128,29 @@ def choose_model(
                     score.append(psnr(predicted, test.spectrum))
         except (InputError, FitError):  # a model that cannot be fitted here is no candidate
             continue
-        psnr_db[name], found[name], seconds[name] = float(torch.cat(score).median()), scored, spent
+        psnr_db[name] = float(trim_mean(torch.cat(score).numpy(), TRIMMED_FRACTION))
+        found[name], seconds[name] = scored, spent
     if not psnr_db:
         raise InputError(f"no field model can be fitted to {len(measured)} measured spectra of {measured.name}")
     best = max(psnr_db, key=lambda name: psnr_db[name])
     return ModelChoice(best, psnr_db, seconds, found)
 
 
+def _blind_folds(measured: Spectra, validation: Validation, seed: int) -> tuple[Tensor, tuple[tuple[int, ...], ...]]:
+    """Return the fold of each spectrum, and the folds that each structure search leaves out."""
+    fold, n = folds(measured.position, validation, seed), len(measured)
+    if all(len(_without(fold, *blind)) >= MIN_TRAINING for blind in BLIND_FOLDS):
+        return fold, BLIND_FOLDS
+    if n <= MIN_TRAINING:
+        raise InputError(f"cross-validation of field models needs more than {MIN_TRAINING} measured spectra, got {n}")
+    number = max(FOLDS, math.ceil(n / (n - MIN_TRAINING)))
+    return folds(measured.position, validation, seed, number), tuple((fold,) for fold in range(number))
+
+
 def _structure(
     name: str,
     measured: Spectra,
-    rows: torch.Tensor,
+    rows: Tensor,
     searched: list[tuple[FieldModel, float]],
     device: torch.device | str,
     options: dict[str, Any],
@@ -149,12 +168,12 @@ def _structure(
     return searched[-1]
 
 
-def _without(fold: torch.Tensor, *numbers: int) -> torch.Tensor:
+def _without(fold: Tensor, *numbers: int) -> Tensor:
     """Return the rows outside the folds of these numbers."""
     return (~torch.isin(fold, torch.tensor(numbers))).nonzero()[:, 0]
 
 
-def _split(measured: Spectra, fold: torch.Tensor, number: int) -> tuple[Spectra, Spectra]:
+def _split(measured: Spectra, fold: Tensor, number: int) -> tuple[Spectra, Spectra]:
     """Return training and test spectra of one fold."""
     test = (fold == number).nonzero()[:, 0]
     return measured.subset(_without(fold, number)), measured.subset(*thinned(test, rows=MAX_TEST_SPECTRA))

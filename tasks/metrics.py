@@ -59,7 +59,7 @@ class MethodMetrics(TypedDict):
 
 
 class ChoiceMetrics(TypedDict):
-    """Chosen field model; median PSNR [dB] on held-out measured spectra and seconds of each candidate."""
+    """Chosen field model; trimmed mean PSNR [dB] on held-out measured spectra and seconds of each candidate."""
 
     name: str
     psnr_db: dict[str, float]

@@ -102,12 +102,12 @@ def block_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:
     return (~held_out).nonzero()[:, 0], held_out.nonzero()[:, 0]
 
 
-def folds(position: Tensor, validation: Validation, seed: int) -> Tensor:
-    """Number of the fold, 0 to 4, of each training position (n, 3): drawn at random, or slabs."""
+def folds(position: Tensor, validation: Validation, seed: int, number: int = FOLDS) -> Tensor:
+    """Return the fold of each training position (n, 3), counted from 0: drawn at random, or slabs."""
     if validation == "block":
-        return slabs(position, FOLDS)
+        return slabs(position, number)
     order = torch.randperm(len(position), generator=torch.Generator().manual_seed(seed))
-    return order % FOLDS
+    return order % number
 
 
 def validation_for(split: str) -> Validation:

@@ -122,7 +122,12 @@ class CrossValidation(Step[Experiment]):
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.subset)
         seed = experiment.seed(self.subset)
-        choice = choose_model(measured, self.compared or None, seed=seed, device=experiment.device)
+        try:
+            choice = choose_model(measured, self.compared or None, seed=seed, device=experiment.device)
+        except InputError:
+            if not self.compared:
+                raise
+            return {"choice": None, "advice": {}}  # field models asked for by name need no comparison
         trained = [name for name in self.compared if name in choice.folds] or [choice.name]
         return {
             "choice": {"name": choice.name, "psnr_db": choice.psnr_db, "seconds": choice.seconds},
