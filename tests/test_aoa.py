@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -346,7 +347,8 @@ def pretended(monkeypatch, room, errors):
     """Return the advice for four folds with these errors by fold and number of synthetic positions."""
     monkeypatch.setattr(cross_validation, "_errors", lambda fold, number, *_: errors(fold.test, number))
     model = make_model("idw").fit(room)
-    return cross_validation.advise([Fold(model, room, fold) for fold in range(4)], n_synthetic=3000, seed=0)
+    folds = [SimpleNamespace(model=model, test=fold) for fold in range(4)]
+    return cross_validation.advise(folds, n_synthetic=3000, seed=0)
 
 
 @pytest.mark.parametrize(
