@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from unittest import mock
 
-from small import glances, small_published, small_swiftwrf
+from small import glances, small_published, small_swiftwrf, with_defaults
 
-from swiftwrf import AngularGrid, RssiConfig, rssi_room, simulated_room
+from swiftwrf import AngularGrid, RssiConfig, RssiModel, rssi_room, simulated_room
 from swiftwrf.errors import LONGEST
 from tasks.aoa import experiment as aoa
 from tasks.aoa.condition import NETWORK
@@ -72,14 +72,10 @@ def quick() -> Iterator[None]:
         glances(),
         mock.patch.object(aoa, "simulated_room", return_value=spectra),
         mock.patch.object(rssi, "rssi_room", return_value=floor),
-        mock.patch(
-            "tasks.rssi.predictors.swiftwrf.RssiConfig", lambda **given: RssiConfig(**given, steps=2, n_primitives=0)
-        ),
+        mock.patch.object(RssiModel, "config_type", with_defaults(RssiConfig(steps=2, n_primitives=0))),
         mock.patch("tasks.rssi.experiment.MAP_CELLS", 8),
         mock.patch.dict(ESTIMATORS._registered, {NETWORK: QuickNetwork}),
-        mock.patch.object(
-            PREDICTORS, "_registered", {name: PREDICTORS[name] for name in PREDICTORS if name in PREDICTORS_KEPT}
-        ),
+        mock.patch.object(PREDICTORS, "_registered", {name: PREDICTORS[name] for name in PREDICTORS_KEPT}),
     ):
         yield
 
