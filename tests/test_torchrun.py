@@ -24,8 +24,8 @@ from swiftwrf import AngularGrid, InputError, simulated_room
 from swiftwrf.data.store import Store
 from swiftwrf.runtime.threads import set_threads
 from tasks import torchrun
-from tasks.aoa.estimators import Settings, aann
-from tasks.aoa.estimators.aann import AANN, AANNConfig
+from tasks.aoa.estimators import aann
+from tasks.aoa.estimators.aann import AANN
 from tasks.cluster import connected
 
 HERE = Path(__file__).parent
@@ -35,8 +35,8 @@ AOA = ("aoa", "--mix", 0.5, "--synthesizer", "swiftwrf", "idw", "--preset", "pap
 class Network(AANN):
     """The network of the paper, trained for one step: rounding grows to degrees with more steps."""
 
-    def __init__(self, settings):
-        super().__init__(settings, AANNConfig(steps=1, batch=5))
+    def __init__(self, config):
+        super().__init__(config, steps=1, batch=5)
 
 
 def run(*arguments):
@@ -53,11 +53,11 @@ def learnt():
     set_threads(1)
     room = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
     backbone = aann.backbone
+    train = Mixed.measured(replace(room, store=Store(room.spectrum.double())))
     with mock.patch.object(aann, "backbone", lambda *options: backbone(*options).double()):
-        network = AANN(Settings(room.grid), AANNConfig(steps=2, batch=5))
-    network.fit(Mixed.measured(replace(room, store=Store(room.spectrum.double()))))
+        network = AANN(steps=2, batch=5).fit(train)
     losses = torch.tensor([record["loss"] for record in network.history])
-    return {"losses": losses, "estimate": network.estimate(room.spectrum.double())}
+    return {"losses": losses, "estimate": network.predict(room.spectrum.double())}
 
 
 def commands(folder: Path) -> int:
@@ -118,7 +118,7 @@ def test_all_processes_end_with_the_code_of_the_first_and_it_alone_reports(ended
 def test_a_batch_has_a_row_for_each_process(monkeypatch):
     monkeypatch.setattr(aann, "process_count", lambda: 3)
     room = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
-    network = AANN(Settings(room.grid), AANNConfig(steps=1, batch=2))
+    network = AANN(steps=1, batch=2)
     with pytest.raises(InputError, match="3 processes cannot share batches of 2 spectra"):
         network.fit(Mixed.measured(room))
 

@@ -10,8 +10,9 @@ import numpy as np
 from augment import withhold
 from swiftwrf import FIELD_MODELS, FieldModel, InputError, RssiModel, Spectra, load
 from swiftwrf.runtime.checkpoint import Saved, refusing
-from tasks.aoa.config import AoaConfig
+from tasks.aoa.condition import fraction_key
 from tasks.aoa.experiment import measurements
+from tasks.aoa.options import AoaConfig
 from tasks.claim import CONFIG, ENVIRONMENT
 from tasks.records import Row, read_json
 from tasks.rssi.experiment import MODEL
@@ -88,15 +89,14 @@ def _aoa_run(folder: Path, content: Row) -> SpectraView:
 
 def kept_models(folder: Path, fraction: float) -> list[tuple[str, Path]]:
     """Return names and files of the field models that a run kept for one measured fraction."""
-    files = {
-        name: folder / f"{'model' if name == 'swiftwrf' else name}-mix{fraction:g}.safetensors" for name in FIELD_MODELS
-    }
+    mix = f"mix{fraction_key(fraction)}"
+    files = {name: folder / f"{'model' if name == 'swiftwrf' else name}-{mix}.safetensors" for name in FIELD_MODELS}
     return [(name, file) for name, file in files.items() if file.is_file()]
 
 
 def _planes_of_run(folder: Path, fraction: float) -> list[dict[str, Any]]:
     """Return the planes that another model of the run found from the same spectra."""
-    file = folder / f"geometry-mix{fraction:g}.json"
+    file = folder / f"geometry-mix{fraction_key(fraction)}.json"
     planes: list[dict[str, Any]] = read_json(file)["planes"] if file.is_file() else []
     return planes
 
