@@ -164,8 +164,8 @@ def model_of(n: int, grid: AngularGrid, device: torch.device) -> SwiftWRF:
         l1, l2, l3 = cholesky.unbind(-1)
         field.primitives.mean.copy_(mean[0])
         field.primitives.cholesky.copy_(torch.stack([l1.log(), l2 / l3, l3.log()], dim=-1))
-    header = {"grid": asdict(grid), "config": asdict(config)} | field.deformation.header()
-    model = SwiftWRF.from_state(field.state_dict(), header)
+    header = {"grid": asdict(grid), "config": asdict(config), "bounds": [[0.0] * 3, [1.0] * 3]}
+    model = SwiftWRF.from_state(field.state_dict(), header | field.deformation.header())
     model.field.to(device)
     return model
 

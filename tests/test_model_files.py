@@ -96,7 +96,7 @@ DAMAGE = {
         _set("wavelength", to="x"),
         _set("grid", to=3),
         _set("kernel", "share", to=7),
-        _tensor("anchor", lambda t: t[:, :2]),
+        _tensor("position", lambda t: t[:, :2]),
         _tensor("readout", lambda t: t * torch.inf),
         _tensor("form", lambda t: t[:-1]),
         _tensor("offset", lambda t: t.repeat(2)),
@@ -179,7 +179,7 @@ print(type(swiftwrf.load(sys.argv[1])).__name__)
 
 
 def test_models_of_every_kind_are_opened_with_swiftwrf_alone(room, tmp_path, small_published):
-    for name in ("gp", "hybrid", "vae"):
+    for name in ("gp", "coarray", "vae"):
         make_model(name).fit(room).save(tmp_path / name)
         opened = subprocess.run(
             [sys.executable, "-c", ONLY_SWIFTWRF, tmp_path / name], capture_output=True, text=True, check=True

@@ -39,7 +39,7 @@ def path_loss_only(n=60, noise=0.0, level=-50.0, exponent=2.0, seed=0):
     position = torch.rand(n, 3, generator=generator, dtype=torch.float64) * torch.tensor([10.0, 10.0, 1.0])
     clean = level - 10 * exponent * torch.cdist(position, receiver).log10()
     rssi = clean + noise * torch.randn(n, 3, generator=generator)
-    return Rssi("path loss", ("a", "b", "c"), receiver, position, rssi, torch.arange(n))
+    return Rssi(rssi, position, receiver_position=receiver, receiver_names="abc", name="path loss")
 
 
 @pytest.mark.parametrize("name", [n for n in PREDICTORS if n.startswith(("mri", "gp"))])
@@ -51,14 +51,7 @@ def test_predictors_with_a_path_loss_model_recover_it(name):
 
 def test_shared_path_loss_model_is_one_model():
     data = path_loss_only()
-    shifted = Rssi(
-        "s",
-        data.receiver_names,
-        data.receiver_position,
-        data.transmitter_position,
-        data.rssi_dbm + torch.tensor([0.0, 3, 6]),
-        data.index,
-    )
+    shifted = replace(data, rssi_dbm=data.rssi_dbm + torch.tensor([0.0, 3, 6]))
     position = torch.tensor([[5.0, 5.0, 2.0]], dtype=torch.float64)  # equally far from all receivers
     predicted = make_predictor("mri_pooled").fit(shifted).predict(position).mean[0]
     assert torch.allclose(predicted, predicted[0])

@@ -30,7 +30,7 @@ def path_loss_only(n=60, noise=0.0, level=-50.0, exponent=2.0, seed=0):
     position = torch.rand(n, 3, generator=generator, dtype=torch.float64) * torch.tensor([10.0, 10.0, 1.0])
     clean = level - 10 * exponent * log_distance(position, receiver)
     rssi = clean + noise * torch.randn(n, 3, generator=generator)
-    return Rssi("path loss", ("a", "b", "c"), receiver, position, rssi, torch.arange(n))
+    return Rssi(rssi, position, receiver_position=receiver, receiver_names="abc", name="law")
 
 
 def with_field(n=150, noise=0.5, seed=0):

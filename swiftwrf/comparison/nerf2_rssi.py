@@ -26,8 +26,8 @@ from swiftwrf.comparison.base import Config, Count, Training, descend
 from swiftwrf.comparison.nerf2 import MAX_SAMPLES_AT_ONCE, Field, NeRF2Size, received
 from swiftwrf.comparison.network import chunks, draw_parameters, restored
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.models.base import from_plain
-from swiftwrf.positions import check_drawn, frame, normalise
+from swiftwrf.models.base import check_finite, from_plain
+from swiftwrf.positions import frame, normalise
 from swiftwrf.rssi.base import RssiFitContext, RssiPredictor, fingerprint
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
@@ -142,7 +142,7 @@ class NeRF2Rssi(RssiPredictor, Saved):
         some = chunks(len(position), max(1, MAX_SAMPLES_AT_ONCE // rays))
         parts = [network(network.local(position[part])) for part in some]
         empty = torch.zeros(0, len(network.receiver))
-        return check_drawn(100 * (torch.cat([empty, *parts]).double() - 1)), None
+        return check_finite(100 * (torch.cat([empty, *parts]).double() - 1)), None
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         return self.network.state_dict(), {"options": asdict(self.config), "receiver_names": self.receiver_names}

@@ -19,6 +19,7 @@ from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.registry import Registry
+from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.validation import NonNegativeInt, checked, configuration
 
 if TYPE_CHECKING:
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 
 ARRAY, FIXED_END = "array", "fixed end"  # requirements that a model can declare
 CPU = torch.device("cpu")
-Record = dict[str, Any]  # one evaluation of a fit
 Preset = Literal["quick", "paper"]
 
 

@@ -163,7 +163,7 @@ class RssiModel(RssiPredictor, Saved):
         self._table = HeadTable(self.rendered)
         at_zero = self._table(torch.zeros(1, len(self.level)))[0]
         self._offset = torch.zeros_like(at_zero) if self.config.paper_head else at_zero
-        self._process = GaussianProcess(self.kernel, *thinned(self.anchor.double(), rows=MAX_VARIANCE_POSITIONS))
+        self._process = GaussianProcess(self.kernel, thinned(self.anchor.double(), rows=MAX_VARIANCE_POSITIONS)[0])
 
     @single_thread()
     def _predict(self, position: Tensor) -> tuple[Tensor, Tensor]:

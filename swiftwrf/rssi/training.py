@@ -9,7 +9,7 @@ from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
-from swiftwrf.gp import Kernel, candidates, held_out_errors, thinned
+from swiftwrf.gp import Kernel, LeaveGroupOut, candidates, thinned
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import Head, render
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
@@ -196,11 +196,10 @@ def choose_residual_kernel(position: Tensor, residual: Tensor, fold: Tensor) -> 
         held_out += [(r, len(part), torch.cat([part, gaps])) for part in parts if len(part)]
 
     def error(kernel: Kernel) -> float:
-        precision = torch.linalg.inv(kernel.noisy_gram(position))
+        precision = torch.linalg.inv(kernel.covariance(position))
         dual = precision @ residual.nan_to_num()
-        return float(
-            torch.cat([held_out_errors(precision, dual[:, r], out)[:n] for r, n, out in held_out]).abs().mean()
-        )
+        errors = [LeaveGroupOut(precision, out).errors(dual[:, r])[:n] for r, n, out in held_out]
+        return float(torch.cat(errors).abs().mean())
 
     # rough fields only: a choice among mixtures with a smooth part follows chance, and its errors are no lower
     rough = (kernel for kernel in candidates(position, RELATIVE_NOISE_VARIANCES) if kernel.share == 1)
