@@ -62,6 +62,10 @@ class RaytraceModel(FieldModel):
         """Room that is traced; None if a scene is given."""
         return self._room
 
+    @property
+    def fixed_end(self) -> tuple[Tensor, Tensor, Moving]:
+        return self.fixed_position, self.rotation, self.moving
+
     def _fit(self, train: Spectra, context: FitContext) -> None:
         sionna()  # refuses before a room is searched
         assert train.array is not None

@@ -6,7 +6,7 @@ import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -14,32 +14,22 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import MIN_TRAINING, Validation
+from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError
-from swiftwrf.models.base import Prediction, Record
+from swiftwrf.models.base import Configured, Prediction, Record
 from swiftwrf.positions import check_positions
 from swiftwrf.runtime.threads import side_by_side
-from swiftwrf.runtime.validation import NonNegativeInt, configuration
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+ITEMS_PER_THREAD = 4  # between two results that are kept: starting threads costs milliseconds
 RECEIVER_POSITIONS = "positions of the receivers"
 
 
 def map_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
-    """Apply a function to items as `map` does, as many at a time as torch has threads."""
-    waiting, n_threads = list(items), torch.get_num_threads()
-    for start in range(0, len(waiting), n_threads):
-        yield from side_by_side(function, waiting[start : start + n_threads])
-
-
-@configuration
-class PredictorConfig:
-    """Options of every RSSI predictor."""
-
-    validation: Validation = "random"
-    """training rows held out to choose settings: single ones at random, or one region at a time"""
-    seed: NonNegativeInt = 0
-    """seed of everything random"""
+    """Apply a function to items as `map` does, in as many threads as torch has."""
+    waiting, n_items = list(items), ITEMS_PER_THREAD * torch.get_num_threads()
+    for start in range(0, len(waiting), n_items):
+        yield from side_by_side(function, waiting[start : start + n_items])
 
 
 @dataclass(frozen=True)
@@ -54,14 +44,15 @@ class RssiFitContext:
     progress: bool
 
 
-class RssiPredictor(ABC):
+class RssiPredictor(Configured, ABC):
     """Base class of all predictors of RSSI at fixed receivers from the position of the transmitter.
 
     A subclass sets `name` and `config_type`, and implements `_fit` and `_predict`. Options are keyword arguments of the
     constructor; `config_type` declares their ranges.
 
     Args:
-        config: Options as one object. Defaults to `config_type()`.
+        config: Options as one object. Defaults to those of the preset.
+        preset: "quick" for the defaults; "paper" for the published settings, if there are any.
         options: Single options, which replace those of `config`.
 
     Raises:
@@ -76,8 +67,6 @@ class RssiPredictor(ABC):
 
     name: ClassVar[str]
     """name on the command line and in reports"""
-    config_type: ClassVar[type[Any]] = PredictorConfig
-    """dataclass of the options"""
     requires_receiver_position: ClassVar[bool] = False
     """whether the positions of the receivers must be known"""
     slow: ClassVar[bool] = False
@@ -87,13 +76,6 @@ class RssiPredictor(ABC):
 
     receiver_names: tuple[str, ...]
     """names of the receivers, set by `fit`"""
-
-    def __init__(self, config: Any = None, **options: Any) -> None:
-        known = [field.name for field in fields(self.config_type)]
-        unknown = [name for name in options if name not in known]
-        if unknown:
-            raise InputError(f"{type(self).__name__} has no option {unknown[0]!r}; it has {', '.join(known)}")
-        self.config = replace(config or self.config_type(), **options)
 
     @classmethod
     def lacking(cls, data: Rssi) -> str:
