@@ -191,7 +191,7 @@ def test_written_spectra_come_back_by_the_batch(cache, folder, tmp_path):
 
 def test_all_at_once_is_refused_where_it_does_not_fit(monkeypatch):
     data = simulated_room(n=N, grid=AngularGrid.hemisphere(4, 8))
-    monkeypatch.setattr("swiftwrf.data.spectra.MOST_PIXELS", N * 4 * 8 - 1)
+    monkeypatch.setattr("swiftwrf.data.spectra.MAX_MEMORY_PIXELS", N * 4 * 8 - 1)
     with pytest.raises(InputError, match="by the batch"):
         _ = data.spectrum
     assert data.subset(torch.arange(5)).spectrum.shape == (5, 4, 8)
