@@ -168,6 +168,11 @@ def _drawing(surfaces: list[Surface]) -> tuple[Figure, Axes, Any]:
     names = list(dict.fromkeys(s.material.name for s in surfaces if s.name.startswith("furniture")))
     if names:
         handles = [Line2D([], [], color=MATERIALS.get(n, OTHER), linewidth=4, alpha=0.6, label=n) for n in names]
-        below: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (0, -0.12), "ncols": len(names), "frameon": False}
+        below: dict[str, Any] = {
+            "loc": "upper left",
+            "bbox_to_anchor": (0, -0.12),
+            "ncols": len(names),
+            "frameon": False,
+        }
         plan.legend(handles=handles, fontsize=7, **below)
     return figure, plan, space
