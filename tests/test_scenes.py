@@ -334,7 +334,7 @@ def test_the_synthesizer_is_refused_before_anything_is_computed(tmp_path, capsys
     ],
 )
 def test_a_scene_that_cannot_be(tmp_path, capsys, monkeypatch, scene, synthesizer, says):
-    monkeypatch.setattr("tasks.aoa.config.sionna", lambda: None)
+    monkeypatch.setattr("tasks.aoa.options.sionna", lambda: None)
     out = ("--out", tmp_path / "out")
     assert run("aoa", "--mix", 0.5, "--synthesizer", synthesizer, "--scene", scene, *out) == 2
     assert says in said(capsys)

@@ -92,7 +92,7 @@ class Spectra(PositionedData):
         if position is None or (spectra is None) == (store is None):
             raise InputError("Spectra takes spectra and their positions: Spectra(spectra, position, ...)")
         position = to_positions("position", position)
-        store = store or _checked_store(spectra)
+        store = _checked_store(spectra) if store is None else store
         grid = grid or AngularGrid.hemisphere(*store.shape[1:])
         if grid.shape != store.shape[1:]:
             raise InputError(f"spectra of shape {store.shape} do not fit a grid of {grid.shape} directions")

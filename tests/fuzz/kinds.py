@@ -53,7 +53,6 @@ from swiftwrf.models.geometry import fit_geometry, fit_hybrid
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.path_gains import fit_path_gains
 from swiftwrf.models.swiftwrf import SwiftWRF
-from tasks.aoa.estimators import Settings
 from tasks.aoa.estimators.kernel_ridge import KernelRegression
 
 N = 12
@@ -143,9 +142,7 @@ def model_rssi(folder: Path) -> None:
 
 
 def model_kernel_ridge(folder: Path) -> None:
-    estimator = KernelRegression(Settings(GRID))
-    estimator.fit(Mixed.measured(_room()))
-    estimator.save(folder / "model")
+    KernelRegression().fit(Mixed.measured(_room())).save(folder / "model")
 
 
 def state_of_a_fit(folder: Path) -> None:
@@ -190,7 +187,7 @@ def read_model(folder: Path) -> object:
 def read_estimator(folder: Path) -> torch.Tensor:
     estimator = load(folder / "model")
     assert isinstance(estimator, KernelRegression)
-    estimate = estimator.estimate(torch.rand(2, *estimator.settings.grid.shape))
+    estimate = estimator.predict(torch.rand(2, *estimator.grid.shape))
     assert estimate.isfinite().all()
     return estimate
 
