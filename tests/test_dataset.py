@@ -118,6 +118,7 @@ WRONG = {
         lambda: Spectra(ROOM.spectrum, ROOM.position, pose=ArrayPose(tuple(ROOM.position[2].tolist()))),
         "position 2 is that of the fixed end",
     ),
+    "a field of others": (lambda: Spectra(ROOM.spectrum, ROOM.position, colour="red"), "Spectra has no colour"),
     "no positions": (lambda: Spectra(ROOM.spectrum), "spectra and their positions"),
     "a split of others": (
         lambda: replace(ROOM, named_splits={"day": (torch.arange(20), torch.tensor([24]))}),

@@ -286,7 +286,7 @@ def test_what_only_sionna_knows_is_refused(ray_tracer, tmp_path, capsys, argumen
         (("--room", "kitchen", *OPTIONS[2:]), "unknown room 'kitchen'; choose from conference, office, bedroom"),
         (("--room", "none.xml", *OPTIONS[2:]), "none.xml is not there"),
         ((*OPTIONS[:4], "--positions", 1), "--positions takes 2 to"),
-        ((*OPTIONS, "--frequency", 2.4), "--frequency takes the carrier in Hz"),
+        ((*OPTIONS, "--frequency", 2.4), r"--frequency takes 1e+06 to 1e+13 [Hz]"),
         ((*OPTIONS, "--order", 9), "--order takes 0 to 8"),
         ((*OPTIONS, "--order", 0, "--diffraction"), "need at least --order 1"),
         ((*OPTIONS, "--scattering", 1.1), "--scattering takes 0 to 1"),

@@ -9,9 +9,9 @@ from unittest import mock
 
 import pytest
 from quick import PREDICTORS_KEPT, TASKS, QuickNetwork
-from small import glances
+from small import glances, with_defaults
 
-from swiftwrf import RssiConfig
+from swiftwrf import RssiConfig, RssiModel
 from tasks.aoa.condition import NETWORK
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.rssi.predictors import PREDICTORS
@@ -38,10 +38,7 @@ def test_every_block_runs(part, tmp_path, monkeypatch):
         with (
             glances(),
             mock.patch.dict(ESTIMATORS._registered, {NETWORK: QuickNetwork}),
-            mock.patch(
-                "tasks.rssi.predictors.swiftwrf.RssiConfig",
-                lambda **given: RssiConfig(**given, steps=2, n_primitives=0),
-            ),
+            mock.patch.object(RssiModel, "config_type", with_defaults(RssiConfig(steps=2, n_primitives=0))),
             mock.patch.object(PREDICTORS, "_registered", {name: PREDICTORS[name] for name in PREDICTORS_KEPT}),
         ):
             assert command_line(module, config, function, arguments) == 0, block

@@ -106,24 +106,23 @@ class RssiModel(RssiPredictor, Saved):
             record: Record = {"stage": "search", "n_primitives": training.n_primitives}
             if not session.records:
                 session.evaluated(record | {"seconds": time.perf_counter() - began}, {}, {})
-            unusable = f"{context.checkpoint} is no state that a fit can continue from"
-            with files.refusing(unusable):
-                fitted = _saved_fits(session)
+            found = session.saved.tensors if session.saved else {}
+            done = len(found.get("level", ()))
+            with files.refusing(f"{context.checkpoint} is no state that a fit can continue from"):
+                files.expect(found, dict.fromkeys(found and ("held_out", "coefficient"), (done, len(training.rssi))))
             fit_some, size = (learn_receivers, PAPER_RECEIVERS) if self.config.paper_head else (fit_receiver, 1)
             # compiled rasterizers are not safe in several threads, and only the paper's head needs them here
             parallel: Map = context.parallel or (map if self.config.paper_head else map_threads)
-            task = partial(fit_some, config=self.config, device=context.device)
-            starts = [start for start in range(0, len(training.receiver_names), size) if start not in fitted]
-            groups = [training.columns(slice(start, start + size)) for start in starts]
-            results = zip(starts, groups, parallel(task, groups), strict=True)
-            for start, group, fitted[start] in bar.track(results, total=len(starts), description="receivers"):
-                record |= {"stage": "final", "receivers": list(group.receiver_names)}
-                error = fitted[start]["held_out"].T.where(_held_out_mask(group, self.config), torch.nan) - group.rssi
-                tensors = {f"{i}.{name}": value for i, found in fitted.items() for name, value in found.items()}
+            task = partial(fit_some, data=training, config=self.config, device=context.device)
+            parts = [slice(start, start + size) for start in range(done, len(training.receiver_names), size)]
+            mask = _held_out_mask(training, self.config)
+            results = zip(parts, parallel(task, parts), strict=True)
+            for part, result in bar.track(results, total=len(parts), description="receivers"):
+                found = {name: torch.cat([found[name], new]) if found else new for name, new in result.items()}
+                error = result["held_out"].T.where(mask[:, part], torch.nan) - training.rssi[:, part]
+                record |= {"stage": "final", "receivers": list(training.receiver_names[part])}
                 record |= {"validation": float(error.abs().nanmean()), "seconds": time.perf_counter() - began}
-                session.evaluated(record, tensors, {})
-            with files.refusing(unusable):
-                found = {name: torch.cat([fitted[i][name] for i in sorted(fitted)]) for name in fitted[0]}
+                session.evaluated(record, found, {})
         self._assemble(train, training, found)
 
     @single_thread()
@@ -248,15 +247,6 @@ def _shapes(n_receivers: int, n_anchors: int) -> dict[str, tuple[int, ...]]:
         "coefficient": (n_anchors, n_receivers),
         "rendered": (n_receivers, 2, 2, N_DIRECTIONS),
     }
-
-
-def _saved_fits(session: Session) -> dict[int, dict[str, Tensor]]:
-    """Return the fits that an interrupted session has finished, by the number of their first receiver."""
-    fitted: dict[int, dict[str, Tensor]] = {}
-    for key, tensor in (session.saved.tensors if session.saved else {}).items():
-        start, name = key.split(".")
-        fitted.setdefault(int(start), {})[name] = tensor
-    return fitted
 
 
 def _held_out_mask(training: RssiTraining, config: RssiConfig) -> Tensor:

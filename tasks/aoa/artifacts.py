@@ -22,6 +22,17 @@ N_WALK_POSITIONS = 120
 MAX_PRIMITIVES = 40  # strongest primitives shown along the walk
 
 
+def model_file(folder: Path, name: str, key: str) -> Path:
+    """Return the file of a run's fitted field model.
+
+    Args:
+        folder: Directory of the run.
+        name: Name of the field model.
+        key: Measured fraction in file names.
+    """
+    return folder / f"{MODEL_FILE if name == SwiftWRF.name else name}-mix{key}.safetensors"
+
+
 def save_artifacts(model: FieldModel, key: str, measured: Spectra, test: Spectra, folder: Path) -> None:
     """Save a fitted field model, its room, and the data of the maps that the report shows.
 
@@ -34,8 +45,7 @@ def save_artifacts(model: FieldModel, key: str, measured: Spectra, test: Spectra
     """
     mix = f"mix{key}"
     if not isinstance(model, MemoryModel):
-        prefix = MODEL_FILE if isinstance(model, SwiftWRF) else model.name
-        model.save(folder / f"{prefix}-{mix}.safetensors")
+        model.save(model_file(folder, model.name, key))
     if model.room is not None:
         write_json(folder / f"geometry-{mix}.json", model.room.to_json())
         position, gain, order = model.room.image_sources()

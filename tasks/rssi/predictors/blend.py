@@ -5,20 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import torch
-from scipy.optimize import linprog
-from scipy.sparse import csr_array, eye_array, hstack, vstack
 from torch import Tensor
 
 from swiftwrf import Rssi
 from swiftwrf.data.splits import folds
 from swiftwrf.models.base import FieldConfig, Preset
 from swiftwrf.rssi import RssiFitContext, RssiPredictor
+from swiftwrf.rssi.stacking import mixing_weights
 from swiftwrf.runtime.validation import configuration
 from tasks.rssi.predictors.base import PREDICTORS, make_predictor
-
-MAX_PAIRS = 5000  # that the weights of a blend are found on
 
 
 @configuration
@@ -40,8 +36,7 @@ class BlendConfig(FieldConfig):
 class Blend(RssiPredictor):
     """A weighted mean of other predictors, weights by cross-validation.
 
-    The weights, the same at all receivers, have the lowest absolute error on held-out training rows (stacking: L. Breiman,
-    "Stacked regressions", Machine Learning 24, 1996).
+    The weights, the same at all receivers, have the lowest mean absolute error on held-out training rows (stacking).
     """
 
     name = "blend"
@@ -60,9 +55,7 @@ class Blend(RssiPredictor):
             position = train.transmitter_position[out]
             for i, name in enumerate(names):
                 held_out[i, out] = self._member(name, train, context, ~out).predict(position).mean.double()
-        detected = ~train.rssi_dbm.isnan()
-        weights = self._weights(held_out[:, detected].T, train.rssi_dbm[detected])
-        self.weights = dict(zip(names, weights, strict=True))
+        self.weights = dict(zip(names, mixing_weights(held_out, train.rssi_dbm).tolist(), strict=True))
         every = torch.ones_like(fold, dtype=torch.bool)
         self._members = {name: self._member(name, train, context, every) for name in names if self.weights[name] > 0}
 
@@ -75,25 +68,6 @@ class Blend(RssiPredictor):
         return member.fit(
             train.subset(rows), pool=context.pool.subset(rows), device=context.device, parallel=context.parallel
         )
-
-    def _weights(self, predicted: Tensor, measured: Tensor) -> list[float]:
-        """Return non-negative weights of sum 1 for predictions (n, m) of n values, by a linear programme.
-
-        Its variables are the weights and the absolute errors.
-        """
-        some = np.random.default_rng(self.config.seed).permutation(len(measured))[:MAX_PAIRS]
-        matrix, values = csr_array(predicted.numpy()[some]), measured.numpy()[some]
-        n, m = matrix.shape
-        size = eye_array(n)
-        result = linprog(
-            c=np.concatenate([np.zeros(m), np.ones(n)]),
-            A_ub=vstack([hstack([matrix, -size]), hstack([-matrix, -size])]),
-            b_ub=np.concatenate([values, -values]),
-            A_eq=np.concatenate([np.ones(m), np.zeros(n)])[None],
-            b_eq=[1.0],
-        )
-        weight: list[float] = result.x[:m].tolist()
-        return weight
 
     def _predict(self, position: Tensor) -> tuple[Tensor, None]:
         parts = [self.weights[name] * member.predict(position).mean.double() for name, member in self._members.items()]
