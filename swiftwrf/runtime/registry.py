@@ -97,5 +97,5 @@ class Registry(Mapping[str, type[Made]]):
 
 @lru_cache(maxsize=32)
 def _entry_points(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
-    """Return the entry points of a group; a search reads the metadata of every installed package, so it is kept for a path."""
+    """Return the entry points of a group. A search reads the metadata of every installed package, so its result is kept."""
     return tuple(entry_points(group=group))
