@@ -122,7 +122,7 @@ def test_unknown_predictor():
 def test_a_predictor_of_another_package(monkeypatch, small, tmp_path):
     """Registered by an entry point, it takes part in a run."""
     point = EntryPoint("outside", "test_rssi:Outside", "swiftwrf.rssi_predictors")
-    monkeypatch.setattr(registry, "entry_points", lambda group: [point] if group == point.group else [])
+    monkeypatch.setattr(registry, "_entry_points", lambda group, path: (point,) if group == point.group else ())
     monkeypatch.setattr(PREDICTORS, "_registered", {name: PREDICTORS[name] for name in ("swiftwrf", "mean")})
     assert run("--rx", "1", "--out", tmp_path / "run") == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
