@@ -1,9 +1,7 @@
-"""The paper's own studies on public data: what deforms, how the fit is staged, the loss, the number of primitives and of
-training spectra, the resolution.
+"""Repeat the paper's ablation studies on public data: deformed parameters, stages, loss, primitives, training spectra, grid.
 
-Every variant changes one thing: of the default, which is a regression, or of a fit by gradient as the paper has it, with a
-size and length at which all variants take about as long. The columns are those of the paper's tables; its numbers are of its
-own data and stand beside for orientation only.
+Every variant changes one option: of the default, which is a regression, or of a fit by gradient as in the paper, with equal
+sizes and numbers of steps. The paper's numbers come from other data and are shown for orientation only.
 """
 
 from __future__ import annotations
@@ -35,7 +33,7 @@ ALL = ("mean", "response", "attenuation", "cholesky")
 @dataclass(frozen=True)
 class Config:
     data: Path | None = None
-    """the folder that holds s23-200, newrf-bedroom and newrf-office; without it only the simulated room"""
+    """folder with s23-200, newrf-bedroom and newrf-office. Defaults to the simulated room alone"""
     quick: bool = False
     """one seed, 150 steps a fit"""
     scheduler: str | None = None
@@ -44,7 +42,7 @@ class Config:
 
 @dataclass(frozen=True)
 class Case:
-    """One variant: how it is fitted, how often, and to which rows of the training spectra (None: all)."""
+    """One variant: its configuration, its seeds, and the rows of the training spectra (None: all)."""
 
     config: FitConfig
     seeds: tuple[int, ...]
@@ -52,7 +50,7 @@ class Case:
 
 
 def main(config: Config) -> None:
-    """Runs every variant on every scene and writes `results/ablation.json`."""
+    """Run every variant on every scene and write `results/ablation.json`."""
     if config.data is None:
         scenes: dict[str, tuple[Spectra, str]] = {"simulated-room random": (simulated_room(), "random")}
     else:
@@ -69,7 +67,7 @@ def main(config: Config) -> None:
 
 
 def study(name: str, data: Spectra, split: str, config: Config, parallel: Map) -> dict[str, Any]:
-    """All variants on one scene."""
+    """Return the scores of all variants on one scene."""
     train, test = data.split(split)
     default = FitConfig(validation=validation_for(split))
     steps = 150 if config.quick else STEPS
@@ -97,7 +95,7 @@ def study(name: str, data: Spectra, split: str, config: Config, parallel: Map) -
 
 
 def variants(default: FitConfig, gradient: FitConfig) -> dict[str, FitConfig]:
-    """Each changes one thing of the default or of a fit by gradient in which everything moves."""
+    """Return the variants of the default, and of a fit by gradient in which all parameters deform."""
 
     def model(base: FitConfig, **changes: Any) -> FitConfig:
         return replace(base, model=replace(base.model, **changes))
@@ -125,7 +123,7 @@ def variants(default: FitConfig, gradient: FitConfig) -> dict[str, FitConfig]:
 
 
 def measure(train: Spectra, test: Spectra, case: Case) -> dict[str, Any]:
-    """Scores over the test spectra, averaged over seeds, with each seed's medians; or why there is no fit."""
+    """Return the scores over the test spectra, averaged over seeds, or the reason why the fit was refused."""
     kept = train if case.rows is None else train.subset(case.rows)
     scores: dict[str, list[torch.Tensor]] = {"ssim": [], "psnr_db": [], "l1": []}
     began = time.perf_counter()
@@ -142,7 +140,7 @@ def measure(train: Spectra, test: Spectra, case: Case) -> dict[str, Any]:
 
 
 def in_words(result: dict[str, Any]) -> str:
-    """One line."""
+    """Return a result in one line."""
     if "refusal" in result:
         return str(result["refusal"])
     return f"SSIM {result['ssim']['median']:.4f} PSNR {result['psnr_db']['median']:.2f} {result['seconds']:.0f} s"

@@ -1,5 +1,6 @@
-"""What other work on the same machine costs: steps of the network and a fit of RSSI, idle and beside a loop on one core, for
-several times that threads wait for each other busily before they sleep (GOMP_SPINCOUNT).
+"""Measure the cost of other work on the same machine, for several busy-waiting times of threads (GOMP_SPINCOUNT).
+
+Steps of the network and a fit of RSSI are timed on an idle machine and beside a loop on one core.
 
 python benchmarks/busy.py
 """
@@ -27,7 +28,7 @@ ROUNDS, STEPS = 2, 20
 
 
 def measure() -> dict[str, float]:
-    """Seconds of a step of 64 spectra and of a fit of twelve receivers, in this process."""
+    """Return the seconds of a step of 64 spectra and of a fit of twelve receivers, in this process."""
     room, floor = simulated_room(128), rssi_room()
     network = AANN(Settings(room.grid), AANNConfig(steps=STEPS, batch=64))
     network.fit(Mixed.measured(room))
@@ -42,7 +43,7 @@ def measure() -> dict[str, float]:
 
 @contextmanager
 def neighbour(there: bool) -> Iterator[None]:
-    """A process that computes on one core, if there is one."""
+    """Run a process that occupies one core during the context, if asked to."""
     loop = Popen([sys.executable, "-c", "while True: pass"]) if there else None
     try:
         yield

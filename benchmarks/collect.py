@@ -1,4 +1,4 @@
-"""Keeps the metrics of a finished run: python benchmarks/collect.py RUN NAME."""
+"""Copy the metrics of a finished run into the results: python benchmarks/collect.py RUN NAME."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tasks.page.records import Records
 
 
 def collect(folder: Path, name: str) -> None:
-    """Writes the run's command, environment, metrics and the rooms it found to `results/NAME.json`."""
+    """Write command, environment, metrics and rooms of the run to `results/NAME.json`."""
     run: Records[RunMetrics] = Records(folder)
     command = shlex.join(Path(word).name if "/" in word else word for word in shlex.split(run.config["command"]))
     content: dict[str, Any] = {"command": command, "environment": run.environment, "metrics": run.metrics}

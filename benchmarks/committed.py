@@ -1,4 +1,4 @@
-"""Committed results, read back with the types of their metrics, and tables in Markdown."""
+"""Read committed results with the types of their metrics, and format tables in Markdown."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ RESULTS = ROOT / "benchmarks" / "results"
 
 
 def load(name: str) -> dict[str, Any]:
-    """One result."""
+    """Return one result."""
     content: dict[str, Any] = json.loads((RESULTS / f"{name}.json").read_text())
     return content
 
 
 def aoa_shares() -> list[tuple[str, MixMetrics, dict[str, Any]]]:
-    """Every share that tasks.aoa measured of a scene, what it found there, and the whole result, by file name and share.
+    """Return key, metrics and whole result of every measured fraction of every scene, sorted by file name and fraction.
 
-    A share that was measured again counts in its newest run.
+    Of several runs with the same fraction the newest one counts.
     """
     scenes: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {}
     for file in sorted(RESULTS.glob("aoa_*.json")):
@@ -38,16 +38,16 @@ def aoa_shares() -> list[tuple[str, MixMetrics, dict[str, Any]]]:
 
 
 def rssi_runs() -> list[RssiMetrics]:
-    """Metrics of all runs of tasks.rssi, by file name."""
+    """Return the metrics of all runs of tasks.rssi, sorted by file name."""
     return [load(file.stem)["metrics"] for file in sorted(RESULTS.glob("rssi_*.json"))]
 
 
 def markdown(columns: list[str], rows: list[list[str]]) -> str:
-    """The table in Markdown."""
+    """Return a table in Markdown."""
     lines = [columns, ["---"] * len(columns), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def interval(error: ErrorSummary) -> str:
-    """Median with its 95 % interval."""
+    """Return a median with its 95 % interval as text."""
     return f"{error['median']:.2f} [{error['low']:.2f}, {error['high']:.2f}]"

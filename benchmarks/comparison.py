@@ -1,10 +1,9 @@
-"""The paper's comparison on public data: every method on every scene, SSIM against the number of training spectra, and turbo
-learning with the spectra of several methods.
+"""Repeat the paper's comparison on public data: every method on every scene, few training spectra, and turbo learning.
 
-Hours of work that can be stopped at any time: each row is kept in the folder `--work` once it is measured, unfinished fits
-and runs go on from their state. The result holds those rows, and of the committed result those that were not measured
-again, so that a scene can be added to it. With `--scheduler` the rows are measured on the workers of a Dask cluster; each
-says on which machine, for seconds of different machines do not compare.
+The hours of work can be stopped at any time: each measured row is kept in the folder `--work`, and unfinished fits and
+runs continue from their state. Rows of the committed result that were not measured again stay in the result, so that a
+scene can be added. With `--scheduler` the workers of a Dask cluster measure the rows; each row contains its machine,
+because seconds of different machines do not compare.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import copy
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
@@ -24,20 +23,20 @@ from committed import ROOT
 from committed import load as committed
 from record import write_result
 from synthesis import load
-from torch import Tensor, nn
+from torch import Tensor
 
-from augment import SYNTHESIZERS, Settings, Synthesizer, lacks, make_synthesizer
-from augment.synthesizers.published import Published
 from swiftwrf import Spectra, simulated_room
 from swiftwrf.data.splits import validation_for
 from swiftwrf.gp import thinned
 from swiftwrf.metrics import l1, psnr, ssim, summary
+from swiftwrf.models.base import FIELD_MODELS, FieldModel, make_model
+from swiftwrf.models.nearest import MemoryModel
 from swiftwrf.runtime.durable import write_text
 from tasks.aoa.config import AoaConfig
 from tasks.aoa.experiment import run
 from tasks.cluster import Cluster, connected
 from tasks.environment import machine
-from tasks.page import figures
+from tasks.page import figures, labels
 from tasks.page.palette import Palette
 
 MEASURED = (("s23-200", "random"), ("s23-200", "block"), ("newrf-bedroom", "random"), ("newrf-office", "random"))
@@ -48,7 +47,7 @@ COUNTS = (20, 40, 80)  # training spectra of s23-200 random; all of them are in 
 SHARES = (0.1, 0.3, 0.5, 0.7)
 TURBO = ("swiftwrf", "nerf2", "wrfgs")
 JUDGES = 50  # test spectra of a scene, evenly chosen: a neural field takes seconds to draw one
-QUICKER = 5  # by how much --quick shortens fits by gradient
+QUICK_DIVISOR = 5  # of the steps of a fit by gradient under --quick
 BATCH, REPEATS = 8, 3  # spectra a call, and calls, of which a rate is the median
 CPU = torch.device("cpu")
 Row = dict[str, Any]
@@ -75,7 +74,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Measures what is not there yet and writes `results/comparison.json` (`comparison_quick.json`) and the figures."""
+    """Measure the missing rows and write `results/comparison.json` (`comparison_quick.json`) and the figures."""
     rows = config.work / ("quick" if config.quick else "rows")
     rows.mkdir(parents=True, exist_ok=True)
     began = time.perf_counter()
@@ -96,7 +95,7 @@ def main(config: Config) -> None:
 
 
 def scenes(config: Config) -> Iterator[tuple[str, Spectra, str]]:
-    """Name, spectra and split of each scene."""
+    """Yield name, spectra and split of each scene."""
     measured = MEASURED[:1] if config.quick else MEASURED
     yield from ((f"{name} {split}", load(config.data / name), split) for name, split in measured)
     yield "simulated-room random", simulated_room(), "random"
@@ -106,7 +105,7 @@ def scenes(config: Config) -> Iterator[tuple[str, Spectra, str]]:
 
 
 def numbers(scene: str, everything: int, config: Config) -> list[int]:
-    """Of training spectra to learn from."""
+    """Return the numbers of training spectra to measure."""
     found = [everything] if "scenes" in config.parts else []
     if scene == "s23-200 random" and "counts" in config.parts:
         found += COUNTS[1:2] if config.quick else COUNTS
@@ -115,14 +114,14 @@ def numbers(scene: str, everything: int, config: Config) -> list[int]:
 
 @dataclass(frozen=True)
 class Job:
-    """A row that is to be measured.
+    """A row to measure.
 
     Args:
-        file: where it is kept, without suffix.
-        method: its name.
-        n: number of training spectra.
-        split: of the scene.
-        quick: whether fits by gradient are shortened.
+        file: File of the row, without suffix.
+        method: Name of the method.
+        n: Number of training spectra.
+        split: Split of the scene.
+        quick: Whether fits by gradient are shortened.
     """
 
     file: Path
@@ -133,23 +132,25 @@ class Job:
 
     @property
     def state(self) -> Path:
-        """Of its fit, as long as that is unfinished."""
+        """File with the state of an unfinished fit."""
         return Path(f"{self.file}.state")
 
     def measure(self, train: Spectra, test: Spectra, state: Path) -> Row:
-        """The row, and where it was measured."""
+        """Return the row and the machine that measured it."""
         some = train.subset(torch.randperm(len(train), generator=torch.Generator().manual_seed(0))[: self.n])
         return row(self.method, some, test, self.split, self.quick, state) | {"machine": machine(CPU)}
 
 
 def jobs(config: Config, rows: Path) -> Iterator[tuple[Spectra, Spectra, list[Job]]]:
-    """Training and test spectra of each scene, with its rows that are not there yet."""
+    """Yield training and test spectra of each scene, with its missing rows."""
     for scene, data, split in scenes(config):
         if config.only and not scene.startswith(config.only):
             continue
         train, test = data.split(split)
         test = test.subset(*thinned(torch.arange(len(test)), rows=JUDGES))
-        methods = [method for method in (*BASELINES, *LEARNT) if method == MEAN or not lacks(method, data)]
+        methods = [
+            method for method in (*BASELINES, *LEARNT) if method == MEAN or not FIELD_MODELS[method].lacking(data)
+        ]
         wanted = [
             Job(rows / f"{scene} {n} {method}", method, n, split, config.quick)
             for n in numbers(scene, len(train), config)
@@ -159,7 +160,7 @@ def jobs(config: Config, rows: Path) -> Iterator[tuple[Spectra, Spectra, list[Jo
 
 
 def measured(jobs: Iterable[tuple[Spectra, Spectra, list[Job]]], cluster: Cluster | None) -> Iterator[tuple[Job, Row]]:
-    """Each row as it gets done, here or on a cluster, where an unfinished fit begins anew."""
+    """Yield each row when it is measured, here or on a cluster, where an interrupted fit starts from the beginning."""
     if cluster is None:
         for train, test, some in jobs:
             yield from ((job, job.measure(train, test, job.state)) for job in some)
@@ -174,13 +175,13 @@ def measured(jobs: Iterable[tuple[Spectra, Spectra, list[Job]]], cluster: Cluste
 
 
 def measure_away(job: Job, scene: tuple[Spectra, Spectra]) -> Row:
-    """On a worker."""
+    """Measure a row on a worker."""
     with TemporaryDirectory(prefix="swiftwrf-") as folder:
         return job.measure(*scene, Path(folder) / "fit.state")
 
 
 def gathered(rows: Path, earlier: Table) -> Table:
-    """All rows that are there, and the earlier ones that were not measured again."""
+    """Return all measured rows, and the earlier rows that were not measured again."""
     found = copy.deepcopy(earlier)
     for file in rows.glob("*.json"):
         scene, n, method = file.stem.rsplit(" ", 2)
@@ -196,11 +197,11 @@ def gathered(rows: Path, earlier: Table) -> Table:
 
 
 def row(method: str, train: Spectra, test: Spectra, split: str, quick: bool, state: Path) -> Row:
-    """Scores of a method at the test positions, the seconds of its fit and of a spectrum, and its size."""
+    """Return the scores of a method at the test positions, the seconds of its fit and of a spectrum, and its size."""
     began, earlier = time.perf_counter(), 0.0
 
-    def told(record: Row) -> None:
-        """A fit that goes on begins with the records of its earlier sessions."""
+    def on_record(record: Row) -> None:
+        """Add the seconds of earlier sessions, whose records a resumed fit repeats first."""
         nonlocal earlier
         earlier = max(earlier, record.get("elapsed", 0.0) - (time.perf_counter() - began))
 
@@ -211,37 +212,33 @@ def row(method: str, train: Spectra, test: Spectra, split: str, quick: bool, sta
         def synthesize(position: Tensor) -> Tensor:
             return mean.repeat(len(position), 1, 1)
     else:
-        settings = Settings(validation=validation_for(split), checkpoint=state, on_record=told)
-        synthesizer = make_synthesizer(method, settings)
-        began = time.perf_counter()  # who draws has compiled by now
-        if quick and isinstance(synthesizer, Published):
-            full = synthesizer.config()
-            synthesizer.config = lambda: replace(full, steps=full.steps // QUICKER)
-        synthesizer.fit(train)
-        synthesize, size = synthesizer.synthesize, weight(synthesizer, train, state.with_suffix(".model"))
+        model = make_model(method, validation=validation_for(split))
+        if quick and getattr(model.config, "steps", 0):
+            model = type(model)(model.config, steps=model.config.steps // QUICK_DIVISOR)
+        model.fit(train, checkpoint=state, on_record=on_record)
+        synthesize, size = model.synthesize, weight(model, train, state.with_suffix(".model"))
     fit_seconds = time.perf_counter() - began + earlier
-    drawn = synthesize(test.position)
+    predicted = synthesize(test.position)
     scores = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
-    found: Row = {name: summary(score(drawn, test.spectrum)) for name, score in scores.items()}
+    found: Row = {name: summary(score(predicted, test.spectrum)) for name, score in scores.items()}
     return (
         found | {"fit_seconds": fit_seconds, "ms": milliseconds(synthesize, test.position), "n_test": len(test)} | size
     )
 
 
-def weight(synthesizer: Synthesizer, train: Spectra, file: Path) -> Row:
-    """Numbers that were fitted and megabytes on disk; those that keep all training spectra weigh as much as these."""
-    model = synthesizer.model
-    if model is None:
+def weight(model: FieldModel, train: Spectra, file: Path) -> Row:
+    """Return the number of fitted values and the megabytes on disk; a model that stores the spectra has their size."""
+    if isinstance(model, MemoryModel):
         return {"parameters": train.spectrum.numel(), "megabytes": 4e-6 * train.spectrum.numel()}
     model.save(file)
     megabytes = file.stat().st_size / 1e6
     file.unlink()
-    fitted = model.parameters() if isinstance(model, nn.Module) else model.state()[0].values()
-    return {"parameters": sum(t.numel() for t in fitted), "megabytes": megabytes}
+    fitted = tuple(model.parameters()) or tuple(model.state()[0].values())
+    return {"parameters": sum(tensor.numel() for tensor in fitted), "megabytes": megabytes}
 
 
 def milliseconds(synthesize: Callable[[Tensor], Tensor], position: Tensor) -> dict[str, float]:
-    """A spectrum, from position to magnitudes: median, least and most of the repeats."""
+    """Return the milliseconds of a spectrum from position to magnitudes: median, minimum and maximum of the repeats."""
     position = position.repeat(-(-BATCH // len(position)), 1)[:BATCH]
     taken = []
     for _ in range(1 + REPEATS):  # the first one warms up
@@ -253,7 +250,7 @@ def milliseconds(synthesize: Callable[[Tensor], Tensor], position: Tensor) -> di
 
 
 def train_networks(config: Config) -> None:
-    """Turbo learning with the spectra of several methods, unless that is done."""
+    """Run turbo learning with the spectra of several methods, unless the run is finished."""
     out = config.work / "turbo"
     stopped = out.with_name("turbo.partial")
     if not out.exists():
@@ -264,7 +261,7 @@ def train_networks(config: Config) -> None:
 
 
 def turbo(work: Path) -> Row | None:
-    """Errors of the network on each training set at each share, if that is done."""
+    """Return the errors of the network on each training set by measured fraction. None if the run is not finished."""
     file = work / "turbo" / "metrics.json"
     if not file.exists():
         return None
@@ -279,8 +276,11 @@ def turbo(work: Path) -> Row | None:
 
 
 def draw(found: Table) -> None:
-    """Speed against error on each scene, and SSIM against the number of training spectra."""
-    folder, palette = ROOT / "docs" / "figures", Palette.of(SYNTHESIZERS.entries())
+    """Draw speed against error on each scene, and SSIM against the number of training spectra."""
+    folder, palette = (
+        ROOT / "docs" / "figures",
+        Palette({name: label.colour for name, label in labels.FIELD_MODELS.items() if label.colour}),
+    )
     panels, axes = figures.new_figure(-(-len(found) // 2), min(2, len(found)), 10, 3.4 * -(-len(found) // 2))
     for ax, (scene, by_count) in zip(axes, found.items(), strict=False):
         rows = next(iter(by_count.values()))  # all training spectra

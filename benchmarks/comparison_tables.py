@@ -1,4 +1,4 @@
-"""The tables of docs/comparison.md, with the paper's numbers beside ours."""
+"""Make the tables of docs/comparison.md, with the paper's numbers beside the measured ones."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ PAPER_TURBO = {
 
 
 def comparison() -> str:
-    """Every method on every scene with all training spectra, the best PSNR of a scene in bold."""
+    """Return every method on every scene with all training spectra, the best PSNR of a scene in bold."""
     rows = []
     for scene, by_count in load("comparison")["scenes"].items():
         n, methods = next(iter(by_count.items()))
@@ -67,7 +67,7 @@ def comparison() -> str:
 
 
 def comparison_counts() -> str:
-    """Median SSIM of every method against the number of training spectra."""
+    """Return the median SSIM of every method against the number of training spectra."""
     by_count = load("comparison")["scenes"]["s23-200 random"]
     ascending = sorted(by_count, key=int)
     methods = list(dict.fromkeys(name for rows in by_count.values() for name in rows))
@@ -80,7 +80,7 @@ def _ssim(row: dict[str, Any] | None) -> str:
 
 
 def comparison_turbo() -> str:
-    """Median errors of the network with the spectra of several methods, elevation / azimuth."""
+    """Return median errors of the network with the spectra of several methods, elevation / azimuth."""
     rows = []
     for share, arms in (load("comparison")["turbo"] or {}).items():
         for name, arm in arms.items():

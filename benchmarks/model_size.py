@@ -1,4 +1,4 @@
-"""Quality against size: fits of each number of primitives beside the one that the fit finds by itself."""
+"""Measure quality against size: fits with fixed numbers of primitives beside the number that the fit chooses."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ SIZES = (16, 32, 64, 128, 256, 512, 1024)
 @dataclass(frozen=True)
 class Config:
     data: Path | None = None
-    """the folder that holds s23-200, newrf-bedroom and newrf-office; without it only the simulated room"""
+    """folder with s23-200, newrf-bedroom and newrf-office. Defaults to the simulated room alone"""
     seed: int = 0
     scheduler: str | None = None
     """address of a Dask scheduler whose workers compute the fits (extra: cluster)"""
 
 
 def main(config: Config) -> None:
-    """Fits every size on every scene."""
+    """Fit every size on every scene and write `results/model_size.json`."""
     scenes: dict[str, tuple[Spectra, str]] = {"simulated-room random": (simulated_room(), "random")}
     if config.data is not None:
         scenes |= {f"{name} {split}": (load_spectra(config.data / name), split) for name, split in SCENES}
@@ -45,7 +45,7 @@ def main(config: Config) -> None:
 
 
 def measure(name: str, data: Spectra, split: str, seed: int, parallel: Map) -> dict[str, Any]:
-    """One fit of each size, and the one that chooses."""
+    """Return the fit that chooses its size, and one fit of each size."""
     train, test = data.split(split, seed)
     sizes = (*SIZES, None)  # the first fit of a process bears what is done once
     results = []
@@ -59,7 +59,7 @@ def measure(name: str, data: Spectra, split: str, seed: int, parallel: Map) -> d
 
 
 def fitted(train: Spectra, test: Spectra, validation: Validation, seed: int, n: int | None) -> dict[str, Any]:
-    """How well a fit with so many primitives, or as many as it finds, draws the test spectra."""
+    """Return size, test scores and seconds of a fit with `n` primitives, or with the number that it chooses."""
     config = FitConfig(
         model=ModelConfig() if n is None else ModelConfig(n_primitives=n), validation=validation, seed=seed
     )

@@ -1,4 +1,4 @@
-"""What own files cost to read, and how well an array is calibrated from them: the targets of docs/formats.md.
+"""Measure the time to read own files, and the accuracy of an array calibration from them.
 
 python benchmarks/own_files.py
 """
@@ -32,7 +32,7 @@ ECHOES, DRAWS = (0.0, 0.05, 0.1, 0.2), 5
 
 
 def survey(folder: Path) -> dict[str, Any]:
-    """A CSV of 5,000 rows and 12 receivers to a map, in one command; the time of the whole process."""
+    """Return the time of one command from a CSV of 5,000 rows and 12 receivers to a map."""
     data = rssi_room(n=ROWS)
     table = pd.DataFrame(data.transmitter_position.numpy(), columns=list("xyz"))
     for number, name in enumerate(data.receiver_names):
@@ -52,7 +52,7 @@ def survey(folder: Path) -> dict[str, Any]:
 
 
 def spectra(folder: Path) -> list[dict[str, Any]]:
-    """Snapshots of 16 elements on disk to spectra of 90 x 360 pixels."""
+    """Return the time from snapshots of 16 elements on disk to spectra of 90 x 360 pixels, for each beamformer."""
     write_snapshots(folder / "snapshots", data=snapshots(n=POSITIONS, count=SNAPSHOTS))
     rows = []
     for name in BEAMFORMERS:
@@ -64,8 +64,10 @@ def spectra(folder: Path) -> list[dict[str, Any]]:
 
 
 def calibration() -> list[dict[str, Any]]:
-    """Phases of 0 to 2 pi and a turn of 20 degrees, from 300 positions at 14 dB, with an echo from the floor; medians and
-    largest errors [deg] over draws of noise, phases and turn."""
+    """Return median and largest errors [deg] of calibrations over draws of noise, element phases and rotation.
+
+    The phases are 0 to 2 pi, the rotation is 20 degrees; 300 positions at 14 dB, with an echo from the floor.
+    """
     rows = []
     for echo in ECHOES:
         found = []
@@ -88,7 +90,7 @@ def calibration() -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Measures and writes."""
+    """Measure everything and write `results/own_files.json`."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         content = {"survey": survey(folder), "spectra": spectra(folder), "calibration": calibration()}

@@ -1,4 +1,4 @@
-"""What every benchmark's result says beside its numbers."""
+"""Write the result of a benchmark with the command and the machine that measured it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RESULTS = Path(__file__).parent / "results"
 def write_result(
     name: str, content: dict[str, Any], device: torch.device | None = None, folder: Path = RESULTS
 ) -> None:
-    """Writes `NAME.json` into the folder: strict JSON with the command and where it ran (`device`, by default the CPU)."""
+    """Write `NAME.json` into the folder, as strict JSON with the command and the environment of `device` (default: CPU)."""
     folder.mkdir(parents=True, exist_ok=True)
     command = shlex.join(["python", *(Path(a).name if Path(a).exists() else a for a in sys.argv)])
     record = {"command": command, "environment": environment(device or torch.device("cpu"), {}), **content}

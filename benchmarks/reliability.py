@@ -1,4 +1,4 @@
-"""How readers, commands and runs end when everything goes wrong: the long version of tests/fuzz and tests/test_interrupts.
+"""Attack readers, commands and runs and record how they end: the long version of tests/fuzz and tests/test_interrupts.
 
 python benchmarks/reliability.py [--mutations 10000 --commands 200 --right 20 --kills 50 --disks 10 --races 5]
 """
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def mutations(root: Path, count: int) -> dict[str, Any]:
-    """Of every reader and model file; seeds that the tests do not use."""
+    """Mutate the files of every reader and model, with seeds that the tests do not use."""
     ends: dict[str, Any] = {}
     for kind in KINDS:
         seeds = range(SHORT, SHORT + -(-count // len(KINDS)))
@@ -62,7 +62,7 @@ def mutations(root: Path, count: int) -> dict[str, Any]:
 
 
 def commands(folder: Path, lines: CommandLines, count: int) -> dict[str, int]:
-    """Command lines in this process; exit codes, and tracebacks as wrong."""
+    """Run command lines in this process; count exit codes, and tracebacks as wrong."""
     ends = {"exit 0": 0, "exit 1": 0, "exit 2": 0, "wrong": 0}
     folder.mkdir()
     with contextlib.chdir(folder):
@@ -81,7 +81,7 @@ def commands(folder: Path, lines: CommandLines, count: int) -> dict[str, int]:
 
 
 def kills(root: Path, count: int) -> dict[str, int]:
-    """SIGKILL at random moments, then --resume, until the tables can be compared with those of whole runs."""
+    """Kill runs at random moments and resume them, until their tables can be compared with those of whole runs."""
     draw, ends = random.Random(3), {"kills": 0, "runs": 0, "wrong": 0}
     wholes = {asked: interrupts.whole_run(root / asked[0], asked) for asked in (interrupts.RSSI, interrupts.AOA)}
     while ends["kills"] < count:
@@ -101,7 +101,7 @@ def kills(root: Path, count: int) -> dict[str, int]:
 
 
 def disks(root: Path, count: int) -> dict[str, int]:
-    """No file may grow beyond a random size; then it may, and the run goes on."""
+    """Limit the size of files at random, then resume the run without the limit."""
     draw, wrong = random.Random(4), 0
     for number in range(count):
         try:
@@ -114,7 +114,7 @@ def disks(root: Path, count: int) -> dict[str, int]:
 
 
 def races(root: Path, count: int) -> dict[str, int]:
-    """Two processes with one --out."""
+    """Start two processes with the same --out."""
     wrong = 0
     for number in range(count):
         try:

@@ -1,6 +1,6 @@
-"""How the time and memory of the RSSI model grow with rows and receivers, on the simulated floor.
+"""Measure time and memory of the RSSI model against rows and receivers, on the simulated floor.
 
-Each point runs in a process of its own, so that its peak is its own; seconds are those of the processor.
+Each point runs in a separate process, for its own peak of memory. Seconds are processor time.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ class Config:
 
 
 def widen(data: Rssi, n: int) -> Rssi:
-    """The same floor with every receiver repeated under new names until there are n."""
+    """Return the floor with its receivers repeated under new names until there are n."""
     columns = [i % len(data.receiver_names) for i in range(n)]
     return replace(data.columns(columns), receiver_names=tuple(f"r{i}" for i in range(n)))
 
 
 def measure(n: int, receivers: int) -> dict[str, float]:
-    """Fits and predicts at one size, in this process."""
+    """Fit and predict at one size, in this process."""
     data = widen(rssi_room(n=n), receivers)
     found: dict[str, float] = {"rows": n, "receivers": receivers}
     with measuring(found, "fit "):
@@ -47,7 +47,7 @@ def measure(n: int, receivers: int) -> dict[str, float]:
 
 
 def main(config: Config) -> None:
-    """Measures each point."""
+    """Measure each point and write `results/scaling_rssi.json`."""
     kept = RESULTS / "scaling_rssi.json"
     rows = json.loads(kept.read_text())["rows"] if kept.is_file() else []
     for n, receivers in config.points:

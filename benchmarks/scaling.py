@@ -1,8 +1,8 @@
-"""How time and memory grow with the number of spectra, on a dense walk through the simulated room.
+"""Measure time and memory against the number of spectra, on a dense walk through the simulated room.
 
-Every stage of every size runs in a process of its own, so that its peak is its own. `rss_gib` is the peak of everything
-resident; that counts the pages of the file of spectra that were looked at, which the system takes back whenever somebody
-else needs the memory. `anonymous_gib` is the peak of what cannot be taken back.
+Every stage of every size runs in a separate process, for its own peak of memory. `rss_gib` is the peak of resident
+memory. It includes the pages of the memory-mapped file of spectra, which the system reclaims when needed. `anonymous_gib`
+is the peak of memory that it cannot reclaim.
 """
 
 from __future__ import annotations
@@ -27,19 +27,20 @@ import tyro
 from committed import RESULTS, ROOT
 from record import write_result
 
-from augment import Mixed, Settings, make_synthesizer
+from augment import Mixed
 from swiftwrf import AngularGrid, Spectra, load_spectra, simulated_room
 from swiftwrf.data.simulated.spectra import REGION
 from swiftwrf.data.store import stored
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import psnr
+from swiftwrf.models.base import make_model
 from tasks.aoa.estimators import Settings as EstimatorSettings
 from tasks.aoa.estimators.aann import AANN, AANNConfig
 from tasks.page import figures
 
 GRID = AngularGrid.hemisphere(90, 360)
 SIZES = (300, 1_000, 10_000, 100_000)
-SYNTHESIZERS = ("swiftwrf", "coarray", "gp")
+MODELS = ("swiftwrf", "coarray", "gp")
 STEP = 0.01  # [m] between two spectra: a person who walks, a hundred spectra a second
 TURNS = (0.91, 0.37, 0.73)  # [rad / m] of the walk along x, y and z, which never comes back to its beginning
 AT_ONCE = 2048  # spectra that are simulated together
@@ -53,13 +54,13 @@ MOST_GIB = 6  # that any stage may take
 @dataclass(frozen=True)
 class Config:
     sizes: tuple[int, ...] = SIZES
-    """numbers of spectra; results of other sizes that were measured before are kept"""
+    """numbers of spectra. Earlier results of other sizes are kept"""
     folder: Path | None = None
-    """for the data, with room for three times their size; a temporary one unless given"""
+    """folder for the data, with space for three times their size. Defaults to a temporary one"""
 
 
 def main(config: Config) -> None:
-    """Measures each stage of each size."""
+    """Measure each stage of each size, write `results/scaling.json` and draw the figure."""
     kept = RESULTS / "scaling.json"
     rows = {row["n"]: row for row in json.loads(kept.read_text())["rows"]} if kept.is_file() else {}
     for n in config.sizes:
@@ -71,7 +72,7 @@ def main(config: Config) -> None:
 
 
 def run(stage: str, n: int, folder: str) -> dict[str, float]:
-    """One stage in a process of its own."""
+    """Run one stage in a separate process."""
     os.environ["XDG_CACHE_HOME"] = folder
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as fresh:
         found = fresh.submit(measure, stage, Path(folder), n).result()
@@ -80,7 +81,7 @@ def run(stage: str, n: int, folder: str) -> dict[str, float]:
 
 
 def slopes(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Exponent of the growth of each stage's seconds between neighbouring sizes: 1 is linear."""
+    """Return the exponent of the growth of each stage's seconds between neighbouring sizes; 1 is linear."""
     found: dict[str, dict[str, float]] = {}
     for small, large in pairwise(rows):
         for stage, values in large["stages"].items():
@@ -91,7 +92,7 @@ def slopes(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
 
 
 def draw(rows: list[dict[str, Any]]) -> None:
-    """Seconds and peak memory of the stages against the number of spectra."""
+    """Draw seconds and peak memory of the stages against the number of spectra."""
     panels, (time_axis, memory_axis) = figures.new_figure(1, 2, 9, 3.4)
     sizes = [row["n"] for row in rows]
     for number, stage in enumerate(STAGES):
@@ -113,14 +114,14 @@ def draw(rows: list[dict[str, Any]]) -> None:
 
 
 def walk(at: torch.Tensor) -> torch.Tensor:
-    """Positions (n, 3) [m] in the room's region after so many spectra (n,) of the walk."""
+    """Return positions (n, 3) [m] in the room's region at spectrum numbers (n,) of the walk."""
     low, high = torch.tensor(REGION, dtype=torch.float64)
     turned = at.double()[:, None] * STEP * torch.tensor(TURNS, dtype=torch.float64)
     return (low + high) / 2 + (high - low) / 2 * torch.sin(turned)
 
 
 def simulated(at: torch.Tensor) -> Spectra:
-    """Spectra of the walk in eight bits, as images have them; made by the batch straight into their store."""
+    """Return spectra of the walk in the eight bits of images, simulated in batches directly into their store."""
     position = walk(at)
     parts = position.split(AT_ONCE)
 
@@ -134,13 +135,13 @@ def simulated(at: torch.Tensor) -> Spectra:
 
 
 def between(n: int) -> torch.Tensor:
-    """Where spectra are synthesized: evenly along the walk, half-way between two measured ones."""
+    """Return spectrum numbers of the test positions: evenly along the walk, half-way between measured ones."""
     return torch.linspace(0, n - 2, DRAWN).floor() + 0.5
 
 
 @contextmanager
 def measuring(found: dict[str, float], part: str = "") -> Iterator[None]:
-    """Notes processor time, and the peaks of memory so far."""
+    """Record processor time and peak memory of the context."""
     began, before = time.perf_counter(), time.process_time()
     ended = threading.Event()
     peak = [0]
@@ -160,13 +161,13 @@ def measuring(found: dict[str, float], part: str = "") -> Iterator[None]:
 
 
 def status(name: str) -> int:
-    """A size that the kernel tells of this process [KiB]."""
+    """Return an entry of the status of this process [KiB]."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
 
 
 def generate(folder: Path, n: int, found: dict[str, float]) -> None:
-    """Writes the walk, and the spectra between its positions."""
+    """Write the walk, and the spectra between its positions."""
     with measuring(found):
         for name, at in (("walk", torch.arange(n)), ("between", between(n))):
             (folder / name).mkdir()
@@ -174,28 +175,28 @@ def generate(folder: Path, n: int, found: dict[str, float]) -> None:
 
 
 def load(folder: Path, n: int, found: dict[str, float]) -> None:
-    """Opens the walk."""
+    """Open the walk."""
     with measuring(found):
         assert len(load_spectra(folder / "walk")) == n
 
 
-def synthesizing(name: str) -> Callable[[Path, int, dict[str, float]], None]:
-    """The stage of one synthesizer."""
+def predicting(name: str) -> Callable[[Path, int, dict[str, float]], None]:
+    """Return the stage that fits one field model and predicts with it."""
 
     def stage(folder: Path, n: int, found: dict[str, float]) -> None:
         data, unseen = load_spectra(folder / "walk"), load_spectra(folder / "between")
-        synthesizer = make_synthesizer(name, Settings(progress=False))
+        model = make_model(name)
         with measuring(found, "fit "):
-            synthesizer.fit(data)
+            model.fit(data)
         with measuring(found, "synthesize "):
-            drawn = synthesizer.synthesize(unseen.position)
-        found["psnr_db"] = float(psnr(drawn, unseen.spectrum).median())
+            predicted = model.synthesize(unseen.position)
+        found["psnr_db"] = float(psnr(predicted, unseen.spectrum).median())
 
     return stage
 
 
 def train(folder: Path, n: int, found: dict[str, float]) -> None:
-    """A few steps of the network."""
+    """Train the network for a few steps."""
     data = load_spectra(folder / "walk")
     network = AANN(EstimatorSettings(data.grid), AANNConfig(steps=TRAINING_STEPS))
     with measuring(found):
@@ -206,13 +207,13 @@ STAGES: dict[str, Callable[[Path, int, dict[str, float]], None]] = {
     "generate": generate,
     "load first": load,
     "load again": load,
-    **{name: synthesizing(name) for name in SYNTHESIZERS},
+    **{name: predicting(name) for name in MODELS},
     "train": train,
 }
 
 
 def measure(stage: str, folder: Path, n: int) -> dict[str, float]:
-    """Times and peaks of a stage, in this process."""
+    """Return times and memory peaks of a stage, in this process."""
     found: dict[str, float] = {}
     STAGES[stage](folder, n, found)
     return {key: round(value, 3) for key, value in found.items()}

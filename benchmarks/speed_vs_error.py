@@ -1,7 +1,8 @@
-"""Speed against error: for every setting the seconds a spectrum takes and how wrong it is, with the Pareto front.
+"""Measure speed against error of every setting: seconds a spectrum, and its error.
 
-Two errors. *Numerical*: against the exact float64 drawing of the same model, for settings that only change how it is drawn.
-*Held-out*: against measured spectra that no model saw, for all. Both are RMS over pixels, the median over spectra.
+The numerical error is the difference to the exact float64 rendering of the same model, for settings that change the
+rendering only. The held-out error is the difference to measured test spectra. Both are RMS over pixels, and the median over
+spectra.
 """
 
 from __future__ import annotations
@@ -18,23 +19,23 @@ from record import write_result
 from synthesis import load
 from torch import Tensor
 
-from augment import SYNTHESIZERS, Settings, make_synthesizer
 from swiftwrf import (
     AngularGrid,
+    CoarrayModel,
     FitConfig,
     ModelConfig,
     Spectra,
     SwiftWRF,
     fit,
-    fit_coarray,
     project,
     simulated_room,
 )
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import psnr
+from swiftwrf.models.base import make_model
 from swiftwrf.rasterize import Maker, prepare, rasterize_magnitude
-from tasks.page import figures
+from tasks.page import figures, labels
 from tasks.page.palette import Palette
 
 CUTOFFS = (None, 1e-5, 1e-4, 1e-3, 1e-2)
@@ -46,19 +47,19 @@ Point = dict[str, Any]
 @dataclass(frozen=True)
 class Config:
     data: Path | None = None
-    """a folder of spectra; without it the simulated room"""
+    """folder of spectra. Defaults to the simulated room"""
     split: str = "random"
     name: str | None = None
-    """of the result (default: that of the data)"""
+    """name of the result. Defaults to that of the data"""
     array: tuple[int, float, float] | None = None
     """square array that took the spectra, where the data do not say: elements a side, spacing [m], carrier [Hz]"""
     seconds: float = 1.0
-    """for the repeats of one rate; at least 3, at most 30 of them"""
+    """seconds for the repeats of one rate, of which there are 3 to 30"""
     seed: int = 0
 
 
 def main(config: Config) -> None:
-    """Measures every setting, writes `results/speed_NAME.json` and draws `docs/figures/speed_NAME.svg`."""
+    """Measure every setting, write `results/speed_NAME.json` and draw `docs/figures/speed_NAME.svg`."""
     data = load(config.data) if config.data else simulated_room(seed=config.seed)
     if config.array is not None:
         side, spacing, frequency = config.array
@@ -80,7 +81,7 @@ def main(config: Config) -> None:
 
 
 class Study:
-    """One scene, with the model that the default fit finds for it."""
+    """One scene and the model that the default fit finds for it."""
 
     def __init__(self, train: Spectra, test: Spectra, config: Config) -> None:
         self.train, self.test, self.seconds = train, test, config.seconds
@@ -95,7 +96,7 @@ class Study:
         self.config = replace(self.config, model=self.model.config)
 
     def rate(self, synthesize: Callable[[Tensor], Tensor]) -> dict[str, float]:
-        """Seconds a spectrum, from positions to magnitudes: median, least and most of the repeats."""
+        """Return the seconds of a spectrum from positions to magnitudes: median, minimum and maximum of the repeats."""
         position = self.test.position.repeat(-(-BATCH // len(self.test)), 1)[:BATCH]
 
         def once() -> float:
@@ -109,7 +110,7 @@ class Study:
         return {"median": taken[repeats // 2], "low": taken[0], "high": taken[-1]}
 
     def point(self, setting: str, synthesize: Callable[[Tensor], Tensor], fit_seconds: float, **more: Any) -> Point:
-        """Of a synthesizer on the grid of the data."""
+        """Return time and error of a model on the grid of the data."""
         drawn = synthesize(self.test.position)
         result = {
             "setting": setting,
@@ -123,7 +124,7 @@ class Study:
         return result
 
     def drawing(self) -> list[Point]:
-        """The default model, drawn in every way; the exact one first."""
+        """Return the default model rendered with every setting, the exact one first."""
         points: list[Point] = []
         own_grid = self.train.grid
         others = [AngularGrid.hemisphere(*shape) for shape in GRIDS if shape != own_grid.shape]
@@ -159,7 +160,7 @@ class Study:
     def _drawer(
         self, grid: AngularGrid, maker: Maker, cutoff: float | None, dtype: torch.dtype
     ) -> Callable[[Tensor], Tensor]:
-        """Positions to magnitudes with the default model; weights are rounded to `dtype`, all is float64 if that is."""
+        """Return the rendering of the default model with weights rounded to `dtype`; float64 applies to all tensors."""
         wide = dtype == torch.float64
 
         @torch.no_grad()
@@ -179,7 +180,7 @@ class Study:
         return synthesize
 
     def models(self) -> list[Point]:
-        """Other models of the same family with the length of fit that the default found."""
+        """Return the default model and variants of its size, deformation and covariance."""
         size, rank = self.model.config.size
         parameters = sum(p.numel() for p in self.model.parameters())
         points = [
@@ -205,21 +206,20 @@ class Study:
         return points
 
     def others(self) -> list[Point]:
-        """The other synthesizers, and projections onto what the array can produce."""
+        """Return the other field models, and projections onto the spectra that the array can produce."""
         array, grid, points = self.train.array, self.train.grid, []
-        for name in ("nearest", "idw", "gp"):
-            synthesizer = make_synthesizer(name, Settings(validation=self.validation, seed=self.seed))
+        models = {}
+        for name in ("nearest", "idw", "gp", *(("coarray",) if array else ())):
+            model = models[name] = make_model(name, validation=self.validation, seed=self.seed)
             began = time.perf_counter()
-            synthesizer.fit(self.train)
-            points.append(self.point(name, synthesizer.synthesize, time.perf_counter() - began))
+            model.fit(self.train)
+            seconds = time.perf_counter() - began
+            more = {"parameters": model.n_parameters} if isinstance(model, CoarrayModel) else {}
+            points.append(self.point(name, model.synthesize, seconds, **more))
         if array is None:
             return points
-        began = time.perf_counter()
-        coarray = fit_coarray(self.train, validation=self.validation, seed=self.seed)
-        seconds = time.perf_counter() - began
-        points.append(self.point("coarray", coarray.synthesize, seconds, parameters=coarray.n_parameters))
-        stretched = float(coarray.offset) > 1e-3
-        for name, synthesize in (("swiftwrf, default", self.model.synthesize), ("gp", synthesizer.synthesize)):
+        stretched = float(models["coarray"].offset) > 1e-3
+        for name, synthesize in (("swiftwrf, default", self.model.synthesize), ("gp", models["gp"].synthesize)):
 
             def projected(position: Tensor, synthesize: Callable[[Tensor], Tensor] = synthesize) -> Tensor:
                 return project(synthesize(position), array, grid, stretched=stretched)
@@ -229,14 +229,14 @@ class Study:
 
 
 def rms(drawn: Tensor, truth: Tensor) -> float:
-    """Root of the mean square over pixels, median over spectra."""
+    """Return the RMS difference over pixels, and its median over spectra."""
     return float((drawn.double() - truth.double()).square().mean(dim=(-2, -1)).sqrt().median())
 
 
 def draw(content: dict[str, Any], file: Path) -> None:
-    """Numerical and held-out error against seconds a spectrum, log-log, with the fronts."""
+    """Draw numerical and held-out error against seconds a spectrum, with the Pareto fronts."""
     figure, axes = figures.new_figure(1, 2, 10.5, 4.2)
-    palette = Palette.of(SYNTHESIZERS.entries())
+    palette = Palette({name: label.colour for name, label in labels.FIELD_MODELS.items() if label.colour})
     own = [p for p in content["drawing"] if p["own_grid"]]
     short = {p["setting"]: p["setting"].rsplit(", ", 1)[0] for p in own}
     numerical = {short[p["setting"]]: (p["seconds"]["median"], max(p["numerical"], 1e-9)) for p in own}

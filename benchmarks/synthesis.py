@@ -1,4 +1,4 @@
-"""How well each synthesizer draws spectra at positions that it has not seen, and how long it takes."""
+"""Measure how well each field model predicts spectra at unseen positions, and the time it takes."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from typing import Any
 import tyro
 from record import write_result
 
-from augment import Settings, make_synthesizer
 from swiftwrf import Spectra, load_spectra, project, simulated_room
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.splits import TEST_SHARE, block_split, validation_for
 from swiftwrf.metrics import covered, l1, psnr, ssim, summary
+from swiftwrf.models.base import make_model
 
-S23_ARRAY = PlanarArray.square(4, 915e6, spacing=0.16)  # which the files of s23-200 do not describe
+S23_ARRAY = PlanarArray.square(4, 915e6, spacing=0.16)  # the files of s23-200 do not describe it
 SCENES = (("s23-200", "random"), ("s23-200", "block"), ("newrf-bedroom", "random"), ("newrf-office", "random"))
 
 
 @dataclass(frozen=True)
 class Config:
     data: Path
-    """the folder that holds s23-200, newrf-bedroom and newrf-office"""
+    """folder with s23-200, newrf-bedroom and newrf-office"""
     scenes: tuple[str, ...] = ()
-    """only these data sets"""
+    """data sets to measure. Defaults to all of them and the simulated room"""
     seed: int = 0
 
 
 def main(config: Config) -> None:
-    """Measures every synthesizer on every scene."""
+    """Measure every field model on every scene and write `results/synthesis.json`."""
     chosen = [(name, split) for name, split in SCENES if not config.scenes or name in config.scenes]
     results = {f"{name} {split}": measure(load(config.data / name), split, config.seed) for name, split in chosen}
     slabs = {}
@@ -42,31 +42,31 @@ def main(config: Config) -> None:
 
 
 def load(folder: Path) -> Spectra:
-    """The spectra, with the array that took them."""
+    """Load spectra with the array that measured them."""
     data = load_spectra(folder)
     return replace(data, array=S23_ARRAY) if data.name.startswith("s23") else data
 
 
 def measure(data: Spectra, split: str, seed: int) -> dict[str, Any]:
-    """Scores of each synthesizer, of the mean training spectrum, and of SwiftWRF projected onto what the array can
-    produce, at the test positions."""
+    """Return the scores at the test positions of each field model, of the mean training spectrum, and of SwiftWRF projected
+    onto the spectra that the array can produce."""
     train, test = data.split(split, seed)
-    drawn = {"mean": train.spectrum.mean(dim=0).expand_as(test.spectrum)}
+    predicted = {"mean": train.spectrum.mean(dim=0).expand_as(test.spectrum)}
     seconds: dict[str, dict[str, float]] = {}
     inside: dict[str, float] = {}
     for name in ("nearest", "idw", "gp", "coarray", "swiftwrf"):
-        synthesizer = make_synthesizer(name, Settings(validation=validation_for(split), seed=seed))
+        model = make_model(name, validation=validation_for(split), seed=seed)
         began = time.perf_counter()
-        synthesizer.fit(train)
+        model.fit(train)
         fitted = time.perf_counter()
-        drawn[name] = synthesizer.synthesize(test.position)
+        predicted[name] = model.synthesize(test.position)
         seconds[name] = {"fit": fitted - began, "synthesize": time.perf_counter() - fitted}
-        deviation = synthesizer.deviation(test.position)
-        if deviation is not None:
-            inside[name] = float(covered(drawn[name], deviation, test.spectrum).mean())
+        std = model.predict(test.position).std
+        if std is not None:
+            inside[name] = float(covered(predicted[name], std, test.spectrum).mean())
     if train.array is not None:
         stretched = data.name.startswith("s23")
-        drawn["swiftwrf, projected"] = project(drawn["swiftwrf"], train.array, train.grid, stretched=stretched)
+        predicted["swiftwrf, projected"] = project(predicted["swiftwrf"], train.array, train.grid, stretched=stretched)
     scores = {
         name: {
             "ssim": summary(ssim(spectrum, test.spectrum)),
@@ -75,7 +75,7 @@ def measure(data: Spectra, split: str, seed: int) -> dict[str, Any]:
             "seconds": seconds.get(name),
             "covered_by_80": inside.get(name),
         }
-        for name, spectrum in drawn.items()
+        for name, spectrum in predicted.items()
     }
     for name, score in scores.items():
         print(
@@ -86,18 +86,18 @@ def measure(data: Spectra, split: str, seed: int) -> dict[str, Any]:
 
 
 def covered_slabs(data: Spectra) -> list[float]:
-    """Share of the pixels that lie in SwiftWRF's 80 % intervals, of each slab that the others draw: a single slab, as a
-    block split has it, says little of how well they are calibrated."""
-    shares = []
+    """Return the fraction of pixels inside SwiftWRF's 80 % intervals for each slab, predicted from the other slabs.
+
+    The single slab of a block split is too little to judge the calibration by.
+    """
+    fractions = []
     for slab in range(round(1 / TEST_SHARE)):
         train, test = map(data.subset, block_split(data.position, slab))
-        synthesizer = make_synthesizer("swiftwrf", Settings(validation="block"))
-        synthesizer.fit(train)
-        deviation = synthesizer.deviation(test.position)
-        assert deviation is not None
-        shares.append(float(covered(synthesizer.synthesize(test.position), deviation, test.spectrum).mean()))
-    print(f"{data.name}, slabs covered: {' '.join(f'{share:.0%}' for share in shares)}", flush=True)
-    return shares
+        predicted = make_model("swiftwrf", validation="block").fit(train).predict(test.position)
+        assert predicted.std is not None
+        fractions.append(float(covered(predicted.mean, predicted.std, test.spectrum).mean()))
+    print(f"{data.name}, slabs covered: {' '.join(f'{fraction:.0%}' for fraction in fractions)}", flush=True)
+    return fractions
 
 
 if __name__ == "__main__":

@@ -1,8 +1,7 @@
-"""The tables of README and docs from the committed results: python benchmarks/tables.py rewrites them in place."""
+"""Rewrite the tables of README and docs from the committed results: python benchmarks/tables.py."""
 
 from __future__ import annotations
 
-import json
 import re
 import statistics
 from typing import Any
@@ -10,14 +9,14 @@ from typing import Any
 from committed import RESULTS, ROOT, aoa_shares, interval, load, markdown, rssi_runs
 from comparison_tables import comparison, comparison_counts, comparison_turbo
 from geometry import SIDES, WALLS, nearest
+from speed_tables import busy, drawing, scaling, scaling_quality, scaling_rssi, size, speed
 from targets import aoa_targets, rssi_targets, synthesis_targets
 
 from tasks.aoa.arms import taken
-from tasks.summarise import pareto
 
 
 def synthesis() -> str:
-    """Median SSIM and PSNR of each synthesizer on each scene."""
+    """Return median SSIM and PSNR of each field model on each scene."""
     rows = []
     for scene, result in load("synthesis")["scenes"].items():
         scores = result["synthesizers"]
@@ -28,7 +27,7 @@ def synthesis() -> str:
 
 
 def aoa() -> str:
-    """Median great-circle errors of the arms of each run; turbo: with further positions where there are any."""
+    """Return median angular errors of the conditions of each run."""
     fixed = ("nearest_spectrum", "kernel_ridge", "measured_only")
     columns = [
         "scene, split, moving end",
@@ -56,7 +55,7 @@ def _drawn_by(arm: str) -> str:
 
 
 def reliability() -> str:
-    """How everything ended that was attacked."""
+    """Return how each kind of attack ended."""
     done = load("reliability")
     ends = done["mutations"].values()
     read, refused, wrong = (sum(end.get(key, 0) for end in ends) for key in ("read", "refused", "wrong"))
@@ -77,7 +76,7 @@ def reliability() -> str:
 
 
 def headline() -> str:
-    """What turbo learning gains in each scene with 30 % of the positions measured."""
+    """Return the gain of turbo learning in each scene with 30 % of the positions measured."""
     rows = []
     for share, mix, result in aoa_shares():
         if share != "0.3":
@@ -94,7 +93,7 @@ def headline() -> str:
 
 
 def room() -> str:
-    """The planes that each run found, whose true places are known."""
+    """Return the errors of the planes that each run found, where the true ones are known."""
     methods, rows = ("geometry", "hybrid", "coarray", "gp"), []
     for share, mix, result in aoa_shares():
         found, walls = result.get("geometry", {}).get(share), WALLS.get(result["metrics"]["data"])
@@ -110,7 +109,7 @@ def room() -> str:
 
 
 def walls() -> str:
-    """The planes that geometry found in several draws of the measured share."""
+    """Return the errors of the planes that geometry found in several draws of the measured fraction."""
     rows = []
     for case, found in load("geometry")["cases"].items():
         scene, moving, _, draw = case.split(", ")
@@ -126,7 +125,7 @@ def walls() -> str:
 
 
 def random_rooms() -> str:
-    """How many of the random rooms are found, and what is called certain of them."""
+    """Return how many of the random rooms are found, and how many planes are called certain."""
     rows = []
     for case, rooms in load("random_rooms")["rooms"].items():
         kind, noise = case.split(", ")
@@ -149,7 +148,7 @@ def _millimetres(plane: dict[str, Any] | None) -> str:
 
 
 def rssi() -> str:
-    """Median and 90 % of the absolute errors of each predictor, and the interval's coverage."""
+    """Return median and 90 % quantile of the absolute errors of each predictor, and the coverage of the interval."""
     methods = ("mean", "mri_pooled", "mri_receiver", "mri_residual", "knn", "gp", "swiftwrf", "blend")
     rows = []
     for metrics in rssi_runs():
@@ -160,7 +159,7 @@ def rssi() -> str:
 
 
 def floor() -> str:
-    """How far `swiftwrf` and the blend are from the best baseline of each run on the built-in floor."""
+    """Return the difference of `swiftwrf` and the blend to the best baseline of each run on the built-in floor."""
     own, rows = ("swiftwrf", "blend"), []
     for file in sorted(RESULTS.glob("floor_*.json")):
         metrics = load(file.stem)["metrics"]
@@ -171,36 +170,8 @@ def floor() -> str:
     return markdown(["seed", "best baseline [dB]", *own], rows)
 
 
-def size() -> str:
-    """What the fit chose beside the best of all sizes."""
-    rows = []
-    for scene, result in load("model_size")["scenes"].items():
-        auto, fixed = result["auto"], result["fixed"]
-        quality = {entry["n_primitives"]: entry["psnr_db"]["median"] for entry in fixed}
-        best = max(quality, key=lambda n: quality[n])
-        enough = next(entry for entry in fixed if entry["psnr_db"]["median"] >= quality[best] - 0.1)
-        rows.append(
-            [
-                scene,
-                f"{auto['n_primitives']}, {auto['rank']}",
-                f"{auto['psnr_db']['median']:.2f}",
-                f"{min(quality.values()):.2f} to {quality[best]:.2f} ({best})",
-                str(enough["n_primitives"]),
-                f"{auto['parameters'] / enough['parameters']:.1f}",
-                f"{auto['seconds']:.1f} s",
-                f"{auto['processor_seconds'] / _at(fixed, auto['n_primitives'])['processor_seconds']:.1f}",
-            ]
-        )
-    columns = ["scene, split", "N, K", "PSNR [dB]", "of N = 16 ... 1024 (best)", "smallest within 0.1 dB"]
-    return markdown([*columns, "parameters over its", "time", "time over that of a fit of fixed N"], rows)
-
-
-def _at(fixed: list[dict[str, Any]], n: int) -> dict[str, Any]:
-    return next(entry for entry in fixed if entry["n_primitives"] == n)
-
-
 def hard_cases() -> str:
-    """The worst over cutoffs of each maker in each case."""
+    """Return the largest errors over cutoffs of each backend in each case."""
     found: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for row in load("stability_cpu")["makers"]:
         found.setdefault(row["case"], {}).setdefault(row["maker"], []).append(row)
@@ -216,13 +187,13 @@ def hard_cases() -> str:
 
 
 def precision() -> str:
-    """What rounding costs."""
+    """Return the errors of rounded numbers."""
     rows = [[row["what"], f"{row['error']:.0e}", f"{row['psnr_db']:.0f}"] for row in load("stability_cpu")["precision"]]
     return markdown(["what is rounded", "largest error of \\|A\\| over the largest", "PSNR [dB]"], rows)
 
 
 def hard_fits() -> str:
-    """How each hard fit ended."""
+    """Return how each hard fit ended."""
     rows = []
     for row in load("stability_cpu")["fits"]:
         if row["refusal"]:
@@ -231,42 +202,6 @@ def hard_fits() -> str:
             ended = f"{row['psnr_db']:.1f} dB on its own spectra (their mean: {row['mean_psnr_db']:.1f})"
         rows.append([row["case"], str(row["n"]), ended, f"{row['seconds']:.0f} s"])
     return markdown(["case", "spectra", "how the fit ended", "time"], rows)
-
-
-def speed() -> str:
-    """Every model and synthesizer on every scene, those on the front in bold."""
-    rows = []
-    for file in sorted(RESULTS.glob("speed_*.json")):
-        content = json.loads(file.read_text())
-        points = {p["setting"]: (p["seconds"]["median"], p["held_out"]) for p in content["models"]}
-        front = pareto(points)
-        for point in content["models"]:
-            name = point["setting"]
-            rows.append(
-                [
-                    f"{content['data']} {content['split']}",
-                    f"**{name}**" if name in front else name,
-                    f"{point['seconds']['median'] * 1e3:.2f}",
-                    f"{point['psnr_db']:.2f}",
-                    f"{point['fit_seconds']:.1f}" if point["fit_seconds"] else "",
-                    f"{point['parameters']:,}" if "parameters" in point else "",
-                ]
-            )
-    return markdown(["scene, split", "setting", "ms a spectrum", "held-out PSNR [dB]", "fit [s]", "parameters"], rows)
-
-
-def drawing() -> str:
-    """How the default model of one scene can be drawn, those on the front in bold."""
-    rows = []
-    for file in sorted(RESULTS.glob("speed_*.json")):
-        content = json.loads(file.read_text())
-        own = [p for p in content["drawing"] if p["own_grid"]]
-        front = pareto({p["setting"]: (p["seconds"]["median"], p["numerical"]) for p in own})
-        for p in own:
-            name = f"**{p['setting']}**" if p["setting"] in front else p["setting"]
-            cells = [f"{p['seconds']['median'] * 1e3:.2f}", f"{p['numerical']:.0e}", f"{p['held_out']:.4f}"]
-            rows.append([f"{content['data']} {content['split']}", name, *cells])
-    return markdown(["scene, split", "setting", "ms a spectrum", "RMS numerical", "RMS held-out"], rows)
 
 
 # SSIM and mean L1 of the paper's tables, on its own data
@@ -286,7 +221,7 @@ PAPER = {
 
 
 def ablation() -> str:
-    """The paper's studies: median SSIM / mean L1 / median PSNR of every variant on every scene."""
+    """Return median SSIM / mean L1 / median PSNR of every variant of the ablation on every scene."""
     scenes = load("ablation")["scenes"]
     names = list(dict.fromkeys(name for scene in scenes.values() for name in scene["variants"]))
     rows = []
@@ -306,7 +241,7 @@ def ablation() -> str:
 
 
 def raytracing() -> str:
-    """Median PSNR of every method in the furnished rooms, and how many planes geometry found."""
+    """Return the median PSNR of every method in the furnished rooms, and the number of planes."""
     rows = []
     for scene, result in load("raytracing")["scenes"].items():
         scores = result["methods"]
@@ -315,56 +250,6 @@ def raytracing() -> str:
         traced = result["traced"]
         rows.append([scene, f"{traced['paths_per_position']:.0f}", *cells, f"{certain} of {len(result['planes'])}"])
     return markdown(["scene, moving end", "paths a position", *scores, "planes certain"], rows)
-
-
-def scaling() -> str:
-    """Seconds of a processor of each stage at each size, peak memory, and the growth to the largest size."""
-    content = load("scaling")
-    sizes = [row["n"] for row in content["rows"]]
-    rows = []
-    for label, growth in content["slopes"].items():
-        stage, part = label.split(", ")
-        cells = [f"{row['stages'][stage][part]:.1f} s" for row in content["rows"]]
-        peaks = [f"{row['stages'][stage]['rss_gib']:.1f}" for row in content["rows"]]
-        anonymous = content["rows"][-1]["stages"][stage]["anonymous_gib"]
-        name = f"{stage}, {part.removesuffix(' seconds')}" if " " in part else stage
-        rows.append([name, *cells, f"{list(growth.values())[-1]:.2f}", " / ".join(peaks), f"{anonymous:.1f}"])
-    columns = ["stage", *(f"{n:,}" for n in sizes), f"exponent to {sizes[-1]:,}", "peak of each size [GiB]"]
-    return markdown([*columns, "not from files [GiB]"], rows)
-
-
-def scaling_rssi() -> str:
-    """Seconds of a processor of the RSSI model, and its peak memory."""
-    content = load("scaling_rssi")
-    rows = [
-        [
-            f"{row['rows']:,.0f}",
-            f"{row['receivers']:.0f}",
-            f"{row['fit seconds']:.1f} s",
-            f"{row['predict seconds']:.2f} s",
-            f"{row['rss_gib']:.1f}",
-        ]
-        for row in content["rows"]
-    ]
-    return markdown(["rows", "receivers", "fit", f"{content['predicted']:,} positions", "peak [GiB]"], rows)
-
-
-def scaling_quality() -> str:
-    """Median PSNR between the positions of the walk."""
-    content = load("scaling")
-    names = [stage for stage, values in content["rows"][0]["stages"].items() if "psnr_db" in values]
-    rows = [[f"{row['n']:,}", *(f"{row['stages'][name]['psnr_db']:.1f}" for name in names)] for row in content["rows"]]
-    return markdown(["spectra", *names], rows)
-
-
-def busy() -> str:
-    """Seconds of a step of the network, idle and beside other work, by how long threads wait busily."""
-    steps = {(row["spins"], row["neighbour"]): row["step_s"] for row in load("busy")["rows"]}
-    rows = [
-        [f"{spins:,}", f"{steps[spins, False]:.2f} s", f"{steps[spins, True]:.2f} s"]
-        for spins in dict.fromkeys(spins for spins, _ in steps)
-    ]
-    return markdown(["GOMP_SPINCOUNT", "idle", "beside a loop on one core"], rows)
 
 
 TABLES = {
@@ -414,7 +299,7 @@ FILES = (
 
 
 def rewrite(text: str) -> str:
-    """The text with each block between `<!-- NAME -->` and `<!-- /NAME -->` replaced by its table."""
+    """Return the text with each block between `<!-- NAME -->` and `<!-- /NAME -->` replaced by its table."""
     for name in re.findall(r"<!-- (\w+) -->", text):
         block = f"<!-- {name} -->\n{TABLES[name]()}\n<!-- /{name} -->"
         text = re.sub(rf"<!-- {name} -->.*?<!-- /{name} -->", lambda _, block=block: block, text, flags=re.DOTALL)

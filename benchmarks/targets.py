@@ -1,6 +1,6 @@
-"""The tables of docs/targets.md: what was aimed at, what the committed results say, and whether that is enough.
+"""Make the tables of docs/targets.md: targets, committed results, and whether they are met.
 
-A figure meets its target if it does so with as many digits as the target has.
+A result is rounded to the digits of its target before the comparison.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ TURBO: dict[str, tuple[dict[str, float], tuple[str, ...]]] = {
 
 
 def _missed(value: float, target: str, unit: str, larger_is_better: bool) -> list[str]:
-    """By how much, in words, or nothing if the target is met."""
+    """Return the difference to the target as text, in an empty list if the target is met."""
     digits = len(target.partition(".")[2])
     short = float(target) - round(value, digits) if larger_is_better else round(value, digits) - float(target)
     return [] if short < 0.5 * 10**-digits else [f"{short:.{digits}f} {unit}".strip()]
@@ -50,7 +50,7 @@ def _verdict(missed: Sequence[str]) -> str:
 
 
 def synthesis_targets() -> str:
-    """SSIM and PSNR at unseen positions."""
+    """Return SSIM and PSNR at unseen positions beside their targets."""
     rows = []
     scenes = load("synthesis")["scenes"]
     for scene, (ssim, psnr) in SYNTHESIS.items():
@@ -65,7 +65,7 @@ def synthesis_targets() -> str:
 
 
 def aoa_targets() -> str:
-    """The network with synthetic spectra against the measured share alone and against everything measured."""
+    """Return the errors of the network with synthetic spectra, with measured ones only, and with all spectra measured."""
     rows = []
     for share, mix, result in aoa_shares():
         metrics = result["metrics"]
@@ -89,7 +89,7 @@ def aoa_targets() -> str:
 
 
 def rssi_targets() -> str:
-    """Median and 90 % absolute error, and who has the best median."""
+    """Return median and 90 % quantile of the absolute error beside their targets, and the best other predictor."""
     rows = []
     found = {f"{metrics['data']} {metrics['split']}": metrics["overall"] for metrics in rssi_runs()}
     for scene, (median, p90) in RSSI.items():

@@ -2,8 +2,8 @@
 
 data = swiftwrf.load_spectra(folder)
 train, test = data.split("block")
-model = swiftwrf.fit(train)
-spectrum = model.synthesize(test.position)
+model = swiftwrf.SwiftWRF().fit(train)
+spectrum = model.predict(test.position).mean
 
 "The paper" in all docstrings is M. Liu, C. Zhang, Q. Yang, Y. Cao, Y. Xu, Y. Xu, S. Sun, M. Dai and Y. Guan, "Deformable 2D
 Gaussian Splatting for Efficient Wireless Radiance Field Rendering", 2025.
@@ -15,6 +15,7 @@ from swiftwrf.data import Rssi, Snapshots, Spectra, load_rssi, load_snapshots, l
 from swiftwrf.data.simulated import rssi_room, simulated_room
 from swiftwrf.diagnostics.calibration import Calibration, calibrate
 from swiftwrf.errors import FitError, InputError
+from swiftwrf.models.base import FIELD_MODELS, FieldModel, Prediction, make_model
 from swiftwrf.models.coarray import CoarrayModel, fit_coarray, project
 from swiftwrf.models.geometry import GeometryModel, fit_geometry
 from swiftwrf.models.swiftwrf import FitConfig, ModelConfig, SwiftWRF, fit
@@ -23,15 +24,18 @@ from swiftwrf.rssi import RssiConfig, RssiModel, fit_rssi
 from swiftwrf.runtime.checkpoint import load
 
 __all__ = [
+    "FIELD_MODELS",
     "AngularGrid",
     "ArrayPose",
     "Calibration",
     "CoarrayModel",
+    "FieldModel",
     "FitConfig",
     "FitError",
     "GeometryModel",
     "InputError",
     "ModelConfig",
+    "Prediction",
     "Rssi",
     "RssiConfig",
     "RssiModel",
@@ -48,6 +52,7 @@ __all__ = [
     "load_rssi",
     "load_snapshots",
     "load_spectra",
+    "make_model",
     "project",
     "rasterize",
     "rasterize_magnitude",

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 from torch import Tensor
 
-from swiftwrf.array.angles import great_circle, to_direction, wrap
+from swiftwrf.array.angles import angular_distance, to_direction, wrap
 from swiftwrf.errors import InputError
 
 WINDOW = 7
@@ -79,7 +79,7 @@ def angle_errors(estimate: Tensor, truth: Tensor) -> dict[str, Tensor]:
     return {
         "azimuth": wrap(estimate[:, 0] - truth[:, 0]).abs(),
         "elevation": (estimate[:, 1] - truth[:, 1]).abs(),
-        "great_circle": great_circle(to_direction(*estimate.unbind(-1)), to_direction(*truth.unbind(-1))),
+        "great_circle": angular_distance(to_direction(*estimate.unbind(-1)), to_direction(*truth.unbind(-1))),
     }
 
 

@@ -28,7 +28,7 @@ from swiftwrf.runtime.threads import set_threads
 from tasks.directory import console
 from tasks.environment import machine, packages
 from tasks.run import choose_device
-from tasks.torchrun import others
+from tasks.torchrun import process_count
 
 if TYPE_CHECKING:
     from distributed import Future
@@ -52,7 +52,7 @@ def connected(address: str | None, device: torch.device) -> Iterator[Cluster | N
     if address is None:
         yield None
         return
-    if others() is not None:
+    if process_count() > 1:
         raise InputError("--scheduler and torchrun both spread the steps of a run; use one of them")
     cluster = Cluster(address, device)
     try:

@@ -15,7 +15,6 @@ from tasks.claim import STEPS
 from tasks.cluster import Cluster
 from tasks.directory import Run, console
 from tasks.records import Row, strict
-from tasks.torchrun import others
 
 if TYPE_CHECKING:
     from distributed import Future
@@ -30,11 +29,6 @@ class Step(ABC, Generic[Setting]):
     @abstractmethod
     def name(self) -> str:
         """What it is kept under; steps of one name are the same step."""
-
-    @property
-    def shared(self) -> bool:
-        """Whether the processes that torchrun started compute it together; the first computes all else alone."""
-        return False
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -68,16 +62,9 @@ def computed(
         steps = list(steps)
         _compute_on(cluster, run, steps, setting)
     for step in steps:
-        value = run.step(step.name, partial(_compute_here, run, setting, step))
+        value = run.step(step.name, partial(step.compute, setting, run.folder))
         yield step, value
         yield from computed(run, step.then(setting, value), setting, None)
-
-
-def _compute_here(run: Run, setting: Setting, step: Step[Setting]) -> Row:
-    together = others()
-    if together is not None and step.shared:
-        together.call(_compute_away, setting, step, *(run.path(name).read_bytes() for name in step.reads))
-    return step.compute(setting, run.folder)
 
 
 def _compute_on(cluster: Cluster, run: Run, steps: Iterable[Step[Setting]], setting: Setting) -> None:
@@ -112,7 +99,7 @@ def _compute_on(cluster: Cluster, run: Run, steps: Iterable[Step[Setting]], sett
 
 
 def _compute_away(setting: Setting, step: Step[Setting], *contents: bytes) -> tuple[Row, float, dict[str, bytes]]:
-    """On a worker or in another process, which have no directory of the run: values, seconds, and the content of the files
+    """On a worker, which has no directory of the run: values, seconds, and the content of the files
     that were left."""
     with TemporaryDirectory(prefix="swiftwrf-") as name:
         folder = Path(name)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from swiftwrf import AngularGrid, InputError
-from swiftwrf.array.beamforming import BEAMFORMERS, LOADING
+from swiftwrf.array.beamforming import BEAMFORMERS, DIAGONAL_LOADING
 from swiftwrf.array.planar import PlanarArray
 
 ARRAY = PlanarArray.grid(2, 3, 0.06, 2.4e9)
@@ -30,7 +30,7 @@ def slow(name, channel):
     share = []
     for a in steering():
         if name == "capon":
-            loaded = covariance * len(a) / covariance.trace() + LOADING * torch.eye(len(a))
+            loaded = covariance * len(a) / covariance.trace() + DIAGONAL_LOADING * torch.eye(len(a))
             share.append(1 / (a.conj() @ torch.linalg.solve(loaded, a)).real)
         else:
             share.append((a.conj() @ covariance @ a).real / (len(a) * covariance.trace().real))

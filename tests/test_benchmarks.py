@@ -14,7 +14,7 @@ def test_the_comparison_goes_on_after_the_rows_that_are_there(tmp_path, monkeypa
     data = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
     written = []
     monkeypatch.setattr(comparison, "scenes", lambda config: [("room random", data, "random")])
-    monkeypatch.setattr(comparison, "QUICKER", 1)
+    monkeypatch.setattr(comparison, "QUICK_DIVISOR", 1)
     monkeypatch.setattr(comparison, "write_result", lambda name, content: written.append((name, content)))
     config = comparison.Config(data=Path(), quick=True, work=tmp_path)
     honest, measured = comparison.row, []

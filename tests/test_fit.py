@@ -12,6 +12,7 @@ from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store
 from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel
 from swiftwrf.metrics import covered, psnr
+from swiftwrf.models.swiftwrf.field import DeformableGaussians
 from swiftwrf.models.swiftwrf.optimise import Optimisation
 from swiftwrf.models.swiftwrf.search import doubling_search
 from swiftwrf.rasterize import reference
@@ -20,16 +21,16 @@ QUICK = FitConfig(model=ModelConfig(n_primitives=24), steps=80, check_every=20) 
 
 
 def test_fit_beats_the_mean_spectrum(room):
-    wrf = fit(room, replace(QUICK, steps=200), progress=False)
+    wrf = fit(room, replace(QUICK, steps=200))
     fitted = psnr(wrf.synthesize(room.position), room.spectrum).median()
     mean = psnr(room.spectrum.mean(dim=0), room.spectrum).median()
     assert fitted > mean + 3
 
 
 def test_same_seed_same_model(room):
-    a, b = (fit(room, QUICK, progress=False).synthesize(room.position) for _ in range(2))
+    a, b = (fit(room, QUICK).synthesize(room.position) for _ in range(2))
     assert torch.equal(a, b)
-    other = fit(room, replace(QUICK, seed=1), progress=False).synthesize(room.position)
+    other = fit(room, replace(QUICK, seed=1)).synthesize(room.position)
     assert not torch.equal(a, other)
 
 
@@ -46,7 +47,7 @@ def test_paper_model_fits_a_toy(room):
     paper = FitConfig.paper(steps=40, check_every=20)
     config = replace(paper, model=replace(paper.model, n_primitives=20))
     records = []
-    fit(room, config, progress=False, on_record=records.append)
+    fit(room, config, on_record=records.append)
     assert [(r["stage"], r["step"]) for r in records] == [("final", 20), ("final", 40)]
 
 
@@ -74,7 +75,7 @@ class Stop(Exception):
 )
 def test_interrupted_fit_goes_on_to_the_same_bits(room, tmp_path, config, stop_at):
     records = []
-    whole = fit(room, config, progress=False, on_record=records.append).synthesize(room.position)
+    whole = fit(room, config, on_record=records.append).synthesize(room.position)
     assert stop_at in [describe(r)[:3] for r in records]
 
     def stop(record):
@@ -83,9 +84,9 @@ def test_interrupted_fit_goes_on_to_the_same_bits(room, tmp_path, config, stop_a
 
     state = tmp_path / "state"
     with pytest.raises(Stop):
-        fit(room, config, progress=False, checkpoint=state, on_record=stop)
+        fit(room, config, checkpoint=state, on_record=stop)
     rest = []
-    again = fit(room, config, progress=False, checkpoint=state, on_record=rest.append)
+    again = fit(room, config, checkpoint=state, on_record=rest.append)
     assert [describe(r) for r in rest] == [describe(r) for r in records]  # the history is whole
     assert torch.equal(again.synthesize(room.position), whole)
 
@@ -110,11 +111,11 @@ def describe(record):
 def test_finds_a_size(room):
     """What was chosen is among what was tried, and predicts held-out spectra as well as any."""
     records = []
-    model = fit(room, progress=False, on_record=records.append)
+    model = fit(room, on_record=records.append)
     tried = {r["n_primitives"]: r["validation"] for r in records if r["stage"] == "search"}
     n = records[-1]["n_primitives"]
     assert records[-1]["stage"] == "final"
-    assert model.config.n_primitives == n
+    assert model.field.config.n_primitives == n
     assert tried[n] <= 1.002 * min(tried.values())
     assert all(tried[smaller] > 1.002 * min(tried.values()) for smaller in tried if smaller < n)
 
@@ -123,7 +124,7 @@ def test_regression_draws_what_the_process_on_the_pixels_predicts(room):
     """With enough primitives to draw any spectrum of the room, and all that is measured known."""
     unseen = room.subset(torch.arange(0, 40, 4))
     known = room.subset(torch.tensor([i for i in range(40) if i % 4]))
-    model = fit(known, FitConfig(model=ModelConfig(n_primitives=256), max_azimuths=0), progress=False)
+    model = fit(known, FitConfig(model=ModelConfig(n_primitives=256), max_azimuths=0))
     kernel = choose_kernel(known.position, known.spectrum, folds(known.position, "random", 0))
     mean = known.spectrum.mean(dim=0)
     change = (known.spectrum - mean).flatten(1)
@@ -142,7 +143,7 @@ def test_regression_recovers_fields_of_primitives(generator):
     response = 0.4 + 0.3 * torch.sin(position @ torch.randn(3, 3, generator=generator, dtype=torch.float64)).float()
     spectrum = torch.einsum("bn,nhw->bhw", response, kernel).clamp(0, 1)
     scene = scene_of(position, spectrum, grid)
-    model = fit(scene.subset(torch.arange(120)), progress=False)
+    model = fit(scene.subset(torch.arange(120)))
     assert psnr(model.synthesize(position[120:]), spectrum[120:]).median() > 35
 
 
@@ -151,7 +152,7 @@ def test_regression_is_the_same_at_any_number_of_threads(room):
         before = torch.get_num_threads()
         torch.set_num_threads(threads)
         try:
-            return fit(room, FitConfig(model=ModelConfig(n_primitives=32)), progress=False).state()[0]
+            return fit(room, FitConfig(model=ModelConfig(n_primitives=32))).state()[0]
         finally:
             torch.set_num_threads(before)
 
@@ -160,46 +161,42 @@ def test_regression_is_the_same_at_any_number_of_threads(room):
         torch.testing.assert_close(two[name], value, atol=1e-5, rtol=1e-5, equal_nan=True, msg=name)
 
 
-def test_deviations_hold_what_they_say(built_in_room):
-    """75 to 85 % of the pixels of spectra nobody measured lie within 1.28 deviations; far away the model is less sure."""
+def test_standard_deviations_are_calibrated(built_in_room):
+    """75 to 85 % of the pixels of unseen spectra lie within 1.28 standard deviations; these grow with the distance."""
     train, test = built_in_room
-    model = fit(train, progress=False)
-    drawn, std = model.synthesize(test.position, return_std=True)
-    inside = covered(drawn, std, test.spectrum).mean()
-    assert 0.75 < inside < 0.85
-    _, far = model.synthesize(test.position + 100, return_std=True)
-    _, near = model.synthesize(train.position, return_std=True)
-    assert near.mean() < std.mean() < far.mean()
+    model = fit(train)
+    found = model.predict(test.position)
+    assert 0.75 < covered(found.mean, found.std, test.spectrum).mean() < 0.85
+    near, far = (model.predict(position).std for position in (train.position, test.position + 100))
+    assert near.mean() < found.std.mean() < far.mean()
 
 
-def test_a_canvas_draws_the_same(room):
-    model = fit(room, FitConfig(model=ModelConfig(n_primitives=16, rank=4)), progress=False)
-    for grid in (None, AngularGrid.hemisphere(7, 30)):
-        canvas = model.canvas(grid)
-        for at in (room.position[:1], room.position):  # drawn one by one, and by one product
-            drawn, std = model.synthesize(at, canvas, return_std=True)
-            expected, expected_std = model.synthesize(at, grid, return_std=True)
-            torch.testing.assert_close(drawn, expected, rtol=0, atol=1e-4)  # what the cutoff leaves out
-            torch.testing.assert_close(std, expected_std)
-
-
-def test_a_fit_by_gradient_knows_no_deviation(room):
-    model = fit(room, replace(QUICK, steps=20), progress=False)
-    with pytest.raises(InputError, match="knows no standard deviations"):
-        model.synthesize(room.position, return_std=True)
+def test_a_fit_by_gradient_descent_has_no_standard_deviation(room):
+    found = fit(room, replace(QUICK, steps=20)).predict(room.position)
+    assert found.std is None
+    with pytest.raises(InputError, match="no standard deviation"):
+        found.interval()
 
 
 @pytest.mark.parametrize(
-    ("config", "message"),
+    ("make", "message"),
     [
-        (FitConfig(model=ModelConfig(deformation="per_primitive_mlp")), "give a number of steps"),
-        (FitConfig(model=ModelConfig(components=("mean",))), "give a number of steps"),
-        (FitConfig(steps=10), "needs a number of primitives"),
+        (lambda: FitConfig(model=ModelConfig(deformation="per_primitive_mlp")), "give a number of steps"),
+        (lambda: FitConfig(model=ModelConfig(components=("mean",))), "give a number of steps"),
+        (lambda: FitConfig(steps=10), "needs a number of primitives"),
     ],
 )
-def test_refuses_what_does_not_fit_together(room, config, message):
+def test_refuses_what_does_not_fit_together(make, message):
     with pytest.raises(InputError, match=message):
-        fit(room, config, progress=False)
+        make()
+
+
+def test_a_fit_like_another_keeps_its_number_of_primitives(room):
+    first = fit(room, FitConfig(model=ModelConfig(n_primitives=24)))
+    records = []
+    again = SwiftWRF(seed=1).fit(room.subset(torch.arange(30)), like=first, on_record=records.append)
+    assert [(r["stage"], r["n_primitives"]) for r in records] == [("final", 24)]
+    assert again.field.config.n_primitives == 24
 
 
 @pytest.mark.parametrize(
@@ -224,9 +221,9 @@ def test_doubling_search_finds_the_smallest_that_does_as_well_as_any(losses, fou
 
 
 def test_refuses_the_state_of_another_fit(room, tmp_path):
-    fit(room, replace(QUICK, steps=20), progress=False, checkpoint=tmp_path / "state")
+    fit(room, replace(QUICK, steps=20), checkpoint=tmp_path / "state")
     with pytest.raises(InputError, match="another fit"):
-        fit(room, QUICK, progress=False, checkpoint=tmp_path / "state")
+        fit(room, QUICK, checkpoint=tmp_path / "state")
 
 
 def test_loss_that_is_not_finite_stops_and_keeps_the_last_good_state(room, tmp_path, monkeypatch):
@@ -238,21 +235,21 @@ def test_loss_that_is_not_finite_stops_and_keeps_the_last_good_state(room, tmp_p
 
     monkeypatch.setattr(Optimisation, "loss", breaks)
     with pytest.raises(FitError, match="step 50"):
-        fit(room, QUICK, progress=False, checkpoint=state)
+        fit(room, QUICK, checkpoint=state)
     monkeypatch.undo()
     records = []
-    fit(room, QUICK, progress=False, checkpoint=state, on_record=records.append)
+    fit(room, QUICK, checkpoint=state, on_record=records.append)
     assert [record["step"] for record in records][:3] == [20, 40, 60]  # went on from the state at 40
     assert records[1]["elapsed"] < records[2]["elapsed"]
 
 
 def test_refuses_too_few_spectra_and_what_is_not_finite(room):
     with pytest.raises(InputError, match="at least 10"):
-        fit(room.subset(torch.arange(9)), QUICK, progress=False)
+        fit(room.subset(torch.arange(9)), QUICK)
     broken = room.spectrum.clone()
     broken[7, 3, 3] = float("nan")
     with pytest.raises(InputError, match="training spectrum 7"):
-        fit(replace(room, store=Store(broken)), QUICK, progress=False)
+        fit(replace(room, store=Store(broken)), QUICK)
 
 
 def test_folds_partition_and_repeat(room):
@@ -268,7 +265,7 @@ def test_recovers_a_scene_that_it_can_represent_exactly(generator):
     grid = AngularGrid.hemisphere(15, 60)
     config = ModelConfig(n_primitives=4, rank=2, components=("mean", "response"))
     kernel = Kernel(long=2.0, short=1.0, share=0.2, noise=1e-3)
-    truth = SwiftWRF.make(config, grid, position, kernel, generator=generator)
+    truth = DeformableGaussians.initial(config, grid, position, kernel, generator=generator)
     with torch.no_grad():
         truth.primitives.response.mul_(3)
         truth.deformation.field.coefficient.normal_(std=1.0, generator=generator)
@@ -307,4 +304,4 @@ def test_a_fit_that_ended_worse_is_refused_again(room, tmp_path, monkeypatch):
     monkeypatch.setattr(Optimisation, "record", record)
     for _ in range(2):
         with pytest.raises(FitError, match="worse than the -1 it began with"):
-            fit(room, replace(QUICK, steps=20), progress=False, checkpoint=tmp_path / "state")
+            fit(room, replace(QUICK, steps=20), checkpoint=tmp_path / "state")

@@ -10,7 +10,7 @@ import torch
 from samples import record_source, tensor_message, write_dichasus, write_espargos, write_records
 
 from swiftwrf import AngularGrid, InputError, load_snapshots, load_spectra
-from swiftwrf.array.angles import great_circle, to_direction
+from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.data.tfrecords import records, tensor
 
 GRID = AngularGrid.hemisphere(45, 180)
@@ -33,7 +33,7 @@ def test_a_tensor_of_another_size_than_it_claims():
 
 def peaks_follow(data):
     peak = data.grid.direction.flatten(0, 1)[data.spectrum.flatten(1).argmax(1)]
-    return float(great_circle(peak, to_direction(*data.label.unbind(-1))).rad2deg().median())
+    return float(angular_distance(peak, to_direction(*data.label.unbind(-1))).rad2deg().median())
 
 
 def test_espargos(tmp_path):

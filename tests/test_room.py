@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from swiftwrf import AngularGrid, InputError, simulated_room
-from swiftwrf.array.angles import great_circle, to_direction
+from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.simulated.room import Room
 
@@ -109,4 +109,4 @@ def test_peak_is_near_the_line_of_sight_without_walls():
     data = simulated_room(n=20, room=empty, phase_noise=0.0, grid=FINE)
     peak = data.spectrum.flatten(1).argmax(dim=1)
     direction = FINE.direction.flatten(0, 1)[peak]
-    assert great_circle(direction, to_direction(*data.label.unbind(-1))).rad2deg().max() < 1.5
+    assert angular_distance(direction, to_direction(*data.label.unbind(-1))).rad2deg().max() < 1.5

@@ -11,7 +11,7 @@ import torch
 from samples import FREQUENCY, WAVELENGTH, snapshot_arrays, snapshots, write_snapshots
 
 from swiftwrf import AngularGrid, InputError, load_snapshots, load_spectra
-from swiftwrf.array.angles import great_circle, to_direction
+from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.data.archives import read_arrays
 
 GRID = AngularGrid.hemisphere(24, 96)
@@ -38,7 +38,7 @@ def test_spectra_peak_at_the_line_of_sight(tmp_path, beamformer):
     assert data.spectrum.shape == (40, 24, 96)
     assert 0 <= float(data.spectrum.min()) <= float(data.spectrum.max()) <= 1
     peak = data.grid.direction.flatten(0, 1)[data.spectrum.flatten(1).argmax(1)]
-    assert great_circle(peak, to_direction(*data.label.unbind(-1))).rad2deg().median() < 3
+    assert angular_distance(peak, to_direction(*data.label.unbind(-1))).rad2deg().median() < 3
     assert (data.moving, data.array, data.fixed_position.tolist()) == ("transmitter", data.array, [0.2, 2.4, 1.2])
 
 

@@ -11,7 +11,7 @@ import torch
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, rasterize
 from swiftwrf.gp import Kernel, SmoothField
 from swiftwrf.metrics import ssim
-from swiftwrf.models.swiftwrf.deformation import Setting, deformation_type
+from swiftwrf.models.swiftwrf.deformation import DEFORMATIONS, DeformationContext
 from swiftwrf.rasterize.magnitude import magnitude
 from swiftwrf.testing.hard_cases import HARD_CASES
 from swiftwrf.testing.scenes import random_scene
@@ -103,8 +103,8 @@ def test_gradcheck_of_the_smooth_field():
 def test_gradcheck_of_the_deformations(make):
     generator, components = torch.Generator().manual_seed(0), ("mean", "response", "attenuation", "cholesky")
     anchor = torch.rand(5, 3, generator=generator, dtype=torch.float64)
-    setting = Setting(3, components, 2, anchor, Kernel())
-    module = deformation_type(make).initial(setting, generator=generator).double()
+    context = DeformationContext(3, components, 2, anchor, Kernel())
+    module = DEFORMATIONS[make].initial(context, generator=generator).double()
     if make == "motion_basis":
         parameters = {"field.coefficient": double(5, 2), "basis": double(2, 3, 8)}
     else:

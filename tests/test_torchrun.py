@@ -1,6 +1,6 @@
-"""Two processes on the CPU, started by torchrun, learn what one does: a fit by gradient, the network, a whole run.
+"""Two processes on the CPU, started by torchrun, train the network of one process and make one run.
 
-Started by torchrun, this file is the program that the test starts: it leaves what it found in the folder that it is given.
+Started by torchrun, this file is the program of the test: it leaves its results in the folder that it is given.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from unittest import mock
 
@@ -17,13 +18,10 @@ import pandas as pd
 import pytest
 import quick
 import torch
-from torch import distributed as dist
 
 from augment import Mixed
-from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, fit, simulated_room
+from swiftwrf import AngularGrid, InputError, simulated_room
 from swiftwrf.data.store import Store
-from swiftwrf.runtime.processes import Processes
-from swiftwrf.runtime.session import Session
 from swiftwrf.runtime.threads import set_threads
 from tasks import torchrun
 from tasks.aoa.estimators import Settings, aann
@@ -31,63 +29,46 @@ from tasks.aoa.estimators.aann import AANN, AANNConfig
 from tasks.cluster import connected
 
 HERE = Path(__file__).parent
-CONFIG = FitConfig(
-    ModelConfig(n_primitives=8, components=("mean", "response", "attenuation", "cholesky")), steps=20, check_every=10
-)
-AOA = ("aoa", "--mix", 0.5, "--synthesizer", "swiftwrf", "idw", "--extra", 0, "--device", "cpu")
+AOA = ("aoa", "--mix", 0.5, "--synthesizer", "swiftwrf", "idw", "--preset", "paper", "--extra", 0, "--device", "cpu")
 
 
 class Network(AANN):
-    """The network of the paper, trained for one step: rounding grows to degrees with more of them."""
+    """The network of the paper, trained for one step: rounding grows to degrees with more steps."""
 
     def __init__(self, settings):
         super().__init__(settings, AANNConfig(steps=1, batch=5))
 
 
 def run(*arguments):
-    """A task on the toy, with the network of the paper."""
-    with (
-        mock.patch.object(quick, "QuickNetwork", Network),
-        mock.patch("tasks.aoa.steps.candidates", return_value=["idw"]),
-    ):
+    """Run a task on the toy, with the network of the paper."""
+    with mock.patch.object(quick, "QuickNetwork", Network):
         return quick.run(*arguments)
 
 
-def learnt(group=None):
-    """What a fit by gradient draws, what it tells, and what two steps make of the network.
+def learnt():
+    """Return estimates and losses of the network after two steps.
 
-    Batches have a number that two does not divide. The network counts in double precision, in which two steps differ
-    only if they are not the same.
+    Two does not divide the batch size. Double precision, in which two steps differ only if they are not the same.
     """
     set_threads(1)
     room = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
-    records = []
-    model = fit(room, replace(CONFIG, batch=7), progress=False, on_record=records.append, group=group)
     backbone = aann.backbone
-    with mock.patch.object(aann, "backbone", lambda *how: backbone(*how).double()):
-        network = AANN(Settings(room.grid, group=group), AANNConfig(steps=2, batch=5))
+    with mock.patch.object(aann, "backbone", lambda *options: backbone(*options).double()):
+        network = AANN(Settings(room.grid), AANNConfig(steps=2, batch=5))
     network.fit(Mixed.measured(replace(room, store=Store(room.spectrum.double()))))
-    estimate = network.estimate(room.spectrum.double())
-    losses = torch.tensor([record["loss"] for record in (*records, *network.history)])
-    return {"drawn": model.synthesize(room.position), "losses": losses, "estimate": estimate}
+    losses = torch.tensor([record["loss"] for record in network.history])
+    return {"losses": losses, "estimate": network.estimate(room.spectrum.double())}
+
+
+def save_learnt(file: Path) -> int:
+    torch.save(learnt(), file)
+    return 0
 
 
 @pytest.fixture(scope="module")
 def ended(tmp_path_factory):
-    """The folder of what two processes did, and what they said."""
+    """The folder of the results of two processes, and their stderr."""
     folder = tmp_path_factory.mktemp("torchrun")
-    honest, calls = Session.evaluated, []
-
-    def interrupt(*arguments):
-        honest(*arguments)
-        calls.append(1)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-
-    set_threads(1)
-    with mock.patch.object(Session, "evaluated", interrupt):
-        assert run(*AOA, "--out", folder / "two") == 130
-    assert list((folder / "two.partial" / "steps").glob("*-fit.safetensors"))
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", __file__]
     path = os.pathsep.join([str(HERE), str(HERE.parent)])
     environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
@@ -97,61 +78,55 @@ def ended(tmp_path_factory):
 
 
 def main(folder: Path) -> None:
-    """In each of the processes."""
-    codes = [run("aoa", "--resume", folder / "two.partial")]
-    where = {name: int(os.environ[name.upper()]) for name in ("rank", "world_size")}
-    dist.init_process_group("gloo", f"file://{folder / 'meeting'}", **where)
-    codes.append(run("aoa", "--mix", 2, "--out", folder / "refused"))
-    found = learnt(dist.group.WORLD)
-    torch.save(found | {"codes": codes}, folder / f"{dist.get_rank()}.pt")
-    dist.destroy_process_group()
+    """The program of each process."""
+    codes = [run(*AOA, "--out", folder / "two"), run("aoa", "--mix", 2, "--out", folder / "refused")]
+    torchrun.together(partial(save_learnt, folder / "learnt.pt"))
+    (folder / f"codes{os.environ['RANK']}.json").write_text(json.dumps(codes))
 
 
-def test_a_shared_fit_is_that_of_one_process(ended):
-    alone = learnt()
-    for rank in range(2):
-        shared = torch.load(ended[0] / f"{rank}.pt")
-        assert (shared["drawn"] - alone["drawn"]).abs().max() < 1e-4
-        assert (shared["estimate"] - alone["estimate"]).abs().max() < 1e-4
-        losses = alone["losses"] if rank == 0 else alone["losses"][-1:]  # the first one alone is told of the fit
-        torch.testing.assert_close(shared["losses"], losses, rtol=1e-4, atol=0)
+def test_the_network_of_two_processes_is_that_of_one(ended):
+    alone, shared = learnt(), torch.load(ended[0] / "learnt.pt")
+    assert (shared["estimate"] - alone["estimate"]).abs().max() < 1e-4
+    torch.testing.assert_close(shared["losses"], alone["losses"], rtol=1e-4, atol=0)
 
 
-def test_a_run_goes_on_in_two_processes(ended):
+def test_a_run_of_two_processes_is_that_of_one(ended):
     folder, said = ended
     set_threads(1)
     assert run(*AOA, "--out", folder / "one") == 0
     one, two = folder / "one", folder / "two"
     assert {file.name for file in two.iterdir()} == {file.name for file in one.iterdir()}
-    for table, unequal in (("errors.csv", 1e-2), ("synthesis.csv", 1e-2)):
-        pd.testing.assert_frame_equal(pd.read_csv(two / table), pd.read_csv(one / table), rtol=0, atol=unequal)
-    histories = [pd.read_csv(run / "history.csv")[["synthesizer", "method", "step"]] for run in (one, two)]
-    pd.testing.assert_frame_equal(*histories)
-    environment = json.loads((two / "environment.json").read_text())
-    assert (environment["processes"], environment["resumed"][0]["processes"]) == (1, 2)
+    for table in ("errors.csv", "synthesis.csv"):
+        pd.testing.assert_frame_equal(pd.read_csv(two / table), pd.read_csv(one / table), rtol=0, atol=1e-2)
+    assert json.loads((two / "environment.json").read_text())["processes"] == 2
     assert said.count("report: ") == 1
 
 
-def test_all_processes_end_with_the_code_of_the_first_and_it_alone_speaks(ended):
+def test_the_paper_preset_keeps_swiftwrf_in_the_comparison(ended):
+    scores = pd.read_csv(ended[0] / "two" / "synthesis.csv")
+    assert "swiftwrf" in set(scores["synthesizer"])
+
+
+def test_all_processes_end_with_the_code_of_the_first_and_it_alone_reports(ended):
     folder, said = ended
-    assert [torch.load(folder / f"{rank}.pt")["codes"] for rank in range(2)] == [[0, 2], [0, 2]]
-    assert said.count("error: --mix takes measured shares in (0, 1], got 2") == 1
+    assert [json.loads((folder / f"codes{rank}.json").read_text()) for rank in range(2)] == [[0, 2], [0, 2]]
+    assert said.count("error: --mix takes") == 1
     assert not list(folder.glob("refused*"))
 
 
 def test_a_batch_has_a_row_for_each_process(monkeypatch):
-    processes = Processes()
-    processes.number, processes.rank = 3, 1
-    assert processes.own(torch.arange(7)).tolist() == [1, 4]
-    assert processes.weight(7) == pytest.approx(2 / (7 / 3))
+    monkeypatch.setattr(aann, "process_count", lambda: 3)
+    room = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
+    network = AANN(Settings(room.grid), AANNConfig(steps=1, batch=2))
     with pytest.raises(InputError, match="3 processes cannot share batches of 2 spectra"):
-        processes.weight(2)
+        network.fit(Mixed.measured(room))
 
 
 def test_what_torchrun_cannot_spread_is_refused(monkeypatch):
-    monkeypatch.setattr(torchrun, "_others", object())
+    monkeypatch.setattr("tasks.cluster.process_count", lambda: 2)
     with pytest.raises(InputError, match="use one of them"), connected("tcp://127.0.0.1:1", torch.device("cpu")):
         pass
+    monkeypatch.setattr(torchrun, "process_count", lambda: 4)
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     with pytest.raises(InputError, match="started 4 processes on a machine of 2 GPUs"):

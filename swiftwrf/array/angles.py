@@ -1,7 +1,7 @@
-"""Directions as an array sees them: the angular grid of a spectrum, unit vectors, distances, the array's pose.
+"""Directions in array coordinates: the angular grid of a spectrum, unit vectors, angular distances, the pose of an array.
 
 Axes and units are those of docs/conventions.md: azimuth counter-clockwise from the array's x axis, elevation from its
-plane (0) to its normal (90 degrees); radians inside, degrees at the borders.
+plane (0) to its normal (90 degrees). Angles are in radians inside the package and in degrees at its borders.
 """
 
 from __future__ import annotations
@@ -13,22 +13,31 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from swiftwrf.errors import InputError
 
-TURN = 2 * math.pi
-MOST_PIXELS = 2**24  # of a spectrum
+MAX_GRID_PIXELS = 2**24  # of one spectrum
 
 
 @dataclass(frozen=True)
 class AngularGrid:
-    """The directions of a spectrum's pixels: evenly spaced elevations, azimuths evenly spaced over the whole circle.
+    """Directions of the pixels of a spectrum: evenly spaced elevations (rows, lowest first) and azimuths (columns, periodic).
 
-    Rows are elevations, lowest first; columns are azimuths and periodic. All angles are in radians.
+    Args:
+        elevation_start: Elevation of row 0 [rad].
+        elevation_step: Elevation difference between rows, above 0 [rad].
+        n_elevation: Number of rows.
+        azimuth_start: Azimuth of column 0 [rad]. The columns cover the whole circle.
+        n_azimuth: Number of columns.
 
     Raises:
-        InputError: no pixels or too many of them, or an angle that is not finite.
+        InputError: No pixels, more than 2^24 pixels, or an angle that is not finite.
+
+    Example:
+        >>> AngularGrid.hemisphere(90, 360).shape
+        (90, 360)
     """
 
     elevation_start: float
@@ -42,19 +51,19 @@ class AngularGrid:
             (self.n_elevation, self.n_azimuth),
             (self.elevation_start, self.elevation_step, self.azimuth_start),
         )
-        if not all(isinstance(size, int) and size >= 1 for size in sizes) or math.prod(sizes) > MOST_PIXELS:
+        if not all(isinstance(size, int) and size >= 1 for size in sizes) or math.prod(sizes) > MAX_GRID_PIXELS:
             raise InputError(
-                f"a grid has whole numbers of rows and columns and at most {MOST_PIXELS} pixels, got {sizes}"
+                f"a grid has whole numbers of rows and columns and at most {MAX_GRID_PIXELS} pixels, got {sizes}"
             )
         if not all(map(math.isfinite, angles)) or self.elevation_step <= 0:
             raise InputError(f"a grid needs finite angles and a step above 0, got {angles} [rad]")
 
     @classmethod
     def degrees(cls, elevation: Iterable[float], azimuth: Iterable[float]) -> AngularGrid:
-        """The grid of the given angles in degrees, e.g. `degrees(elevation=range(1, 91), azimuth=range(360))`.
+        """Return the grid of the given angles in degrees, e.g. `degrees(elevation=range(1, 91), azimuth=range(360))`.
 
         Raises:
-            InputError: uneven spacing, descending order, or azimuths that do not go once round the circle.
+            InputError: Uneven spacing, descending order, or azimuths that do not cover the circle once.
         """
         rows, columns = [float(e) for e in elevation], [float(a) for a in azimuth]
         row_step = _even_step(rows, "elevation")
@@ -68,7 +77,7 @@ class AngularGrid:
 
     @classmethod
     def hemisphere(cls, n_elevation: int, n_azimuth: int) -> AngularGrid:
-        """A grid of the given size whose rows end at elevation 90 degrees, the layout of the NeRF2 spectra."""
+        """Return the grid of that size whose last row is at elevation 90 degrees, the layout of the NeRF2 spectra."""
         step = 90 / n_elevation
         return cls.degrees(
             elevation=[step * (row + 1) for row in range(n_elevation)],
@@ -76,7 +85,7 @@ class AngularGrid:
         )
 
     def coarsen(self, factor: int) -> AngularGrid:
-        """The grid of the centres of factor x factor pixels; the sizes must be multiples of the factor."""
+        """Return the grid of the centres of factor x factor pixels. Both sizes must be multiples of the factor."""
         middle = (factor - 1) / 2
         return AngularGrid(
             self.elevation_start + middle * self.elevation_step,
@@ -88,7 +97,8 @@ class AngularGrid:
 
     @property
     def azimuth_step(self) -> float:
-        return TURN / self.n_azimuth
+        """Azimuth difference between columns [rad]."""
+        return math.tau / self.n_azimuth
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -96,7 +106,7 @@ class AngularGrid:
         return self.n_elevation, self.n_azimuth
 
     @cached_property
-    @torch.inference_mode(False)  # what is kept must also serve calls that await gradients
+    @torch.inference_mode(False)  # cached tensors must also serve calls that record gradients
     def elevation(self) -> Tensor:
         """Elevation of each row, float64 (n_elevation,) [rad]."""
         return self.elevation_start + self.elevation_step * torch.arange(self.n_elevation, dtype=torch.float64)
@@ -113,8 +123,8 @@ class AngularGrid:
         """Unit vector of each pixel in array coordinates, float64 (n_elevation, n_azimuth, 3)."""
         return to_direction(self.azimuth[None, :], self.elevation[:, None])
 
-    def strongest(self, spectrum: Tensor) -> Tensor:
-        """Azimuth and elevation (n, 2) [rad] of the largest magnitude of each spectrum (n, n_elevation, n_azimuth)."""
+    def peak_direction(self, spectrum: Tensor) -> Tensor:
+        """Return azimuth and elevation (n, 2) [rad] of the largest magnitude of spectra (n, n_elevation, n_azimuth)."""
         pixel = spectrum.flatten(1).argmax(dim=1)
         return torch.stack([self.azimuth[pixel % self.n_azimuth], self.elevation[pixel // self.n_azimuth]], dim=-1)
 
@@ -129,45 +139,57 @@ def _even_step(values: list[float], name: str) -> float:
 
 
 def to_direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
-    """Unit vectors (..., 3) of azimuth and elevation (...) [rad], which broadcast."""
+    """Return unit vectors (..., 3) of azimuth and elevation (...) [rad], which broadcast.
+
+    Example:
+        >>> to_direction(torch.tensor(0.0), torch.tensor(0.0)).tolist()
+        [1.0, 0.0, 0.0]
+    """
     azimuth, elevation = torch.broadcast_tensors(azimuth, elevation)
     flat = torch.cos(elevation)
     return torch.stack([flat * torch.cos(azimuth), flat * torch.sin(azimuth), torch.sin(elevation)], dim=-1)
 
 
 def to_angles(direction: Tensor) -> tuple[Tensor, Tensor]:
-    """Azimuth in [0, 2 pi) and elevation in [0, pi/2] (...) [rad] of vectors (..., 3) in array coordinates.
+    """Return azimuth in [0, 2 pi) and elevation in [0, pi/2] (...) [rad] of vectors (..., 3) in array coordinates.
 
-    A planar array cannot tell +z from -z, so directions behind it are folded up.
+    A planar array does not distinguish +z from -z, so directions behind it are folded to the front.
     """
     x, y, z = direction.unbind(-1)
-    azimuth = torch.remainder(torch.atan2(y, x), TURN)
-    azimuth = torch.where(
-        azimuth >= TURN, torch.zeros_like(azimuth), azimuth
-    )  # remainder(-tiny, TURN) rounds up to TURN
+    azimuth = torch.remainder(torch.atan2(y, x), math.tau)
+    azimuth = azimuth.where(azimuth < math.tau, torch.zeros_like(azimuth))  # remainder rounds -tiny up to 2 pi
     return azimuth, torch.atan2(z.abs(), torch.hypot(x, y))
 
 
 def wrap(angle: Tensor) -> Tensor:
-    """The angle [rad] brought to [-pi, pi] by whole turns."""
-    return angle - TURN * torch.round(angle / TURN)
+    """Return the angle [rad] in [-pi, pi] that differs by a multiple of 2 pi."""
+    return angle - math.tau * torch.round(angle / math.tau)
 
 
-def great_circle(a: Tensor, b: Tensor) -> Tensor:
-    """Angle between vectors a and b (..., 3), in [0, pi] (...) [rad]; exact for small angles, where acos is not."""
+def angular_distance(a: Tensor, b: Tensor) -> Tensor:
+    """Return the angle in [0, pi] (...) [rad] between vectors a and b (..., 3). Unlike acos, it is exact for small angles.
+
+    Example:
+        >>> round(float(angular_distance(torch.tensor([1.0, 0, 0]), torch.tensor([0, 1.0, 0]))), 4)
+        1.5708
+    """
     return torch.atan2(torch.linalg.cross(a, b, dim=-1).norm(dim=-1), (a * b).sum(dim=-1))
 
 
 @dataclass(frozen=True)
 class ArrayPose:
-    """Where an array stands and how it is turned.
+    """Position and orientation of an array.
 
     Args:
-        position: of the array's reference point, 3 numbers [m].
-        orientation: unit quaternion in the order x, y, z, w that turns array into world coordinates.
+        position: Position of the array's reference point, 3 numbers [m].
+        orientation: Unit quaternion (x, y, z, w) that rotates array into world coordinates. Defaults to no rotation.
 
     Raises:
-        InputError: the quaternion is not of unit length (1e-3), or something is not finite.
+        InputError: The length of the quaternion differs from 1 by more than 1e-3, or a number is not finite.
+
+    Example:
+        >>> ArrayPose((0.0, 0.0, 1.0)).rotation.diagonal().tolist()
+        [1.0, 1.0, 1.0]
     """
 
     position: tuple[float, float, float]
@@ -186,18 +208,12 @@ class ArrayPose:
     @cached_property
     @torch.inference_mode(False)
     def rotation(self) -> Tensor:
-        """Matrix R that turns array into world coordinates, float64 (3, 3)."""
-        x, y, z, w = (q / math.hypot(*self.orientation) for q in self.orientation)
-        return torch.tensor(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ],
-            dtype=torch.float64,
-        )
+        """Matrix that rotates array into world coordinates, float64 (3, 3)."""
+        return torch.from_numpy(Rotation.from_quat(self.orientation).as_matrix())
 
     def line_of_sight(self, transmitter: Tensor, receiver: Tensor) -> Tensor:
-        """Azimuth and elevation (n, 2) [rad] at which an array turned like this one, standing at `receiver`, sees
-        `transmitter` (both (n, 3) or (3,) [m]): d = R^T (transmitter - receiver) / |.|, folded above the plane."""
+        """Return azimuth and elevation (n, 2) [rad] of `transmitter` in coordinates of the array at `receiver`.
+
+        Both are (n, 3) or (3,) [m]: d = R^T (transmitter - receiver) / |.|, folded to the front of the array.
+        """
         return torch.stack(to_angles((transmitter - receiver) @ self.rotation), dim=-1)

@@ -1,10 +1,10 @@
-"""What a planar antenna array reports of the paths that reach it (paper, section 3)."""
+"""Planar antenna arrays: their channels, the spectra that a beamformer computes from them, and their co-array."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -12,25 +12,30 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.beamforming import BEAMFORMERS, PHASE
 from swiftwrf.errors import InputError
+from swiftwrf.runtime.cache import cached_tensors
 
 LIGHT_SPEED = 299_792_458.0  # [m / s]
-MOST_ELEMENTS = 4096  # of an array: what follows grows with their square
-MOST_VALUES = 2**28  # of the co-array's functions on a grid: 2 GiB
-SAME = 1e-6  # differences closer than this share of a wavelength are one
-OPPOSITE = 1e-2  # an element closer than this share of a wavelength to where it would lie opposite does so
-AT_ONCE, MOST_PAIRS = 256, 2**24  # spectra, and pairs of elements, in double precision
+MAX_ELEMENTS = 4096  # of an array: the co-array grows with their square
+MAX_BASIS_VALUES = 2**28  # of the co-array's basis functions on a grid: 2 GiB
+LAG_TOLERANCE_WAVELENGTHS = 1e-6  # closer differences of element positions are one
+OPPOSITE_TOLERANCE_WAVELENGTHS = 1e-2  # between an element and the mirror image of another one
+BATCH_SPECTRA, MAX_ELEMENT_PAIRS = 256, 2**24  # in double precision at a time
 
 
 @dataclass(frozen=True, eq=False)
 class PlanarArray:
-    """Elements in the plane z = 0 of the array's coordinates.
+    """Antenna elements in the plane z = 0 of the array's coordinates.
 
     Args:
-        element: positions (K, 2) [m], float64.
-        wavelength: of the carrier [m].
+        element: Positions of the K elements, float64 (K, 2) [m].
+        wavelength: Wavelength of the carrier [m].
 
     Raises:
-        InputError: elements of another shape, no or too many of them, or something that is not finite.
+        InputError: Elements of another shape, none or more than 4096 of them, or a number that is not finite.
+
+    Example:
+        >>> PlanarArray.grid(2, 8, spacing=0.06, frequency_hz=2.4e9)
+        PlanarArray(16 elements, 2.4 GHz)
     """
 
     element: Tensor
@@ -38,8 +43,8 @@ class PlanarArray:
 
     def __post_init__(self) -> None:
         shape = tuple(self.element.shape)
-        if len(shape) != 2 or shape[1] != 2 or not 1 <= shape[0] <= MOST_ELEMENTS:
-            raise InputError(f"an array has 1 to {MOST_ELEMENTS} elements at positions (K, 2), got shape {shape}")
+        if len(shape) != 2 or shape[1] != 2 or not 1 <= shape[0] <= MAX_ELEMENTS:
+            raise InputError(f"an array has 1 to {MAX_ELEMENTS} elements at positions (K, 2), got shape {shape}")
         if not bool(self.element.isfinite().all()) or not 0 < self.wavelength < math.inf:
             raise InputError(
                 "an array's elements need finite positions [m] and its carrier a wavelength above 0 m, got "
@@ -49,8 +54,11 @@ class PlanarArray:
     def __eq__(self, other: object) -> bool:
         return isinstance(other, PlanarArray) and self._content == other._content
 
-    def __hash__(self) -> int:  # equal arrays share what is computed for one
+    def __hash__(self) -> int:  # equal arrays share cached results
         return hash(self._content)
+
+    def __repr__(self) -> str:
+        return f"PlanarArray({len(self.element)} elements, {self.frequency_hz / 1e9:.4g} GHz)"
 
     @cached_property
     def _content(self) -> tuple[float, ...]:
@@ -58,80 +66,86 @@ class PlanarArray:
 
     @property
     def frequency_hz(self) -> float:
-        """Of the carrier."""
+        """Frequency of the carrier [Hz]."""
         return LIGHT_SPEED / self.wavelength
 
     @classmethod
     def square(cls, side: int, frequency_hz: float, spacing: float | None = None) -> PlanarArray:
-        """side x side elements, `spacing` [m] or else half a wavelength apart, the first at the origin."""
+        """Return side x side elements, the first at the origin, `spacing` [m] apart. Defaults to half a wavelength."""
         wavelength = LIGHT_SPEED / frequency_hz
         steps = torch.arange(side, dtype=torch.float64) * (spacing or wavelength / 2)
         return cls(torch.cartesian_prod(steps, steps), wavelength)
 
     @classmethod
     def grid(cls, rows: int, columns: int, spacing: float, frequency_hz: float) -> PlanarArray:
-        """rows x columns elements, `spacing` [m] apart and centred on the origin; the element of row r and column c is
-        number r * columns + c, columns ascend along x and rows along y."""
+        """Return rows x columns elements, `spacing` [m] apart and centred on the origin.
+
+        Columns ascend along x and rows along y. Element r * columns + c is that of row r and column c.
+        """
         y, x = (spacing * (torch.arange(n, dtype=torch.float64) - (n - 1) / 2) for n in (rows, columns))
         return cls(torch.cartesian_prod(y, x).flip(1), LIGHT_SPEED / frequency_hz)
 
     @property
     def opposite(self) -> Tensor | None:
-        """Which element lies across the array's centre from each one, (K,); None where none does for one of them.
+        """Index of the element at the point reflection of each one in the array's centre, (K,). None if one has none.
 
-        An array with such elements cannot tell a channel from its conjugate, seen by an array turned by half a turn.
+        Such an array does not distinguish a channel from its conjugate, received by the array rotated by 180 degrees.
         """
         centre = (self.element.amax(dim=0) + self.element.amin(dim=0)) / 2
         apart, number = torch.cdist(2 * centre - self.element, self.element).min(dim=1)
-        return number if bool((apart < OPPOSITE * self.wavelength).all()) else None
+        return number if bool((apart < OPPOSITE_TOLERANCE_WAVELENGTHS * self.wavelength).all()) else None
 
     def phase(self, direction: Tensor) -> Tensor:
-        """By how much each element leads the origin for a wave from unit vectors (..., 3), (..., K) [rad] (paper, the
-        phase difference Delta alpha)."""
+        """Return the phase lead (..., K) [rad] of each element over the origin for waves from unit vectors (..., 3).
+
+        It is the phase difference Delta alpha of the paper.
+        """
         return 2 * math.pi / self.wavelength * (direction[..., :2].to(self.element) @ self.element.T)
 
     def spectrum(self, channel: Tensor, grid: AngularGrid, beamformer: str = PHASE) -> Tensor:
-        """The magnitude at each direction, in [0, 1], float32 (n, n_elevation, n_azimuth).
-
-        With `phase`, the default, only the phases of the channel count: what the array reports is where the wave comes
-        from, not its power.
+        """Return the magnitude at each direction, in [0, 1], float32 (n, n_elevation, n_azimuth).
 
         Args:
-            channel: complex channel of each element, (n, K), or (n, S, K) of several snapshots (subcarriers or packets).
-            grid: the directions to scan.
-            beamformer: of `swiftwrf.array.beamforming`: phase, bartlett or capon.
+            channel: Complex channel of each element, (n, K), or (n, S, K) of several snapshots (subcarriers or packets).
+            grid: Directions to scan.
+            beamformer: Name in `swiftwrf.array.beamforming`: phase, bartlett or capon. With phase, magnitudes of the
+                channel have no effect, as in the paper.
 
         Raises:
-            InputError: an unknown beamformer, or too few snapshots for it.
+            InputError: An unknown beamformer, or too few snapshots for it.
         """
         snapshots = channel[:, None] if channel.dim() == 2 else channel
-        make = BEAMFORMERS[beamformer]
-        drawn = torch.empty(len(channel), *grid.shape)
-        for rows in torch.arange(len(channel)).split(max(1, min(AT_ONCE, MOST_PAIRS // len(self.element) ** 2))):
-            squared = make(snapshots[rows], lambda matrix: self.responses(matrix, grid))
-            drawn[rows] = squared.clamp(0, 1).sqrt().float()
-        return drawn
+        make, functions = BEAMFORMERS[beamformer], basis(self, grid)
+        spectrum = torch.empty(len(channel), *grid.shape)
+        for rows in torch.arange(len(channel)).split(
+            max(1, min(BATCH_SPECTRA, MAX_ELEMENT_PAIRS // len(self.element) ** 2))
+        ):
+            squared = make(
+                snapshots[rows], lambda matrix: (self._coefficients(matrix) @ functions).reshape(-1, *grid.shape)
+            )
+            spectrum[rows] = squared.clamp(0, 1).sqrt().float()
+        return spectrum
 
     def responses(self, matrix: Tensor, grid: AngularGrid) -> Tensor:
-        """a^H M a of Hermitian matrices (n, K, K) for the steering vectors a of a grid, float64 (n, n_elevation, n_azimuth).
+        """Return a^H M a, float64 (n, n_elevation, n_azimuth), of Hermitian matrices (n, K, K) and steering vectors a."""
+        return (self._coefficients(matrix) @ basis(self, grid)).reshape(-1, *grid.shape)
 
-        What elements of one difference say is added up first: a few dozen real numbers are left of a matrix (see
-        `swiftwrf.models.coarray`).
-        """
+    def _coefficients(self, matrix: Tensor) -> Tensor:
+        """Return the coefficients (n, 1 + 2 P) of a^H M a in the co-array basis: sums of entries with one difference."""
         a, b, lag = pairs(self)
-        functions = basis(self, grid)
-        half = torch.zeros(len(matrix), len(functions) // 2, dtype=torch.complex128).index_add(1, lag, matrix[:, a, b])
+        half = torch.zeros(len(matrix), len(differences(self)), dtype=torch.complex128)
+        half = half.index_add(1, lag, matrix[:, a, b])
         trace = matrix.diagonal(dim1=1, dim2=2).sum(1, keepdim=True).real
-        coefficient = torch.cat([trace, 2 * half.real, 2 * half.imag], dim=1)
-        return (coefficient @ functions).reshape(-1, *grid.shape)
+        return torch.cat([trace, 2 * half.real, 2 * half.imag], dim=1)
 
     def channel(self, direction: Tensor, gain: Tensor, owner: Tensor, n: int) -> Tensor:
-        """Sum of paths at each element: gain exp(j phase), complex128 (n, K).
+        """Return the sum of paths at each element, gain * exp(j phase), complex128 (n, K).
 
         Args:
-            direction: unit vectors towards where the paths come from, in array coordinates, (paths, 3).
-            gain: complex amplitude of each path at the origin, (paths,).
-            owner: which of the n channels a path belongs to, (paths,).
+            direction: Unit vectors towards where the P paths come from, in array coordinates, (P, 3).
+            gain: Complex amplitude of each path at the origin, (P,).
+            owner: Index of the channel to which each path belongs, int64 (P,).
+            n: Number of channels.
         """
         phase = self.phase(direction.double())
         wave = gain.to(torch.complex128)[:, None] * torch.polar(torch.ones_like(phase), phase)
@@ -139,22 +153,23 @@ class PlanarArray:
 
 
 def differences(array: PlanarArray) -> Tensor:
-    """The co-array without 0, one of each pair l, -l, float64 (P, 2) [wavelengths]."""
+    """Return half the co-array without 0, one of each pair l, -l, float64 (P, 2) [wavelengths]."""
     return _lags(array)[0]
 
 
 def pairs(array: PlanarArray) -> tuple[Tensor, Tensor, Tensor]:
-    """Of all pairs of elements (a, b) with a difference in the half co-array: a, b and the number of the difference."""
+    """Return the pairs of elements (a, b) with a difference in the half co-array: a, b and the index of the difference."""
     return _lags(array)[1:]
 
 
-@lru_cache(maxsize=8)
-@torch.inference_mode(False)  # what is kept must also serve calls that await gradients
+@cached_tensors
+@torch.inference_mode(False)  # cached tensors must also serve calls that record gradients
 def _lags(array: PlanarArray) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The half co-array (P, 2) [wavelengths], and the pairs of elements a, b with their number in it."""
+    """Return the half co-array (P, 2) [wavelengths], and the pairs of elements a, b with their index in it."""
     element = array.element.double() / array.wavelength
     every = (element[:, None] - element).reshape(-1, 2)
-    rounded, group, count = torch.round(every / SAME).unique(dim=0, return_inverse=True, return_counts=True)
+    rounded = torch.round(every / LAG_TOLERANCE_WAVELENGTHS)
+    rounded, group, count = rounded.unique(dim=0, return_inverse=True, return_counts=True)
     mean = torch.zeros_like(rounded).index_add(0, group, every) / count[:, None]
     first = (rounded[:, 0] > 0) | ((rounded[:, 0] == 0) & (rounded[:, 1] > 0))
     pair = first[group].nonzero()[:, 0]
@@ -162,15 +177,19 @@ def _lags(array: PlanarArray) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return mean[first], pair // len(element), pair % len(element), number
 
 
-@lru_cache(maxsize=8)
-@torch.inference_mode(False)  # what is kept must also serve calls that await gradients
+@cached_tensors
+@torch.inference_mode(False)
 def basis(array: PlanarArray, grid: AngularGrid, dtype: torch.dtype = torch.float64) -> Tensor:
-    """The functions that squared spectra consist of: 1, P cosines, P sines, (1 + 2 P, pixels); kept for the next call."""
-    between = differences(array)
-    if (values := (1 + 2 * len(between)) * math.prod(grid.shape)) > MOST_VALUES:
+    """Return the functions whose sums are squared spectra: 1, P cosines and P sines, (1 + 2 P, pixels).
+
+    Raises:
+        InputError: The functions take more than 2 GiB on this grid.
+    """
+    lag = differences(array)
+    if (values := (1 + 2 * len(lag)) * math.prod(grid.shape)) > MAX_BASIS_VALUES:
         raise InputError(
-            f"the {1 + 2 * len(between)} functions of this array take {values:.2g} values on a grid of {grid.shape}, more "
-            f"than {MOST_VALUES:.2g}; take a coarser grid or an array of fewer elements"
+            f"the {1 + 2 * len(lag)} functions of this array take {values:.2g} values on a grid of {grid.shape}, more "
+            f"than {MAX_BASIS_VALUES:.2g}; take a coarser grid or an array of fewer elements"
         )
-    phase = 2 * math.pi * between @ grid.direction[..., :2].reshape(-1, 2).T
+    phase = 2 * math.pi * lag @ grid.direction[..., :2].reshape(-1, 2).T
     return torch.cat([torch.ones_like(phase[:1]), phase.cos(), phase.sin()]).to(dtype)

@@ -4,7 +4,7 @@ from swiftwrf.comparison.base import Config, fit
 from swiftwrf.comparison.dcgan import Dcgan, DcganConfig, DcganSize
 from swiftwrf.comparison.drawing import Drawing
 from swiftwrf.comparison.nerf2 import NeRF2, NeRF2Config, NeRF2Size
-from swiftwrf.comparison.nerf2_rssi import NeRF2Rssi, NeRF2RssiConfig, NeRF2RssiSize, fit_rssi
+from swiftwrf.comparison.nerf2_rssi import NeRF2Rssi, NeRF2RssiConfig, NeRF2RssiSize
 from swiftwrf.comparison.vae import Vae, VaeConfig, VaeSize
 from swiftwrf.comparison.wrfgs import WrfGs, WrfGsConfig, WrfGsSize
 
@@ -27,5 +27,4 @@ __all__ = [
     "WrfGsConfig",
     "WrfGsSize",
     "fit",
-    "fit_rssi",
 ]

@@ -14,10 +14,8 @@ decay.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -28,11 +26,9 @@ from swiftwrf.comparison.base import Config, Training, descend
 from swiftwrf.comparison.drawing import chunks, draw_parameters, restored
 from swiftwrf.comparison.nerf2 import SAMPLES_AT_ONCE, Field, NeRF2Size, received
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.positions import check_drawn, check_positions, frame, normalise
-from swiftwrf.rssi.prepare import check
-from swiftwrf.rssi.state import fingerprint
+from swiftwrf.positions import check_drawn, frame, normalise
+from swiftwrf.rssi.base import RssiFitContext, RssiPredictor, fingerprint
 from swiftwrf.runtime.checkpoint import Header, Saved
-from swiftwrf.runtime.session import Record
 
 
 @dataclass(frozen=True)
@@ -49,7 +45,7 @@ class NeRF2RssiSize(NeRF2Size):
 
 
 @dataclass(frozen=True)
-class NeRF2RssiConfig(Config[NeRF2RssiSize, "NeRF2Rssi"]):
+class NeRF2RssiConfig(Config[NeRF2RssiSize, "NeRF2RssiNetwork"]):
     """How NeRF2 is fitted to RSSI; a batch is of transmitter positions."""
 
     size: NeRF2RssiSize = NeRF2RssiSize()
@@ -79,15 +75,13 @@ class NeRF2RssiConfig(Config[NeRF2RssiSize, "NeRF2Rssi"]):
         return NeRF2RssiTraining(self, train, device)
 
 
-class NeRF2Rssi(nn.Module, Saved):
-    """RSSI at every receiver from the transmitter's position.
+class NeRF2RssiNetwork(nn.Module):
+    """The field and the places of the receivers in it.
 
     Args:
-        size: of the model.
-        n_receivers: R.
+        size: Size of the field and its rays.
+        n_receivers: Number of receivers R.
     """
-
-    kind: ClassVar[str] = "nerf2 rssi model"
 
     def __init__(self, size: NeRF2RssiSize, n_receivers: int) -> None:
         super().__init__()
@@ -98,78 +92,84 @@ class NeRF2Rssi(nn.Module, Saved):
     centre: Tensor
     receiver: Tensor
 
-    def forward(self, transmitter: Tensor, receiver: Tensor) -> Tensor:
-        """Amplitudes a (n, R) with transmitters (n, 3) and receivers (R, 3) [m from the centre]."""
+    def forward(self, transmitter: Tensor) -> Tensor:
+        """Return amplitudes (n, R) with the transmitter at positions (n, 3) [m from the centre]."""
         grid = AngularGrid.hemisphere(self.size.elevations, self.size.azimuths)
+        receiver = self.local(self.receiver)[:, None]
         direction = grid.direction.flatten(0, 1).to(receiver)
-        signal = received(self.field, self.size, transmitter[:, None, None], receiver[:, None], direction)
+        signal = received(self.field, self.size, transmitter[:, None, None], receiver, direction)
         return torch.hypot(*signal.mean(dim=-1))
 
     def local(self, position: Tensor) -> Tensor:
-        """Positions (n, 3) [m] from the centre, float32."""
+        """Return positions (n, 3) [m] relative to the centre, float32."""
         return normalise(position.to(self.centre.device), self.centre, 1.0)
 
-    @torch.no_grad()
-    def predict(self, position: Tensor) -> Tensor:
-        """RSSI [dBm] at every receiver, float64 (n, R), with the transmitter at positions (n, 3) [m].
 
-        Raises:
-            InputError: positions of another shape, or not finite.
-        """
-        position, receiver = check_positions(position), self.local(self.receiver)
-        rays = self.size.azimuths * self.size.elevations * self.size.samples * max(len(receiver), 1)
+class NeRF2Rssi(RssiPredictor, Saved):
+    """A neural field for all receivers, its rays averaged; predictions are differentiable in the position.
+
+    Args:
+        config: Options as one object. Defaults to `NeRF2RssiConfig()`.
+        options: Single options, which replace those of `config`.
+
+    Example:
+        >>> import swiftwrf
+        >>> model = NeRF2Rssi(steps=2, batch=4).fit(swiftwrf.rssi_room(n=20))
+        >>> model.predict(torch.zeros(1, 3)).mean.shape
+        torch.Size([1, 12])
+    """
+
+    kind: ClassVar[str] = "nerf2 rssi model"
+    name = "nerf2"
+    config_type = NeRF2RssiConfig
+    requires_receiver_position = True
+    slow = True
+
+    network: NeRF2RssiNetwork
+
+    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+        owner = fingerprint(self.config, train, train)
+        training = self.config.training(train, context.device)
+        self.network = descend(training, owner, context.checkpoint, context.on_record, context.progress).cpu()
+
+    def _predict(self, position: Tensor) -> tuple[Tensor, None]:
+        network = self.network
+        rays = network.size.azimuths * network.size.elevations * network.size.samples * max(len(network.receiver), 1)
         some = chunks(len(position), max(1, SAMPLES_AT_ONCE // rays))
-        parts = [self(self.local(position[part]), receiver).cpu() for part in some]
-        return check_drawn(100 * (torch.cat([torch.zeros(0, len(receiver)), *parts]).double() - 1))
+        parts = [network(network.local(position[part])) for part in some]
+        empty = torch.zeros(0, len(network.receiver))
+        return check_drawn(100 * (torch.cat([empty, *parts]).double() - 1)), None
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
-        return self.state_dict(), {"size": asdict(self.size)}
+        return self.network.state_dict(), {"options": asdict(self.config), "receiver_names": self.receiver_names}
 
     @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> NeRF2Rssi:
-        size = NeRF2RssiSize(**header["size"])
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
+        size = NeRF2RssiSize(**header["options"]["size"])
         size.check()
-        return restored(lambda: cls(size, len(tensors["receiver"])), tensors)
+        model = cls(**header["options"] | {"size": size})
+        model.receiver_names = tuple(map(str, header["receiver_names"]))
+        model.network = restored(lambda: NeRF2RssiNetwork(size, len(model.receiver_names)), tensors)
+        return model
 
 
-class NeRF2RssiTraining(Training[NeRF2RssiConfig, NeRF2Rssi]):
-    """By the squared error of amplitudes where RSSI was heard."""
+class NeRF2RssiTraining(Training[NeRF2RssiConfig, NeRF2RssiNetwork]):
+    """Descent of the squared error of amplitudes where RSSI was detected."""
 
     def __init__(self, config: NeRF2RssiConfig, train: Rssi, device: torch.device) -> None:
-        model = NeRF2Rssi(config.size, len(train.receiver_names))
+        model = NeRF2RssiNetwork(config.size, len(train.receiver_names))
         draw_parameters(model, torch.Generator().manual_seed(config.seed))
         model.centre, _ = frame(train.transmitter_position)
         model.receiver = train.receiver_position.double()
         super().__init__(config, model.to(device), betas=(0.9, 0.999), weight_decay=config.weight_decay)
-        heard = (~train.rssi_dbm.isnan()).any(dim=1)
-        self.position = model.local(train.transmitter_position[heard])
-        self.amplitude = (1 + train.rssi_dbm[heard] / 100).float().to(device)
+        detected = (~train.rssi_dbm.isnan()).any(dim=1)
+        self.position = model.local(train.transmitter_position[detected])
+        self.amplitude = (1 + train.rssi_dbm[detected] / 100).float().to(device)
 
     def objective(self) -> Tensor:
         row = torch.randint(len(self.position), (self.config.batch,), generator=self.generator()).to(
             self.position.device
         )
         measured = self.amplitude[row]
-        heard = ~measured.isnan()
-        predicted = self.model(self.position[row], self.model.local(self.model.receiver))
-        return functional.mse_loss(predicted[heard], measured[heard])
-
-
-def fit_rssi(
-    train: Rssi,
-    config: NeRF2RssiConfig,
-    *,
-    device: torch.device | str = "cpu",
-    checkpoint: Path | None = None,
-    on_record: Callable[[Record], None] | None = None,
-    progress: bool = True,
-) -> NeRF2Rssi:
-    """Fits all receivers; arguments as of `swiftwrf.comparison.fit`.
-
-    Raises:
-        InputError: fewer than 10 measurements in all, something not finite, or a checkpoint of another fit.
-        FitError: a loss or gradient that is not finite, or a fit that ends worse than it began.
-    """
-    check(train, train)
-    training = config.training(train, torch.device(device))
-    return descend(training, fingerprint(config, train, train), checkpoint, on_record, progress)
+        detected = ~measured.isnan()
+        return functional.mse_loss(self.model(self.position[row])[detected], measured[detected])

@@ -23,7 +23,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from swiftwrf.array.angles import great_circle, to_angles, to_direction
+from swiftwrf.array.angles import angular_distance, to_angles, to_direction
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.rssi.law import fit_law, log_distance
@@ -105,7 +105,7 @@ def check_frames(spectra: Spectra) -> FrameReport | None:
     if len(rows) < FEW or spectra.fixed_position is None or spectra.rotation is None:
         return None
     rows = rows[torch.linspace(0, len(rows) - 1, min(MOST_POSITIONS, len(rows))).round().long()]
-    peak = to_direction(*spectra.grid.strongest(spectra.store[rows]).unbind(-1))
+    peak = to_direction(*spectra.grid.peak_direction(spectra.store[rows]).unbind(-1))
     sign = 1.0 if spectra.moving == "transmitter" else -1.0
     scene = _Scene(spectra.position[rows], spectra.fixed_position, spectra.rotation, sign)
     declared = scene.direction()
@@ -119,7 +119,7 @@ def check_frames(spectra: Spectra) -> FrameReport | None:
     return FrameReport(
         agreement=agreement,
         chance=chance,
-        angle_deg=math.degrees(float(great_circle(declared, peak).median())),
+        angle_deg=math.degrees(float(angular_distance(declared, peak).median())),
         explanations=tuple(name for name, (value, _) in found.items() if value >= named - TIED) if error else (),
         explained=named if error else turned if rotates else agreement,
         turn_deg=tuple(np.degrees(turn).tolist()) if rotates and not error else None,
@@ -133,7 +133,7 @@ def _folded(direction: Tensor) -> Tensor:
 
 def _agreement(direction: Tensor, peak: Tensor) -> tuple[float, float]:
     """Agreement of directions and peaks (n, 3) of the same positions, and of different ones."""
-    angle = great_circle(peak[:, None].expand(-1, len(direction), -1), direction.expand(len(peak), -1, -1))
+    angle = angular_distance(peak[:, None].expand(-1, len(direction), -1), direction.expand(len(peak), -1, -1))
     kernel = torch.exp(-0.5 * (angle / WIDTH).square())
     n = len(peak)
     same = float(kernel.diagonal().mean())
@@ -231,7 +231,7 @@ def _constant_turn(scene: _Scene, peak: Tensor) -> tuple[NDArray[np.float64], fl
 
 def _mean_kernel(direction: Tensor, peak: Tensor) -> Tensor:
     """Agreement of directions (..., n, 3) and peaks (n, 3), (...)."""
-    angle = great_circle(direction, peak.expand_as(direction))
+    angle = angular_distance(direction, peak.expand_as(direction))
     mean: Tensor = torch.exp(-0.5 * (angle / WIDTH).square()).mean(-1)
     return mean
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self, get_type_hints
 
 import torch
 from torch import Tensor
@@ -19,11 +19,12 @@ from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.registry import Registry
-from swiftwrf.runtime.validation import NonNegativeInt, configuration
+from swiftwrf.runtime.validation import NonNegativeInt, checked, configuration
 
 ARRAY, FIXED_END = "array", "fixed end"  # requirements that a model can declare
 CPU = torch.device("cpu")
 Record = dict[str, Any]  # one evaluation of a fit
+Preset = Literal["quick", "paper"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +68,11 @@ class FieldConfig:
     seed: NonNegativeInt = 0
     """seed of everything random"""
 
+    @classmethod
+    def paper(cls, **changes: Any) -> FieldConfig:
+        """Return the settings of the model's publication; the defaults, for a model without published settings."""
+        return cls(**changes)
+
 
 @dataclass(frozen=True)
 class FitContext:
@@ -86,7 +92,8 @@ class FieldModel(Saved):
     keyword arguments of the constructor; `config_type` declares their ranges.
 
     Args:
-        config: Options as one object. Defaults to `config_type()`.
+        config: Options as one object. Defaults to those of the preset.
+        preset: "quick" for the defaults, sized for a desktop; "paper" for the settings of the model's publication.
         options: Single options, which replace those of `config`.
 
     Raises:
@@ -111,12 +118,18 @@ class FieldModel(Saved):
     grid: AngularGrid
     """grid of the training spectra, set by `fit`"""
 
-    def __init__(self, config: Any = None, **options: Any) -> None:
+    @checked
+    def __init__(self, config: Any = None, *, preset: Preset = "quick", **options: Any) -> None:
         known = [field.name for field in fields(self.config_type)]
         unknown = [name for name in options if name not in known]
         if unknown:
             raise InputError(f"{type(self).__name__} has no option {unknown[0]!r}; it has {', '.join(known)}")
-        self.config = replace(config or self.config_type(), **options)
+        if config is None:
+            self.config = (self.config_type.paper if preset == "paper" else self.config_type)(**options)
+        elif isinstance(config, self.config_type):
+            self.config = replace(config, **options)
+        else:
+            raise InputError(f"{type(self).__name__} takes a {self.config_type.__name__}, got {type(config).__name__}")
 
     @classmethod
     def lacking(cls, data: Spectra) -> list[str]:
@@ -162,7 +175,11 @@ class FieldModel(Saved):
         if like is not None and not self.accepts_like(like):
             raise InputError(f"{self.name} cannot reuse the structure of a {like.kind}")
         self.grid = train.grid
-        self._fit(train, FitContext(like, torch.device(device), checkpoint, on_record, progress))
+        try:
+            self._fit(train, FitContext(like, torch.device(device), checkpoint, on_record, progress))
+        except BaseException:
+            del self.grid  # the model counts as not fitted
+            raise
         return self
 
     @abstractmethod
@@ -296,8 +313,7 @@ class FieldModel(Saved):
 
     @classmethod
     def _restored_config(cls, options: Mapping[str, Any]) -> Any:
-        """Return the configuration of a saved model; JSON has lists where options have tuples."""
-        return cls.config_type(**{k: tuple(v) if isinstance(v, list) else v for k, v in options.items()})
+        return from_plain(cls.config_type, options)
 
     @abstractmethod
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
@@ -308,6 +324,18 @@ class FieldModel(Saved):
             f"fitted, {self.grid.shape[0]} x {self.grid.shape[1]} directions" if hasattr(self, "grid") else "not fitted"
         )
         return f"{type(self).__name__}({fitted})"
+
+
+def from_plain(config_type: type[Any], options: Mapping[str, Any]) -> Any:
+    """Return a configuration from values that JSON has stored: nested configurations as objects, tuples as lists."""
+    hints = get_type_hints(config_type)
+
+    def restored(name: str, value: Any) -> Any:
+        if is_dataclass(hints.get(name)):
+            return from_plain(hints[name], value)
+        return tuple(value) if isinstance(value, list) else value
+
+    return config_type(**{name: restored(name, value) for name, value in options.items()})
 
 
 def check_finite(spectrum: Tensor) -> Tensor:
@@ -324,11 +352,12 @@ def check_finite(spectrum: Tensor) -> Tensor:
 FIELD_MODELS: Registry[FieldModel] = Registry("field model", "swiftwrf.models")
 
 
-def make_model(name: str, **options: Any) -> FieldModel:
+def make_model(name: str, preset: Preset = "quick", **options: Any) -> FieldModel:
     """Return a field model by its name, with those of the options that it has.
 
     Args:
         name: Name in the registry, e.g. "hybrid".
+        preset: "quick", or "paper" for published settings; a model without published settings ignores it.
         options: Options such as seed and validation. A model ignores options that it does not have.
 
     Raises:
@@ -340,7 +369,8 @@ def make_model(name: str, **options: Any) -> FieldModel:
     """
     model_type = FIELD_MODELS[name]
     known = {field.name for field in fields(model_type.config_type)}
-    return model_type(**{option: value for option, value in options.items() if option in known})
+    chosen = {option: value for option, value in options.items() if option in known}
+    return model_type(preset=preset, **chosen)
 
 
 def model_types(names: Iterable[str] | None = None) -> dict[str, type[FieldModel]]:
@@ -352,5 +382,15 @@ def model_types(names: Iterable[str] | None = None) -> dict[str, type[FieldModel
     return {name: FIELD_MODELS[name] for name in (FIELD_MODELS if names is None else names)}
 
 
-__all__ = ["ARRAY", "FIELD_MODELS", "FIXED_END", "FieldConfig", "FieldModel", "FitContext", "Prediction", "Record"]
-__all__ += ["check_finite", "make_model", "model_types"]
+__all__ = [
+    "ARRAY",
+    "FIELD_MODELS",
+    "FIXED_END",
+    "FieldConfig",
+    "FieldModel",
+    "FitContext",
+    "Prediction",
+    "Preset",
+    "Record",
+]
+__all__ += ["check_finite", "from_plain", "make_model", "model_types"]

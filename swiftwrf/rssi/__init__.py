@@ -1,9 +1,9 @@
 """RSSI at fixed receivers from the position of the transmitter."""
 
+from swiftwrf.rssi.base import Map, PredictorConfig, RssiFitContext, RssiPredictor
 from swiftwrf.rssi.config import RssiConfig
-from swiftwrf.rssi.fit import Map, fit_rssi
-from swiftwrf.rssi.law import Law, fit_law, log_distance
-from swiftwrf.rssi.model import RssiModel
-from swiftwrf.rssi.uncertainty import LEVEL
+from swiftwrf.rssi.model import LEVEL, RssiModel, fit_rssi
+from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
 
-__all__ = ["LEVEL", "Law", "Map", "RssiConfig", "RssiModel", "fit_law", "fit_rssi", "log_distance"]
+__all__ = ["LEVEL", "Map", "PathLoss", "PredictorConfig", "RssiConfig", "RssiFitContext", "RssiModel", "RssiPredictor"]
+__all__ += ["fit_path_loss", "fit_rssi", "log_distance"]

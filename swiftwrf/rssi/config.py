@@ -1,37 +1,46 @@
-"""How RSSI is modelled and fitted."""
+"""Options of the RSSI model."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Annotated, Any
 
-from swiftwrf.data.splits import Validation
+from annotated_types import Ge
+
+from swiftwrf.rssi.base import PredictorConfig
+from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
 
-@dataclass(frozen=True)
-class RssiConfig:
-    """How RSSI is modelled and fitted. The defaults are what measured best on held-out training rows."""
+@configuration
+class RssiConfig(PredictorConfig):
+    """Options of `RssiModel`. The defaults have the lowest error on held-out training rows.
 
-    n_primitives: int = 50
-    """a receiver; none where held-out rows are predicted no better with a field than by the log-distance law"""
-    huber: float = 1.345
-    """errors beyond so many standard deviations of the noise count linearly (Huber's constant: 95 % efficient where the
-    noise is Gaussian), for packets have outliers"""
-    validation: Validation = "random"
-    """what is held out inside the training part: single rows, or a region"""
-    plain: bool = False
-    """the plain head, rssi = 100 (pooled - 1), its primitives learnt step by step; otherwise primitives as drawn, on a
-    log-distance law with directivity, in closed form"""
-    steps: int = 600
-    """of the plain head's optimisation"""
-    batch: int = 1024
-    """rows a step"""
-    rate: float = 5e-2
-    """of a step"""
-    seed: int = 0
+    Example:
+        >>> RssiConfig.paper(steps=100).paper_head
+        True
+    """
+
+    n_primitives: NonNegativeInt = 50
+    """primitives a receiver; a fit uses none if the path-loss model predicts held-out rows as well as a field"""
+    huber: PositiveFloat = 1.345
+    """number of standard deviations of the noise beyond which an error counts linearly (Huber's constant: 95 % efficient
+    for Gaussian noise), since packets have outliers"""
+    max_locations: Annotated[int, Ge(10)] = 1500
+    """location bins that the rows are averaged in; the time of a fit grows with the cube of their number"""
+    paper_head: bool = False
+    """the head of the paper, rssi = 100 (mean magnitude - 1), its primitives learnt by gradient descent; otherwise fixed
+    primitives on a path-loss model with directivity, fitted by iteratively reweighted least squares"""
+    steps: PositiveInt = 600
+    """gradient steps of the paper's head"""
+    batch: PositiveInt = 1024
+    """location bins a gradient step"""
+    rate: PositiveFloat = 5e-2
+    """learning rate of a gradient step"""
 
     @classmethod
     def paper(cls, **changes: Any) -> RssiConfig:
-        """The plain head: 50 learnt primitives a receiver, their averaged magnitude and nothing else. The paper leaves the
-        scale of its target open; this is NeRF2's."""
-        return replace(cls(plain=True), **changes)
+        """Return the paper's head: 50 learnt primitives a receiver, and their mean magnitude only.
+
+        The paper leaves the scale of its target open. This is the scale of NeRF2.
+        """
+        return replace(cls(paper_head=True), **changes)

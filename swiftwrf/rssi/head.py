@@ -1,13 +1,15 @@
-"""The head: a receiver's primitives, whose responses move with the transmitter, averaged over all directions.
+"""The head of a receiver: primitives whose responses depend on a latent field, averaged over all directions.
 
-    pooled(c) = 100 mean over directions |A + c B|        [dB]
+    m(c) = 100 mean over directions |A + c B|        [dB]
 
 A is the field of the canonical primitives on a 16 x 16 grid, B that of the same primitives with other responses, scaled so
-that a small c is a change in dB. 100 dB a unit is the scale of the NeRF2 data (rssi = 100 (a - 1)). Where the primitives
-stay, A and B are drawn once, and all that is left of them is one convex function of one number.
+that a small c is a change in dB. 100 dB a unit is the scale of the NeRF2 data (rssi = 100 (a - 1)). If the primitives are
+fixed, A and B are rendered once, and m is one convex function of one number.
 """
 
 from __future__ import annotations
+
+import hashlib
 
 import torch
 from torch import Tensor, nn
@@ -17,64 +19,64 @@ from swiftwrf.models.swiftwrf.primitives import Primitives
 from swiftwrf.rasterize import rasterize
 from swiftwrf.rasterize.magnitude import magnitude
 
-GRID = AngularGrid.hemisphere(16, 16)
-SCALE = 100.0  # dB a unit of magnitude
-REACH, STEP = 64.0, 0.125  # [dB] of the table: a motion beyond is 10 deviations of any field that was measured
+HEAD_GRID = AngularGrid.hemisphere(16, 16)
+N_DIRECTIONS = HEAD_GRID.shape[0] * HEAD_GRID.shape[1]
+DB_PER_UNIT = 100.0  # of magnitude
+TABLE_RANGE_DB, TABLE_STEP_DB = 64.0, 0.125  # 64 dB are 10 standard deviations of any measured field
+RESPONSE_SPREAD = 0.3  # responses of B relative to A: independent ones overfit, since only their sum is measured
 
 
 class Head(nn.Module):
-    """The primitives of R receivers.
+    """The primitives of one receiver.
 
     Args:
-        n_receivers: R.
-        n_primitives: of each; 0 draws nothing.
-        seed: of where they lie and how they respond.
+        receiver_name: Name of the receiver. Its primitives depend on the name and the seed only.
+        n_primitives: Number of primitives. With 0 the head is 0 everywhere.
+        seed: Seed of the primitives' means and responses.
     """
 
-    def __init__(self, n_receivers: int, n_primitives: int, seed: int) -> None:
+    def __init__(self, receiver_name: str, n_primitives: int, seed: int) -> None:
         super().__init__()
-        generator = torch.Generator().manual_seed(seed)
-        self.primitives = Primitives(n_primitives, GRID, generator=generator, scenes=(n_receivers,))
-        # the moving responses resemble the canonical ones: independent ones overfit where only sums are measured
-        self.basis = nn.Parameter(1 + 0.3 * torch.randn(n_receivers, n_primitives, generator=generator))
+        digest = hashlib.sha256(f"{seed} {receiver_name}".encode()).digest()
+        generator = torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))
+        self.primitives = Primitives(n_primitives, HEAD_GRID, generator=generator)
+        self.basis = nn.Parameter(1 + RESPONSE_SPREAD * torch.randn(n_primitives, generator=generator))
 
-    def draw(self) -> Tensor:
-        """A and B of each receiver, (R, 2, 2, directions): which, real and imaginary part."""
-        mean, cholesky, attenuation, response = self.primitives()
+    def render(self) -> Tensor:
+        """Return A and B, (2, 2, directions): which field, real and imaginary part."""
         if not len(self.primitives):
-            return torch.zeros(len(mean), 2, 2, GRID.shape[0] * GRID.shape[1])
-        canonical = attenuation[..., None] * response
-        weight = torch.stack([canonical, self.basis[..., None] * canonical], dim=1)  # (R, 2, N, 2)
-        means, choleskys = (x[:, None].expand(-1, 2, -1, -1) for x in (mean, cholesky))
-        still, moving = rasterize(means, choleskys, weight, GRID).flatten(-2).unbind(1)
-        phase = still / magnitude(still[..., None]).squeeze(-1).unsqueeze(-2).clamp_min(1e-6)
-        gain = SCALE * (phase * moving).sum(dim=-2).mean(dim=-1)
-        drawn: Tensor = torch.stack([still, moving / gain.clamp_min(1e-3)[:, None, None]], dim=1)
-        return drawn
+            return torch.zeros(2, 2, N_DIRECTIONS)
+        mean, cholesky, attenuation, response = self.primitives()
+        canonical = attenuation[:, None] * response
+        weight = torch.stack([canonical, self.basis[:, None] * canonical])  # (2, N, 2)
+        means, choleskys = (x.expand(2, -1, -1) for x in (mean, cholesky))
+        fixed, varying = rasterize(means, choleskys, weight, HEAD_GRID).flatten(-2)
+        phase = fixed / magnitude(fixed[..., None]).squeeze(-1).clamp_min(1e-6)
+        gain = DB_PER_UNIT * (phase * varying).sum(dim=0).mean()
+        return torch.stack([fixed, varying / gain.clamp_min(1e-3)])
 
 
-def pooled(drawn: Tensor, motion: Tensor) -> Tensor:
-    """The averaged magnitude (n, R) [dB] of drawn fields (R, 2, 2, directions) at motions (n, R) [dB]."""
-    moved = drawn[:, 0] + motion[..., None, None] * drawn[:, 1]
-    mean: Tensor = magnitude(moved[..., None]).mean(dim=(-2, -1))
-    return SCALE * mean
+def mean_magnitude(rendered: Tensor, latent: Tensor) -> Tensor:
+    """Return m(c) (n, R) [dB] of rendered fields (R, 2, 2, directions) at a latent field c (n, R) [dB]."""
+    changed = rendered[:, 0] + latent[..., None, None] * rendered[:, 1]
+    mean: Tensor = magnitude(changed[..., None]).mean(dim=(-2, -1))
+    return DB_PER_UNIT * mean
 
 
-class Table:
-    """`pooled` of some receivers at all motions, by straight lines between points an eighth of a dB apart, which is off by
-    less than 2e-3 dB.
+class HeadTable:
+    """Piecewise linear `mean_magnitude` of R receivers, tabulated every 0.125 dB, with an error below 2e-3 dB.
 
     Args:
-        drawn: fields (R, 2, 2, directions).
+        rendered: Fields (R, 2, 2, directions).
     """
 
-    def __init__(self, drawn: Tensor) -> None:
-        node = torch.arange(-REACH, REACH + STEP, STEP, device=drawn.device)
-        self.value = pooled(drawn, node[:, None].expand(-1, len(drawn))).double()  # (nodes, R)
+    def __init__(self, rendered: Tensor) -> None:
+        node = torch.arange(-TABLE_RANGE_DB, TABLE_RANGE_DB + TABLE_STEP_DB, TABLE_STEP_DB, device=rendered.device)
+        self.value = mean_magnitude(rendered, node[:, None].expand(-1, len(rendered))).double()  # (nodes, R)
 
-    def __call__(self, motion: Tensor) -> tuple[Tensor, Tensor]:
-        """The averaged magnitude and its slope at motions (n, R) [dB], each of their type."""
-        place = (motion + REACH) / STEP
-        node = place.floor().long().clamp(0, len(self.value) - 2)
-        low, high = (self.value.gather(0, n).to(motion) for n in (node, node + 1))
-        return low + (place - node) * (high - low), (high - low) / STEP
+    def __call__(self, latent: Tensor) -> tuple[Tensor, Tensor]:
+        """Return m(c) and its slope, each (n, R), at a latent field c (n, R) [dB]."""
+        place = (latent + TABLE_RANGE_DB) / TABLE_STEP_DB
+        node = place.detach().floor().long().clamp(0, len(self.value) - 2)
+        low, high = (self.value.gather(0, n).to(latent) for n in (node, node + 1))
+        return low + (place - node) * (high - low), (high - low) / TABLE_STEP_DB

@@ -1,134 +1,186 @@
-"""RSSI from SwiftWRF: for each receiver a small spectrum that moves with the transmitter, averaged to one number.
+"""SwiftWRF for RSSI: for each receiver a path-loss model, and a head whose latent field depends on the position.
 
-    rssi_r(s) = T_r - 10 gamma_r log10 |s - receiver_r| + directivity_r(s) + pooled_r(c_r(s)) - pooled_r(0)       [dBm]
+    rssi_r(s) = T_r - 10 gamma_r log10 |s - receiver_r| + directivity_r(s) + w_r (m_r(c_r(s)) - m_r(0))       [dBm]
 
-pooled_r is the averaged magnitude of receiver r's primitives on a 16 x 16 grid (`swiftwrf.rssi.head`), c_r a smooth function
-of position that moves their responses, and the directivity a few harmonics of the direction from the receiver. The plain
-head of the paper is -100 + pooled_r(c_r(s)).
+m_r is the mean magnitude of receiver r's primitives (`swiftwrf.rssi.head`), c_r a Gaussian process of the position,
+directivity_r a few harmonics of the direction from the receiver, and w_r the mixing weight of the field. The paper's head is
+-100 + m_r(c_r(s)).
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
-from functools import cached_property
-from typing import ClassVar
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from statistics import NormalDist
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
+from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import InputError
-from swiftwrf.gp import Kernel
-from swiftwrf.positions import check_batch, check_positions
-from swiftwrf.rssi.head import Table
-from swiftwrf.rssi.law import harmonics, log_distance
-from swiftwrf.rssi.uncertainty import Known
+from swiftwrf.gp import GaussianProcess, Kernel, thinned
+from swiftwrf.models.base import Record
+from swiftwrf.rssi.base import Map, RssiFitContext, RssiPredictor, fingerprint, map_threads
+from swiftwrf.rssi.config import RssiConfig
+from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
+from swiftwrf.rssi.paper_head import HELD_OUT_FOLD, learn_receiver
+from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
+from swiftwrf.rssi.regression import fit_receiver
+from swiftwrf.rssi.stacking import MIN_STACKING_ROWS, comparable, receiver_weights
+from swiftwrf.rssi.training import RssiTraining, prepare
+from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header, Saved
+from swiftwrf.runtime.progress import progress_bar
+from swiftwrf.runtime.session import Session
 from swiftwrf.runtime.threads import single_thread
 
-FARTHEST = 1e9  # [m] from the measurements: beyond, single precision ends, and so does any receiver's reach
+LEVEL = 0.8  # nominal coverage of the interval that the standard deviation is calibrated for
+MAX_DISTANCE_M = 1e9  # from the measurements: float32 ends beyond, and so does any receiver's range
+MAX_VARIANCE_POSITIONS = 200  # measured positions that determine where the field is known
 
 
-@dataclass(frozen=True, eq=False)
-class RssiModel(Saved):
-    """RSSI at R receivers for any position of the transmitter; what `fit_rssi` returns.
+class RssiModel(RssiPredictor, Saved):
+    """RSSI at fixed receivers for any position of the transmitter; predictions are differentiable in the position.
+
+    Everything is chosen on five held-out folds of the training rows: the kernel and whether there is a field at all; the
+    mixing weights of the field beside simpler predictors (the path-loss model of the receiver, that of all receivers, the
+    mean of the receiver); and the scale of the standard deviation. A receiver detected in fewer than 10 rows falls back to
+    the path-loss model of all receivers. If the positions of the receivers are unknown, a path-loss model is a level.
 
     Args:
-        receiver_names: in the order of the columns.
-        n_primitives: a receiver; 0 where the law is all.
-        kernel: of the motion, lengths in [m].
-        weight: of the field, the receiver's law, the law of all receivers and the receiver's mean in the prediction, (4,);
-            it is worked into the tensors below.
-        receiver: positions, float64 (R, 3) [m].
-        centre: of the measured positions, float64 (3,) [m].
-        level, slope: float64 (R,) [dBm], [dB a decade].
-        directivity: (R, 8) [dB].
-        anchor: positions of the motion's coefficients, less the centre, (n, 3) [m].
-        coefficient: (n, R) [dB].
-        drawn: fields of the head, (R, 2, 2, directions).
-        offset: what is taken from the averaged magnitude, (R,) [dB].
-        share: of the head's change in the prediction, (1,).
-        known_position, known_root: of `swiftwrf.rssi.uncertainty.Known`.
-        field_db, noise_db: deviation of the field under its prior, and of a measurement about it, (R,).
-        widening: half of the interval in deviations, (1,).
+        config: Options as one object. Defaults to `RssiConfig()`.
+        options: Single options, which replace those of `config`.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.rssi_room(n=60).split()
+        >>> prediction = RssiModel(validation="block").fit(train).predict(test.transmitter_position)
+        >>> low, high = prediction.interval(0.8)
+        >>> bool((low < prediction.mean).all())
+        True
     """
 
     kind: ClassVar[str] = "rssi model"
+    name = "swiftwrf"
+    config_type = RssiConfig
 
-    receiver_names: tuple[str, ...]
     n_primitives: int
+    """primitives a receiver; 0 if there is no field"""
     kernel: Kernel
-    weight: Tensor
+    """kernel of the latent field, lengths in [m]"""
+    mixing_weight: Tensor
+    """weights (4, R) of the field and the three simpler predictors, contained in the tensors below"""
     receiver: Tensor
+    """positions of the receivers, float64 (R, 3) [m]"""
     centre: Tensor
+    """centre of the measured positions, float64 (3,) [m]"""
     level: Tensor
+    """RSSI at 1 m, float64 (R,) [dBm]"""
     slope: Tensor
+    """float64 (R,) [dB a decade]"""
     directivity: Tensor
+    """coefficients of the harmonics, (R, 8) [dB]"""
     anchor: Tensor
+    """positions of the location bins less the centre, (n, 3) [m]"""
     coefficient: Tensor
-    drawn: Tensor
-    offset: Tensor
-    share: Tensor
-    known_position: Tensor
-    known_root: Tensor
+    """coefficients of the kernel to the anchors, (n, R) [dB]"""
+    rendered: Tensor
+    """fields of the heads, (R, 2, 2, directions)"""
     field_db: Tensor
+    """calibrated standard deviation of the field far from all measurements, (R,) [dB]"""
     noise_db: Tensor
-    widening: Tensor
+    """calibrated standard deviation of a measurement about the field, (R,) [dB]"""
 
-    @cached_property
-    def _table(self) -> Table:
-        return Table(self.drawn)
+    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+        began = time.perf_counter()
+        owner = fingerprint(self.config, train, context.pool)
+        with progress_bar(context.progress) as bar:
+            session = Session(context.checkpoint, owner, bar, context.on_record)
+            training = prepare(train, context.pool, self.config)
+            record: Record = {"stage": "search", "n_primitives": training.n_primitives}
+            if not session.records:
+                session.evaluated(record | {"seconds": time.perf_counter() - began}, {}, {})
+            with files.refusing(f"{context.checkpoint} is no state that a fit can go on from"):
+                fitted = _saved_receivers(session)
+            pending = [r for r in range(len(training.receiver_names)) if r not in fitted]
+            fit_one: Any = learn_receiver if self.config.paper_head else fit_receiver
+            # compiled rasterizers are not safe in several threads, and only the paper's head needs them here
+            parallel: Map = context.parallel or (map if self.config.paper_head else map_threads)
+            task = partial(fit_one, config=self.config, device=context.device)
+            results = zip(pending, parallel(task, [training.column(r) for r in pending]), strict=True)
+            for r, fitted[r] in bar.track(results, total=len(pending), description="receivers"):
+                error = fitted[r]["held_out"].where(_held_out_mask(training, self.config)[:, r], torch.nan)
+                record = {"stage": "final", "receiver": training.receiver_names[r], "n_primitives": training.n_primitives}
+                record["validation"] = float((error - training.rssi[:, r]).abs().nanmean())
+                tensors = {f"{i}.{name}": value for i, found in fitted.items() for name, value in found.items()}
+                session.evaluated(record | {"seconds": time.perf_counter() - began}, tensors, {})
+        self._assemble(train, training, fitted)
 
-    def motion(self, position: Tensor) -> Tensor:
-        """c of each receiver at positions (n, 3) less the centre, (n, R) [dB]."""
-        return self.kernel(position, self.anchor) @ self.coefficient
-
-    @torch.no_grad()
     @single_thread()
-    def predict(self, position: Tensor, batch: int = 512) -> tuple[Tensor, Tensor, Tensor]:
-        """RSSI at any positions, with an interval for a measurement there.
-
-        Args:
-            position: of the transmitter [m], (n, 3).
-            batch: positions at a time, so many that they stay in the processor's cache.
-
-        Returns:
-            Prediction, lower and upper end of the interval, each float32 (n, R) [dBm].
-
-        Raises:
-            InputError: positions of another shape, not finite, or more than a million kilometres away; a batch below 1.
-        """
-        position = check_positions(position)
-        check_batch(batch)
-        away = (position - self.centre).abs().amax() if len(position) else torch.zeros(())
-        if away > FARTHEST:
+    def _assemble(self, train: Rssi, training: RssiTraining, fitted: dict[int, dict[str, Tensor]]) -> None:
+        """Take the fits of all receivers over: mix them with the simpler predictors, and calibrate the standard deviation."""
+        columns = [fitted[r] for r in range(len(fitted))]
+        found = {name: torch.stack([column[name] for column in columns]) for name in columns[0]}
+        held_out = found["held_out"].T.where(_held_out_mask(training, self.config), torch.nan)
+        predictors = torch.cat([held_out[None], training.baseline_held_out])  # (4, n, R)
+        measured, row = train.rssi_dbm, training.bin_of_row
+        if not comparable(predictors[: 1 if self.config.paper_head else None, row], measured).any():
             raise InputError(
-                f"a position is {float(away):.3g} m away from the measurements; at most {FARTHEST:g} m make sense"
+                "no rows can be held out to estimate the error of the model: all measurements are in one part of the "
+                'region; measure elsewhere, too, give a pool of more receivers, or take validation="random"'
             )
-        middle = torch.empty(len(position), len(self.receiver_names))
-        deviation = torch.empty_like(middle)
-        for start in range(0, len(position), batch):
-            rows = slice(start, start + batch)
-            local = (position[rows] - self.centre).float()
-            middle[rows] = self._prediction(position[rows], local)
-            deviation[rows] = self._deviation(local)
-        half = self.widening * deviation
-        return middle, middle - half, middle + half
+        weight = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)[:, None].expand(-1, len(columns)).contiguous()
+        if not self.config.paper_head:
+            weight = receiver_weights(predictors, measured, row)
+        predicted = (weight[:, None] * predictors).where(weight[:, None] > 0, 0.0).sum(dim=0)
+        score = ((measured - predicted[row]) / _held_out_std(training)[row]).abs()
+        scale = _receiver_quantiles(score) / NormalDist().inv_cdf((1 + LEVEL) / 2)
 
-    def _prediction(self, position: Tensor, local: Tensor) -> Tensor:
-        law = self.level + self.slope * log_distance(position, self.receiver)
+        def mixed(own: Tensor, baselines: Tensor) -> Tensor:
+            return (weight * torch.cat([own[None], baselines])).sum(dim=0)
+
+        self.n_primitives, self.kernel, self.mixing_weight = training.n_primitives, training.kernel, weight
+        # an unknown position has no effect: slope and directivity are 0
+        self.receiver, self.centre = train.receiver_position.double().nan_to_num(0.0), training.centre
+        self.level = mixed(found["level"], training.baselines.level)
+        self.slope = mixed(found["slope"], training.baselines.slope)
+        self.directivity = (weight[0][:, None] * found["directivity"]).float()
+        self.anchor, self.coefficient = training.position.float(), found["coefficient"].T.float()
+        self.rendered = found["rendered"]
+        self.field_db, self.noise_db = (scale * training.field_db).float(), (scale * training.noise_db).float()
+        self._precompute()
+
+    def _precompute(self) -> None:
+        """Compute what all predictions share."""
+        self._table = HeadTable(self.rendered)
+        at_zero = self._table(torch.zeros(1, len(self.level)))[0]
+        self._offset = torch.zeros_like(at_zero) if self.config.paper_head else at_zero
+        self._process = GaussianProcess(self.kernel, *thinned(self.anchor.double(), rows=MAX_VARIANCE_POSITIONS))
+
+    @single_thread()
+    def _predict(self, position: Tensor) -> tuple[Tensor, Tensor]:
+        offset = position - self.centre
+        if len(offset) and (farthest := float(offset.abs().amax())) > MAX_DISTANCE_M:
+            raise InputError(
+                f"a position is {farthest:.3g} m away from the measurements; at most {MAX_DISTANCE_M:g} m make sense"
+            )
+        local = offset.float()
+        path_loss = self.level + self.slope * log_distance(position, self.receiver)
         bearing = harmonics(local, (self.receiver - self.centre).float())
-        head = self._table(self.motion(local))[0] - self.offset
-        return law.float() + torch.einsum("brh,rh->br", bearing, self.directivity) + self.share * head
-
-    def _deviation(self, local: Tensor) -> Tensor:
-        """Of a measurement about the prediction, (n, R) [dB]: noise, and the field's uncertainty, which grows away from
-        measured positions."""
-        unknown = Known(self.known_position, self.known_root).unknown(local, self.kernel)
-        return (self.noise_db.square() + self.field_db.square() * unknown[:, None]).sqrt()
+        head = self._table(self.kernel(local, self.anchor) @ self.coefficient)[0] - self._offset
+        mean = path_loss.float() + torch.einsum("brh,rh->br", bearing, self.directivity)
+        mean = mean + self.mixing_weight[0].float() * head
+        variance = self._process.variance(offset).float()
+        return mean, (self.noise_db.square() + self.field_db.square() * variance[:, None]).sqrt()
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
-        tensors = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+        tensors = {name: getattr(self, name) for name in _shapes(0, 0)}
         header = {
+            "options": asdict(self.config),
             "receiver_names": self.receiver_names,
             "n_primitives": self.n_primitives,
             "kernel": asdict(self.kernel),
@@ -136,6 +188,93 @@ class RssiModel(Saved):
         return tensors, header
 
     @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> RssiModel:
-        own = {field.name: tensors[field.name] for field in fields(cls) if field.name in tensors}
-        return cls(tuple(header["receiver_names"]), header["n_primitives"], Kernel(**header["kernel"]), **own)
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
+        model = cls(RssiConfig(**header["options"]))
+        model.receiver_names, model.n_primitives = tuple(map(str, header["receiver_names"])), int(header["n_primitives"])
+        model.kernel = Kernel(**header["kernel"])
+        shapes = _shapes(len(model.receiver_names), len(tensors["anchor"]))
+        files.expect(tensors, shapes)
+        for name in shapes:
+            setattr(model, name, tensors[name])
+        model._precompute()
+        return model
+
+
+def fit_rssi(
+    train: Rssi,
+    config: RssiConfig | None = None,
+    *,
+    pool: Rssi | None = None,
+    device: torch.device | str = "cpu",
+    parallel: Map | None = None,
+    checkpoint: Path | None = None,
+    on_record: Callable[[Record], None] | None = None,
+    progress: bool = False,
+) -> RssiModel:
+    """Fit an `RssiModel`; arguments and errors as of `RssiModel.fit`.
+
+    Example:
+        >>> import swiftwrf
+        >>> fit_rssi(swiftwrf.rssi_room(n=60))
+        RssiModel(fitted, 12 receivers)
+    """
+    return RssiModel(config).fit(
+        train,
+        pool=pool,
+        device=device,
+        parallel=parallel,
+        checkpoint=checkpoint,
+        on_record=on_record,
+        progress=progress,
+    )
+
+
+def _shapes(n_receivers: int, n_anchors: int) -> dict[str, tuple[int, ...]]:
+    """Return the shape of every saved tensor."""
+    per_receiver = dict.fromkeys(("level", "slope", "field_db", "noise_db"), (n_receivers,))
+    return per_receiver | {
+        "mixing_weight": (4, n_receivers),
+        "receiver": (n_receivers, 3),
+        "centre": (3,),
+        "directivity": (n_receivers, N_HARMONICS),
+        "anchor": (n_anchors, 3),
+        "coefficient": (n_anchors, n_receivers),
+        "rendered": (n_receivers, 2, 2, N_DIRECTIONS),
+    }
+
+
+def _saved_receivers(session: Session) -> dict[int, dict[str, Tensor]]:
+    """Return the fits of the receivers that an interrupted fit has finished, by their number."""
+    fitted: dict[int, dict[str, Tensor]] = {}
+    for key, tensor in (session.saved.tensors if session.saved else {}).items():
+        number, name = key.split(".")
+        fitted.setdefault(int(number), {})[name] = tensor
+    return fitted
+
+
+def _held_out_mask(training: RssiTraining, config: RssiConfig) -> Tensor:
+    """Return which bins are predicted without their own fold by the fits of the receivers, bool (n, R)."""
+    detected = ~training.rssi.isnan()
+    return detected & (training.fold == HELD_OUT_FOLD)[:, None] if config.paper_head else detected
+
+
+def _receiver_quantiles(score: Tensor) -> Tensor:
+    """Return the 80 % quantile of finite scores (rows, R) at each receiver (R,); of all scores at receivers with few."""
+    finite = score.where(score.isfinite(), torch.nan)
+    quantile = finite.nanquantile(LEVEL, dim=0)
+    few = (~finite.isnan()).sum(dim=0) < MIN_STACKING_ROWS
+    return quantile.where(~few, score[score.isfinite()].quantile(LEVEL)) if few.any() else quantile
+
+
+def _held_out_std(training: RssiTraining) -> Tensor:
+    """Return the uncalibrated standard deviation (n, R) [dB] of a measurement in each bin, by all other folds.
+
+    The interval is thus cross-conformal (V. Vovk, Annals of Mathematics and Artificial Intelligence 74, 2015): the error of
+    each row is divided by the standard deviation that a model without the row predicts.
+    """
+    variance = torch.empty(len(training.position), dtype=torch.float64)
+    for number in training.fold.unique():
+        out = training.fold == number
+        (known,) = thinned(training.position[~out], rows=MAX_VARIANCE_POSITIONS)
+        variance[out] = GaussianProcess(training.kernel, known).variance(training.position[out])
+    return (training.noise_db.square() + training.field_db.square() * variance[:, None]).sqrt()

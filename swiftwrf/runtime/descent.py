@@ -8,7 +8,6 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import chain
 from typing import Any, Generic, TypeVar, cast
 
 import torch
@@ -17,7 +16,6 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from swiftwrf.errors import FitError, InputError
 from swiftwrf.runtime.checkpoint import refusing
-from swiftwrf.runtime.processes import Processes
 from swiftwrf.runtime.session import Record, Session, State
 
 Model = TypeVar("Model", bound=nn.Module)
@@ -53,18 +51,10 @@ class Descent(ABC, Generic[Model]):
         model: to train, on its device.
         groups: Adam's parameter groups, each with its largest learning rate, `peak`.
         schedule: how long and how.
-        processes: that share each step, all from the same start.
     """
 
-    def __init__(
-        self,
-        name: str,
-        model: Model,
-        groups: Iterable[dict[str, Any]],
-        schedule: Schedule,
-        processes: Processes | None = None,
-    ) -> None:
-        self.name, self.model, self.schedule, self.processes = name, model, schedule, processes or Processes()
+    def __init__(self, name: str, model: Model, groups: Iterable[dict[str, Any]], schedule: Schedule) -> None:
+        self.name, self.model, self.schedule = name, model, schedule
         self.optimiser = torch.optim.Adam(groups, betas=schedule.betas, weight_decay=schedule.weight_decay)
         self.average = self.averaged()
         self.step, self.seconds = 0, 0.0
@@ -83,7 +73,7 @@ class Descent(ABC, Generic[Model]):
 
     @abstractmethod
     def objective(self) -> Tensor:
-        """What the next step descends, a scalar; its average where several processes share the step."""
+        """What the next step descends, a scalar."""
 
     @abstractmethod
     def rate(self, step: int) -> float:
@@ -98,11 +88,9 @@ class Descent(ABC, Generic[Model]):
         try:
             loss = self.objective()
         except InputError as error:  # parameters ran away, so that the model can no longer be drawn
-            self._average(self.broken_at.new_full((), math.nan, dtype=torch.float32))  # the others end with this one
             raise FitError(f"the fit broke at step {self.step}: {error}; {self._advice()}") from None
         self.optimiser.zero_grad()
         loss.backward()
-        self._average(loss.detach())
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), max_norm=self.schedule.clip)
         finite = loss.detach().isfinite() & norm.isfinite()
         self.broken_at = torch.where(finite, self.broken_at, self.broken_at.clamp(max=self.step))
@@ -117,11 +105,6 @@ class Descent(ABC, Generic[Model]):
         self.average.update_parameters(self.model)
         self.step += 1
         return loss.detach()
-
-    def _average(self, loss: Tensor) -> None:
-        """Over the processes: the loss and all gradients."""
-        gradients = (torch.zeros_like(p) if p.grad is None else p.grad for p in self.model.parameters())
-        self.processes.average(chain([loss], gradients))
 
     def _evaluates_after(self, step: int) -> bool:
         return step % self.schedule.check_every == 0 or step == self.schedule.steps

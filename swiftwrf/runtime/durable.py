@@ -7,10 +7,14 @@ second the old file.
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
+
+# directories without read permission, directories on Windows, network file systems that cannot fsync a directory
+UNSUPPORTED = {errno.EACCES, errno.EPERM, errno.EINVAL, errno.ENOTSUP}
 
 
 def cache_folder() -> Path:
@@ -19,13 +23,20 @@ def cache_folder() -> Path:
 
 
 def sync(path: Path) -> None:
-    """Brings a file, or the names in a directory, to the disk."""
-    with suppress(PermissionError):  # a directory that may be written but not read, and directories on Windows
+    """Bring the content of a file, or the names in a directory, to the disk, where the file system can.
+
+    Raises:
+        OSError: The write failed, e.g. because the disk is full.
+    """
+    try:
         descriptor = os.open(path, os.O_RDONLY)
         try:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
+    except OSError as error:
+        if error.errno not in UNSUPPORTED:
+            raise
 
 
 @contextmanager

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from swiftwrf.errors import InputError
 from swiftwrf.runtime import checkpoint
-from swiftwrf.runtime.processes import Processes
 
 Record = dict[str, Any]
 KIND = "fit state"
@@ -59,7 +58,6 @@ class Session:
         owner: fingerprint of configuration and spectra.
         bar: shows progress.
         on_record: is called at each evaluation.
-        processes: that go on together; only the first reads, writes and informs.
         saved: the state of an earlier session of the same fit.
         losses: on held-out spectra, of runs that are done, by their key.
         records: of all evaluations of the fit, those of earlier sessions first.
@@ -73,7 +71,6 @@ class Session:
     owner: str
     bar: Progress
     on_record: Callable[[Record], None] | None
-    processes: Processes = field(default_factory=Processes)
     saved: State | None = None
     losses: dict[str, float] = field(default_factory=dict)
     records: list[Record] = field(default_factory=list)
@@ -81,7 +78,7 @@ class Session:
     began: float = field(default_factory=time.perf_counter)
 
     def __post_init__(self) -> None:
-        self.saved = self.processes.from_first(self._read)
+        self.saved = self._read()
         for record in self.records:
             self._inform(record)
 
@@ -108,7 +105,7 @@ class Session:
         after an interruption has it once."""
         record = record | {"elapsed": self.elapsed}
         self.records.append(record)
-        if self.path is not None and self.processes.first:
+        if self.path is not None:
             shared = {
                 "losses": self.losses,
                 "fingerprint": self.owner,
@@ -119,5 +116,5 @@ class Session:
         self._inform(record)
 
     def _inform(self, record: Record) -> None:
-        if self.on_record is not None and self.processes.first:
+        if self.on_record is not None:
             self.on_record(record)

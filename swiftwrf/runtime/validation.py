@@ -11,7 +11,7 @@ import inspect
 import math
 import types
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
 
 from annotated_types import Ge, Gt, Le, Lt
@@ -33,7 +33,8 @@ RANGES = {Ge: ("at least", "ge"), Gt: ("above", "gt"), Le: ("at most", "le"), Lt
 def check_value(name: str, value: object, annotation: Any) -> None:
     """Refuse a value that its annotation does not allow.
 
-    Understands `Literal`, `Annotated` with ranges, unions, tuples, int, float, bool and str; other annotations pass.
+    Understands `Literal`, `Annotated` with ranges, unions, tuples, dataclasses, int, float, bool and str; other annotations
+    pass.
 
     Args:
         name: Name of the value, for the message.
@@ -71,6 +72,8 @@ def _allowed(value: object, annotation: Any) -> bool:
         return isinstance(value, annotation)
     if annotation in (None, type(None)):
         return value is None
+    if isinstance(annotation, type) and is_dataclass(annotation):
+        return isinstance(value, annotation)
     return True
 
 
@@ -100,6 +103,8 @@ def _described(annotation: Any) -> str:
         return (
             f"a tuple of {_described(arguments[0])}" if arguments[-1] is ... else f"a tuple of {len(arguments)} values"
         )
+    if isinstance(annotation, type) and is_dataclass(annotation):
+        return f"a {annotation.__name__}"
     names = {int: "a whole number", float: "a number", bool: "True or False", str: "a text", type(None): "None"}
     return names.get(annotation, getattr(annotation, "__name__", str(annotation)))
 
@@ -129,7 +134,9 @@ def configuration(cls: type[Class]) -> type[Class]:
             self.check()
 
     cls.__post_init__ = check_fields  # type: ignore[attr-defined]
-    return dataclass(frozen=True)(cls)
+    made = dataclass(frozen=True)(cls)
+    made.__init__.__no_type_check__ = True  # type: ignore[misc,attr-defined]  # the check above has the better message
+    return made
 
 
 @functools.cache

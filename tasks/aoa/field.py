@@ -28,7 +28,7 @@ def strongest_direction(synthesizer: Synthesizer, measured: Spectra, seed: int) 
     magnitude: list[Tensor] = []
     for part in position.split(BATCH):
         spectrum = synthesizer.synthesize(part)
-        direction.append(measured.grid.strongest(spectrum))
+        direction.append(measured.grid.peak_direction(spectrum))
         magnitude.append(spectrum.amax(dim=(1, 2)))
     azimuth, elevation = torch.cat(direction).T.numpy()
     return {

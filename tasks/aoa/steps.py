@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
 
 import torch
 from torch import Tensor
@@ -14,21 +13,19 @@ from torch import Tensor
 from augment import SYNTHESIZERS, Mixed, choose_synthesizer, make_synthesizer, mix
 from augment.choose import SLOW, candidates
 from augment.suggest import suggest
-from augment.synthesizers import Synthesizer
 from swiftwrf import FitError, InputError
 from swiftwrf.data.store import Store
 from swiftwrf.runtime.checkpoint import read, write
 from tasks.aoa import arms
 from tasks.aoa.advice import advise
 from tasks.aoa.config import AUTO
-from tasks.aoa.estimators import ESTIMATORS, Estimator, SavedEstimator, learners
+from tasks.aoa.estimators import ESTIMATORS, SavedEstimator, learners
 from tasks.aoa.keep import keep
 from tasks.aoa.setting import At, Setting
 from tasks.claim import STEPS
 from tasks.metrics import AdviceMetrics
 from tasks.run import Row
 from tasks.steps import Step
-from tasks.torchrun import group
 
 KIND = "synthetic spectra"
 AT_ONCE = 4096  # positions that are drawn before they are rounded: half a gigabyte of 90 x 360 pixels
@@ -109,10 +106,6 @@ class Synthesis(Step[Setting]):
         return f"synthesis_{self.synthesizer}-{self.at}"
 
     @property
-    def shared(self) -> bool:
-        return cast(type[Synthesizer], SYNTHESIZERS[self.synthesizer].make).shared
-
-    @property
     def file(self) -> str:
         """Where the spectra are kept."""
         return f"{STEPS}/{self.name}.safetensors"
@@ -137,7 +130,6 @@ class Synthesis(Step[Setting]):
             setting.of_synthesizers(self.at),
             checkpoint=checkpoint,
             on_record=fit.add,
-            group=group() if self.shared else None,
         )
         synthesizer = make_synthesizer(self.synthesizer, settings)
         fit.begin()
@@ -200,17 +192,12 @@ class Arm(Step[Setting]):
         return f"{self.method}-r{self.at.repeat}" if self.training == arms.UPPER.name else f"{self.method}-{self.at}"
 
     @property
-    def shared(self) -> bool:
-        return cast(type[Estimator], ESTIMATORS[self.estimator].make).shared
-
-    @property
     def reads(self) -> tuple[str, ...]:
         return (self.synthesis.file,) if self.synthesis else ()
 
     def compute(self, setting: Setting, folder: Path) -> Row:
         train = self._training_set(setting, folder)
-        settings = replace(setting.of_estimators(self.at), group=group() if self.shared else None)
-        estimator = ESTIMATORS[self.estimator].make(settings)
+        estimator = ESTIMATORS[self.estimator].make(setting.of_estimators(self.at))
         began = time.perf_counter()
         estimator.fit(train)
         fitted = time.perf_counter()

@@ -9,7 +9,7 @@ from matplotlib.patches import Circle
 from pandas import DataFrame
 from torch import Tensor
 
-from swiftwrf.array.angles import great_circle, to_direction
+from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.data import Rssi, Spectra
 from swiftwrf.positions import distance
 from tasks.inspect.findings.base import Findings
@@ -107,14 +107,14 @@ def _draw_axes(ax: Axes, data: Spectra, a: int, b: int) -> None:
 
 def _directions(data: Spectra) -> Plot:
     rows = data.line_of_sight.nonzero()[:MOST_DOTS, 0]
-    peak = to_direction(*data.grid.strongest(data.store[rows]).unbind(-1))
+    peak = to_direction(*data.grid.peak_direction(data.store[rows]).unbind(-1))
     line = to_direction(*data.label[rows].unbind(-1))
     figure, axes = figures.new_figure(1, 3, 11, 3.6)
     for ax, (title, direction) in zip(axes, {"line of sight": line, "peak": peak}.items(), strict=False):
         ax.scatter(direction[:, 0], direction[:, 1], s=6, c=data.label[rows, 0].rad2deg(), cmap="hsv", vmin=0, vmax=360)
         ax.add_patch(Circle((0, 0), 1, fill=False, color=figures.RULE))  # the array's horizon
         ax.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal", title=title, xlabel="array x", ylabel="array y")
-    apart = great_circle(peak, line).rad2deg()
+    apart = angular_distance(peak, line).rad2deg()
     axes[2].hist(apart.numpy(), bins=45, range=(0, 90), color=DOTS)
     axes[2].set(xlabel="peak to line of sight [deg]", ylabel="spectra")
     azimuth, elevation = data.label[rows].rad2deg().unbind(-1)

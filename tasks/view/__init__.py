@@ -1,4 +1,4 @@
-"""A page to look around in a fitted field, served on this machine."""
+"""A page to explore a fitted model in the browser, served on this machine."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from typing import Annotated
 import tyro
 
 from swiftwrf import InputError
-from tasks.view.opening import opened
+from tasks.view.sources import open_source
+from tasks.view.spectra import SpectraView
 
-MOST_PORT = 65535
+MAX_PORT = 65535
 
 
 @dataclass(frozen=True)
 class ViewConfig:
-    """A page to look around in a fitted field: drag the moving end and see its spectrum, or hover over a map of RSSI.
+    """A page to explore a fitted model: drag the moving end and see its spectrum, or hover over a map of RSSI.
 
     Needs the optional extra: pip install 'swiftwrf-tasks[view]'. Ctrl-C ends it.
     """
@@ -24,26 +25,30 @@ class ViewConfig:
     source: Annotated[str, tyro.conf.Positional]
     """directory of a run of tasks.aoa or tasks.rssi, or a saved model"""
     port: int = 8080
-    """of the page; 0 takes any that is free"""
+    """port of the page; 0 takes any free port"""
     host: str = "127.0.0.1"
-    """address to listen on; other machines see the page, without a password, at any but this"""
+    """address to listen on; with any other address, other machines see the page without a password"""
 
 
 def run(config: ViewConfig, resume: Path | None = None) -> None:
-    """Serves the page until it is interrupted.
+    """Serve the page until the process is interrupted.
 
     Raises:
-        InputError: nothing there to be looked at, a port that is in use, or the optional extra is not installed.
+        InputError: The source holds no model, the port is in use, or the optional extra is not installed.
     """
     if resume is not None:
         raise InputError("a page is quick and cannot be resumed; start it again")
-    if not 0 <= config.port <= MOST_PORT:
-        raise InputError(f"--port must be from 0 to {MOST_PORT}, got {config.port}")
+    if not 0 <= config.port <= MAX_PORT:
+        raise InputError(f"--port must be from 0 to {MAX_PORT}, got {config.port}")
     try:
-        from tasks.view.server import free_port, serve
+        from tasks.view.page import free_port, serve
+        from tasks.view.rssi_page import RssiPage
+        from tasks.view.spectra_page import SpectraPage
     except ModuleNotFoundError as error:
         if error.name != "nicegui":
             raise
         raise InputError("tasks.view needs the optional extra: pip install 'swiftwrf-tasks[view]'") from None
     port = free_port(config.host, config.port)
-    serve(opened(Path(config.source)), config.host, port)
+    view = open_source(Path(config.source))
+    build = (lambda: SpectraPage(view)) if isinstance(view, SpectraView) else (lambda: RssiPage(view))
+    serve(view.title, build, config.host, port)

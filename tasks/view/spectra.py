@@ -1,10 +1,11 @@
-"""Spectra anywhere: what is drawn where the moving end stands, without anything of how it is shown."""
+"""Spectra at any position: the computations behind the page of spectra."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,157 +13,178 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from swiftwrf import AngularGrid, Spectra
-from swiftwrf.array.angles import great_circle, to_direction
-from swiftwrf.data.spectra import direction_of_link
+from swiftwrf.array.angles import angular_distance, to_direction
+from swiftwrf.data.spectra import Moving, direction_of_link
+from swiftwrf.models.base import FieldModel
 from swiftwrf.positions import distance
 from tasks.aoa.page.room import MARGIN, extent
-from tasks.view.fitted import Fitted, Link
 
-FAR = 1.5  # away from the measured positions, in their extent
+MAX_DRAG_SECONDS = 0.02  # of one prediction while the moving end is dragged
+MAX_BEYOND_DATA = 1.5  # margin of the page around the measured positions, in units of their extent
 Direction = tuple[float, float]  # azimuth, elevation [deg]
+Link = tuple[Tensor, Tensor, Moving]  # position of the fixed end (3,) [m], rotation of the array (3, 3), moving end
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedModel:
+    """A fitted model on the page.
+
+    Args:
+        title: Name on the page.
+        model: Field model.
+        planes: Planes of the room as in `geometry-mix*.json`. Defaults to those of the model.
+        in_training: Whether each measured spectrum trained the model, (n,). None if that is unknown.
+    """
+
+    title: str
+    model: FieldModel
+    planes: list[dict[str, Any]]
+    in_training: NDArray[np.bool_] | None = None
+
+    @cached_property
+    def drag_grid(self) -> AngularGrid:
+        """Finest grid that is predicted within `MAX_DRAG_SECONDS` on this machine, or the coarsest one."""
+        grid, position = self.model.grid, self.model.region()[:1]
+        factors = range(1, min(grid.shape) + 1) if self.model.any_grid else (1,)
+        grids = [grid.coarsen(factor) for factor in factors if not any(size % factor for size in grid.shape)]
+        return next((grid for grid in grids if _seconds(self.model, position, grid) <= MAX_DRAG_SECONDS), grids[-1])
+
+    @property
+    def link(self) -> Link | None:
+        """Fixed end, rotation of the array and moving end. None if the model does not contain them."""
+        if (room := self.model.room) is not None:
+            return room.fixed_position, room.rotation, room.moving
+        link = getattr(self.model, "link", None)
+        return None if link is None else (link.fixed, link.rotation, link.moving)
+
+
+def _seconds(model: FieldModel, position: Tensor, grid: AngularGrid) -> float:
+    """Return the time of the second prediction; the first one compiles and fills caches."""
+    for _ in range(2):
+        began = time.perf_counter()
+        with torch.no_grad():
+            model.predict(position, grid)
+    return time.perf_counter() - began
 
 
 @dataclass(frozen=True)
-class Drawn:
-    """A spectrum where the moving end stands.
+class PredictedSpectrum:
+    """A spectrum predicted at one position of the moving end.
 
     Args:
-        position: of the moving end [m], (3,).
-        grid: of the spectrum; coarser than the model's where that would take too long.
-        spectrum: magnitudes, (n_elevation, n_azimuth).
-        deviation: expected of a measured spectrum; None where the model knows none.
-        strongest: direction of the largest magnitude.
-        line_of_sight: direction of the transmitter; None where it is unknown.
-        seconds: that it took.
+        position: Position of the moving end [m], (3,).
+        grid: Directions of the spectrum.
+        mean: Magnitudes, (n_elevation, n_azimuth).
+        std: Standard deviation of a measured spectrum, of the same shape. None if the model has none.
+        peak: Direction of the largest magnitude.
+        line_of_sight: Direction of the transmitter. None if the fixed end is unknown.
+        seconds: Time of the prediction.
     """
 
     position: NDArray[np.floating]
     grid: AngularGrid
-    spectrum: NDArray[np.floating]
-    deviation: NDArray[np.floating] | None
-    strongest: Direction
+    mean: NDArray[np.floating]
+    std: NDArray[np.floating] | None
+    peak: Direction
     line_of_sight: Direction | None
     seconds: float
 
 
-@dataclass(frozen=True)
-class Measured:
-    """The measured spectrum that is nearest to a position.
-
-    Args:
-        number: of its row, counted from 0.
-        away_m: distance from the position [m].
-        learnt: whether the model has learnt from it.
-        spectrum, strongest: see `Drawn`.
-    """
-
-    number: int
-    away_m: float
-    learnt: bool
-    spectrum: NDArray[np.floating]
-    strongest: Direction
-
-
 @dataclass(frozen=True, eq=False)
-class SpectraScene:
-    """What can be looked at: fitted models, and the spectra that were measured where they are known.
+class SpectraView:
+    """Fitted models and the measured spectra, as far as they are known.
 
     Args:
-        title: of the page.
-        fitted: the models, at least one.
-        data: what was measured; None where it is unknown.
-        notes: what to say of it, a sentence each.
+        title: Title of the page.
+        models: Models to choose from, at least one.
+        data: Measured spectra. None if they are unknown.
+        notes: Remarks on the data, a sentence each.
     """
 
     title: str
-    fitted: list[Fitted]
+    models: list[LoadedModel]
     data: Spectra | None = None
     notes: list[str] = field(default_factory=list)
 
     @cached_property
     def link(self) -> Link | None:
-        """Where the fixed end stands, how the array is turned and which end moves, as the data or else a model tell."""
-        if self.data is not None:
-            if self.data.fixed_position is None or self.data.rotation is None:
-                return None
-            return self.data.fixed_position, self.data.rotation, self.data.moving
-        return next((fitted.link for fitted in self.fitted if fitted.link is not None), None)
+        """Fixed end, rotation of the array and moving end, from the data, else from a model. None if unknown."""
+        if self.data is None:
+            return next((loaded.link for loaded in self.models if loaded.link is not None), None)
+        if self.data.fixed_position is None or self.data.rotation is None:
+            return None
+        return self.data.fixed_position, self.data.rotation, self.data.moving
 
     @property
     def moving(self) -> str:
-        """What the moving end is called."""
+        """Name of the moving end."""
         if self.data is not None:
             return self.data.moving
         return "moving end" if self.link is None else self.link[2]
 
     @property
     def fixed(self) -> NDArray[np.floating] | None:
-        """Where the other one stands (3,) [m]; None where it is unknown."""
+        """Position of the fixed end [m], (3,). None if unknown."""
         return None if self.link is None else self.link[0].numpy()
 
     @cached_property
-    def places(self) -> NDArray[np.floating]:
-        """Positions (n, 3) [m] that the page shows: those measured, or around which the models know spectra."""
-        known = [fitted.region for fitted in self.fitted] if self.data is None else [self.data.position]
+    def positions(self) -> NDArray[np.floating]:
+        """Positions (n, 3) [m] that the page covers: the measured ones, else the regions of the models."""
+        known = [loaded.model.region() for loaded in self.models] if self.data is None else [self.data.position]
         return np.concatenate([position.double().numpy() for position in known])
 
     @cached_property
     def box(self) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Opposite corners (3,) [m] of what the page shows: the room as far as it is known, but of what lies far from the
-        measured positions only the side on which it is, or there would be no room to drag between these."""
-        planes = [plane for fitted in self.fitted for plane in fitted.planes]
-        inside = self.places if self.fixed is None else np.concatenate([self.places, self.fixed[None]])
+        """Opposite corners (3,) [m] of the page's region: the room, cut off far from the measured positions."""
+        planes = [plane for loaded in self.models for plane in loaded.planes]
+        inside = self.positions if self.fixed is None else np.concatenate([self.positions, self.fixed[None]])
         low, high = extent(planes, inside)
-        nearest, farthest = self.places.min(axis=0), self.places.max(axis=0)
-        margin = np.maximum(FAR * (farthest - nearest).max(), MARGIN)
+        nearest, farthest = self.positions.min(axis=0), self.positions.max(axis=0)
+        margin = np.maximum(MAX_BEYOND_DATA * (farthest - nearest).max(), MARGIN)
         return np.maximum(low, nearest - margin), np.minimum(high, farthest + margin)
 
     @property
     def start(self) -> NDArray[np.floating]:
-        """Where the moving end stands at first: a measured position near the middle, or the middle."""
-        middle = (self.places.min(axis=0) + self.places.max(axis=0)) / 2
-        nearest = int(np.linalg.norm(self.places - middle, axis=1).argmin())
-        start: NDArray[np.floating] = middle if self.data is None else self.places[nearest]
+        """Initial position of the moving end (3,) [m]: the measured one nearest to the middle, or the middle."""
+        middle: NDArray[np.floating] = (self.positions.min(axis=0) + self.positions.max(axis=0)) / 2
+        nearest = int(np.linalg.norm(self.positions - middle, axis=1).argmin())
+        start: NDArray[np.floating] = middle if self.data is None else self.positions[nearest]
         return start
 
-    def draw(self, fitted: Fitted, position: NDArray[np.floating], quick: bool = False) -> Drawn:
-        """The spectrum of a model with the moving end at a position (3,) [m]; quickly, perhaps on a coarser grid."""
-        grid, draw = fitted.quick if quick else (fitted.grid, fitted.fine)
-        at = torch.as_tensor(position, dtype=torch.float64).reshape(1, 3)
+    def predict(self, loaded: LoadedModel, position: NDArray[np.floating], dragging: bool = False) -> PredictedSpectrum:
+        """Predict the spectrum at a position (3,) [m]; while dragging on a grid that is fast enough."""
+        grid = loaded.drag_grid if dragging else loaded.model.grid
+        query = torch.as_tensor(position, dtype=torch.float64).reshape(1, 3)
         began = time.perf_counter()
-        spectrum, deviation = draw(at)
+        with torch.no_grad():
+            prediction = loaded.model.predict(query, grid)
         seconds = time.perf_counter() - began
-        sight = None if self.link is None else _degrees(direction_of_link(at, *self.link)[0])
-        return Drawn(
+        return PredictedSpectrum(
             np.asarray(position, dtype=float),
             grid,
-            spectrum[0].numpy(),
-            None if deviation is None else deviation[0].numpy(),
-            strongest(spectrum[0], grid),
-            sight,
+            prediction.mean[0].numpy(),
+            None if prediction.std is None else prediction.std[0].numpy(),
+            peak(prediction.mean[0], grid),
+            None if self.link is None else _degrees(direction_of_link(query, *self.link)[0]),
             seconds,
         )
 
-    def nearest(self, fitted: Fitted, position: NDArray[np.floating]) -> Measured | None:
-        """The measured spectrum nearest to a position (3,) [m]; None where none are known."""
-        if self.data is None:
-            return None
+    def nearest(self, position: NDArray[np.floating]) -> tuple[int, float]:
+        """Return index and distance [m] of the measured spectrum nearest to a position (3,) [m]."""
+        assert self.data is not None
         away = distance(torch.as_tensor(position, dtype=torch.float64).reshape(1, 3), self.data.position)[0]
-        row = int(away.argmin())
-        spectrum = self.data.store[row : row + 1][0]
-        learnt = fitted.learnt is not None and bool(fitted.learnt[row])
-        return Measured(row, float(away[row]), learnt, spectrum.numpy(), strongest(spectrum, self.data.grid))
+        return int(away.argmin()), float(away.min())
 
 
-def strongest(spectrum: Tensor, grid: AngularGrid) -> Direction:
-    """Direction of the largest magnitude of a spectrum (n_elevation, n_azimuth)."""
-    return _degrees(grid.strongest(spectrum[None])[0])
+def peak(spectrum: Tensor, grid: AngularGrid) -> Direction:
+    """Return the direction of the largest magnitude of a spectrum (n_elevation, n_azimuth)."""
+    return _degrees(grid.peak_direction(spectrum[None])[0])
 
 
 def angle_between(a: Direction, b: Direction) -> float:
-    """Great-circle angle of two directions [deg]."""
+    """Return the angle between two directions [deg]."""
     first, second = (to_direction(*torch.tensor(direction, dtype=torch.float64).deg2rad()) for direction in (a, b))
-    return float(great_circle(first, second).rad2deg())
+    return float(angular_distance(first, second).rad2deg())
 
 
 def _degrees(direction: Tensor) -> Direction:

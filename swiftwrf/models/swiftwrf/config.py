@@ -1,130 +1,134 @@
-"""Configuration of a SwiftWRF model and of its fit."""
+"""Options of a SwiftWRF model and of its fit."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import field, replace
+from typing import Annotated, Any, Literal
 
 import torch
+from annotated_types import Gt, Lt
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
-from swiftwrf.models.swiftwrf.deformation import COMPONENTS, deformation_type
+from swiftwrf.models.base import FieldConfig
+from swiftwrf.models.swiftwrf.deformation import DEFORMATIONS
 from swiftwrf.models.swiftwrf.primitives import Primitives
+from swiftwrf.runtime.validation import (
+    Fraction,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    configuration,
+)
+
+PixelLoss = Literal["l1", "l2"]
 
 
-@dataclass(frozen=True)
+@configuration
 class ModelConfig:
-    """What a SwiftWRF model consists of."""
+    """Structure of a SwiftWRF model.
 
-    n_primitives: int | Literal["auto"] = "auto"
-    """number N of primitives; auto lets the fit find how many the scene needs"""
+    Example:
+        >>> ModelConfig(n_primitives=64).rank
+        'auto'
+    """
+
+    n_primitives: PositiveInt | Literal["auto"] = "auto"
+    """number N of primitives; "auto" lets the fit choose it on held-out spectra"""
     deformation: str = "motion_basis"
-    """how they move: a name of `swiftwrf.models.swiftwrf.deformation.DEFORMATIONS`"""
+    """name of the deformation in `swiftwrf.models.swiftwrf.deformation.DEFORMATIONS`"""
     components: tuple[Literal["mean", "response", "attenuation", "cholesky"], ...] = ("response",)
-    """which of their parameters change with the position"""
-    rank: int | Literal["auto"] = "auto"
-    """number K of motions that the motion basis mixes; auto lets the fit find how many the scene needs"""
+    """parameters of the primitives that depend on the position"""
+    rank: NonNegativeInt | Literal["auto"] = "auto"
+    """rank K of the low-rank deformation; "auto" lets the fit choose it on held-out spectra"""
     axis_aligned: bool = False
     """keep the axes of the primitives along azimuth and elevation: l2 = 0"""
     bounded: bool = False
     """keep canonical means inside the grid by the paper's tanh map"""
-    cutoff: float = 1e-4
-    """kernel values below it are not drawn"""
+    cutoff: Annotated[float, Gt(0), Lt(1)] = 1e-4
+    """kernel values below the cutoff count as 0"""
+
+    def check(self) -> None:
+        """Refuse unknown deformations and repeated components."""
+        DEFORMATIONS[self.deformation]
+        if len(set(self.components)) < len(self.components):
+            raise InputError(f"components must be named once each, got {', '.join(self.components)}")
 
     @property
     def size(self) -> tuple[int, int]:
-        """N and K.
+        """Number of primitives and rank.
 
         Raises:
-            InputError: one is still to be found.
+            InputError: One of them is "auto".
         """
         if self.n_primitives == "auto" or self.rank == "auto":
-            raise InputError(
-                "a model needs numbers for n_primitives and rank; swiftwrf.fit finds those that are 'auto'"
-            )
+            raise InputError("n_primitives and rank must be numbers here; only a fit can choose them")
         return self.n_primitives, self.rank
 
-    def check(self) -> None:
-        """Refuses what no model can have, wherever the configuration comes from.
-
-        Raises:
-            InputError: such a setting.
-        """
-        deformation_type(self.deformation)
-        unknown = set(self.components) - set(COMPONENTS)
-        if unknown or len(set(self.components)) < len(self.components):
-            raise InputError(f"components must be some of {', '.join(COMPONENTS)}, each once, got {self.components}")
-        whole = all(type(value) is int and value >= 0 for value in self.size)
-        if not whole or not 0 < self.cutoff < 1 or not all(type(x) is bool for x in (self.bounded, self.axis_aligned)):
-            raise InputError(f"this makes no model: {self}")
-
     def make_primitives(self, grid: AngularGrid, generator: torch.Generator) -> Primitives:
-        """Canonical primitives at their start."""
+        """Return canonical primitives with random parameters."""
         n, _ = self.size
         return Primitives(n, grid, bounded=self.bounded, axis_aligned=self.axis_aligned, generator=generator)
 
 
-@dataclass(frozen=True)
-class FitConfig:
-    """How a model is fitted. The defaults are what measured best; `FitConfig.paper()` is the paper."""
+@configuration
+class FitConfig(FieldConfig):
+    """Options of `SwiftWRF`. The defaults fit by regression; `FitConfig.paper()` has the settings of the paper.
+
+    Example:
+        >>> FitConfig.paper(seed=1).steps
+        110000
+    """
 
     model: ModelConfig = field(default_factory=ModelConfig)
-    steps: int = 0
-    """0: by regression; otherwise steps by gradient from a random start, coarse ones included; what follows on steps,
-    rates, batch, prior and smoothing is theirs"""
-    coarse_share: float = 0.0
-    """share of them on shared primitives, without deformation (the paper's coarse stage)"""
-    batch: int = 16
-    """spectra a step"""
-    rate: float = 3e-2
-    """learning rate of primitives and coefficients (half of it for the motion basis)"""
-    deformation_rate: float | None = None
-    """learning rate of the paper's network"""
-    warm_up: int = 50
+    """structure of the model"""
+    steps: NonNegativeInt = 0
+    """number of Adam steps, including the coarse stage; 0 fits in closed form and ignores the optimiser's options below"""
+    coarse_share: Fraction = 0.0
+    """fraction of the steps without deformation (the paper's coarse stage)"""
+    batch: PositiveInt = 16
+    """spectra per step"""
+    rate: PositiveFloat = 3e-2
+    """learning rate of primitives and coefficients; the basis of the low-rank deformation has half of it"""
+    deformation_rate: PositiveFloat | None = None
+    """learning rate of the paper's network; None takes `rate`"""
+    warm_up: NonNegativeInt = 50
     """steps over which the rates rise"""
-    final_rate: float = 0.02
-    """share of the rates left after cosine decay"""
-    ssim_weight: float = 0.3
-    """weight of 1 - SSIM in the loss, by which a size is chosen, too; the pixels' error has the rest"""
-    pixel_loss: Literal["l1", "l2"] = "l1"
-    """absolute or squared error"""
-    prior_weight: float = 1e-4
-    """weight of the motion's negative log prior per training spectrum"""
-    smoothing: float = 0.0
+    final_rate: Fraction = 0.02
+    """final fraction of the rates after cosine decay"""
+    ssim_weight: Fraction = 0.3
+    """weight of 1 - SSIM in the loss, also when the fit compares sizes; the pixel loss has the remaining weight"""
+    pixel_loss: PixelLoss = "l1"
+    """absolute or squared error of pixels"""
+    prior_weight: NonNegativeFloat = 1e-4
+    """weight of the deformation's negative log prior per training spectrum"""
+    smoothing: NonNegativeFloat = 0.0
     """the paper's gamma: scale of the noise on positions, annealed to 0"""
-    smoothing_steps: int = 10_000
-    """the paper's tau: fine steps until that noise is gone"""
+    smoothing_steps: PositiveInt = 10_000
+    """the paper's tau: fine steps after which that noise is 0"""
     stop_mean: bool = False
-    """keep the canonical means where the coarse stage left them"""
-    max_azimuths: int = 180
-    """spectra with more columns are averaged down to at most this many for fitting; 0 fits all pixels"""
-    validation: Validation = "random"
-    """what is held out inside the training part: single spectra, or a region where the model must extrapolate"""
-    check_every: int = 50
-    """steps between two evaluations, at which progress is recorded and the state kept"""
-    seed: int = 0
+    """freeze the canonical means after the coarse stage"""
+    max_azimuths: NonNegativeInt = 180
+    """fit to spectra averaged down to at most this number of columns; 0 fits to all pixels"""
+    check_every: PositiveInt = 50
+    """steps between two evaluations, at which a record is sent and the state is saved"""
 
     def check(self) -> None:
-        """Refuses settings that do not fit together.
-
-        Raises:
-            InputError: what goes only by gradient without steps, or steps of a model whose size is to be found.
-        """
+        """Refuse a regression of what only gradient descent fits, and gradient descent without a number of primitives."""
         model = self.model
-        still = model.deformation == "none" or (model.deformation == "motion_basis" and "response" in model.components)
-        if not self.steps and not still:
+        linear = model.deformation == "none" or (model.deformation == "motion_basis" and "response" in model.components)
+        if not self.steps and not linear:
             raise InputError(
-                f"deformation {model.deformation} of {', '.join(model.components)} is not found by regression; give a "
-                "number of steps to fit it by gradient"
+                f"deformation {model.deformation} of {', '.join(model.components)} cannot be fitted by regression; give a "
+                "number of steps to fit it by gradient descent"
             )
         if self.steps and model.n_primitives == "auto":
-            raise InputError("a fit by gradient needs a number of primitives; only regression finds it")
+            raise InputError("a fit by gradient descent needs a number of primitives; only regression chooses it")
 
     @classmethod
     def paper(cls, **changes: Any) -> FitConfig:
-        """The paper's settings: 10,000 bounded primitives, its network, means kept, annealed noise, all pixels."""
+        """Return the settings of the paper: 10,000 bounded primitives, its network, frozen means, annealed noise."""
         model = ModelConfig(
             n_primitives=10_000,
             rank=0,

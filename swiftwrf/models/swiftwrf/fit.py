@@ -1,120 +1,88 @@
-"""From measured spectra to a model: how much the scene needs, then a model of that size."""
+"""The fit of a SwiftWRF model: choose rank and number of primitives on held-out spectra, then fit all spectra."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import asdict, replace
-from functools import partial
-from pathlib import Path
 
 import torch
-from torch import Tensor
-from torch.distributed import ProcessGroup
 
-from swiftwrf.data.spectra import Spectra, check_training, fingerprint
+from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.data.splits import folds
-from swiftwrf.gp import Kernel, choose_kernel
+from swiftwrf.gp import choose_kernel
+from swiftwrf.models.base import FitContext
 from swiftwrf.models.swiftwrf.config import FitConfig
-from swiftwrf.models.swiftwrf.deformation import deformation_type
-from swiftwrf.models.swiftwrf.model import SwiftWRF
-from swiftwrf.models.swiftwrf.optimise import Optimisation
+from swiftwrf.models.swiftwrf.deformation import DEFORMATIONS
+from swiftwrf.models.swiftwrf.field import DeformableGaussians
+from swiftwrf.models.swiftwrf.optimise import Optimisation, run_name
 from swiftwrf.models.swiftwrf.regression import TRIAL_STEPS, Regression
 from swiftwrf.models.swiftwrf.search import doubling_search
-from swiftwrf.runtime.processes import Processes
 from swiftwrf.runtime.progress import progress_bar
-from swiftwrf.runtime.session import Record, Session, Size
+from swiftwrf.runtime.session import Session
 
-FEWEST, MOST = 16, 512  # primitives that the search tries
+MIN_PRIMITIVES, MAX_PRIMITIVES = 16, 512  # numbers of primitives that the search tries
 
 
-def fit(
-    train: Spectra,
-    config: FitConfig | None = None,
-    *,
-    device: torch.device | str = "cpu",
-    checkpoint: Path | None = None,
-    on_record: Callable[[Record], None] | None = None,
-    progress: bool = True,
-    group: ProcessGroup | None = None,
-) -> SwiftWRF:
-    """Fits a SwiftWRF model to spectra.
+def fit_field(train: Spectra, config: FitConfig, context: FitContext) -> DeformableGaussians:
+    """Fit deformable Gaussians. The same data, options and machine give the same result.
 
-    By regression, unless the configuration asks for steps by gradient: sizes are doubled until held-out training spectra
-    gain no more, and all spectra make the model of that size. Same data, configuration and machine give the same model.
+    Each record has stage (search, final), n_primitives, steps, step, loss, validation (of the search), seconds of the run
+    and elapsed seconds of the fit. A fit that continues from a checkpoint sends the earlier records first.
 
     Args:
-        train: the only spectra it sees.
-        config: how; `FitConfig()` unless given.
-        device: where to compute.
-        checkpoint: a file that keeps the state of the fit; where it exists, the fit goes on from it.
-        on_record: called at each evaluation with stage (search, final), n_primitives, steps, step, loss, validation loss
-            (of the search), seconds of that run and elapsed ones of the fit; a fit that goes on begins with the records
-            of its earlier sessions.
-        progress: show a progress bar on a terminal.
-        group: processes of `torch.distributed` that share the batches of a fit by gradient. Each of them makes this call
-            with the same spectra and configuration, and gets the model of one process but for the rounding of sums; only
-            the first keeps the checkpoint, is told records and shows progress.
+        train: Checked training spectra.
+        config: Options.
+        context: Device, checkpoint, callback and progress.
 
     Raises:
-        InputError: fewer than 10 spectra, something not finite, a configuration that does not fit together, a
-            checkpoint of another fit, or more processes than spectra in a batch.
-        FitError: a loss or gradient that is not finite (the checkpoint holds the last good state), or a fit that ends
-            worse than it began.
+        InputError: The checkpoint belongs to another fit.
+        FitError: A loss or gradient is not finite (the checkpoint has the last good state), or the loss ends above its
+            first value.
     """
-    config = config or FitConfig()
-    check_training(train)
-    config.check()
-    processes = Processes(group)
     fold = folds(train.position, config.validation, config.seed)
     work = train.at_most(config.max_azimuths)
-    kernel = processes.from_first(partial(choose_kernel, work.position, work.store, fold))
+    kernel = choose_kernel(work.position, work.store, fold)
     if config.validation == "random":
-        fold = torch.arange(len(train))  # regression leaves out one spectrum as easily as a fifth of them
+        fold = torch.arange(len(train))  # leave-one-out costs a regression no more than five folds
     if config.model.rank == "auto":
-        rank = processes.from_first(partial(_rank, work, config, fold, kernel))
+        deformation = DEFORMATIONS[config.model.deformation]
+        rank = deformation.choose_rank(work.position, work.store, fold, kernel)
         config = replace(config, model=replace(config.model, rank=rank))
-    with progress_bar(progress and processes.first) as bar:
-        session = Session(checkpoint, fingerprint(work, asdict(config)), bar, on_record, processes)
+    with progress_bar(context.progress) as bar:
+        session = Session(context.checkpoint, fingerprint(work, asdict(config)), bar, context.on_record)
         if config.steps:
-            optimisation = Optimisation(config, work, kernel, device, processes)
+            optimisation = Optimisation(config, work, kernel, context.device)
             optimisation.run(session)
-            model = optimisation.result
+            field = optimisation.result
         else:
-            model = _regress(Regression(work, config, kernel, fold), config, session).to(device)
-    model.grid = train.grid
-    return model.eval()
+            field = _regress(Regression(work, config, kernel, fold), config, session).to(context.device)
+    field.grid = train.grid
+    return field
 
 
-def _rank(train: Spectra, config: FitConfig, fold: Tensor, kernel: Kernel) -> int:
-    deformation = deformation_type(config.model.deformation)
-    return deformation.choose_rank(train.position, train.store, fold, kernel)
-
-
-def _regress(regression: Regression, config: FitConfig, session: Session) -> SwiftWRF:
-    """The smallest model that predicts held-out spectra as well as any, or the one of the size that is asked for."""
+def _regress(regression: Regression, config: FitConfig, session: Session) -> DeformableGaussians:
+    """Return the smallest field whose held-out loss is level with the lowest, or the one of the given size."""
     task = session.bar.add_task("regression", total=None)
 
-    def record(size: Size, began: float, loss: float, validation: float | None) -> None:
+    def record(stage: str, n: int, began: float, loss: float, validation: float | None) -> None:
         seconds = time.perf_counter() - began
         found = {"steps": 0, "step": 0, "loss": loss, "validation": validation, "seconds": seconds}
-        stage = "final" if size.final else "search"
-        session.evaluated({"stage": stage, "n_primitives": size.n_primitives} | found, {}, {"run": size.key})
+        session.evaluated({"stage": stage, "n_primitives": n} | found, {}, {"run": run_name(stage, n)})
 
     def loss(n: int) -> float:
-        size = Size(False, n, 0)
-        session.bar.update(task, description=str(size))
-        if size.key not in session.losses:
+        name = run_name("search", n)
+        session.bar.update(task, description=name)
+        if name not in session.losses:
             began = time.perf_counter()
-            session.losses[size.key] = regression.held_out_loss(n, TRIAL_STEPS)
-            record(size, began, session.losses[size.key], session.losses[size.key])
-        return session.losses[size.key]
+            session.losses[name] = regression.held_out_loss(n, TRIAL_STEPS)
+            record("search", n, began, session.losses[name], session.losses[name])
+        return session.losses[name]
 
     n = config.model.n_primitives
     if n == "auto":
-        n = doubling_search(loss, FEWEST, MOST, patience=1)
-    size, began = Size(True, n, 0), time.perf_counter()
-    session.bar.update(task, description=str(size))
-    model = regression.model(n)
-    record(size, began, regression.held_out_loss(n), None)
-    return model
+        n = doubling_search(loss, MIN_PRIMITIVES, MAX_PRIMITIVES, patience=1)
+    began = time.perf_counter()
+    session.bar.update(task, description=run_name("final", n))
+    field = regression.field(n)
+    record("final", n, began, regression.held_out_loss(n), None)
+    return field

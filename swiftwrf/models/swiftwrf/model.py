@@ -1,252 +1,136 @@
-"""SwiftWRF: primitives that move with the position, drawn as a spectrum."""
+"""The field model of this package: 2D Gaussians, rasterized as a spectrum at any position."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
-from typing import ClassVar, Literal, NamedTuple, overload
+from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.errors import InputError
-from swiftwrf.gp import Kernel
-from swiftwrf.models.swiftwrf.config import ModelConfig
-from swiftwrf.models.swiftwrf.deformation import Deformation, Offsets, Setting, deformation_type
-from swiftwrf.models.swiftwrf.primitives import Gaussians, Primitives
-from swiftwrf.positions import check_batch, check_drawn, check_positions, frame, normalise
-from swiftwrf.rasterize import rasterize, rasterize_magnitude
-from swiftwrf.rasterize.reference import kernels
-from swiftwrf.runtime.checkpoint import Header, Saved, expect
+from swiftwrf.data.spectra import Spectra
+from swiftwrf.models.base import FIELD_MODELS, FieldModel, FitContext, Record
+from swiftwrf.models.swiftwrf.config import FitConfig, ModelConfig
+from swiftwrf.models.swiftwrf.field import DeformableGaussians
+from swiftwrf.models.swiftwrf.fit import MAX_PRIMITIVES, fit_field
+from swiftwrf.rasterize.magnitude import magnitude
+from swiftwrf.runtime.checkpoint import Header
 
-MANY = 16  # spectra from which on a product of matrices is faster than drawing each
-MOST_VALUES = 2**26  # of the kernels on a grid: 256 MiB
+MAX_CACHED_VALUES = 2**26  # float32 values that one model caches: 256 MiB
 
 
-class Canvas(NamedTuple):
-    """What all spectra that a model draws on a grid have in common; see `SwiftWRF.canvas`.
+@FIELD_MODELS.register("swiftwrf")
+class SwiftWRF(FieldModel):
+    """2D Gaussians whose parameters deform with the position (M. Liu et al., 2025).
 
-    Args:
-        grid: directions that are drawn.
-        kernel: of primitives that stay where they are, (N, H, W); None where some move or there are too many.
-        variation: standard deviation of all spectra, (H, W); None where the model knows none.
+    By default a fit is a regression: the Gaussians stay in place, their responses are least squares, and a Gaussian process
+    interpolates them. Such a model predicts standard deviations. `steps` above 0 fits by gradient descent instead, as the
+    paper does.
+
+    The kernels of Gaussians that stay in place are cached for each grid, so one prediction costs one matrix product.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.simulated_room(n=50).split()
+        >>> model = SwiftWRF(model=swiftwrf.ModelConfig(n_primitives=16)).fit(train)
+        >>> prediction = model.predict(test.position)
+        >>> prediction.mean.shape == prediction.std.shape == (10, 30, 120)
+        True
     """
 
-    grid: AngularGrid
-    kernel: Tensor | None
-    variation: Tensor | None
+    name = "swiftwrf"
+    kind = "swiftwrf model"
+    config_type = FitConfig
+    any_grid = True
 
+    field: DeformableGaussians
+    """fitted Gaussians and their deformation; the gradients of their parameters are off after a fit"""
 
-class SwiftWRF(nn.Module, Saved):
-    """Spectrum at any position: |sum_n psi_n delta_n kernel_n|, with parameters deformed by the position.
+    def _fit(self, train: Spectra, context: FitContext) -> None:
+        config: FitConfig = self.config
+        if isinstance(context.like, SwiftWRF):
+            n = min(context.like.field.config.size[0], MAX_PRIMITIVES)
+            config = FitConfig(validation=config.validation, seed=config.seed, model=ModelConfig(n_primitives=n))
+        self._take(fit_field(train, config, context))
 
-    Args:
-        config: what it consists of.
-        grid: the grid that it is fitted on and that `synthesize` draws unless told otherwise.
-        centre, scale: of the frame in which positions are normalised, float64 (3,) and () [m].
-        primitives: canonical ones.
-        deformation: how they move.
-    """
+    def _take(self, field: DeformableGaussians) -> None:
+        self.field = field.eval().requires_grad_(False)
+        self._cache: dict[tuple[object, ...], Tensor] = {}
 
-    kind: ClassVar[str] = "swiftwrf model"
+    def parameters(self) -> Iterable[Tensor]:
+        return self.field.parameters()
 
-    def __init__(
-        self,
-        config: ModelConfig,
-        grid: AngularGrid,
-        centre: Tensor,
-        scale: Tensor,
-        primitives: Primitives,
-        deformation: Deformation,
-    ) -> None:
-        super().__init__()
-        self.config, self.grid = config, grid
-        self.register_buffer("centre", centre)
-        self.register_buffer("scale", scale)
-        self.primitives, self.deformation = primitives, deformation
-
-    centre: Tensor
-    scale: Tensor
-
-    @classmethod
-    def make(
-        cls, config: ModelConfig, grid: AngularGrid, anchor: Tensor, kernel: Kernel, *, generator: torch.Generator
-    ) -> SwiftWRF:
-        """A model at its start.
-
-        Args:
-            config, grid: see the class.
-            anchor: positions (M, 3) [m] of training spectra; they give the frame in which positions are normalised and
-                the anchors of the motion.
-            kernel: of the motion's prior, with lengths [m].
-            generator: for the initial parameters.
-        """
-        n, rank = config.size
-        centre, scale = frame(anchor)
-        primitives = config.make_primitives(grid, generator)
-        position = normalise(anchor, centre, scale)
-        setting = Setting(n, config.components, rank, position, kernel.scaled(1 / float(scale)))
-        deformation = deformation_type(config.deformation).initial(setting, generator=generator)
-        return cls(config, grid, centre, scale, primitives, deformation)
-
-    def normalise(self, position: Tensor) -> Tensor:
-        """Positions (n, 3) [m] in the training positions' frame, float32: their box is centred in [-1, 1]^3 and scaled
-        alike on all axes. In float64 first, so that coordinates in kilometres keep their millimetres."""
-        return normalise(position, self.centre, self.scale)
-
-    def gaussians(self, position: Tensor, *, deform: bool = True, stop_mean: bool = False) -> Gaussians:
-        """The primitives at normalised positions (B, 3).
-
-        Args:
-            deform: False leaves them canonical (the coarse stage).
-            stop_mean: no gradient reaches the canonical means (the paper's fine stage).
-        """
-        canonical: Gaussians = self.primitives()
-        if stop_mean:
-            canonical = canonical._replace(mean=canonical.mean.detach())
-        if not deform:
-            return canonical
-        offsets: Offsets = self.deformation(position, canonical.mean)
-        mean, cholesky, attenuation, response = canonical
-        if offsets.cholesky is not None:
-            cholesky = self.primitives.constrained(self.primitives.cholesky + offsets.cholesky)
-        if offsets.mean is not None:
-            mean = mean + offsets.mean
-        if offsets.attenuation is not None:
-            attenuation = attenuation + offsets.attenuation
-        if offsets.response is not None:
-            response = response + offsets.response
-        return Gaussians(mean, cholesky, attenuation, response)
-
-    def draw(self, gaussians: Gaussians, n: int, grid: AngularGrid) -> Tensor:
-        """Magnitudes (n, H, W) of primitives at n positions."""
-        mean = gaussians.mean.expand(n, -1, -1)
-        weight = gaussians.weight.expand(n, -1, -1)
-        return rasterize_magnitude(mean, gaussians.cholesky, weight, grid, cutoff=self.config.cutoff)
-
-    def forward(self, position: Tensor, *, deform: bool = True, stop_mean: bool = False) -> Tensor:
-        """Magnitudes (B, H, W) at normalised positions (B, 3), on the model's grid, differentiable."""
-        return self.draw(self.gaussians(position, deform=deform, stop_mean=stop_mean), len(position), self.grid)
-
-    @overload
-    def synthesize(self, position: Tensor, grid: AngularGrid | Canvas | None = None, batch: int = 64) -> Tensor: ...
-
-    @overload
-    def synthesize(
-        self, position: Tensor, grid: AngularGrid | Canvas | None = None, batch: int = 64, *, return_std: Literal[True]
-    ) -> tuple[Tensor, Tensor]: ...
-
-    @torch.no_grad()
-    def synthesize(
-        self, position: Tensor, grid: AngularGrid | Canvas | None = None, batch: int = 64, *, return_std: bool = False
-    ) -> Tensor | tuple[Tensor, Tensor]:
-        """Spectra at any positions.
-
-        Args:
-            position: of the moving end [m], (n, 3).
-            grid: directions to draw; the model's own unless given. Any resolution will do. Who draws few spectra at a
-                time, but often, gives a `canvas`.
-            batch: spectra drawn at a time, which bounds the memory.
-            return_std: also by how much a measured spectrum is expected to differ, from the Gaussian process behind the
-                motion, calibrated on held-out training spectra: 80 % of all pixels lie within 1.28 of it.
-
-        Returns:
-            Magnitudes clipped to [0, 1], float32 (n, n_elevation, n_azimuth), on the CPU; with `return_std` also their
-            standard deviations, of the same shape.
-
-        Raises:
-            InputError: positions of another shape, or not finite; a batch below 1; standard deviations of a model that was
-                fitted by gradient.
-        """
-        position = check_positions(position)
-        check_batch(batch)
-        if isinstance(grid, Canvas):
-            grid, kernel, variation = grid
+    def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
+        field, x = self.field, self.field.normalise(position)
+        gaussians = field.gaussians(x)
+        cacheable = not field.shapes_deform and len(field.primitives) * math.prod(grid.shape) <= MAX_CACHED_VALUES
+        if cacheable and not any(parameter.requires_grad for parameter in self.parameters()):
+            kernel = self._cached("kernel", grid, field.kernels)
+            mean = _magnitudes(gaussians.weight.expand(len(x), -1, -1), kernel)
         else:
-            grid = grid or self.grid
-            kernel = self._fixed_kernels(grid) if len(position) >= MANY else None
-            variation = None
-        if return_std and variation is None:
-            variation = self._variation(grid)  # refuses where there is none
-        spectrum = torch.empty(len(position), *grid.shape)
-        std = torch.empty_like(spectrum) if return_std else None
-        for start in range(0, len(position), batch):
-            x = self.normalise(position[start : start + batch].to(self.centre.device))
-            gaussians = self.gaussians(x)
-            drawn = self.draw(gaussians, len(x), grid) if kernel is None else _product(gaussians.weight, kernel)
-            spectrum[start : start + batch] = drawn.clamp(0, 1)
-            if std is not None and variation is not None and (doubt := self.deformation.doubt(x)) is not None:
-                std[start : start + batch] = doubt[:, None, None] * variation
-        spectrum = check_drawn(spectrum)
-        return spectrum if std is None else (spectrum, check_drawn(std))
+            mean = field.render(gaussians, len(x), grid)
+        scale = field.deformation.unscaled_std(x) if with_std else None
+        return mean, None if scale is None else scale[:, None, None] * self._cached("spread", grid, field.spread)
 
-    @torch.no_grad()
-    def canvas(self, grid: AngularGrid | None = None) -> Canvas:
-        """What does not depend on the position, computed once for all spectra to come: `synthesize` on a canvas draws a
-        single spectrum as fast as one of many. It holds as long as the parameters stay as they are.
+    def _cached(self, quantity: str, grid: AngularGrid, compute: Callable[[AngularGrid], Tensor]) -> Tensor:
+        """Return a quantity that depends on the grid and the parameters only, from the cache if both are unchanged."""
+        tensors = [*self.field.parameters(), *self.field.buffers()]
+        if any(tensor.requires_grad for tensor in tensors):
+            return compute(grid)
+        state = tuple((tensor.data_ptr(), tensor._version, tensor.device) for tensor in tensors)
+        key = (quantity, grid, state)
+        if key not in self._cache:
+            value = compute(grid)
+            kept = {old: tensor for old, tensor in self._cache.items() if old[2] == state}
+            while kept and sum(tensor.numel() for tensor in kept.values()) + value.numel() > MAX_CACHED_VALUES:
+                del kept[next(iter(kept))]
+            self._cache = kept | {key: value}
+        return self._cache[key]
 
-        Args:
-            grid: directions to draw; the model's own unless given.
-        """
-        grid = grid or self.grid
-        return Canvas(grid, self._fixed_kernels(grid), self._variation(grid) if self.knows_deviation else None)
+    def _state(self) -> tuple[dict[str, Tensor], Header]:
+        field = self.field
+        return field.state_dict(), {"config": asdict(field.config)} | field.deformation.header()
 
-    def _fixed_kernels(self, grid: AngularGrid) -> Tensor | None:
-        """Kernels (N, H, W) of primitives that stay where they are, so that many spectra are one matrix product; None where
-        some move or there are too many."""
-        moving = {"mean", "cholesky"} & set(self.config.components) and self.config.deformation != "none"
-        if moving or len(self.primitives) * math.prod(grid.shape) > MOST_VALUES:
-            return None
-        canonical = self.primitives()
-        return kernels(canonical.mean, canonical.cholesky, grid, self.config.cutoff)
-
-    @property
-    def knows_deviation(self) -> bool:
-        """Whether `synthesize` can tell standard deviations."""
-        return self.deformation.doubt(self.centre.new_zeros(1, 3).float()) is not None
-
-    def _variation(self, grid: AngularGrid) -> Tensor:
-        """Standard deviation of all spectra, as far as motions of the responses draw it, (H, W)."""
-        if not self.knows_deviation:
-            raise InputError("this model knows no standard deviations; only one that was fitted by regression does")
-        canonical = self.primitives()
-        basis = torch.as_tensor(self.deformation.basis)  # only motions have doubt
-        moved = Offsets.of(basis, self.config.components).response
-        variance = torch.zeros(grid.shape, device=self.centre.device)
-        assert moved is not None
-        for motion in (canonical.attenuation[..., None] * moved).split(64):
-            mean = canonical.mean.expand(len(motion), -1, -1)
-            part = rasterize(mean, canonical.cholesky, motion, grid, cutoff=self.config.cutoff)
-            variance += part[:, 0].square().sum(dim=0)
-        return variance.sqrt()
-
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        header = {"config": asdict(self.config), "grid": asdict(self.grid)}
-        return self.state_dict(), header | self.deformation.header()
-
-    @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> SwiftWRF:
-        config = ModelConfig(**{**header["config"], "components": tuple(header["config"]["components"])})
-        grid = AngularGrid(**header["grid"])
-        config.check()
-        n, _ = config.size
-        own_shapes = {"mean": (n, 2), "cholesky": (n, 3), "attenuation": (n,), "response": (n, 2), "floor": (2,)}
-        expect(tensors, {"centre": (3,), "scale": ()} | {f"primitives.{name}": s for name, s in own_shapes.items()})
-        if not float(tensors["scale"]) > 0:
-            raise InputError(f"scale is {float(tensors['scale'])}, expected metres above 0")
-        primitives = config.make_primitives(grid, torch.Generator())
-        own = {name.removeprefix("deformation."): t for name, t in tensors.items() if name.startswith("deformation.")}
-        deformation = deformation_type(config.deformation).restore(config.components, header, own)
-        model = cls(config, grid, tensors["centre"], tensors["scale"], primitives, deformation)
-        model.load_state_dict(tensors)
-        return model.eval()
+    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
+        self._take(DeformableGaussians.restore(self.grid, tensors, header))
 
 
-def _product(weight: Tensor, kernel: Tensor) -> Tensor:
-    """|A| (B, H, W) from weights (B, N, 2), or (N, 2) for all."""
+def _magnitudes(weight: Tensor, kernel: Tensor) -> Tensor:
+    """Return magnitudes (B, H, W) of the sum of kernels (N, H, W) with complex weights (B, N, 2)."""
     real, imaginary = weight.unbind(-1)
     field: Tensor = torch.tensordot(real, kernel, dims=1)
-    if imaginary.any():
-        field = torch.hypot(field, torch.tensordot(imaginary, kernel, dims=1))
-    return field.abs()
+    if not bool(imaginary.any()):
+        return field.abs()
+    return magnitude(torch.stack([field, torch.tensordot(imaginary, kernel, dims=1)], dim=1))
+
+
+def fit(
+    train: Spectra,
+    config: FitConfig | None = None,
+    *,
+    device: torch.device | str = "cpu",
+    checkpoint: Path | None = None,
+    on_record: Callable[[Record], None] | None = None,
+    progress: bool = False,
+) -> SwiftWRF:
+    """Fit a SwiftWRF model to spectra. Equivalent to `SwiftWRF(config).fit(train, ...)`.
+
+    Args:
+        train: Training spectra, at least 10.
+        config: Options of the model and its fit. Defaults to `FitConfig()`.
+        device, checkpoint, on_record, progress: See `FieldModel.fit`.
+
+    Raises:
+        InputError: As `FieldModel.fit`.
+        FitError: The loss diverged, or ended above its first value.
+
+    Example:
+        >>> import swiftwrf
+        >>> room = swiftwrf.simulated_room(n=50)
+        >>> swiftwrf.fit(room, swiftwrf.FitConfig(model=swiftwrf.ModelConfig(n_primitives=16)))
+        SwiftWRF(fitted, 30 x 120 directions)
+    """
+    return SwiftWRF(config).fit(train, device=device, checkpoint=checkpoint, on_record=on_record, progress=progress)

@@ -1,9 +1,9 @@
-"""A model by regression: the spectra, not the parameters, are what is smooth in position.
+"""The fit of SwiftWRF by regression.
 
-Primitives that stay where they are draw a spectrum that is linear in their responses. So the responses of each training
-spectrum are its least squares, and between the positions they follow from a Gaussian process as the pixels themselves would.
-Only the shapes of the primitives are found step by step, by variable projection (Golub and Pereyra 1973): those that leave
-least of the spectra's mean and principal components.
+A spectrum of primitives with fixed shapes is linear in their responses. The responses of each training spectrum are
+therefore a least-squares solution, and a Gaussian process interpolates them between positions. Only the shapes need gradient
+steps, by variable projection (Golub and Pereyra 1973): they minimise the residual of the mean spectrum and the principal
+components.
 """
 
 from __future__ import annotations
@@ -22,36 +22,36 @@ from swiftwrf.gp import EXACT, Kernel, NearbyField, SmoothField, held_out, thinn
 from swiftwrf.metrics import NORMAL_80
 from swiftwrf.models.swiftwrf.config import FitConfig, ModelConfig
 from swiftwrf.models.swiftwrf.deformation import COMPONENTS, Deformation
-from swiftwrf.models.swiftwrf.deformation.motion_basis import MotionBasis
+from swiftwrf.models.swiftwrf.deformation.low_rank import LowRankDeformation
 from swiftwrf.models.swiftwrf.deformation.static import Static
+from swiftwrf.models.swiftwrf.field import DeformableGaussians
 from swiftwrf.models.swiftwrf.loss import spectrum_loss
-from swiftwrf.models.swiftwrf.model import SwiftWRF
 from swiftwrf.models.swiftwrf.primitives import Primitives
 from swiftwrf.positions import frame, normalise
 from swiftwrf.rasterize.reference import kernels
 from swiftwrf.runtime.threads import single_thread
 
 SHAPE_STEPS = 60
-TRIAL_STEPS = 8  # tell sizes apart as well as all of them do
-SHAPE_RATE = 0.02  # of means [rad] and logarithms of widths
-RIDGE = 1e-6  # of a kernel's mean square: keeps neighbours from cancelling each other with large responses
-MAX_ROWS = 1000  # spectra that choose the shapes and judge a size; more do not change the choice
-SHAPE_AZIMUTHS = 90  # columns of the spectra that the shapes are found on: an array's beams are far wider
-SINGULAR = 1e-9  # share of the variance below which a component is rounding
-BEYOND = 0.5  # spacings by which the first means lie outside the grid at the horizon
-FILLING = 16  # one primitive in so many starts where the others leave most
-PEAK = 1.5  # its standard deviation at the start, in pixels
-INSIDE = 0.8  # share of predictions inside the interval that calibrates their deviation
+TRIAL_STEPS = 8  # steps of a comparison of sizes; it ranks them as all steps do
+SHAPE_RATE = 0.02  # learning rate of means [rad] and logarithms of widths
+RIDGE = 1e-6  # regularisation relative to a kernel's mean square, against large responses of opposite sign
+MAX_ROWS = 1000  # spectra that fit the shapes and compare sizes; more do not change the choice
+SHAPE_AZIMUTHS = 90  # columns of the spectra that fit the shapes; the beams of an array are far wider
+MIN_VARIANCE = 1e-9  # fraction of the variance below which a principal component is rounding
+MARGIN = 0.5  # spacings by which the first means lie below the horizon
+FILL_EVERY = 16  # one primitive in this number starts at the largest residual
+PEAK_WIDTH = 1.5  # its initial standard deviation, in pixels
+COVERAGE = 0.8  # fraction of held-out pixels in the interval that calibrates the standard deviation
 
 
 class Regression:
-    """What models of all sizes for the same spectra share.
+    """Regressions of any number of primitives on the same spectra.
 
     Args:
-        train: spectra to fit.
-        config: of the fit, with a number for the rank.
-        kernel: of the prior over positions, lengths in [m].
-        fold: number of the part that each training spectrum is held out with, (n,).
+        train: Spectra to fit.
+        config: Options, with a number for the rank.
+        kernel: Prior covariance over positions, with lengths in metres.
+        fold: Index of the fold of each training spectrum, (n,).
     """
 
     def __init__(self, train: Spectra, config: FitConfig, kernel: Kernel, fold: Tensor) -> None:
@@ -64,14 +64,14 @@ class Regression:
 
     @single_thread()
     def held_out_loss(self, n: int, steps: int = SHAPE_STEPS) -> float:
-        """Of n primitives, shaped in so many steps, on spectra that the regression has not seen."""
+        """Return the held-out loss of n primitives whose shapes had a number of steps."""
         kernel = _kernels(self._shaped(n, steps), self.small.grid, self.config.model).detach()
-        drawn, _ = self._held_out(self.small, kernel)
-        return float(spectrum_loss(drawn, self.small.spectrum, self.config.ssim_weight, self.config.pixel_loss))
+        predicted, _ = self._held_out(self.small, kernel)
+        return float(spectrum_loss(predicted, self.small.spectrum, self.config.ssim_weight, self.config.pixel_loss))
 
     @single_thread()
-    def model(self, n: int) -> SwiftWRF:
-        """Of n primitives, from all spectra."""
+    def field(self, n: int) -> DeformableGaussians:
+        """Fit n primitives to all spectra."""
         train, primitives = self.train, self._shaped(n, SHAPE_STEPS)
         kernel = _kernels(primitives, train.grid, self.config.model).detach()
         mean, component = self._components(self.some)
@@ -81,52 +81,53 @@ class Regression:
         config = replace(self.config.model, n_primitives=n, rank=len(component))
         centre, scale = frame(train.position)
         deformation: Deformation = Static()
-        if len(component):
+        if not len(component):
+            config = replace(config, deformation="none")
+        else:
             flat = component.flatten(1)
-            scores = [(part - mean).flatten(1) @ flat.T for part in train.store.batches()]
-            score = torch.cat(scores) / flat.square().sum(dim=1)
+            score = torch.cat([(part - mean).flatten(1) @ flat.T for part in train.store.batches()])
+            score = score / flat.square().sum(dim=1)
             position = normalise(train.position, centre, scale)
             regress = SmoothField.regress if len(train) <= EXACT else NearbyField
-            field = regress(position, self.kernel.scaled(1 / float(scale)), score)
+            scores = regress(position, self.kernel.scaled(1 / float(scale)), score)
             basis = torch.zeros(len(component), n, sum(COMPONENTS[c] for c in config.components))
             at = sum(COMPONENTS[c] for c in config.components[: config.components.index("response")])
             basis[..., at] = response[1:] / attenuation
-            deformation = MotionBasis(field, basis, config.components, self._deviation(kernel, response[1:]))
-        return SwiftWRF(config, train.grid, centre, scale, primitives, deformation)
+            deformation = LowRankDeformation(scores, basis, config.components, self._deviation(kernel, response[1:]))
+        return DeformableGaussians(config, train.grid, centre, scale, primitives, deformation)
 
     def _components(self, spectra: Spectra) -> tuple[Tensor, Tensor]:
-        """Mean (H, W) and principal components (K, H, W) of spectra, these as large as their scores deviate."""
+        """Return mean (H, W) and principal components (K, H, W) of spectra, scaled by their standard deviations."""
         mean = spectra.spectrum.mean(dim=0)
         change = (spectra.spectrum - mean).flatten(1)
         variance, vector = torch.linalg.eigh((change @ change.T).double())
-        rank = min(int(self.config.model.rank), int((variance > SINGULAR * variance.sum()).sum()))
+        rank = min(int(self.config.model.rank), int((variance > MIN_VARIANCE * variance.sum()).sum()))
         component = vector.T[len(vector) - rank :].float() @ change / math.sqrt(len(change))
         return mean, component.reshape(rank, *mean.shape)
 
     def _held_out(self, spectra: Spectra, kernel: Tensor) -> tuple[Tensor, Tensor]:
-        """Spectra (n, H, W) as regression without their fold draws them, and their variance relative to the prior, (n,)."""
+        """Return held-out predictions (n, H, W) of spectra, and their variances relative to the prior, (n,)."""
         response = _responses(kernel, spectra.spectrum)
         mean = response.mean(dim=0)
         predicted, variance = held_out(self.kernel, spectra.position, self.fold, response - mean)
-        return _draw(mean + predicted.float(), kernel).clamp(0, 1), variance.float()
+        return _render(mean + predicted.float(), kernel).clamp(0, 1), variance.float()
 
     def _deviation(self, kernel: Tensor, response: Tensor) -> float:
-        """By which the prior deviation of a pixel must be multiplied so that its interval holds as many held-out spectra as
-        it says."""
-        drawn, variance = self._held_out(self.some, kernel)
-        prior = _draw(response, kernel).square().sum(dim=0).clamp_min(1e-12)
-        miss = (drawn - self.some.spectrum).abs() / (variance[:, None, None] * prior).sqrt()
-        return float(np.quantile(miss, INSIDE)) / NORMAL_80
+        """Return the factor that calibrates the predictive standard deviation on held-out spectra."""
+        predicted, variance = self._held_out(self.some, kernel)
+        prior = _render(response, kernel).square().sum(dim=0).clamp_min(1e-12)
+        miss = (predicted - self.some.spectrum).abs() / (variance[:, None, None] * prior).sqrt()
+        return float(np.quantile(miss, COVERAGE)) / NORMAL_80
 
     def _shaped(self, n: int, steps: int) -> Primitives:
-        """n primitives that leave least of the mean spectrum and the principal components after so many steps."""
+        """Return n primitives with fitted shapes, fitted once for each number of steps."""
         if (n, steps) not in self.primitives:
             self.primitives[n, steps] = self._shape(replace(self.config.model, n_primitives=n), steps)
         return self.primitives[n, steps]
 
     @cached_property
     def _target(self) -> Tensor:
-        """Mean spectrum and principal components that shapes are found on, (1 + K, H, W)."""
+        """Mean spectrum and principal components that the shapes are fitted to, (1 + K, H, W)."""
         mean, component = self._components(self.small)
         return torch.cat([mean[None], component])
 
@@ -135,51 +136,51 @@ class Regression:
         primitives = config.make_primitives(grid, torch.Generator().manual_seed(self.config.seed))
         _spread(primitives)
         target, kernel = self._target, _kernels(primitives, grid, config).detach()
-        _fill(primitives, (_draw(_responses(kernel, target), kernel) - target).square().sum(dim=0), grid)
+        _fill(primitives, (_render(_responses(kernel, target), kernel) - target).square().sum(dim=0), grid)
         shapes = [primitives.mean, primitives.cholesky]
         optimiser = torch.optim.Adam(shapes, lr=SHAPE_RATE, betas=(0.9, 0.99))
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
         for _ in range(steps):
             kernel = _kernels(primitives, grid, config)
-            # at the best responses the loss does not change with them, so they count as constants
-            left = _draw(_responses(kernel.detach(), target), kernel) - target
+            # the gradient by the responses is 0 at their least-squares solution, so they count as constants
+            residual = _render(_responses(kernel.detach(), target), kernel) - target
             optimiser.zero_grad()
-            left.square().sum().div(target.square().sum().clamp_min(1e-12)).backward()
+            residual.square().sum().div(target.square().sum().clamp_min(1e-12)).backward()
             optimiser.step()
             schedule.step()
         return primitives
 
 
 def _spread(primitives: Primitives) -> None:
-    """Means evenly over the hemisphere (Fibonacci lattice) and a little below the horizon, widths as their spacing."""
+    """Place means on a Fibonacci lattice over the hemisphere and a little below the horizon, as wide as their spacing."""
     n = len(primitives)
     spacing = math.sqrt(2 * math.pi / n)
-    height = 1 - (torch.arange(n) + 0.5) / n * (1 + BEYOND * spacing)
+    height = 1 - (torch.arange(n) + 0.5) / n * (1 + MARGIN * spacing)
     elevation, azimuth = torch.asin(height), torch.arange(n) * math.pi * (3 - math.sqrt(5)) % (2 * math.pi)
     wide = spacing / elevation.cos().clamp_min(spacing / (2 * math.pi))
     primitives.mean.data = torch.stack([azimuth, elevation], dim=1)
     primitives.cholesky.data = torch.stack([wide.log(), torch.zeros(n), torch.full((n,), math.log(spacing))], dim=1)
 
 
-def _fill(primitives: Primitives, left: Tensor, grid: AngularGrid) -> None:
-    """Moves some primitives, now narrow, to where most of the energy is left (H, W): peaks that lie between the others."""
-    width = PEAK * torch.tensor([grid.azimuth_step, grid.elevation_step])
-    for n in range(0, len(primitives), FILLING):
-        row, column = divmod(int(left.argmax()), left.shape[1])
+def _fill(primitives: Primitives, residual: Tensor, grid: AngularGrid) -> None:
+    """Move some primitives, made narrow, to the peaks of the residual energy (H, W)."""
+    width = PEAK_WIDTH * torch.tensor([grid.azimuth_step, grid.elevation_step])
+    for n in range(0, len(primitives), FILL_EVERY):
+        row, column = divmod(int(residual.argmax()), residual.shape[1])
         mean = torch.stack([grid.azimuth[column], grid.elevation[row]]).float()
         primitives.mean.data[n] = mean
         primitives.cholesky.data[n, ::2] = width.log()
         taken = kernels(mean[None], torch.tensor([[width[0], 0.0, width[1]]]), grid, None)[0]
-        left = left * (1 - taken).square()
+        residual = residual * (1 - taken).square()
 
 
 def _kernels(primitives: Primitives, grid: AngularGrid, config: ModelConfig) -> Tensor:
-    drawn = primitives()
-    return kernels(drawn.mean, drawn.cholesky, grid, config.cutoff)
+    canonical = primitives()
+    return kernels(canonical.mean, canonical.cholesky, grid, config.cutoff)
 
 
 def _responses(kernel: Tensor, spectrum: Tensor) -> Tensor:
-    """Least squares of spectra (k, H, W) on kernels (n, H, W), (k, n)."""
+    """Return the least-squares responses (k, n) of spectra (k, H, W) on kernels (n, H, W)."""
     flat = kernel.flatten(1).double()
     gram = flat @ flat.T
     gram += RIDGE * gram.diagonal().mean() * torch.eye(len(gram), dtype=gram.dtype)
@@ -187,6 +188,6 @@ def _responses(kernel: Tensor, spectrum: Tensor) -> Tensor:
     return response
 
 
-def _draw(response: Tensor, kernel: Tensor) -> Tensor:
-    drawn: Tensor = torch.einsum("kn,nhw->khw", response, kernel)
-    return drawn
+def _render(response: Tensor, kernel: Tensor) -> Tensor:
+    rendered: Tensor = torch.einsum("kn,nhw->khw", response, kernel)
+    return rendered

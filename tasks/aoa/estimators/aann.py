@@ -10,6 +10,7 @@ these than between one of them and a new one, the more so the fewer they are, an
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 from dataclasses import asdict, dataclass
@@ -18,8 +19,8 @@ from typing import Any
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch import distributed as dist
 from torch.nn import functional
-from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import update_bn
 
 from augment import Mixed
@@ -27,11 +28,11 @@ from swiftwrf import InputError
 from swiftwrf.array.angles import AngularGrid, to_angles, to_direction
 from swiftwrf.data.spectra import coarsening
 from swiftwrf.runtime.checkpoint import Header, expect
-from swiftwrf.runtime.processes import Processes
 from swiftwrf.runtime.progress import progress
 from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator, Settings
 from tasks.aoa.estimators.radial import RadialRegression, coarse_pixels, kept_rows
-from tasks.aoa.estimators.resnet import FEATURES, backbone, shared_by
+from tasks.aoa.estimators.resnet import FEATURES, backbone, distributed
+from tasks.torchrun import distribute, process_count
 
 LEAST_ROWS = 8  # a prime number of rows can only be averaged to one, which leaves nothing to learn from
 LOOKS = 30  # at each spectrum of a scene in a quick training; a training set with synthetic spectra gets several times fewer
@@ -73,29 +74,27 @@ class AANNConfig:
 class AANN(SavedEstimator):
     """ResNet-50 with one input channel and an MLP head, from a seeded start; weights are not downloaded.
 
-    Several processes share each batch, its statistics in the batch norms included: they train the network that one would,
-    but for the rounding of sums.
+    The processes of torchrun share each batch, its statistics in the batch norms included: they train the network of one
+    process but for the rounding of sums.
 
     Args:
-        settings: seed of weights and batches, device, the preset of the training, and the processes that share it.
+        settings: seed of weights and batches, device, and the preset of the training.
         config: of the training, in place of the preset's.
     """
 
     kind = "angle-of-arrival network"
-    shared = True
 
     def __init__(self, settings: Settings, config: AANNConfig | None = None) -> None:
         super().__init__(settings)
         config = config or (AANNConfig.paper() if settings.preset == "paper" else AANNConfig.quick(settings.spectra))
         seed, device = settings.seed, torch.device(settings.device)
-        bfloat16 = _gains_from_bfloat16(device)
         self._config, self._device = config, device
         with torch.random.fork_rng(devices=[]):  # torchvision draws its weights from the global generator
             torch.manual_seed(seed)
             network = backbone(config.circular, device.type == "cpu")
         self._network = network.to(device).to(memory_format=torch.channels_last)
         self._generator = torch.Generator().manual_seed(seed)
-        self._autocast = torch.autocast(device.type, torch.bfloat16, enabled=bfloat16)
+        self._autocast = _autocast(device)
 
     def _prepare(self, spectrum: Tensor) -> Tensor:
         factor = coarsening(spectrum.shape[1:], self._config.max_azimuths, LEAST_ROWS)
@@ -103,39 +102,24 @@ class AANN(SavedEstimator):
         return (2 * small - 1).to(self._device, memory_format=torch.channels_last)
 
     def fit(self, train: Mixed) -> None:
-        config, processes = self._config, Processes(self.settings.group)
-        network = self._network if processes.group is None else shared_by(self._network, processes)
+        config, network = self._config, self._network
         size = min(config.batch, max(len(train) // 2, 1))
-        weight = processes.weight(size)
+        if size < process_count():
+            raise InputError(
+                f"{process_count()} processes cannot share batches of {size} spectra; start at most {size}"
+            )
         spectrum = torch.cat([self._prepare(part) for part in train.batches()])
         direction = to_direction(*train.label.unbind(-1)).float().to(self._device)
         self._mean = functional.normalize(direction.mean(dim=0), dim=0)
         self._spread = (direction - self._mean).square().sum(dim=1).mean().sqrt().clamp_min(1e-4)
-        optimiser = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=1e-2, fused=True)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimiser, config.rate, total_steps=config.steps, pct_start=RISING
-        )
-        network.train()
-        began, order = time.perf_counter(), torch.empty(0, dtype=torch.int64)
-        for step in progress(range(1, config.steps + 1), "AANN", shown=processes.first):
-            if len(order) < size:
-                order = torch.randperm(len(train), generator=self._generator)
-            batch, order = order[:size], order[size:]
-            rows = processes.own(batch)
-            miss = (self._point(spectrum[rows], network) - direction[rows]) / self._spread
-            loss = weight * functional.smooth_l1_loss(miss, torch.zeros_like(miss))
-            optimiser.zero_grad()
-            loss.backward()
-            nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-            optimiser.step()
-            schedule.step()
-            if step % 10 == 0 or step == config.steps:
-                processes.average([loss.detach()])
-                self.history.append({"step": step, "loss": loss.item(), "seconds": time.perf_counter() - began})
+        batches = _batches(len(train), size, config.steps, self._generator)
+        given = spectrum, direction, self._mean, self._spread
+        if process_count() > 1:
+            away = copy.deepcopy(network).cpu()
+            distribute(_train, away, config, self._device.type, batches, *(tensor.cpu() for tensor in given))
+        self.history = _train(network, config, self._device.type, batches, *given)
 
-        if isinstance(network, DistributedDataParallel):
-            self._network.load_state_dict(network.module.state_dict())
-        network = self._network.train()
+        network.train()
         # a short training leaves the batch norms' running statistics behind the weights, so they are taken anew
         some = torch.randperm(len(train), generator=self._generator)[:STATISTICS]
         with self._autocast:
@@ -154,12 +138,6 @@ class AANN(SavedEstimator):
         self._scale[0] /= math.sqrt(trust)
         known = direction.double().cpu().numpy()
         self._direction = RadialRegression.fit(self._feature(seen), known, self.settings.seed)
-
-    def _point(self, prepared: Tensor, network: nn.Module) -> Tensor:
-        """Unit vectors (n, 3) of prepared spectra, as the head gives them."""
-        with self._autocast:
-            offset = network(prepared)
-        return functional.normalize(self._mean + self._spread * offset.float(), dim=1)
 
     @torch.no_grad()
     def _seen(self, prepared: Tensor) -> tuple[Tensor, Tensor]:
@@ -204,6 +182,66 @@ class AANN(SavedEstimator):
         pixels = coarse_pixels(own._prepare(torch.zeros(1, *own.settings.grid.shape))[:, 0]).shape[1]
         own._direction = RadialRegression.from_state(tensors, header, FEATURES + pixels, 3)
         return own
+
+
+def _batches(rows: int, size: int, steps: int, generator: torch.Generator) -> Tensor:
+    """Return the row numbers of each step's batch, (steps, size): parts of one random order of the rows after the other."""
+    batches, order = [], torch.empty(0, dtype=torch.int64)
+    for _ in range(steps):
+        if len(order) < size:
+            order = torch.randperm(rows, generator=generator)
+        batches.append(order[:size])
+        order = order[size:]
+    return torch.stack(batches)
+
+
+def _train(
+    network: nn.Module,
+    config: AANNConfig,
+    device: str,
+    batches: Tensor,
+    spectrum: Tensor,
+    direction: Tensor,
+    mean: Tensor,
+    spread: Tensor,
+) -> list[dict[str, Any]]:
+    """Train a network in place and return its history: step, loss and seconds.
+
+    Every process of torchrun makes this call, with its part of each batch.
+    """
+    number, rank = process_count(), dist.get_rank() if process_count() > 1 else 0
+    network = network.to(device)
+    spectrum, direction, mean, spread = (tensor.to(device) for tensor in (spectrum, direction, mean, spread))
+    shared = distributed(network) if number > 1 else None
+    trained = shared or network
+    optimiser = torch.optim.AdamW(trained.parameters(), lr=config.rate, weight_decay=1e-2, fused=True)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, config.rate, total_steps=config.steps, pct_start=RISING)
+    trained.train()
+    began, history = time.perf_counter(), []
+    for step, batch in enumerate(progress(list(batches), "AANN", shown=rank == 0), start=1):
+        rows = batch[rank::number]
+        with _autocast(torch.device(device)):
+            offset = trained(spectrum[rows])
+        miss = (functional.normalize(mean + spread * offset.float(), dim=1) - direction[rows]) / spread
+        # the mean over the processes, which DistributedDataParallel takes, becomes the mean over the batch
+        loss = functional.smooth_l1_loss(miss, torch.zeros_like(miss)) * (number * len(rows) / len(batch))
+        optimiser.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(trained.parameters(), 1.0)
+        optimiser.step()
+        schedule.step()
+        if step % 10 == 0 or step == config.steps:
+            shown = loss.detach()
+            if number > 1:
+                dist.all_reduce(shown)
+            history.append({"step": step, "loss": shown.item() / number, "seconds": time.perf_counter() - began})
+    if shared:
+        network.load_state_dict(shared.module.state_dict())
+    return history
+
+
+def _autocast(device: torch.device) -> torch.autocast:
+    return torch.autocast(device.type, torch.bfloat16, enabled=_gains_from_bfloat16(device))
 
 
 def _scale_of(rows: Tensor) -> Tensor:

@@ -8,7 +8,6 @@ from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor
-from torch.distributed import ProcessGroup
 
 from augment import Mixed
 from swiftwrf import AngularGrid
@@ -28,7 +27,6 @@ class Settings:
         preset: how large and how long.
         spectra: that there would be with everything measured: how long a training lasts, whatever it is given, must follow
             from one number, or the longer training would win.
-        group: processes of `torch.distributed` that train one of those that are `shared`.
     """
 
     grid: AngularGrid
@@ -36,7 +34,6 @@ class Settings:
     device: torch.device | str = "cpu"
     preset: Preset = "quick"
     spectra: int = 0
-    group: ProcessGroup | None = None
 
 
 class Estimator(ABC):
@@ -48,8 +45,6 @@ class Estimator(ABC):
 
     learns: ClassVar[bool] = True
     """whether more labelled spectra can make it better"""
-    shared: ClassVar[bool] = False
-    """whether several processes train one together"""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings

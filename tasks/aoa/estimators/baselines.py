@@ -20,7 +20,7 @@ class Peak(Estimator):
         """Nothing to learn."""
 
     def estimate(self, spectrum: Tensor) -> Tensor:
-        return self.settings.grid.strongest(spectrum)
+        return self.settings.grid.peak_direction(spectrum)
 
 
 @ESTIMATORS.register("constant")

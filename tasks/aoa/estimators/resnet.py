@@ -1,17 +1,16 @@
-"""ResNet-50 for spectra: one input channel, a small head, and what makes it fast on CPUs and shared by several processes."""
+"""ResNet-50 for spectra: one input channel, a small head, fast convolutions for CPUs, and training in several processes."""
 
 from __future__ import annotations
 
 import copy
-from typing import cast
+from typing import Any, cast
 
 import torch
 import torchvision
 from torch import Tensor, nn
+from torch import distributed as dist
 from torch.nn import functional
 from torch.nn.parallel import DistributedDataParallel
-
-from swiftwrf.runtime.processes import Processes
 
 FEATURES = 2048  # that the network sees in a spectrum, behind its last convolution
 
@@ -72,36 +71,42 @@ class Neighbours(nn.Module):
         return functional.linear(torch.cat(neighbours, dim=-1), weight).permute(0, 3, 1, 2)
 
 
-class SharedNorm(nn.BatchNorm2d):
-    """What `nn.SyncBatchNorm` is on GPUs, for CPUs, where torch has none: statistics of the batch of all processes."""
+class _Total(torch.autograd.Function):
+    """Differentiable sum over the processes."""
 
-    def __init__(self, inner: nn.BatchNorm2d, processes: Processes) -> None:
-        super().__init__(inner.num_features, eps=inner.eps)
-        self.load_state_dict(inner.state_dict())
-        self.processes = processes
+    @staticmethod
+    def forward(ctx: Any, tensor: Tensor) -> Tensor:
+        total = tensor.clone()
+        dist.all_reduce(total)
+        return total
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Any:
+        return _Total.apply(gradient)
+
+
+class CpuSyncBatchNorm(nn.BatchNorm2d):
+    """Synchronised batch norm for the CPU, where `nn.SyncBatchNorm` has no implementation."""
 
     def forward(self, x: Tensor) -> Tensor:
         wide, pixels = x.to(torch.promote_types(x.dtype, torch.float32)), (0, 2, 3)
-        rows = self.processes.total(wide.new_tensor(len(x)))
-        n = rows * x.shape[2] * x.shape[3]
-        mean = self.processes.total(wide.sum(pixels)) / n
+        count = _Total.apply(wide.new_tensor(len(x) * x.shape[2] * x.shape[3]))
+        mean = _Total.apply(wide.sum(pixels)) / count
         centred = wide - mean[:, None, None]
-        variance = self.processes.total(centred.square().sum(pixels)) / n
+        variance = _Total.apply(centred.square().sum(pixels)) / count
         scale = self.weight * (variance + self.eps).rsqrt()
-        return (centred * scale[:, None, None] + self.bias[:, None, None]).to(x.dtype)
+        return cast(Tensor, centred * scale[:, None, None] + self.bias[:, None, None]).to(x.dtype)
 
 
-def shared_by(network: nn.Module, processes: Processes) -> nn.Module:
-    """A copy to be trained by several processes, whose batch norms see the whole batch."""
+def distributed(network: nn.Module) -> DistributedDataParallel:
+    """Return a copy of a network whose gradients and batch norms are those of the batches of all processes."""
     copied = copy.deepcopy(network)
     if next(copied.parameters()).is_cuda:
-        copied = nn.SyncBatchNorm.convert_sync_batchnorm(copied, processes.group)
-    else:
-        for module in list(copied.modules()):
-            for name, child in module.named_children():
-                if isinstance(child, nn.BatchNorm2d):
-                    setattr(module, name, SharedNorm(child, processes))
-    return DistributedDataParallel(copied, process_group=processes.group)
+        return DistributedDataParallel(nn.SyncBatchNorm.convert_sync_batchnorm(copied))
+    for module in copied.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.__class__ = CpuSyncBatchNorm
+    return DistributedDataParallel(copied)
 
 
 def backbone(circular: bool, products: bool) -> nn.Module:

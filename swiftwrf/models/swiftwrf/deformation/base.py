@@ -1,6 +1,6 @@
-"""What every deformation is.
+"""The interface of every deformation.
 
-Positions here are normalised: the training positions' bounding box, scaled alike on all axes, is centred in [-1, 1]^3.
+Positions are normalised: the bounding box of the training positions is centred in [-1, 1]^3, with one scale for all axes.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -18,11 +18,11 @@ from swiftwrf.gp import Kernel
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.registry import Registry
 
-COMPONENTS = {"mean": 2, "response": 2, "attenuation": 1, "cholesky": 3}  # what can deform, and its numbers a primitive
+COMPONENTS = {"mean": 2, "response": 2, "attenuation": 1, "cholesky": 3}  # deformable parameters: values per primitive
 
 
 class Offsets(NamedTuple):
-    """What is added to each primitive at each position; None where a component does not deform."""
+    """Offsets of the parameters of each primitive at each position; None for a parameter that does not deform."""
 
     mean: Tensor | None = None  # (B, N, 2) [rad]
     response: Tensor | None = None  # (B, N, 2)
@@ -31,7 +31,7 @@ class Offsets(NamedTuple):
 
     @classmethod
     def of(cls, flat: Tensor, components: tuple[str, ...]) -> Offsets:
-        """Splits (B, N, sum of sizes) into the named components."""
+        """Split (B, N, sum of sizes) into the named components."""
         parts = dict(zip(components, flat.split([COMPONENTS[c] for c in components], dim=-1), strict=True))
         if "attenuation" in parts:
             parts["attenuation"] = parts["attenuation"].squeeze(-1)
@@ -39,15 +39,15 @@ class Offsets(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Setting:
-    """What a deformation is made for.
+class DeformationContext:
+    """Sizes and prior that a new deformation needs.
 
     Args:
-        n: number of primitives.
-        components: that deform.
-        rank: number of motions, for those that mix some.
-        anchor: normalised positions (M, 3) of the training spectra.
-        kernel: of the prior over positions, on normalised positions.
+        n: Number of primitives.
+        components: Parameters that deform.
+        rank: Rank of a low-rank deformation.
+        anchor: Normalised positions (M, 3) of the training spectra.
+        kernel: Prior covariance over normalised positions.
     """
 
     n: int
@@ -58,58 +58,51 @@ class Setting:
 
 
 class Deformation(nn.Module, ABC):
-    """Normalised position to offsets of the primitives' parameters."""
+    """Map from a normalised position to offsets of the parameters of the primitives."""
 
     @classmethod
     @abstractmethod
-    def initial(cls, setting: Setting, *, generator: torch.Generator) -> Deformation:
-        """One at its start."""
+    def initial(cls, context: DeformationContext, *, generator: torch.Generator) -> Deformation:
+        """Return a deformation with initial parameters."""
 
     @classmethod
     @abstractmethod
     def restore(cls, components: tuple[str, ...], header: Header, tensors: Mapping[str, Tensor]) -> Deformation:
-        """One of the shapes that saved `tensors` (by name within the deformation) have; they are copied in afterwards."""
+        """Return a deformation with the shapes of saved tensors (by name within the deformation), to be loaded later."""
 
     def header(self) -> Header:
-        """Plain values that `restore` needs."""
+        """Return the plain values that `restore` needs."""
         return {}
 
     @classmethod
     def choose_rank(cls, position: Tensor, spectrum: Store, fold: Tensor, kernel: Kernel) -> int:
-        """How many motions training spectra call for; see `swiftwrf.gp.choose_rank`. 0 for those that mix none."""
+        """Return the rank with the lowest held-out error; see `swiftwrf.gp.choose_rank`. 0 if there is no rank."""
         return 0
 
     @abstractmethod
     def forward(self, position: Tensor, mean: Tensor) -> Offsets:
-        """Offsets at normalised positions (B, 3) of primitives with canonical means (N, 2) [rad]."""
+        """Return offsets at normalised positions (B, 3) of primitives with canonical means (N, 2) [rad]."""
 
-    def doubt(self, position: Tensor) -> Tensor | None:
-        """Standard deviation of a measured spectrum about the drawn one at normalised positions (B, 3), in units of that of
-        all spectra, (B,); None where it is unknown."""
+    def unscaled_std(self, position: Tensor) -> Tensor | None:
+        """Return the predictive standard deviation at normalised positions (B, 3) relative to the prior one, (B,).
+
+        None if the fit gives no standard deviation.
+        """
         return None
 
     def prior(self) -> Tensor | None:
-        """Negative log prior up to a factor 1/2; None without one."""
+        """Return twice the negative log prior of the parameters, or None without a prior."""
         return None
 
     def parameter_groups(self, rate: float, own_rate: float | None) -> list[dict[str, Any]]:
-        """Parameters with their peak learning rates.
+        """Return the parameters with their peak learning rates.
 
         Args:
-            rate: of the primitives.
-            own_rate: of the deformation, where the configuration gives one.
+            rate: Learning rate of the primitives.
+            own_rate: Learning rate of the deformation, if the configuration has one.
         """
         parameters = list(self.parameters())
         return [{"params": parameters, "peak": own_rate or rate}] if parameters else []
 
 
 DEFORMATIONS: Registry[Deformation] = Registry("deformation")
-
-
-def deformation_type(name: str) -> type[Deformation]:
-    """The class of the deformation of that name.
-
-    Raises:
-        InputError: there is none.
-    """
-    return cast(type[Deformation], DEFORMATIONS[name])

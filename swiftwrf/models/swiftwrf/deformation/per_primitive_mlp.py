@@ -9,7 +9,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from swiftwrf.models.swiftwrf.deformation.base import COMPONENTS, DEFORMATIONS, Deformation, Offsets, Setting
+from swiftwrf.models.swiftwrf.deformation.base import COMPONENTS, DEFORMATIONS, Deformation, DeformationContext, Offsets
 from swiftwrf.models.swiftwrf.encoding import encode
 from swiftwrf.runtime.checkpoint import Header
 
@@ -42,8 +42,8 @@ class PerPrimitiveMLP(Deformation):
         nn.init.zeros_(self.output.bias)
 
     @classmethod
-    def initial(cls, setting: Setting, *, generator: torch.Generator) -> PerPrimitiveMLP:
-        return cls(setting.components, generator=generator)
+    def initial(cls, context: DeformationContext, *, generator: torch.Generator) -> PerPrimitiveMLP:
+        return cls(context.components, generator=generator)
 
     @classmethod
     def restore(cls, components: tuple[str, ...], header: Header, tensors: Mapping[str, Tensor]) -> PerPrimitiveMLP:

@@ -1,4 +1,4 @@
-"""No motion: one spectrum for all positions."""
+"""No deformation: one spectrum for all positions."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from swiftwrf.models.swiftwrf.deformation.base import DEFORMATIONS, Deformation, Offsets, Setting
+from swiftwrf.models.swiftwrf.deformation.base import DEFORMATIONS, Deformation, DeformationContext, Offsets
 from swiftwrf.runtime.checkpoint import Header
 
 
 @DEFORMATIONS.register("none")
 class Static(Deformation):
-    """Leaves the primitives canonical."""
+    """Return no offsets: the primitives stay canonical."""
 
     @classmethod
-    def initial(cls, setting: Setting, *, generator: torch.Generator) -> Static:
+    def initial(cls, context: DeformationContext, *, generator: torch.Generator) -> Static:
         return cls()
 
     @classmethod

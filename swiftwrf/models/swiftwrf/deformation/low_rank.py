@@ -1,4 +1,4 @@
-"""Low-rank motion with a Gaussian-process prior over positions."""
+"""Low-rank deformation with a Gaussian-process prior over positions."""
 
 from __future__ import annotations
 
@@ -13,24 +13,26 @@ from torch import Tensor, nn
 from swiftwrf import gp
 from swiftwrf.data.store import Store
 from swiftwrf.errors import InputError
-from swiftwrf.models.swiftwrf.deformation.base import COMPONENTS, DEFORMATIONS, Deformation, Offsets, Setting
+from swiftwrf.models.swiftwrf.deformation.base import COMPONENTS, DEFORMATIONS, Deformation, DeformationContext, Offsets
 from swiftwrf.runtime.checkpoint import Header, expect
 
 
 @DEFORMATIONS.register("motion_basis")
-class MotionBasis(Deformation):
-    """All primitives move by one basis, mixed by smooth functions of position.
+class LowRankDeformation(Deformation):
+    """Offsets of all primitives as K basis vectors with coefficients that are smooth functions of the position.
 
-    Far from all measured positions the model falls back to the canonical primitives. One small matrix product a position,
-    whatever the number of primitives.
+    Far from all training positions the coefficients are 0 and the primitives canonical. A position costs one small matrix
+    product, for any number of primitives.
 
     Args:
-        field: the smooth functions; those of neighbours are not fitted by gradient.
-        basis: motions of the primitives, (rank, N, numbers that deform).
-        components: that deform.
-        deviation: of measured spectra about the drawn ones, relative to what the prior of the motion says; 0 where it
-            is unknown.
+        field: The smooth functions. A `NearbyField` cannot be fitted by gradient descent.
+        basis: Offsets of the primitives, (K, N, sum of component sizes).
+        components: Parameters that deform.
+        deviation: Calibration factor between the prior's standard deviation of a spectrum and the measured one; 0 if
+            unknown.
     """
+
+    deviation: Tensor
 
     def __init__(
         self,
@@ -43,27 +45,25 @@ class MotionBasis(Deformation):
         self.components, self.field, self.basis = components, field, nn.Parameter(basis)
         self.register_buffer("deviation", torch.tensor(deviation))
 
-    deviation: Tensor
+    @classmethod
+    def initial(cls, context: DeformationContext, *, generator: torch.Generator) -> LowRankDeformation:
+        rank, size = context.rank, sum(COMPONENTS[c] for c in context.components)
+        field = gp.SmoothField(context.anchor, context.kernel, rank)
+        basis = 0.1 / math.sqrt(max(rank, 1)) * torch.randn(rank, context.n, size, generator=generator)
+        return cls(field, basis, context.components)
 
     @classmethod
-    def initial(cls, setting: Setting, *, generator: torch.Generator) -> MotionBasis:
-        rank, size = setting.rank, sum(COMPONENTS[c] for c in setting.components)
-        field = gp.SmoothField(setting.anchor, setting.kernel, rank)
-        basis = 0.1 / math.sqrt(max(rank, 1)) * torch.randn(rank, setting.n, size, generator=generator)
-        return cls(field, basis, setting.components)
-
-    @classmethod
-    def restore(cls, components: tuple[str, ...], header: Header, tensors: Mapping[str, Tensor]) -> MotionBasis:
+    def restore(cls, components: tuple[str, ...], header: Header, tensors: Mapping[str, Tensor]) -> LowRankDeformation:
         rank, n, m = header["config"]["rank"], header["config"]["n_primitives"], len(tensors["field.anchor"])
-        kernel, few = gp.Kernel(**header["kernel"]), "field.whiten" in tensors
-        own = {"whiten": (m, m), "coefficient": (m, rank)} if few else {"value": (m, rank)}
+        kernel, exact = gp.Kernel(**header["kernel"]), "field.whiten" in tensors
+        own = {"whiten": (m, m), "coefficient": (m, rank)} if exact else {"value": (m, rank)}
         field_shapes = {f"field.{name}": shape for name, shape in ({"anchor": (m, 3)} | own).items()}
         basis_shape = (rank, n, sum(COMPONENTS[c] for c in components))
         expect(dict(tensors), field_shapes | {"basis": basis_shape, "deviation": ()})
         if not float(tensors["deviation"]) >= 0:
             raise InputError(f"deviation is {float(tensors['deviation'])}, expected 0 or more")
         anchor, basis = tensors["field.anchor"], tensors["basis"].clone()
-        if few:
+        if exact:
             return cls(gp.SmoothField(anchor, kernel, rank, tensors["field.whiten"]), basis, components)
         return cls(gp.NearbyField(anchor, kernel, tensors["field.value"]), basis, components)
 
@@ -75,10 +75,10 @@ class MotionBasis(Deformation):
         return gp.choose_rank(position, spectrum, fold, kernel)
 
     def forward(self, position: Tensor, mean: Tensor) -> Offsets:
-        """Offsets at positions (B, 3); the canonical means play no part."""
+        """Return offsets at normalised positions (B, 3); the canonical means are not used."""
         return Offsets.of(torch.einsum("bk,kns->bns", self.field(position), self.basis), self.components)
 
-    def doubt(self, position: Tensor) -> Tensor | None:
+    def unscaled_std(self, position: Tensor) -> Tensor | None:
         if not self.deviation > 0:
             return None
         return self.deviation * (self.field.variance(position) + self.field.kernel.noise).sqrt()

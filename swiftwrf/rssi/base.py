@@ -1,0 +1,203 @@
+"""The interface of every RSSI predictor: fit to measured RSSI, then predict it at any position."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from swiftwrf.data.rssi import Rssi
+from swiftwrf.data.splits import MIN_TRAINING, Validation
+from swiftwrf.errors import InputError
+from swiftwrf.models.base import Prediction, Record
+from swiftwrf.positions import check_positions
+from swiftwrf.runtime.threads import side_by_side
+from swiftwrf.runtime.validation import NonNegativeInt, configuration
+
+Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+RECEIVER_POSITIONS = "positions of the receivers"
+
+
+def map_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
+    """Apply a function to items as `map` does, as many at a time as torch has threads."""
+    waiting, n_threads = list(items), torch.get_num_threads()
+    for start in range(0, len(waiting), n_threads):
+        yield from side_by_side(function, waiting[start : start + n_threads])
+
+
+@configuration
+class PredictorConfig:
+    """Options of every RSSI predictor."""
+
+    validation: Validation = "random"
+    """training rows held out to choose settings: single ones at random, or one region at a time"""
+    seed: NonNegativeInt = 0
+    """seed of everything random"""
+
+
+@dataclass(frozen=True)
+class RssiFitContext:
+    """Arguments of `RssiPredictor.fit` other than the training rows; see there."""
+
+    pool: Rssi
+    device: torch.device
+    parallel: Map | None
+    checkpoint: Path | None
+    on_record: Callable[[Record], None] | None
+    progress: bool
+
+
+class RssiPredictor(ABC):
+    """Base class of all predictors of RSSI at fixed receivers from the position of the transmitter.
+
+    A subclass sets `name` and `config_type`, and implements `_fit` and `_predict`. Options are keyword arguments of the
+    constructor; `config_type` declares their ranges.
+
+    Args:
+        config: Options as one object. Defaults to `config_type()`.
+        options: Single options, which replace those of `config`.
+
+    Raises:
+        InputError: An unknown option, or a value outside its range.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.rssi_room(n=60).split()
+        >>> swiftwrf.RssiModel(seed=1).fit(train).predict(test.transmitter_position).mean.shape
+        torch.Size([12, 12])
+    """
+
+    name: ClassVar[str]
+    """name on the command line and in reports"""
+    config_type: ClassVar[type[Any]] = PredictorConfig
+    """dataclass of the options"""
+    requires_receiver_position: ClassVar[bool] = False
+    """whether the positions of the receivers must be known"""
+    slow: ClassVar[bool] = False
+    """whether a fit takes minutes, so that it is compared only on request"""
+    batch_size: ClassVar[int] = 512
+    """positions evaluated at a time, few enough to stay in the processor's cache"""
+
+    receiver_names: tuple[str, ...]
+    """names of the receivers, set by `fit`"""
+
+    def __init__(self, config: Any = None, **options: Any) -> None:
+        known = [field.name for field in fields(self.config_type)]
+        unknown = [name for name in options if name not in known]
+        if unknown:
+            raise InputError(f"{type(self).__name__} has no option {unknown[0]!r}; it has {', '.join(known)}")
+        self.config = replace(config or self.config_type(), **options)
+
+    @classmethod
+    def lacking(cls, data: Rssi) -> str:
+        """Return a sentence about what the data lack for this predictor, or an empty text if they have it."""
+        if cls.requires_receiver_position and not data.located:
+            return f"{cls.name} needs the {RECEIVER_POSITIONS}, which {data.name} does not describe"
+        return ""
+
+    def fit(
+        self,
+        train: Rssi,
+        *,
+        pool: Rssi | None = None,
+        device: torch.device | str = "cpu",
+        parallel: Map | None = None,
+        checkpoint: Path | None = None,
+        on_record: Callable[[Record], None] | None = None,
+        progress: bool = False,
+    ) -> Self:
+        """Fit the predictor to measured RSSI and return it.
+
+        Args:
+            train: Training rows, at least 10 measurements in all. Missing values (nan) are ignored.
+            pool: The same rows at every receiver of the data, from which properties common to all receivers are learnt.
+                Defaults to `train`.
+            device: Device to compute on. The fitted predictor is on the CPU.
+            parallel: Function that maps a picklable fit over receivers as `map` does, e.g. on other machines. Defaults to
+                threads of this process.
+            checkpoint: File for the state of a long fit. If it exists, the fit continues from it.
+            on_record: Called with each evaluation, e.g. stage and seconds.
+            progress: Show a progress bar on a terminal.
+
+        Raises:
+            InputError: Too few measurements, values that are not finite, a missing requirement, a pool of other rows, or a
+                checkpoint of another fit.
+            FitError: The fit diverged.
+        """
+        pool = pool or train
+        check_training(train, pool)
+        if lacking := self.lacking(train):
+            raise InputError(lacking)
+        self._fit(train, RssiFitContext(pool, torch.device(device), parallel, checkpoint, on_record, progress))
+        self.receiver_names = tuple(map(str, train.receiver_names))
+        return self
+
+    @abstractmethod
+    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+        """Fit to checked data."""
+
+    @abstractmethod
+    def _predict(self, position: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Return RSSI (b, R) [dBm] and its standard deviation, or None, for a batch of positions (b, 3), float64 [m]."""
+
+    def predict(self, position: Tensor) -> Prediction:
+        """Predict the RSSI at every receiver.
+
+        Gradients flow to the positions where the mathematics is differentiable, unless torch.no_grad is active.
+
+        Args:
+            position: Positions of the transmitter, (n, 3) [m].
+
+        Returns:
+            Mean (n, R) [dBm], and the standard deviation of a measurement (n, R) [dB] if the predictor has one.
+
+        Raises:
+            InputError: Positions of another shape or not finite, or a predictor that is not fitted.
+        """
+        if not hasattr(self, "receiver_names"):
+            raise InputError(f"this {type(self).__name__} is not fitted; call fit first")
+        position = check_positions(position)
+        with torch.set_grad_enabled(torch.is_grad_enabled() and position.requires_grad):
+            parts = [self._predict(some) for some in position.split(self.batch_size)]
+        stds = [std for _, std in parts if std is not None]
+        return Prediction(torch.cat([mean for mean, _ in parts]), torch.cat(stds) if stds else None)
+
+    def __repr__(self) -> str:
+        fitted = f"fitted, {len(self.receiver_names)} receivers" if hasattr(self, "receiver_names") else "not fitted"
+        return f"{type(self).__name__}({fitted})"
+
+
+def check_training(train: Rssi, pool: Rssi) -> None:
+    """Refuse data that nothing can be fitted to.
+
+    Raises:
+        InputError: Fewer than 10 measurements in all, values that are not finite, or a pool of other rows.
+    """
+    detected = int((~train.rssi_dbm.isnan()).sum())
+    if detected < MIN_TRAINING:
+        names = ", ".join(train.receiver_names)
+        raise InputError(f"{names}: detected in {detected} training rows in all; at least {MIN_TRAINING} are needed")
+    if not train.transmitter_position.isfinite().all() or not (train.located or train.receiver_position.isnan().all()):
+        raise InputError("positions of transmitters and receivers must be finite numbers [m], or nan for all receivers")
+    if train.rssi_dbm.isinf().any():
+        raise InputError("RSSI must be finite numbers [dBm], or nan where not detected")
+    if not torch.equal(pool.transmitter_position, train.transmitter_position):
+        raise InputError("the pool must hold the same rows as the training part, at more receivers")
+
+
+def fingerprint(config: Any, train: Rssi, pool: Rssi) -> str:
+    """Return a digest that identifies a fit by its configuration (a dataclass) and its measurements."""
+    digest = hashlib.sha256(json.dumps([type(config).__name__, asdict(config), train.receiver_names]).encode())
+    for tensor in (
+        *(train.transmitter_position, train.receiver_position, train.rssi_dbm),
+        *(pool.receiver_position, pool.rssi_dbm),
+    ):
+        digest.update(tensor.contiguous().numpy().tobytes())
+    return digest.hexdigest()

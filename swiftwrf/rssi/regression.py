@@ -1,0 +1,131 @@
+"""MAP estimate of one receiver by iteratively reweighted least squares, with leave-group-out predictions.
+
+The latent field c of a receiver's head is a Gaussian process; level, slope and directivity have Gaussian priors; the error
+is Gaussian in the middle and linear in the tails (P. J. Huber, 1964). With the head replaced by its tangent this is weighted
+least squares, solved again until weights and tangent converge (Gauss-Newton).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from swiftwrf.errors import FitError
+from swiftwrf.gp import held_out_errors
+from swiftwrf.rssi.config import RssiConfig
+from swiftwrf.rssi.head import HeadTable
+from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
+from swiftwrf.rssi.training import RssiTraining
+from swiftwrf.runtime.threads import single_thread
+
+PATH_LOSS_STD_DB = 30.0  # prior of level and slope about their least squares: as good as none
+DIRECTIVITY_STD_DB = 2.0  # prior of each harmonic of a receiver's antenna and surroundings
+MAX_ITERATIONS, WEIGHT_TOLERANCE = 30, 3e-3  # each weight is in (0, 1]
+MIN_CONTRACTION = 0.9  # a change of the field above this share of the last one is an oscillation
+FIELD_TOLERANCE_DB = 0.1  # mean change of the latent field that counts as converged
+
+
+@single_thread()  # several threads add up sums in another order
+def fit_receiver(data: RssiTraining, config: RssiConfig, device: torch.device) -> dict[str, Tensor]:
+    """Fit one receiver.
+
+    Args:
+        data: Training data of one receiver.
+        config: Options.
+        device: Device to compute on.
+
+    Returns:
+        level () [dBm], slope () [dB a decade] and directivity (8,) [dB]; coefficient (n,) of the kernel to the bins, whose
+        sum is the latent field [dB]; rendered fields of the head (2, 2, directions); held_out (n,), predictions of detected
+        bins by all other folds [dBm].
+
+    Raises:
+        FitError: A system that cannot be solved, for positions or values beyond any measurement.
+    """
+    rssi, distance = data.rssi[:, 0], log_distance(data.position, data.receiver)
+    detected = (~rssi.isnan()).nonzero()[:, 0]
+    bearing = harmonics(data.position, data.receiver)[:, 0]
+    scale = torch.tensor([PATH_LOSS_STD_DB] * 2 + [DIRECTIVITY_STD_DB] * N_HARMONICS, dtype=torch.float64)
+    feature = torch.cat([torch.ones_like(distance), distance, bearing], dim=1) * scale
+    residual = rssi - data.prior_mean(distance)[:, 0]
+    coefficient, error, linear = torch.zeros_like(rssi), torch.zeros_like(rssi), torch.zeros_like(scale)
+    if len(detected):
+        some = data.position[detected].to(device)
+        variance = float(data.field_db[0]) ** 2
+        try:
+            dual, slope, factor = solve(
+                residual[detected].to(device),
+                feature[detected].to(device),
+                variance * data.kernel(some, some),
+                (data.noise_db[0] / data.count[detected, 0].sqrt()).to(device),
+                HeadTable(data.rendered.to(device)),
+                config.huber,
+            )
+            error[detected] = fold_errors(factor, dual, data.fold[detected].to(device)).cpu()
+        except torch.linalg.LinAlgError as reason:  # type: ignore[attr-defined]
+            raise FitError(
+                f"the RSSI fit of receiver {data.receiver_names[0]!r} broke ({reason}); are its values sane?"
+            ) from None
+        coefficient[detected] = variance * (slope * dual).cpu()
+        linear = scale * (dual.cpu() @ feature[detected])
+    return {
+        "level": data.prior_mean.level[0] + linear[0],
+        "slope": data.prior_mean.slope[0] + linear[1],
+        "directivity": linear[2:],
+        "coefficient": coefficient,
+        "rendered": data.rendered[0],
+        "held_out": rssi.nan_to_num() - error,
+    }
+
+
+def solve(
+    residual: Tensor, feature: Tensor, covariance: Tensor, noise_db: Tensor, table: HeadTable, huber: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Fit residual = feature b + head(c) + noise in n bins, with b standard normal and c of a given covariance.
+
+    Args:
+        residual: RSSI less the prior mean, (n,) [dB].
+        feature: Scaled regressors, (n, k).
+        covariance: Covariance of the latent field c, (n, n) [dB^2].
+        noise_db: Standard deviation of the noise, (n,) [dB].
+        table: Head of the receiver.
+        huber: See `RssiConfig`.
+
+    Returns:
+        The dual coefficients (n,), which are the inverse covariance of the data times the data, the slope of the tangent (n,)
+        and the Cholesky factor of the covariance of the data (n, n).
+    """
+    zero = table(torch.zeros(1, 1, dtype=torch.float64, device=residual.device))[0][0, 0]
+    weight, latent = torch.ones_like(residual), torch.zeros_like(residual)
+    step, last = 1.0, math.inf
+    for _ in range(MAX_ITERATIONS):
+        head, slope = (x[:, 0] for x in table(latent[:, None]))
+        target = residual - (head - zero) + slope * latent
+        variance = noise_db.square() / weight
+        whole = (slope[:, None] * covariance).mul_(slope).addmm_(feature, feature.T)
+        whole.diagonal().add_(variance)
+        factor = torch.linalg.cholesky(whole)
+        dual = torch.cholesky_solve(target[:, None], factor)[:, 0]
+        change = covariance @ (slope * dual) - latent
+        mean_change = float(change.abs().mean())
+        if mean_change > MIN_CONTRACTION * last:  # oscillates where the head bends
+            step /= 2
+        latent, last = latent + step * change, mean_change
+        previous, error = weight, (variance * dual).abs()  # of the data about the tangent
+        weight = (huber * noise_db / error.clamp_min(1e-12)).clamp_max(1)
+        settled = float((weight - previous).abs().max()) < WEIGHT_TOLERANCE
+        if settled and (step == 1 or mean_change < FIELD_TOLERANCE_DB):
+            break
+    return dual, slope, factor
+
+
+def fold_errors(factor: Tensor, dual: Tensor, fold: Tensor) -> Tensor:
+    """Return the errors (n,) [dB] of the predictions of each bin by all other folds (n,)."""
+    precision = torch.cholesky_inverse(factor)
+    error = torch.empty_like(dual)
+    for number in fold.unique():
+        part = (fold == number).nonzero()[:, 0]
+        error[part] = held_out_errors(precision, dual, part)
+    return error

@@ -1,0 +1,125 @@
+"""Open a run or a saved model for the page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from augment import withhold
+from swiftwrf import InputError, RssiModel, Spectra, load
+from swiftwrf.models.base import FIELD_MODELS, FieldModel
+from swiftwrf.runtime.checkpoint import Saved, refusing
+from tasks.aoa.config import AoaConfig
+from tasks.aoa.experiment import measurements
+from tasks.claim import CONFIG, ENVIRONMENT
+from tasks.records import Row, read_json
+from tasks.rssi.experiment import MODEL
+from tasks.run import configured
+from tasks.view.rssi import MeasuredFloor, RssiView
+from tasks.view.spectra import LoadedModel, SpectraView
+
+EXPECTED = "give the directory of a run of tasks.aoa or tasks.rssi, or a saved model"
+
+
+def open_source(source: Path) -> SpectraView | RssiView:
+    """Open the directory of a run or the file of a saved model.
+
+    Raises:
+        InputError: The source holds no model that predicts spectra or RSSI.
+    """
+    try:
+        is_file, is_folder = source.is_file(), source.is_dir()
+    except OSError as error:
+        raise InputError(f"{source} cannot be read ({error.strerror}); {EXPECTED}") from None
+    if is_file:
+        return _saved_model(source)
+    if not is_folder:
+        raise InputError(f"{source} is not there; {EXPECTED}")
+    if not (source / CONFIG).is_file():
+        raise InputError(f"{source} is no run: it has no {CONFIG}; {EXPECTED}")
+    content = read_json(source / CONFIG)
+    match content.get("task"):
+        case "aoa":
+            return _aoa_run(source, content)
+        case "rssi":
+            return _rssi_run(source)
+        case other:
+            raise InputError(f"{source} is a run of tasks.{other}; {EXPECTED}")
+
+
+def _saved_model(file: Path) -> SpectraView | RssiView:
+    model = load(file)
+    if isinstance(model, RssiModel):
+        return RssiView(file.name, model, MeasuredFloor.from_model(model))
+    field_model = _field_model(model)
+    return SpectraView(file.name, [LoadedModel(model.kind, field_model, _planes(field_model))])
+
+
+def _field_model(model: Saved) -> FieldModel:
+    if not isinstance(model, FieldModel):
+        raise InputError(f"a {model.kind} predicts neither spectra nor RSSI maps; {EXPECTED}")
+    return model
+
+
+def _planes(model: FieldModel) -> list[dict[str, Any]]:
+    planes: list[dict[str, Any]] = [] if model.room is None else model.room.to_json()["planes"]
+    return planes
+
+
+def _aoa_run(folder: Path, content: Row) -> SpectraView:
+    with refusing(f"the records in {folder} are not those of a run"):
+        config = configured(AoaConfig, content["config"], folder)
+        data, train, notes = _measured(folder, config)
+        models = []
+        for fraction in config.mix:
+            in_training = None
+            if data is not None and train is not None:
+                measured, _ = withhold(train, fraction, config.seed)
+                in_training = np.isin(data.index.numpy(), measured.index.numpy())
+            for name, file in kept_models(folder, fraction):
+                model = _field_model(load(file))
+                planes = _planes(model) or _planes_of_run(folder, fraction)
+                models.append(LoadedModel(f"{name}, {fraction:.0%} measured", model, planes, in_training))
+    if not models:
+        raise InputError(f"{folder} holds no model; run tasks.aoa with a --synthesizer that can be saved")
+    return SpectraView(folder.name, models, data, notes)
+
+
+def kept_models(folder: Path, fraction: float) -> list[tuple[str, Path]]:
+    """Return names and files of the field models that a run kept for one measured fraction."""
+    files = {
+        name: folder / f"{'model' if name == 'swiftwrf' else name}-mix{fraction:g}.safetensors" for name in FIELD_MODELS
+    }
+    return [(name, file) for name, file in files.items() if file.is_file()]
+
+
+def _planes_of_run(folder: Path, fraction: float) -> list[dict[str, Any]]:
+    """Return the planes that another model of the run found from the same spectra."""
+    file = folder / f"geometry-mix{fraction:g}.json"
+    planes: list[dict[str, Any]] = read_json(file)["planes"] if file.is_file() else []
+    return planes
+
+
+def _measured(folder: Path, config: AoaConfig) -> tuple[Spectra | None, Spectra | None, list[str]]:
+    """Read the spectra of a run again: return all spectra, the training part, and remarks on them."""
+    try:
+        data = measurements(config)
+        recorded = read_json(folder / ENVIRONMENT).get("input_sha256", {})  # may contain more: a scene to trace in
+        if {name: recorded.get(name) for name in data.source} != data.source:
+            raise InputError("they have changed since the run")
+        return data, data.split(config.split, config.seed)[0], list(data.notes)
+    except InputError as error:
+        return None, None, [f"The measured spectra are not shown: {error}."]
+
+
+def _rssi_run(folder: Path) -> RssiView:
+    file = folder / MODEL
+    if not file.is_file():
+        raise InputError(f"{folder} holds no model: it has no {MODEL}; the run did not end, or is of an older version")
+    model = load(file)
+    if not isinstance(model, RssiModel):
+        raise InputError(f"{file} holds a {model.kind}, expected a {RssiModel.kind}")
+    with refusing(f"the maps in {folder} are not those of a run"), np.load(folder / "maps.npz") as stored:
+        return RssiView(folder.name, model, MeasuredFloor.from_run(dict(stored)))
