@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -11,10 +12,8 @@ from swiftwrf.errors import InputError
 from swiftwrf.positions import nearest
 
 FLAT = 1e-3  # extent below which a dimension of the region counts as none, as a fraction of the largest extent
-MARGIN = 0.03  # fraction of the extent by which the region exceeds the known positions on each side
 NEIGHBOURS = 8  # the distance to this neighbour gives the scale on which positions fill a region
 QUANTILE = 0.95  # of these distances
-MAX_TRIES = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,78 +35,78 @@ class Cells:
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Where the moving end can be: the neighbourhood of known positions within their box.
+    """Where the moving end can be: a box around known positions, most of its prior mass in their neighbourhood.
 
-    A region follows a measured path and fills a measured room, because it reaches as far from the known positions as these
-    lie from each other.
+    The neighbourhood reaches as far from the known positions as these lie from each other. So it follows a measured path and
+    fills a measured room.
 
     Args:
         known: Known positions, float64 (n, 3) [m].
-        margin_m: Distance [m] by which the region exceeds the known positions. Defaults to their spacing.
+        margin: Fraction of the extent by which the box exceeds the known positions on each side.
+        outside: Prior mass spread over the whole box.
+
+    Raises:
+        InputError: Fewer than 2 known positions, a negative margin, or a mass outside (0, 1].
 
     Example:
         >>> region = Region(torch.rand(50, 3, dtype=torch.float64))
-        >>> len(region.cells(1000).position) > 500
-        True
+        >>> cells = region.cells(1000)
+        >>> round(float(cells.log_volume.exp().sum()), 6)
+        1.0
     """
 
     known: Tensor
-    margin_m: float | None = None
+    margin: float = 0.03
+    outside: float = 0.05
 
     def __post_init__(self) -> None:
         if self.known.dim() != 2 or self.known.shape[1] != 3 or len(self.known) < 2:
             raise InputError(f"a region needs at least 2 known positions (n, 3), got shape {tuple(self.known.shape)}")
+        if not self.margin >= 0 or not 0 < self.outside <= 1:
+            raise InputError(f"a margin is at least 0 and a mass above 0, got {self.margin} and {self.outside}")
 
-    @property
-    def scale(self) -> float:
-        """Distance [m] from known positions that the region covers."""
-        if self.margin_m is not None:
-            return self.margin_m
+    @cached_property
+    def scale_m(self) -> float:
+        """Distance [m] from the known positions that their neighbourhood covers."""
         spots = self.known.unique(dim=0)
         apart, _ = nearest(spots, spots, min(NEIGHBOURS + 1, len(spots)))
         return float(apart[:, -1].quantile(QUANTILE))
 
-    def contains(self, position: Tensor) -> Tensor:
-        """Return True for each position (n, 3) [m] inside the region, (n,)."""
-        _, centre, axes, half = self._frame()
-        inside = (((position - centre) @ axes.T).abs() <= half + 1e-9).all(dim=1)
-        inside[inside.clone()] = nearest(position[inside], self.known, 1)[0][:, 0] <= self.scale
-        return inside
-
-    def _frame(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return extents, centre, the axes along which positions extend, and half the box along each [m]."""
+    @cached_property
+    def _box(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Centre (3,), axes (d, 3) along which the positions extend, and half the extent along each (d,) [m]."""
         middle = self.known.mean(dim=0)
         _, size, axes = torch.linalg.svd(self.known - middle, full_matrices=False)
         extended = size > FLAT * size[0].clamp_min(1e-12)
-        # axes of the coordinates where they extend in all three: rooms are boxes
-        axes = torch.eye(3, dtype=torch.float64) if bool(extended.all()) else axes[extended]
+        # a region in all three dimensions is a box along the coordinates, as rooms are
+        axes = torch.eye(3, dtype=torch.float64) if bool(extended.sum() == 3) else axes[extended]
         along = (self.known - middle) @ axes.T
         low, high = along.amin(dim=0), along.amax(dim=0)
-        margin = MARGIN * (high - low) if self.margin_m is None else torch.full_like(high, self.margin_m)
-        return high - low, middle + (low + high) / 2 @ axes, axes, (high - low) / 2 + margin
+        return middle + (low + high) / 2 @ axes, axes, (high - low) * (0.5 + self.margin)
+
+    def contains(self, position: Tensor) -> Tensor:
+        """Return True for each position (n, 3) [m] inside the box, (n,)."""
+        centre, axes, half = self._box
+        away = position - centre
+        flat = (away - away @ axes.T @ axes).norm(dim=1)
+        return ((away @ axes.T).abs() <= half).all(dim=1) & (flat <= self.scale_m)
 
     def cells(self, count: int) -> Cells:
-        """Return about `count` cells of equal size that cover the region.
-
-        Args:
-            count: Number of cells, at least 1.
-        """
-        _, centre, axes, half = self._frame()
-        spacing = float((2 * half).prod() / count) ** (1 / len(half)) if len(half) else 1.0
-        for _ in range(MAX_TRIES):
-            numbers = (2 * half / spacing).ceil().clamp_min(1)
+        """Return about `count` cells of equal size that cover the box; `log_volume` is their prior mass."""
+        centre, axes, half = self._box
+        if not len(half):
+            step, offset = torch.empty(0, dtype=torch.float64), torch.zeros(1, 0, dtype=torch.float64)
+        else:
+            spacing = float((2 * half).prod() / count) ** (1 / len(half))
+            numbers = (2 * half / spacing).round().clamp_min(1)
             step = 2 * half / numbers
             lines = [
                 -h + s * (torch.arange(int(n), dtype=torch.float64) + 0.5)
                 for h, s, n in zip(half, step, numbers, strict=True)
             ]
-            offset = torch.cartesian_prod(*lines).reshape(-1, len(half)) if lines else torch.zeros(1, 0, dtype=torch.float64)
-            position = centre + offset @ axes
-            position = position[self.contains(position)]
-            if len(position) >= count / 2 or not len(half):
-                break
-            spacing *= (max(len(position), count / 1000) / count) ** (1 / len(half))
-        if not len(position):  # known positions lie between the centres of cells
-            position = self.known
-        log_volume = torch.full((len(position),), -float(torch.tensor(len(position)).log()), dtype=torch.float64)
-        return Cells(position, log_volume, step[:, None] * axes, torch.zeros_like(log_volume))
+            offset = torch.cartesian_prod(*lines).reshape(-1, len(half))
+        position = centre + offset @ axes
+        near = nearest(position, self.known, 1)[0][:, 0] <= self.scale_m
+        mass = torch.full((len(position),), self.outside / len(position), dtype=torch.float64)
+        mass[near] += (1 - self.outside) / max(int(near.sum()), 1)
+        return Cells(position, (mass / mass.sum()).log(), step[:, None] * axes, torch.zeros_like(mass))
