@@ -16,8 +16,7 @@ from record import write_result
 from swiftwrf import Spectra, load_spectra, simulated_room
 from swiftwrf.data.spectra import Moving
 from swiftwrf.metrics import psnr, summary
-from swiftwrf.models.geometry import fit_geometry
-from swiftwrf.models.geometry.hybrid import fit_hybrid
+from swiftwrf.models.geometry import fit_geometry, fit_hybrid
 
 SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")  # of a room
 WALLS = {  # where they are on each side [m]
@@ -56,7 +55,7 @@ def measure(data: Spectra, share: float, draw: int) -> dict[str, Any]:
     began, cpu = time.perf_counter(), time.process_time()
     model = fit_geometry(train, progress=False)
     seconds, cpu_seconds = time.perf_counter() - began, time.process_time() - cpu
-    hybrid = fit_hybrid(train, model)
+    hybrid = fit_hybrid(train, model, progress=False)
     planes = model.to_json()["planes"]
     walls = {f"{side[0]} = {o}": nearest(planes, side, o) for side, o in zip(SIDES, WALLS[data.name], strict=True)}
     return {
@@ -66,11 +65,13 @@ def measure(data: Spectra, share: float, draw: int) -> dict[str, Any]:
         "walls": walls,
         "planes": len(model.planes),
         "order": model.order,
-        "score_held_out": model.score_held_out,
+        "score_held_out": model.estimate.score_held_out,
         "verdict": model.verdict,
         "psnr_db": {
             "geometry": summary(psnr(model.synthesize(test.position), test.spectrum)),
-            "sample": summary(psnr(model.synthesize(test.position, torch.Generator().manual_seed(0)), test.spectrum)),
+            "sample": summary(
+                psnr(model.sample(test.position, generator=torch.Generator().manual_seed(0)), test.spectrum)
+            ),
             "hybrid": summary(psnr(hybrid.synthesize(test.position), test.spectrum)),
         },
     }

@@ -69,8 +69,8 @@ def fitted(train: Spectra, test: Spectra, validation: Validation, seed: int, n: 
     seconds, busy = time.perf_counter() - began, time.process_time() - busy
     drawn = model.synthesize(test.position)
     return {
-        "n_primitives": model.config.n_primitives,
-        "rank": model.config.rank,
+        "n_primitives": model.field.config.n_primitives,
+        "rank": model.field.config.rank,
         "parameters": sum(p.numel() for p in model.parameters()),
         "psnr_db": summary(psnr(drawn, test.spectrum)),
         "ssim": summary(ssim(drawn, test.spectrum)),

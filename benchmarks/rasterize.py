@@ -1,8 +1,8 @@
-"""Spectra per second: each maker alone and the whole model, on the machine's GPU where there is one, else on its CPU.
+"""Spectra per second: each backend alone and the whole model, on the machine's GPU where there is one, else on its CPU.
 
-Rates are of magnitudes |A|: medians over repeats with the least and the most, makers compared within one run. On a GPU every
-rate also comes as a share of two bounds: the exponentials of the pixels inside the cutoff (16 a clock and multiprocessor),
-and the writing of the magnitude at the speed of a measured copy.
+Rates are of magnitudes |A|: medians over repeats with minimum and maximum. Backends are compared within one run. On a GPU
+every rate is also given as a share of two bounds: the exponentials of the pixels inside the cutoff (16 a clock and
+multiprocessor), and the writing of the magnitude at the speed of a measured copy.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from torch import Tensor
 
 from swiftwrf import AngularGrid, ModelConfig, SwiftWRF, rasterize
 from swiftwrf.gp import Kernel
-from swiftwrf.rasterize import Maker, rasterize_magnitude
+from swiftwrf.rasterize import Backend, rasterize_magnitude
 from tasks.run import choose_device
 
 Rate = dict[str, float]
@@ -67,30 +67,30 @@ def main(config: Config) -> None:
 def measure(
     grid: AngularGrid, n: int, batch: int, device: torch.device, machine: Rate | None, seconds: float
 ) -> dict[str, Any]:
-    """One row: every maker alone, forward and with gradients, and the model from positions to magnitudes."""
+    """Return one row: every backend alone, forward and with gradients, and the model from positions to magnitudes."""
     inputs = scene(n, batch, device)
     exact = exact_spectrum(inputs, grid)
-    makers: dict[str, Any] = {}
-    for maker in ("reference", "cuda" if device.type == "cuda" else "cpu"):
+    backends: dict[str, Any] = {}
+    for backend in ("reference", "cuda" if device.type == "cuda" else "cpu"):
         # the definition draws one position at a time: its rate does not grow with the batch
-        few = [x[:1] if x.dim() == 3 else x for x in inputs] if maker == "reference" else inputs
-        if maker == "reference" and exact is None:
+        few = [x[:1] if x.dim() == 3 else x for x in inputs] if backend == "reference" else inputs
+        if backend == "reference" and exact is None:
             continue
-        drawn = rasterize(*few, grid, maker, CUTOFF)
-        makers[maker] = {
+        drawn = rasterize(*few, grid, backend, CUTOFF)
+        backends[backend] = {
             "forward_per_s": rate(
-                lambda f=few, m=maker: rasterize_magnitude(*f, grid, m, CUTOFF), len(few[0]), device, seconds
+                lambda f=few, b=backend: rasterize_magnitude(*f, grid, b, CUTOFF), len(few[0]), device, seconds
             ),
             "forward_backward_per_s": rate(
-                lambda f=few, m=maker: with_gradients(f, grid, m), len(few[0]), device, seconds
+                lambda f=few, b=backend: with_gradients(f, grid, b), len(few[0]), device, seconds
             ),
             "error_of_sum_weight": None if exact is None else value_error(drawn[:1], exact, inputs[2][:1]),
         }
-    row: dict[str, Any] = {"grid": grid.shape, "n": n, "batch": batch, "makers": makers}
-    fast = makers["cuda" if device.type == "cuda" else "cpu"]
-    if "reference" in makers:
+    row: dict[str, Any] = {"grid": grid.shape, "n": n, "batch": batch, "backends": backends}
+    fast = backends["cuda" if device.type == "cuda" else "cpu"]
+    if "reference" in backends:
         row["over_reference"] = {
-            key: fast[key]["median"] / makers["reference"][key]["median"]
+            key: fast[key]["median"] / backends["reference"][key]["median"]
             for key in ("forward_per_s", "forward_backward_per_s")
         }
     row["end_to_end_per_s"] = end_to_end(n, batch, grid, device, seconds)
@@ -138,10 +138,10 @@ def kernel_values(inputs: list[Tensor], grid: AngularGrid) -> float:
     return float(total)
 
 
-def with_gradients(inputs: list[Tensor], grid: AngularGrid, maker: Maker) -> None:
+def with_gradients(inputs: list[Tensor], grid: AngularGrid, backend: Backend) -> None:
     """One drawing of |A| and the gradients of everything."""
     leaves = [x.detach().requires_grad_() for x in inputs]
-    drawn = rasterize_magnitude(*leaves, grid, maker, CUTOFF)
+    drawn = rasterize_magnitude(*leaves, grid, backend, CUTOFF)
     torch.autograd.grad(drawn, leaves, torch.ones_like(drawn))
 
 
@@ -206,7 +206,7 @@ def gpu_rates() -> Rate:
 def report(row: dict[str, Any]) -> None:
     """One line."""
     rates = {
-        name: {k: f"{v['median']:.4g}" for k, v in m.items() if k.endswith("_s")} for name, m in row["makers"].items()
+        name: {k: f"{v['median']:.4g}" for k, v in m.items() if k.endswith("_s")} for name, m in row["backends"].items()
     }
     print(row["grid"], "N", row["n"], "batch", row["batch"], rates, f"end to end {row['end_to_end_per_s']['median']:.4g}",
           row.get("share_of_bounds", ""), flush=True)  # fmt: skip

@@ -34,7 +34,7 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import psnr
 from swiftwrf.models.base import make_model
-from swiftwrf.rasterize import Maker, prepare, rasterize_magnitude
+from swiftwrf.rasterize import Backend, prepare, rasterize_magnitude
 from tasks.page import figures, labels
 from tasks.page.palette import Palette
 
@@ -93,7 +93,7 @@ class Study:
         began = time.perf_counter()
         self.model = fit(train, self.config, progress=False)
         self.fit_seconds = time.perf_counter() - began
-        self.config = replace(self.config, model=self.model.config)
+        self.config = replace(self.config, model=self.model.field.config)
 
     def rate(self, synthesize: Callable[[Tensor], Tensor]) -> dict[str, float]:
         """Return the seconds of a spectrum from positions to magnitudes: median, minimum and maximum of the repeats."""
@@ -130,26 +130,26 @@ class Study:
         others = [AngularGrid.hemisphere(*shape) for shape in GRIDS if shape != own_grid.shape]
         grids = [(own_grid, True), *((grid, False) for grid in others)]
         exact = {g: self._drawer(g, "reference", None, torch.float64)(self.test.position) for g, _ in grids}
-        for maker in ("reference", "cpu"):
+        for backend in ("reference", "cpu"):
             for cutoff in CUTOFFS:
                 for dtype in (torch.float32, torch.float16, torch.bfloat16):
                     for grid, own in grids:
                         if not own and (dtype != torch.float32 or cutoff not in (None, 1e-4)):
                             continue
-                        if maker == "reference" and (cutoff is not None or dtype != torch.float32):
+                        if backend == "reference" and (cutoff is not None or dtype != torch.float32):
                             continue  # as fast and as wrong as without
-                        points.append(self._drawn(grid, maker, cutoff, dtype, exact[grid], own))
+                        points.append(self._drawn(grid, backend, cutoff, dtype, exact[grid], own))
         return points
 
     def _drawn(
-        self, grid: AngularGrid, maker: Maker, cutoff: float | None, dtype: torch.dtype, exact: Tensor, own: bool
+        self, grid: AngularGrid, backend: Backend, cutoff: float | None, dtype: torch.dtype, exact: Tensor, own: bool
     ) -> Point:
         size = f"{grid.n_elevation} x {grid.n_azimuth}"
         weights = "" if dtype == torch.float32 else f", weights {str(dtype).removeprefix('torch.')}"
-        setting = f"{maker}, cutoff {'none' if cutoff is None else f'{cutoff:g}'}{weights}, {size}"
-        synthesize = self._drawer(grid, maker, cutoff, dtype)
+        setting = f"{backend}, cutoff {'none' if cutoff is None else f'{cutoff:g}'}{weights}, {size}"
+        synthesize = self._drawer(grid, backend, cutoff, dtype)
         drawn = synthesize(self.test.position)
-        result: Point = {"setting": setting, "maker": maker, "seconds": self.rate(synthesize), "own_grid": own}
+        result: Point = {"setting": setting, "backend": backend, "seconds": self.rate(synthesize), "own_grid": own}
         result |= {"numerical": rms(drawn, exact), "largest": float((drawn - exact).abs().max())}
         if own:
             result |= {"held_out": rms(drawn, self.test.spectrum)}
@@ -158,30 +158,29 @@ class Study:
 
     @torch.no_grad()
     def _drawer(
-        self, grid: AngularGrid, maker: Maker, cutoff: float | None, dtype: torch.dtype
+        self, grid: AngularGrid, backend: Backend, cutoff: float | None, dtype: torch.dtype
     ) -> Callable[[Tensor], Tensor]:
         """Return the rendering of the default model with weights rounded to `dtype`; float64 applies to all tensors."""
-        wide = dtype == torch.float64
+        wide, field = dtype == torch.float64, self.model.field
 
         @torch.no_grad()
         def synthesize(position: Tensor) -> Tensor:
             spectrum = torch.empty(len(position), *grid.shape, dtype=torch.float64 if wide else torch.float32)
-            step = 1 if maker == "reference" else BATCH
+            step = 1 if backend == "reference" else BATCH
             for start in range(0, len(position), step):
                 rows = slice(start, start + step)
-                mean, cholesky, attenuation, response = self.model.gaussians(self.model.normalise(position[rows]))
-                weight = (attenuation[..., None] * response).to(dtype)
-                n = len(position[rows])
-                tensors = (mean.expand(n, -1, -1), cholesky, weight.expand(n, -1, -1))
+                gaussians = field.gaussians(field.normalise(position[rows]))
+                n, weight = len(position[rows]), gaussians.weight.to(dtype)
+                tensors = (gaussians.mean.expand(n, -1, -1), gaussians.cholesky, weight.expand(n, -1, -1))
                 tensors = tuple(x.double() if wide else x.float() for x in tensors)
-                spectrum[rows] = rasterize_magnitude(*tensors, grid, maker, cutoff)
+                spectrum[rows] = rasterize_magnitude(*tensors, grid, backend, cutoff)
             return spectrum.clamp_(0, 1)
 
         return synthesize
 
     def models(self) -> list[Point]:
         """Return the default model and variants of its size, deformation and covariance."""
-        size, rank = self.model.config.size
+        size, rank = self.model.field.config.size
         parameters = sum(p.numel() for p in self.model.parameters())
         points = [
             self.point(
@@ -198,7 +197,7 @@ class Study:
         for setting, changes in variants.items():
             slow = {"steps": 600, "rate": 1e-2, "deformation_rate": 2e-3} if "network" in setting else {}
             began = time.perf_counter()
-            changed: ModelConfig = replace(self.model.config, **changes)
+            changed: ModelConfig = replace(self.model.field.config, **changes)
             model: SwiftWRF = fit(self.train, replace(self.config, model=changed, **slow), progress=False)
             seconds = time.perf_counter() - began
             parameters = sum(p.numel() for p in model.parameters())

@@ -1,4 +1,4 @@
-"""What hard cases do to every maker, to reduced precision and to a fit: errors, goodness or the refusal, measured.
+"""What hard cases do to every backend, to reduced precision and to a fit: errors, goodness or the refusal, measured.
 
 docs/stability.md gives the rules; its tables come from this benchmark's result.
 """
@@ -31,7 +31,7 @@ from swiftwrf import (
 from swiftwrf.data.store import Store
 from swiftwrf.gp import Kernel
 from swiftwrf.metrics import psnr
-from swiftwrf.rasterize import Maker, rasterize_magnitude
+from swiftwrf.rasterize import Backend, rasterize_magnitude
 from swiftwrf.testing.hard_cases import HARD_CASES, field_errors, magnitude_errors
 from swiftwrf.testing.tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
 
@@ -45,31 +45,34 @@ class Config:
 def main(config: Config) -> None:
     """Measures everything and writes `results/stability_<cpu or cuda>.json`."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    makers: tuple[Maker, ...] = ("reference", "cuda" if device.type == "cuda" else "cpu")
+    backends: tuple[Backend, ...] = ("reference", "cuda" if device.type == "cuda" else "cpu")
     drawn = [
-        draw_case(name, maker, cutoff, device) for name in HARD_CASES for maker in makers for cutoff in (None, 1e-4)
+        render_case(name, backend, cutoff, device)
+        for name in HARD_CASES
+        for backend in backends
+        for cutoff in (None, 1e-4)
     ]
     fits = [fit_case(name, config.many) for name in FITS]
-    content = {"makers": drawn, "precision": precision(device), "fits": fits}
+    content = {"backends": drawn, "precision": precision(device), "fits": fits}
     write_result(f"stability_{device.type}", content, device)
 
 
-def draw_case(name: str, maker: Maker, cutoff: float | None, device: torch.device) -> dict[str, Any]:
-    """Errors of one maker in one case, and what is tolerated."""
+def render_case(name: str, backend: Backend, cutoff: float | None, device: torch.device) -> dict[str, Any]:
+    """Errors of one backend in one case, and what is tolerated."""
     case = HARD_CASES[name]
 
     def field(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None) -> Tensor:
-        return rasterize(mean, cholesky, weight, grid, maker, cutoff)
+        return rasterize(mean, cholesky, weight, grid, backend, cutoff)
 
     def length(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None) -> Tensor:
-        return rasterize_magnitude(mean, cholesky, weight, grid, maker, cutoff)
+        return rasterize_magnitude(mean, cholesky, weight, grid, backend, cutoff)
 
     value, gradient = field_errors(field, case, cutoff, str(device))
     _, magnitude_gradient = magnitude_errors(length, case, cutoff, str(device))
     return {
         "case": name,
         "rule": case.rule,
-        "maker": maker,
+        "backend": backend,
         "cutoff": cutoff,
         "value": value,
         "gradient": gradient,

@@ -173,17 +173,17 @@ def floor() -> str:
 def hard_cases() -> str:
     """Return the largest errors over cutoffs of each backend in each case."""
     found: dict[str, dict[str, list[dict[str, Any]]]] = {}
-    for row in load("stability_cpu")["makers"]:
-        found.setdefault(row["case"], {}).setdefault(row["maker"], []).append(row)
+    for row in load("stability_cpu")["backends"]:
+        found.setdefault(row["case"], {}).setdefault(row["backend"], []).append(row)
     rows = []
-    for case, makers in found.items():
+    for case, backends in found.items():
         cells = []
-        for entries in makers.values():
+        for entries in backends.values():
             value = {entry["cutoff"]: entry["value"] for entry in entries}
             gradient = max(max(entry["gradient"], entry["magnitude_gradient"]) for entry in entries)
             cells.append(f"{value[None]:.0e}, {value[1e-4]:.0e}; {gradient:.0e}")
-        rows.append([case, next(iter(makers.values()))[0]["rule"].replace("|", "\\|"), *cells])
-    return markdown(["case", "rule", *(f"`{maker}` (float32)" for maker in found[rows[0][0]])], rows)
+        rows.append([case, next(iter(backends.values()))[0]["rule"].replace("|", "\\|"), *cells])
+    return markdown(["case", "rule", *(f"`{backend}` (float32)" for backend in found[rows[0][0]])], rows)
 
 
 def precision() -> str:

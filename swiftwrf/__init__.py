@@ -17,7 +17,7 @@ from swiftwrf.diagnostics.calibration import Calibration, calibrate
 from swiftwrf.errors import FitError, InputError
 from swiftwrf.models.base import FIELD_MODELS, FieldModel, Prediction, make_model
 from swiftwrf.models.coarray import CoarrayModel, fit_coarray, project
-from swiftwrf.models.geometry import GeometryModel, fit_geometry
+from swiftwrf.models.geometry import GeometryModel, HybridModel, fit_geometry, fit_hybrid
 from swiftwrf.models.swiftwrf import FitConfig, ModelConfig, SwiftWRF, fit
 from swiftwrf.rasterize import rasterize, rasterize_magnitude
 from swiftwrf.rssi import RssiConfig, RssiModel, fit_rssi
@@ -33,6 +33,7 @@ __all__ = [
     "FitConfig",
     "FitError",
     "GeometryModel",
+    "HybridModel",
     "InputError",
     "ModelConfig",
     "Prediction",
@@ -47,6 +48,7 @@ __all__ = [
     "fit",
     "fit_coarray",
     "fit_geometry",
+    "fit_hybrid",
     "fit_rssi",
     "load",
     "load_rssi",

@@ -1,45 +1,41 @@
-"""The directory of a run belongs to one process at a time, and is deleted only by who made it while it holds nothing."""
+"""A run's directory belongs to one process at a time, and only the process that made it deletes it, while it is empty."""
 
 from __future__ import annotations
 
 import errno
-import os
 import shutil
-import sys
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from swiftwrf import InputError
 
-if sys.platform != "win32":
-    import fcntl
-
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # errors of file systems without locks
 LOCK, STEPS, CONFIG, ENVIRONMENT = "lock", "steps", "config.json", "environment.json"
-REFUSED = (errno.EAGAIN, errno.EACCES)  # what a lock that somebody else holds answers
 
 
 def begun(folder: Path) -> bool:
-    """Whether a run in this directory got so far that something would be lost with it: its configuration is written
-    before anything is computed."""
+    """Return True if a run in this directory has written its configuration or computed a step."""
     names = {file.name for file in folder.iterdir() if not file.name.startswith(".")}
     return bool(names - {LOCK, STEPS, ENVIRONMENT}) or has_steps(folder)
 
 
 def has_steps(folder: Path) -> bool:
-    """Whether a step has left something in this directory."""
+    """Return True if a step has left a file in this directory."""
     steps = folder / STEPS
     return steps.is_dir() and any(not file.name.startswith(".") for file in steps.iterdir())
 
 
 class Claim:
-    """A directory that this process alone fills; the lock ends with the process, whatever ends it.
+    """A directory that this process alone fills. The lock ends with the process.
 
     Args:
-        folder: the directory; made unless it is there.
-        new: refuse a directory in which a run has begun. Making a directory is atomic, and so is the lock: of two
-            processes that come at once, one is refused.
+        folder: The directory. It is made if it does not exist.
+        new: Refuse a directory in which a run has begun. Of two processes that start at once, one is refused, because
+            making a directory is atomic and so is its lock.
 
     Raises:
-        InputError: somebody else is at work in it, or (where `new`) a run has begun in it.
+        InputError: Another process works in the directory or, with `new`, a run has begun in it.
     """
 
     def __init__(self, folder: Path, *, new: bool) -> None:
@@ -51,44 +47,40 @@ class Claim:
                 self.made = True
             except FileExistsError:
                 self._refuse_begun()
-        self._lock: int | None = self._take()
+        self._lock = FileLock(folder / LOCK, thread_local=False)
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout:
+            raise InputError(f"another process is at work in {folder}; wait for it or choose another --out") from None
+        except OSError as error:
+            if error.errno not in NO_LOCKS:  # there, making the directory is the only guard
+                raise
         if new and not self.made:
-            self._refuse_begun()  # somebody may have filled it before the lock was ours
+            try:
+                self._refuse_begun()  # another process may have filled it before the lock was acquired
+            except InputError:
+                self.release()
+                raise
 
     def _refuse_begun(self) -> None:
         if not self.folder.is_dir() or begun(self.folder):
-            self.release()
             raise InputError(
                 f"{self.folder} exists already and a run is never overwritten; choose another --out or go on with "
                 f"--resume {self.folder}"
             )
 
-    def _take(self) -> int:
-        lock = self.folder / LOCK
-        descriptor = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
-        try:
-            if sys.platform != "win32":
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.stat(lock).st_ino == os.fstat(descriptor).st_ino:
-                return descriptor
-        except FileNotFoundError:  # the other process finished and gave the directory its name
-            pass
-        except OSError as error:
-            if error.errno not in REFUSED:  # a file system without locks: the directory's making must do
-                return descriptor
-        os.close(descriptor)
-        raise InputError(f"another process is at work in {self.folder}; wait for it or choose another --out") from None
+    def discard_if_empty(self) -> bool:
+        """Delete the directory if it holds no result: neither steps, if this process made it, nor any file of others.
 
-    def discard_if_nothing_is_lost(self) -> bool:
-        """Deletes the directory if this process made it and no step has left anything in it; whether it did."""
-        nothing = self.made and not has_steps(self.folder)
-        if nothing:
+        Returns:
+            True if deleted.
+        """
+        empty = not has_steps(self.folder) if self.made else {file.name for file in self.folder.iterdir()} <= {LOCK}
+        if empty:
             shutil.rmtree(self.folder)
         self.release()
-        return nothing
+        return empty
 
     def release(self) -> None:
-        """Lets others have the directory."""
-        lock, self._lock = getattr(self, "_lock", None), None
-        if lock is not None:
-            os.close(lock)
+        """Let other processes claim the directory."""
+        self._lock.release()

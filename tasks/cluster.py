@@ -1,7 +1,7 @@
-"""Work on the workers of a Dask scheduler, for more of it than one machine can take.
+"""Steps of a run on the workers of a Dask scheduler, for more work than one machine can take.
 
-The numbers are those of this machine: a worker takes as many threads, must have the same versions, and does one thing at a
-time (random generators and the number of threads belong to the whole process).
+Results are those of this machine: a worker uses the same number of threads, must have the same versions, and makes one call
+at a time, because random generators and the number of threads belong to the whole process.
 """
 
 from __future__ import annotations
@@ -9,15 +9,14 @@ from __future__ import annotations
 import asyncio
 import ctypes
 import logging
+import re
 import sys
 import threading
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
@@ -33,21 +32,20 @@ from tasks.torchrun import process_count
 if TYPE_CHECKING:
     from distributed import Future
 
-CONNECT = 5  # seconds that a scheduler has to answer
-PATIENCE = 30  # seconds to wait for workers, at the start and when all have gone
-LOOK = 2  # seconds between two looks whether there are any
-FETCH = 600  # seconds that a result may take from the worker to here
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of mallopt (malloc.h)
-GO_ON = "go on with --resume DIR.partial here, with --scheduler ADDRESS on a cluster"
+CONNECT_S = 5  # until a scheduler has answered
+WORKERS_S = 30  # until workers have come, at the start and after all have gone
+POLL_S = 2  # between two checks that there are workers
+FETCH_S = 600  # until a result has travelled from the worker to here
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # parameters of mallopt (malloc.h)
+CONTINUE = "go on with --resume DIR.partial here, with --scheduler ADDRESS on a cluster"
 
 
 @contextmanager
 def connected(address: str | None, device: torch.device) -> Iterator[Cluster | None]:
-    """The cluster of the scheduler at this address; None where there is no address.
+    """Connect to the cluster of a scheduler. Yields None if there is no address.
 
     Raises:
-        InputError: the optional extra is not installed, the address cannot be one, nobody answers there, no workers come, or
-            torchrun started this process.
+        InputError: The optional extra is missing, no scheduler or no worker answers, or torchrun started this process.
     """
     if address is None:
         yield None
@@ -58,215 +56,165 @@ def connected(address: str | None, device: torch.device) -> Iterator[Cluster | N
     try:
         yield cluster
     finally:
-        cluster.close()
+        cluster.client.close()
 
 
 class Cluster:
-    """The workers of a Dask scheduler; a worker that dies is replaced by another one.
+    """The workers of a Dask scheduler. Dask repeats the calls of a worker that dies on another one.
 
     Args:
-        address: tcp://HOST:PORT, or tls:// with the certificates of Dask's own configuration.
-        device: that every worker must have.
+        address: tcp://HOST:PORT, or tls://HOST:PORT with the certificates of Dask's configuration.
+        device: Device that every worker must have.
 
     Raises:
-        InputError: see `connected`.
+        InputError: See `connected`.
     """
 
     def __init__(self, address: str, device: torch.device) -> None:
-        _check_address(address)
+        _check_scheduler(address)
         from distributed import Client
 
-        for name in ("distributed", "distributed.client"):  # what goes wrong is said here, in a sentence
+        for name in ("distributed", "distributed.client"):  # failures are reported here, in one sentence
             logging.getLogger(name).setLevel(logging.CRITICAL)
-        try:
-            answers = asyncio.run(_who(address))
-        except Exception as error:  # whatever is there may answer anything
-            reason = str(error) or f"nothing in {CONNECT} s"
-            raise InputError(
-                f"no Dask scheduler answers at {address} ({reason}); start one with `dask scheduler` and give its address"
-            ) from None
-        if answers != "Scheduler":
-            raise InputError(f"a Dask {answers} answers at {address}; --scheduler takes the address of its scheduler")
-        self.machines: set[str] = set()
+        self.machines: set[str] = set()  # of the workers that have returned a result
+        self.client = Client(address, timeout=CONNECT_S)
         self._address, self._device = address, device.type
-        self._client = Client(address, timeout=CONNECT)
-        if not self._workers_come():
-            self.close()
+        if not self._has_workers():
+            self.client.close()
             raise InputError(
-                f"the Dask scheduler at {address} has no workers after {PATIENCE} s; start some with `dask worker {address}`"
+                f"the Dask scheduler at {address} has no workers after {WORKERS_S} s; start some: `dask worker {address}`"
             )
 
-    def close(self) -> None:
-        """Leaves the scheduler; what it still holds of this work is dropped."""
-        self._client.close()
-
     def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
-        """As the built-in function, on the workers.
+        """Yield the function of each item, in order, as the built-in `map` does.
 
         Raises:
-            FitError: the scheduler or all workers went away, or one item ended several workers.
+            FitError: The scheduler or all workers are lost, or one call ended several workers.
         """
         held, items = self.hold(function), list(items)
         futures = [self.submit(f"part {i + 1} of {len(items)}", held, item) for i, item in enumerate(items)]
-        done: dict[Future[Any], Any] = {}
         for future in futures:
-            while future not in done:
-                ready, value = self.next([other for other in futures if other not in done])
-                done[ready] = value
-            yield done[future]
+            yield self.next([future])[1]
 
     def hold(self, thing: object) -> Future[Any]:
-        """Something that many calls take, sent once. The scheduler keeps a copy in case the workers that have it die."""
+        """Send an object that many calls take to the cluster, once. It survives the workers that hold it."""
         import cloudpickle
 
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Sending large graph")
-            return self._client.submit(bytes, cloudpickle.dumps(thing), key=f"data-{uuid4().hex}")
+            return self.client.submit(bytes, cloudpickle.dumps(thing), key=f"data-{uuid4().hex}")
 
     def submit(
         self, name: str, function: Future[Any], item: Any, *held: Future[Any], urgent: bool = False
     ) -> Future[Any]:
-        """Calls `function` (as held) with the item and what else is held, on some worker; urgent calls come first."""
-        terms = _Terms(torch.get_num_threads(), self._device, _versions())
+        """Call a held function with the item and held objects on a worker. Urgent calls come first."""
+        terms = (torch.get_num_threads(), self._device, packages())
         key = f"{name}-{uuid4().hex}"
-        return self._client.submit(_call, terms, function, item, *held, key=key, priority=int(urgent))
+        return self.client.submit(_call, terms, function, item, *held, key=key, priority=int(urgent))
 
     def next(self, pending: Collection[Future[Any]]) -> tuple[Future[Any], Any]:
-        """One of these that is done, and what it gave.
+        """Wait for one of the calls and return it with its result.
 
         Raises:
-            FitError: the scheduler or all workers went away, or the call ended several workers.
-            Exception: what the call raised.
+            FitError: The scheduler or all workers are lost, or the call ended several workers.
+            Exception: The exception of the call.
         """
         from distributed import wait
 
         while True:
             try:
-                future = next(iter(wait(list(pending), timeout=LOOK, return_when="FIRST_COMPLETED").done))
-                error = future.exception(timeout=FETCH)
-                result = (None, "") if error is not None else future.result(timeout=FETCH)
+                future = next(iter(wait(list(pending), timeout=POLL_S, return_when="FIRST_COMPLETED").done))
+                error = future.exception(timeout=FETCH_S)
+                value, where = (None, "") if error is not None else future.result(timeout=FETCH_S)
             except TimeoutError:
-                if not self._workers_come():
-                    raise FitError(f"all workers of the Dask scheduler at {self._address} went away; {GO_ON}") from None
-            except (CancelledError, OSError):  # the connection's: what a call raised is returned above
-                raise FitError(f"the Dask scheduler at {self._address} went away; {GO_ON}") from None
+                if not self._has_workers():
+                    raise self._lost("all workers of ") from None
+            except (CancelledError, OSError):  # of the connection: an exception of the call is in `error`
+                raise self._lost() from None
             else:
                 if error is not None:
-                    raise _in_words(str(future.key).rpartition("-")[0], error)
-                value, where = result
+                    raise _explained(str(future.key).rpartition("-")[0], error)
                 self.machines.add(where)
                 return future, value
 
-    def _workers_come(self) -> bool:
-        """Whether there are workers, after some waiting if need be."""
+    def _lost(self, what: str = "") -> FitError:
+        return FitError(f"{what}the Dask scheduler at {self._address} went away; {CONTINUE}")
+
+    def _has_workers(self) -> bool:
+        """Return True if there are workers, after waiting for them if necessary."""
         try:
-            if not self._client.scheduler_info()["workers"]:
-                console.print(f"waiting up to {PATIENCE} s for workers of {self._address} ...")
-                self._client.wait_for_workers(1, timeout=PATIENCE)
+            if not self.client.scheduler_info()["workers"]:
+                console.print(f"waiting up to {WORKERS_S} s for workers of {self._address} ...")
+                self.client.wait_for_workers(1, timeout=WORKERS_S)
         except TimeoutError:
             return False
-        except OSError as error:
-            raise FitError(f"the Dask scheduler at {self._address} went away ({error}); {GO_ON}") from None
+        except OSError:
+            raise self._lost() from None
         return True
 
 
-def _in_words(name: str, error: BaseException) -> BaseException:
-    """The error that a call raised; a sentence where it got nowhere."""
+def _explained(name: str, error: BaseException) -> BaseException:
+    """Return the exception of a call, or one with a sentence if the call never ran."""
     from distributed import KilledWorker
 
     if isinstance(error, KilledWorker):
-        return FitError(f"{name} ended several workers, one after the other; give them more memory, then {GO_ON}")
+        return FitError(f"{name} ended several workers, one after the other; give them more memory, then {CONTINUE}")
     if isinstance(error, ImportError) or isinstance(error.__cause__, ImportError):
         return InputError(f"the scheduler or a worker lacks what {name} needs ({error}); install this package there")
     return error
 
 
-def _check_address(address: str) -> None:
-    """Refuses what no client should be made for: one that fails half-made stays behind in the process.
-
-    Raises:
-        InputError: no such address, or a tls:// one without certificates.
-    """
+def _check_scheduler(address: str) -> None:
+    """Refuse an address at which no scheduler answers. A client of anything else would wait for ever."""
     try:
-        from distributed.comm.addressing import parse_address, parse_host_port
+        from distributed.core import rpc
         from distributed.security import Security
     except ImportError:
         raise InputError("--scheduler needs the optional extra: pip install 'swiftwrf-tasks[cluster]'") from None
-    try:
-        scheme, place = parse_address(address)
-        parse_host_port(place)
-    except ValueError:
-        scheme = ""
-    if scheme not in ("tcp", "tls"):
+    if not re.fullmatch(r"(tcp|tls)://.+:\d{1,5}", address):
         raise InputError(f"--scheduler takes tcp://HOST:PORT or tls://HOST:PORT, got {address!a}")
-    if scheme == "tls":
-        try:
-            context = Security().get_connection_args("client").get("ssl_context")
-        except OSError as error:
-            raise InputError(f"--scheduler {address}: a certificate of Dask's configuration fails ({error})") from None
-        if context is None:
-            raise InputError(
-                f"--scheduler {address} needs certificates: name them in Dask's configuration "
-                "(distributed.comm.tls.ca-file and .client.cert) or use tcp://"
-            )
 
+    async def identity() -> str:
+        async with rpc(address, connection_args=Security().get_connection_args("client")) as remote:
+            return str((await asyncio.wait_for(remote.identity(), CONNECT_S))["type"])
 
-async def _who(address: str) -> str:
-    """What of Dask answers at this address. A client would wait for ever where something else does."""
-    from distributed.core import rpc
-    from distributed.security import Security
-
-    async with rpc(address, connection_args=Security().get_connection_args("client")) as remote:
-        return str((await asyncio.wait_for(remote.identity(), CONNECT))["type"])
-
-
-@dataclass(frozen=True)
-class _Terms:
-    """What the numbers depend on beside data and settings."""
-
-    threads: int
-    device: str
-    versions: dict[str, str]
-
-    def meet(self) -> None:
-        """Makes this process such that the numbers are those of the one that asks.
-
-        Raises:
-            InputError: that cannot be.
-        """
-        own = _versions()
-        other = [f"{name} {own[name]} (not {wanted})" for name, wanted in self.versions.items() if own[name] != wanted]
-        if other:
-            raise InputError(f"a worker has {', '.join(other)}; install the same versions on all machines of a cluster")
-        choose_device(self.device)
-        set_threads(self.threads)
-
-
-def _versions() -> dict[str, str]:
-    return {"swiftwrf-tasks": version("swiftwrf-tasks")} | packages()
+    try:
+        kind = asyncio.run(identity())
+    except Exception as error:  # another server may answer anything
+        reason = str(error) or f"nothing in {CONNECT_S} s"
+        raise InputError(
+            f"no Dask scheduler answers at {address} ({reason}); start one with `dask scheduler` and give its address"
+        ) from None
+    if kind != "Scheduler":
+        raise InputError(f"a Dask {kind} answers at {address}; --scheduler takes the address of its scheduler")
 
 
 @cache
-def _keep_memory() -> None:
-    """What this process frees it keeps for itself, where its C library is glibc.
+def _keep_freed_memory() -> None:
+    """Let this process keep the memory that it frees, if its C library is glibc.
 
-    Dask has its workers return memory to the system at once, and with that each block of 128 KiB and more comes from the
-    system anew: clearing those pages took a third of the time that a network trained.
+    Dask makes workers return memory to the system at once. Clearing new pages took a third of a network's training.
     """
     if sys.platform == "linux" and hasattr(library := ctypes.CDLL(None), "mallopt"):
         library.mallopt(M_TRIM_THRESHOLD, 2**30)
-        library.mallopt(M_MMAP_THRESHOLD, 2**25)  # the most that it takes
+        library.mallopt(M_MMAP_THRESHOLD, 2**25)  # the largest possible
 
 
 _ONE_AT_A_TIME = threading.Lock()
 
 
-def _call(terms: _Terms, function: bytes, item: Any, *held: bytes) -> tuple[Any, str]:
-    """On a worker: what the function gives, and the machine."""
+def _call(terms: tuple[int, str, dict[str, str]], function: bytes, item: Any, *held: bytes) -> tuple[Any, str]:
+    """Call a function on a worker and return its result with the name of the machine."""
     import cloudpickle
 
+    threads, device, versions = terms
     with _ONE_AT_A_TIME:
         called, *things = (cloudpickle.loads(content) for content in (function, *held))
-        _keep_memory()
-        terms.meet()  # after the libraries behind the function are loaded: their threads count, too
-        return called(item, *things), machine(torch.device(terms.device))
+        _keep_freed_memory()
+        own = packages()
+        other = [f"{name} {own[name]} (not {wanted})" for name, wanted in versions.items() if own[name] != wanted]
+        if other:
+            raise InputError(f"a worker has {', '.join(other)}; install the same versions on all machines of a cluster")
+        choose_device(device)
+        set_threads(threads)  # after the libraries of the function are loaded, so that it reaches all of them
+        return called(item, *things), machine(torch.device(device))

@@ -1,4 +1,4 @@
-"""The directory of a run: configuration, environment, records and results; resumable, and whole or not there."""
+"""The directory of a run: configuration, environment, results and report. It can be resumed until it is finished."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ import hashlib
 import json
 import re
 import secrets
-import shlex
 import shutil
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -24,19 +22,19 @@ from swiftwrf import InputError
 from swiftwrf.runtime.durable import rename
 from swiftwrf.runtime.threads import set_threads
 from tasks.claim import CONFIG, ENVIRONMENT, LOCK, STEPS, Claim
-from tasks.environment import environment, now
+from tasks.environment import environment, invocation, now
 from tasks.records import Row, read_json, strict, write_json, write_npz, write_table
 
 PARTIAL = ".partial"  # suffix of a run that is not finished
-MOST_LABEL = 60  # characters of what is added to the time in a directory's name
+MAX_LABEL = 60  # characters of the label in the name of a directory under runs/
 console = Console(stderr=True, highlight=False)
 
 
-def saved_config(folder: Path, task: str) -> Row:
-    """The configuration of an interrupted run of this task, as it was when the run began.
+def interrupted(folder: Path) -> Row:
+    """Return the content of an interrupted run's configuration file: task, command and config.
 
     Raises:
-        InputError: no such run, one of another task, or a configuration that has changed since.
+        InputError: There is no interrupted run, or it stopped before it wrote its configuration.
     """
     if not folder.name.endswith(PARTIAL) or not folder.is_dir():
         raise InputError(f"{folder} is no interrupted run; expected a directory *{PARTIAL} with a {CONFIG}")
@@ -44,7 +42,16 @@ def saved_config(folder: Path, task: str) -> Row:
         raise InputError(
             f"{folder} was stopped before its {CONFIG} was written, so it holds nothing to go on with; start the run again"
         )
-    content = read_json(folder / CONFIG)
+    return read_json(folder / CONFIG)
+
+
+def saved_config(folder: Path, task: str) -> Row:
+    """Return the configuration of an interrupted run.
+
+    Raises:
+        InputError: There is no such run, it is of another task, or its configuration has changed since it began.
+    """
+    content = interrupted(folder)
     if content.get("task") != task:
         raise InputError(
             f"{folder} is a run of tasks.{content.get('task')}; resume it with that task, not tasks.{task}"
@@ -58,26 +65,32 @@ def saved_config(folder: Path, task: str) -> Row:
     return config
 
 
+def _versions(environment: Row) -> dict[str, str]:
+    """Return the versions on which the results of a run depend: of the packages, and the commit of this project."""
+    packages = environment.get("packages")
+    return (packages if isinstance(packages, dict) else {}) | {"commit": environment.get("commit") or "unknown"}
+
+
 def _digest(config: Any) -> str:
     return hashlib.sha256(json.dumps(strict(config), sort_keys=True).encode()).hexdigest()
 
 
 @contextmanager
 def new_directory(out: Path, what: str) -> Iterator[Path]:
-    """A directory to be filled in the block, under a name that nothing else has; it becomes `out` if nothing was raised.
+    """Yield a directory with a temporary name, to be filled in the block. It becomes `out` if nothing is raised.
 
     Raises:
-        InputError: `out` exists already, or was made by somebody else in the meantime.
+        InputError: `out` exists already, or another process made it in the meantime.
     """
     if out.exists() or not out.name:
-        raise InputError(f"{out} exists already and {what} is never overwritten; choose another --out")
+        raise InputError(f"{out} exists already and {what} is never overwritten; choose another directory")
     out.parent.mkdir(parents=True, exist_ok=True)
     unfinished = out.with_name(f".{out.name}.{secrets.token_hex(4)}")
     unfinished.mkdir()
     try:
         yield unfinished
         if out.exists():
-            raise InputError(f"{out} was made by somebody else in the meantime; choose another --out")
+            raise InputError(f"another process made {out} in the meantime; choose another directory")
         rename(unfinished, out)
     finally:
         if unfinished.exists():
@@ -87,21 +100,20 @@ def new_directory(out: Path, what: str) -> Iterator[Path]:
 class Run:
     """The directory of a run while it is being filled.
 
-    It is made as `NAME.partial` and renamed to `NAME` by `finish`. What a step has computed is kept there, so that a
-    resumed run goes on after it. A directory is deleted only by the process that made it, and only before a step has left
-    anything in it.
+    It is made as `NAME.partial` and renamed to `NAME` by `finish`. It keeps the result of each step, so that a resumed run
+    continues after it. Only the process that made a directory deletes it, and only before a step has left a file in it.
 
     Args:
-        task: its name, the parent directory of runs without `--out`.
-        out: where the run will lie, or None for a new directory under `runs/`.
-        label: what to add to the time in the name of such a directory.
-        config: a dataclass of plain values.
-        device: where it computes.
-        source: sha256 of all that the run reads, by name; a resumed run must find what it began with.
-        resume: the directory of an interrupted run to go on with. It gets the number of threads that it began with.
+        task: Name of the task, which is the parent directory of runs without `--out`.
+        out: Directory of the finished run. None for a new directory under `runs/`.
+        label: Text after the time in the name of such a new directory.
+        config: Dataclass of plain values.
+        device: Device of the computation.
+        source: SHA-256 of everything that the run reads, by name. A resumed run must find the same input.
+        resume: Directory of an interrupted run to continue. It takes the number of threads of its beginning.
 
     Raises:
-        InputError: `out` exists already, another process is at work in it, or the input has changed since the run began.
+        InputError: `out` exists already, another process works in it, or the run began with other input, libraries or code.
     """
 
     def __init__(
@@ -117,7 +129,7 @@ class Run:
         if resume is not None:
             self.final = resume.with_name(resume.name.removesuffix(PARTIAL))
         else:
-            label = re.sub(r"[^\w.,=-]+", "_", label, flags=re.ASCII)[:MOST_LABEL]
+            label = re.sub(r"[^\w.,=-]+", "_", label, flags=re.ASCII)[:MAX_LABEL]
             self.final = Path(out) if out else Path("runs") / task / f"{datetime.now():%Y%m%d-%H%M%S}-{label}"
         if not self.final.name:
             raise InputError(f"--out {out} has no name of its own; give a new directory, e.g. runs/{task}/first")
@@ -125,14 +137,14 @@ class Run:
         self._refuse_existing()
         self._claim = Claim(self.folder, new=resume is None)
         try:
-            self._refuse_existing()  # the one before us may have finished before the directory was ours
+            self._refuse_existing()  # another process may have finished it before the claim
             (self.folder / STEPS).mkdir(exist_ok=True)
             if resume is None:
                 self._begin(task, config, device, source)
             else:
                 self._go_on(device, source)
         except BaseException:
-            self._claim.discard_if_nothing_is_lost()
+            self._claim.discard_if_empty()
             raise
 
     def _refuse_existing(self) -> None:
@@ -140,12 +152,11 @@ class Run:
             raise InputError(f"{self.final} exists already and a run is never overwritten; choose another --out")
 
     def _begin(self, task: str, config: Any, device: torch.device, source: dict[str, str]) -> None:
-        set_threads(torch.get_num_threads())  # the same call as in a run that goes on
+        set_threads(torch.get_num_threads())  # the same call as in a resumed run
         values = asdict(config)
         self._environment = environment(device, source) | {"config_sha256": _digest(values)}
         self.write_json(ENVIRONMENT, self._environment)
-        command = shlex.join(["python", "-m", f"tasks.{task}", *sys.argv[1:]])
-        self.write_json(CONFIG, {"task": task, "command": command, "config": values})
+        self.write_json(CONFIG, {"task": task, "command": invocation(task), "config": values})
 
     def _go_on(self, device: torch.device, source: dict[str, str]) -> None:
         self._environment = read_json(self.path(ENVIRONMENT))
@@ -160,10 +171,9 @@ class Run:
         if isinstance(threads, int) and 1 <= threads <= 1024:  # they are part of the seed
             set_threads(threads)
         here = environment(device, source)
-        versions = self._environment.get("packages")
-        if versions != here["packages"]:
-            versions = versions if isinstance(versions, dict) else {}
-            other = ", ".join(f"{n} {v}" for n, v in versions.items() if here["packages"].get(n) != v)
+        versions, own = _versions(self._environment), _versions(here)
+        if versions != own:
+            other = ", ".join(f"{name} {version}" for name, version in versions.items() if own.get(name) != version)
             raise InputError(
                 f"{self.folder} began with {other or 'other libraries'}; go on with these or start a new run"
             )
@@ -172,22 +182,22 @@ class Run:
         self.write_json(ENVIRONMENT, self._environment)
 
     def write_json(self, name: str, content: Any) -> None:
-        """Strict JSON: nan and infinity become null."""
+        """Write strict JSON: nan and infinity become null."""
         write_json(self.path(name), content)
 
     def write_csv(self, name: str, rows: Iterable[Row]) -> None:
-        """A table with the keys of the rows as columns."""
+        """Write a table with the keys of the rows as columns."""
         write_table(self.path(name), rows)
 
     def write_npz(self, name: str, arrays: Mapping[str, Any]) -> None:
-        """Arrays by name."""
+        """Write arrays by name."""
         write_npz(self.path(name), arrays)
 
     def step(self, name: str, compute: Callable[[], Row]) -> Row:
-        """What `compute` returns (plain values); computed once, also over a resumed run.
+        """Return the plain values of `compute`, which is called once, also over a resumed run.
 
         Raises:
-            InputError: what an earlier session kept is damaged.
+            InputError: The kept result is damaged.
         """
         value = self.kept(name)
         if value is None:
@@ -198,10 +208,10 @@ class Run:
         return value
 
     def kept(self, name: str) -> Row | None:
-        """What a step of that name has computed; None where none has.
+        """Return the kept result of a step, or None.
 
         Raises:
-            InputError: what was kept is damaged.
+            InputError: The kept result is damaged.
         """
         file = self.path(f"{STEPS}/{name}.json")
         if not file.exists():
@@ -212,25 +222,27 @@ class Run:
         return value
 
     def keep(self, name: str, value: Row, seconds: float) -> Row:
-        """Keeps what a step has computed, and the seconds that it took; the value as it is read back."""
+        """Keep the result and the duration of a step. Return the result as it is read back."""
         plain: Row = strict(value)
         self.write_json(f"{STEPS}/{name}.json", {"value": plain, "seconds": seconds})
         return plain
 
     def computed_on(self, machines: Iterable[str]) -> None:
-        """Says in the environment that these machines computed, too."""
+        """Record in the environment that these machines computed, too."""
         known = self._environment.get("workers", [])
         if not set(machines) <= set(known):
             self._environment["workers"] = sorted({*known, *machines})
             self.write_json(ENVIRONMENT, self._environment)
 
     def path(self, name: str) -> Path:
-        """A file in the run's directory."""
+        """Return a file in the run's directory."""
         return self.folder / name
 
     def finish(self, metrics: Mapping[str, Any], report: Callable[[Path, Row], None]) -> Path:
-        """Writes environment, report and, last, metrics; gives the run its name; then removes what only a resumed run
-        needs, so that a run stopped in between can still be resumed."""
+        """Write environment, report and metrics, give the run its name, and return its directory.
+
+        Files that only a resumed run needs are removed last, so that a run stopped in between can be resumed.
+        """
         self._environment["end"] = now()
         self.write_json(ENVIRONMENT, self._environment)
         plain: Row = strict(metrics)
@@ -248,7 +260,7 @@ class Run:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         if kind is None or not self.folder.exists():
             self._claim.release()
-        elif issubclass(kind, InputError) and self._claim.discard_if_nothing_is_lost():
+        elif issubclass(kind, InputError) and self._claim.discard_if_empty():
             pass
         else:
             self._claim.release()

@@ -1,10 +1,12 @@
-"""Where a run computes: code, versions, machine, input."""
+"""Provenance of a run: command, code, versions, machine, input."""
 
 from __future__ import annotations
 
 import os
 import platform
+import shlex
 import subprocess
+import sys
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -12,19 +14,28 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import distributed as dist
+
+from tasks.torchrun import process_count
 
 
 def now() -> str:
-    """The time in UTC, to the second."""
+    """Return the time in UTC, to the second."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def environment(device: torch.device, source: dict[str, str]) -> dict[str, Any]:
-    """Code, versions, machine and input of a run.
+def invocation(task: str) -> str:
+    """Return the command line of this process, which runs a task."""
+    program, *arguments = sys.argv
+    if Path(program).stem == "swiftwrf":
+        return shlex.join(["swiftwrf", *arguments])
+    return shlex.join(["python", "-m", f"tasks.{task}", *arguments])
 
-    The number of threads belongs to the seed: sums over threads are added up in another order, and a training turns the
-    last bit of a sum into degrees. So does the number of processes, which add up sums, too.
+
+def environment(device: torch.device, source: dict[str, str]) -> dict[str, Any]:
+    """Return code, versions, machine and input of a run.
+
+    The numbers of threads and processes belong to the seed: they decide the order in which sums are added, and a training
+    turns the last bit of a sum into degrees.
     """
     return {
         "commit": _commit(),
@@ -33,31 +44,31 @@ def environment(device: torch.device, source: dict[str, str]) -> dict[str, Any]:
         "packages": packages(),
         "device": machine(device),
         "threads": torch.get_num_threads(),
-        "processes": dist.get_world_size() if dist.is_initialized() else 1,
+        "processes": process_count(),
         "input_sha256": source,
         "start": now(),
     }
 
 
 def packages() -> dict[str, str]:
-    """Versions of the libraries that numbers come from."""
-    names = ("torch", "torchvision", "numpy", "scipy", "scikit-learn", "numba")
+    """Return the versions of this project and of the libraries on which results depend."""
+    names = ("swiftwrf-tasks", "torch", "torchvision", "numpy", "scipy", "scikit-learn", "numba")
     return {name: version(name) for name in names}
 
 
 def _commit() -> str | None:
-    """Of the repository the code runs from, marked where files differ from it; None outside a repository."""
+    """Return the commit of the code, marked if files differ from it. None if the code is in no repository of its own."""
+    own = Path(__file__)
+    describe = ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
     with suppress(OSError, subprocess.CalledProcessError):
-        described = subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
-            cwd=Path(__file__).parent, capture_output=True, text=True, check=True,
-        )  # fmt: skip
-        return described.stdout.strip()
+        for command in (["git", "ls-files", "--error-unmatch", own.name], describe):
+            done = subprocess.run(command, cwd=own.parent, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
     return None
 
 
 def machine(device: torch.device) -> str:
-    """Name of the GPU, or model and number of cores of the processor."""
+    """Return the name of the GPU, or model and number of cores of the processor."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     with suppress(OSError):

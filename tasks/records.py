@@ -1,13 +1,11 @@
-"""Tables and values on disk: written whole or not at all, read back as they were, refused where they are damaged.
+"""Tables and values on disk: written whole or not at all, refused if damaged.
 
-A cell that begins with = + - @ is a formula to spreadsheet programs, which run it. Names come from the files of others, so
-such a name is written behind an apostrophe, which those programs take for "this is text", and read back without.
+Spreadsheet programs run a cell that begins with = + - @ as a formula. Receiver names come from files of others, so a text
+of that kind is written behind an apostrophe, which those programs take for a mark of text, and read without it.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import re
@@ -23,18 +21,17 @@ from swiftwrf import InputError
 from swiftwrf.runtime.durable import replacing, write_text
 
 Row = dict[str, Any]
-NAMES = (
-    "method",
-    "receiver",
-    "synthesizer",
-    "stage",
-    "origin",
-)  # columns of text, whatever it looks like (NA, 1, 12:34)
+NAMES = ("method", "receiver", "synthesizer", "stage", "origin")  # columns of text, even if a cell reads NA, 1 or 12:34
 FORMULA = re.compile(r"^'*[=+\-@\t\r]")
 
 
 def strict(value: Any) -> Any:
-    """The value as strict JSON carries it: nan and infinity become null."""
+    """Return the value as strict JSON carries it: nan and infinity become None, keys become text.
+
+    Example:
+        >>> strict({1: (0.5, float("nan"))})
+        {'1': [0.5, None]}
+    """
     if isinstance(value, dict):
         return {str(key): strict(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -47,15 +44,15 @@ def strict(value: Any) -> Any:
 
 
 def write_json(file: Path, content: Any) -> None:
-    """Strict JSON."""
+    """Write a value as strict JSON."""
     write_text(file, json.dumps(strict(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def read_json(file: Path) -> Row:
-    """The JSON object in a file.
+    """Read the JSON object in a file.
 
     Raises:
-        InputError: no such file, or something else in it.
+        InputError: There is no such file, or its content is no JSON object.
     """
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
@@ -69,25 +66,22 @@ def read_json(file: Path) -> Row:
 
 
 def write_table(file: Path, rows: Iterable[Row]) -> None:
-    """A comma-separated table with the keys of the rows as columns."""
+    """Write a comma-separated table with the keys of the rows as columns."""
     write_text(file, as_table(rows))
 
 
 def as_table(rows: Iterable[Row]) -> str:
-    """The text of such a table."""
+    """Return the text of a comma-separated table with the keys of the rows as columns.
+
+    Example:
+        >>> as_table([{"receiver": "=1+1", "rssi_dbm": -60.5}])
+        "receiver,rssi_dbm\\r\\n'=1+1,-60.5\\r\\n"
+    """
     rows = list(rows)
-    stream = io.StringIO(newline="")
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    writer = csv.writer(stream)
-    writer.writerow(columns)
-    writer.writerows([_escaped(row.get(name, "")) for name in columns] for row in rows)
-    return stream.getvalue()
-
-
-def write_npz(file: Path, arrays: Mapping[str, Any]) -> None:
-    """Arrays by name."""
-    with replacing(file) as temporary, temporary.open("wb") as stream:
-        np.savez_compressed(stream, **arrays)
+    columns = dict.fromkeys(key for row in rows for key in row)
+    cells = {name: pd.Series([_escaped(row.get(name)) for row in rows], dtype=object) for name in columns}
+    table: str = pd.DataFrame(cells).to_csv(index=False, lineterminator="\r\n")
+    return table
 
 
 def _escaped(value: Any) -> Any:
@@ -95,10 +89,10 @@ def _escaped(value: Any) -> Any:
 
 
 def read_table(file: Path) -> pd.DataFrame:
-    """What `write_table` wrote; columns of names are text.
+    """Read a table of `write_table`; columns of names are text.
 
     Raises:
-        InputError: no such file, or no table in it.
+        InputError: There is no such file, or its content is no table.
     """
     try:
         columns = list(pd.read_csv(file, nrows=0))
@@ -107,12 +101,16 @@ def read_table(file: Path) -> pd.DataFrame:
         table = pd.read_csv(file, dtype=dict.fromkeys(names, str), keep_default_na=False, na_values=missing)
     except OSError as error:
         raise InputError(f"{file} cannot be read ({error.strerror}); is this the directory of a run?") from None
-    except ValueError as error:  # pandas' own errors and those of decoding are such
+    except ValueError as error:  # errors of pandas and of decoding are ValueErrors
         raise InputError(f"{file} is not the table that a run writes ({error}); restore it") from None
     for name in names:
-        table[name] = table[name].map(_unescaped, na_action="ignore")
+        table[name] = table[name].map(
+            lambda text: text[1:] if text.startswith("'") and FORMULA.match(text) else text, na_action="ignore"
+        )
     return table
 
 
-def _unescaped(text: str) -> str:
-    return text[1:] if text.startswith("'") and FORMULA.match(text) else text
+def write_npz(file: Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays by name."""
+    with replacing(file) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, **arrays)

@@ -1,4 +1,4 @@
-"""What runs a task: the command line to a configuration, errors to sentences and exit codes; see `tasks.directory`."""
+"""Running a task: from the command line to a configuration, from errors to sentences and exit codes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import errno
 import inspect
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -25,91 +25,108 @@ from tasks.torchrun import check_gpus, together
 
 Config = TypeVar("Config")
 Preset = Literal["quick", "paper"]
-SEEDS = 2**32  # scikit-learn's and NumPy's generators take no larger ones
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+SEEDS = 2**32  # number of seeds that the generators of scikit-learn and NumPy accept
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def command_line(
     name: str,
     config_type: type[Config],
-    task: Callable[[Config, Path | None], None],
+    task: Callable[..., None],
     arguments: Sequence[str],
-    more: Callable[[], str] | None = None,
+    program: str | None = None,
 ) -> int:
-    """Parses the arguments into `config_type`, runs the task and turns its errors into sentences and exit codes; under
-    torchrun in the first process, for which the others compute.
+    """Run a task with the options of a command line; see `execute` and `exit_code`."""
+    return exit_code(partial(execute, name, config_type, task, arguments, program))
 
-    `--resume DIR` takes the configuration from an interrupted run instead; where to compute on, here or on the cluster of
-    `--scheduler`, is said anew. The help says what the docstring of
-    `config_type` does, and `more`.
+
+def exit_code(action: Callable[[], None]) -> int:
+    """Return the exit code of an action and print its error as one sentence. Under torchrun the first process acts.
 
     Returns:
-        0: done; 2: wrong input, or nowhere to write, said in one sentence; 1: a fit that broke; 130: interrupted.
+        0: done. 1: a fit failed. 2: wrong input, or a file that cannot be written. 130: interrupted.
     """
-    return together(partial(_command, name, config_type, task, arguments, more))
+    return together(partial(_exit_code, action))
 
 
-def _command(
-    name: str,
-    config_type: type[Config],
-    task: Callable[[Config, Path | None], None],
-    arguments: Sequence[str],
-    more: Callable[[], str] | None,
-) -> int:
+def _exit_code(action: Callable[[], None]) -> int:
     try:
-        config, folder = _parse(name, config_type, arguments, more)
-        _check_values(config)
-        task(config, folder)
+        action()
     except InputError as error:
-        return _say(str(error), 2)
+        return _report(str(error), 2)
     except FitError as error:
-        return _say(str(error), 1)
-    except OSError as error:  # readers say InputError where they cannot read, so this is about writing
-        return _say(_not_written(error), 2)
+        return _report(str(error), 1)
+    except OSError as error:  # readers raise InputError, so this is about writing
+        return _report(_not_written(error), 2)
     except MemoryError as error:
-        return _say(f"not enough memory ({error}); use less data or a smaller model", 2)
+        return _report(f"not enough memory ({error}); use less data or a smaller model", 2)
     except KeyboardInterrupt:
         return 130
     return 0
 
 
-def _say(sentence: str, code: int) -> int:
+def _report(sentence: str, code: int) -> int:
     print(f"error: {one_line(sentence)}", file=sys.stderr)
     return code
 
 
 def _not_written(error: OSError) -> str:
     file = error.filename2 or error.filename or "the run's files"
-    if error.errno in FULL:
+    if error.errno in DISK_FULL:
         return f"no space left to write {file}; make room and go on with --resume, or choose another --out"
     reason = "no permission" if isinstance(error, PermissionError) else error.strerror or str(error)
     return f"cannot write {file} ({reason}); choose another --out"
 
 
-def _parse(
-    name: str, config_type: type[Config], arguments: Sequence[str], more: Callable[[], str] | None
-) -> tuple[Config, Path | None]:
-    """The configuration, and the directory to resume where that is asked for."""
+def execute(
+    name: str,
+    config_type: type[Config],
+    task: Callable[..., None],
+    arguments: Sequence[str],
+    program: str | None = None,
+) -> None:
+    """Parse a command line and run the task.
+
+    A task that can be resumed takes a second argument, `resume`. For such a task `--resume DIR` takes the configuration of
+    an interrupted run, and `--scheduler ADDRESS` after it continues the run on a cluster.
+
+    Args:
+        name: Module of the task, e.g. tasks.aoa.
+        config_type: Dataclass of the options. Its docstring is the description in the help.
+        task: Function of the configuration and, if it can be resumed, of the directory to resume or None.
+        arguments: Options of the command line.
+        program: Name of the command in the help. Defaults to `python -m NAME`.
+
+    Raises:
+        InputError: Wrong options, or the error of the task.
+    """
+    resumable, values, folder = "resume" in inspect.signature(task).parameters, None, None
     match arguments:
+        case ["--resume", *_] if not resumable:
+            raise InputError(f"a run of {name} cannot be resumed; start it again")
         case ["--resume", resumed, *place] if not place or (place[0] == "--scheduler" and len(place) == 2):
             folder = Path(resumed)
-            values = saved_config(folder, name.removeprefix("tasks."))
-            values["scheduler"] = place[1] if place else None
+            values = saved_config(folder, name.removeprefix("tasks.")) | {"scheduler": place[1] if place else None}
+            config = configured(config_type, values, folder)
         case ["--resume", *_]:
             raise InputError(
-                "--resume takes one directory, and --scheduler to go on on a cluster; the rest is as the run began"
+                "--resume takes one directory, and --scheduler to use a cluster; no other option can change"
             )
         case _:
-            description = "\n\n".join([inspect.cleandoc(config_type.__doc__ or ""), *([more()] if more else [])])
-            return tyro.cli(config_type, prog=f"python -m {name}", description=description, args=arguments), None
-    return configured(config_type, values, folder), folder
+            description = inspect.cleandoc(config_type.__doc__ or "")
+            config = tyro.cli(config_type, prog=program or f"python -m {name}", description=description, args=arguments)
+    _check_values(config)
+    if resumable:
+        task(config, folder)
+    else:
+        task(config)
 
 
 def configured(config_type: type[Config], values: Row, folder: Path) -> Config:
-    """The configuration that a run has kept as plain values.
+    """Return the configuration that a run has kept as plain values.
 
     Raises:
-        InputError: those of another version.
+        InputError: The values are of another version of the command.
     """
     try:
         return config_type(**{key: tuple(v) if isinstance(v, list) else v for key, v in values.items()})
@@ -118,10 +135,10 @@ def configured(config_type: type[Config], values: Row, folder: Path) -> Config:
 
 
 def _check_values(config: Any) -> None:
-    """What no option may be: empty text, a number that is not finite, a seed that generators do not take.
+    """Refuse empty text, control characters, numbers that are not finite, and seeds that generators do not accept.
 
     Raises:
-        InputError: the first such option.
+        InputError: The first such option.
     """
     for option in fields(config):
         flag, given = f"--{option.name.replace('_', '-')}", getattr(config, option.name)
@@ -136,20 +153,29 @@ def _check_values(config: Any) -> None:
             raise InputError(f"--seed must be from 0 to {SEEDS - 1}, got {given}")
 
 
-def choice(meaning: str, registry: Registry[Any]) -> Any:
-    """Annotation of an option that takes names of a registry; its help lists what is registered when it is shown."""
+def choice(meaning: str, registry: Registry[Any], known: Mapping[str, Any] | None = None) -> Any:
+    """Return the annotation of an option that takes names of a registry. Its help lists the registered names.
+
+    Args:
+        meaning: Meaning of the option.
+        registry: Registry of the names.
+        known: Labels with a `meaning` by name. Other names have the first line of their docstring.
+    """
 
     def entries(default: str) -> str:
-        return f"{'; '.join(f'{entry.name}: {entry.meaning}' for entry in registry.entries())} (default: {default})"
+        meanings = {
+            name: known[name].meaning if known and name in known else registry.summary(name) for name in registry
+        }
+        return f"{'; '.join(f'{name}: {text}' for name, text in meanings.items())} (default: {default})"
 
     return tyro.conf.arg(help=f"{meaning}:", help_behavior_hint=entries)
 
 
 def choose_device(name: str) -> torch.device:
-    """The device of that name; `auto` is the GPU where there is one.
+    """Return the device of that name. With `auto` it is the GPU if there is one.
 
     Raises:
-        InputError: a GPU asked for where there is none, or fewer of them than processes.
+        InputError: There is no GPU, or there are fewer GPUs than processes of torchrun.
     """
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda needs an NVIDIA GPU that torch can use, and there is none; use --device cpu")
@@ -160,4 +186,15 @@ def choose_device(name: str) -> torch.device:
     return torch.device(name)
 
 
-__all__ = ["SEEDS", "Preset", "Row", "Run", "choice", "choose_device", "command_line", "console"]
+__all__ = [
+    "SEEDS",
+    "Preset",
+    "Row",
+    "Run",
+    "choice",
+    "choose_device",
+    "command_line",
+    "console",
+    "execute",
+    "exit_code",
+]

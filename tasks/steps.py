@@ -1,4 +1,4 @@
-"""What a run computes, cut into steps: each is kept when it is done, says what follows from it, and may run anywhere."""
+"""The computation of a run, cut into steps. The result of each is kept, and a step may run on any machine."""
 
 from __future__ import annotations
 
@@ -19,70 +19,71 @@ from tasks.records import Row, strict
 if TYPE_CHECKING:
     from distributed import Future
 
-Setting = TypeVar("Setting")  # what all steps of a run share
+Context = TypeVar("Context")
+"""data and configuration that all steps of a run share"""
 
 
-class Step(ABC, Generic[Setting]):
-    """One computation of a run. It may travel, so it is small: what is large is in the setting and in files."""
+class Step(ABC, Generic[Context]):
+    """One computation of a run. It is sent to workers, so it is small: large data are in the context and in files."""
 
     @property
     @abstractmethod
     def name(self) -> str:
-        """What it is kept under; steps of one name are the same step."""
+        """Key of the kept result. Steps with one name are one step."""
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """Files in the run's directory that it needs, left there by the step from which it follows."""
+        """Files in the run's directory that the step reads, written by the step from which it follows."""
         return ()
 
     @abstractmethod
-    def compute(self, setting: Setting, folder: Path) -> Row:
-        """Plain values. Files are read and left in the folder: the run's directory, or one that stands for it."""
+    def compute(self, context: Context, folder: Path) -> Row:
+        """Return plain values. Files are read and written in `folder`: the run's directory, or a copy on a worker."""
 
-    def then(self, setting: Setting, value: Row) -> Sequence[Step[Setting]]:
-        """The steps that follow from what it computed."""
+    def then(self, context: Context, value: Row) -> Sequence[Step[Context]]:
+        """Return the steps that follow from the result."""
         return ()
 
 
 def computed(
-    run: Run, steps: Iterable[Step[Setting]], setting: Setting, cluster: Cluster | None
-) -> Iterator[tuple[Step[Setting], Row]]:
-    """Each step with what it computed, and after it those that follow from it: in this order wherever they are computed.
+    run: Run, steps: Iterable[Step[Context]], context: Context, cluster: Cluster | None
+) -> Iterator[tuple[Step[Context], Row]]:
+    """Yield each step with its result, followed by the steps that follow from it.
 
     Args:
-        run: where they are kept; what is kept is not computed again.
-        steps: the first ones.
-        setting: what all share.
-        cluster: computes as many as it has workers at a time; None: here, one after the other.
+        run: Run that keeps the results. A kept result is not computed again.
+        steps: The first steps.
+        context: Data and configuration that all steps share.
+        cluster: Cluster that computes the steps in parallel. With None they are computed here, one after the other.
 
     Raises:
-        FitError: the cluster was lost.
+        FitError: The cluster is lost.
     """
     if cluster is not None:
         steps = list(steps)
-        _compute_on(cluster, run, steps, setting)
+        _compute_on(cluster, run, steps, context)
     for step in steps:
-        value = run.step(step.name, partial(step.compute, setting, run.folder))
+        value = run.step(step.name, partial(step.compute, context, run.folder))
         yield step, value
-        yield from computed(run, step.then(setting, value), setting, None)
+        yield from computed(run, step.then(context, value), context, None)
 
 
-def _compute_on(cluster: Cluster, run: Run, steps: Iterable[Step[Setting]], setting: Setting) -> None:
-    """Keeps in the run what the steps, and those that follow, compute on a cluster, as they get done."""
-    function = cluster.hold(partial(_compute_away, setting))
-    pending: dict[Future[Any], Step[Setting]] = {}
+def _compute_on(cluster: Cluster, run: Run, steps: Iterable[Step[Context]], context: Context) -> None:
+    """Compute steps, and those that follow, on a cluster and keep each result in the run when it arrives."""
+    function = cluster.hold(partial(_compute_away, context))
+    pending: dict[Future[Any], Step[Context]] = {}
     begun: set[str] = set()
 
-    def begin(steps: Iterable[Step[Setting]]) -> None:
+    def begin(steps: Iterable[Step[Context]]) -> None:
         held: dict[str, Future[Any]] = {}
         for step in steps:
             value = run.kept(step.name)
             if value is not None:
-                begin(step.then(setting, value))
+                begin(step.then(context, value))
             elif step.name not in begun:
                 begun.add(step.name)
                 held |= {name: cluster.hold(run.path(name).read_bytes()) for name in step.reads if name not in held}
-                urgent = type(step).then is not Step.then  # others wait for it
+                urgent = type(step).then is not Step.then  # other steps wait for it
                 future = cluster.submit(step.name, function, step, *(held[name] for name in step.reads), urgent=urgent)
                 pending[future] = step
 
@@ -95,19 +96,18 @@ def _compute_on(cluster: Cluster, run: Run, steps: Iterable[Step[Setting]], sett
         value = run.keep(step.name, value, seconds)
         run.computed_on(cluster.machines)
         console.print(f"[bold]{step.name}[/] {seconds:.1f} s")
-        begin(step.then(setting, value))
+        begin(step.then(context, value))
 
 
-def _compute_away(setting: Setting, step: Step[Setting], *contents: bytes) -> tuple[Row, float, dict[str, bytes]]:
-    """On a worker, which has no directory of the run: values, seconds, and the content of the files
-    that were left."""
+def _compute_away(context: Context, step: Step[Context], *contents: bytes) -> tuple[Row, float, dict[str, bytes]]:
+    """Compute a step on a worker, in a copy of the run's directory. Return values, seconds and the content of new files."""
     with TemporaryDirectory(prefix="swiftwrf-") as name:
         folder = Path(name)
         (folder / STEPS).mkdir()
         for file, content in zip(step.reads, contents, strict=True):
             (folder / file).write_bytes(content)
         began = time.perf_counter()
-        value: Row = strict(step.compute(setting, folder))
+        value: Row = strict(step.compute(context, folder))
         seconds = time.perf_counter() - began
         left = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
         return value, seconds, {file: path.read_bytes() for file, path in left.items() if file not in step.reads}

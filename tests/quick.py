@@ -10,11 +10,10 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from typing import Any
 from unittest import mock
 
 from augment import SYNTHESIZERS
-from swiftwrf import AngularGrid, FitConfig, GeometryModel, ModelConfig, RssiConfig, Spectra, rssi_room, simulated_room
+from swiftwrf import AngularGrid, FitConfig, ModelConfig, RssiConfig, Spectra, rssi_room, simulated_room
 from swiftwrf.comparison import (
     Config,
     DcganConfig,
@@ -29,7 +28,9 @@ from swiftwrf.comparison import (
     WrfGsSize,
 )
 from swiftwrf.errors import LONGEST
-from swiftwrf.models.geometry import GeometryConfig, fit_geometry
+from swiftwrf.models.geometry import GeometryConfig
+from swiftwrf.models.geometry.fit import search_room
+from swiftwrf.models.geometry.planes import RoomEstimate
 from swiftwrf.models.geometry.search import Search
 from tasks.aoa import experiment as aoa
 from tasks.aoa.arms import NETWORK
@@ -42,8 +43,8 @@ from tasks.estimate import EstimateConfig
 from tasks.estimate import run as estimate
 from tasks.inspect import InspectConfig
 from tasks.inspect import run as inspect
-from tasks.report.__main__ import ReportConfig
-from tasks.report.__main__ import run as report
+from tasks.report import ReportConfig
+from tasks.report import run as report
 from tasks.rssi import experiment as rssi
 from tasks.rssi.predictors import PREDICTORS
 from tasks.run import command_line
@@ -103,11 +104,11 @@ def small_published() -> Iterator[None]:
 def glances() -> Iterator[None]:
     """No long search for rooms, which has tests of its own."""
 
-    def glance(train: Spectra, **given: Any) -> GeometryModel:
-        return fit_geometry(train, GLANCE, **given)
+    def glance(train: Spectra, config: GeometryConfig, progress: bool = False) -> RoomEstimate:
+        return search_room(train, replace(GLANCE, seed=config.seed, validation=config.validation), progress)
 
     with (
-        mock.patch("augment.synthesizers.geometry.fit_geometry", glance),
+        mock.patch("swiftwrf.models.geometry.model.search_room", glance),
         mock.patch("swiftwrf.models.geometry.fit.ENOUGH", 1),
         mock.patch.object(Search, "improve", lambda search, room: room),
     ):

@@ -41,7 +41,7 @@ RSSI = ("rssi", "--rx", 1, 2, 3, 4, 5)  # two groups
 @pytest.fixture(autouse=True)
 def patient(monkeypatch):
     """Processes start slowly where other tests run beside."""
-    monkeypatch.setattr(clusters, "PATIENCE", 120)
+    monkeypatch.setattr(clusters, "WORKERS_S", 120)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def local():
 def cluster(local):
     joined = Cluster(local.scheduler_address, CPU)
     yield joined
-    joined.close()
+    joined.client.close()
 
 
 @pytest.fixture(scope="module")
@@ -179,7 +179,7 @@ def test_workers_take_the_threads_of_the_run(cluster):
 
 
 def test_workers_of_other_versions_are_refused(cluster, monkeypatch):
-    monkeypatch.setattr(clusters, "_versions", lambda: {"torch": "0.1"})
+    monkeypatch.setattr(clusters, "packages", lambda: {"torch": "0.1"})
     with pytest.raises(InputError, match=r"a worker has torch .* \(not 0.1\)"):
         list(cluster.map(abs, [1]))
 
@@ -205,7 +205,7 @@ def test_what_ends_every_worker_ends_in_a_sentence(local, cluster, monkeypatch):
 
 
 def test_workers_that_never_come(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(clusters, "PATIENCE", 1)
+    monkeypatch.setattr(clusters, "WORKERS_S", 1)
     with distributed.LocalCluster(n_workers=0, dashboard_address=":0") as empty:
         assert run(*RSSI, "--scheduler", empty.scheduler_address, "--out", tmp_path / "run") == 2
     lines = capsys.readouterr().err.splitlines()
@@ -215,13 +215,13 @@ def test_workers_that_never_come(tmp_path, monkeypatch, capsys):
 
 
 def test_workers_that_go_for_good(monkeypatch):
-    monkeypatch.setattr(clusters, "PATIENCE", 1)
+    monkeypatch.setattr(clusters, "WORKERS_S", 1)
     with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as mortal:
         left, nanny = Cluster(mortal.scheduler_address, CPU), mortal.workers[0]
         during(monkeypatch, (Cluster, "next", 1), lambda: mortal.sync(nanny.close))
         with pytest.raises(FitError, match=r"all workers .* went away"):
             list(left.map(time.sleep, [60]))
-        left.close()
+        left.client.close()
 
 
 def test_a_connection_that_breaks_while_a_result_is_fetched(cluster, monkeypatch):
@@ -292,7 +292,7 @@ def test_a_worker_is_no_scheduler(local):
 
 
 def test_another_server_is_no_scheduler(monkeypatch):
-    monkeypatch.setattr(clusters, "CONNECT", 1)
+    monkeypatch.setattr(clusters, "CONNECT_S", 1)
     with socket.create_server(("127.0.0.1", 0)) as mute, pytest.raises(InputError, match="nothing in 1 s"):
         Cluster(f"tcp://127.0.0.1:{mute.getsockname()[1]}", CPU)
 
@@ -304,11 +304,11 @@ def test_another_server_is_no_scheduler(monkeypatch):
         ("127.0.0.1", "takes tcp://HOST:PORT"),
         ("http://127.0.0.1:1", "takes tcp://HOST:PORT"),
         ("inproc://1/2", "takes tcp://HOST:PORT"),
-        ("tls://127.0.0.1:1", "needs certificates"),
+        ("tls://127.0.0.1:1", "ssl_context"),
     ],
 )
 def test_addresses_that_lead_nowhere(tmp_path, capsys, monkeypatch, address, says):
-    monkeypatch.setattr(clusters, "CONNECT", 1)
+    monkeypatch.setattr(clusters, "CONNECT_S", 1)
     assert run(*RSSI, "--scheduler", address, "--out", tmp_path / "run") == 2
     assert says in said(capsys)
     assert not list(tmp_path.iterdir())
@@ -321,7 +321,7 @@ def test_tls_with_the_certificates_of_dask(tmp_path, monkeypatch):
         subprocess.run([*command, "-keyout", key, "-out", certificate], check=True, capture_output=True)
     except FileNotFoundError:
         pytest.skip("needs openssl")
-    monkeypatch.setattr(clusters, "PATIENCE", 1)
+    monkeypatch.setattr(clusters, "WORKERS_S", 1)
     tls = {
         f"distributed.comm.tls.{end}.{part}": file
         for end in ENDS
@@ -335,7 +335,7 @@ def test_tls_with_the_certificates_of_dask(tmp_path, monkeypatch):
             with pytest.raises(InputError, match="has no workers"):
                 Cluster(empty.scheduler_address, CPU)
         dask.config.set({"distributed.comm.tls.ca-file": str(tmp_path / "gone.pem")})
-        with pytest.raises(InputError, match="a certificate of Dask's configuration fails"):
+        with pytest.raises(InputError, match=r"gone\.pem"):
             Cluster("tls://127.0.0.1:1", CPU)
 
 

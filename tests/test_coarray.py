@@ -122,7 +122,7 @@ def test_a_spectrum_without_any_signal_spoils_nothing(room):
 
 
 def test_refuses_spectra_of_an_unknown_array_and_positions_that_are_none(room):
-    with pytest.raises(InputError, match="geometry and carrier"):
+    with pytest.raises(InputError, match="needs the array"):
         fit_coarray(replace(room, array=None))
     with pytest.raises(InputError, match="shape"):
         fit_coarray(room).synthesize(torch.zeros(3))
@@ -138,3 +138,15 @@ def test_measured_spectra_are_nearly_in_the_space(measured_data):
 
 def test_simulated_room_tells_its_array():
     assert simulated_room(n=12, grid=GRID).array is not None
+
+
+def test_spectra_are_differentiable_in_the_position(room):
+    model = fit_coarray(room)
+    position = room.position[:3] + 0.02
+    at = position.clone().requires_grad_()
+    model.predict(at).mean.sum().backward()
+    for axis in range(3):
+        step = torch.zeros(3, dtype=torch.float64)
+        step[axis] = 1e-3
+        ends = [model.synthesize(position + sign * step).double().sum((1, 2)) for sign in (1, -1)]
+        torch.testing.assert_close(at.grad[:, axis], (ends[0] - ends[1]) / 2e-3, rtol=0.02, atol=0.5)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 
 import pytest
 import torch
@@ -33,6 +31,7 @@ from quick import run, said
         ("rssi", ("--rx", "1", "--out", "."), "no name of its own"),
         ("rssi", ("--rx", "1", "--out", "{file}-" + "x" * 300), "cannot write"),
         ("rssi", ("--resume", "{file}"), "no interrupted run"),
+        ("report", ("--resume", "{file}"), "cannot be resumed"),
         ("report", ("{file}",), "no finished run"),
         ("report", ("--out", "{file}/x"), "no runs"),
     ],
@@ -62,13 +61,3 @@ def test_unreadable_data_are_told_from_unwritable_directories(tmp_path, capsys):
     (tmp_path / "data").mkdir(mode=0)
     assert run("rssi", "--rx", "1", "--data", tmp_path / "data") == 2
     assert "write" not in said(capsys)
-
-
-@pytest.mark.parametrize(
-    ("given", "spins"), [({}, "30000"), ({"GOMP_SPINCOUNT": "5"}, "5"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "None")]
-)
-def test_threads_wait_for_each_other_as_the_user_says(given, spins):
-    code = "import os, sys, tasks; print(os.environ.get('GOMP_SPINCOUNT'), 'torch' in sys.modules)"
-    own = {key: value for key, value in os.environ.items() if key not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}
-    done = subprocess.run([sys.executable, "-c", code], env=own | given, stdout=subprocess.PIPE, text=True, check=True)
-    assert done.stdout == f"{spins} False\n"  # libgomp reads it when torch is loaded

@@ -1,8 +1,7 @@
-"""The CUDA maker: what it compiles to, what it draws on the CPU through a shim, and, where there is a GPU, on it."""
+"""The CUDA backend: compiled by NVRTC, run on the CPU through a shim and, on a machine with a GPU, on it."""
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import math
 import os
@@ -11,180 +10,145 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
+from unittest import mock
 
 import pytest
 import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from swiftwrf import AngularGrid, InputError, rasterize
-from swiftwrf.rasterize import _choose, cuda, nvrtc, reference
+from swiftwrf.rasterize import available_backends, cuda, cuda_kernels, operators, reference
 from swiftwrf.rasterize.magnitude import magnitude
 from swiftwrf.testing.hard_cases import HARD_CASES, Case, degrees, field_errors, magnitude_errors
 from swiftwrf.testing.scenes import random_scene
 from swiftwrf.testing.tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
 
 SHIM = Path(__file__).parent / "cuda_shim"
+rasterize_package = sys.modules[rasterize.__module__]
 KERNELS = {"find_reach", "rasterize", "rasterize_backward", "magnitude_backward"}
-SANITIZERS = os.environ.get(
-    "CUDA_SHIM_SANITIZERS", ""
-)  # set by the test that runs this file's `small` tests under them
+SANITIZERS = os.environ.get("CUDA_SHIM_SANITIZERS", "")  # set by `test_sanitizers_find_nothing` in its child process
 
 
 # ---------------------------------------------------------------------------------------------------------- compilation
 
 
 @pytest.fixture(scope="module")
-def compiler():
+def architectures():
     try:
-        return nvrtc.Nvrtc()
-    except nvrtc.CudaUnavailable as error:
+        return cuda_kernels.architectures()
+    except cuda_kernels.CudaUnavailable as error:
         pytest.skip(str(error))
 
 
 @pytest.mark.parametrize("architecture", [75, 80, 86, 89, 90, 100, 120])
-def test_compiles_without_stack_and_within_64_registers(compiler, architecture):
-    if architecture not in compiler.architectures:
-        pytest.skip(f"NVRTC {compiler.version} does not compile for sm_{architecture}")
-    image, log = compiler.compile(cuda.SOURCE.read_text(), f"sm_{architecture}", "--ptxas-options=-v")
+def test_compiles_to_machine_code_without_stack_and_within_64_registers(architectures, architecture):
+    if architecture not in architectures:
+        pytest.skip(f"this NVRTC does not compile for sm_{architecture}")
+    source = cuda_kernels.SOURCE.read_text()
+    image, log = cuda_kernels.compile_source(source, f"sm_{architecture}", "--ptxas-options=-v")
     assert image.startswith(b"\x7fELF")
     assert set(re.findall(r"entry function '(\w+)'", log)) == KERNELS
     assert re.findall(r"(\d+) bytes stack frame, (\d+) bytes spill", log) == [("0", "0")] * len(KERNELS)
     assert max(int(n) for n in re.findall(r"Used (\d+) registers", log)) <= 64
 
 
-def test_newer_gpus_get_portable_code_and_older_ones_a_sentence(compiler):
-    newest = compiler.architectures[-1]
-    assert compiler.target(newest) == f"sm_{newest}"
-    assert compiler.target(newest + 10) == f"compute_{newest}"
-    with pytest.raises(nvrtc.CudaUnavailable, match=r"compute capability 7\.5 or more, got 6\.1"):
-        compiler.target(61)
+@pytest.mark.usefixtures("architectures")
+def test_compiles_to_portable_code():
+    image, _ = cuda_kernels.compile_source(cuda_kernels.SOURCE.read_text(), "compute_90")
+    assert set(re.findall(r"\.entry (\w+)\(", image.decode())) == KERNELS
+    assert image.endswith(b"\0")  # The driver reads PTX up to the null byte.
 
 
-def test_says_what_does_not_compile(compiler):
-    with pytest.raises(nvrtc.CudaUnavailable, match="cannot compile the rasterizer for sm_90"):
-        compiler.compile("nonsense", "sm_90")
+def test_newer_gpus_get_portable_code_and_older_ones_a_sentence(architectures):
+    newest = architectures[-1]
+    assert cuda_kernels.target(newest) == f"sm_{newest}"
+    assert cuda_kernels.target(newest + 10) == f"compute_{newest}"
+    with pytest.raises(InputError, match=r"compute capability 7\.5 or more, got 6\.1"):
+        cuda_kernels.target(61)
 
 
-class CountingCompiler:
-    """Counts how often it compiles."""
-
-    version = "1.2"
-
-    def __init__(self):
-        self.compilations = 0
-
-    def target(self, capability):
-        return f"sm_{capability}"
-
-    def compile(self, source, target):
-        self.compilations += 1
-        return f"{source} for {target}".encode(), ""
-
-
-def test_images_are_cached_and_damaged_ones_built_anew(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    compiler = CountingCompiler()
-    for _ in range(2):
-        assert nvrtc._image(compiler, "source", 90) == b"source for sm_90"
-    assert compiler.compilations == 1
-    (cached,) = (tmp_path / "swiftwrf").iterdir()
-    for damaged in (cached.read_bytes()[:-1], b""):
-        cached.write_bytes(damaged)
-        assert nvrtc._image(compiler, "source", 90) == b"source for sm_90"
-    assert compiler.compilations == 3
-    nvrtc._image(compiler, "source", 80)
-    nvrtc._image(compiler, "other source", 90)
-    assert compiler.compilations == 5
-    assert len(list((tmp_path / "swiftwrf").iterdir())) == 3
-
-
-def test_a_cache_that_cannot_be_written_does_not_matter(tmp_path, monkeypatch):
-    (tmp_path / "swiftwrf").write_text("a file where the folder should be")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert nvrtc._image(CountingCompiler(), "source", 90) == b"source for sm_90"
+@pytest.mark.usefixtures("architectures")
+def test_a_source_that_does_not_compile_is_refused_with_the_log():
+    with pytest.raises(InputError, match=r"cannot compile the rasterizer for sm_90.*: rasterize\.cu\(1\): error"):
+        cuda_kernels.compile_source("nonsense", "sm_90")
 
 
 # ------------------------------------------------------------------------------------------------------- unavailability
 
 
-def test_a_missing_library_is_one_sentence():
-    with pytest.raises(InputError, match="needs the NVIDIA driver, and it was not found; use maker='reference'"):
-        nvrtc._load("the NVIDIA driver", ["libnot-there.so.1"])
+def test_missing_bindings_are_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cuda.bindings.nvrtc", None)
+    with pytest.raises(InputError, match="needs the package cuda-bindings; install it, or use backend='reference'"):
+        cuda_kernels.architectures()
 
 
-def test_auto_falls_back_to_the_definition_with_one_warning(monkeypatch):
-    def fail(device):
-        raise nvrtc.CudaUnavailable("no driver")
+@pytest.mark.parametrize(("function", "library"), [("nvrtcVersion", "NVRTC"), ("cuInit", "the NVIDIA driver")])
+def test_missing_libraries_are_named(function, library):
+    missing = mock.Mock(side_effect=RuntimeError("not found"), __name__=function)
+    with pytest.raises(InputError, match=f"needs {library}, which cuda.bindings does not find"):
+        cuda_kernels._call(missing)
 
-    monkeypatch.setattr(cuda, "kernels", fail)
-    cuda._available.cache_clear()
-    with FakeTensorMode():
-        mean = torch.empty(1, 3, 2, device="cuda")
-    with pytest.warns(UserWarning, match="slow maker 'reference': no driver") as warned:
-        chosen = [_choose("auto", mean) for _ in range(2)]
-    assert chosen == ["reference", "reference"]
+
+def test_auto_falls_back_to_the_reference_with_one_warning(monkeypatch):
+    monkeypatch.setattr(cuda_kernels, "kernels", mock.Mock(side_effect=cuda_kernels.CudaUnavailable("no driver")))
+    rasterize_package._cuda_compiles.cache_clear()
+    device = torch.device("cuda")
+    with pytest.warns(UserWarning, match="slow backend 'reference': no driver") as warned:
+        assert [available_backends(device) for _ in range(2)] == [("reference",)] * 2
     assert len(warned) == 1
-    cuda._available.cache_clear()
-    monkeypatch.setattr(cuda, "kernels", lambda device: None)
-    assert _choose("auto", mean) == "cuda"
-    assert _choose("auto", mean.double()) == "reference"
-    cuda._available.cache_clear()
+    rasterize_package._cuda_compiles.cache_clear()
+    monkeypatch.setattr(cuda_kernels, "kernels", mock.Mock())
+    assert available_backends("cuda") == ("cuda", "reference")
+    with FakeTensorMode():
+        mean, cholesky = torch.empty(1, 3, 2, device="cuda"), torch.empty(3, 3, device="cuda")
+        assert rasterize_package._fast(mean, cholesky, mean, "auto", None)
+        assert not rasterize_package._fast(mean.double(), cholesky.double(), mean.double(), "auto", None)
+    rasterize_package._cuda_compiles.cache_clear()
 
 
 # -------------------------------------------------------------------------------------------- the source, run on the CPU
 
 
 class KernelsOnCpu:
-    """Launches like `nvrtc.Kernels`, on the CPU."""
+    """Launch like `cuda_kernels.Kernels`, on the CPU."""
 
     def __init__(self, library: Path) -> None:
         self._library = ctypes.CDLL(str(library))
 
     def launch(self, kernel, blocks, threads, *arguments):
-        pointers = (ctypes.c_void_p * len(arguments))(*(ctypes.addressof(a) for a in arguments))
+        values = cuda_kernels.packed(*arguments)
+        pointers = (ctypes.c_void_p * len(values))(*(value.ctypes.data for value in values))
         assert self._library.launch(kernel.encode(), ctypes.c_uint(blocks), threads, pointers) == 0
+
+
+def build(library, *options):
+    """Compile the kernels for the CPU."""
+    if shutil.which("g++") is None or sys.platform != "linux":
+        pytest.skip("needs g++ on Linux")
+    command = ["g++", "-std=c++17", "-ffp-contract=off", "-shared", "-fPIC", f"-I{cuda_kernels.SOURCE.parent}"]
+    subprocess.run([*command, *options, str(SHIM / "rasterize.cpp"), "-o", str(library)], check=True)
 
 
 @pytest.fixture(scope="module")
 def shim(tmp_path_factory):
-    """Lets the CUDA maker's operators draw CPU tensors; gives the library, which is a stand-in for the driver, too."""
-    if shutil.which("g++") is None or sys.platform != "linux":
-        pytest.skip("needs g++ on Linux")
+    """Let the operators render CPU tensors with the CUDA backend."""
     library = tmp_path_factory.mktemp("shim") / "rasterize.so"
-    flags = [f"-fsanitize={SANITIZERS}", "-fno-sanitize-recover=all", "-O1"] if SANITIZERS else ["-O2"]
-    command = ["g++", "-std=c++17", *flags, "-ffp-contract=off", "-shared", "-fPIC", f"-I{cuda.SOURCE.parent}"]
-    subprocess.run([*command, str(SHIM / "rasterize.cpp"), str(SHIM / "driver.cpp"), "-o", str(library)], check=True)
+    build(library, *([f"-fsanitize={SANITIZERS}", "-fno-sanitize-recover=all", "-O1"] if SANITIZERS else ["-O2"]))
     on_cpu, on_gpu = KernelsOnCpu(library), cuda.kernels
-    cuda._rasterize.register_kernel("cpu", cuda._draw)
-    cuda._rasterize_backward.register_kernel("cpu", cuda._draw_backward)
-    cuda._magnitude.register_kernel("cpu", cuda._draw_magnitude)
-    cuda._magnitude_backward.register_kernel("cpu", cuda._draw_magnitude_backward)
     with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(operators.BACKENDS, "cpu", cuda.__name__)
         patch.setattr(cuda, "kernels", lambda device: on_cpu if device.type == "cpu" else on_gpu(device))
-        yield library
+        yield
 
 
-def test_launches_as_the_driver_expects(shim, compiler, tmp_path, monkeypatch):
-    load = nvrtc._load
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(
-        nvrtc, "_load", lambda what, names: ctypes.CDLL(str(shim)) if "driver" in what else load(what, names)
-    )
-    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (9, 0))
-    monkeypatch.setattr(torch.cuda, "device", lambda device: contextlib.nullcontext())
-    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
-    monkeypatch.setattr(torch.cuda, "current_stream", lambda: SimpleNamespace(cuda_stream=0x123456789ABC))
-    kernels = nvrtc.Kernels(cuda.SOURCE.read_text(), torch.device("cpu"))
-    inputs = [x.detach() for x in random_scene(4, 2)]
-    grid = AngularGrid.hemisphere(17, 33)
-    expected = cuda.rasterize(*inputs, grid, 1e-4)
-    monkeypatch.setattr(cuda, "kernels", lambda device: kernels)
-    assert torch.equal(cuda.rasterize(*inputs, grid, 1e-4), expected)
-    with pytest.raises(
-        nvrtc.CudaUnavailable, match="cuModuleGetFunction of other failed on cpu: named symbol not found"
-    ):
-        kernels.launch("other", 1, 32)
+@pytest.mark.usefixtures("architectures")
+def test_cuda_bindings_launch_the_kernels_on_a_stand_in_for_the_driver(tmp_path):
+    build(tmp_path / "libcuda.so.1", "-O2", "-fvisibility=hidden", str(SHIM / "driver.cpp"))
+    command = [sys.executable, str(SHIM / "launch.py")]
+    environment = os.environ | {"LD_LIBRARY_PATH": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("cuModuleGetFunction failed with CUDA_ERROR_NOT_FOUND; use backend='reference'")
 
 
 @pytest.fixture
@@ -198,8 +162,8 @@ def poisoned():
 def assert_close(case, cutoff, device="cpu"):
     """A and |A|, in value and gradient, within the table of tolerances."""
     for value, gradient in (
-        field_errors(cuda.rasterize, case, cutoff, device),
-        magnitude_errors(cuda.magnitude, case, cutoff, device),
+        field_errors(operators.field, case, cutoff, device),
+        magnitude_errors(operators.magnitude, case, cutoff, device),
     ):
         assert value < VALUE_TOLERANCE[cutoff] * case.slack
         assert gradient < GRADIENT_TOLERANCE[cutoff] * case.slack
@@ -221,7 +185,7 @@ def test_small_hard_cases(case, cutoff):
 @pytest.mark.parametrize("per_position", [False, True])
 @pytest.mark.parametrize(("shape", "n"), [((7, 12), 33), ((16, 16), 50), ((17, 33), 100), ((30, 120), 40)])
 @pytest.mark.usefixtures("shim", "poisoned")
-def test_agrees_with_the_definition(shape, n, per_position, cutoff):
+def test_agrees_with_the_reference(shape, n, per_position, cutoff):
     grid = AngularGrid.hemisphere(*shape)
     assert_close(ordinary(random_scene(n, 3, per_position=per_position, grid=grid), grid), cutoff)
 
@@ -246,29 +210,29 @@ def test_agrees_on_the_measured_grid(n):
 @pytest.mark.usefixtures("shim", "poisoned")
 def test_small_tiles_that_nothing_reaches_are_zero():
     mean, cholesky = degrees((180.0, 45.0)), torch.tensor([[0.05, 0.0, 0.05]])
-    drawn = cuda.rasterize(mean, cholesky, torch.ones(1, 1, 2), AngularGrid.hemisphere(30, 120), 1e-4)
-    assert 0 < torch.count_nonzero(drawn) < 400
-    assert drawn.isfinite().all()
+    rendered = operators.field(mean, cholesky, torch.ones(1, 1, 2), AngularGrid.hemisphere(30, 120), 1e-4)
+    assert 0 < torch.count_nonzero(rendered) < 400
+    assert rendered.isfinite().all()
 
 
 @pytest.mark.parametrize(("batch", "n"), [(2, 0), (0, 4), (0, 0)])
 @pytest.mark.usefixtures("shim", "poisoned")
-def test_small_nothing_to_draw(batch, n):
+def test_small_nothing_to_render(batch, n):
     inputs = [x.requires_grad_() for x in (torch.zeros(batch, n, 2), torch.ones(n, 3), torch.zeros(batch, n, 2))]
-    drawn = cuda.rasterize(*inputs, AngularGrid.hemisphere(17, 33), 1e-4)
-    assert drawn.shape == (batch, 2, 17, 33)
-    assert not drawn.any()
-    for gradient, x in zip(torch.autograd.grad(drawn.sum(), inputs), inputs, strict=True):
+    rendered = operators.field(*inputs, AngularGrid.hemisphere(17, 33), 1e-4)
+    assert rendered.shape == (batch, 2, 17, 33)
+    assert not rendered.any()
+    for gradient, x in zip(torch.autograd.grad(rendered.sum(), inputs), inputs, strict=True):
         assert torch.equal(gradient, torch.zeros_like(x))
 
 
 @pytest.mark.usefixtures("shim")
-def test_cutoff_means_what_it_means_to_the_definition():
+def test_cutoff_agrees_with_the_reference():
     grid = AngularGrid.hemisphere(30, 120)
     mean, cholesky = degrees((100.0, 45.0)), torch.tensor([[0.3, 0.1, 0.2]])
-    drawn = cuda.rasterize(mean, cholesky, torch.ones(1, 1, 2), grid, 1e-2)
-    exact = reference.rasterize(mean.double(), cholesky.double(), torch.ones(1, 1, 2, dtype=torch.float64), grid, 1e-2)
-    assert torch.equal(drawn != 0, exact != 0)
+    rendered = operators.field(mean, cholesky, torch.ones(1, 1, 2), grid, 1e-2)
+    exact = reference.field(mean.double(), cholesky.double(), torch.ones(1, 1, 2, dtype=torch.float64), grid, 1e-2)
+    assert torch.equal(rendered != 0, exact != 0)
 
 
 @pytest.mark.usefixtures("shim")
@@ -292,10 +256,10 @@ def check_bits(device):
 
 
 def value_and_gradients(inputs, grid, cotangent):
-    """What the CUDA maker draws, and its gradients."""
+    """Return the field of the CUDA backend and its gradients."""
     leaves = [x.detach().requires_grad_() for x in inputs]
-    drawn = cuda.rasterize(*leaves, grid, 1e-4)
-    return drawn.detach(), torch.autograd.grad(drawn, leaves, cotangent)
+    rendered = operators.field(*leaves, grid, 1e-4)
+    return rendered.detach(), torch.autograd.grad(rendered, leaves, cotangent)
 
 
 @pytest.mark.usefixtures("shim", "poisoned")
@@ -305,36 +269,38 @@ def test_magnitude_is_that_of_the_field_and_has_no_gradient_where_nothing_is():
     leaves = [
         x.requires_grad_() for x in (degrees((180.0, 45.0)), torch.tensor([[0.05, 0.0, 0.05]]), torch.ones(1, 1, 2))
     ]
-    drawn = cuda.magnitude(*leaves, grid, 1e-4)
-    torch.testing.assert_close(drawn, magnitude(cuda.rasterize(*leaves, grid, 1e-4)))
-    assert torch.equal(drawn, cuda.magnitude(*(x.detach() for x in leaves), grid, 1e-4))
-    assert bool((drawn == 0).any())
-    assert all(gradient.isfinite().all() for gradient in torch.autograd.grad(drawn.sum(), leaves))
+    rendered = operators.magnitude(*leaves, grid, 1e-4)
+    torch.testing.assert_close(rendered, magnitude(operators.field(*leaves, grid, 1e-4)))
+    assert torch.equal(rendered, operators.magnitude(*(x.detach() for x in leaves), grid, 1e-4))
+    assert bool((rendered == 0).any())
+    assert all(gradient.isfinite().all() for gradient in torch.autograd.grad(rendered.sum(), leaves))
 
 
 @pytest.mark.usefixtures("shim")
 def test_takes_strided_and_misaligned_tensors():
     grid = AngularGrid.hemisphere(17, 33)
     mean, cholesky, weight = (x.detach() for x in random_scene(20, 1, grid=grid))
-    expected = cuda.rasterize(mean.repeat(3, 1, 1), cholesky, weight.repeat(3, 1, 1), grid, 1e-4)
+    expected = operators.field(mean.repeat(3, 1, 1), cholesky, weight.repeat(3, 1, 1), grid, 1e-4)
     misaligned = torch.cat([torch.zeros(1), weight.flatten()])[1:].view_as(weight)
     assert misaligned.data_ptr() % 8
-    assert torch.equal(cuda.rasterize(mean.expand(3, -1, -1), cholesky, weight.expand(3, -1, -1), grid, 1e-4), expected)
-    assert torch.equal(cuda.rasterize(mean, cholesky, misaligned, grid, 1e-4), expected[:1])
+    assert torch.equal(
+        operators.field(mean.expand(3, -1, -1), cholesky, weight.expand(3, -1, -1), grid, 1e-4), expected
+    )
+    assert torch.equal(operators.field(mean, cholesky, misaligned, grid, 1e-4), expected[:1])
 
 
 @pytest.mark.usefixtures("shim")
 def test_operator_refuses_other_dtypes():
     mean, cholesky, weight = (x.detach() for x in random_scene(4, 1))
     with pytest.raises(InputError, match=r"expected float32 tensors on cpu, got torch\.float64"):
-        cuda.rasterize(mean, cholesky.double(), weight, AngularGrid.hemisphere(17, 33), 1e-4)
+        operators.field(mean, cholesky.double(), weight, AngularGrid.hemisphere(17, 33), 1e-4)
 
 
 @pytest.mark.usefixtures("shim")
 def test_a_primitive_that_is_not_a_number_shows():
     mean, cholesky, weight = (x.detach() for x in random_scene(4, 1))
     mean[0, 1, 0] = float("nan")
-    assert cuda.rasterize(mean, cholesky, weight, AngularGrid.hemisphere(17, 33), 1e-4).isnan().any()
+    assert operators.field(mean, cholesky, weight, AngularGrid.hemisphere(17, 33), 1e-4).isnan().any()
 
 
 @pytest.mark.usefixtures("shim")
@@ -345,13 +311,13 @@ def test_operators_are_registered_properly():
 def check_registration(device):
     """PyTorch's own checks of the operators."""
     inputs = [x.detach().to(device).requires_grad_() for x in random_scene(4, 2)]
-    torch.library.opcheck(cuda._rasterize, (*inputs, 0.1, 0.2, 5, 0.0, 9, 1e-4))
+    torch.library.opcheck(operators._field, (*inputs, 0.1, 0.2, 5, 0.0, 9, 1e-4))
     grad = torch.ones(2, 2, 5, 9, device=device)
-    torch.library.opcheck(cuda._rasterize_backward, (grad, *(x.detach() for x in inputs), 0.1, 0.2, 5, 0.0, 9, None))
-    drawn, phase = cuda._magnitude(*inputs, 0.1, 0.2, 5, 0.0, 9, 1e-4, True)
-    torch.library.opcheck(cuda._magnitude, (*(x.detach() for x in inputs), 0.1, 0.2, 5, 0.0, 9, 1e-4, False))
-    tensors = (x.detach() for x in (drawn, phase, *inputs))
-    torch.library.opcheck(cuda._magnitude_backward, (*tensors, 0.1, 0.2, 5, 0.0, 9, None))
+    torch.library.opcheck(operators._field_gradients, (grad, *(x.detach() for x in inputs), 0.1, 0.2, 5, 0.0, 9, None))
+    rendered, phase = operators._magnitude(*inputs, 0.1, 0.2, 5, 0.0, 9, 1e-4, True)
+    torch.library.opcheck(operators._magnitude, (*(x.detach() for x in inputs), 0.1, 0.2, 5, 0.0, 9, 1e-4, False))
+    tensors = (x.detach() for x in (rendered, phase, *inputs))
+    torch.library.opcheck(operators._magnitude_gradients, (*tensors, 0.1, 0.2, 5, 0.0, 9, None))
 
 
 @pytest.mark.usefixtures("shim")
@@ -364,14 +330,14 @@ def check_full_graph(device, backend):
     grid = AngularGrid.hemisphere(7, 12)
     inputs = [x.detach().to(device).requires_grad_() for x in random_scene(4, 2)]
 
-    def draw(*tensors):
-        return cuda.magnitude(*tensors, grid, 1e-4)
+    def render(*tensors):
+        return operators.magnitude(*tensors, grid, 1e-4)
 
-    compiled = torch.compile(draw, fullgraph=True, backend=backend)
-    torch.testing.assert_close(compiled(*inputs), draw(*inputs))
+    compiled = torch.compile(render, fullgraph=True, backend=backend)
+    torch.testing.assert_close(compiled(*inputs), render(*inputs))
     for a, b in zip(
         torch.autograd.grad(compiled(*inputs).sum(), inputs),
-        torch.autograd.grad(draw(*inputs).sum(), inputs),
+        torch.autograd.grad(render(*inputs).sum(), inputs),
         strict=True,
     ):
         torch.testing.assert_close(a, b)
@@ -416,7 +382,7 @@ def test_gpu_hard_cases(case, cutoff):
 @pytest.mark.parametrize("per_position", [False, True])
 @pytest.mark.parametrize(("shape", "n"), [((16, 16), 50), ((17, 33), 100), ((30, 120), 40)])
 @pytest.mark.usefixtures("poisoned")
-def test_gpu_agrees_with_the_definition(shape, n, per_position):
+def test_gpu_agrees_with_the_reference(shape, n, per_position):
     grid = AngularGrid.hemisphere(*shape)
     for cutoff in (None, 1e-4):
         assert_close(ordinary(random_scene(n, 3, per_position=per_position, grid=grid), grid), cutoff, "cuda")
@@ -435,27 +401,27 @@ def test_gpu_same_bits_twice_and_whatever_the_batch():
 
 
 @pytest.mark.cuda
-def test_gpu_is_what_auto_draws_with():
+def test_gpu_is_what_auto_renders_with():
     inputs = [x.detach().cuda() for x in random_scene(20, 2)]
     grid = AngularGrid.hemisphere(17, 33)
-    assert torch.equal(rasterize(*inputs, grid), rasterize(*inputs, grid, maker="cuda"))
+    assert torch.equal(rasterize(*inputs, grid), rasterize(*inputs, grid, backend="cuda"))
     doubles = [x.double() for x in inputs]
-    assert torch.equal(rasterize(*doubles, grid), rasterize(*doubles, grid, maker="reference"))
+    assert torch.equal(rasterize(*doubles, grid), rasterize(*doubles, grid, backend="reference"))
 
 
 @pytest.mark.cuda
 def test_gpu_follows_the_current_stream():
     grid = AngularGrid.hemisphere(90, 360)
     inputs = [x.cuda() for x in many(1000, grid)]
-    expected = cuda.rasterize(*inputs, grid, 1e-4)
+    expected = operators.field(*inputs, grid, 1e-4)
     other = torch.cuda.Stream()
     other.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(other):
         torch.cuda._sleep(50_000_000)  # cycles: a launch on another stream would overtake the next line
         late = [x * 1 for x in inputs]
-        drawn = cuda.rasterize(*late, grid, 1e-4)
+        rendered = operators.field(*late, grid, 1e-4)
     other.synchronize()
-    assert torch.equal(drawn, expected)
+    assert torch.equal(rendered, expected)
 
 
 @pytest.mark.cuda
@@ -465,8 +431,8 @@ def test_gpu_graph_capture():
     cotangent = torch.ones(2, 2, *grid.shape, device="cuda")
 
     def step():
-        drawn = cuda.rasterize(*leaves, grid, 1e-4)
-        return drawn, *torch.autograd.grad(drawn, leaves, cotangent)
+        rendered = operators.field(*leaves, grid, 1e-4)
+        return rendered, *torch.autograd.grad(rendered, leaves, cotangent)
 
     side = torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
@@ -499,9 +465,9 @@ def test_gpu_every_device():
         pytest.skip("needs two GPUs")
     grid = AngularGrid.hemisphere(17, 33)
     inputs = [x.detach() for x in random_scene(20, 2, grid=grid)]
-    drawn = [cuda.rasterize(*(x.to(f"cuda:{i}") for x in inputs), grid, 1e-4) for i in (1, 0)]
-    assert [d.device.index for d in drawn] == [1, 0]
-    torch.testing.assert_close(drawn[0].cpu(), drawn[1].cpu())
+    rendered = [operators.field(*(x.to(f"cuda:{i}") for x in inputs), grid, 1e-4) for i in (1, 0)]
+    assert [d.device.index for d in rendered] == [1, 0]
+    torch.testing.assert_close(rendered[0].cpu(), rendered[1].cpu())
 
 
 @pytest.mark.cuda

@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 
 import pytest
 import torch
 
-from swiftwrf import InputError, simulated_room
+from swiftwrf import AngularGrid, InputError, load, simulated_room
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.store import Store
 from swiftwrf.gp import Kernel
 from swiftwrf.metrics import psnr
-from swiftwrf.models.geometry import GeometryConfig, GeometryModel, fit_geometry
+from swiftwrf.models.geometry import GeometryConfig, GeometryModel, Plane, fit_geometry, refit_geometry
+from swiftwrf.models.geometry.ambiguity import _Table, turned
 from swiftwrf.models.geometry.fit import _completed, _settled, observe, split
-from swiftwrf.models.geometry.hybrid import HybridModel, _strengths, fit_hybrid
+from swiftwrf.models.geometry.hybrid import HybridModel, fit_hybrid
 from swiftwrf.models.geometry.images import Scene, field, image_gain, images, mirror, sequences
-from swiftwrf.models.geometry.observe import autocorrelation, correlations, element_phases
+from swiftwrf.models.geometry.path_gains import PathGains, fit_path_gains
+from swiftwrf.models.geometry.phase_retrieval import autocorrelation, correlations, element_phases
 from swiftwrf.models.geometry.planes import Planes
 from swiftwrf.models.geometry.refine import derivatives
+from swiftwrf.models.geometry.responses import Waves
 from swiftwrf.models.geometry.search import SIGNS
-from swiftwrf.models.geometry.strengths import Strengths, fit_strengths
-from swiftwrf.models.geometry.turns import _Table, turned
-from swiftwrf.models.geometry.waves import Waves
+from swiftwrf.models.nearest import NearestModel
+from swiftwrf.runtime.checkpoint import write
 from swiftwrf.testing.rooms import ARRAY, GRID, mirror_room
 
 QUICK = GeometryConfig(reach=2.0, width=2)
@@ -265,8 +268,8 @@ def test_pure_noise_has_no_certain_plane():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"array": None}, "which array"),
-        ({"rotation": None}, "how the array is turned"),
+        ({"array": None}, "needs the array, which"),
+        ({"rotation": None}, "needs the fixed end"),
         ({"fixed_position": None}, "fixed end"),
         ({"array": PlanarArray.square(4, 915e6, spacing=0.11)}, "check its geometry and carrier"),
     ],
@@ -285,14 +288,14 @@ def test_the_same_seed_finds_the_same_room_and_draws_the_same_spectra(noisy, roo
     few = noisy.subset(torch.arange(12))
     quick = {"reach": 0.5, "width": 1, "further": 0}
     assert fit(few, **quick).to_json() == fit(few, **quick).to_json()
-    drawn = [room.synthesize(noisy.position[:5], torch.Generator().manual_seed(s)) for s in (1, 1, 2)]
+    drawn = [room.sample(noisy.position[:5], generator=torch.Generator().manual_seed(s)) for s in (1, 1, 2)]
     assert torch.equal(drawn[0], drawn[1])
     assert not torch.equal(drawn[0], drawn[2])
 
 
 def test_draws_differ_from_the_mean_as_much_as_measurements_do(noisy, room):
     mean = room.synthesize(noisy.position)
-    drawn = [room.synthesize(noisy.position, torch.Generator().manual_seed(seed)) for seed in range(32)]
+    drawn = [room.sample(noisy.position, generator=torch.Generator().manual_seed(seed)) for seed in range(32)]
     assert mean.shape == drawn[0].shape == noisy.spectrum.shape
     apart = torch.cat([psnr(one, mean) for one in drawn]).median() - psnr(noisy.spectrum, mean).median()
     assert abs(float(apart)) < 4
@@ -324,7 +327,14 @@ def test_hybrid_is_not_worse_than_geometry():
     assert torch.equal(again.synthesize(test.position), hybrid.synthesize(test.position))
 
 
-def test_strengths_follow_a_shadow():
+def with_path_gains(hybrid, path_gains):
+    """A copy of the hybrid with other path gains."""
+    other = copy(hybrid)
+    other.path_gains = path_gains
+    return other
+
+
+def test_path_gains_follow_a_shadow():
     """A wall that does not reflect to one half of the region: its amplitude is known where the phases say so."""
     whole, bare = mirror_room(SIX, n=140), mirror_room({n: o for n, o in SIX.items() if n != (0, 0, 1)}, n=140)
     hidden = whole.position[:, 0] > 2.5
@@ -333,42 +343,122 @@ def test_strengths_follow_a_shadow():
     train, test = data.subset(torch.arange(0, 110)), data.subset(torch.arange(110, 140))
     room = fit(train, further=0, width=1)
     hybrid = fit_hybrid(train, room)
-    assert hybrid.strengths is not None
+    assert hybrid.path_gains is not None
     gained = psnr(hybrid.synthesize(test.position), test.spectrum) - psnr(room.synthesize(test.position), test.spectrum)
     assert float(gained.median()) > 5
-    alone = replace(hybrid.strengths, readout=hybrid.strengths.readout[:, :1])  # one of the fields that are averaged
-    drawn = hybrid.synthesize(test.position, torch.Generator().manual_seed(0))
-    for worse in (replace(hybrid, strengths=alone).synthesize(test.position), drawn):
+    one = replace(hybrid.path_gains, readout=hybrid.path_gains.readout[:, :1])  # one of the fields that are averaged
+    sample = hybrid.sample(test.position, generator=torch.Generator().manual_seed(0))
+    for worse in (with_path_gains(hybrid, one).synthesize(test.position), sample):
         assert float(psnr(worse, test.spectrum).median()) < float(
             psnr(hybrid.synthesize(test.position), test.spectrum).median()
         )
     again = HybridModel.from_state(*hybrid.state())
     assert torch.equal(again.synthesize(test.position), hybrid.synthesize(test.position))
-    tensors, header = hybrid.state()
-    with pytest.raises(InputError, match=r"strengths\.readout has shape"):
-        HybridModel.from_state({**tensors, "strengths.readout": tensors["strengths.readout"][:, :, 1:]}, header)
-    like = fit_hybrid(train.subset(torch.arange(60)), room, like=hybrid)
-    assert like.strengths is not None
-    assert like.strengths.kernel == hybrid.strengths.kernel
+    like = HybridModel().fit(train.subset(torch.arange(60)), like=hybrid)
+    assert like.path_gains is not None
+    assert like.path_gains.kernel == hybrid.path_gains.kernel
+    assert [plane.normal for plane in like.room.planes] == [plane.normal for plane in room.planes]
 
 
-def test_strengths_are_held_out_from_spectra_that_were_not_observed_too(monkeypatch):
+def test_path_gains_are_held_out_from_spectra_without_observed_phases_too(monkeypatch):
     """What stands for predictions of one fold follows from the observed spectra of the other folds."""
     monkeypatch.setattr("swiftwrf.models.geometry.fit.MOST", 40)
     data, fold = mirror_room(SIX, n=80), torch.arange(80) % 3
-    room = fit(data, further=0, width=1)
     kernel = Kernel(long=0.5, short=1.0, share=1.0, noise=1e-3)
-    chosen = Strengths(kernel, data.position, torch.zeros(80, 1, 1, 2))
-    like = HybridModel(room, chosen, 1.0, kernel, data.position, torch.zeros(80, 0), torch.zeros(1, 1))
-    _, known = _strengths(data, room, fold, 0, like)
+    hybrid, like = HybridModel(), HybridModel()
+    hybrid._room, hybrid.grid = fit(data, further=0, width=1), data.grid
+    like.path_gains = PathGains(kernel, data.position, torch.zeros(80, 1, 1, 2))
+    known = hybrid._fit_path_gains(data, fold, like)
     scene, rows = observe(data)
     assert len(rows) <= 40
     for number in range(3):
-        fitted = fit_strengths(room, scene.subset((fold[rows] != number).nonzero()[:, 0]), kernel)
-        expected = ARRAY.spectrum(fitted.channel(room, data.position[fold == number]), GRID)
+        fitted = fit_path_gains(hybrid.room, scene.subset((fold[rows] != number).nonzero()[:, 0]), kernel)
+        expected = ARRAY.spectrum(fitted.channel(hybrid.room, data.position[fold == number]), GRID)
         torch.testing.assert_close(known[fold == number], expected)
 
 
-def test_strengths_stay_constant_where_nothing_is_hidden():
+def test_path_gains_stay_constant_where_nothing_is_hidden():
     data = mirror_room(SIX, n=120)
-    assert fit_hybrid(data, fit(data, further=0, width=1)).strengths is None
+    assert fit_hybrid(data, fit(data, further=0, width=1)).path_gains is None
+
+
+@pytest.fixture(scope="module")
+def hybrid(noisy, room):
+    return fit_hybrid(noisy, room)
+
+
+def test_a_room_of_the_same_spectra_is_reused_and_of_others_refined(noisy, room, hybrid):
+    assert hybrid.room.estimate is room.estimate
+    few = noisy.subset(torch.arange(20))
+    for model in (room, hybrid):
+        refined = GeometryModel().fit(few, like=model)
+        assert [plane.normal for plane in refined.planes] == [plane.normal for plane in room.planes]
+        assert refined.to_json() == refit_geometry(room, few).to_json() != room.to_json()
+    with pytest.raises(InputError, match="cannot reuse the structure"):
+        GeometryModel().fit(few, like=NearestModel().fit(few))
+
+
+@pytest.mark.parametrize("moving", ["receiver", "transmitter"])
+def test_spectra_are_differentiable_in_the_position(moving):
+    data = simulated_room(n=40, moving=moving, grid=GRID)
+    walls = [Plane((1.0, 0.0, 0.0), 6.0, -0.5), Plane((0.0, 0.0, -1.0), 0.0, -0.5)]
+    room = GeometryModel.of_planes(data, walls)
+    hybrid = fit_hybrid(data, room)
+    assert hybrid.mixing_weight > 0
+    assert hybrid.readout.shape[1]
+    position = data.position[:3] + 0.02
+    for model in (room, hybrid):
+        weight = torch.rand(3, *data.grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        at = position.clone().requires_grad_()
+        (model.predict(at).mean * weight).sum().backward()
+        for axis in range(3):
+            step = torch.zeros(3, dtype=torch.float64)
+            step[axis] = 5e-4
+            ends = [(model.synthesize(position + sign * step) * weight).sum((1, 2)) for sign in (1, -1)]
+            torch.testing.assert_close(at.grad[:, axis], (ends[0] - ends[1]) / 1e-3, rtol=0.02, atol=1.0)
+
+
+def test_room_predicts_any_grid(noisy, room):
+    """On a grid twice as fine every second pixel is the same."""
+    fine = room.synthesize(noisy.position[:3], AngularGrid.hemisphere(20, 80))
+    torch.testing.assert_close(fine[:, 1::2, ::2], room.synthesize(noisy.position[:3]))
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["element", "rotation", "fixed_position", "covariance", "position", "readout", "component", "path_gains.readout"],
+)
+def test_states_of_wrong_sizes_are_refused(hybrid, name, tmp_path):
+    """Also tensors that only `predict` would need."""
+    some = PathGains(hybrid.kernel, hybrid.position.clone(), torch.zeros(len(hybrid.position), 2, 25, 2))
+    tensors, header = with_path_gains(hybrid, some).state()
+    HybridModel.from_state(tensors, header)
+    cut = tensors[name][:, :1] if name == "element" else tensors[name][:-1]
+    write(tmp_path / "model", HybridModel.kind, tensors | {name: cut}, header)
+    with pytest.raises(InputError):
+        load(tmp_path / "model")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("residual", {"direct": "x"}),
+        ("moving", "reciever"),
+        ("mixing_weight", "x"),
+        ("order", 9),
+        ("planes", [{"normal": [1]}]),
+    ],
+)
+def test_headers_of_wrong_values_are_refused(hybrid, key, value, tmp_path):
+    tensors, header = hybrid.state()
+    write(tmp_path / "model", HybridModel.kind, tensors, header | {key: value})
+    with pytest.raises(InputError):
+        load(tmp_path / "model")
+
+
+@pytest.mark.parametrize(
+    "change", [{"positions": 0}, {"reach": -1.0}, {"max_order": 9}, {"width": 0}, {"validation": "blok"}]
+)
+def test_options_outside_their_range_are_refused(change):
+    with pytest.raises(InputError):
+        GeometryModel(**change)

@@ -12,10 +12,11 @@ from swiftwrf.data.store import Store
 from swiftwrf.gp import Kernel
 from swiftwrf.models.base import make_model
 from swiftwrf.models.swiftwrf.deformation.base import COMPONENTS
-from swiftwrf.models.swiftwrf.deformation.per_primitive_mlp import PerPrimitiveMLP, encode
+from swiftwrf.models.swiftwrf.deformation.per_primitive_mlp import PerPrimitiveMLP
 from swiftwrf.models.swiftwrf.field import DeformableGaussians
 from swiftwrf.models.swiftwrf.loss import spectrum_loss
-from swiftwrf.models.swiftwrf.primitives import FLOOR, Primitives
+from swiftwrf.models.swiftwrf.mlp import encode
+from swiftwrf.models.swiftwrf.primitives import MIN_WIDTH_PIXELS, Primitives
 
 GRID = AngularGrid.hemisphere(15, 60)
 KERNEL = Kernel(long=1.0, short=0.3, share=0.6, noise=1e-2)
@@ -52,8 +53,8 @@ def test_constraints_hold_for_any_parameters(generator):
         for parameter in primitives.parameters():
             parameter.normal_(std=20, generator=generator)
     mean, cholesky, attenuation, _ = primitives()
-    assert (cholesky[:, 0] >= FLOOR * GRID.azimuth_step).all()
-    assert (cholesky[:, 2] >= FLOOR * GRID.elevation_step).all()
+    assert (cholesky[:, 0] >= MIN_WIDTH_PIXELS * GRID.azimuth_step).all()
+    assert (cholesky[:, 2] >= MIN_WIDTH_PIXELS * GRID.elevation_step).all()
     assert ((attenuation >= 0) & (attenuation <= 1)).all()
     assert ((mean >= 0) & (mean <= torch.tensor([2 * torch.pi, torch.pi / 2]) + 1e-6)).all()
 

@@ -1,4 +1,4 @@
-"""The fast maker against the definition, in value and gradient; and what both refuse."""
+"""The CPU backend against the reference, in value and gradient; refused arguments; behaviour without numba."""
 
 from __future__ import annotations
 
@@ -14,26 +14,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from swiftwrf import AngularGrid, InputError, rasterize
+from swiftwrf.rasterize import operators
 from swiftwrf.rasterize.magnitude import magnitude
 from swiftwrf.testing.hard_cases import Case, field_errors
 from swiftwrf.testing.scenes import GRID, random_scene
 from swiftwrf.testing.tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
 
 
-def against_definition(inputs, grid, cutoff):
-    """Value and worst gradient error of the CPU maker."""
+def against_reference(inputs, grid, cutoff):
+    """Return the value error and the largest gradient error of the CPU backend."""
 
-    def draw(mean, cholesky, weight, grid, cutoff):
+    def render(mean, cholesky, weight, grid, cutoff):
         return rasterize(mean, cholesky, weight, grid, "cpu", cutoff)
 
-    return field_errors(draw, Case("", *(x.detach() for x in inputs), grid), cutoff)
+    return field_errors(render, Case("", *(x.detach() for x in inputs), grid), cutoff)
 
 
 @pytest.mark.parametrize("cutoff", [None, 1e-4])
 @pytest.mark.parametrize("per_position", [False, True])
 @pytest.mark.parametrize("batch", [1, 3])
-def test_cpu_agrees_with_the_definition(cutoff, per_position, batch):
-    value, gradient = against_definition(random_scene(batch=batch, per_position=per_position), GRID, cutoff)
+def test_cpu_agrees_with_the_reference(cutoff, per_position, batch):
+    value, gradient = against_reference(random_scene(batch=batch, per_position=per_position), GRID, cutoff)
     assert value < VALUE_TOLERANCE[cutoff]
     assert gradient < GRADIENT_TOLERANCE[cutoff]
 
@@ -42,24 +43,25 @@ def test_cpu_agrees_with_the_definition(cutoff, per_position, batch):
 @given(st.integers(0, 10_000), st.sampled_from([(7, 12), (30, 120), (16, 16)]), st.integers(0, 60))
 def test_cpu_agrees_on_any_scene_and_grid(seed, shape, n):
     grid = AngularGrid.hemisphere(*shape)
-    value, gradient = against_definition(random_scene(n=n, seed=seed, grid=grid), grid, None)
+    value, gradient = against_reference(random_scene(n=n, seed=seed, grid=grid), grid, None)
     assert value < VALUE_TOLERANCE[None]
     assert gradient < GRADIENT_TOLERANCE[None]
 
 
 def test_torch_keeps_its_threads():
-    """numba sets the number of OpenMP, which is that of torch, too."""
+    """Numba sets the number of OpenMP threads, which torch shares. It follows torch as far as it has threads."""
     before = torch.get_num_threads()
-    torch.set_num_threads(numba.config.NUMBA_NUM_THREADS + 1)
     try:
-        inputs = random_scene(batch=3)
-        rasterize(*inputs, GRID, "cpu").sum().backward()
-        assert torch.get_num_threads() == numba.config.NUMBA_NUM_THREADS + 1
+        for number in (numba.config.NUMBA_NUM_THREADS + 1, 1):
+            torch.set_num_threads(number)
+            rasterize(*random_scene(batch=3), GRID, "cpu").sum().backward()
+            assert torch.get_num_threads() == number
+            assert numba.get_num_threads() == min(number, numba.config.NUMBA_NUM_THREADS)
     finally:
         torch.set_num_threads(before)
 
 
-def test_the_first_drawing_keeps_the_number_of_threads():
+def test_the_first_rendering_keeps_the_number_of_threads():
     """Numba starts its threads once a process, and they are as many as the processor has."""
     code = (
         "import torch, swiftwrf; from swiftwrf.rssi.head import Head; "
@@ -73,23 +75,23 @@ def test_the_first_drawing_keeps_the_number_of_threads():
 def test_one_primitive_is_the_gaussian_of_the_formula():
     mean = torch.tensor([[[math.radians(90), math.radians(45)]]])
     cholesky = torch.tensor([[0.3, 0.1, 0.2]])
-    drawn = rasterize(mean, cholesky, torch.tensor([[[2.0, -1.0]]]), GRID, cutoff=None)
+    rendered = rasterize(mean, cholesky, torch.tensor([[[2.0, -1.0]]]), GRID, cutoff=None)
     factor = torch.tensor([[0.3, 0.0], [0.1, 0.2]], dtype=torch.float64)
     offset = torch.stack(
         torch.broadcast_tensors(GRID.azimuth[None, :] - math.radians(90), GRID.elevation[:, None] - math.radians(45)),
         dim=-1,
     )
     kernel = torch.exp(-0.5 * torch.einsum("hwi,ij,hwj->hw", offset, torch.linalg.inv(factor @ factor.T), offset))
-    torch.testing.assert_close(drawn[0, 0].double(), 2 * kernel, atol=1e-6, rtol=0)
-    torch.testing.assert_close(drawn[0, 1].double(), -kernel, atol=1e-6, rtol=0)
+    torch.testing.assert_close(rendered[0, 0].double(), 2 * kernel, atol=1e-6, rtol=0)
+    torch.testing.assert_close(rendered[0, 1].double(), -kernel, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("maker", ["reference", "cpu"])
-def test_azimuth_is_periodic(maker):
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_azimuth_is_periodic(backend):
     mean, cholesky, weight = (x.detach() for x in random_scene())
     turned = mean + torch.tensor([GRID.azimuth_step * 7, 0.0])
-    a = rasterize(mean, cholesky, weight, GRID, maker, cutoff=None)
-    b = rasterize(turned, cholesky, weight, GRID, maker, cutoff=None)
+    a = rasterize(mean, cholesky, weight, GRID, backend, cutoff=None)
+    b = rasterize(turned, cholesky, weight, GRID, backend, cutoff=None)
     torch.testing.assert_close(a.roll(7, dims=-1), b, atol=2e-4, rtol=0)
 
 
@@ -101,20 +103,53 @@ def test_same_bits_twice_and_whatever_the_batch():
         assert torch.equal(whole[i], rasterize(mean[i], cholesky, weight[i], GRID, "cpu"))
 
 
-@pytest.mark.parametrize("maker", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
 @pytest.mark.parametrize(("batch", "n"), [(2, 0), (0, 4)])
-def test_nothing_to_draw(maker, batch, n):
+def test_nothing_to_render(backend, batch, n):
     mean, cholesky, weight = torch.zeros(batch, n, 2), torch.ones(n, 3), torch.zeros(batch, n, 2)
-    drawn = rasterize(mean, cholesky, weight, GRID, maker)
-    assert drawn.shape == (batch, 2, *GRID.shape)
-    assert not drawn.any()
+    rendered = rasterize(mean, cholesky, weight, GRID, backend)
+    assert rendered.shape == (batch, 2, *GRID.shape)
+    assert not rendered.any()
 
 
-def test_custom_operator_is_registered_properly():
-    from swiftwrf.rasterize.cpu import _rasterize
-
+def test_operators_are_registered_properly():
     mean, cholesky, weight = random_scene(n=4, batch=2)
-    torch.library.opcheck(_rasterize, (mean, cholesky, weight, 10, 20, 1e-4))
+    options = (0.1, 0.2, 10, 0.0, 20, 1e-4)
+    torch.library.opcheck(operators._field, (mean, cholesky, weight, *options))
+    torch.library.opcheck(operators._magnitude, (*(x.detach() for x in (mean, cholesky, weight)), *options, False))
+
+
+def test_torch_compile_traces_the_whole_function():
+    inputs = random_scene(n=4, batch=2)
+    compiled = torch.compile(lambda *x: rasterize(*x, GRID), fullgraph=True, backend="aot_eager")
+    assert torch.equal(compiled(*inputs), rasterize(*inputs, GRID))
+
+
+def test_without_numba_the_reference_renders():
+    code = """
+import sys
+sys.modules["numba"] = None
+import warnings, torch, swiftwrf
+from swiftwrf.rasterize import available_backends
+from swiftwrf.runtime.threads import set_threads
+from swiftwrf.testing.scenes import GRID, random_scene
+
+set_threads(1)
+inputs = [x.detach() for x in random_scene()]
+with warnings.catch_warnings(record=True) as caught:
+    rendered = swiftwrf.rasterize(*inputs, GRID)
+print(available_backends("cpu"), caught[0].message)
+assert torch.equal(rendered, swiftwrf.rasterize(*inputs, GRID, "reference"))
+try:
+    swiftwrf.rasterize(*inputs, GRID, "cpu")
+except swiftwrf.InputError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.splitlines() == [
+        "('reference',) rendering with the slow backend 'reference': the package numba is not installed",
+        "backend 'cpu' needs the package numba; install it or use backend='reference'",
+    ], done.stderr
 
 
 @pytest.mark.parametrize(
@@ -134,14 +169,14 @@ def test_refuses_what_does_not_fit(change, says):
         rasterize(*change(*(x.detach() for x in random_scene())), GRID)
 
 
-def test_refuses_makers_and_cutoffs_that_do_not_exist():
+def test_refuses_unknown_backends_and_cutoffs_out_of_range():
     inputs = [x.detach() for x in random_scene()]
-    with pytest.raises(InputError, match="unknown maker"):
-        rasterize(*inputs, GRID, maker="opengl")
-    with pytest.raises(InputError, match="cutoff"):
+    with pytest.raises(InputError, match="backend must be 'auto' or 'reference' or 'cpu' or 'cuda', got 'opengl'"):
+        rasterize(*inputs, GRID, backend="opengl")
+    with pytest.raises(InputError, match=r"cutoff must be a number above 0 and below 1 or None, got 1\.0"):
         rasterize(*inputs, GRID, cutoff=1.0)
     with pytest.raises(InputError, match="float32 tensors on cpu"):
-        rasterize(*(x.double() for x in inputs), GRID, maker="cpu")
+        rasterize(*(x.double() for x in inputs), GRID, backend="cpu")
 
 
 def test_magnitude_has_no_gradient_at_zero():
@@ -159,18 +194,18 @@ from tasks.rssi.predictors import PREDICTORS, Settings
 
 predictor = PREDICTORS["swiftwrf"].make(Settings())
 synthesizer = make_synthesizer("swiftwrf", OfSynthesizers(progress=False))
-print(len(cpu.draw.signatures))
+print(len(cpu.render.signatures))
 room = simulated_room(n=30)
 predictor.fit(rssi_room(30)), synthesizer.fit(room)
 predictor.predict(room.position), synthesizer.synthesize(room.position)
-print(len(cpu.draw.signatures))
+print(len(cpu.render.signatures))
 """
     done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True)
     assert done.stdout.split() == ["1", "1"]
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU's rasterizer speaks to torch's compiler")
-def test_importing_and_drawing_leave_torchs_compiler_alone():
+def test_importing_and_rendering_leave_torchs_compiler_alone():
     """It would be a third of the seconds before a command says anything, and half of those of a small fit."""
     code = (
         "import sys, tasks.rssi.__main__\n"

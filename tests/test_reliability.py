@@ -16,6 +16,7 @@ from quick import run, said
 from swiftwrf import InputError
 from swiftwrf.runtime import durable
 from tasks.claim import Claim
+from tasks.command import main
 from tasks.page.records import Records
 from tasks.records import read_table, write_table
 from tasks.report import merge
@@ -81,6 +82,12 @@ def test_a_failed_start_leaves_nothing(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+def test_the_console_script_finds_the_task_of_a_run(stopped):
+    with quick.quick():
+        assert main(["resume", str(stopped)]) == 0
+    assert (stopped.with_name("run") / "report.html").exists()
+
+
 def test_resume_refuses_another_configuration(stopped, capsys):
     file = stopped / "config.json"
     content = json.loads(file.read_text())
@@ -113,12 +120,18 @@ def test_resume_refuses_changed_data(tmp_path, monkeypatch, capsys):
 
 
 def test_resume_refuses_other_versions(stopped, capsys):
-    """A library of another version computes other numbers; on a cluster, too, such workers are refused."""
+    """A library or this project in another version computes other numbers."""
     file = stopped / "environment.json"
     content = json.loads(file.read_text())
     file.write_text(json.dumps(content | {"packages": content["packages"] | {"torch": "0.1"}}))
     assert run("rssi", "--resume", stopped) == 2
     assert "began with torch 0.1; go on with these" in said(capsys)
+    file.write_text(json.dumps(content | {"packages": content["packages"] | {"swiftwrf-tasks": "0.0.1"}}))
+    assert run("rssi", "--resume", stopped) == 2
+    assert "began with swiftwrf-tasks 0.0.1; go on with these" in said(capsys)
+    file.write_text(json.dumps(content | {"commit": "0123456789ab"}))
+    assert run("rssi", "--resume", stopped) == 2
+    assert "began with commit 0123456789ab; go on with these" in said(capsys)
     file.write_text(json.dumps(content | {"packages": 3}))
     assert run("rssi", "--resume", stopped) == 2
     assert "began with other libraries" in said(capsys)

@@ -17,8 +17,6 @@ import pytest
 import torch
 from quick import run, said
 
-from augment import Settings, make_synthesizer
-from augment.synthesizers.raytrace import planes
 from swiftwrf import AngularGrid, GeometryModel, InputError, load_spectra, simulated_room
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.data.raytraced import ROOMS, FurnishedRoom, Material, Scene, Surface, Tracing, outline, sionna, trace
@@ -26,7 +24,7 @@ from swiftwrf.data.raytraced.surfaces import box
 from swiftwrf.data.raytraced.trace import _first
 from swiftwrf.data.simulated.room import Room
 from swiftwrf.models.geometry import Plane
-from swiftwrf.models.geometry.sample import Residual
+from swiftwrf.models.raytrace import RaytraceModel, surfaces
 from tasks.scenes import draw_positions
 
 FREQUENCY = 2.4e9
@@ -346,21 +344,18 @@ def test_the_synthesizer_draws_the_spectra_of_its_scene(ray_tracer, tmp_path):
     """Traced twice, once as data and once from the scene's name, they are the same; so is the moving array, turned."""
     run("scenes", *OPTIONS[:4], "--positions", 6, "--out", tmp_path / "scene")
     data = load_spectra(tmp_path / "scene", grid=AngularGrid.hemisphere(15, 60))
-    synthesizer = make_synthesizer("raytrace", Settings(scene="bedroom", progress=False))
-    synthesizer.fit(data)
-    torch.testing.assert_close(synthesizer.synthesize(data.position), data.spectrum, rtol=0, atol=2e-3)
+    model = RaytraceModel(scene="bedroom").fit(data)
+    torch.testing.assert_close(model.synthesize(data.position), data.spectrum, rtol=0, atol=2e-3)
     outside = torch.tensor([[50.0, 0, 0], [1e300, 0, 0]], dtype=torch.float64)
-    assert not synthesizer.synthesize(outside).any()
+    assert not model.synthesize(outside).any()
+    again = RaytraceModel.from_state(*model.state())
+    torch.testing.assert_close(again.synthesize(data.position), model.synthesize(data.position))
 
 
 def test_planes_of_a_found_room_reflect_as_strongly_as_the_spectra_say(ray_tracer):
     data = simulated_room(n=4, grid=AngularGrid.hemisphere(15, 60))
     wall = Plane(normal=(1.0, 0.0, 0.0), offset_m=6.0, gain=-0.6, std_mm=1.0, certain=True)
-    room = GeometryModel(
-        data.array, data.grid, data.rotation, data.fixed_position, data.moving, [wall], 2, 0.0, 0.0, "", torch.eye(1),
-        Residual(),
-    )  # fmt: skip
-    made = planes(room, data.position)
+    made = surfaces(GeometryModel.of_planes(data, [wall]))
     scene = Scene(made, data.array.frequency_hz)
     position = data.fixed_position + torch.tensor([[2.0, 0, 0]], dtype=torch.float64)
     relative = position - data.fixed_position

@@ -1,4 +1,4 @@
-"""Hard cases: every maker within its tolerance, every fit good or refused in a sentence, never not-a-number."""
+"""Hard cases: every backend within its tolerance, every fit good or refused in a sentence, never not-a-number."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ SMALL_FIT = FitConfig(model=ModelConfig(n_primitives=24))
 
 @pytest.mark.parametrize("cutoff", [None, 1e-4])
 @pytest.mark.parametrize("case", HARD_CASES)
-def test_cpu_maker_stays_within_its_tolerance(case, cutoff):
-    found = stability.draw_case(case, "cpu", cutoff, torch.device("cpu"))
+def test_cpu_backend_stays_within_its_tolerance(case, cutoff):
+    found = stability.render_case(case, "cpu", cutoff, torch.device("cpu"))
     assert found["value"] < found["value_tolerance"]
     assert found["gradient"] < found["gradient_tolerance"]
     assert found["magnitude_gradient"] < found["gradient_tolerance"]
 
 
-def test_float32_definition_is_finite_in_every_case():
-    """Its rounding is that of angles in float32, coarser than the fast makers'; it is the definition in float64."""
+def test_float32_reference_is_finite_in_every_case():
+    """It rounds angles in float32, more coarsely than the fast backends. It is the definition in float64."""
     for name in HARD_CASES:
-        found = stability.draw_case(name, "reference", None, torch.device("cpu"))
+        found = stability.render_case(name, "reference", None, torch.device("cpu"))
         assert found["value"] < 1e-3
         assert math.isfinite(found["gradient"])
 
 
 @pytest.mark.parametrize("name", ["mean", "cholesky", "weight"])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-@pytest.mark.parametrize("maker", ["reference", "cpu"])
-def test_what_is_not_finite_is_refused(name, value, maker):
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_what_is_not_finite_is_refused(name, value, backend):
     case = HARD_CASES["both sides of the seam"]
     inputs = dict(zip(("mean", "cholesky", "weight"), (x.clone() for x in case.inputs), strict=True))
     inputs[name].view(-1)[1] = value
     with pytest.raises(InputError, match=f"{name} holds a value that is not finite"):
-        rasterize(**inputs, grid=case.grid, maker=maker)
+        rasterize(**inputs, grid=case.grid, backend=backend)
 
 
 @pytest.mark.parametrize("case", [name for name in stability.FITS if name not in REFUSED])
@@ -80,7 +80,7 @@ def double(*shape, seed=0):
     return torch.randn(*shape, generator=generator, dtype=torch.float64).requires_grad_()
 
 
-def test_gradcheck_of_the_definition():
+def test_gradcheck_of_the_reference():
     inputs = random_scene(n=3, batch=2, dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda *x: rasterize(*x, AngularGrid.hemisphere(7, 12), "reference", None), inputs)
 

@@ -1,8 +1,7 @@
-"""Methods that SwiftWRF is compared with, written anew from what is published about them."""
+"""Methods of comparison, implemented from their publications."""
 
-from swiftwrf.comparison.base import Config, fit
+from swiftwrf.comparison.base import Config, TrainedModel
 from swiftwrf.comparison.dcgan import Dcgan, DcganConfig, DcganSize
-from swiftwrf.comparison.drawing import Drawing
 from swiftwrf.comparison.nerf2 import NeRF2, NeRF2Config, NeRF2Size
 from swiftwrf.comparison.nerf2_rssi import NeRF2Rssi, NeRF2RssiConfig, NeRF2RssiSize
 from swiftwrf.comparison.vae import Vae, VaeConfig, VaeSize
@@ -13,18 +12,17 @@ __all__ = [
     "Dcgan",
     "DcganConfig",
     "DcganSize",
-    "Drawing",
     "NeRF2",
     "NeRF2Config",
     "NeRF2Rssi",
     "NeRF2RssiConfig",
     "NeRF2RssiSize",
     "NeRF2Size",
+    "TrainedModel",
     "Vae",
     "VaeConfig",
     "VaeSize",
     "WrfGs",
     "WrfGsConfig",
     "WrfGsSize",
-    "fit",
 ]

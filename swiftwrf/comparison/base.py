@@ -1,95 +1,83 @@
-"""What all methods share: their sizes, their training, the fit."""
+"""The base of all methods of comparison: options, training, and the field model of a trained network."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, TypeVar, get_type_hints
 
 import numpy as np
 import torch
+from annotated_types import Ge, Le, Lt
+from torch import Tensor
 
-from swiftwrf.data.spectra import Spectra, check_training, fingerprint
-from swiftwrf.errors import InputError
+from swiftwrf.array.angles import AngularGrid
+from swiftwrf.comparison.network import Network, restored
+from swiftwrf.data.spectra import Spectra, fingerprint
+from swiftwrf.models.base import FieldModel, FitContext, Record, from_plain
+from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.descent import Descent, Model, Schedule, warm_cosine
 from swiftwrf.runtime.progress import progress_bar
-from swiftwrf.runtime.session import Record, Session
+from swiftwrf.runtime.session import Session
+from swiftwrf.runtime.validation import Fraction, NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
-LARGEST, MOST_LAYERS = 2**24, 64  # of a model: what a file claims is believed only so far
-
-
-@dataclass(frozen=True)
-class Size:
-    """What a model consists of: whole numbers and lengths, all above 0."""
-
-    def check(self) -> None:
-        """Refuses what no model can have, wherever it comes from.
-
-        Raises:
-            InputError: such a number.
-        """
-        for field in fields(self):
-            value, whole = getattr(self, field.name), type(field.default) is int
-            limit = MOST_LAYERS if field.name == "depth" else LARGEST
-            right = type(value) is int if whole else type(value) in (int, float)
-            if not right or not 0 < value <= limit:
-                raise InputError(f"{field.name} must be a number above 0 and at most {limit}, got {value!r}")
+# sizes of networks, limited because a damaged file may claim any
+Count = Annotated[int, Ge(1), Le(2**24)]
+Depth = Annotated[int, Ge(1), Le(64)]
 
 
-AnySize = TypeVar("AnySize", bound=Size)
+@configuration
+class Config(ABC):
+    """Size and training of a method. The defaults of each method are its quick preset, `paper()` its publication."""
 
-
-@dataclass(frozen=True)
-class Config(ABC, Generic[AnySize, Model]):
-    """How a model is sized and trained; the defaults of each method are its quick preset."""
-
-    size: AnySize
-    steps: int
-    """of the optimisation"""
-    batch: int
-    """spectra a step"""
-    rate: float
-    """largest learning rate"""
-    warm_up: int = 50
+    size: Any = None
+    """size of the network"""
+    steps: PositiveInt = 1000
+    """number of Adam steps"""
+    batch: PositiveInt = 16
+    """spectra per step"""
+    rate: PositiveFloat = 1e-3
+    """peak learning rate"""
+    warm_up: NonNegativeInt = 50
     """steps over which the rates rise"""
-    final_rate: float = 0.02
-    """share of the rates that is left when they have decayed"""
-    decay_steps: int | None = None
-    """steps in which they decay, along a cosine that goes on afterwards; all steps unless given"""
-    averaging: float = 0.98
-    """by how much a step's weight in the averaged parameters decays a step; 0 keeps the last ones"""
-    clip: float = 1.0
-    """largest norm of the gradient"""
-    check_every: int = 50
-    """steps between two evaluations, at which progress is recorded and the state kept"""
-    seed: int = 0
+    final_rate: Fraction = 0.02
+    """final fraction of the rates after cosine decay"""
+    decay_steps: PositiveInt | None = None
+    """steps of the decay, after which the cosine continues; None takes all steps"""
+    averaging: Annotated[float, Ge(0), Lt(1)] = 0.98
+    """decay per step of the weights in the averaged parameters; 0 takes the last parameters"""
+    clip: PositiveFloat = 1.0
+    """maximum norm of the gradient"""
+    check_every: PositiveInt = 50
+    """steps between two evaluations, at which a record is sent and the state is saved"""
+    seed: NonNegativeInt = 0
+    """seed of everything random"""
 
     @classmethod
     @abstractmethod
-    def paper(cls, **changes: Any) -> Config[AnySize, Model]:
-        """The size and the training of the publication."""
+    def paper(cls, **changes: Any) -> Config:
+        """Return size and training of the publication."""
 
     @abstractmethod
-    def training(self, train: Any, device: torch.device) -> Training[Any, Model]:
-        """At its start."""
+    def training(self, train: Any, device: torch.device) -> Training[Any, Any]:
+        """Return the training of a new network."""
 
 
-AnyConfig = TypeVar("AnyConfig", bound=Config[Any, Any])
+AnyConfig = TypeVar("AnyConfig", bound=Config)
 
 
 class Training(Descent[Model], Generic[AnyConfig, Model]):
-    """Trains the model of a configuration.
+    """Training of the network of a configuration.
 
-    Whatever a step draws at random comes from a generator of that step's own, so that a training that goes on draws the
-    same.
+    Each step has its own random generator, so that a training that continues from a checkpoint gives the same result.
 
     Args:
-        config: how.
-        model: at its start, on its device.
-        groups: parameter groups of Adam; all parameters with the configuration's rate unless given.
-        betas, weight_decay: of Adam.
+        config: Options.
+        model: Initialised network, on its device.
+        groups: Parameter groups of Adam. Defaults to all parameters with the configuration's rate.
+        betas, weight_decay: Options of Adam.
     """
 
     def __init__(
@@ -108,11 +96,11 @@ class Training(Descent[Model], Generic[AnyConfig, Model]):
         self.config = config
 
     def rate(self, step: int) -> float:
-        own = self.config
-        return warm_cosine(step, own.decay_steps or own.steps, own.warm_up, own.final_rate)
+        config = self.config
+        return warm_cosine(step, config.decay_steps or config.steps, config.warm_up, config.final_rate)
 
     def generator(self) -> torch.Generator:
-        """For what the next step draws."""
+        """Return the random generator of the next step."""
         (state,) = np.random.SeedSequence((self.config.seed, self.step)).generate_state(1)
         return torch.Generator().manual_seed(int(state))
 
@@ -124,38 +112,43 @@ def descend(
     on_record: Callable[[Record], None] | None,
     progress: bool,
 ) -> Model:
-    """The model after all steps; see `fit`. `owner` is the fingerprint of the fit."""
+    """Return the trained network; `owner` is the fingerprint of the fit, the other arguments are those of a fit."""
     with progress_bar(progress) as bar:
         training.run(Session(checkpoint, owner, bar, on_record))
     return training.result.eval()
 
 
-def fit(
-    train: Spectra,
-    config: Config[Any, Model],
-    *,
-    device: torch.device | str = "cpu",
-    checkpoint: Path | None = None,
-    on_record: Callable[[Record], None] | None = None,
-    progress: bool = True,
-) -> Model:
-    """Fits the model of a configuration to spectra; same data, configuration and machine give the same model.
+class TrainedModel(FieldModel):
+    """Field model of a trained network.
 
-    Args:
-        train: the only spectra it sees.
-        config: which method, and how.
-        device: where to compute.
-        checkpoint: a file that keeps the state of the fit; where it exists, the fit goes on from it.
-        on_record: called at each evaluation with stage, step, loss and seconds; a fit that goes on begins with the records
-            of its earlier sessions.
-        progress: show a progress bar on a terminal.
-
-    Raises:
-        InputError: fewer than 10 spectra, something not finite, something that the method needs and the data do not tell,
-            or a checkpoint of another fit.
-        FitError: a loss or gradient that is not finite (the checkpoint holds the last good state), or a fit that ends
-            worse than it began.
+    A subclass sets `network_type` and a `config_type` that derives from `Config`.
     """
-    check_training(train)
-    owner = fingerprint(train, type(config).__name__, asdict(config))
-    return descend(config.training(train, torch.device(device)), owner, checkpoint, on_record, progress)
+
+    network_type: ClassVar[type[Any]]
+    slow = True
+
+    network: Network
+    """trained network; the gradients of its parameters are off after a fit"""
+
+    def _fit(self, train: Spectra, context: FitContext) -> None:
+        owner = fingerprint(train, type(self).__name__, asdict(self.config))
+        training = self.config.training(train, context.device)
+        network = descend(training, owner, context.checkpoint, context.on_record, context.progress)
+        self.network = network.requires_grad_(False)
+
+    def parameters(self) -> Iterable[Tensor]:
+        return self.network.parameters()
+
+    def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
+        return self.network.render(position, grid), None
+
+    def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
+        return self.network.render(position, grid, generator)
+
+    def _state(self) -> tuple[dict[str, Tensor], Header]:
+        return self.network.state_dict(), self.network.header()
+
+    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
+        size = from_plain(get_type_hints(self.config_type)["size"], header["size"])
+        network: Network = restored(lambda: self.network_type.blank(size, self.grid, header), tensors)
+        self.network = network.requires_grad_(False)

@@ -1,23 +1,22 @@
-"""DCGAN: spectra drawn by a generator that a discriminator cannot tell from measured ones.
+"""DCGAN: spectra of a generator that a discriminator cannot distinguish from measured ones.
 
 A. Radford, L. Metz and S. Chintala, "Unsupervised Representation Learning with Deep Convolutional Generative Adversarial
-Networks", 2016: its layers, batch normalisation and optimiser. How the papers of this field condition it on the position is
-not published; here the noise and the encoded position go through one more layer before the generator, the discriminator is
-given the encoded position, and the generator is also held to the measured spectrum by an L1 term, as is usual for paired
-data (P. Isola, J.-Y. Zhu, T. Zhou and A. A. Efros, "Image-to-Image Translation with Conditional Adversarial Networks",
-2017).
-Generator and discriminator step at once, from torch's initial weights (from N(0, 0.02^2) the position is hardly heard).
-Without a generator of random numbers a spectrum is drawn from noise 0, its mean.
+Networks", 2016: its layers, batch normalisation and optimiser. The conditioning on the position that papers of this field
+use is not published. Here noise and encoded position pass one more layer before the generator, and the discriminator takes
+the encoded position. The generator also has an L1 loss to the measured spectrum, as is usual for paired data (P. Isola,
+J.-Y. Zhu, T. Zhou and A. A. Efros, "Image-to-Image Translation with Conditional Adversarial Networks", 2017). Both step at
+once, from torch's initial weights; with weights from N(0, 0.02^2) the position has hardly any effect. The mean prediction
+has noise 0.
 
-The quick preset is sized for two cores; `DcganConfig.paper()` has the publication's 1,024 to 128 channels, 100 noise
-numbers, rate and batches of 128.
+The quick preset is sized for two cores. `DcganConfig.paper()` has the publication's 1,024 to 128 channels, 100 noise
+variables, rate and batches of 128.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -25,37 +24,31 @@ from torch.func import functional_call
 from torch.nn import functional
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.comparison.base import Config, Size, Training
-from swiftwrf.comparison.convolution import decoder, encoder
-from swiftwrf.comparison.drawing import Drawing, Frame, draw_parameters
+from swiftwrf.comparison.base import Config, Count, TrainedModel
+from swiftwrf.comparison.convolution import ConvolutionalNetwork, ConvolutionalSize, PairedTraining, decoder, encoder
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.models.swiftwrf.encoding import encode
+from swiftwrf.models.base import FIELD_MODELS
+from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
 
-@dataclass(frozen=True)
-class DcganSize(Size):
-    """Of the networks."""
+@configuration
+class DcganSize(ConvolutionalSize):
+    """Size of the networks."""
 
-    noise: int = 16
-    """numbers that the position does not tell"""
-    width: int = 8
-    """channels at the finest stage"""
-    hidden: int = 128
-    """width of the layer that noise and position go through"""
-    bands: int = 5
-    """frequencies of the position's encoding"""
+    noise: Count = 16
+    """number of noise variables"""
 
 
-@dataclass(frozen=True)
-class DcganConfig(Config[DcganSize, "Dcgan"]):
-    """How the DCGAN is fitted."""
+@configuration
+class DcganConfig(Config):
+    """Options of `Dcgan`."""
 
     size: DcganSize = DcganSize()
-    steps: int = 1000
-    batch: int = 8
-    rate: float = 5e-3
-    l1_weight: float = 100.0
-    """of the mean absolute error beside the discriminator's verdict"""
+    steps: PositiveInt = 1000
+    batch: PositiveInt = 8
+    rate: PositiveFloat = 5e-3
+    l1_weight: NonNegativeFloat = 100.0
+    """weight of the mean absolute error beside the adversarial loss"""
 
     @classmethod
     def paper(cls, **changes: Any) -> DcganConfig:
@@ -73,86 +66,71 @@ class DcganConfig(Config[DcganSize, "Dcgan"]):
         return replace(paper, **changes)
 
     def training(self, train: Spectra, device: torch.device) -> DcganTraining:
-        return DcganTraining(self, train, device)
+        return DcganTraining(self, DcganNetwork, train, device, betas=(0.5, 0.999))
 
 
 class Discriminator(nn.Module):
-    """How far a spectrum looks measured at its position, (B,), from spectra (B, H, W) and encoded positions."""
+    """Logit (B,) that a spectrum is measured, from spectra (B, H, W) and encoded positions."""
 
     def __init__(self, grid: AngularGrid, width: int, encoded: int) -> None:
         super().__init__()
-        self.features, seen = encoder(grid, width, inputs=1, norm=nn.BatchNorm2d)
-        self.verdict = nn.Linear(seen + encoded, 1)
+        self.features, features = encoder(grid, width, inputs=1, norm=nn.BatchNorm2d)
+        self.verdict = nn.Linear(features + encoded, 1)
 
     def forward(self, spectrum: Tensor, encoded: Tensor) -> Tensor:
-        verdict: Tensor = self.verdict(torch.cat([self.features(spectrum[:, None]), encoded], dim=-1))
-        return verdict[:, 0]
+        logit: Tensor = self.verdict(torch.cat([self.features(spectrum[:, None]), encoded], dim=-1))
+        return logit[:, 0]
 
 
-class Dcgan(Drawing):
-    """Generator and discriminator.
-
-    Args:
-        size, grid: see `Drawing`; spectra are drawn on this grid alone.
-    """
-
-    kind: ClassVar[str] = "dcgan model"
-    size_type = DcganSize
+class DcganNetwork(ConvolutionalNetwork):
+    """Generator and discriminator."""
 
     def __init__(self, size: DcganSize, grid: AngularGrid) -> None:
         super().__init__(size, grid)
-        encoded = 3 * (2 * size.bands + 1)
-        self.frame = Frame()
-        hidden = nn.Linear(size.noise + encoded, size.hidden)
+        hidden = nn.Linear(size.noise + self.n_encoded, size.hidden)
         self.generator = nn.Sequential(hidden, nn.ReLU(), decoder(grid, size.width, size.hidden, norm=nn.BatchNorm2d))
-        self.discriminator = Discriminator(grid, size.width, encoded)
-
-    @classmethod
-    def make(cls, size: DcganSize, train: Spectra, generator: torch.Generator) -> Dcgan:
-        """At its start."""
-        model = cls(size, train.grid)
-        model.frame.place(train.position)
-        draw_parameters(model, generator)
-        return model
-
-    def encoded(self, position: Tensor) -> Tensor:
-        """Positions (B, 3) [m] as the networks take them."""
-        return encode(self.frame(position), self.size.bands)
+        self.discriminator = Discriminator(grid, size.width, self.n_encoded)
 
     def generate(self, encoded: Tensor, generator: torch.Generator | None) -> Tensor:
-        """Magnitudes (B, H, W) from noise of the generator, or from none."""
+        """Return magnitudes (B, H, W) of encoded positions, from random noise if there is a generator."""
         noise = torch.zeros(len(encoded), self.size.noise)
         if generator is not None:
             noise = torch.randn(noise.shape, generator=generator)
-        drawn: Tensor = self.generator(torch.cat([noise.to(encoded.device), encoded], dim=-1))
-        return drawn[:, 0]
+        generated: Tensor = self.generator(torch.cat([noise.to(encoded.device), encoded], dim=-1))
+        return generated[:, 0]
 
-    def synthesize(self, position: Tensor, batch: int = 64, generator: torch.Generator | None = None) -> Tensor:
-        """Spectra at any positions, on the grid of the fitted ones.
-
-        Args:
-            position, batch: as of `SwiftWRF.synthesize`, and so are result and errors.
-            generator: draws the noise; without one it is 0.
-        """
-        return self.drawn(position, self.grid, batch, lambda some: self.generate(self.encoded(some), generator))
+    def render(self, position: Tensor, grid: AngularGrid, generator: torch.Generator | None = None) -> Tensor:
+        return self.generate(self.encoded(position), generator)
 
 
-class DcganTraining(Training[DcganConfig, Dcgan]):
-    """Of both at once: one sum, in which each sees the other's parameters as constants."""
-
-    def __init__(self, config: DcganConfig, train: Spectra, device: torch.device) -> None:
-        model = Dcgan.make(config.size, train, torch.Generator().manual_seed(config.seed)).to(device)
-        super().__init__(config, model, betas=(0.5, 0.999))
-        self.position, self.spectrum = train.position, train.spectrum.to(device)
+class DcganTraining(PairedTraining[DcganConfig, DcganNetwork]):
+    """Training of both networks at once: one sum of losses, in which each takes the other's parameters as constants."""
 
     def objective(self) -> Tensor:
         generator, model = self.generator(), self.model
-        row = torch.randint(len(self.position), (self.config.batch,), generator=generator)
-        spectrum, encoded = self.spectrum[row.to(self.spectrum.device)], model.encoded(self.position[row])
-        drawn = model.generate(encoded, generator)
-        told_apart = functional.softplus(-model.discriminator(spectrum, encoded))
-        told_apart = told_apart + functional.softplus(model.discriminator(drawn.detach(), encoded))
+        spectrum, encoded = self.pairs(generator)
+        generated = model.generate(encoded, generator)
+        discriminator = functional.softplus(-model.discriminator(spectrum, encoded))
+        discriminator = discriminator + functional.softplus(model.discriminator(generated.detach(), encoded))
         frozen = {name: parameter.detach() for name, parameter in model.discriminator.named_parameters()}
-        taken_for_measured = functional.softplus(-functional_call(model.discriminator, frozen, (drawn, encoded)))
-        error = (drawn - spectrum).abs().mean()
-        return told_apart.mean() + taken_for_measured.mean() + self.config.l1_weight * error
+        adversarial = functional.softplus(-functional_call(model.discriminator, frozen, (generated, encoded)))
+        error = (generated - spectrum).abs().mean()
+        return discriminator.mean() + adversarial.mean() + self.config.l1_weight * error
+
+
+@FIELD_MODELS.register("dcgan")
+class Dcgan(TrainedModel):
+    """Conditional generative adversarial network; a sample generates a spectrum from random noise.
+
+    Example:
+        >>> import swiftwrf
+        >>> room = swiftwrf.simulated_room(n=20)
+        >>> Dcgan(steps=1).fit(room).sample(room.position, generator=torch.Generator()).shape
+        torch.Size([20, 30, 120])
+    """
+
+    name = "dcgan"
+    kind = "dcgan model"
+    config_type = DcganConfig
+    network_type = DcganNetwork
+    samples = True

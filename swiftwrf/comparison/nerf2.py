@@ -1,71 +1,72 @@
-"""NeRF2: a network that says how space absorbs, turns and emits, and the sum along rays through it.
+"""NeRF2: a network of absorption, phase shift and emission in space, integrated along rays.
 
 X. Zhao, Z. An, Q. Pan and L. Yang, "NeRF2: Neural Radio-Frequency Radiance Fields", ACM MobiCom 2023. `NeRF2Config.paper()`
 has the sizes, rates and steps of its code: 690,564 parameters, 64 samples over 5 m, 8,192 single rays a step.
 
-Changed everywhere: positions count from the centre of the training positions, for map coordinates would lose their
-millimetres; what the attenuation network says of a point is computed once for all transmitters (the same function);
-transmittance is the exponential of a sum, without the 1e-10 that keeps a product from 0; rays start at the moving array
-where the receiver moves.
+Changed everywhere: positions are relative to the centre of the training positions, so that map coordinates keep their
+millimetres. The attenuation network is evaluated once for all transmitters (the same function). Transmittance is the
+exponential of a sum, without the 1e-10 that keeps a product from 0. Rays start at the moving array if the receiver moves.
 
-Changed in the quick preset, sized for two cores: 64 wide (256), 24 samples (64), 7 frequency bands (10), a step of 16
+Changed in the quick preset, sized for two cores: width 64 (256), 24 samples (64), 7 frequency bands (10), a step of 16
 spectra that share 64 rays (8,192 of any spectra), 3,000 steps (30,000) at rate 3e-3 (8e-4) that decays once (three times),
-averaged parameters (the last), gradients clipped, no weight decay (5e-5).
+averaged parameters (the last), clipped gradients, no weight decay (5e-5).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.comparison.base import Config, Size, Training
-from swiftwrf.comparison.drawing import Link, LinkDrawing, chunks, draw_parameters
-from swiftwrf.comparison.layers import Layers
+from swiftwrf.comparison.base import Config, Count, Depth, TrainedModel, Training
+from swiftwrf.comparison.network import LinkNetwork, chunks, draw_parameters
 from swiftwrf.comparison.volume import Medium, integrate
 from swiftwrf.data.spectra import Moving, Spectra
-from swiftwrf.models.swiftwrf.encoding import encode
+from swiftwrf.models.base import FIELD_MODELS, FIXED_END
+from swiftwrf.models.swiftwrf.mlp import SkipMLP, encode
+from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
-SAMPLES_AT_ONCE = 2**19  # samples of the field evaluated at a time, which bounds the memory
+MAX_SAMPLES_AT_ONCE = 2**19  # samples of the field evaluated at a time, which bounds the memory
 
 
-@dataclass(frozen=True)
-class NeRF2Size(Size):
-    """Of the network and its rays."""
+@configuration
+class NeRF2Size:
+    """Size of the network and its rays."""
 
-    width: int = 64
-    """of the layers"""
-    depth: int = 8
+    width: Count = 64
+    """width of the layers"""
+    depth: Depth = 8
     """layers of the attenuation network"""
-    bands: int = 7
+    bands: Count = 7
     """frequencies of the encodings"""
-    samples: int = 24
-    """along a ray"""
-    reach: float = 5.0
+    samples: Count = 24
+    """samples along a ray"""
+    reach: PositiveFloat = 5.0
     """length of a ray [m]"""
 
 
-@dataclass(frozen=True)
-class NeRF2Config(Config[NeRF2Size, "NeRF2"]):
-    """How NeRF2 is fitted."""
+@configuration
+class NeRF2Config(Config):
+    """Options of `NeRF2`."""
 
     size: NeRF2Size = NeRF2Size()
-    steps: int = 3000
-    batch: int = 16
-    rate: float = 3e-3
-    check_every: int = 100
-    rays: int = 64
-    """a spectrum and step"""
+    steps: PositiveInt = 3000
+    batch: PositiveInt = 16
+    rate: PositiveFloat = 3e-3
+    check_every: PositiveInt = 100
+    rays: PositiveInt = 64
+    """rays per spectrum and step"""
     shared_rays: bool = True
-    """the spectra of a step have the same rays"""
-    weight_decay: float = 0.0
+    """the spectra of a step share their rays"""
+    weight_decay: NonNegativeFloat = 0.0
+    """weight decay of Adam"""
     compiled: bool = False
-    """compile the network (torch.compile; takes a C++ compiler, or Triton on a GPU)"""
+    """compile the network with torch.compile, which needs a C++ compiler, or Triton on a GPU"""
 
     @classmethod
     def paper(cls, **changes: Any) -> NeRF2Config:
@@ -91,24 +92,27 @@ class NeRF2Config(Config[NeRF2Size, "NeRF2"]):
 
 
 class Field(nn.Module):
-    """Eight layers say how a point absorbs and turns the phase; three more, from what they know of the point, the direction
-    and the transmitter, what it emits. Amplitudes are |leaky_relu|, phases 2 pi sigmoid."""
+    """Networks of the attenuation and of the emission at a point.
+
+    An eight-layer network predicts absorption and phase shift. A three-layer network on its features, the ray's direction
+    and the transmitter's position predicts the emission. Amplitudes are |leaky_relu|, phases 2 pi sigmoid.
+    """
 
     def __init__(self, size: NeRF2Size) -> None:
         super().__init__()
         self.bands = size.bands
         inputs, width = 3 * (2 * size.bands + 1), size.width
-        self.layers = Layers(inputs, width, size.depth)
+        self.layers = SkipMLP(inputs, width, size.depth)
         self.attenuation = nn.Linear(width, 2)
         self.feature = nn.Linear(width, width)
         self.mixing = nn.Linear(width + 2 * inputs, width)
         self.emission = nn.Sequential(nn.ReLU(), nn.Linear(width, width // 2), nn.ReLU(), nn.Linear(width // 2, 2))
 
     def forward(self, point: Tensor, direction: Tensor, transmitter: Tensor) -> Medium:
-        """The field at points (..., 3) [m] seen along directions (..., 3) from transmitters (..., 3) [m], which broadcast.
+        """Return the medium at points (..., 3) [m] for directions (..., 3) and transmitters (..., 3) [m]; these broadcast.
 
-        The layer that takes feature, direction and transmitter side by side is the sum of one for each, so that none is
-        computed more often than it differs.
+        The layer on the concatenation of feature, direction and transmitter is computed as a sum of three layers, so that
+        each is evaluated for its own shape before broadcasting.
         """
         x = encode(point, self.bands, lowest=1.0)
         h = self.layers(x)
@@ -122,77 +126,53 @@ class Field(nn.Module):
 
 
 def _polar(raw: Tensor) -> tuple[Tensor, Tensor]:
-    """Amplitude and phase of two raw numbers (..., 2)."""
+    """Return amplitude and phase of raw outputs (..., 2)."""
     return functional.leaky_relu(raw[..., 0]).abs(), 2 * math.pi * torch.sigmoid(raw[..., 1])
 
 
-class NeRF2(LinkDrawing):
-    """Magnitude of the sum along a ray from the receiver, in each direction.
-
-    Args:
-        size, grid, moving: see `LinkDrawing`.
-    """
-
-    kind: ClassVar[str] = "nerf2 model"
-    size_type = NeRF2Size
+class NeRF2Network(LinkNetwork):
+    """Magnitude of the integral along a ray from the receiver, for each direction."""
 
     def __init__(self, size: NeRF2Size, grid: AngularGrid, moving: Moving) -> None:
         super().__init__(size, grid, moving)
         self.field = Field(size)
 
-    @classmethod
-    def make(cls, size: NeRF2Size, train: Spectra, generator: torch.Generator) -> NeRF2:
-        """At its start.
-
-        Raises:
-            InputError: the data do not say where the fixed end stands.
-        """
-        model = cls(size, train.grid, train.moving)
-        model.link = Link.of(train)
-        draw_parameters(model, generator)
-        return model
-
     def forward(self, transmitter: Tensor, receiver: Tensor, direction: Tensor) -> Tensor:
-        """Magnitudes (P, D) at P places of the moving end.
+        """Return magnitudes (P, D) at P positions of the moving end.
 
         Args:
-            transmitter, receiver: as `Link` gives them, (P or 1, 3).
-            direction: of the rays in world coordinates, (P or 1, D, 3).
+            transmitter, receiver: Positions (P or 1, 3), see `Link`.
+            direction: Directions of the rays in world coordinates, (P or 1, D, 3).
         """
         return torch.hypot(*received(self.field, self.size, transmitter[:, None], receiver[:, None], direction))
 
-    def synthesize(self, position: Tensor, grid: AngularGrid | None = None, batch: int = 64) -> Tensor:
-        """Spectra at any positions; arguments, result and errors as of `SwiftWRF.synthesize`."""
-        grid = grid or self.grid
-        direction = self.link.to_world(grid.direction.flatten(0, 1).to(self.link.rotation.device))
-
-        def draw(some: Tensor) -> Tensor:
-            ends = self.link(some)
-            parts = chunks(len(direction), max(1, SAMPLES_AT_ONCE // (len(some) * self.size.samples)))
-            return torch.cat([self(*ends, direction[None, part]) for part in parts], dim=1).reshape(-1, *grid.shape)
-
-        return self.drawn(position, grid, batch, draw)
+    def render(self, position: Tensor, grid: AngularGrid, generator: torch.Generator | None = None) -> Tensor:
+        ends = self.link(position)
+        direction = self.link.to_world(grid.direction.flatten(0, 1).to(position.device))
+        parts = chunks(len(direction), max(1, MAX_SAMPLES_AT_ONCE // (len(position) * self.size.samples)))
+        return torch.cat([self(*ends, direction[None, part]) for part in parts], dim=1).reshape(-1, *grid.shape)
 
 
 def received(field: Field, size: NeRF2Size, transmitter: Tensor, receiver: Tensor, direction: Tensor) -> Tensor:
-    """Real and imaginary part of what rays bring, (2, ...).
+    """Return real and imaginary part of the signal of rays, (2, ...).
 
     Args:
-        field: that they cross.
-        size: number of samples and length of a ray.
-        transmitter, receiver, direction: of each ray, (..., 3), which broadcast.
+        field: Field that the rays cross.
+        size: Number of samples and length of a ray.
+        transmitter, receiver, direction: Ends and direction of each ray, (..., 3); they broadcast.
     """
     distance = torch.linspace(0, size.reach, size.samples, device=direction.device)
     point = receiver[..., None, :] + distance[:, None] * direction[..., None, :]
     return integrate(field(point, direction[..., None, :], transmitter[..., None, :]), distance)
 
 
-class NeRF2Training(Training[NeRF2Config, NeRF2]):
-    """On single rays: the squared error of magnitudes."""
+class NeRF2Training(Training[NeRF2Config, NeRF2Network]):
+    """Minimisation of the squared error of magnitudes on random rays."""
 
     def __init__(self, config: NeRF2Config, train: Spectra, device: torch.device) -> None:
-        model = NeRF2.make(config.size, train, torch.Generator().manual_seed(config.seed)).to(device)
-        super().__init__(config, model, betas=(0.9, 0.999), weight_decay=config.weight_decay)
+        model = NeRF2Network.of(config.size, train)
+        draw_parameters(model, torch.Generator().manual_seed(config.seed))
+        super().__init__(config, model.to(device), betas=(0.9, 0.999), weight_decay=config.weight_decay)
         if config.compiled:
             model.field.compile()
         self.position, self.spectrum = train.position, train.spectrum.flatten(1).to(device)
@@ -203,6 +183,25 @@ class NeRF2Training(Training[NeRF2Config, NeRF2]):
         row = torch.randint(len(self.position), (config.batch,), generator=generator)
         rays = (1 if config.shared_rays else config.batch, config.rays)
         pixel = torch.randint(len(self.direction), rays, generator=generator).to(self.spectrum.device)
-        drawn = self.model(*self.model.link(self.position[row]), self.direction[pixel])
+        predicted = self.model(*self.model.link(self.position[row]), self.direction[pixel])
         measured = self.spectrum[row.to(pixel.device)[:, None], pixel]
-        return functional.mse_loss(drawn, measured)
+        return functional.mse_loss(predicted, measured)
+
+
+@FIELD_MODELS.register("nerf2")
+class NeRF2(TrainedModel):
+    """Neural radio-frequency radiance field.
+
+    Example:
+        >>> import swiftwrf
+        >>> room = swiftwrf.simulated_room(n=20)
+        >>> NeRF2(size=NeRF2Size(width=8, samples=6), steps=1).fit(room).predict(room.position[:2]).mean.shape
+        torch.Size([2, 30, 120])
+    """
+
+    name = "nerf2"
+    kind = "nerf2 model"
+    config_type = NeRF2Config
+    network_type = NeRF2Network
+    requires = (FIXED_END,)
+    any_grid = True

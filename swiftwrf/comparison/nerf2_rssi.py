@@ -14,7 +14,7 @@ decay.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any, ClassVar, Self
 
 import torch
@@ -22,37 +22,39 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.comparison.base import Config, Training, descend
-from swiftwrf.comparison.drawing import chunks, draw_parameters, restored
-from swiftwrf.comparison.nerf2 import SAMPLES_AT_ONCE, Field, NeRF2Size, received
+from swiftwrf.comparison.base import Config, Count, Training, descend
+from swiftwrf.comparison.nerf2 import MAX_SAMPLES_AT_ONCE, Field, NeRF2Size, received
+from swiftwrf.comparison.network import chunks, draw_parameters, restored
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.positions import check_drawn, frame, normalise
 from swiftwrf.rssi.base import RssiFitContext, RssiPredictor, fingerprint
 from swiftwrf.runtime.checkpoint import Header, Saved
+from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
 
-@dataclass(frozen=True)
+@configuration
 class NeRF2RssiSize(NeRF2Size):
-    """Of the network and its rays."""
+    """Size of the network and its rays."""
 
-    width: int = 32
-    bands: int = 4
-    samples: int = 8
-    azimuths: int = 6
-    """of rays"""
-    elevations: int = 3
-    """likewise"""
+    width: Count = 32
+    bands: Count = 4
+    samples: Count = 8
+    azimuths: Count = 6
+    """azimuths of the rays"""
+    elevations: Count = 3
+    """elevations of the rays"""
 
 
-@dataclass(frozen=True)
-class NeRF2RssiConfig(Config[NeRF2RssiSize, "NeRF2RssiNetwork"]):
-    """How NeRF2 is fitted to RSSI; a batch is of transmitter positions."""
+@configuration
+class NeRF2RssiConfig(Config):
+    """Options of `NeRF2Rssi`; a batch consists of transmitter positions."""
 
     size: NeRF2RssiSize = NeRF2RssiSize()
-    steps: int = 2400
-    batch: int = 32
-    rate: float = 5e-3
-    weight_decay: float = 0.0
+    steps: PositiveInt = 2400
+    batch: PositiveInt = 32
+    rate: PositiveFloat = 5e-3
+    weight_decay: NonNegativeFloat = 0.0
+    """weight decay of Adam"""
 
     @classmethod
     def paper(cls, **changes: Any) -> NeRF2RssiConfig:
@@ -114,7 +116,7 @@ class NeRF2Rssi(RssiPredictor, Saved):
 
     Example:
         >>> import swiftwrf
-        >>> model = NeRF2Rssi(steps=2, batch=4).fit(swiftwrf.rssi_room(n=20))
+        >>> model = NeRF2Rssi(steps=1, batch=4).fit(swiftwrf.rssi_room(n=20))
         >>> model.predict(torch.zeros(1, 3)).mean.shape
         torch.Size([1, 12])
     """
@@ -135,7 +137,7 @@ class NeRF2Rssi(RssiPredictor, Saved):
     def _predict(self, position: Tensor) -> tuple[Tensor, None]:
         network = self.network
         rays = network.size.azimuths * network.size.elevations * network.size.samples * max(len(network.receiver), 1)
-        some = chunks(len(position), max(1, SAMPLES_AT_ONCE // rays))
+        some = chunks(len(position), max(1, MAX_SAMPLES_AT_ONCE // rays))
         parts = [network(network.local(position[part])) for part in some]
         empty = torch.zeros(0, len(network.receiver))
         return check_drawn(100 * (torch.cat([empty, *parts]).double() - 1)), None
@@ -146,7 +148,6 @@ class NeRF2Rssi(RssiPredictor, Saved):
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         size = NeRF2RssiSize(**header["options"]["size"])
-        size.check()
         model = cls(**header["options"] | {"size": size})
         model.receiver_names = tuple(map(str, header["receiver_names"]))
         model.network = restored(lambda: NeRF2RssiNetwork(size, len(model.receiver_names)), tensors)

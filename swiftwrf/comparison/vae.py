@@ -1,55 +1,49 @@
-"""VAE: spectra decoded from the position and from a few latent numbers that the position does not tell.
+"""VAE: spectra decoded from the position and from latent variables that the position does not determine.
 
 D. P. Kingma and M. Welling, "Auto-Encoding Variational Bayes", 2014, conditioned as by K. Sohn, H. Lee and X. Yan, "Learning
-Structured Output Representation using Deep Conditional Generative Models", 2015. Which layers and which conditioning the
-papers of this field compare with is not published; these are ours. An encoder sees spectrum and position, a prior the
-position alone, both give mean and variance of the latent numbers, and a convolutional decoder draws from them and the
-position. Without a generator a spectrum is drawn from the prior's mean, the latent numbers' conditional one.
+Structured Output Representation using Deep Conditional Generative Models", 2015. The layers and the conditioning that papers
+of this field compare with are not published; these are our choice. An encoder takes spectrum and position, a prior takes the
+position. Both return mean and variance of the latent variables. A convolutional decoder takes a latent sample and the
+position. The mean prediction decodes the mean of the prior.
 
-The quick preset is sized for two cores; `VaeConfig.paper()` has eight times the channels, more latent numbers and steps.
+The quick preset is sized for two cores. `VaeConfig.paper()` has eight times the channels, more latent variables and steps.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.comparison.base import Config, Size, Training
-from swiftwrf.comparison.convolution import decoder, encoder
-from swiftwrf.comparison.drawing import Drawing, Frame, draw_parameters
+from swiftwrf.comparison.base import Config, Count, TrainedModel
+from swiftwrf.comparison.convolution import ConvolutionalNetwork, ConvolutionalSize, PairedTraining, decoder, encoder
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.models.swiftwrf.encoding import encode
+from swiftwrf.models.base import FIELD_MODELS
+from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, configuration
 
 
-@dataclass(frozen=True)
-class VaeSize(Size):
-    """Of the networks."""
+@configuration
+class VaeSize(ConvolutionalSize):
+    """Size of the networks."""
 
-    latent: int = 16
-    """numbers that the position does not tell"""
-    width: int = 8
-    """channels at the finest stage"""
-    hidden: int = 128
-    """width of the layer that the position and the encoded spectrum go through"""
-    bands: int = 5
-    """frequencies of the position's encoding"""
+    latent: Count = 16
+    """number of latent variables"""
 
 
-@dataclass(frozen=True)
-class VaeConfig(Config[VaeSize, "Vae"]):
-    """How the VAE is fitted."""
+@configuration
+class VaeConfig(Config):
+    """Options of `Vae`."""
 
     size: VaeSize = VaeSize()
-    steps: int = 1000
-    batch: int = 16
-    rate: float = 2e-3
-    noise: float = 0.5
-    """standard deviation of a pixel about what is decoded; as if pixels were independent, hence so much: a smaller one lets
-    the latent numbers stray from their prior"""
+    steps: PositiveInt = 1000
+    batch: PositiveInt = 16
+    rate: PositiveFloat = 2e-3
+    noise: PositiveFloat = 0.5
+    """standard deviation of a pixel about the decoded spectrum, large because the loss treats pixels as independent; with a
+    smaller one the latent variables leave their prior"""
 
     @classmethod
     def paper(cls, **changes: Any) -> VaeConfig:
@@ -57,100 +51,81 @@ class VaeConfig(Config[VaeSize, "Vae"]):
         return replace(paper, **changes)
 
     def training(self, train: Spectra, device: torch.device) -> VaeTraining:
-        return VaeTraining(self, train, device)
+        return VaeTraining(self, VaeNetwork, train, device)
 
 
 class Normal(NamedTuple):
-    """Independent normal distributions of latent numbers."""
+    """Independent normal distributions of latent variables."""
 
     mean: Tensor  # (B, latent)
-    log_variance: Tensor  # likewise
+    log_variance: Tensor  # (B, latent)
 
     @classmethod
     def of(cls, raw: Tensor) -> Normal:
-        """From twice as many raw numbers."""
+        """Return the distributions of raw outputs (B, 2 latent)."""
         mean, log_variance = raw.chunk(2, dim=-1)
         return cls(mean, log_variance.clamp(-10, 10))
 
     def sample(self, generator: torch.Generator) -> Tensor:
-        """One draw each."""
+        """Return one sample of each distribution."""
         noise = torch.randn(self.mean.shape, generator=generator).to(self.mean.device)
         return self.mean + noise * (0.5 * self.log_variance).exp()
 
     def divergence(self, other: Normal) -> Tensor:
-        """Kullback-Leibler divergence from `other`, (B,)."""
-        apart = (self.mean - other.mean).square() + self.log_variance.exp()
-        each = other.log_variance - self.log_variance + apart * torch.exp(-other.log_variance) - 1
+        """Return the Kullback-Leibler divergence from `other`, (B,)."""
+        spread = (self.mean - other.mean).square() + self.log_variance.exp()
+        each = other.log_variance - self.log_variance + spread * torch.exp(-other.log_variance) - 1
         return 0.5 * each.sum(dim=-1)
 
 
-class Vae(Drawing):
-    """Decoder, encoder and prior.
-
-    Args:
-        size, grid: see `Drawing`; spectra are drawn on this grid alone.
-    """
-
-    kind: ClassVar[str] = "vae model"
-    size_type = VaeSize
+class VaeNetwork(ConvolutionalNetwork):
+    """Decoder, encoder and prior."""
 
     def __init__(self, size: VaeSize, grid: AngularGrid) -> None:
         super().__init__(size, grid)
-        encoded, hidden, latent = 3 * (2 * size.bands + 1), size.hidden, size.latent
-        self.frame = Frame()
-        self.encoder, seen = encoder(grid, size.width, inputs=1)
-        self.posterior = nn.Sequential(nn.Linear(seen + encoded, hidden), nn.ReLU(), nn.Linear(hidden, 2 * latent))
+        encoded, hidden, latent = self.n_encoded, size.hidden, size.latent
+        self.encoder, features = encoder(grid, size.width, inputs=1)
+        self.posterior = nn.Sequential(nn.Linear(features + encoded, hidden), nn.ReLU(), nn.Linear(hidden, 2 * latent))
         self.prior = nn.Sequential(nn.Linear(encoded, hidden), nn.ReLU(), nn.Linear(hidden, 2 * latent))
         self.hidden = nn.Sequential(nn.Linear(latent + encoded, hidden), nn.ReLU())
         self.decoder = decoder(grid, size.width, hidden)
 
-    @classmethod
-    def make(cls, size: VaeSize, train: Spectra, generator: torch.Generator) -> Vae:
-        """At its start."""
-        model = cls(size, train.grid)
-        model.frame.place(train.position)
-        draw_parameters(model, generator)
-        return model
-
-    def encoded(self, position: Tensor) -> Tensor:
-        """Positions (B, 3) [m] as the networks take them."""
-        return encode(self.frame(position), self.size.bands)
-
     def decode(self, latent: Tensor, encoded: Tensor) -> Tensor:
-        """Magnitudes (B, H, W)."""
-        drawn: Tensor = self.decoder(self.hidden(torch.cat([latent, encoded], dim=-1)))
-        return drawn[:, 0]
+        """Return magnitudes (B, H, W)."""
+        decoded: Tensor = self.decoder(self.hidden(torch.cat([latent, encoded], dim=-1)))
+        return decoded[:, 0]
 
-    def synthesize(self, position: Tensor, batch: int = 64, generator: torch.Generator | None = None) -> Tensor:
-        """Spectra at any positions, on the grid of the fitted ones.
-
-        Args:
-            position, batch: as of `SwiftWRF.synthesize`, and so are result and errors.
-            generator: draws the latent numbers from their prior; without one they take its mean.
-        """
-
-        def draw(some: Tensor) -> Tensor:
-            encoded = self.encoded(some)
-            prior = Normal.of(self.prior(encoded))
-            return self.decode(prior.mean if generator is None else prior.sample(generator), encoded)
-
-        return self.drawn(position, self.grid, batch, draw)
+    def render(self, position: Tensor, grid: AngularGrid, generator: torch.Generator | None = None) -> Tensor:
+        encoded = self.encoded(position)
+        prior = Normal.of(self.prior(encoded))
+        return self.decode(prior.mean if generator is None else prior.sample(generator), encoded)
 
 
-class VaeTraining(Training[VaeConfig, Vae]):
-    """By the evidence lower bound, a pixel and in units of the squared error."""
-
-    def __init__(self, config: VaeConfig, train: Spectra, device: torch.device) -> None:
-        model = Vae.make(config.size, train, torch.Generator().manual_seed(config.seed)).to(device)
-        super().__init__(config, model)
-        self.position, self.spectrum = train.position, train.spectrum.to(device)
+class VaeTraining(PairedTraining[VaeConfig, VaeNetwork]):
+    """Maximisation of the evidence lower bound, per pixel and in units of the squared error."""
 
     def objective(self) -> Tensor:
         generator, model = self.generator(), self.model
-        row = torch.randint(len(self.position), (self.config.batch,), generator=generator)
-        spectrum, encoded = self.spectrum[row.to(self.spectrum.device)], model.encoded(self.position[row])
-        seen = torch.cat([model.encoder(spectrum[:, None]), encoded], dim=-1)
-        posterior, prior = Normal.of(model.posterior(seen)), Normal.of(model.prior(encoded))
-        drawn = model.decode(posterior.sample(generator), encoded)
-        kept = posterior.divergence(prior).mean() / spectrum[0].numel()
-        return (drawn - spectrum).square().mean() + 2 * self.config.noise**2 * kept
+        spectrum, encoded = self.pairs(generator)
+        posterior = Normal.of(model.posterior(torch.cat([model.encoder(spectrum[:, None]), encoded], dim=-1)))
+        decoded = model.decode(posterior.sample(generator), encoded)
+        divergence = posterior.divergence(Normal.of(model.prior(encoded))).mean() / spectrum[0].numel()
+        return (decoded - spectrum).square().mean() + 2 * self.config.noise**2 * divergence
+
+
+@FIELD_MODELS.register("vae")
+class Vae(TrainedModel):
+    """Conditional variational autoencoder; a sample decodes latent variables sampled from their prior.
+
+    Example:
+        >>> import swiftwrf
+        >>> room = swiftwrf.simulated_room(n=20)
+        >>> Vae(steps=1).fit(room).predict(room.position).mean.shape
+        torch.Size([20, 30, 120])
+    """
+
+    name = "vae"
+    kind = "vae model"
+    config_type = VaeConfig
+    network_type = VaeNetwork
+    samples = True

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any, ClassVar, Literal, Self, get_type_hints
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_type_hints
 
 import torch
 from torch import Tensor
@@ -20,6 +20,9 @@ from swiftwrf.positions import check_positions
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.validation import NonNegativeInt, checked, configuration
+
+if TYPE_CHECKING:
+    import swiftwrf.models.geometry.model
 
 ARRAY, FIXED_END = "array", "fixed end"  # requirements that a model can declare
 CPU = torch.device("cpu")
@@ -117,6 +120,8 @@ class FieldModel(Saved):
 
     grid: AngularGrid
     """grid of the training spectra, set by `fit`"""
+    bounds: Tensor
+    """corners of the box around the training positions, float64 (2, 3) [m], set by `fit`"""
 
     @checked
     def __init__(self, config: Any = None, *, preset: Preset = "quick", **options: Any) -> None:
@@ -174,7 +179,7 @@ class FieldModel(Saved):
             raise InputError(f"{self.name} needs the {' and the '.join(lacking)}, which {train.name} does not describe")
         if like is not None and not self.accepts_like(like):
             raise InputError(f"{self.name} cannot reuse the structure of a {like.kind}")
-        self.grid = train.grid
+        self.grid, self.bounds = train.grid, bounding_box(train.position)
         try:
             self._fit(train, FitContext(like, torch.device(device), checkpoint, on_record, progress))
         except BaseException:
@@ -251,6 +256,20 @@ class FieldModel(Saved):
                 lambda some: (self._sample(some, grid, generator).clamp(0, 1), None), self._checked(position), grid
             )[0]
 
+    @property
+    def room(self) -> swiftwrf.models.geometry.model.GeometryModel | None:
+        """Room that the model found or uses; None for models without one."""
+        return None
+
+    def region(self) -> Tensor:
+        """Return positions (n, 3) [m] around which the model was fitted.
+
+        Defaults to centre and corners of the box around the training positions. Models that store the training positions
+        return these.
+        """
+        self._checked_grid(None)
+        return torch.cat([self.bounds.mean(dim=0, keepdim=True), self.bounds])
+
     def parameters(self) -> Iterable[Tensor]:
         """Return the tensors that can require gradients; none by default."""
         return ()
@@ -298,7 +317,7 @@ class FieldModel(Saved):
         """
         grid = self._checked_grid(None)
         tensors, header = self._state()
-        return tensors, {"options": asdict(self.config), "grid": asdict(grid)} | header
+        return tensors, {"options": asdict(self.config), "grid": asdict(grid), "bounds": self.bounds.tolist()} | header
 
     @abstractmethod
     def _state(self) -> tuple[dict[str, Tensor], Header]:
@@ -308,6 +327,7 @@ class FieldModel(Saved):
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         model = cls(cls._restored_config(header.get("options", {})))
         model.grid = AngularGrid(**header["grid"])
+        model.bounds = bounding_box(torch.tensor(header["bounds"], dtype=torch.float64))
         model._restore(tensors, header)
         return model
 
@@ -324,6 +344,12 @@ class FieldModel(Saved):
             f"fitted, {self.grid.shape[0]} x {self.grid.shape[1]} directions" if hasattr(self, "grid") else "not fitted"
         )
         return f"{type(self).__name__}({fitted})"
+
+
+def bounding_box(position: Tensor) -> Tensor:
+    """Return the lower and upper corner (2, 3) of the box around positions (n, 3) [m]."""
+    position = check_positions(position)
+    return torch.stack([position.amin(dim=0), position.amax(dim=0)])
 
 
 def from_plain(config_type: type[Any], options: Mapping[str, Any]) -> Any:

@@ -11,29 +11,27 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray, basis, differences
-from swiftwrf.data.spectra import Spectra, check_training, fingerprint
+from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import EXACT, GaussianProcess, Kernel, NearbyProcess, choose_kernel
 from swiftwrf.gp.pca import Components, principal_components
-from swiftwrf.positions import check_batch, check_drawn, check_positions
-from swiftwrf.runtime.checkpoint import Header, Saved, expect, refusing, restore
+from swiftwrf.models.base import ARRAY, FIELD_MODELS, FieldModel, FitContext, Record
+from swiftwrf.runtime.checkpoint import Header, expect, refusing, restore
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
 
-COMPONENTS = 64  # principal components of the training magnitudes that the model keeps at most
-LEAST = 1e-6  # share of the variance below which a component is left out
-DTYPES = {torch.float64: ("anchor", "readout"), torch.float32: ("offset", "form")}
+MAX_COMPONENTS = 64  # principal components of the training magnitudes
+MIN_VARIANCE = 1e-6  # fraction of the variance below which a component is left out
 
 
 @lru_cache(maxsize=4)
@@ -82,116 +80,135 @@ def _offset(flat: Tensor, functions: Tensor, inverse: Tensor) -> Tensor:
     return least.clamp_min(0)[:, None]
 
 
-@dataclass(frozen=True, eq=False)
-class CoarrayModel(Saved):
-    """Spectrum at any position by the array's physics; what `fit_coarray` returns.
+@FIELD_MODELS.register("coarray")
+class CoarrayModel(FieldModel):
+    """A Gaussian process in the linear space of the squared spectra that the array can produce.
 
-    A Gaussian process tells the mean magnitude between the positions; its square, projected, gives the coefficients. The
-    coefficients themselves would be the mean of squares, in which strong spectra drown the others (0.2 dB worse in rooms).
+    The process predicts the mean magnitude between the positions; its square, projected, gives the co-array coefficients. A
+    process on the coefficients themselves would predict the mean of squares, in which strong spectra dominate.
 
-    Args:
-        array: the antenna array.
-        grid: what `synthesize` draws unless told otherwise.
-        kernel: of the process, lengths in [m].
-        anchor: the training positions, float64 (n, 3) [m].
-        readout: kernel weights to K component scores and the offset; these themselves where there are more than 2000
-            positions, of which the nearest tell; float64 (n, K + 1).
-        offset: the mean of what stretching took from a spectrum, (1,).
-        form: scores, with a 1 in front, to coefficients by a quadratic form, (1 + 2 P, K + 1, K + 1).
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.simulated_room(n=50).split()
+        >>> model = CoarrayModel().fit(train)
+        >>> model.predict(test.position, swiftwrf.AngularGrid.hemisphere(45, 180)).mean.shape
+        torch.Size([10, 45, 180])
     """
 
-    kind: ClassVar[str] = "co-array model"
+    name = "coarray"
+    kind = "co-array model"
+    requires = (ARRAY,)
+    samples = True
+    any_grid = True
+    batch = 32  # spectra that stay in the processor's cache
 
     array: PlanarArray
-    grid: AngularGrid
     kernel: Kernel
-    anchor: Tensor
+    """kernel of the process, lengths in [m]"""
+    position: Tensor
+    """training positions, float64 (n, 3) [m]"""
     readout: Tensor
+    """kernel weights to K component scores and the offset, or these values for a local process, float64 (n, K + 1)"""
     offset: Tensor
+    """mean offset that stretching removed from a spectrum, float32 (1,)"""
     form: Tensor
+    """quadratic form from scores, after a 1, to coefficients, float32 (1 + 2 P, K + 1, K + 1)"""
 
     @property
     def n_parameters(self) -> int:
-        """Numbers that were fitted."""
+        """Number of fitted values."""
         return self.readout.numel() + self.form.numel()
 
-    @cached_property
-    def process(self) -> GaussianProcess | NearbyProcess:
-        """That of the component scores."""
-        return (GaussianProcess if len(self.anchor) <= EXACT else NearbyProcess)(self.kernel, self.anchor)
+    def region(self) -> Tensor:
+        return self.position
 
-    def coefficients(self, position: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-        """Of the squared spectrum, (n, 1 + 2 P), and the offset to take off its root, (n, 1); drawn from the posterior at
-        each position where there is a generator."""
-        if isinstance(self.process, NearbyProcess):
-            mean = self.process.mean(position, self.readout)
+    def _fit(self, train: Spectra, context: FitContext) -> None:
+        assert train.array is not None
+        owner = fingerprint(train, self.config.validation, self.config.seed)
+        kept = context.checkpoint
+        if kept is not None and kept.exists():
+            model, header = restore(kept, self.kind)
+            provenance = header.get("provenance")
+            if not isinstance(provenance, dict) or provenance.get("fit") != owner:
+                raise InputError(f"{kept} is of another fit (other spectra or options); remove it or give another path")
+            with refusing(f"{kept} is no co-array model that was kept by a fit"):
+                seconds = float(provenance["seconds"])
+            vars(self).update(vars(model))
         else:
-            mean = self.kernel(position, self.anchor) @ self.readout
-        predicted = mean.float()
-        if generator is not None:  # a score's variance is 1 over the number of anchors
-            unknown = (self.process.variance(position) / len(self.anchor)).sqrt().float()
-            noise = torch.randn(len(position), predicted.shape[1] - 1, generator=generator)
-            predicted[:, :-1] += unknown[:, None] * noise
-        score = torch.cat([torch.ones_like(predicted[:, :1]), predicted[:, :-1]], dim=1)
-        return torch.einsum("nk,ckl,nl->nc", score, self.form, score), self.offset + predicted[:, -1:]
+            began = time.perf_counter()
+            with progress_bar(context.progress) as bar:
+                bar.add_task("co-array model", total=1)
+                self._solve(train, train.array)
+            seconds = time.perf_counter() - began
+            if kept is not None:
+                self.save(kept, {"fit": owner, "seconds": repr(seconds)})
+        if context.on_record is not None:
+            context.on_record({"stage": "final", "seconds": seconds, "elapsed": seconds})
 
-    @torch.no_grad()
-    def synthesize(
-        self,
-        position: Tensor,
-        grid: AngularGrid | None = None,
-        batch: int = 32,
-        generator: torch.Generator | None = None,
-    ) -> Tensor:
-        """Spectra at any positions: one matrix product and a root a pixel.
+    @single_thread()
+    def _solve(self, train: Spectra, array: PlanarArray) -> None:
+        functions = basis(array, train.grid, torch.float32)
+        inverse = _inverse(array, train.grid).float()
+        parts = list(train.store.parts())
+        offset = torch.cat([_offset(train.store[rows].flatten(1), functions, inverse) for rows in parts])
 
-        Args:
-            position: of the moving end [m], (n, 3).
-            grid: directions to draw; the training spectra's unless given.
-            batch: spectra at a time, so many that they stay in the processor's cache.
-            generator: draws from the process' posterior at each position instead of taking its mean.
+        def batches() -> Iterator[Tensor]:
+            return (train.store[rows].flatten(1) + offset[rows] for rows in parts)
 
-        Returns:
-            Magnitudes in [0, 1], float32 (n, n_elevation, n_azimuth).
+        few = len(train) <= EXACT
+        if few:
+            mean, vector, component = _components(torch.cat(list(batches())))
+        else:
+            mean, vector, component = principal_components(batches, MAX_COMPONENTS, MIN_VARIANCE)
+        self.form = _quadratic_form(torch.cat([mean[None], component]), inverse)
+        fold = folds(train.position, self.config.validation, self.config.seed)
+        self.kernel = choose_kernel(train.position, train.store, fold)
+        target = torch.cat([vector, (offset - offset.mean()).double()], dim=1)
+        self.readout = torch.linalg.solve(self.kernel.noisy_gram(train.position), target) if few else target
+        self.array, self.position, self.offset = array, train.position, offset.mean()[None]
 
-        Raises:
-            InputError: positions of another shape, or not finite; a batch below 1.
-        """
-        position = check_positions(position)
-        check_batch(batch)
-        grid = grid or self.grid
-        functions = basis(self.array, grid, torch.float32)
-        spectrum = torch.empty(len(position), functions.shape[1])
-        stretched = bool(self.offset > 0)
-        for start in range(0, len(position), batch):
-            rows = slice(start, start + batch)
-            coefficient, offset = self.coefficients(position[rows], generator)
-            drawn = torch.mm(coefficient, functions, out=spectrum[rows])
-            drawn.clamp_(min=0).sqrt_()
-            if stretched:
-                drawn.sub_(offset)
-            drawn.clamp_(0, 1)
-        return check_drawn(spectrum).reshape(-1, *grid.shape)
+    @cached_property
+    def _process(self) -> GaussianProcess | NearbyProcess:
+        return (GaussianProcess if len(self.position) <= EXACT else NearbyProcess)(self.kernel, self.position)
 
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        names = ("anchor", "readout", "offset", "form")
-        tensors = {name: getattr(self, name) for name in names} | {"element": self.array.element}
-        return tensors, {"grid": asdict(self.grid), "kernel": asdict(self.kernel), "wavelength": self.array.wavelength}
+    def _scores(self, position: Tensor) -> Tensor:
+        """Return the mean of the component scores and the offset, float32 (n, K + 1)."""
+        if isinstance(self._process, NearbyProcess):
+            return self._process.mean(position, self.readout).float()
+        return (self.kernel(position, self.position) @ self.readout).float()
 
-    @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> CoarrayModel:
-        array = PlanarArray(tensors["element"], header["wavelength"])
-        n, scores = len(tensors["anchor"]), tensors["readout"].shape[-1]
-        coefficients = 1 + 2 * len(differences(array))
-        shapes = {
-            "anchor": (n, 3),
-            "readout": (n, scores),
-            "offset": (1,),
-            "form": (coefficients, scores, scores),
-        }
-        expect(tensors, shapes)
-        double, single = ({name: tensors[name].to(dtype) for name in names} for dtype, names in DTYPES.items())
-        return cls(array, AngularGrid(**header["grid"]), Kernel(**header["kernel"]), **double, **single)
+    def _spectra(self, score: Tensor, grid: AngularGrid) -> Tensor:
+        """Return the spectra (b, H, W) of component scores with an offset (b, K + 1)."""
+        one = torch.cat([torch.ones_like(score[:, :1]), score[:, :-1]], dim=1)
+        coefficient = torch.einsum("nk,ckl,nl->nc", one, self.form, one)
+        spectrum = (coefficient @ basis(self.array, grid, torch.float32)).clamp_(min=0).sqrt_()
+        if bool(self.offset > 0):
+            spectrum = spectrum - (self.offset + score[:, -1:])
+        return spectrum.reshape(-1, *grid.shape)
+
+    def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
+        return self._spectra(self._scores(position), grid), None
+
+    def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
+        score = self._scores(position)
+        # a score's variance is 1 over the number of training positions
+        unknown = (self._process.variance(position) / len(self.position)).sqrt().float()
+        score[:, :-1] += unknown[:, None] * torch.randn(len(position), score.shape[1] - 1, generator=generator)
+        return self._spectra(score, grid)
+
+    def _state(self) -> tuple[dict[str, Tensor], Header]:
+        tensors = {name: getattr(self, name) for name in ("position", "readout", "offset", "form")}
+        header = {"kernel": asdict(self.kernel), "wavelength": self.array.wavelength}
+        return tensors | {"element": self.array.element}, header
+
+    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
+        self.array = PlanarArray(tensors["element"], header["wavelength"])
+        n, scores = len(tensors["position"]), tensors["readout"].shape[-1]
+        form = (1 + 2 * len(differences(self.array)), scores, scores)
+        expect(tensors, {"position": (n, 3), "readout": (n, scores), "offset": (1,), "form": form})
+        self.kernel = Kernel(**header["kernel"])
+        self.position, self.readout = tensors["position"].double(), tensors["readout"].double()
+        self.offset, self.form = tensors["offset"].float(), tensors["form"].float()
 
 
 def fit_coarray(
@@ -200,78 +217,36 @@ def fit_coarray(
     validation: Validation = "random",
     seed: int = 0,
     checkpoint: Path | None = None,
-    on_record: Callable[[dict[str, Any]], None] | None = None,
+    on_record: Callable[[Record], None] | None = None,
     progress: bool = True,
 ) -> CoarrayModel:
-    """Fits the model; nothing is optimised step by step.
+    """Fit a co-array model in closed form.
 
     Args:
-        train: the only spectra it sees, with their array.
-        validation: how training spectra are held out to choose the kernel.
-        seed: of what is held out.
-        checkpoint: a file that keeps the fitted model; where it exists and is of these spectra, it is opened instead.
-        on_record: called once, with stage (final), seconds and elapsed, those of the fit also where it is opened.
-        progress: show a progress bar on a terminal.
+        train: Training spectra with their array.
+        validation: How training spectra are held out to choose the kernel.
+        seed: Seed of the folds.
+        checkpoint: File for the fitted model. If it exists, the model is read from it.
+        on_record: Called once with stage (final), seconds and elapsed, those of the fit also if the model is read.
+        progress: Show a progress bar on a terminal.
 
     Raises:
-        InputError: no array, fewer than 10 spectra, or something not finite.
+        InputError: As `FieldModel.fit`.
+
+    Example:
+        >>> import swiftwrf
+        >>> fit_coarray(swiftwrf.simulated_room(n=20), progress=False)
+        CoarrayModel(fitted, 90 x 360 directions)
     """
-    check_training(train)
-    if train.array is None:
-        raise InputError(f"{train.name} does not say which array took the spectra; give its geometry and carrier")
-    owner = fingerprint(train, validation, seed)
-    if checkpoint is not None and checkpoint.exists():
-        kept, header = restore(checkpoint, CoarrayModel.kind)
-        provenance = header.get("provenance")
-        if not isinstance(provenance, dict) or provenance.get("fit") != owner:
-            raise InputError(
-                f"{checkpoint} is of another fit (other spectra or settings); remove it or give another path"
-            )
-        if on_record is not None:
-            with refusing(f"{checkpoint} is no co-array model that was kept by a fit"):
-                seconds = float(provenance["seconds"])
-            on_record({"stage": "final", "seconds": seconds, "elapsed": seconds})
-        return cast(CoarrayModel, kept)
-    began = time.perf_counter()
-    with progress_bar(progress) as bar:
-        bar.add_task("co-array model", total=1)
-        model = _solve(train, train.array, folds(train.position, validation, seed))
-    seconds = time.perf_counter() - began
-    if checkpoint is not None:
-        model.save(checkpoint, {"fit": owner, "seconds": repr(seconds)})
-    if on_record is not None:
-        on_record({"stage": "final", "seconds": seconds, "elapsed": seconds})
-    return model
-
-
-@single_thread()
-def _solve(train: Spectra, array: PlanarArray, fold: Tensor) -> CoarrayModel:
-    functions = basis(array, train.grid, torch.float32)
-    inverse = _inverse(array, train.grid).float()
-    parts = list(train.store.parts())
-    offset = torch.cat([_offset(train.store[rows].flatten(1), functions, inverse) for rows in parts])
-
-    def batches() -> Iterator[Tensor]:
-        return (train.store[rows].flatten(1) + offset[rows] for rows in parts)
-
-    few = len(train) <= EXACT
-    if few:
-        mean, vector, component = _components(torch.cat(list(batches())))
-    else:
-        mean, vector, component = principal_components(batches, COMPONENTS, LEAST)
-    form = _quadratic_form(torch.cat([mean[None], component]), inverse)
-
-    kernel = choose_kernel(train.position, train.store, fold)
-    target = torch.cat([vector, (offset - offset.mean()).double()], dim=1)
-    readout = torch.linalg.solve(kernel.noisy_gram(train.position), target) if few else target
-    return CoarrayModel(array, train.grid, kernel, train.position, readout, offset.mean()[None], form)
+    model = CoarrayModel(validation=validation, seed=seed)
+    return model.fit(train, checkpoint=checkpoint, on_record=on_record, progress=progress)
 
 
 def _components(flat: Tensor) -> Components:
     """Principal components from the rows' inner products, of which there are far fewer than pixels."""
     mean = flat.mean(dim=0)
     value, vector = torch.linalg.eigh(((flat - mean) @ (flat - mean).T).double())
-    vector = vector[:, value > LEAST * value.sum()][:, -COMPONENTS:]
+    vector = vector[:, value > MIN_VARIANCE * value.sum()][:, -MAX_COMPONENTS:]
     return Components(mean, vector, vector.T.float() @ (flat - mean))
 
 

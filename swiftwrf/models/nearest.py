@@ -23,6 +23,9 @@ class MemoryModel(FieldModel):
     def _fit(self, train: Spectra, context: FitContext) -> None:
         self.position, self.store = train.position, train.store
 
+    def region(self) -> Tensor:
+        return self.position
+
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         return {
             "position": self.position,

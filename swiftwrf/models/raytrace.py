@@ -1,118 +1,151 @@
-"""Ray tracing by Sionna RT, in a scene that is given or in the room that the spectra show."""
+"""Ray tracing by Sionna RT, in a given scene or in the room that is estimated from the spectra."""
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 
 import torch
-from augment.synthesizers.base import ARRAY, FIXED_END, SYNTHESIZERS, Synthesizer
-from augment.synthesizers.geometry import find_room
 from torch import Tensor
 
-from swiftwrf import GeometryModel, Spectra
+from swiftwrf.array.angles import AngularGrid
+from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.raytraced import ROOMS, SCENE_FILE, Material, Scene, Surface, Tracing, sionna, trace
 from swiftwrf.data.raytraced.surfaces import rectangle
-from swiftwrf.models.geometry import refit_geometry
+from swiftwrf.data.spectra import Moving, Spectra
+from swiftwrf.models.base import ARRAY, FIELD_MODELS, FIXED_END, FieldModel, FitContext
+from swiftwrf.models.geometry import GeometryConfig, GeometryModel
+from swiftwrf.runtime.checkpoint import Header, expect
+from swiftwrf.runtime.validation import check_value, configuration
 
-BEYOND = 10.0  # times as far as anything known do the walls of a found room reach: they have no edges
-FARTHEST = 1e4  # [m] from the fixed end: beyond, single precision loses the phase
-STRONGEST = 0.95  # gain of a plane that a material can have
-THICK_M, LOSS = 100.0, 1e-3  # a slab [m] of a conductivity [S/m] that lets no second reflection out
+EXTENT = 10.0  # half the side of an unbounded wall, in distances of the farthest known point from the fixed end
+MAX_DISTANCE_M = 1e4  # from the fixed end; beyond, single precision loses the phase
+MAX_GAIN = 0.95  # of a plane that a material can have
+THICKNESS_M, CONDUCTIVITY_S_PER_M = 100.0, 1e-3  # of a slab without a second reflection
 
 
-@SYNTHESIZERS.register(
-    "raytrace",
-    meaning="rays traced by Sionna RT, in --scene or in the room that geometry finds (extra: raytrace)",
-    needs=(ARRAY, FIXED_END),
-    colour="#994455",
-)
-class Raytrace(Synthesizer):
-    """Paths by the laws of reflection for vertically polarised isotropic ends.
+@configuration
+class RaytraceConfig(GeometryConfig):
+    """Options of the ray tracing; those of the search apply without a scene."""
 
-    The scene that is given is taken as it is, and learns nothing from the spectra. Of the room that is found, planes become
-    half spaces without loss that reflect at normal incidence as strongly as the spectra say.
+    scene: str | None = None
+    """name of a built-in room or a scene file; by default the room is estimated from the spectra"""
+
+
+@FIELD_MODELS.register("raytrace")
+class RaytraceModel(FieldModel):
+    """Paths by the laws of reflection between vertically polarised isotropic ends, traced by Sionna RT.
+
+    A given scene is used as it is, without any fit. Planes of an estimated room become lossless half spaces whose reflection
+    at normal incidence has the estimated gain.
     """
 
-    def fit(self, train: Spectra) -> None:
-        sionna()  # refuses before a room is sought
-        self._train, self._room = train, None
-        if self.settings.scene is None:
-            self._room, self.shared_seconds = find_room(train, self.settings)
-        self._build()
+    name = "raytrace"
+    kind = "ray-tracing model"
+    config_type = RaytraceConfig
+    requires = (ARRAY, FIXED_END)
+    slow = True
+    any_grid = True
 
-    def fit_like(self, other: Synthesizer, train: Spectra) -> None:
-        assert isinstance(other, Raytrace)
-        self._train, self._room = train, None
-        if other._room is not None:
-            self._room = refit_geometry(other._room, train, seed=self.settings.seed)
+    array: PlanarArray
+    rotation: Tensor
+    fixed_position: Tensor
+    moving: Moving
+    progress: bool = False
+    """whether `predict` shows a progress bar on a terminal"""
+
+    @classmethod
+    def accepts_like(cls, model: FieldModel) -> bool:
+        return model.room is not None or isinstance(model, cls)
+
+    @property
+    def room(self) -> GeometryModel | None:
+        """Room that is traced; None if a scene is given."""
+        return self._room
+
+    def _fit(self, train: Spectra, context: FitContext) -> None:
+        sionna()  # refuses before a room is searched
+        assert train.array is not None
+        assert train.rotation is not None
+        assert train.fixed_position is not None
+        self.array, self.rotation = train.array, train.rotation
+        self.fixed_position, self.moving = train.fixed_position, train.moving
+        self.progress = context.progress
+        self._room = None
+        if self.config.scene is None:
+            like = context.like if context.like and context.like.room else None
+            search = {option.name: getattr(self.config, option.name) for option in fields(GeometryConfig)}
+            self._room = GeometryModel(**search).fit(train, like=like, progress=context.progress)
         self._build()
 
     def _build(self) -> None:
-        """The scene, and where its origin is in world coordinates: single precision wants near numbers."""
-        array, fixed, name = self._train.array, self._train.fixed_position, self.settings.scene
-        assert array is not None
-        assert fixed is not None
-        if self._room is not None:
-            self._origin = fixed
-            self._scene = Scene(planes(self._room, self._train.position), array.frequency_hz)
+        """Build the scene around an origin that keeps coordinates small, for Sionna computes in single precision."""
+        if self._room is None:
+            assert self.config.scene is not None
+            self._origin = torch.zeros_like(self.fixed_position)
+            self._scene = open_scene(self.config.scene, self.array.frequency_hz)
         else:
-            assert name is not None
-            self._origin = torch.zeros_like(fixed)
-            self._scene = open_scene(name, array.frequency_hz)
+            self._origin = self.fixed_position
+            self._scene = Scene(surfaces(self._room), self.array.frequency_hz)
 
-    @torch.no_grad()
-    def synthesize(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """As of all synthesizers; where no path arrives, zeros."""
-        array, fixed, rotation = self._train.array, self._train.fixed_position, self._train.rotation
-        assert array is not None
-        assert fixed is not None
-        assert rotation is not None
-        spectrum = torch.zeros(len(position), *self._train.grid.shape)
-        near = ((position - fixed).abs() <= FARTHEST).all(dim=1).nonzero()[:, 0]
+    def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
+        """Return spectra, zero at positions that no path reaches. Not differentiable."""
+        position = position.detach()
+        spectrum = torch.zeros(len(position), *grid.shape)
+        near = ((position - self.fixed_position).abs() <= MAX_DISTANCE_M).all(dim=1).nonzero()[:, 0]
         if not len(near):
-            return spectrum
+            return spectrum, None
         paths = trace(
             self._scene,
-            fixed - self._origin,
-            position[near].double() - self._origin,
-            self._train.moving,
-            Tracing(seed=self.settings.seed),
-            self.settings.progress,
+            self.fixed_position - self._origin,
+            position[near] - self._origin,
+            self.moving,
+            Tracing(seed=self.config.seed),
+            self.progress,
         )
-        channel = array.channel(paths.direction @ rotation, paths.gain, paths.owner, len(near))
-        heard = paths.count > 0
-        spectrum[near[heard]] = array.spectrum(channel[heard], self._train.grid)
-        return spectrum
+        channel = self.array.channel(paths.direction @ self.rotation, paths.gain, paths.owner, len(near))
+        reached = paths.count > 0
+        spectrum[near[reached]] = self.array.spectrum(channel[reached], grid)
+        return spectrum, None
+
+    def _state(self) -> tuple[dict[str, Tensor], Header]:
+        if self._room is not None:
+            return self._room._state()
+        tensors = {"element": self.array.element, "rotation": self.rotation, "fixed_position": self.fixed_position}
+        return tensors, {"wavelength": self.array.wavelength, "moving": self.moving}
+
+    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
+        expect(tensors, {"rotation": (3, 3), "fixed_position": (3,)})
+        check_value("moving", header["moving"], Moving)
+        self.array = PlanarArray(tensors["element"], header["wavelength"])
+        self.rotation, self.fixed_position = tensors["rotation"].double(), tensors["fixed_position"].double()
+        self.moving, self._room = header["moving"], None
+        if self.config.scene is None:
+            self._room = GeometryModel.within(self, tensors, header)
+        self._build()
 
 
 def open_scene(name: str, frequency_hz: float) -> Scene:
-    """A room by its name or a scene by its file, at a carrier.
+    """Return a built-in room by its name, or a scene by its file, at a carrier frequency.
 
     Raises:
-        InputError: as of `Scene`; an unknown room.
+        InputError: An unknown room, or a file that is no scene.
     """
     if name.endswith(SCENE_FILE):
         return Scene.read(Path(name), frequency_hz)
     return Scene(ROOMS[name]().surfaces(), frequency_hz)
 
 
-def planes(room: GeometryModel, position: Tensor) -> list[Surface]:
-    """The planes of a found room as squares without end, the fixed end at the origin.
-
-    Args:
-        room: what the spectra show.
-        position: that were measured, (n, 3) [m].
-    """
-    normal, offset, gain = room.tensors()
-    away = offset[0] - normal[0] @ room.fixed_position
-    known = float(torch.cat([away.abs(), (position - room.fixed_position).norm(dim=1)]).max())
+def surfaces(room: GeometryModel) -> list[Surface]:
+    """Return the planes of an estimated room as squares without an end, the fixed end at the origin."""
+    found = room.tensors()
+    away = found.offset[0] - found.normal[0] @ room.fixed_position
+    farthest = float(torch.cat([away.abs(), (room.bounds - room.fixed_position).norm(dim=1)]).max())
     made = []
-    for number, (direction, at, strength) in enumerate(
-        zip(normal[0], away.tolist(), gain[0].abs().tolist(), strict=True)
-    ):
-        strength = min(strength, STRONGEST)
-        material = Material(f"plane-{number}", THICK_M, ((1 + strength) / (1 - strength)) ** 2, LOSS)
-        side = 2 * BEYOND * known * torch.linalg.svd(direction[None]).Vh[1:]  # (2, 3), across the normal
-        corner = at * direction - side.sum(dim=0) / 2
-        made.append(Surface.joined(f"plane-{number}", material, [rectangle(corner.tolist(), *side.tolist())]))
+    for number, normal in enumerate(found.normal[0]):
+        gain = min(float(found.gain[0, number].abs()), MAX_GAIN)
+        material = Material(f"plane-{number}", THICKNESS_M, ((1 + gain) / (1 - gain)) ** 2, CONDUCTIVITY_S_PER_M)
+        side = 2 * EXTENT * farthest * torch.linalg.svd(normal[None]).Vh[1:]  # (2, 3), across the normal
+        corner = float(away[number]) * normal - side.sum(dim=0) / 2
+        made.append(Surface.joined(material.name, material, [rectangle(corner.tolist(), *side.tolist())]))
     return made

@@ -1,27 +1,34 @@
-"""Primitives to spectrum: one contract, several makers.
+"""Rasterization of primitives to spectra: one interface, several backends.
 
-| maker       | where                        | what                                                            |
-|-------------|------------------------------|-----------------------------------------------------------------|
-| `reference` | any device, float32, float64 | the definition, dense                                           |
-| `cpu`       | CPU, float32                 | culled rows, compiled by numba at first use                     |
-| `cuda`      | NVIDIA GPU, float32          | culled tiles, compiled at first use by the NVRTC of torch       |
-| `auto`      |                              | the fast one for the tensors' device and dtype, else `reference`|
+| backend     | tensors                      | method                                                       |
+|-------------|------------------------------|--------------------------------------------------------------|
+| `reference` | any device, float32, float64 | the definition, dense                                        |
+| `cpu`       | CPU, float32                 | culled rows, compiled by numba at the first use              |
+| `cuda`      | NVIDIA GPU, float32          | culled tiles, compiled by NVRTC at the first use             |
+| `auto`      |                              | the fast backend of device and dtype if available, else `reference` |
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import Literal, get_args
+import warnings
+from collections.abc import Callable
+from functools import cache, lru_cache
+from importlib.util import find_spec
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Gt, Lt
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.errors import InputError
-from swiftwrf.rasterize import cuda, reference
+from swiftwrf.rasterize import cuda_kernels, operators, reference
 from swiftwrf.rasterize.magnitude import magnitude
+from swiftwrf.runtime.validation import check_value
 
-Maker = Literal["auto", "reference", "cpu", "cuda"]
+Backend = Literal["auto", "reference", "cpu", "cuda"]
+Cutoff = Annotated[float, Gt(0), Lt(1)] | None
+HAS_NUMBA = find_spec("numba") is not None
 
 
 def rasterize(
@@ -29,44 +36,42 @@ def rasterize(
     cholesky: Tensor,
     weight: Tensor,
     grid: AngularGrid,
-    maker: Maker = "auto",
+    backend: Backend = "auto",
     cutoff: float | None = 1e-4,
 ) -> Tensor:
-    """Sum of 2D Gaussians on an angular grid (paper, section 4.1).
+    """Render the sum of 2D Gaussians on an angular grid (paper, section 4.1).
 
-    Differentiable in mean, cholesky and weight. Leading dimensions are positions; a primitive's whole footprint is
-    drawn, periodic in azimuth, clipped in elevation.
+    Differentiable in mean, cholesky and weight. Leading dimensions are positions. The whole footprint of a primitive is
+    rendered, periodic in azimuth and clipped in elevation.
 
     Args:
-        mean: azimuth and elevation of each primitive [rad], (..., N, 2); azimuths may be any number of turns away.
+        mean: Azimuth and elevation of each primitive [rad], (..., N, 2). Azimuths may be any number of turns away.
         cholesky: l1, l2, l3 of L = [[l1, 0], [l2, l3]] on (azimuth, elevation) [rad], (N, 3) shared by all positions
-            or (..., N, 3); l1 and l3 not zero (their sign changes L, see the formula in `reference.py`).
-        weight: delta psi, real and imaginary part, (..., N, 2).
-        grid: the directions to draw.
-        maker: who draws; see the table above.
-        cutoff: kernel values below it count as 0, whatever the weight, so that weights near 0 keep their exact
-            gradient; None draws everything. The error is at most cutoff * sum |weight| in reach.
+            or (..., N, 3). l1 and l3 must not be 0; `reference.py` gives the formula.
+        weight: Real and imaginary part of delta psi, (..., N, 2).
+        grid: Directions to render.
+        backend: Implementation; see the table of `swiftwrf.rasterize`. Defaults to "auto".
+        cutoff: Kernel values below it count as 0 for every weight, so that weights near 0 keep their exact gradient.
+            The error is at most cutoff times the sum of |weight| in reach. None evaluates every kernel everywhere.
 
     Returns:
         Real and imaginary part of A, (..., 2, n_elevation, n_azimuth).
 
     Raises:
-        InputError: shapes, dtypes or devices that do not fit, a cutoff outside (0, 1), a maker that cannot draw these
-            tensors or cannot be built here, or (outside compiled and CUDA code, where looking would wait for the device)
-            a value that is not finite or a zero on a Cholesky factor's diagonal.
-    """
-    _check(mean, cholesky, weight, cutoff)
-    chosen = _choose(maker, mean)
-    if chosen == "reference":
-        return reference.rasterize(mean, cholesky, weight, grid, cutoff)
-    flat = _flattened(mean, cholesky, weight)
-    if chosen == "cuda":
-        drawn = cuda.rasterize(*flat, grid, cutoff)
-    else:
-        from swiftwrf.rasterize import cpu  # numba is imported by those who use it
+        InputError: Shapes, dtypes or devices do not match, `cutoff` lies outside (0, 1), or the backend is unavailable
+            for these tensors. On the CPU outside torch.compile also values that are not finite and zeros on the
+            diagonal of a Cholesky factor. On a GPU this check would wait for the device.
 
-        drawn = cpu.rasterize(*flat, grid, cutoff)
-    return drawn.reshape(*mean.shape[:-2], 2, *grid.shape)
+    Example:
+        >>> import torch
+        >>> mean, factor, weight = torch.tensor([[3.1, 0.8]]), torch.tensor([[0.3, 0.0, 0.3]]), torch.tensor([[1.0, 0.0]])
+        >>> rasterize(mean, factor, weight, AngularGrid.hemisphere(9, 36)).shape
+        torch.Size([2, 9, 36])
+    """
+    if not _fast(mean, cholesky, weight, backend, cutoff):
+        return reference.field(mean, cholesky, weight, grid, cutoff)
+    rendered = operators.field(*_flattened(mean, cholesky, weight), grid, cutoff)
+    return rendered.reshape(*mean.shape[:-2], 2, *grid.shape)
 
 
 def rasterize_magnitude(
@@ -74,51 +79,106 @@ def rasterize_magnitude(
     cholesky: Tensor,
     weight: Tensor,
     grid: AngularGrid,
-    maker: Maker = "auto",
+    backend: Backend = "auto",
     cutoff: float | None = 1e-4,
 ) -> Tensor:
-    """|A| of what `rasterize` draws, (..., n_elevation, n_azimuth), with gradient 0 where A = 0; the same arguments and
-    errors. The CUDA maker draws it without writing A."""
-    if _choose(maker, mean) != "cuda":
-        return magnitude(rasterize(mean, cholesky, weight, grid, maker, cutoff))
-    _check(mean, cholesky, weight, cutoff)
-    drawn = cuda.magnitude(*_flattened(mean, cholesky, weight), grid, cutoff)
-    return drawn.reshape(*mean.shape[:-2], *grid.shape)
+    """Render the magnitude |A| of the sum of 2D Gaussians, with gradient 0 where A = 0.
+
+    Args and errors are those of `rasterize`. The CUDA backend does not store A.
+
+    Returns:
+        Magnitude of A, (..., n_elevation, n_azimuth).
+
+    Example:
+        >>> import torch
+        >>> mean, factor, weight = torch.tensor([[0.0, 1.0]]), torch.tensor([[0.3, 0.0, 0.3]]), torch.tensor([[0.6, 0.8]])
+        >>> spectrum = rasterize_magnitude(mean, factor, weight, AngularGrid(1.0, 0.1, 1, 0.0, 8))
+        >>> round(spectrum[0, 0].item(), 3)
+        1.0
+    """
+    if not _fast(mean, cholesky, weight, backend, cutoff):
+        return magnitude(reference.field(mean, cholesky, weight, grid, cutoff))
+    rendered = operators.magnitude(*_flattened(mean, cholesky, weight), grid, cutoff)
+    return rendered.reshape(*mean.shape[:-2], *grid.shape)
+
+
+def available_backends(device: torch.device | str = "cpu") -> tuple[str, ...]:
+    """Return the backends that render float32 tensors on a device, fastest first.
+
+    Example:
+        >>> available_backends("cpu")[-1]
+        'reference'
+    """
+    device = torch.device(device)
+    return (device.type, "reference") if _available(device) else ("reference",)
 
 
 @lru_cache
 def prepare(device: torch.device | str) -> None:
-    """Compiles the fast maker for a device, which else is part of the time of whatever is drawn first."""
-    one = torch.ones(1, 1, 2, device=device)
-    rasterize_magnitude(one, torch.ones(1, 3, device=device), one, AngularGrid(0.0, 1.0, 1, 0.0, 1))
+    """Compile the fast backend of a device, so that measured times do not include its compilation.
+
+    Example:
+        >>> prepare("cpu")
+    """
+    ones = torch.ones(1, 1, 2, device=device)
+    rasterize_magnitude(ones, torch.ones(1, 3, device=device), ones, AngularGrid(0.0, 1.0, 1, 0.0, 1))
+
+
+def _constant(function: Callable[[torch.device], bool]) -> Callable[[torch.device], bool]:
+    """Let torch.compile evaluate the function instead of tracing it.
+
+    This imports torch's compiler, a third of the import time of the package, and is needed on GPUs only.
+    """
+    return torch.compiler.assume_constant_result(function) if torch.cuda.is_available() else function
+
+
+def _available(device: torch.device) -> bool:
+    return HAS_NUMBA if device.type == "cpu" else device.type == "cuda" and _cuda_available(device)
+
+
+@_constant
+def _cuda_available(device: torch.device) -> bool:
+    return _cuda_compiles(device)
+
+
+@cache
+def _cuda_compiles(device: torch.device) -> bool:
+    try:
+        cuda_kernels.kernels(device)
+    except cuda_kernels.CudaUnavailable as error:
+        warnings.warn(f"rendering with the slow backend 'reference': {error}", stacklevel=2)
+        return False
+    return True
 
 
 def _flattened(mean: Tensor, cholesky: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """All positions in one leading dimension."""
+    """Return the tensors with all positions in one leading dimension."""
     n_position, n = mean.shape[:-2].numel(), mean.shape[-2]
     if cholesky.dim() > 2:
         cholesky = cholesky.reshape(n_position, n, 3)
     return mean.reshape(n_position, n, 2), cholesky, weight.reshape(n_position, n, 2)
 
 
-def _choose(maker: Maker, mean: Tensor) -> str:
-    if maker not in get_args(Maker):
-        raise InputError(f"unknown maker {maker!r}; choose one of {', '.join(get_args(Maker))}")
-    if maker == "auto":
-        if mean.dtype != torch.float32 or mean.device.type not in ("cpu", "cuda"):
-            return "reference"
-        return "reference" if mean.is_cuda and not cuda.available(mean.device) else mean.device.type
-    if maker != "reference" and (mean.device.type != maker or mean.dtype != torch.float32):
+def _fast(mean: Tensor, cholesky: Tensor, weight: Tensor, backend: Backend, cutoff: float | None) -> bool:
+    """Check the arguments of `rasterize`, and return whether the fast backend of the device renders them."""
+    check_value("backend", backend, Backend)
+    check_value("cutoff", cutoff, Cutoff)
+    _check(mean, cholesky, weight)
+    if backend == "auto":
+        if mean.device.type == "cpu" and mean.dtype == torch.float32 and not HAS_NUMBA:
+            warnings.warn(
+                "rendering with the slow backend 'reference': the package numba is not installed", stacklevel=3
+            )
+        return mean.dtype == torch.float32 and _available(mean.device)
+    if backend != "reference" and (mean.device.type != backend or mean.dtype != torch.float32):
         raise InputError(
-            f"maker {maker!r} draws float32 tensors on {maker}, got {mean.dtype} on {mean.device}; "
-            "move them there or use maker='auto'"
+            f"backend {backend!r} renders float32 tensors on {backend}, got {mean.dtype} on {mean.device}; "
+            "move them there or use backend='auto'"
         )
-    return maker
+    return backend != "reference"
 
 
-def _check(mean: Tensor, cholesky: Tensor, weight: Tensor, cutoff: float | None) -> None:
-    if cutoff is not None and not 0 < cutoff < 1:
-        raise InputError(f"cutoff must lie in (0, 1) or be None, got {cutoff}")
+def _check(mean: Tensor, cholesky: Tensor, weight: Tensor) -> None:
     if mean.dim() < 2 or mean.shape[-1] != 2:
         raise InputError(f"mean must have shape (..., N, 2), got {tuple(mean.shape)}")
     batch, n = mean.shape[:-2], mean.shape[-2]
@@ -137,11 +197,11 @@ def _check(mean: Tensor, cholesky: Tensor, weight: Tensor, cutoff: float | None)
     if mean.device.type == "cpu" and not torch.compiler.is_compiling():
         for name, tensor in (("mean", mean), ("cholesky", cholesky), ("weight", weight)):
             if not torch.isfinite(tensor).all():
-                raise InputError(f"{name} holds a value that is not finite; a primitive there would silently vanish")
+                raise InputError(f"{name} contains a value that is not finite; its primitive would not be rendered")
         if n and bool((cholesky[..., ::2] == 0).any()):
             raise InputError(
-                "a Cholesky factor has a zero on its diagonal (a primitive of no width); keep l1 and l3 off 0"
+                "a Cholesky factor has a zero on its diagonal (a primitive of no width); keep l1 and l3 away from 0"
             )
 
 
-__all__ = ["Maker", "prepare", "rasterize", "rasterize_magnitude"]
+__all__ = ["Backend", "available_backends", "prepare", "rasterize", "rasterize_magnitude"]

@@ -1,13 +1,12 @@
-"""The kernels for CPUs: each primitive visits only the pixels it reaches, and the processor's lanes share a row.
+"""Kernels of the CPU backend, compiled by numba: each primitive visits only the pixels within its cutoff.
 
-Along a row the exponent is a parabola in the column about the row's own centre, so a row needs no exponential of its own:
-each lane computes 2^t of its column by a polynomial. Work is spread over positions and, where there are few, over bands of
-rows (forward) or blocks of primitives (backward); sums are put in the lanes' order when the kernels are compiled and no sum
-depends on how work was spread, so the bits are the same for any number of threads and any batch size.
+The exponent of a kernel is a parabola along a row. The vector lanes of the processor evaluate 2^t for the columns of a row
+by a polynomial. Threads share positions and, if positions are few, bands of rows (forward) or blocks of primitives
+(backward). No sum depends on this division, so results have the same bits for any number of threads and any batch size.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, call-arg, no-any-return"
-# (the jitted functions take NumPy arrays and scalars; numba types them itself)
+# (numba infers the types of the compiled functions)
 
 from __future__ import annotations
 
@@ -16,15 +15,14 @@ import math
 import numpy as np
 from numba import njit, prange
 
-BASE2 = np.float32(-0.5 / math.log(2))  # of half a squared distance: exp(-x / 2) = 2^(BASE2 x)
+BASE2 = np.float32(-0.5 / math.log(2))  # exp(-x / 2) = 2^(BASE2 x)
 
-_FAST = {"contract", "nsz", "arcp", "reassoc"}  # not nnan or ninf: what is not finite stays visible
+_FAST = {"contract", "nsz", "arcp", "reassoc"}  # Without nnan and ninf, so that values that are not finite propagate.
 _inline = njit(inline="always", fastmath=_FAST)
 
 
 def _jit(function):
-    """Compiled at first use, and kept for the next process where there is a place to keep it: neither an installation that
-    may not be written nor a user without a home is one."""
+    """Compile a function at its first use, and cache the result on disk if numba finds a folder that it can write to."""
     try:
         return njit(parallel=True, fastmath=_FAST, cache=True)(function)
     except RuntimeError:
@@ -32,8 +30,19 @@ def _jit(function):
 
 
 @_inline
+def _pixels(mean, cholesky, origin, step, n_azimuth):
+    """Return column, row and Cholesky factor in pixels, the column within the grid.
+
+    The mean is float64: float32 would lose the fraction of a pixel of far columns and of means many turns away.
+    """
+    x, y = (mean[0] - origin[1]) / step[1], (mean[1] - origin[0]) / step[0]
+    l1, l2, l3 = cholesky[0] / step[1], cholesky[1] / step[0], cholesky[2] / step[0]
+    return x - math.floor(x / n_azimuth) * n_azimuth, y, np.float32(l1), np.float32(l2), np.float32(l3)
+
+
+@_inline
 def _rows(y, l2, l3, reach2, top, bottom):
-    """First row and one past the last of [top, bottom) that a kernel centred on row `y` reaches."""
+    """Return the first row, and the row after the last, of [top, bottom) within the cutoff of a kernel on row `y`."""
     extent = math.sqrt(reach2 * (l2 * l2 + l3 * l3))
     first = max(top, math.ceil(max(y - extent, -1.0)))
     last = min(bottom - 1, math.floor(min(y + extent, float(bottom))))
@@ -41,9 +50,11 @@ def _rows(y, l2, l3, reach2, top, bottom):
 
 
 @_inline
-def _shape(l1, l2, l3):
-    """What turns differences into exponents: u = inv1 dx and v = inv3 dy - shear dx, and, the square completed,
-    u^2 + v^2 = steepness dy^2 + curvature (dx - lean dy)^2."""
+def _quadratic(l1, l2, l3):
+    """Return inv1, inv3, shear, curvature, lean, steepness of a Cholesky factor.
+
+    u = inv1 dx and v = inv3 dy - shear dx, so that u^2 + v^2 = steepness dy^2 + curvature (dx - lean dy)^2.
+    """
     inv1, inv3 = np.float32(1) / l1, np.float32(1) / l3
     shear = l2 * inv1 * inv3
     curvature = inv1 * inv1 + shear * shear
@@ -52,10 +63,10 @@ def _shape(l1, l2, l3):
 
 @_inline
 def _columns(x, dy, curvature, lean, steepness, reach2, n_azimuth):
-    """First column and one past the last that a kernel centred on column `x` reaches on the row `dy` above its centre, and
-    how far the first is from the row's own centre.
+    """Return the first column, the column after the last, and the distance of the first from the row's own centre.
 
-    Never more than the turn centred on the mean (the nearest image), and a direction half a turn away is drawn once.
+    The columns are those within the cutoff of a kernel centred on column `x`, on the row `dy` above its centre. They cover
+    at most the turn centred on the mean, so that a direction half a turn away counts once.
     """
     remain = reach2 - steepness * dy * dy
     if remain < 0:
@@ -73,11 +84,11 @@ def _columns(x, dy, curvature, lean, steepness, reach2, n_azimuth):
 
 @_inline
 def _exp2(t):
-    """2^t to 3e-7 of itself; what is below the smallest normal number is that number."""
-    t = np.float32(-126) if t < np.float32(-126) else t  # written so that nan stays nan
+    """Return 2^t with a relative error of 3e-7, and at least the smallest normal number."""
+    t = np.float32(-126) if t < np.float32(-126) else t  # nan stays nan
     whole = np.floor(t + np.float32(0.5))
     x = t - whole
-    power = np.float32(1.3276470e-3)  # least relative error on [-1/2, 1/2]
+    power = np.float32(1.3276470e-3)  # minimax polynomial of the relative error on [-1/2, 1/2]
     power = power * x + np.float32(9.6755410e-3)
     power = power * x + np.float32(5.5507135e-2)
     power = power * x + np.float32(2.4022120e-1)
@@ -89,7 +100,7 @@ def _exp2(t):
 
 @_inline
 def _kernel(start, n_columns, drop, bend, kernel):
-    """2^(drop + bend d^2) at the distances d = start, start + 1, ... from the row's centre."""
+    """Write 2^(drop + bend d^2) for the distances d = start, start + 1, ... from the row's centre into `kernel`."""
     for k in range(n_columns):
         d = start + np.float32(np.int32(k))
         kernel[k] = _exp2(drop + bend * d * d)
@@ -97,7 +108,7 @@ def _kernel(start, n_columns, drop, bend, kernel):
 
 @_inline
 def _add(kernel, begin, end, weight_re, weight_im, re, im, pixel):
-    """Adds a part of a row of kernel values, from `pixel` on."""
+    """Add the kernel values from `begin` to `end`, times the weight, to the pixels from `pixel` on."""
     for k in range(end - begin):
         g = kernel[begin + k]
         re[pixel + k] += weight_re * g
@@ -106,7 +117,7 @@ def _add(kernel, begin, end, weight_re, weight_im, re, im, pixel):
 
 @_inline
 def _sums(kernel, begin, end, start, weight_re, weight_im, re, im, pixel):
-    """Over a part of a row: kernel times derivative, real and imaginary; z, their weighted sum, times d and times d^2."""
+    """Return sums over a part of a row: kernel times derivative (real, imaginary), and their weighted sum times d, d^2."""
     zero = np.float32(0)
     d_re, d_im, z_d, z_dd = zero, zero, zero, zero
     for k in range(end - begin):
@@ -122,8 +133,22 @@ def _sums(kernel, begin, end, start, weight_re, weight_im, re, im, pixel):
 
 
 @_jit
-def draw(mean, cholesky, weight, reach2, n_elevation, n_azimuth, n_bands, out):
+def render(mean, cholesky, weight, origin, step, shape, reach2, n_bands, out):
+    """Write the field into `out`, (B, 2, n_elevation n_azimuth).
+
+    Args:
+        mean: Azimuth and elevation [rad], (B, N, 2).
+        cholesky: Cholesky factors [rad], (1, N, 3) or (B, N, 3).
+        weight: Real and imaginary part, (B, N, 2).
+        origin: Elevation and azimuth of the first pixel [rad].
+        step: Distance of pixels in elevation and azimuth [rad].
+        shape: Number of rows and columns.
+        reach2: Squared distance of the cutoff [standard deviations].
+        n_bands: Number of bands of rows that threads share.
+        out: Output.
+    """
     n_position, n = mean.shape[0], mean.shape[1]
+    n_elevation, n_azimuth = shape
     shared = cholesky.shape[0] == 1
     band = (n_elevation + n_bands - 1) // n_bands
     for task in prange(n_position * n_bands):
@@ -136,12 +161,11 @@ def draw(mean, cholesky, weight, reach2, n_elevation, n_azimuth, n_bands, out):
         im[top * n_azimuth : bottom * n_azimuth] = np.float32(0)
         c = 0 if shared else b
         for i in range(n):
-            l1, l2, l3 = cholesky[c, i, 0], cholesky[c, i, 1], cholesky[c, i, 2]
-            x, y = mean[b, i, 0], mean[b, i, 1]
+            x, y, l1, l2, l3 = _pixels(mean[b, i], cholesky[c, i], origin, step, n_azimuth)
             weight_re, weight_im = weight[b, i, 0], weight[b, i, 1]
-            _, _, _, curvature, lean, steepness = _shape(l1, l2, l3)
+            _, _, _, curvature, lean, steepness = _quadratic(l1, l2, l3)
             whole = np.int64(math.floor(x))
-            fraction = x - whole  # in float64: a kernel may be far narrower than a pixel
+            fraction = x - whole  # in float64, because a kernel may be far narrower than a pixel
             first_row, end_row = _rows(y, l2, l3, reach2, top, bottom)
             for row in range(first_row, end_row):
                 dy = np.float32(row - y)
@@ -156,8 +180,13 @@ def draw(mean, cholesky, weight, reach2, n_elevation, n_azimuth, n_bands, out):
 
 
 @_jit
-def draw_backward(grad, mean, cholesky, weight, reach2, n_elevation, n_azimuth, block, d_mean, d_cholesky, d_weight):
+def render_backward(grad, mean, cholesky, weight, origin, step, shape, reach2, block, d_mean, d_cholesky, d_weight):
+    """Write the gradients (B, N, 2), (B, N, 3), (B, N, 2) for `grad`, (B, 2, n_elevation n_azimuth), of the field.
+
+    The other arguments are those of `render`; `block` is the number of primitives of a task.
+    """
     n_position, n = mean.shape[0], mean.shape[1]
+    n_elevation, n_azimuth = shape
     shared = cholesky.shape[0] == 1
     n_blocks = (n + block - 1) // block
     for task in prange(n_position * n_blocks):
@@ -167,14 +196,13 @@ def draw_backward(grad, mean, cholesky, weight, reach2, n_elevation, n_azimuth, 
         re, im = grad[b, 0], grad[b, 1]
         c = 0 if shared else b
         for i in range(begin, min(begin + block, n)):
-            l1, l2, l3 = cholesky[c, i, 0], cholesky[c, i, 1], cholesky[c, i, 2]
-            x, y = mean[b, i, 0], mean[b, i, 1]
+            x, y, l1, l2, l3 = _pixels(mean[b, i], cholesky[c, i], origin, step, n_azimuth)
             weight_re, weight_im = weight[b, i, 0], weight[b, i, 1]
-            inv1, inv3, shear, curvature, lean, steepness = _shape(l1, l2, l3)
+            inv1, inv3, shear, curvature, lean, steepness = _quadratic(l1, l2, l3)
             whole = np.int64(math.floor(x))
-            fraction = x - whole  # in float64: a kernel may be far narrower than a pixel
+            fraction = x - whole  # in float64, because a kernel may be far narrower than a pixel
             d_re, d_im = 0.0, 0.0
-            # sums of z, the kernel times the derivative by it, over the footprint with u, v, u^2, u v, v^2
+            # Sums over the footprint of z, the kernel times its derivative, times u, v, u^2, u v, v^2.
             z_u, z_v, z_uu, z_uv, z_vv = 0.0, 0.0, 0.0, 0.0, 0.0
             first_row, end_row = _rows(y, l2, l3, reach2, 0, n_elevation)
             for row in range(first_row, end_row):
@@ -190,7 +218,7 @@ def draw_backward(grad, mean, cholesky, weight, reach2, n_elevation, n_azimuth, 
                 s_re, s_im, z_d, z_dd = near[0] + far[0], near[1] + far[1], near[2] + far[2], near[3] + far[3]
                 d_re += s_re
                 d_im += s_im
-                # along the row u and v are straight lines in d: u + inv1 d, v - shear d
+                # Along the row u and v are linear in d: u + inv1 d, v - shear d.
                 z = weight_re * s_re + weight_im * s_im
                 u = lean * dy * inv1
                 v = (dy - l2 * u) * inv3
@@ -199,10 +227,10 @@ def draw_backward(grad, mean, cholesky, weight, reach2, n_elevation, n_azimuth, 
                 z_uu += u * u * z + 2 * u * inv1 * z_d + inv1 * inv1 * z_dd
                 z_uv += u * v * z + (v * inv1 - u * shear) * z_d - inv1 * shear * z_dd
                 z_vv += v * v * z - 2 * v * shear * z_d + shear * shear * z_dd
-            d_mean[b, i, 0] = inv1 * z_u - shear * z_v
-            d_mean[b, i, 1] = inv3 * z_v
-            d_cholesky[b, i, 0] = inv1 * z_uu - shear * z_uv
-            d_cholesky[b, i, 1] = inv3 * z_uv
-            d_cholesky[b, i, 2] = inv3 * z_vv
+            d_mean[b, i, 0] = (inv1 * z_u - shear * z_v) / step[1]
+            d_mean[b, i, 1] = inv3 * z_v / step[0]
+            d_cholesky[b, i, 0] = (inv1 * z_uu - shear * z_uv) / step[1]
+            d_cholesky[b, i, 1] = inv3 * z_uv / step[0]
+            d_cholesky[b, i, 2] = inv3 * z_vv / step[0]
             d_weight[b, i, 0] = d_re
             d_weight[b, i, 1] = d_im

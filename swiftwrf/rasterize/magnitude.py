@@ -1,7 +1,7 @@
-"""|A| of a rasterized spectrum, with gradient 0 where A = 0."""
+"""Magnitude |A| of a rasterized field, with gradient 0 where A = 0."""
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
-# (the signatures of autograd functions are torch's)
+# (torch does not type the signatures of autograd functions)
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 class _Magnitude(torch.autograd.Function):
-    """One pass each way; torch's vector norm over a strided dimension costs more than drawing the spectrum."""
+    """A pass forward and a pass backward: faster than torch's vector norm and absolute value of complex numbers."""
 
     @staticmethod
     def forward(ctx, field):
@@ -26,6 +26,18 @@ class _Magnitude(torch.autograd.Function):
 
 
 def magnitude(field: Tensor) -> Tensor:
-    """Magnitude (..., H, W) of real and imaginary part (..., 2, H, W); differentiable, with gradient 0 where it is 0."""
+    """Return |A|, differentiable, with gradient 0 where A = 0.
+
+    Args:
+        field: Real and imaginary part of A, (..., 2, n_elevation, n_azimuth).
+
+    Returns:
+        Magnitude, (..., n_elevation, n_azimuth).
+
+    Example:
+        >>> import torch
+        >>> magnitude(torch.tensor([3.0, 4.0]).reshape(2, 1, 1)).item()
+        5.0
+    """
     result: Tensor = _Magnitude.apply(field)
     return result

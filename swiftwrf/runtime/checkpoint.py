@@ -1,6 +1,6 @@
-"""Tensors and plain values in one safetensors file, written whole or not at all; opening one never runs code.
+"""Model files: tensors and plain values in one safetensors file, written atomically; opening one never runs its code.
 
-Every fitted model is saved and opened the same way: it derives from `Saved`, and `load` opens any of them.
+Every fitted model derives from `Saved`, and `load` opens any of them.
 """
 
 from __future__ import annotations
@@ -8,7 +8,8 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -21,17 +22,18 @@ from swiftwrf.errors import InputError
 from swiftwrf.runtime.durable import write_bytes
 
 FORMAT = 1
-Header = dict[str, Any]  # values that JSON can carry
+EXTENSION_GROUPS = ("swiftwrf.models", "swiftwrf.estimators")  # entry points of packages that define saved kinds
+Header = dict[str, Any]  # values that JSON can store
 
 
 def write(path: str | Path, kind: str, tensors: dict[str, Tensor], header: Header) -> None:
-    """Writes the file, or leaves the old one where the write is interrupted.
+    """Write a file atomically: an interrupted write leaves the old file.
 
     Args:
-        path: of the file.
-        kind: what the file holds; `read` refuses another kind.
-        tensors: by name.
-        header: values that JSON can carry.
+        path: File to write.
+        kind: Kind of the content; `read` refuses another kind.
+        tensors: Tensors by name.
+        header: Values that JSON can store.
     """
     metadata = {"kind": kind, "format": str(FORMAT), "header": json.dumps(header)}
     content = save({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, metadata)
@@ -39,10 +41,10 @@ def write(path: str | Path, kind: str, tensors: dict[str, Tensor], header: Heade
 
 
 def read(path: str | Path, *kinds: str) -> tuple[str, dict[str, Tensor], Header]:
-    """Kind, tensors and header of a file of one of the given kinds.
+    """Return kind, tensors and header of a file of one of the given kinds.
 
     Raises:
-        InputError: no such file, not a safetensors file, another kind or a newer format, or a number that is not finite.
+        InputError: No such file, not a safetensors file, another kind or a newer format, or a value that is not finite.
     """
     try:
         with safe_open(path, framework="pt") as file:
@@ -58,7 +60,7 @@ def read(path: str | Path, *kinds: str) -> tuple[str, dict[str, Tensor], Header]
             for name, tensor in tensors.items():
                 if not bool(torch.isfinite(tensor).all()):
                     raise InputError(
-                        f"{path}: {name} holds a value that is not finite, so nothing it gives can be trusted; make it anew"
+                        f"{path}: {name} holds a value that is not finite; create the file again"
                     )
     except InputError:
         raise
@@ -70,12 +72,12 @@ def read(path: str | Path, *kinds: str) -> tuple[str, dict[str, Tensor], Header]
 
 
 def expect(tensors: dict[str, Tensor], shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Refuses tensors that are not there or of another shape than the header calls for.
+    """Refuse tensors that are missing or have other shapes than the header implies.
 
-    What a header says is believed only after this: it may ask for gigabytes, the tensors lie in the file.
+    Call it before memory is allocated for sizes from the header: a damaged header may claim gigabytes.
 
     Raises:
-        InputError: the first such tensor.
+        InputError: The first such tensor.
     """
     for name, shape in shapes.items():
         if name not in tensors:
@@ -85,7 +87,7 @@ def expect(tensors: dict[str, Tensor], shapes: Mapping[str, tuple[int, ...]]) ->
 
 
 class Saved(ABC):
-    """A fitted model that one file can hold; subclasses name their kind and are known to `load` from then on."""
+    """Base class of fitted models that one file stores. A subclass with a `kind` is registered for `load`."""
 
     kind: ClassVar[str]
     kinds: ClassVar[dict[str, type[Saved]]] = {}
@@ -97,37 +99,62 @@ class Saved(ABC):
 
     @abstractmethod
     def state(self) -> tuple[dict[str, Tensor], Header]:
-        """Tensors by name, and plain values."""
+        """Return tensors by name, and plain values."""
 
     @classmethod
     @abstractmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Saved:
-        """The model of which `state` gave these.
+        """Return the model that `state` describes.
 
         Raises:
-            InputError: they do not fit together; found before memory is taken for what the header claims.
+            InputError: Tensors and header do not match. No memory is allocated for sizes that only the header claims.
         """
 
     def save(self, path: str | Path, provenance: dict[str, str] | None = None) -> None:
-        """Writes the model to one safetensors file, its configuration and `provenance` in the header."""
+        """Write the model to one safetensors file.
+
+        Args:
+            path: File to write.
+            provenance: Additional texts for the header, e.g. data set and commit.
+        """
         tensors, header = self.state()
         write(path, self.kind, tensors, header | {"provenance": provenance or {}})
 
 
 def load(path: str | Path) -> Saved:
-    """The model that was saved there, of whatever kind.
+    """Open a saved model of any kind: field model, RSSI model or estimator.
+
+    Kinds of other packages are found by the entry points of the groups `swiftwrf.models` and `swiftwrf.estimators`.
 
     Raises:
-        InputError: not such a file, or one whose parts do not fit together.
+        InputError: Not a model file, an unknown kind, or content that does not match.
+
+    Example:
+        >>> import tempfile, swiftwrf
+        >>> model = swiftwrf.make_model("nearest").fit(swiftwrf.simulated_room(n=20))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     model.save(folder + "/model.safetensors")
+        ...     swiftwrf.load(folder + "/model.safetensors")
+        NearestModel(fitted, 30 x 120 directions)
     """
+    with suppress(OSError, SafetensorError), safe_open(path, framework="pt") as file:
+        if (file.metadata() or {}).get("kind") not in Saved.kinds:
+            _import_extensions()
     return restore(path, *Saved.kinds)[0]
 
 
+def _import_extensions() -> None:
+    """Import all packages that define saved kinds; those that cannot be imported define none."""
+    for point in (point for group in EXTENSION_GROUPS for point in entry_points(group=group)):
+        with suppress(Exception):  # code of another package may raise anything
+            point.load()
+
+
 def restore(path: str | Path, *kinds: str) -> tuple[Saved, Header]:
-    """The model that was saved there, of one of these kinds, and its header: the one way in for all of them.
+    """Return the saved model of one of these kinds, and its header.
 
     Raises:
-        InputError: not such a file, or one whose parts do not fit together.
+        InputError: Not such a file, or content that does not match.
     """
     kind, tensors, header = read(path, *kinds)
     with refusing(f"{path} is no {kind} that can be used"):
@@ -136,9 +163,9 @@ def restore(path: str | Path, *kinds: str) -> tuple[Saved, Header]:
 
 @contextmanager
 def refusing(what: str) -> Iterator[None]:
-    """Says that what was kept on disk does not fit together, whatever part of it shows it first."""
+    """Raise InputError for any error that inconsistent content of a file causes."""
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
-        raise InputError(f"{what}: {reason}; it was changed or written by another version, make it anew") from None
+        raise InputError(f"{what}: {reason}; it was changed or written by another version, create it again") from None

@@ -1,4 +1,4 @@
-"""Gradient descent with guards, whose state survives interruptions: what the fits of all learnt models share."""
+"""Gradient descent with checks of the loss and a state that survives interruptions, for every network and module."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from swiftwrf.runtime.session import Record, Session, State
 
 Model = TypeVar("Model", bound=nn.Module)
 
-KEPT = {"step": int, "seconds": float, "first_loss": float, "last_loss": float}  # what is saved beside the tensors
+SAVED_VALUES = {"step": int, "seconds": float, "first_loss": float, "last_loss": float}  # attributes in a checkpoint
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How long a descent is and how it steps.
+    """Length and step rule of a descent.
 
     Args:
-        steps: their number.
-        check_every: steps between two evaluations, at which progress is recorded and the state kept.
-        averaging: by how much a step's weight in the averaged parameters decays a step; 0 keeps the last ones.
-        clip: largest norm of the gradient.
-        betas, weight_decay: of Adam.
+        steps: Number of steps.
+        check_every: Steps between two evaluations, at which a record is sent and the state is saved.
+        averaging: Decay per step of the weights in the averaged parameters; 0 takes the last parameters.
+        clip: Maximum norm of the gradient.
+        betas, weight_decay: Options of Adam.
     """
 
     steps: int
@@ -44,13 +44,13 @@ class Schedule:
 
 
 class Descent(ABC, Generic[Model]):
-    """Adam from a seeded start; the result is the running average of the parameters.
+    """Adam with a running average of the parameters.
 
     Args:
-        name: of the run within its fit.
-        model: to train, on its device.
-        groups: Adam's parameter groups, each with its largest learning rate, `peak`.
-        schedule: how long and how.
+        name: Name of the run within its fit, also on the progress bar.
+        model: Module to train, on its device.
+        groups: Parameter groups of Adam, each with its peak learning rate, `peak`.
+        schedule: Length and step rule.
     """
 
     def __init__(self, name: str, model: Model, groups: Iterable[dict[str, Any]], schedule: Schedule) -> None:
@@ -66,28 +66,24 @@ class Descent(ABC, Generic[Model]):
         """The running average, which begins with the parameters as they are."""
         return AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(self.schedule.averaging))
 
-    @property
-    def label(self) -> str:
-        """Its name on the progress bar."""
-        return self.name
-
     @abstractmethod
     def objective(self) -> Tensor:
-        """What the next step descends, a scalar."""
+        """Return the loss of the next step, a scalar."""
 
     @abstractmethod
     def rate(self, step: int) -> float:
-        """Share of the largest learning rates at a step."""
+        """Return the learning rates at a step as a fraction of their peaks."""
 
     def advance(self) -> Tensor:
-        """One step; its loss.
+        """Take one step and return its loss.
 
         Raises:
-            FitError: a loss or gradient that is not finite. A GPU is only asked at each evaluation, for asking waits for it.
+            FitError: The loss or gradient is not finite. On a GPU this is checked at evaluations only, because the check
+                waits for the device.
         """
         try:
             loss = self.objective()
-        except InputError as error:  # parameters ran away, so that the model can no longer be drawn
+        except InputError as error:  # the parameters diverged, so that the rasterizer refuses them
             raise FitError(f"the fit broke at step {self.step}: {error}; {self._advice()}") from None
         self.optimiser.zero_grad()
         loss.backward()
@@ -98,9 +94,9 @@ class Descent(ABC, Generic[Model]):
             raise FitError(
                 f"the fit broke at step {broken}: its loss or gradient is not a finite number; {self._advice()}"
             )
-        share = self.rate(self.step)
+        fraction = self.rate(self.step)
         for group in self.optimiser.param_groups:
-            group["lr"] = group["peak"] * share
+            group["lr"] = group["peak"] * fraction
         self.optimiser.step()
         self.average.update_parameters(self.model)
         self.step += 1
@@ -114,21 +110,20 @@ class Descent(ABC, Generic[Model]):
 
     @property
     def result(self) -> Model:
-        """The model with averaged parameters."""
+        """Model with the averaged parameters."""
         return cast(Model, self.average.module)
 
     def run(self, session: Session) -> None:
-        """Takes all steps, from where the session's saved state stands if that is of this run; keeps the state at each
-        evaluation.
+        """Take all steps, from the saved state if it belongs to this run, and save the state at each evaluation.
 
         Raises:
-            FitError: it ended worse than it began.
+            FitError: The loss ends above its first value.
         """
         if session.saved is not None and session.saved.header.get("run") == self.name:
-            with refusing(f"{session.path} is no state that a fit can go on from"):
+            with refusing(f"{session.path} is no state that a fit can continue from"):
                 self._restore(session.saved)
         steps = self.schedule.steps
-        task = session.bar.add_task(self.label, total=steps, completed=self.step)
+        task = session.bar.add_task(self.name, total=steps, completed=self.step)
         began = time.perf_counter() - self.seconds
         while self.step < steps:
             loss = self.advance()
@@ -139,14 +134,14 @@ class Descent(ABC, Generic[Model]):
                 self.seconds, self.last_loss = time.perf_counter() - began, float(loss)
                 session.evaluated(self.record(loss), *self._state())
         session.bar.remove_task(task)
-        if self.last_loss > self.first_loss:  # also where a kept state had ended so
+        if self.last_loss > self.first_loss:  # also if the checkpoint is that of a completed run
             raise FitError(
                 f"the fit ended with a loss of {self.last_loss:.3g}, worse than the {self.first_loss:.3g} it began with; "
                 f"{self._advice()}"
             )
 
     def record(self, loss: Tensor) -> Record:
-        """What is told at an evaluation."""
+        """Return the record of an evaluation."""
         return {
             "stage": "final",
             "steps": self.schedule.steps,
@@ -161,15 +156,15 @@ class Descent(ABC, Generic[Model]):
         tensors |= {f"average.{name}": value for name, value in self.average.state_dict().items()}
         for number, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{number}.{name}": torch.as_tensor(value) for name, value in moments.items()}
-        header = {name: getattr(self, name) for name in KEPT}
+        header = {name: getattr(self, name) for name in SAVED_VALUES}
         return tensors, header | {"run": self.name}
 
     def _restore(self, saved: State) -> None:
         header, tensors = saved.header, saved.tensors
-        for name, kind in KEPT.items():
+        for name, kind in SAVED_VALUES.items():
             setattr(self, name, kind(header[name]))
         if not 0 <= self.step <= self.schedule.steps:
-            raise InputError(f"its step {self.step} is none of {self.schedule.steps}")
+            raise InputError(f"its step {self.step} is not one of {self.schedule.steps}")
         for prefix, module in (("model.", self.model), ("average.", self.average)):
             module.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
         state: dict[str, Any] = copy.deepcopy(self.optimiser.state_dict())
@@ -181,6 +176,6 @@ class Descent(ABC, Generic[Model]):
 
 
 def warm_cosine(step: int, steps: int, warm_up: int, final: float) -> float:
-    """Share of a rate that rises over `warm_up` steps and decays to `final` along a cosine."""
+    """Return the fraction of a rate that rises over `warm_up` steps and decays to `final` along a cosine."""
     cosine = 0.5 * (1 + math.cos(math.pi * step / steps))
     return min(1.0, (step + 1) / max(warm_up, 1)) * (final + (1 - final) * cosine)

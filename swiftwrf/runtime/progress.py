@@ -1,4 +1,4 @@
-"""The progress of long work, on a terminal; nothing elsewhere."""
+"""Progress bars of long work, shown on a terminal only."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from rich import get_console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+Item = TypeVar("Item")
+
 
 class _Rate(ProgressColumn):
     def render(self, task: Task) -> Text:
@@ -16,17 +18,19 @@ class _Rate(ProgressColumn):
 
 
 def progress_bar(shown: bool = True) -> Progress:
-    """A bar with steps, rate and time left; it disappears when it is done."""
+    """Return a bar with steps, rate and remaining time, which disappears at the end."""
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"))
     return Progress(
         *columns, _Rate(), TimeRemainingColumn(), transient=True, disable=not shown or not get_console().is_terminal
     )
 
 
-Item = TypeVar("Item")
-
-
 def progress(items: Sequence[Item], description: str, shown: bool = True) -> Iterator[Item]:
-    """The items, with a bar."""
+    """Yield the items, with a progress bar.
+
+    Example:
+        >>> list(progress([1, 2], "counting"))
+        [1, 2]
+    """
     with progress_bar(shown) as bar:
         yield from bar.track(items, description=description)

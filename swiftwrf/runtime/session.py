@@ -1,4 +1,4 @@
-"""Where an interrupted fit stands: what its runs share, kept in one file."""
+"""The state of a long fit, which one file keeps so that an interrupted fit can continue."""
 
 from __future__ import annotations
 
@@ -19,31 +19,8 @@ KIND = "fit state"
 
 
 @dataclass(frozen=True)
-class Size:
-    """What identifies a run of a fit.
-
-    Args:
-        final: on all spectra, or with some held out for the search.
-        n_primitives, steps: how large and how long.
-    """
-
-    final: bool
-    n_primitives: int
-    steps: int
-
-    @property
-    def key(self) -> str:
-        """Its name in a saved state."""
-        return f"{'final' if self.final else 'search'} {self.n_primitives} {self.steps}"
-
-    def __str__(self) -> str:
-        steps = f", {self.steps} steps" if self.steps else ""
-        return f"{'final' if self.final else 'search'}, {self.n_primitives} primitives{steps}"
-
-
-@dataclass(frozen=True)
 class State:
-    """Where a run stood."""
+    """Saved state of one run: plain values and tensors."""
 
     header: dict[str, Any]
     tensors: dict[str, Tensor]
@@ -51,20 +28,22 @@ class State:
 
 @dataclass
 class Session:
-    """What the runs of one fit share: where their state is kept, and who is informed.
+    """State shared by the runs of one fit: their checkpoint, records and callback.
 
     Args:
-        path: of the state; None keeps none.
-        owner: fingerprint of configuration and spectra.
-        bar: shows progress.
-        on_record: is called at each evaluation.
-        saved: the state of an earlier session of the same fit.
-        losses: on held-out spectra, of runs that are done, by their key.
-        records: of all evaluations of the fit, those of earlier sessions first.
-        earlier: seconds that earlier sessions took, as far as their work was kept.
+        path: Checkpoint. None keeps no state.
+        owner: Fingerprint of configuration and spectra.
+        bar: Progress bar.
+        on_record: Called at each evaluation; at first with the records of the checkpoint.
+
+    Attributes:
+        saved: State of the interrupted run, if the checkpoint exists.
+        losses: Held-out losses of completed runs by name.
+        records: Records of all evaluations, including those of the checkpoint.
+        earlier: Seconds that the checkpoint has taken.
 
     Raises:
-        InputError: a saved state that is damaged or of another fit.
+        InputError: The checkpoint is damaged or belongs to another fit.
     """
 
     path: Path | None
@@ -78,43 +57,39 @@ class Session:
     began: float = field(default_factory=time.perf_counter)
 
     def __post_init__(self) -> None:
-        self.saved = self._read()
+        if self.path is not None and self.path.exists():
+            self.saved = self._read(self.path)
         for record in self.records:
-            self._inform(record)
+            self._send(record)
 
-    def _read(self) -> State | None:
-        if self.path is None or not self.path.exists():
-            return None
-        _, tensors, header = checkpoint.read(self.path, KIND)
+    def _read(self, path: Path) -> State:
+        _, tensors, header = checkpoint.read(path, KIND)
         if header.get("fingerprint") != self.owner:
             raise InputError(
-                f"{self.path} is the state of another fit (other spectra or settings); remove it or give another path"
+                f"{path} is the state of another fit (other spectra or settings); remove it or give another path"
             )
-        with checkpoint.refusing(f"{self.path} is no state that a fit can go on from"):
+        with checkpoint.refusing(f"{path} is no state that a fit can continue from"):
             self.losses, self.records = dict(header["losses"]), list(header["records"])
             self.earlier = float(header["elapsed"])
         return State(header, tensors)
 
     @property
     def elapsed(self) -> float:
-        """Seconds that the fit took so far, over all its sessions."""
+        """Seconds of the fit, including those before an interruption."""
         return self.earlier + time.perf_counter() - self.began
 
     def evaluated(self, record: Record, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
-        """Keeps the record of an evaluation with the state of the run under way, then informs: a history that is read
-        after an interruption has it once."""
+        """Save the record of an evaluation with the state of the current run, then send it.
+
+        The record is saved first, so that the history after an interruption contains it once.
+        """
         record = record | {"elapsed": self.elapsed}
         self.records.append(record)
         if self.path is not None:
-            shared = {
-                "losses": self.losses,
-                "fingerprint": self.owner,
-                "records": self.records,
-                "elapsed": self.elapsed,
-            }
-            checkpoint.write(self.path, KIND, tensors, header | shared)
-        self._inform(record)
+            shared = {"losses": self.losses, "fingerprint": self.owner, "records": self.records}
+            checkpoint.write(self.path, KIND, tensors, header | shared | {"elapsed": self.elapsed})
+        self._send(record)
 
-    def _inform(self, record: Record) -> None:
+    def _send(self, record: Record) -> None:
         if self.on_record is not None:
             self.on_record(record)

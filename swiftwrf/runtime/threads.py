@@ -1,7 +1,8 @@
-"""How many threads computations take."""
+"""The number of threads of computations."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -14,36 +15,64 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+class _Users:
+    """Users of `threads_kept` that are active in this process, and the number of threads before the first of them."""
+
+    def __init__(self) -> None:
+        self.lock, self.active, self.original = threading.Lock(), 0, 0
+
+
+_users = _Users()
+
+
 def set_threads(number: int) -> None:
-    """So many threads from now on: of torch, of numba, and of the linear algebra behind NumPy and SciPy.
+    """Set the number of threads of torch, which numba follows, and of the linear algebra of NumPy and SciPy.
 
-    Sums over threads are added up in another order, so the number belongs to what makes a result repeatable. This also
-    keeps MKL from choosing one by itself, which shows in the last bits.
+    The number of threads is part of what makes a result repeatable, because it decides the order in which sums are added.
+    A fixed number also keeps MKL from choosing one, which changes the last bits.
+
+    Example:
+        >>> set_threads(1)
+        >>> torch.get_num_threads()
+        1
     """
-    import numba  # by those who use it
-
     torch.set_num_threads(number)
-    numba.set_num_threads(min(number, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
     threadpool_limits(number)
 
 
 @contextmanager
 def threads_kept() -> Iterator[None]:
-    """torch has as many threads afterwards as before; a decorator, too. Compiled loops of numba set the number of OpenMP,
-    which torch shares."""
+    """Restore torch's number of threads on exit; also a decorator.
+
+    Compiled loops of numba set the number of OpenMP, which torch shares. Users in several threads may overlap: torch keeps
+    one number for each thread and one for threads to come, so the last user restores the number before the first.
+
+    Example:
+        >>> before = torch.get_num_threads()
+        >>> with threads_kept():
+        ...     torch.set_num_threads(before + 1)
+        >>> torch.get_num_threads() == before
+        True
+    """
     before = torch.get_num_threads()
+    with _users.lock:
+        if _users.active == 0:
+            _users.original = before
+        _users.active += 1
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        with _users.lock:
+            _users.active -= 1
+            torch.set_num_threads(before if _users.active else _users.original)
 
 
 @contextmanager
 def single_thread() -> Iterator[None]:
-    """One thread for many small tensor operations; a decorator, too.
+    """Use one thread for many small tensor operations; also a decorator.
 
-    Several threads meet after every operation. Where these last microseconds, and other work shares the machine, they
-    mostly wait for each other: ten times slower was seen.
+    Threads synchronise after every operation. If an operation takes microseconds and other work shares the machine, most
+    of the time is spent waiting: up to ten times the time of one thread.
     """
     with threads_kept():
         torch.set_num_threads(1)
@@ -51,10 +80,14 @@ def single_thread() -> Iterator[None]:
 
 
 def side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """The function of each item, as many at once as torch has threads, each on one of its own.
+    """Return the function of each item, computed in as many threads as torch has, with one thread inside each call.
 
-    These meet but once, so other work on the machine costs them only what it takes, and results are those of one thread.
+    The threads synchronise once, so other work on the machine slows them little. Results are those of one thread.
+
+    Example:
+        >>> side_by_side(abs, [-1, 2])
+        [1, 2]
     """
-    at_once = torch.get_num_threads()
-    with single_thread(), threadpool_limits(1), ThreadPoolExecutor(at_once) as threads:
+    workers = torch.get_num_threads()
+    with single_thread(), threadpool_limits(1), ThreadPoolExecutor(workers) as threads:
         return list(threads.map(function, items))

@@ -1,1 +1,1 @@
-"""What tests and benchmarks share: hard cases, random scenes, tolerances. For those who change the code or add a maker."""
+"""What tests and benchmarks share: hard cases, random scenes, tolerances. For those who change the code or add a backend."""

@@ -1,6 +1,6 @@
-"""Hard cases of the rasterizer with the rule that each follows, and how far a maker is from the definition in float64.
+"""Hard cases of the rasterizer with the rule that each follows, and how far a backend is from the definition in float64.
 
-The benchmark `stability.py` tabulates them; the tests hold every maker to the tolerances beside this file.
+The benchmark `stability.py` tabulates them; the tests hold every backend to the tolerances beside this file.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Case:
     """One hard case.
 
     Args:
-        rule: what every maker does with it.
+        rule: what every backend does with it.
         mean: azimuth and elevation, (1, N, 2) [rad].
         cholesky: (N, 3) [rad].
         weight: (1, N, 2).
@@ -111,9 +111,9 @@ HARD_CASES: dict[str, Case] = {
 
 
 def field_errors(draw: Draw, case: Case, cutoff: float | None, device: str = "cpu") -> tuple[float, float]:
-    """Errors of A from a maker: value and the worst of the gradients; see `_compare`."""
+    """Errors of A from a backend: value and the worst of the gradients; see `_compare`."""
     exact_inputs, inputs = _leaves(case, device)
-    exact = reference.rasterize(*exact_inputs, case.grid, cutoff)
+    exact = reference.field(*exact_inputs, case.grid, cutoff)
     return _compare(exact, draw(*inputs, case.grid, cutoff), exact_inputs, inputs)
 
 
@@ -121,7 +121,7 @@ def magnitude_errors(draw: Draw, case: Case, cutoff: float | None, device: str =
     """Errors of |A|: value and the worst of the gradients. Beside |A| = 0 its gradient turns with the rounding of A, so the
     cotangent fades there."""
     exact_inputs, inputs = _leaves(case, device)
-    exact = magnitude(reference.rasterize(*exact_inputs, case.grid, cutoff))
+    exact = magnitude(reference.field(*exact_inputs, case.grid, cutoff))
     fade = (exact / exact.mean().clamp_min(1e-300)).clamp(max=1).detach()
     return _compare(exact, draw(*inputs, case.grid, cutoff), exact_inputs, inputs, fade)
 

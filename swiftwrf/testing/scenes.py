@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.models.swiftwrf.primitives import FLOOR
+from swiftwrf.models.swiftwrf.primitives import MIN_WIDTH_PIXELS
 
 GRID = AngularGrid.hemisphere(30, 120)
 
@@ -28,7 +28,7 @@ def random_scene(
         [2 * math.pi, 0.3]
     )
     shape = (batch, n, 3) if per_position else (n, 3)
-    floor = FLOOR * torch.tensor([grid.azimuth_step, 0.0, grid.elevation_step])
+    floor = MIN_WIDTH_PIXELS * torch.tensor([grid.azimuth_step, 0.0, grid.elevation_step])
     cholesky = torch.exp(torch.rand(shape, generator=generator) * 4 - 4) + floor
     cholesky[..., 1] *= torch.randn(shape[:-1], generator=generator)
     weight = torch.randn(batch, n, 2, generator=generator)

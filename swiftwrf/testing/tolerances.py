@@ -1,4 +1,4 @@
-"""How far a fast maker may be from the definition in float64; the one table of it.
+"""How far a fast backend may be from the definition in float64; the one table of it.
 
 Values as a share of the sum of |weight|, gradients as relative L2, both times a case's `slack`. Float32 rounding sets the
 entries without a cutoff; for values the cutoff itself those with one.

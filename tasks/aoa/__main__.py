@@ -2,10 +2,7 @@
 
 import sys
 
-from tasks.aoa import arms
-from tasks.aoa.config import AoaConfig
-from tasks.aoa.experiment import run
-from tasks.run import command_line
+from tasks.command import run_command
 
 if __name__ == "__main__":
-    sys.exit(command_line("tasks.aoa", AoaConfig, run, sys.argv[1:], arms.meaning))
+    sys.exit(run_command("aoa", sys.argv[1:]))

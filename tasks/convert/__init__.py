@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -18,6 +16,7 @@ from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMAT
 from swiftwrf.data.writing import write_rssi, write_spectra
 from swiftwrf.diagnostics.calibration import Calibration, calibrate
 from tasks.directory import console, new_directory
+from tasks.environment import invocation
 from tasks.records import write_json
 from tasks.source import SpectraSource, TableSource, reading
 
@@ -39,14 +38,12 @@ class ConvertConfig(SpectraSource, TableSource):
     """of that split"""
 
 
-def run(config: ConvertConfig, resume: Path | None = None) -> None:
+def run(config: ConvertConfig) -> None:
     """Reads, calibrates where asked, and writes.
 
     Raises:
         InputError: what cannot be read, calibrated or written in the layout.
     """
-    if resume is not None:
-        raise InputError("a conversion cannot be resumed; start it again")
     how = reading(config)
     if (config.split is not None or config.seed) and not config.calibrate:
         raise InputError("--split and --seed are of the calibration; give --calibrate, too")
@@ -59,7 +56,7 @@ def run(config: ConvertConfig, resume: Path | None = None) -> None:
             console.print(f"{data.name}: {note}")
         written = _write(data, how, folder)
         record = {
-            "command": shlex.join(["python", "-m", "tasks.convert", *sys.argv[1:]]),
+            "command": invocation("convert"),
             "options": asdict(config),
             "source_sha256": data.source,
             "notes": data.notes,

@@ -2,8 +2,7 @@
 
 import sys
 
-from tasks.convert import ConvertConfig, run
-from tasks.run import command_line
+from tasks.command import run_command
 
 if __name__ == "__main__":
-    sys.exit(command_line("tasks.convert", ConvertConfig, run, sys.argv[1:]))
+    sys.exit(run_command("convert", sys.argv[1:]))

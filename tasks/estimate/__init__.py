@@ -33,14 +33,12 @@ class EstimateConfig(SpectraSource):
     """table to write; must not exist"""
 
 
-def run(config: EstimateConfig, resume: Path | None = None) -> None:
+def run(config: EstimateConfig) -> None:
     """Writes a row a spectrum: azimuth and elevation [deg] and, where positions are known, the truth and the error.
 
     Raises:
         InputError: no such estimator, spectra that cannot be read or are not like those it was trained on, or `out` exists.
     """
-    if resume is not None:
-        raise InputError("an estimate is quick and cannot be resumed; start it again")
     out = Path(config.out)
     if out.exists():
         raise InputError(f"--out {out} exists already and is never overwritten; choose another")

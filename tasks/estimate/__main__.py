@@ -2,8 +2,7 @@
 
 import sys
 
-from tasks.estimate import EstimateConfig, run
-from tasks.run import command_line
+from tasks.command import run_command
 
 if __name__ == "__main__":
-    sys.exit(command_line("tasks.estimate", EstimateConfig, run, sys.argv[1:]))
+    sys.exit(run_command("estimate", sys.argv[1:]))

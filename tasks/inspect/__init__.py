@@ -9,7 +9,6 @@ from typing import Annotated
 
 import tyro
 
-from swiftwrf import InputError
 from swiftwrf.data import Rssi, Snapshots
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
 from tasks.directory import new_directory
@@ -30,14 +29,12 @@ class InspectConfig(SpectraSource, TableSource):
     """directory of the page; must not exist (default: a new one under runs/inspect)"""
 
 
-def run(config: InspectConfig, resume: Path | None = None) -> None:
+def run(config: InspectConfig) -> None:
     """Says what it sees, and writes a page and inspect.json.
 
     Raises:
         InputError: what cannot be read.
     """
-    if resume is not None:
-        raise InputError("an inspection is quick and cannot be resumed; start it again")
     how = reading(config)
     out = Path(config.out) if config.out else Path("runs") / "inspect" / f"{datetime.now():%Y%m%d-%H%M%S}"
     with new_directory(out, "an inspection") as folder:

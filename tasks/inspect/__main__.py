@@ -2,8 +2,7 @@
 
 import sys
 
-from tasks.inspect import InspectConfig, run
-from tasks.run import command_line
+from tasks.command import run_command
 
 if __name__ == "__main__":
-    sys.exit(command_line("tasks.inspect", InspectConfig, run, sys.argv[1:]))
+    sys.exit(run_command("inspect", sys.argv[1:]))

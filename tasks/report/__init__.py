@@ -1,11 +1,14 @@
-"""One report over several finished runs; knows all tasks, and none of them knows it."""
+"""One report over several finished runs of one task."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import tyro
 
 from swiftwrf import InputError
 from tasks.aoa import page as aoa
@@ -17,11 +20,27 @@ from tasks.rssi import page as rssi
 PAGES: dict[str, Callable[[list[Records[Any]]], Page]] = {"aoa": aoa.page, "rssi": rssi.page}
 
 
+@dataclass(frozen=True)
+class ReportConfig:
+    """One report over several finished runs of one task."""
+
+    runs: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """directories of the runs"""
+    out: str = "runs/report"
+    """directory of the report; must not exist"""
+
+
+def run(config: ReportConfig) -> None:
+    """Write the report and print its place."""
+    merge([Path(folder) for folder in config.runs], Path(config.out))
+    print(f"report: {Path(config.out) / 'report.html'}")
+
+
 def merge(folders: list[Path], out: Path) -> None:
-    """Writes one report over several finished runs of one task.
+    """Write one report over several finished runs of one task.
 
     Raises:
-        InputError: no runs, an unfinished one, runs of several tasks, records that are not a run's, or `out` exists.
+        InputError: There are no runs, one is unfinished, their tasks differ, their records are damaged, or `out` exists.
     """
     several = len(folders) > 1
     runs: list[Records[Any]] = [Records(f, number=n if several else 0) for n, f in enumerate(folders, start=1)]
@@ -40,7 +59,7 @@ def _write(folder: Path, task: str, runs: list[Records[Any]]) -> None:
     except InputError:
         raise
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        # the records are files, which anybody may have changed, and everything in them is used somewhere on the page
+        # the records are files that anybody may have changed, and the page uses all of them
         names = ", ".join(os.fspath(run.folder) for run in runs)
         raise InputError(
             f"the records in {names} do not hold what a report shows ({type(error).__name__}: {error}); they were changed "

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 import time
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -18,8 +17,10 @@ from swiftwrf.data.raytraced import ROOMS, SCENE_FILE, FurnishedRoom, Scene, Tra
 from swiftwrf.data.spectra import Moving
 from swiftwrf.data.writing import write_paths
 from tasks.directory import console, new_directory
+from tasks.environment import invocation
 from tasks.page.page import write_page
 from tasks.records import write_json
+from tasks.run import choice
 from tasks.scenes.page import page
 
 MOST_POSITIONS, MOST_ORDER = 100_000, 8
@@ -34,8 +35,7 @@ class ScenesConfig:
     paths of one position.
     """
 
-    room: str
-    """a room by its name (above), or a Mitsuba scene with radio materials (FILE.xml)"""
+    room: Annotated[str, choice("a Mitsuba scene with radio materials (FILE.xml), or a built-in room", ROOMS)]
     moving: Moving
     """which end moves; the array lies level at the receiver"""
     positions: int
@@ -65,15 +65,13 @@ class ScenesConfig:
     """of positions, rays and scattered phases"""
 
 
-def run(config: ScenesConfig, resume: Path | None = None) -> None:
+def run(config: ScenesConfig) -> None:
     """Draws positions, traces, and writes.
 
     Raises:
         InputError: an option that makes no sense, no such room or scene, positions outside of it, a material that is not
             known at the carrier; Sionna RT or LLVM is missing.
     """
-    if resume is not None:
-        raise InputError("tracing takes minutes and cannot be resumed; start it again")
     check(config)
     room, fixed, region = where(config)
     with new_directory(Path(config.out), "a scene") as folder:
@@ -96,7 +94,7 @@ def run(config: ScenesConfig, resume: Path | None = None) -> None:
             position, paths = position[heard], paths.reached
         write_paths(folder, paths, fixed, position, config.moving, config.frequency)
         record = {
-            "command": shlex.join(["python", "-m", "tasks.scenes", *sys.argv[1:]]),
+            "command": invocation("scenes"),
             "options": asdict(config),
             "source_sha256": {Path(config.room).name: sha256(Path(config.room))} if room is None else {},
             "fixed": fixed.tolist(),

@@ -2,15 +2,7 @@
 
 import sys
 
-from swiftwrf.data.raytraced import ROOMS
-from tasks.run import command_line
-from tasks.scenes import ScenesConfig, run
-
-
-def rooms() -> str:
-    """The built-in ones, for the help."""
-    return "\n\n".join(f"{entry.name}: {entry.meaning}" for entry in ROOMS.entries())
-
+from tasks.command import run_command
 
 if __name__ == "__main__":
-    sys.exit(command_line("tasks.scenes", ScenesConfig, run, sys.argv[1:], rooms))
+    sys.exit(run_command("scenes", sys.argv[1:]))

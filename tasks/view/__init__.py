@@ -30,14 +30,12 @@ class ViewConfig:
     """address to listen on; with any other address, other machines see the page without a password"""
 
 
-def run(config: ViewConfig, resume: Path | None = None) -> None:
+def run(config: ViewConfig) -> None:
     """Serve the page until the process is interrupted.
 
     Raises:
         InputError: The source holds no model, the port is in use, or the optional extra is not installed.
     """
-    if resume is not None:
-        raise InputError("a page is quick and cannot be resumed; start it again")
     if not 0 <= config.port <= MAX_PORT:
         raise InputError(f"--port must be from 0 to {MAX_PORT}, got {config.port}")
     try:

@@ -2,8 +2,7 @@
 
 import sys
 
-from tasks.run import command_line
-from tasks.view import ViewConfig, run
+from tasks.command import run_command
 
 if __name__ == "__main__":
-    sys.exit(command_line("tasks.view", ViewConfig, run, sys.argv[1:]))
+    sys.exit(run_command("view", sys.argv[1:]))

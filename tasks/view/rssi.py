@@ -16,11 +16,11 @@ from torch import Tensor
 
 from swiftwrf import RssiModel
 from swiftwrf.models.base import Prediction
+from swiftwrf.rssi import LEVEL
 from tasks.page import figures
 from tasks.records import as_table
 from tasks.view.drawing import PlanProjection
 
-LEVEL = 0.8  # of the intervals
 CELLS = 120  # of a map, along its longer side
 RECEIVER_COLOURS, N_RECEIVER_COLOURS = "tab20", 20
 RECEIVER_MARK = "#ee6677"
@@ -57,8 +57,8 @@ class MeasuredFloor:
 
     @classmethod
     def from_model(cls, model: RssiModel) -> MeasuredFloor:
-        """Return the measured positions that a model contains, without their RSSI."""
-        position = (model.known_position + model.centre).numpy()
+        """Return the positions that a model contains, without the RSSI measured there."""
+        position = (model.anchor + model.centre).numpy()
         return cls(position, np.full((len(position), len(model.receiver_names)), np.nan), model.receiver.numpy())
 
 

@@ -1,4 +1,4 @@
-// A stand-in for the CUDA driver that runs the kernels on the CPU and is strict about what it is called with.
+// A stand-in for the CUDA driver, libcuda.so.1: it runs the kernels on the CPU and checks the arguments of every call.
 #include <cstdint>
 #include <cstring>
 
@@ -6,7 +6,7 @@ extern "C" {
 
 int launch(const char* kernel, unsigned blocks, int threads, void** arguments);
 
-static void* const CONTEXT = reinterpret_cast<void*>(uintptr_t{0x7f0000000007});  // cut to 32 bits these would not match
+static void* const CONTEXT = reinterpret_cast<void*>(uintptr_t{0x7f0000000007});  // does not survive a cut to 32 bits
 static void* const MODULE = reinterpret_cast<void*>(uintptr_t{0x7e0000000000});
 static void* const STREAM = reinterpret_cast<void*>(uintptr_t{0x123456789abc});
 static bool current = false;
@@ -35,8 +35,18 @@ int cuLaunchKernel(
     return launch(static_cast<const char*>(function), blocks, static_cast<int>(threads), arguments);
 }
 
-int cuGetErrorString(int status, const char** text) {
-    return *text = status == 500 ? "named symbol not found" : "invalid argument", 0;
+// The only exported function: cuda.bindings asks it for every other one by name, also for those that are not here.
+__attribute__((visibility("default")))
+int cuGetProcAddress_v2(const char* symbol, void** function, int version, uint64_t flags, int* status) {
+    static const struct { const char* name; void* address; } known[] = {
+        {"cuInit", (void*)cuInit}, {"cuDeviceGet", (void*)cuDeviceGet},
+        {"cuDevicePrimaryCtxRetain", (void*)cuDevicePrimaryCtxRetain}, {"cuCtxSetCurrent", (void*)cuCtxSetCurrent},
+        {"cuModuleLoadData", (void*)cuModuleLoadData}, {"cuModuleGetFunction", (void*)cuModuleGetFunction},
+        {"cuLaunchKernel", (void*)cuLaunchKernel},
+    };
+    for (const auto& entry : known)
+        if (std::strcmp(symbol, entry.name) == 0) return *function = entry.address, 0;
+    return *function = nullptr, 500;
 }
 
 }  // extern "C"

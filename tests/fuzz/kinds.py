@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
@@ -27,7 +26,6 @@ from swiftwrf import (
     FitConfig,
     ModelConfig,
     Rssi,
-    RssiModel,
     Spectra,
     comparison,
     fit,
@@ -41,9 +39,10 @@ from swiftwrf import (
 )
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.gp import Kernel
+from swiftwrf.models.base import make_model
 from swiftwrf.models.geometry import fit_geometry, fit_hybrid
 from swiftwrf.models.geometry.fit import observe
-from swiftwrf.models.geometry.strengths import fit_strengths
+from swiftwrf.models.geometry.path_gains import fit_path_gains
 from swiftwrf.models.swiftwrf import SwiftWRF
 from tasks.aoa.estimators import Settings
 from tasks.aoa.estimators.kernel_ridge import KernelRegression
@@ -116,6 +115,10 @@ def model_swiftwrf(folder: Path) -> None:
     fit(_room(), TINY, progress=False).save(folder / "model")
 
 
+def model_of(name: str, folder: Path) -> None:
+    make_model(name).fit(_room()).save(folder / "model")
+
+
 def model_coarray(folder: Path) -> None:
     fit_coarray(_room(), progress=False).save(folder / "model")
 
@@ -126,8 +129,9 @@ def model_geometry(folder: Path) -> None:
 
 def model_hybrid(folder: Path) -> None:
     geometry = fit_geometry(_room(), GLANCE, progress=False)
-    strengths = fit_strengths(geometry, observe(_room())[0], Kernel())
-    replace(fit_hybrid(_room(), geometry), strengths=strengths).save(folder / "model")
+    model = fit_hybrid(_room(), geometry, progress=False)
+    model.path_gains = fit_path_gains(geometry, observe(_room())[0], Kernel())
+    model.save(folder / "model")
 
 
 def model_published(name: str, folder: Path) -> None:
@@ -182,10 +186,10 @@ def read_rssi(folder: Path) -> Rssi:
 
 def read_model(folder: Path) -> object:
     model, position = load(folder / "model"), torch.tensor([[3.0, 2.5, 1.2]])
-    drawn = model.synthesize(position) if hasattr(model, "synthesize") else model.predict(position)
-    drawn = torch.cat(drawn) if isinstance(model, RssiModel) else drawn
-    assert drawn.isfinite().all()
-    return drawn
+    predicted = model.predict(position)
+    for values in (predicted.mean, predicted.std):
+        assert values is None or values.isfinite().all()
+    return predicted
 
 
 def read_estimator(folder: Path) -> torch.Tensor:
@@ -223,6 +227,9 @@ KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "co-array model": (model_coarray, read_model),
     "geometry model": (model_geometry, read_model),
     "hybrid model": (model_hybrid, read_model),
+    "pixel Gaussian process": (functools.partial(model_of, "gp"), read_model),
+    "inverse-distance model": (functools.partial(model_of, "idw"), read_model),
+    "nearest-spectrum model": (functools.partial(model_of, "nearest"), read_model),
     "rssi model": (model_rssi, read_model),
     "nerf2 model": (functools.partial(model_published, "nerf2"), read_model),
     "wrf-gs model": (functools.partial(model_published, "wrfgs"), read_model),

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, Le
 from torch import Tensor
 
-from swiftwrf.data.spectra import Spectra, check_training
-from swiftwrf.data.splits import MIN_TRAINING, Validation, folds
+from swiftwrf.data.spectra import Spectra
+from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import thinned
+from swiftwrf.models.base import FieldConfig
+from swiftwrf.models.geometry.ambiguity import turned
 from swiftwrf.models.geometry.images import Scene
-from swiftwrf.models.geometry.model import GeometryModel
-from swiftwrf.models.geometry.observe import correlations, element_phases
 from swiftwrf.models.geometry.orient import GAIN, candidates
-from swiftwrf.models.geometry.planes import FLOOR, Planes, advantage, clearly, correlation_score, in_step
+from swiftwrf.models.geometry.phase_retrieval import correlations, element_phases
+from swiftwrf.models.geometry.planes import FLOOR, Planes, RoomEstimate, advantage, clearly, correlation_score, in_step
 from swiftwrf.models.geometry.search import PERFECT, STARTS, WEAK, Search, find_room
-from swiftwrf.models.geometry.turns import turned
-from swiftwrf.models.geometry.verdict import judged
+from swiftwrf.models.geometry.uncertainty import assess
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
+from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
 SOLVED = 0.1  # relative error of a spectrum's autocorrelation up to which its phases are used
 NEEDED = 2.5  # standard errors by which held-out spectra must be better for a plane or an order, all of them for turns
@@ -29,65 +32,53 @@ ROUNDS = 3  # in which planes move by turns
 FURTHER = 4.0  # standard errors for a plane of any orientation, of which far more are tried
 FAINT = 0.01  # gain below which a plane is none: a ten-thousandth of the power is what rounding and misfits look like
 TRIED = 8  # candidates of any orientation that are refined
+MAX_ORDER = 4  # of the images that may be tried
 MOST = 2000  # spectra that are looked at: a room is a few dozen numbers
 ENOUGH = 300  # held-out positions to decide by: as many parts are held out in turn as that takes
 
 
-@dataclass(frozen=True)
-class GeometryConfig:
-    """How a room is searched.
+@configuration
+class GeometryConfig(FieldConfig):
+    """Options of the search for a room."""
 
-    Args:
-        reach: how far beyond the region of both ends planes are looked for [m].
-        positions: that planes are searched with; all are used to refine what was found.
-        width: of the beams that the search starts from.
-        max_order: of the images that are tried.
-        further: planes of any orientation that are tried at most beyond those of the six sides.
-    """
-
-    reach: float = 3.0
-    positions: int = 100
-    width: int = 8
-    max_order: int = 3
-    further: int = 3
+    reach: PositiveFloat = 3.0
+    """distance beyond the region of both ends up to which planes are searched [m]"""
+    positions: PositiveInt = 100
+    """number of positions in the search; all positions refine its result"""
+    width: PositiveInt = 8
+    """width of the beam search for the first planes"""
+    max_order: Annotated[int, Ge(1), Le(MAX_ORDER)] = 3
+    """highest number of reflections of an image source"""
+    further: NonNegativeInt = 3
+    """maximum number of planes of any orientation beyond those of the six sides"""
 
 
 @single_thread()
-def fit_geometry(
-    train: Spectra,
-    config: GeometryConfig | None = None,
-    *,
-    validation: Validation = "random",
-    seed: int = 0,
-    progress: bool = True,
-) -> GeometryModel:
-    """Finds the planes that mirror the known fixed end, from at most 2000 of the spectra, evenly chosen.
+def search_room(train: Spectra, config: GeometryConfig, progress: bool = False) -> RoomEstimate:
+    """Estimate the planes of a room from at most 2000 of the training spectra, evenly chosen.
 
     Args:
-        train: the only spectra it sees, with array, rotation and fixed end.
-        config: how to search.
-        validation: how training spectra are held out to decide on planes and order.
-        seed: of what is held out and what is searched with.
-        progress: shows a bar on a terminal.
+        train: Training spectra with array, rotation and fixed end.
+        config: Options of the search.
+        progress: Show a progress bar on a terminal.
 
     Raises:
-        InputError: no array, rotation or fixed end; fewer than 10 spectra, or something not finite; spectra that the
-            array cannot have produced; all positions at one place.
+        InputError: Fewer than 10 different positions, or spectra that the array cannot have produced.
     """
-    config, (train, _) = config or GeometryConfig(), _evenly(train)
-    observed, _ = observe(train, seed)
+    train, _ = _evenly(train)
     assert train.array is not None
     assert train.fixed_position is not None
+    observed, _ = observe(train, config.seed)
     scene = observed.around(train.fixed_position)
-    fold = folds(scene.moving, validation, seed)
+    fold = folds(scene.moving, config.validation, config.seed)
     kept, held = scene.subset((fold != 0).nonzero()[:, 0]), scene.subset((fold == 0).nonzero()[:, 0])
     with progress_bar(progress) as bar:
         task = bar.add_task("finding the room", total=STARTS)
         signs, found = find_room(
-            _some(kept, config.positions, seed), config.reach, width=config.width, tick=lambda: bar.advance(task)
+            _some(kept, config.positions, config.seed), config.reach, config.width, tick=lambda: bar.advance(task)
         )
     score = correlation_score(held, Planes.of(found).refined(kept), train.array)
-    some = _some(scene, config.positions, seed)
+    some = _some(scene, config.positions, config.seed)
     found = Search(some, config.reach, signs).improve(found)
     room = Planes.of(found).refined(scene)
     splits = split(scene, fold)
@@ -95,27 +86,26 @@ def fit_geometry(
     room = _completed(room, scene, some, splits, signs, config.reach)
     room = _extended(room, scene, some, splits, config)
     room = _with_order(room, splits, config.max_order)
-    return judged(train, observed, room.shifted(train.fixed_position).refined(observed), score, config.reach)
+    return assess(train, observed, room.shifted(train.fixed_position).refined(observed), score, config.reach)
 
 
 @single_thread()
-def refit_geometry(model: GeometryModel, train: Spectra, *, seed: int = 0) -> GeometryModel:
-    """The same planes with offsets and gains refined on other spectra of the scene: no search, hence under a second.
+def refine_room(room: RoomEstimate, planes: Planes, train: Spectra, seed: int) -> RoomEstimate:
+    """Refine offsets and gains of a room on other spectra of the scene, without a search, in under a second.
 
     Args:
-        model: tells the planes, the order of their images and the statistics of draws.
-        train: the spectra to refine on.
-        seed: of the start of the phase retrieval.
+        room: Estimate from other spectra.
+        planes: Its planes as tensors.
+        train: Spectra to refine on.
+        seed: Seed of the phase retrieval.
 
     Raises:
-        InputError: as `fit_geometry`.
+        InputError: As `search_room`.
     """
     scene, _ = observe(train, seed)
-    normal, offset, gain = model.tensors()
-    room = Planes(normal, offset, gain, model.order).refined(scene)
-    found = zip(model.planes, room.normal[0].tolist(), room.offset[0].tolist(), room.gain[0].tolist(), strict=True)
-    planes = [replace(plane, normal=tuple(n), offset_m=o, gain=g) for plane, n, o, g in found]
-    return replace(model, planes=planes)
+    new = planes.refined(scene)
+    found = zip(room.planes, new.normal[0].tolist(), new.offset[0].tolist(), new.gain[0].tolist(), strict=True)
+    return replace(room, planes=[replace(p, normal=tuple(n), offset_m=o, gain=g) for p, n, o, g in found])
 
 
 def _evenly(train: Spectra) -> tuple[Spectra, Tensor]:
@@ -145,14 +135,9 @@ def observe(train: Spectra, seed: int = 0) -> tuple[Scene, Tensor]:
         InputError: as `fit_geometry`.
     """
     train, rows = _evenly(train)
-    check_training(train)
-    for value, what in ((train.array, "which array took the spectra"), (train.rotation, "how the array is turned")):
-        if value is None:
-            raise InputError(f"{train.name} does not say {what}; the room can only be found where it is known")
-    if train.fixed_position is None:
-        raise InputError(f"{train.name} does not say where the fixed end stands; the room can only be found from there")
-    assert train.array is not None  # said above, which a type checker cannot follow
+    assert train.array is not None
     assert train.rotation is not None
+    assert train.fixed_position is not None
     if len(train.position.unique(dim=0)) < MIN_TRAINING:
         raise InputError(f"the positions of {train.name} are fewer than {MIN_TRAINING} different ones")
     channel, error = element_phases(correlations(train), train.array, seed)

@@ -1,193 +1,219 @@
-"""Geometry plus what is smooth: the strengths of its paths, and a Gaussian process on what these leave of the spectra.
+"""Geometry with position-dependent path gains, plus a Gaussian process on the residual spectra.
 
-    spectrum(s) = a geometry(s; strengths(s)) + mean + k(s, training positions) w
+    spectrum(s) = a room(s; path gains(s)) + mean + k(s, training positions) w
 
-Strengths vary unless held-out spectra come out clearly better without. Where the paths explain only a part, their fringes
-are worth their share a: the least-squares share at training spectra that are held out from the strengths and from the
-process, hence never worse there than the better of the two parts.
+Path gains depend on position unless cross-validation clearly prefers constant gains. The geometric part is scaled by the
+mixing weight a, fitted by least squares on held-out training spectra, so on those the sum is at least as good as either part
+alone.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import ClassVar
+from dataclasses import asdict
 
 import torch
 from torch import Tensor
 
-from swiftwrf.data.spectra import Spectra, check_training
+from swiftwrf.array.angles import AngularGrid
+from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import Kernel, choose_kernel, held_out_weights
 from swiftwrf.metrics import psnr
-from swiftwrf.models.geometry.fit import observe
+from swiftwrf.models.base import ARRAY, FIELD_MODELS, FIXED_END, FieldModel, FitContext
+from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.model import GeometryModel
+from swiftwrf.models.geometry.path_gains import PathGains, fit_path_gains, prior
 from swiftwrf.models.geometry.planes import advantage
-from swiftwrf.models.geometry.strengths import Strengths, fit_strengths, prior
-from swiftwrf.positions import check_batch, check_drawn, check_positions
-from swiftwrf.runtime.checkpoint import Header, Saved, expect
+from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.threads import single_thread
+from swiftwrf.runtime.validation import Fraction, check_value
 
-COMPONENTS = 64  # principal components of the difference that are kept at most
-PIXELS = 4000  # of a spectrum that are enough to choose kernel and share
-MOST = 10_000  # spectra: all their inner products are computed
-BATCH = 256  # spectra at a time
-NEEDED = 1.0  # standard errors by which constant strengths must be ahead of others, judged from fewer spectra
-FIRST = 0.7  # share with which the kernel is chosen
+MAX_COMPONENTS = 64  # principal components of the residual spectra
+MIN_VARIANCE = 1e-6  # fraction of the variance below which a component is left out
+MAX_PIXELS = 4000  # of a spectrum, to choose kernel and mixing weight
+MAX_SPECTRA = 10_000  # the fit computes all their inner products
+CONSTANT_GAINS_MARGIN = 1.0  # standard errors by which constant path gains must be ahead to be taken
+FIRST_WEIGHT = 0.7  # mixing weight with which the kernel is chosen
 
 
-@dataclass(frozen=True, eq=False)
-class HybridModel(Saved):
-    """What `fit_hybrid` returns.
+@FIELD_MODELS.register("hybrid")
+class HybridModel(FieldModel):
+    """Geometry with position-dependent path gains, and a Gaussian process on the residual.
 
-    Args:
-        geometry: the room.
-        strengths: of its paths; None where they are the same everywhere.
-        share: of its spectra in the prediction, 0 to 1.
-        kernel: of the process, lengths in [m].
-        anchor: training positions, float64 (n, 3) [m].
-        readout: kernel weights to component scores, float32 (n, k).
-        component: the mean difference, then the components, float32 (1 + k, pixels).
+    Only the geometric part of a sample is random.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.simulated_room(n=50).split()
+        >>> HybridModel(width=1, further=0).fit(train).predict(test.position).mean.shape
+        torch.Size([10, 90, 360])
     """
 
-    kind: ClassVar[str] = "hybrid model"
+    name = "hybrid"
+    kind = "hybrid model"
+    config_type = GeometryConfig
+    requires = (ARRAY, FIXED_END)
+    samples = True
+    batch = 256
 
-    geometry: GeometryModel
-    strengths: Strengths | None
-    share: float
+    path_gains: PathGains | None
+    """gains of the paths; None if they are constant"""
+    mixing_weight: float
+    """weight of the geometric part, 0 to 1"""
     kernel: Kernel
-    anchor: Tensor
+    """kernel of the process on the residual, lengths in [m]"""
+    position: Tensor
+    """training positions, float64 (n, 3) [m]"""
     readout: Tensor
+    """kernel weights to component scores, float32 (n, k)"""
     component: Tensor
-
-    @torch.no_grad()
-    def synthesize(self, position: Tensor, generator: torch.Generator | None = None, batch: int = BATCH) -> Tensor:
-        """Spectra at positions (n, 3) [m] of the moving end, float32 (n, n_elevation, n_azimuth) in [0, 1]; with a generator
-        the room's part is drawn.
-
-        Raises:
-            InputError: positions of another shape, or not finite.
-        """
-        position = check_positions(position)
-        check_batch(batch)
-        spectrum = torch.empty(len(position), *self.geometry.grid.shape)
-        for start in range(0, len(position), batch):
-            rows = slice(start, start + batch)
-            score = self.kernel(position[rows], self.anchor).float() @ self.readout
-            smooth = (self.component[0] + score @ self.component[1:]).reshape(-1, *self.geometry.grid.shape)
-            sharp = self.share * _room(self.geometry, self.strengths, position[rows], generator) if self.share else 0.0
-            spectrum[rows] = (smooth + sharp).clamp(0, 1)
-        return check_drawn(spectrum)
-
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        """All there is to save: tensors and plain values."""
-        tensors, values = self.geometry.state()
-        own = {"anchor": self.anchor, "readout": self.readout, "component": self.component}
-        values |= {"share": self.share, "kernel": asdict(self.kernel), "strengths": None}
-        if self.strengths is not None:
-            own |= {"strengths.anchor": self.strengths.anchor, "strengths.readout": self.strengths.readout}
-            values["strengths"] = asdict(self.strengths.kernel)
-        return tensors | own, values
+    """mean residual spectrum, then its components, float32 (1 + k, pixels)"""
 
     @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> HybridModel:
-        """The model that `state` described."""
-        own = {name: tensors[name] for name in ("anchor", "readout", "component")}
-        geometry = GeometryModel.from_state(tensors, header)
-        strengths = None
-        if header["strengths"] is not None:
-            anchor, readout = (tensors.get(f"strengths.{name}", torch.empty(0, 0)) for name in ("anchor", "readout"))
-            shape = (len(anchor), *readout.shape[1:2], len(geometry.image_sources()[0]), 2)
-            expect(tensors, {"strengths.anchor": (len(anchor), 3), "strengths.readout": shape})
-            strengths = Strengths(Kernel(**header["strengths"]), anchor, readout)
-        return cls(geometry, strengths, header["share"], Kernel(**header["kernel"]), **own)
+    def accepts_like(cls, model: FieldModel) -> bool:
+        return model.room is not None
+
+    @property
+    def room(self) -> GeometryModel:
+        """Room whose paths the model uses."""
+        return self._room
+
+    def region(self) -> Tensor:
+        return self.position
+
+    def _fit(self, train: Spectra, context: FitContext) -> None:
+        if len(train) > MAX_SPECTRA:
+            raise InputError(
+                f"hybrid is fitted to all inner products of its spectra, at most {MAX_SPECTRA} of them, not {len(train)}; "
+                "take geometry, coarray or swiftwrf, or fewer spectra"
+            )
+        self._room = GeometryModel(self.config).fit(train, like=context.like, progress=context.progress)
+        self._fit_residual(train, context.like if isinstance(context.like, HybridModel) else None)
+
+    @single_thread()
+    def _fit_residual(self, train: Spectra, like: HybridModel | None) -> None:
+        fold = folds(train.position, self.config.validation, self.config.seed)
+        known = self._fit_path_gains(train, fold, like).flatten(1)
+        seen = train.spectrum.flatten(1)
+        stride = max(1, seen.shape[1] // MAX_PIXELS) | 1
+        some, some_known = seen[:, ::stride], known[:, ::stride]
+        self.kernel = choose_kernel(train.position, (some - FIRST_WEIGHT * some_known)[:, None], fold)
+        self.position = train.position
+        self.mixing_weight, gains = _mixing_weight(train.position, some, some_known, fold, self.kernel)
+        if not gains:
+            self.mixing_weight, self.component = 1.0, torch.zeros(1, seen.shape[1])
+            self.readout = torch.zeros(len(train), 0)
+            return
+        left = seen - self.mixing_weight * known
+        mean = left.mean(0)
+        value, vector = torch.linalg.eigh(((left - mean) @ (left - mean).T).double())
+        vector = vector[:, value > MIN_VARIANCE * value.sum()][:, -MAX_COMPONENTS:]
+        self.readout = torch.linalg.solve(self.kernel.noisy_gram(train.position), vector).float()
+        self.component = torch.cat([mean[None], vector.T.float() @ (left - mean)])
+
+    def _fit_path_gains(self, train: Spectra, fold: Tensor, like: HybridModel | None) -> Tensor:
+        """Fit the path gains; return the spectra (n, H, W) that the paths predict with each fold held out from the gains."""
+        self.path_gains = None
+        if not self.room.planes or (like and not like.path_gains):
+            return self.room.synthesize(train.position)
+        scene, rows = observe(train, self.config.seed)
+        kernel = like.path_gains.kernel if like and like.path_gains else prior(scene.moving)
+        known = torch.empty(len(train), *train.grid.shape)
+        for number in fold.unique():
+            out = (fold == number).nonzero()[:, 0]  # including spectra without observed phases
+            kept = scene.subset((fold[rows] != number).nonzero()[:, 0])
+            self.path_gains = fit_path_gains(self.room, kept, kernel)
+            for part in out.split(self.batch):
+                known[part] = self._paths(train.position[part])
+        if not like:
+            constant, seen = self.room.synthesize(train.position), train.spectrum
+            if advantage(psnr(constant, seen), psnr(known, seen)) > CONSTANT_GAINS_MARGIN:
+                self.path_gains = None
+                return constant
+        self.path_gains = fit_path_gains(self.room, scene, kernel)
+        return known
+
+    def _paths(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Return the spectra (b, H, W) that the paths predict at a batch of positions (b, 3) [m]."""
+        if self.path_gains is None:
+            channel = self.room.channel(position, generator)
+        else:
+            channel = self.path_gains.channel(self.room, position, generator)
+        return self.room.array.spectrum(channel, self.grid)
+
+    def _total(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        score = self.kernel(position, self.position).float() @ self.readout
+        spectrum = (self.component[0] + score @ self.component[1:]).reshape(-1, *self.grid.shape)
+        return spectrum + self.mixing_weight * self._paths(position, generator) if self.mixing_weight else spectrum
+
+    def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
+        return self._total(position), None
+
+    def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
+        return self._total(position, generator)
+
+    def _state(self) -> tuple[dict[str, Tensor], Header]:
+        tensors, header = self.room._state()
+        tensors |= {"position": self.position, "readout": self.readout, "component": self.component}
+        header |= {"mixing_weight": self.mixing_weight, "kernel": asdict(self.kernel), "path_gains": None}
+        if self.path_gains is not None:
+            tensors |= {"path_gains.anchor": self.path_gains.anchor, "path_gains.readout": self.path_gains.readout}
+            header["path_gains"] = asdict(self.path_gains.kernel)
+        return tensors, header
+
+    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
+        self._room = GeometryModel.within(self, tensors, header)
+        expect(tensors, {"position": (n := len(tensors["position"]), 3)})
+        shape = (n, tensors["readout"].shape[-1])
+        expect(tensors, {"readout": shape, "component": (1 + shape[1], self.grid.shape[0] * self.grid.shape[1])})
+        self.position, self.kernel = tensors["position"].double(), Kernel(**header["kernel"])
+        self.readout, self.component = tensors["readout"].float(), tensors["component"].float()
+        check_value("mixing_weight", header["mixing_weight"], Fraction)
+        self.mixing_weight, self.path_gains = header["mixing_weight"], None
+        if header["path_gains"] is not None:
+            anchor, readout = tensors["path_gains.anchor"], tensors["path_gains.readout"]
+            gains = (len(anchor), *readout.shape[1:2], len(self.room.image_sources()[0]), 2)
+            expect(tensors, {"path_gains.anchor": (len(anchor), 3), "path_gains.readout": gains})
+            self.path_gains = PathGains(Kernel(**header["path_gains"]), anchor.double(), readout.float())
 
 
-def room_of(model: Saved) -> GeometryModel | None:
-    """The room that a model found; None where it knows of none."""
-    room = model.geometry if isinstance(model, HybridModel) else model
-    return room if isinstance(room, GeometryModel) else None
-
-
-@single_thread()
 def fit_hybrid(
     train: Spectra,
-    geometry: GeometryModel,
+    geometry: FieldModel | None = None,
     *,
     validation: Validation = "random",
     seed: int = 0,
-    like: HybridModel | None = None,
+    progress: bool = True,
 ) -> HybridModel:
-    """Fits strengths to what the spectra say of the paths, and the process to what the room leaves of them.
+    """Fit the hybrid model.
 
     Args:
-        train: the only spectra it sees.
-        geometry: found from the same spectra.
-        validation: how they are held out to choose kernel and share.
-        seed: of what is held out.
-        like: a model of the same room from other spectra, whose kernel of the strengths is taken.
+        train: Training spectra, 10 to 10,000, with array, rotation and fixed end.
+        geometry: Fitted model with a room. Its planes are refined if it was fitted to other spectra. By default the room is
+            estimated from `train`.
+        validation: How training spectra are held out to choose kernel and mixing weight.
+        seed: Seed of the folds.
+        progress: Show a progress bar on a terminal.
 
     Raises:
-        InputError: fewer than 10 spectra or more than 10,000, or something not finite.
+        InputError: As `FieldModel.fit`, or more than 10,000 spectra.
+
+    Example:
+        >>> import swiftwrf
+        >>> data = swiftwrf.simulated_room(n=40)
+        >>> room = swiftwrf.GeometryModel(width=1, further=0).fit(data)
+        >>> fit_hybrid(data, room).mixing_weight > 0
+        True
     """
-    check_training(train)
-    if len(train) > MOST:
-        raise InputError(
-            f"hybrid is fitted to all inner products of its spectra, at most {MOST} of them, not {len(train)}; take "
-            "geometry, coarray or swiftwrf, or fewer spectra"
-        )
-    fold = folds(train.position, validation, seed)
-    strengths, known = _strengths(train, geometry, fold, seed, like)
-    seen, known = train.spectrum.flatten(1), known.flatten(1)
-    stride = max(1, seen.shape[1] // PIXELS) | 1
-    some, some_known = seen[:, ::stride], known[:, ::stride]
-    kernel = choose_kernel(train.position, (some - FIRST * some_known)[:, None], fold)
-    share, gains = _share(train.position, some, some_known, fold, kernel)
-    left = seen - share * known
-    if not gains:
-        nothing = torch.zeros(1, seen.shape[1])
-        return HybridModel(geometry, strengths, 1.0, kernel, train.position, torch.zeros(len(train), 0), nothing)
-    mean = left.mean(0)
-    value, vector = torch.linalg.eigh(((left - mean) @ (left - mean).T).double())
-    vector = vector[:, value > 1e-6 * value.sum()][:, -COMPONENTS:]
-    readout = torch.linalg.solve(kernel.noisy_gram(train.position), vector).float()
-    component = torch.cat([mean[None], vector.T.float() @ (left - mean)])
-    return HybridModel(geometry, strengths, share, kernel, train.position, readout, component)
+    return HybridModel(validation=validation, seed=seed).fit(train, like=geometry, progress=progress)
 
 
-def _room(
-    geometry: GeometryModel, strengths: Strengths | None, position: Tensor, generator: torch.Generator | None = None
-) -> Tensor:
-    """Spectra (n, H, W) that follow from the paths."""
-    if strengths is None:
-        return geometry.synthesize(position, generator)
-    channels = (strengths.channel(geometry, part, generator) for part in position.split(BATCH))
-    return torch.cat([geometry.array.spectrum(channel, geometry.grid) for channel in channels])
+def _mixing_weight(position: Tensor, seen: Tensor, known: Tensor, fold: Tensor, kernel: Kernel) -> tuple[float, bool]:
+    """Return the least-squares weight, 0 to 1, of `known` (n, pixels) where `seen` is held out from the process.
 
-
-def _strengths(
-    train: Spectra, geometry: GeometryModel, fold: Tensor, seed: int, like: HybridModel | None
-) -> tuple[Strengths | None, Tensor]:
-    """Strengths from all training spectra, and the spectra (n, H, W) that follow at each one's position from the others."""
-    if not geometry.planes or (like and not like.strengths):
-        return None, geometry.synthesize(train.position)
-    scene, rows = observe(train, seed)
-    kernel = like.strengths.kernel if like and like.strengths else prior(scene.moving)
-    known = torch.empty(len(train), *geometry.grid.shape)
-    for number in fold.unique():
-        out = (fold == number).nonzero()[:, 0]  # those of which nothing was observed, too
-        kept = scene.subset((fold[rows] != number).nonzero()[:, 0])
-        known[out] = _room(geometry, fit_strengths(geometry, kept, kernel), train.position[out])
-    if not like:
-        constant, seen = geometry.synthesize(train.position), train.spectrum
-        if advantage(psnr(constant, seen), psnr(known, seen)) > NEEDED:
-            return None, constant
-    return fit_strengths(geometry, scene, kernel), known
-
-
-def _share(position: Tensor, seen: Tensor, known: Tensor, fold: Tensor, kernel: Kernel) -> tuple[float, bool]:
-    """The share of `known` (n, pixels) that leaves least of `seen` where it is held out from the process, in [0, 1], and
-    whether that, with the process, leaves less than `known` alone, by the mean logarithm of the squared error."""
+    Also return whether weight and process together predict better than `known` alone, by the mean log squared error.
+    """
     missed, sharp = torch.empty_like(seen), torch.empty_like(known)
     for out, kept, weight in held_out_weights(kernel, position, fold):
         for x, left in ((seen, missed), (known, sharp)):

@@ -1,197 +1,270 @@
-"""The room that the spectra show: planes with their verdicts, and the spectra that follow from it at any position."""
+"""A room of mirror planes, and the spectra that follow from it at any position."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from dataclasses import asdict
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.spectra import Moving
+from swiftwrf.data.spectra import Moving, Spectra, fingerprint
+from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
-from swiftwrf.models.geometry.images import Scene, field, image_gain, images, sequences
+from swiftwrf.models.base import ARRAY, FIELD_MODELS, FIXED_END, FieldModel, FitContext, bounding_box
+from swiftwrf.models.geometry.fit import MAX_ORDER, GeometryConfig, refine_room, search_room
+from swiftwrf.models.geometry.images import Scene, image_gain, images
+from swiftwrf.models.geometry.planes import Plane, Planes, RoomEstimate
 from swiftwrf.models.geometry.sample import Residual, draw
-from swiftwrf.positions import check_batch, check_drawn, check_positions
-from swiftwrf.runtime.checkpoint import Header, Saved, expect
+from swiftwrf.runtime.checkpoint import Header, expect
+from swiftwrf.runtime.validation import check_value
 
-MOST_PLANES, MOST_ORDER = 64, 4  # of a room in a file
-
-
-FARTHEST = 1e7  # [m] from the fixed end: beyond, phases are lost to rounding
+MAX_PLANES = 64  # of a room in a file
+MAX_DISTANCE_M = 1e7  # from the fixed end; beyond, rounding destroys the phases
 
 
-@dataclass(frozen=True)
-class Plane:
-    """A mirror plane normal . x = offset in world coordinates.
+@FIELD_MODELS.register("geometry")
+class GeometryModel(FieldModel):
+    """Image sources of the fixed end in mirror planes that are estimated from the spectra.
 
-    Args:
-        normal: unit vector out of the room.
-        offset_m: [m].
-        gain: amplitude that it reflects, with its sign.
-        std_mm: standard deviation of the offset [mm].
-        certain: no other place explains the spectra nearly as well, and held-out spectra need the plane.
+    A sample moves the planes within their standard deviations (once for every 256 positions), hides paths, and adds diffuse
+    paths as strong as the prediction error.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.simulated_room(n=50).split()
+        >>> room = GeometryModel(width=1, further=0).fit(train)
+        >>> room.predict(test.position).mean.shape
+        torch.Size([10, 90, 360])
     """
 
-    normal: tuple[float, float, float]
-    offset_m: float
-    gain: float
-    std_mm: float
-    certain: bool
-
-
-@dataclass(frozen=True, eq=False)
-class GeometryModel(Saved):
-    """Spectra by image sources; what `fit_geometry` returns.
-
-    Args:
-        array: the antenna array.
-        grid: of the spectra.
-        rotation: turns array into world coordinates, (3, 3).
-        fixed_position: of the end that does not move [m], (3,).
-        moving: which end moves.
-        planes: what was found, none where there was nothing to find.
-        order: of the images.
-        score_held_out: 1 - correlation of predicted and observed co-array numbers of training spectra that were held out
-            from the search for planes along the sides, its first stage.
-        unexplained: share of the power of the co-array numbers, of the training spectra that were looked at, that the
-            prediction leaves.
-        verdict: the finding in a sentence.
-        covariance: of the offsets [m^2], (P, P).
-        residual: statistics of what the planes leave, for draws.
-    """
-
-    kind: ClassVar[str] = "geometry model"
+    name = "geometry"
+    kind = "geometry model"
+    config_type = GeometryConfig
+    requires = (ARRAY, FIXED_END)
+    samples = True
+    any_grid = True
+    batch = 256
 
     array: PlanarArray
-    grid: AngularGrid
     rotation: Tensor
+    """rotation from array to world coordinates (3, 3)"""
     fixed_position: Tensor
+    """position of the fixed end (3,) [m]"""
     moving: Moving
-    planes: list[Plane]
-    order: int
-    score_held_out: float
-    unexplained: float
-    verdict: str
-    covariance: Tensor
-    residual: Residual
+    """end that moves"""
+    estimate: RoomEstimate
+    """planes with their uncertainty"""
+    fingerprint: str
+    """digest of the training spectra"""
 
-    @torch.no_grad()
-    def synthesize(self, position: Tensor, generator: torch.Generator | None = None, batch: int = 256) -> Tensor:
-        """Spectra at any positions of the moving end.
+    @classmethod
+    def accepts_like(cls, model: FieldModel) -> bool:
+        return model.room is not None
+
+    @classmethod
+    def of_planes(cls, link: Spectra, planes: list[Plane], order: int = 2) -> Self:
+        """Return the model of a room whose planes are known.
 
         Args:
-            position: [m], (n, 3).
-            generator: draws a sample - plane offsets within their deviations (anew for every `batch` spectra), paths that
-                are blocked, further paths as strong as what the planes leave - instead of the most plausible spectrum.
-            batch: spectra at a time.
+            link: Any spectra of the scene, for array, rotation, fixed end and grid.
+            planes: Planes of the room.
+            order: Highest number of reflections of an image source.
 
-        Returns:
-            Magnitudes in [0, 1], float32 (n, n_elevation, n_azimuth).
-
-        Raises:
-            InputError: positions of another shape, or not finite.
+        Example:
+            >>> import swiftwrf
+            >>> floor = Plane((0.0, 0.0, -1.0), offset_m=0.0, gain=-0.6)
+            >>> GeometryModel.of_planes(swiftwrf.simulated_room(n=10), [floor]).image_sources()[2]
+            tensor([0, 1])
         """
-        position = check_positions(position)
-        check_batch(batch)
-        spectrum = torch.empty(len(position), *self.grid.shape)
-        for start in range(0, len(position), batch):
-            rows = slice(start, start + batch)
-            spectrum[rows] = self.array.spectrum(self.channel(position[rows], generator), self.grid)
-        return check_drawn(spectrum)
+        certain = torch.diag(torch.tensor([(plane.std_mm / 1000) ** 2 for plane in planes], dtype=torch.float64))
+        model, estimate = cls(), RoomEstimate(planes, order, 0.0, 0.0, "given planes", certain, Residual())
+        model.grid, model.bounds = link.grid, bounding_box(link.position)
+        model._set_link(link)
+        model.estimate, model.fingerprint = estimate, ""
+        return model
+
+    @classmethod
+    def within(cls, model: FieldModel, tensors: dict[str, Tensor], header: Header) -> Self:
+        """Return the room that a saved model of another kind contains."""
+        room = cls()
+        room.grid, room.bounds = model.grid, model.bounds
+        room._restore(tensors, header)
+        return room
+
+    def _set_link(self, link: Spectra) -> None:
+        assert link.array is not None
+        assert link.rotation is not None
+        assert link.fixed_position is not None
+        self.array, self.rotation = link.array, link.rotation
+        self.fixed_position, self.moving = link.fixed_position, link.moving
+
+    def _fit(self, train: Spectra, context: FitContext) -> None:
+        owner, known = fingerprint(train), context.like.room if context.like else None
+        self._set_link(train)
+        if known is None:
+            self.estimate = search_room(train, self.config, context.progress)
+        elif known.fingerprint == owner:
+            self.estimate = known.estimate
+        else:
+            self.estimate = refine_room(known.estimate, known.tensors(), train, self.config.seed)
+        self.fingerprint = owner
+
+    @property
+    def room(self) -> GeometryModel:
+        """The model itself."""
+        return self
+
+    @property
+    def planes(self) -> list[Plane]:
+        """Planes of the room."""
+        return self.estimate.planes
+
+    @property
+    def order(self) -> int:
+        """Highest number of reflections of an image source."""
+        return self.estimate.order
+
+    @property
+    def verdict(self) -> str:
+        """Result of the search in one sentence."""
+        return self.estimate.verdict
+
+    def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
+        return self.array.spectrum(self.channel(position), grid), None
+
+    def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
+        return self.array.spectrum(self.channel(position, generator), grid)
 
     def channel(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """What each element hears at positions (n, 3) [m], complex64 (n, K), drawn where there is a generator."""
-        scene = self.scene(position)
-        normal, offset, gain = self.tensors()
-        chain = sequences(normal[0], self.order) if self.planes else []
-        if generator is not None:
-            return draw(scene, normal, offset, gain, chain, self.covariance, self.residual, generator)
-        return scene.wave(scene.transmitter) + field(scene, normal, offset, gain, chain)[0]
+        """Return the channel of each element at positions (n, 3) [m], complex64 (n, K); a sample with a generator."""
+        scene, room = self.scene(position), self.tensors()
+        if generator is None:
+            return room.field(scene)
+        covariance, residual = self.estimate.covariance, self.estimate.residual
+        return draw(scene, room.normal, room.offset, room.gain, room.sequence, covariance, residual, generator)
 
     def scene(self, position: Tensor) -> Scene:
-        """The scene at positions (n, 3) [m], nothing observed; from `FARTHEST` on only the direction counts."""
+        """Return the link at positions (n, 3) [m], without observations. Beyond 10,000 km only the direction counts."""
         away = position - self.fixed_position
         size = away.abs().amax(dim=1, keepdim=True)
-        position = torch.where(size > FARTHEST, self.fixed_position + FARTHEST * (away / size), position)
+        position = torch.where(size > MAX_DISTANCE_M, self.fixed_position + MAX_DISTANCE_M * (away / size), position)
         nothing = torch.ones(len(position), len(self.array.element), dtype=torch.complex64)
         return Scene.of(position, self.fixed_position, self.moving, self.array, self.rotation, nothing)
 
-    def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Normals (1, P, 3), offsets (1, P) [m] and gains (1, P)."""
+    def tensors(self) -> Planes:
+        """Return the planes as tensors."""
         normal = torch.tensor([p.normal for p in self.planes], dtype=torch.float64).reshape(1, -1, 3)
         offset = torch.tensor([[p.offset_m for p in self.planes]], dtype=torch.float64)
-        return normal, offset, torch.tensor([[p.gain for p in self.planes]])
+        return Planes(normal, offset, torch.tensor([[p.gain for p in self.planes]]), self.order)
 
     def image_sources(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Mirror images of the fixed end: positions (S, 3) [m], gains (S,) and numbers of reflections (S,), itself first."""
-        normal, offset, gain = self.tensors()
+        """Return the fixed end and its mirror images: positions (S, 3) [m], gains (S,) and numbers of reflections (S,)."""
         at, strength, order = self.fixed_position[None], torch.ones(1), torch.zeros(1, dtype=torch.int64)
-        if not self.planes:
+        room = self.tensors()
+        if not (chain := room.sequence):
             return at, strength, order
-        chain = sequences(normal[0], self.order)
         scene = Scene.of(at, at[0], "receiver", self.array, self.rotation, torch.ones(1, len(self.array.element)))
-        found = images(scene, normal, offset, chain)[0, :, 0]
+        found = images(scene, room.normal, room.offset, chain)[0, :, 0]
+        reflections = torch.tensor([len(s) for s in chain])
         return (
             torch.cat([at, found]),
-            torch.cat([strength, image_gain(gain, chain)[0]]),
-            torch.cat([order, torch.tensor([len(s) for s in chain])]),
+            torch.cat([strength, image_gain(room.gain, chain)[0]]),
+            torch.cat([order, reflections]),
         )
 
     def to_json(self) -> dict[str, Any]:
-        """The room in plain values: planes as normal . x = offset in world coordinates."""
-        planes = [{**asdict(p), "normal": list(p.normal)} for p in self.planes]
-        return {
-            "planes": planes,
-            "order": self.order,
-            "score_held_out": self.score_held_out,
-            "unexplained": self.unexplained,
-        }
+        """Return the room as plain values, see `RoomEstimate.to_json`."""
+        return self.estimate.to_json()
 
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        """All there is to save: tensors and plain values."""
-        tensors = {
-            "element": self.array.element,
-            "rotation": self.rotation,
-            "fixed_position": self.fixed_position,
-            "covariance": self.covariance,
-        }
-        values = self.to_json() | {
+    def region(self) -> Tensor:
+        """Return the middle of the room and two opposite corners (3, 3) [m]."""
+        low, high = self.bounds[0].clone(), self.bounds[1].clone()
+        for plane in self.planes:
+            axis = max(range(3), key=lambda axis: abs(plane.normal[axis]))
+            at = plane.offset_m / plane.normal[axis]
+            (high if plane.normal[axis] > 0 else low)[axis] = at
+        return torch.stack([(low + high) / 2, low, high])
+
+    def _state(self) -> tuple[dict[str, Tensor], Header]:
+        link = {"element": self.array.element, "rotation": self.rotation, "fixed_position": self.fixed_position}
+        header = self.to_json() | {
             "wavelength": self.array.wavelength,
-            "grid": asdict(self.grid),
             "moving": self.moving,
             "verdict": self.verdict,
-            "residual": asdict(self.residual),
+            "residual": asdict(self.estimate.residual),
+            "fingerprint": self.fingerprint,
         }
-        return tensors, values
+        return link | {"covariance": self.estimate.covariance}, header
 
-    @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> GeometryModel:
-        """The model that `state` described.
-
-        Raises:
-            InputError: tensors or an order that no room has; image sources grow with the planes to the power of the order.
-        """
-        n_planes, order = len(header["planes"]), header["order"]
-        expect(tensors, {"rotation": (3, 3), "fixed_position": (3,)})
-        if type(order) is not int or not 0 <= order <= MOST_ORDER or n_planes > MOST_PLANES:
-            raise InputError(
-                f"a room has at most {MOST_PLANES} planes and paths of 0 to {MOST_ORDER} reflections, got {n_planes} and "
+    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
+        planes, order = header["planes"], header["order"]
+        if type(order) is not int or not 0 <= order <= MAX_ORDER or len(planes) > MAX_PLANES:
+            raise InputError(  # the number of image sources is that of the planes to the power of the order
+                f"a room has at most {MAX_PLANES} planes and paths of 0 to {MAX_ORDER} reflections, got {len(planes)} and "
                 f"{order}"
             )
-        return cls(
-            array=PlanarArray(tensors["element"], header["wavelength"]),
-            grid=AngularGrid(**header["grid"]),
-            rotation=tensors["rotation"],
-            fixed_position=tensors["fixed_position"],
-            moving=header["moving"],
-            planes=[Plane(**{**p, "normal": tuple(p["normal"])}) for p in header["planes"]],
-            order=header["order"],
-            score_held_out=header["score_held_out"],
-            unexplained=header["unexplained"],
-            verdict=header["verdict"],
-            covariance=tensors["covariance"],
+        expect(tensors, {"rotation": (3, 3), "fixed_position": (3,), "covariance": (len(planes), len(planes))})
+        self.array = PlanarArray(tensors["element"], header["wavelength"])
+        self.rotation, self.fixed_position = tensors["rotation"].double(), tensors["fixed_position"].double()
+        check_value("moving", header["moving"], Moving)
+        self.moving, self.fingerprint = header["moving"], str(header["fingerprint"])
+        self.estimate = RoomEstimate(
+            planes=[Plane(**{**plane, "normal": tuple(plane["normal"])}) for plane in planes],
+            order=order,
+            score_held_out=float(header["score_held_out"]),
+            unexplained=float(header["unexplained"]),
+            verdict=str(header["verdict"]),
+            covariance=tensors["covariance"].double(),
             residual=Residual(**header["residual"]),
         )
+
+
+def fit_geometry(
+    train: Spectra,
+    config: GeometryConfig | None = None,
+    *,
+    validation: Validation | None = None,
+    seed: int | None = None,
+    progress: bool = True,
+) -> GeometryModel:
+    """Estimate the room in which spectra were measured.
+
+    Args:
+        train: Training spectra with array, rotation and fixed end.
+        config: Options of the search.
+        validation: Replaces `config.validation`.
+        seed: Replaces `config.seed`.
+        progress: Show a progress bar on a terminal.
+
+    Raises:
+        InputError: As `FieldModel.fit`, or spectra that the array cannot have produced.
+
+    Example:
+        >>> import swiftwrf
+        >>> data = swiftwrf.simulated_room(n=40)
+        >>> fit_geometry(data, GeometryConfig(width=1, further=0), progress=False).order
+        2
+    """
+    given: dict[str, Any] = {
+        name: value for name, value in (("validation", validation), ("seed", seed)) if value is not None
+    }
+    return GeometryModel(config, **given).fit(train, progress=progress)
+
+
+def refit_geometry(model: FieldModel, train: Spectra, *, seed: int | None = None) -> GeometryModel:
+    """Return the room of a model with offsets and gains refined on other spectra of the scene, without a search.
+
+    Args:
+        model: Fitted model with a room.
+        train: Spectra to refine on.
+        seed: Seed of the phase retrieval. Defaults to that of the room's search.
+
+    Raises:
+        InputError: As `fit_geometry`, or a model without a room.
+    """
+    config = model.room.config if model.room is not None else None
+    given: dict[str, Any] = {} if seed is None else {"seed": seed}
+    return GeometryModel(config, **given).fit(train, like=model)

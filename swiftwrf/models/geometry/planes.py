@@ -3,17 +3,69 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 from torch import Tensor
 
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.models.geometry.images import Scene, Sequence, field, sequences, turn_of
-from swiftwrf.models.geometry.observe import autocorrelation
+from swiftwrf.models.geometry.phase_retrieval import autocorrelation
 from swiftwrf.models.geometry.refine import refine
+from swiftwrf.models.geometry.sample import Residual
 from swiftwrf.models.geometry.search import SIDES, Room
+from swiftwrf.runtime.validation import NonNegativeFloat, configuration
 
 FLOOR = 1e-5  # of what is missing: rounding of spectra, and of the phases that follow from them
+
+
+@configuration
+class Plane:
+    """A mirror plane normal . x = offset in world coordinates.
+
+    Args:
+        normal: Unit vector out of the room.
+        offset_m: Offset [m].
+        gain: Reflection gain (amplitude) with its sign.
+        std_mm: Standard deviation of the offset [mm].
+        certain: No alternative offset explains the spectra nearly as well, and held-out spectra need the plane.
+    """
+
+    normal: tuple[float, float, float]
+    offset_m: float
+    gain: float
+    std_mm: NonNegativeFloat = 0.0
+    certain: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class RoomEstimate:
+    """Planes of a room with their uncertainty.
+
+    Args:
+        planes: Planes, an empty list if none explains the spectra.
+        order: Highest number of reflections of an image source.
+        score_held_out: 1 - correlation of predicted and observed co-array coefficients of the training spectra that were
+            held out from the first stage of the search.
+        unexplained: Fraction of the power of the co-array coefficients of the training spectra that is not predicted.
+        verdict: Result in one sentence.
+        covariance: Covariance of the offsets (P, P) [m^2].
+        residual: Statistics of the prediction error, for samples.
+    """
+
+    planes: list[Plane]
+    order: int
+    score_held_out: float
+    unexplained: float
+    verdict: str
+    covariance: Tensor
+    residual: Residual
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the planes (normal . x = offset in world coordinates), order and scores as plain values."""
+        planes = [{**asdict(plane), "normal": list(plane.normal)} for plane in self.planes]
+        scores = {"score_held_out": self.score_held_out, "unexplained": self.unexplained}
+        return {"planes": planes, "order": self.order} | scores
 
 
 @dataclass(frozen=True)

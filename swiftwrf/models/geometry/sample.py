@@ -3,29 +3,29 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from swiftwrf.models.geometry.images import Scene, Sequence, field, image_gain, images, visibility
+from swiftwrf.runtime.validation import Fraction, NonNegativeFloat, configuration
 
 DIFFUSE = 8  # further paths in a draw
 SEED = 0
 CALIBRATION = 12  # bisections of the further paths' strength
 
 
-@dataclass(frozen=True)
+@configuration
 class Residual:
-    """What the planes leave.
+    """Statistics of the paths that the planes do not predict.
 
     Args:
-        direct: share of the positions with a line of sight.
-        diffuse: amplitude of further paths, relative to that of the direct wave and the planes' together.
+        direct: Fraction of the positions with a line of sight.
+        diffuse: Amplitude of diffuse paths, relative to the sum of the direct and the reflected paths.
     """
 
-    direct: float = 1.0
-    diffuse: float = 0.0
+    direct: Fraction = 1.0
+    diffuse: NonNegativeFloat = 0.0
 
 
 def draw(

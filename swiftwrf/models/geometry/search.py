@@ -20,7 +20,7 @@ from torch import Tensor
 
 from swiftwrf.models.geometry.images import Scene, field, sequences, turn_of
 from swiftwrf.models.geometry.refine import refine
-from swiftwrf.models.geometry.waves import Waves
+from swiftwrf.models.geometry.responses import Waves
 
 SIDES = torch.tensor(
     [[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], dtype=torch.float64

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
+from collections.abc import Callable
 from dataclasses import asdict, replace
 
 import torch
@@ -16,11 +18,11 @@ from swiftwrf.models.swiftwrf.deformation import DEFORMATIONS
 from swiftwrf.models.swiftwrf.field import DeformableGaussians
 from swiftwrf.models.swiftwrf.optimise import Optimisation, run_name
 from swiftwrf.models.swiftwrf.regression import TRIAL_STEPS, Regression
-from swiftwrf.models.swiftwrf.search import doubling_search
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.session import Session
 
 MIN_PRIMITIVES, MAX_PRIMITIVES = 16, 512  # numbers of primitives that the search tries
+MIN_GAIN = 0.004  # relative reduction of the loss that counts, 0.04 dB
 
 
 def fit_field(train: Spectra, config: FitConfig, context: FitContext) -> DeformableGaussians:
@@ -86,3 +88,25 @@ def _regress(regression: Regression, config: FitConfig, session: Session) -> Def
     field = regression.field(n)
     record("final", n, began, regression.held_out_loss(n), None)
     return field
+
+
+def doubling_search(loss: Callable[[int], float], first: int, last: int, patience: int) -> int:
+    """Return the smallest of first, 2 first, 4 first, ... whose loss is within 0.4 % of the lowest loss found.
+
+    The size doubles until `patience` doublings in a row have each reduced the loss by less than 0.4 %, so the search costs
+    about as much as its last fits.
+
+    Args:
+        loss: Held-out loss of a fit of a size.
+        first: First size.
+        last: Maximum size.
+        patience: Number of doublings without gain that ends the search.
+    """
+    losses: dict[int, float] = {}
+    size, lowest, without_gain = first, math.inf, 0
+    while size <= last and without_gain < patience:
+        losses[size] = loss(size)
+        without_gain = 0 if losses[size] < (1 - MIN_GAIN) * lowest else without_gain + 1
+        lowest = min(lowest, losses[size])
+        size *= 2
+    return next(size for size, found in losses.items() if found <= (1 + MIN_GAIN) * lowest)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pandas import DataFrame, concat
 
 from augment import SYNTHESIZERS
-from swiftwrf.models.swiftwrf.search import GAIN
+from swiftwrf.models.swiftwrf.fit import MIN_GAIN
 from tasks.aoa import arms
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.share import AoaRecords, Share, first_history, fits
@@ -69,7 +69,7 @@ def sizes(runs: list[AoaRecords]) -> list[Plot]:
         axes[0].set(xlabel="primitives", ylabel="loss on held-out spectra")
         caption = (
             f"First share of {run.scene}. Loss on measured spectra that each size did not see, at coarse resolution; the "
-            f"model took the smallest within {GAIN:.1%} of the best: {n} primitives (line)."
+            f"model took the smallest within {MIN_GAIN:.1%} of the best: {n} primitives (line)."
         )
         data = by_size[["n_primitives", "validation"]]
         plots.append(Plot(f"size-{Share.of(run)[0].file_name}", figure, caption, data))

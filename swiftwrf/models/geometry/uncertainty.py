@@ -9,12 +9,19 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.spectra import Spectra
+from swiftwrf.models.geometry.ambiguity import turned
 from swiftwrf.models.geometry.images import Scene, field, turn_of
-from swiftwrf.models.geometry.model import GeometryModel, Plane
-from swiftwrf.models.geometry.planes import Planes, advantage, correlation_score, explained, in_step
+from swiftwrf.models.geometry.planes import (
+    Plane,
+    Planes,
+    RoomEstimate,
+    advantage,
+    correlation_score,
+    explained,
+    in_step,
+)
 from swiftwrf.models.geometry.refine import deviations
 from swiftwrf.models.geometry.sample import Residual, residual_statistics
-from swiftwrf.models.geometry.turns import turned
 
 CERTAIN = 3.0  # standard errors by which a plane must be better than in a rival place to be certain
 VAGUE = 0.5  # deviation [rad of phase] beyond which a plane is not certain
@@ -23,53 +30,41 @@ SCALES = (0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05)  # of the carrier that
 MISFIT = 0.02  # wavelengths that planes are off where nothing is explained: what is not modelled is no random noise
 
 
-def judged(train: Spectra, scene: Scene, room: Planes, score: float, reach: float) -> GeometryModel:
-    """The model with its verdicts."""
+def assess(train: Spectra, scene: Scene, room: Planes, score: float, reach: float) -> RoomEstimate:
+    """Return the planes of a room with their standard deviations, and which of them are identifiable.
+
+    Args:
+        train: Training spectra, for array and line of sight.
+        scene: Observed phases.
+        room: Refined planes in world coordinates.
+        score: Score at held-out positions.
+        reach: Standard deviation [m] of planes that are not identifiable.
+    """
     assert train.array is not None
-    assert train.rotation is not None
-    assert train.fixed_position is not None
-    planes: list[Plane] = []
-    covariance = torch.zeros(0, 0, dtype=torch.float64)
-    residual = Residual()
-    doubt = ""
     unexplained = 1 - (1 - correlation_score(scene, room, train.array)) ** 2
-    if room.normal.shape[1]:
-        covariance = deviations(scene, room.normal, room.offset, room.gain, room.sequence)
-        systematic = MISFIT * train.array.wavelength * math.sqrt(max(unexplained, 0))
-        covariance = covariance + systematic**2 * torch.eye(len(covariance), dtype=torch.float64)
-        direct = float(train.line_of_sight.double().mean())
-        residual = residual_statistics(scene, room.normal, room.offset, room.gain, room.sequence, direct)
-        doubt = _flat(scene) or _other_carrier(scene, room)
-        std = covariance.diagonal().clamp_min(0).sqrt().tolist()
-        twins = [(twin, explained(scene.coherence(twin.field(scene)))) for twin in turned(scene, room)]
-        rivals = [_rival(scene, room, i, twins) for i in range(len(std))]
-        lost = [rival <= CERTAIN or s * scene.wavenumber > VAGUE for s, (rival, _) in zip(std, rivals, strict=True)]
-        # rooms most of whose planes could stand elsewhere may be wrong as a whole, each plane holding the others
-        all_lost = bool(doubt) or sum(lost) > len(lost) / 2
-        for i, (rival, distance) in enumerate(rivals):
-            away = reach if all_lost else distance if rival <= CERTAIN else 0.0
-            x, y, z = room.normal[0, i].tolist()
-            offset, gain = float(room.offset[0, i]), float(room.gain[0, i])
-            deviation = 1000 * max(std[i], away)
-            planes.append(Plane((x, y, z), offset, gain, deviation, not (lost[i] or all_lost)))
-    certain_planes = sum(p.certain for p in planes)
-    verdict = (
-        f"{len(planes)} planes, {certain_planes} of them certain{doubt}" if planes else "no plane explains the spectra"
-    )
-    return GeometryModel(
-        array=train.array,
-        grid=train.grid,
-        rotation=train.rotation,
-        fixed_position=train.fixed_position,
-        moving=train.moving,
-        planes=planes,
-        order=room.order,
-        score_held_out=score,
-        unexplained=unexplained,
-        verdict=verdict,
-        covariance=covariance,
-        residual=residual,
-    )
+    if not room.normal.shape[1]:
+        nothing = torch.zeros(0, 0, dtype=torch.float64)
+        return RoomEstimate([], room.order, score, unexplained, "no plane explains the spectra", nothing, Residual())
+    covariance = deviations(scene, room.normal, room.offset, room.gain, room.sequence)
+    systematic = MISFIT * train.array.wavelength * math.sqrt(max(unexplained, 0))
+    covariance = covariance + systematic**2 * torch.eye(len(covariance), dtype=torch.float64)
+    direct = float(train.line_of_sight.double().mean())
+    residual = residual_statistics(scene, room.normal, room.offset, room.gain, room.sequence, direct)
+    doubt = _flat(scene) or _other_carrier(scene, room)
+    std = covariance.diagonal().clamp_min(0).sqrt().tolist()
+    twins = [(twin, explained(scene.coherence(twin.field(scene)))) for twin in turned(scene, room)]
+    rivals = [_rival(scene, room, i, twins) for i in range(len(std))]
+    lost = [rival <= CERTAIN or s * scene.wavenumber > VAGUE for s, (rival, _) in zip(std, rivals, strict=True)]
+    # rooms most of whose planes could stand elsewhere may be wrong as a whole, each plane holding the others
+    all_lost = bool(doubt) or sum(lost) > len(lost) / 2
+    planes = []
+    for i, (rival, distance) in enumerate(rivals):
+        away = reach if all_lost else distance if rival <= CERTAIN else 0.0
+        x, y, z = room.normal[0, i].tolist()
+        offset, gain = float(room.offset[0, i]), float(room.gain[0, i])
+        planes.append(Plane((x, y, z), offset, gain, 1000 * max(std[i], away), not (lost[i] or all_lost)))
+    verdict = f"{len(planes)} planes, {sum(plane.certain for plane in planes)} of them certain{doubt}"
+    return RoomEstimate(planes, room.order, score, unexplained, verdict, covariance, residual)
 
 
 def _rival(scene: Scene, room: Planes, plane: int, twins: list[tuple[Planes, Tensor]]) -> tuple[float, float]:

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.gp import GaussianProcess, Kernel
-from swiftwrf.models.geometry.images import Scene, image_gain, images, sequences, visibility
+from swiftwrf.models.geometry.images import Scene, image_gain, images, visibility
 from swiftwrf.models.geometry.model import GeometryModel
 
 DEVIATION = torch.tensor([0.6, 0.3])  # of an amplitude from its plane's gain, in phase and in quadrature
@@ -35,7 +35,7 @@ STEPS, RATE = 30, 0.2  # of Adam, on standard normal variables
 
 
 @dataclass(frozen=True, eq=False)
-class Strengths:
+class PathGains:
     """Amplitudes of the direct path and of each image as functions of position, in several equally plausible fields.
 
     Args:
@@ -71,19 +71,19 @@ class Strengths:
 def paths(geometry: GeometryModel, scene: Scene) -> tuple[Tensor, Tensor]:
     """What the elements would hear of the direct path and of each image alone, complex64 (n, 1 + S, K), and their gains,
     (1 + S,)."""
-    normal, offset, gain = geometry.tensors()
-    sequence = sequences(normal[0], geometry.order)
+    room = geometry.tensors()
+    sequence = room.sequence
     wave, strength = [scene.wave(scene.transmitter)[None]], [torch.ones(1)]
     if sequence:
-        source = images(scene, normal, offset, sequence)
-        reflected = scene.wave(source) * visibility(scene, normal, offset, sequence)[..., None]
+        source = images(scene, room.normal, room.offset, sequence)
+        reflected = scene.wave(source) * visibility(scene, room.normal, room.offset, sequence)[..., None]
         wave.append(reflected[0])
-        strength.append(image_gain(gain, sequence)[0])
+        strength.append(image_gain(room.gain, sequence)[0])
     return torch.cat([part.expand(-1, len(scene), -1) for part in wave]).transpose(0, 1), torch.cat(strength)
 
 
 @torch.enable_grad()
-def fit_strengths(geometry: GeometryModel, scene: Scene, kernel: Kernel) -> Strengths:
+def fit_path_gains(geometry: GeometryModel, scene: Scene, kernel: Kernel) -> PathGains:
     """The most plausible amplitudes around several draws, given the phases that the scene observed."""
     wave, gain = paths(geometry, scene)
     anchor = scene.moving.double()
@@ -103,7 +103,7 @@ def fit_strengths(geometry: GeometryModel, scene: Scene, kernel: Kernel) -> Stre
         optimiser.step()
         schedule.step()
     weight = torch.linalg.solve_triangular(root.T, normal.detach().flatten(1).double(), upper=True)
-    return Strengths(kernel, anchor, DEVIATION * weight.float().view_as(normal))
+    return PathGains(kernel, anchor, DEVIATION * weight.float().view_as(normal))
 
 
 def prior(position: Tensor) -> Kernel:

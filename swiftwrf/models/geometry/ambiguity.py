@@ -16,7 +16,7 @@ import torch
 
 from swiftwrf.models.geometry.images import Scene, images
 from swiftwrf.models.geometry.planes import Planes
-from swiftwrf.models.geometry.waves import Waves
+from swiftwrf.models.geometry.responses import Waves
 
 SIX = 6  # planes that may move: one for each side of a room
 TURNS = 4  # whole ones, to either side

@@ -1,0 +1,127 @@
+"""Commands: `swiftwrf aoa --mix 0.3`, or `python -m tasks.aoa --mix 0.3`.
+
+The console script also works in a directory with a `tasks.py`, which `python -m tasks.aoa` would import in place of this
+package. Only the module of the requested command is imported, so `swiftwrf --help` takes no time.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple, get_type_hints
+
+
+class Command(NamedTuple):
+    """A command of the console script.
+
+    Args:
+        summary: One line for the help.
+        module: Module with `run(config)`, or `run(config, resume)` if its runs can be resumed. The annotation of `config`
+            is the dataclass of the options.
+    """
+
+    summary: str
+    module: str
+
+
+COMMANDS = {
+    "aoa": Command(
+        "estimate angles of arrival with few measured spectra, and report the errors", "tasks.aoa.experiment"
+    ),
+    "rssi": Command("predict RSSI maps of receivers, and report the errors", "tasks.rssi.experiment"),
+    "report": Command("merge finished runs of one task into one report", "tasks.report"),
+    "inspect": Command("check measurements before a run: counts, frames, calibration", "tasks.inspect"),
+    "convert": Command("write measurements of any known format in the toolkit's layout", "tasks.convert"),
+    "estimate": Command("estimate directions of new spectra with a trained estimator", "tasks.estimate"),
+    "scenes": Command("trace ray paths in a room (extra: raytrace)", "tasks.scenes"),
+    "view": Command("show a fitted field in the browser (extra: view)", "tasks.view"),
+}
+RESUME = "continue an interrupted run: swiftwrf resume DIR.partial [--scheduler ADDRESS]"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the console script.
+
+    Args:
+        arguments: Command and its options. Defaults to those of the process.
+
+    Returns:
+        Exit code; see `tasks.run.exit_code`.
+
+    Example:
+        >>> main(["--help"])  # doctest: +ELLIPSIS
+        usage: swiftwrf COMMAND [OPTIONS]
+        ...
+        0
+    """
+    name, *options = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    if name in ("-h", "--help"):
+        print(_help())
+        return 0
+    if name == "resume":
+        return _resume(options)
+    if name not in COMMANDS:
+        print(f"error: unknown command {name!a}; choose from {', '.join((*COMMANDS, 'resume'))}", file=sys.stderr)
+        return 2
+    return run_command(name, options, f"swiftwrf {name}")
+
+
+def run_command(name: str, options: Sequence[str], program: str | None = None) -> int:
+    """Run one command and return its exit code.
+
+    Args:
+        name: Key of `COMMANDS`.
+        options: Options of the command line.
+        program: Name of the program in the help. Defaults to `python -m tasks.NAME`.
+    """
+    _shorten_waits()
+    from tasks.run import exit_code
+
+    return exit_code(partial(_execute, name, options, program))
+
+
+def _resume(options: Sequence[str]) -> int:
+    if not options or options[0].startswith("-"):
+        print(f"usage: swiftwrf resume DIR.partial [--scheduler ADDRESS]\n\n{RESUME}")
+        return 0 if options[:1] in (["-h"], ["--help"]) else 2
+    _shorten_waits()
+    from swiftwrf import InputError
+    from tasks.directory import interrupted
+    from tasks.run import exit_code
+
+    def action() -> None:
+        task = interrupted(Path(options[0])).get("task")
+        if task not in COMMANDS:
+            raise InputError(f"{options[0]} is a run of the unknown task {task!a}; restore its config.json")
+        _execute(task, ["--resume", *options], None)
+
+    return exit_code(action)
+
+
+def _execute(name: str, options: Sequence[str], program: str | None) -> None:
+    from tasks.run import execute
+
+    task: Any = import_module(COMMANDS[name].module).run
+    execute(f"tasks.{name}", get_type_hints(task)["config"], task, options, program)
+
+
+def _help() -> str:
+    summaries = {name: command.summary for name, command in COMMANDS.items()} | {"resume": RESUME}
+    lines = (f"  {name:<9} {summary}" for name, summary in summaries.items())
+    return "\n".join(
+        ["usage: swiftwrf COMMAND [OPTIONS]", "", *lines, "", "options of a command: swiftwrf COMMAND --help"]
+    )
+
+
+def _shorten_waits() -> None:
+    """Let threads wait for each other a tenth as long before they sleep, unless the user has set it.
+
+    By default threads that share a loop wait busily for milliseconds. If other work uses the same cores, that makes the
+    steps of a network eight times slower (benchmarks/busy.py). libgomp reads the variable when torch is loaded.
+    """
+    if "OMP_WAIT_POLICY" not in os.environ:
+        os.environ.setdefault("GOMP_SPINCOUNT", "30000")
