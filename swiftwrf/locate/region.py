@@ -84,6 +84,11 @@ class Region:
         low, high = along.amin(dim=0), along.amax(dim=0)
         return middle + (low + high) / 2 @ axes, axes, (high - low) * (0.5 + self.margin)
 
+    @property
+    def extent(self) -> Tensor:
+        """Lengths of the box, (d,) [m]."""
+        return 2 * self._box[2]
+
     def contains(self, position: Tensor) -> Tensor:
         """Return True for each position (n, 3) [m] inside the box, (n,)."""
         centre, axes, half = self._box

@@ -9,19 +9,18 @@ J. Acoust. Soc. Am. 89, 1991).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.spectra import Spectra
 from swiftwrf.locate.likelihood import Likelihood, ResidualDistribution
-from swiftwrf.models.geometry.images import sequences
 from swiftwrf.models.geometry.model import GeometryModel
-from swiftwrf.models.geometry.observe import autocorrelation, correlations, element_phases
-from swiftwrf.models.geometry.strengths import DEVIATION, Strengths, paths
+from swiftwrf.models.geometry.path_gains import PathGains, paths
+from swiftwrf.models.geometry.phase_retrieval import autocorrelation, coarray_numbers, element_phases
 
 CHUNK = 50_000  # candidates whose channels are computed together
 PHASE_CHUNK = 4_000  # candidates whose covariances are factorised together
@@ -40,12 +39,11 @@ class SpectrumFeatures:
     phases: Tensor
 
     @classmethod
-    def of(cls, spectra: Spectra, seed: int = 0) -> SpectrumFeatures:
-        """Compute the features of spectra with a known array."""
-        assert spectra.array is not None
-        numbers = correlations(spectra)
-        channel, _ = element_phases(numbers, spectra.array, seed)
-        opposite = spectra.array.opposite
+    def of(cls, spectra: Iterable[Tensor], array: PlanarArray, grid: AngularGrid, seed: int = 0) -> SpectrumFeatures:
+        """Compute the features of spectra, batches (b, H, W) of magnitudes."""
+        numbers = coarray_numbers(spectra, array, grid)
+        channel, _ = element_phases(numbers, array, seed)
+        opposite = array.opposite
         twins = [channel] if opposite is None else [channel, channel.conj()[:, opposite]]
         return cls(real_parts(numbers), torch.stack(twins, dim=1).to(torch.complex64))
 
@@ -69,7 +67,7 @@ def room_features(room: GeometryModel) -> Callable[[Tensor], Tensor]:
     )
 
 
-def gain_features(room: GeometryModel, gains: Strengths) -> Callable[[Tensor], Tensor]:
+def gain_features(room: GeometryModel, gains: PathGains) -> Callable[[Tensor], Tensor]:
     """Return a function from positions (m, 3) to co-array numbers by position-dependent path gains, float32 (m, F)."""
 
     def features(some: Tensor) -> Tensor:
@@ -89,14 +87,14 @@ class CoarrayLikelihood(Likelihood):
     Args:
         features: Function from positions (m, 3) [m] to predicted co-array numbers (m, F).
         residual: Held-out residuals (n, F), predicted minus observed.
-        observed: Observed co-array numbers (n, F), for the scale.
+        power: Mean square of the observed numbers.
     """
 
     name = "coarray"
 
-    def __init__(self, features: Callable[[Tensor], Tensor], residual: Tensor, observed: Tensor) -> None:
+    def __init__(self, features: Callable[[Tensor], Tensor], residual: Tensor, power: float) -> None:
         self.features = features
-        self.distribution = ResidualDistribution.fit(residual, float(observed.square().mean()))
+        self.distribution = ResidualDistribution.fit(residual, power)
 
     def whitened(self, position: Tensor) -> Tensor:
         """Return whitened predictions (m, F) at positions (m, 3)."""
@@ -159,11 +157,10 @@ class PathStatistics:
 
     def of_paths(self, room: GeometryModel) -> Tensor:
         """Return the variance of each path's gain, (1 + S,): direct, then images in their order."""
-        normal, _, gain = room.tensors()
-        sequence = sequences(normal[0], room.order) if room.planes else []
-        second = gain[0].square() + self.plane
+        found = room.tensors()
+        second = found.gain[0].square() + self.plane
         variance = [self.direct]
-        for planes in sequence:
+        for planes in found.sequence:
             if len(planes) == 1:
                 variance.append(self.plane[planes[0]])
             else:
@@ -225,20 +222,11 @@ def _isotropic(room: GeometryModel) -> Tensor:
 
 
 STATISTICS_STEPS = 60
-PRIOR_VARIANCE = float(DEVIATION.square().sum())
-
-
-def held_out_folds(n: int, folds: int) -> Tensor:
-    """Return the fold of each of n rows, (n,)."""
-    return torch.arange(n) % folds
-
-
 __all__ = [
     "CoarrayLikelihood",
     "PhaseLikelihood",
     "PathStatistics",
     "SpectrumFeatures",
     "gain_features",
-    "held_out_folds",
     "room_features",
 ]
