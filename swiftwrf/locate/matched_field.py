@@ -16,9 +16,9 @@ from swiftwrf.errors import InputError
 from swiftwrf.gp import thinned
 from swiftwrf.locate.pool import pooled_weights
 from swiftwrf.locate.posterior import Posterior, normalised
-from swiftwrf.locate.region import Cells, Region
+from swiftwrf.locate.region import Cells, Region, outside_mass
 from swiftwrf.locate.search import best_cells, refined
-from swiftwrf.locate.spectra import (
+from swiftwrf.locate.spectrum_likelihood import (
     CoarrayLikelihood,
     PathStatistics,
     PhaseLikelihood,
@@ -123,6 +123,8 @@ class MatchedField:
         self._set_residuals(train.position, features, fold, parts)
         self._fit = fitted(torch.ones_like(fold, dtype=torch.bool))
         self.known = train.position
+        others = [Region(train.position[fold != number]) for number in range(FOLDS)]
+        self.outside = outside_mass(others, [train.position[fold == number] for number in range(FOLDS)])
         self._prepare()
         self.weight = torch.tensor(FIRST_WEIGHTS, dtype=torch.float64)
         self.weight = self._calibrated(train.position, features, fold, parts)
@@ -139,7 +141,7 @@ class MatchedField:
 
     def _prepare(self) -> None:
         """Compute what all spectra share: cells of the region and their predicted co-array numbers."""
-        self.region = Region(self.known)
+        self.region = Region(self.known, outside=self.outside)
         extent = self.region.extent
         spacing = self.config.spacing * self.room.array.wavelength
         count = math.prod((extent / spacing).clamp_min(1).tolist())

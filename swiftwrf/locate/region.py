@@ -96,6 +96,10 @@ class Region:
         flat = (away - away @ axes.T @ axes).norm(dim=1)
         return ((away @ axes.T).abs() <= half).all(dim=1) & (flat <= self.scale_m)
 
+    def is_near(self, position: Tensor) -> Tensor:
+        """Return True for each position (n, 3) [m] in the neighbourhood of the known positions, (n,)."""
+        return nearest(position, self.known, 1)[0][:, 0] <= self.scale_m
+
     def cells(self, count: int) -> Cells:
         """Return about `count` cells of equal size that cover the box; `log_volume` is their prior mass."""
         centre, axes, half = self._box
@@ -111,7 +115,19 @@ class Region:
             ]
             offset = torch.cartesian_prod(*lines).reshape(-1, len(half))
         position = centre + offset @ axes
-        near = nearest(position, self.known, 1)[0][:, 0] <= self.scale_m
+        near = self.is_near(position)
         mass = torch.full((len(position),), self.outside / len(position), dtype=torch.float64)
         mass[near] += (1 - self.outside) / max(int(near.sum()), 1)
         return Cells(position, (mass / mass.sum()).log(), step[:, None] * axes, torch.zeros_like(mass))
+
+
+def outside_mass(regions: list[Region], positions: list[Tensor]) -> float:
+    """Return the prior mass outside the neighbourhood of known positions, from held-out positions of each fold.
+
+    Args:
+        regions: Region of the other folds' positions, one a fold.
+        positions: Held-out positions (n, 3) [m], one tensor a fold.
+    """
+    outside = sum(int((~region.is_near(at)).sum()) for region, at in zip(regions, positions, strict=True))
+    total = sum(len(at) for at in positions)
+    return (outside + 1) / (total + 2)

@@ -1,197 +1,199 @@
-"""Likelihoods of RSSI by the radio maps of all receivers: values, detections, and similar fingerprints."""
+"""Position from RSSI: the locator by radio maps, and weighted nearest neighbours, its baseline and one of its likelihoods."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
-import numpy as np
 import torch
-from scipy.optimize import minimize
 from torch import Tensor
 
-from swiftwrf.locate.likelihood import DEGREES, Likelihood
-from swiftwrf.models.base import Prediction
+from swiftwrf.data.rssi import Rssi
+from swiftwrf.data.splits import Validation, folds
+from swiftwrf.errors import InputError
+from swiftwrf.locate.pool import pooled_weights
+from swiftwrf.locate.posterior import Posterior, normalised
+from swiftwrf.locate.region import Region, outside_mass
+from swiftwrf.locate.rssi_likelihood import DetectionLikelihood, FingerprintLikelihood, RssiMaps, ValueLikelihood
+from swiftwrf.rssi import RssiModel
+from swiftwrf.runtime.progress import progress as tracked
+from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 
-MIN_STD_DB = 0.5
-SHRINKAGES = (0.0, 0.1, 0.3, 0.6, 1.0)  # of a correlation matrix towards the identity, that are compared
-PAIRS = 10.0  # rows of a pair of receivers after which its correlation counts half
-CHUNK = 2**24  # values of receivers x candidates x rows at a time
-
-
-@dataclass(frozen=True, eq=False)
-class RssiMaps:
-    """Predicted RSSI at candidate positions.
-
-    Args:
-        mean, std: float32 (m, R) [dBm], [dB].
-    """
-
-    mean: Tensor
-    std: Tensor
-
-    @classmethod
-    def of(cls, prediction: Prediction) -> RssiMaps:
-        """Take the maps from a prediction with standard deviations."""
-        assert prediction.std is not None
-        return cls(prediction.mean.float(), prediction.std.float().clamp_min(MIN_STD_DB))
+NEIGHBOUR_COUNTS = (1, 2, 3, 5, 8, 13, 20)
+BLOCK_MARGIN = 0.25  # of the region: a block of a fifth may lie beyond the known positions
+UNDETECTED_BELOW_DB = 5.0  # below the weakest value, of what is not detected, in the space of fingerprints
 
 
-@dataclass(frozen=True, eq=False)
-class ValueLikelihood:
-    """Student likelihood of the values, whose errors are correlated between receivers (device, body, weather).
+@configuration
+class RssiLocatorConfig:
+    """Options of the locator."""
 
-    Args:
-        correlation: Correlation of standardised residuals between receivers, float64 (R, R).
-        degrees: Degrees of freedom; infinite for a Gaussian.
-    """
-
-    correlation: Tensor
-    degrees: float
-
-    name = "values"
-
-    @classmethod
-    def fit(cls, residual: Tensor) -> ValueLikelihood:
-        """Fit to standardised held-out residuals (n, R), NaN if not detected; cross-validation chooses the shape."""
-        fold = torch.arange(len(residual)) % 2
-        best, found = -math.inf, cls(torch.eye(residual.shape[1], dtype=torch.float64), math.inf)
-        for shrinkage in SHRINKAGES:
-            halves = [cls(_correlation(residual[fold == part], shrinkage), math.inf) for part in (0, 1)]
-            distances = [half._distance(residual[fold != part]) for part, half in enumerate(halves)]
-            for degrees in DEGREES:
-                score = sum(float(_density(*distance, degrees).sum()) for distance in distances)
-                if score > best:
-                    best, found = score, cls(_correlation(residual, shrinkage), degrees)
-        return found
-
-    def _distance(self, residual: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return squared whitened distances, log-determinants and numbers of values of residual rows (n, R)."""
-        maps = RssiMaps(torch.zeros(1, residual.shape[1]), torch.ones(1, residual.shape[1]))
-        return tuple(part[:, 0] for part in self._parts(maps, residual.float()))  # type: ignore[return-value]
-
-    def _parts(self, maps: RssiMaps, rssi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        n, m = len(rssi), len(maps.mean)
-        distance, determinant = torch.zeros(n, m), torch.zeros(n, m)
-        detected = ~rssi.isnan()
-        log_std = maps.std.log()
-        patterns, owner = detected.unique(dim=0, return_inverse=True)
-        for number, pattern in enumerate(patterns):
-            rows, columns = (owner == number).nonzero()[:, 0], pattern.nonzero()[:, 0]
-            if not len(columns):
-                continue
-            root = torch.linalg.cholesky(self.correlation[columns][:, columns])
-            whitening = torch.linalg.inv(root).T.float()
-            determinant[rows] = log_std[:, columns].sum(dim=1) + float(root.diagonal().log().sum())
-            # (y - mean) / std @ W, expanded, so that nothing of size rows x candidates x receivers is held
-            scaled = maps.mean[:, columns] / maps.std[:, columns]
-            for some in rows.split(max(1, CHUNK // (m * len(columns)))):
-                error = rssi[some][:, columns][:, None] / maps.std[:, columns] - scaled
-                distance[some] = (error @ whitening).square().sum(dim=2)
-        return distance, determinant, detected.sum(dim=1, keepdim=True).float()
-
-    def log_likelihood(self, maps: RssiMaps, rssi: Tensor) -> Tensor:
-        """Return log-likelihoods (n, m) of RSSI (n, R) [dBm] at candidates with maps (m, R)."""
-        return _density(*self._parts(maps, rssi.float()), self.degrees)
-
-
-def _density(distance: Tensor, determinant: Tensor, count: Tensor, degrees: float) -> Tensor:
-    if math.isinf(degrees):
-        return -distance / 2 - determinant - count / 2 * math.log(2 * math.pi)
-    constant = torch.lgamma((degrees + count) / 2) - math.lgamma(degrees / 2) - count / 2 * math.log(degrees * math.pi)
-    return constant - determinant - (degrees + count) / 2 * torch.log1p(distance / degrees)
-
-
-def _correlation(residual: Tensor, shrinkage: float) -> Tensor:
-    """Return the shrunk correlation matrix (R, R) of standardised residuals (n, R) with gaps."""
-    known = (~residual.isnan()).double()
-    filled = residual.double().nan_to_num()
-    count = known.T @ known
-    product = (filled.T @ filled) / count.clamp_min(1)
-    product = product * count / (count + PAIRS)  # pairs of few common rows count less
-    scale = product.diagonal().clamp_min(0.25).sqrt()
-    own = (product / scale / scale[:, None]).clamp(-0.99, 0.99)
-    shape = (1 - shrinkage) * own
-    value, vector = torch.linalg.eigh(shape - torch.diag(shape.diagonal()) + torch.eye(len(own), dtype=own.dtype))
-    positive = (vector * value.clamp_min(0.05)) @ vector.T
-    return positive * scale * scale[:, None]
-
-
-@dataclass(frozen=True)
-class DetectionLikelihood:
-    """Likelihood of which receivers detect the transmitter: logistic in the predicted RSSI, with losses at any power.
-
-    Args:
-        threshold: RSSI at which half of the packets are detected [dBm].
-        width: Width of the transition [dB].
-        loss: Probability that a strong packet is lost.
-    """
-
-    threshold: float
-    width: float
-    loss: float
-
-    name = "detections"
-
-    @classmethod
-    def fit(cls, mean: Tensor, detected: Tensor) -> DetectionLikelihood:
-        """Fit to predicted RSSI (n, R) [dBm] and detections, bool (n, R), of held-out rows."""
-        m, d = mean.double().flatten(), detected.flatten()
-
-        def loss(raw: np.ndarray) -> float:  # type: ignore[type-arg]
-            return -float(cls._of(raw)._log_probability(m, d).mean())
-
-        start = np.array([float(m.quantile(0.1)), 1.5, -2.0])
-        return cls._of(minimize(loss, start, method="Nelder-Mead", options={"maxiter": 300}).x)
-
-    @classmethod
-    def _of(cls, raw: np.ndarray) -> DetectionLikelihood:  # type: ignore[type-arg]
-        return cls(float(raw[0]), float(np.exp(np.clip(raw[1], -1, 4))), float(0.9 / (1 + np.exp(-raw[2]))))
-
-    def _log_probability(self, mean: Tensor, detected: Tensor) -> Tensor:
-        chance = (1 - self.loss) * torch.sigmoid((mean - self.threshold) / self.width)
-        chance = chance.clamp(1e-4, 1 - 1e-4)
-        return torch.where(detected, chance.log(), (-chance).log1p())
-
-    def log_likelihood(self, maps: RssiMaps, rssi: Tensor) -> Tensor:
-        """Return log-likelihoods (n, m) of the detections in RSSI (n, R) at candidates with maps (m, R)."""
-        chance = ((1 - self.loss) * torch.sigmoid((maps.mean - self.threshold) / self.width)).clamp(1e-4, 1 - 1e-4)
-        detected = (~rssi.isnan()).float()
-        return detected @ chance.log().T + (1 - detected) @ (-chance).log1p().T
+    validation: Validation = "random"
+    """training rows held out to calibrate: single ones at random, or one region at a time"""
+    n_cells: PositiveInt = 4000
+    """candidate positions"""
+    n_calibration: PositiveInt = 600
+    """held-out rows that determine the weights of the likelihoods, at most"""
+    seed: NonNegativeInt = 0
+    """seed of everything random"""
 
 
 @dataclass(frozen=True, eq=False)
-class FingerprintLikelihood:
-    """Student distribution of the position around the weighted mean of the k most similar training rows.
+class _Part:
+    """One held-out fold: its rows, and what follows from the others."""
+
+    out: Tensor
+    kept: Tensor
+    model: RssiModel
+    maps: RssiMaps
+
+
+class RssiLocator:
+    """Posterior over the position of the transmitter, given its RSSI at the receivers.
+
+    Three likelihoods are pooled: the values under the radio maps with their uncertainty and correlated errors, which
+    receivers detect the transmitter at all, and the position of similar training rows. Held-out rows determine their
+    distributions and weights.
 
     Args:
-        position: Training positions, float64 (n, 3) [m].
-        rssi: Training RSSI with a value for what is not detected, float32 (n, R) [dBm].
-        floor: That value [dBm].
-        k: Number of neighbours.
-        scale_m: Scale of the distribution along each axis [m].
-        degrees: Degrees of freedom.
+        config: Options as one object. Defaults to `RssiLocatorConfig()`.
+        options: Single options, which replace those of `config`.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.rssi_room(n=100).split()
+        >>> posterior = RssiLocator(n_cells=500).fit(train).locate(test.rssi_dbm)
+        >>> posterior.median.shape
+        torch.Size([20, 3])
     """
 
-    position: Tensor
-    rssi: Tensor
-    floor: float
-    k: int
-    scale_m: Tensor
-    degrees: float = 4.0
+    kind: ClassVar[str] = "RSSI locator"
 
-    name = "fingerprints"
+    def __init__(self, config: RssiLocatorConfig | None = None, **options: Any) -> None:
+        self.config = replace(config or RssiLocatorConfig(), **options)
 
-    def estimate(self, rssi: Tensor) -> Tensor:
-        """Return the weighted mean position of the k most similar rows, (n, 3) [m]."""
-        apart, row = torch.cdist(rssi.float().nan_to_num(self.floor), self.rssi).topk(self.k, largest=False)
-        weight = 1 / apart.double().clamp_min(0.1)
-        return (weight[..., None] * self.position[row]).sum(dim=1) / weight.sum(dim=1, keepdim=True)
+    def fit(self, train: Rssi, *, model: RssiModel | None = None, progress: bool = False) -> Self:
+        """Fit the likelihoods to measured rows and return the locator.
 
-    def log_likelihood(self, position: Tensor, rssi: Tensor) -> Tensor:
-        """Return log-likelihoods (n, m) of candidate positions (m, 3) [m]."""
-        away = (position - self.estimate(rssi)[:, None]) / self.scale_m
-        return -(self.degrees + 3) / 2 * torch.log1p(away.square().sum(dim=2) / self.degrees)
+        Args:
+            train: Measured rows, at least 10.
+            model: Radio maps fitted to the same rows. Fitted by default.
+            progress: Show a progress bar on a terminal.
 
+        Raises:
+            InputError: Too few rows or positions.
+        """
+        config = self.config
+        self.receiver_names = train.receiver_names
+        self.model = model or RssiModel(validation=config.validation, seed=config.seed).fit(train)
+        known, rssi = train.transmitter_position, train.rssi_dbm
+        self.floor_dbm = float(rssi[~rssi.isnan()].min()) - UNDETECTED_BELOW_DB
+        fold = folds(known, config.validation, config.seed)
+        numbers = tracked(fold.unique().tolist(), "held-out folds", progress)
+        parts = [self._part(train, fold, number) for number in numbers]
+        self.region = Region(
+            known,
+            BLOCK_MARGIN if config.validation == "block" else 0.03,
+            outside_mass([Region(known[part.kept]) for part in parts], [known[part.out] for part in parts]),
+        )
+        self.cells = self.region.cells(config.n_cells)
+        self._fit_likelihoods(train, parts)
+        self._calibrate(train, parts)
+        self._maps = RssiMaps.of(self.model.predict(self.cells.position))
+        return self
 
-__all__ = ["DetectionLikelihood", "FingerprintLikelihood", "Likelihood", "RssiMaps", "ValueLikelihood"]
+    def _part(self, train: Rssi, fold: Tensor, number: int) -> _Part:
+        out, kept = (fold == number).nonzero()[:, 0], (fold != number).nonzero()[:, 0]
+        model = RssiModel(validation=self.config.validation, seed=self.config.seed).fit(train.subset(kept))
+        return _Part(out, kept, model, RssiMaps.of(model.predict(train.transmitter_position[out])))
+
+    def _likelihoods(
+        self, train: Rssi, parts: list[_Part]
+    ) -> tuple[ValueLikelihood, DetectionLikelihood, int, Tensor]:
+        """Fit the distributions to held-out folds: of values, of detections, and of the error of k nearest neighbours."""
+        rssi = torch.cat([train.rssi_dbm[part.out] for part in parts])
+        mean, std = (torch.cat([getattr(part.maps, name) for part in parts]) for name in ("mean", "std"))
+        errors = {k: self._neighbour_errors(train, parts, k) for k in NEIGHBOUR_COUNTS if k < len(rssi) / 2}
+        k = min(errors, key=lambda k: float(errors[k].norm(dim=1).median()))
+        edge = float(self.cells.edge.norm(dim=1).max()) if len(self.cells.edge) else 1.0
+        scale = (errors[k].abs().quantile(0.6, dim=0).square() + edge**2).sqrt()
+        values = ValueLikelihood.fit((rssi.float() - mean) / std)
+        return values, DetectionLikelihood.fit(mean, ~rssi.isnan()), k, scale
+
+    def _neighbour_errors(self, train: Rssi, parts: list[_Part], k: int) -> Tensor:
+        one = torch.ones(3, dtype=torch.float64)
+        return torch.cat(
+            [
+                self._fingerprints(train, part.kept, k, one).estimate(train.rssi_dbm[part.out])
+                - train.transmitter_position[part.out]
+                for part in parts
+            ]
+        )
+
+    def _fingerprints(self, train: Rssi, rows: Tensor, k: int, scale_m: Tensor) -> FingerprintLikelihood:
+        filled = train.rssi_dbm[rows].float().nan_to_num(self.floor_dbm)
+        return FingerprintLikelihood(train.transmitter_position[rows], filled, self.floor_dbm, k, scale_m)
+
+    def _fit_likelihoods(self, train: Rssi, parts: list[_Part]) -> None:
+        self.values, self.detections, k, scale = self._likelihoods(train, parts)
+        self.fingerprints = self._fingerprints(train, torch.arange(len(train)), k, scale)
+
+    def _calibrate(self, train: Rssi, parts: list[_Part]) -> None:
+        """Choose the weights of the likelihoods by the posterior density at held-out positions.
+
+        The distributions of each fold are fitted to the other folds.
+        """
+        truth, values = [], []
+        share = min(1.0, self.config.n_calibration / len(train))
+        for number, part in enumerate(parts):
+            value, detection, k, scale = self._likelihoods(train, parts[:number] + parts[number + 1 :])
+            fingerprints = self._fingerprints(train, part.kept, k, scale)
+            some = torch.linspace(0, len(part.out) - 1, max(1, round(share * len(part.out)))).long()
+            rssi, at = train.rssi_dbm[part.out[some]], train.transmitter_position[part.out[some]]
+            maps = RssiMaps.of(part.model.predict(self.cells.position))
+
+            def all_of(
+                maps: RssiMaps,
+                position: Tensor,
+                rows: Tensor,
+                one: ValueLikelihood = value,
+                two: DetectionLikelihood = detection,
+                three: FingerprintLikelihood = fingerprints,
+            ) -> Tensor:
+                parts = (one.log_likelihood(maps, rows), two.log_likelihood(maps, rows), three.log_likelihood(position, rows))
+                return torch.stack([value.double() for value in parts])
+
+            values.append(all_of(maps, self.cells.position, rssi))
+            own = RssiMaps(part.maps.mean[some], part.maps.std[some])
+            truth.append(all_of(own, at, rssi).diagonal(dim1=1, dim2=2))
+        candidates = torch.cat(values, dim=1)
+        volume = self.cells.log_volume.expand(candidates.shape[1], -1)
+        self.weight = pooled_weights(torch.cat(truth, dim=1), candidates, volume)
+
+    @torch.no_grad()
+    def locate(self, rssi: Tensor) -> Posterior:
+        """Return the posterior over the transmitter's position for each row.
+
+        Args:
+            rssi: RSSI at the receivers of the training rows, (n, R) [dBm], NaN if not detected.
+
+        Raises:
+            InputError: Another number of receivers, infinite values, or a row that no receiver detected.
+        """
+        rssi = torch.as_tensor(rssi, dtype=torch.float64)
+        if rssi.dim() != 2 or rssi.shape[1] != len(self.receiver_names):
+            raise InputError(f"expected RSSI of shape (n, {len(self.receiver_names)}), got {tuple(rssi.shape)}")
+        if bool(rssi.isinf().any()):
+            raise InputError("RSSI must be finite numbers [dBm], or NaN if not detected")
+        silent = rssi.isnan().all(dim=1).nonzero()[:, 0]
+        if len(silent):
+            raise InputError(f"no receiver detected the transmitter in row {int(silent[0])}; leave such rows out")
+        at = self.cells.position
+        parts = (
+            self.values.log_likelihood(self._maps, rssi),
+            self.detections.log_likelihood(self._maps, rssi),
+            self.fingerprints.log_likelihood(at, rssi),
+        )
+        log_mass = sum(weight * part.double() for weight, part in zip(self.weight.tolist(), parts, strict=True))
+        edge = float(self.cells.edge.norm(dim=1).max()) if len(self.cells.edge) else 0.0
+        return Posterior(at[None], normalised(log_mass + self.cells.log_volume), edge)
