@@ -20,8 +20,7 @@ from record import write_result
 
 from augment import Mixed
 from swiftwrf import fit_rssi, rssi_room, simulated_room
-from tasks.aoa.estimators.aann import AANN, AANNConfig
-from tasks.aoa.estimators.base import Settings
+from tasks.aoa.estimators.aann import AANN
 
 SPINS = ("300000", "30000", "3000")  # the first is libgomp's own
 ROUNDS, STEPS = 2, 20
@@ -30,8 +29,7 @@ ROUNDS, STEPS = 2, 20
 def measure() -> dict[str, float]:
     """Return the seconds of a step of 64 spectra and of a fit of twelve receivers, in this process."""
     room, floor = simulated_room(128), rssi_room()
-    network = AANN(Settings(room.grid), AANNConfig(steps=STEPS, batch=64))
-    network.fit(Mixed.measured(room))
+    network = AANN(steps=STEPS, batch=64).fit(Mixed.measured(room))
     first, last = network.history[0], network.history[-1]
     began = time.perf_counter()
     fit_rssi(floor, progress=False)

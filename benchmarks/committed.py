@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from tasks.aoa.condition import Condition, conditions_of, headline
 from tasks.metrics import AoaMetrics, ErrorSummary, MixMetrics, RssiMetrics
 
 ROOT = Path(__file__).parent.parent
@@ -35,6 +36,11 @@ def aoa_shares() -> list[tuple[str, MixMetrics, dict[str, Any]]]:
         for shares in scenes.values()
         for share, result in sorted(shares.items())
     ]
+
+
+def turbo_condition(mix: MixMetrics) -> Condition:
+    """Return the network's condition with synthetic spectra that a user would choose."""
+    return headline(conditions_of(mix["methods"]).values())
 
 
 def rssi_runs() -> list[RssiMetrics]:

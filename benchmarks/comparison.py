@@ -25,15 +25,15 @@ from record import write_result
 from synthesis import load
 from torch import Tensor
 
-from swiftwrf import Spectra, simulated_room
+from swiftwrf import FIELD_MODELS, FieldModel, Spectra, make_model, simulated_room
 from swiftwrf.data.splits import validation_for
 from swiftwrf.gp import thinned
 from swiftwrf.metrics import l1, psnr, ssim, summary
-from swiftwrf.models.base import FIELD_MODELS, FieldModel, make_model
 from swiftwrf.models.nearest import MemoryModel
 from swiftwrf.runtime.durable import write_text
-from tasks.aoa.config import AoaConfig
+from tasks.aoa.condition import conditions_of
 from tasks.aoa.experiment import run
+from tasks.aoa.options import AoaConfig
 from tasks.cluster import Cluster, connected
 from tasks.environment import machine
 from tasks.page import figures, labels
@@ -267,9 +267,9 @@ def turbo(work: Path) -> Row | None:
         return None
     return {
         share: {
-            name: {angle: arm[angle] for angle in ("elevation_deg", "azimuth_deg")}
-            for name, arm in mix["methods"].items()
-            if name.startswith("turbo_") or name.startswith("measured_")
+            name: {angle: mix["methods"][name][angle] for angle in ("elevation_deg", "azimuth_deg")}
+            for name, condition in conditions_of(mix["methods"]).items()
+            if condition.is_network
         }
         for share, mix in json.loads(file.read_text())["mixes"].items()
     }
@@ -279,7 +279,7 @@ def draw(found: Table) -> None:
     """Draw speed against error on each scene, and SSIM against the number of training spectra."""
     folder, palette = (
         ROOT / "docs" / "figures",
-        Palette({name: label.colour for name, label in labels.FIELD_MODELS.items() if label.colour}),
+        Palette.of(labels.FIELD_MODELS),
     )
     panels, axes = figures.new_figure(-(-len(found) // 2), min(2, len(found)), 10, 3.4 * -(-len(found) // 2))
     for ax, (scene, by_count) in zip(axes, found.items(), strict=False):

@@ -26,7 +26,6 @@ from torch.profiler import ProfilerActivity, profile
 from augment import Mixed
 from swiftwrf import AngularGrid, FitConfig, ModelConfig, fit, fit_coarray, simulated_room
 from swiftwrf.rasterize import rasterize_magnitude
-from tasks.aoa.estimators import Settings
 from tasks.aoa.estimators.aann import AANN, AANNConfig
 from tasks.run import choose_device
 
@@ -73,8 +72,7 @@ def sizes(config: Config) -> tuple[AngularGrid, tuple[int, ...], tuple[int, ...]
 
 
 def rates(config: Config, device: torch.device) -> Row:
-    """Spectra a second: drawing alone, with gradients, the model on its device, and `synthesize`, which brings them to the
-    CPU."""
+    """Return spectra per second: rasterizer alone, with gradients, deformed primitives, and predictions of the model."""
     grid, numbers, batches = sizes(config)
     rows = []
     for n in numbers:
@@ -84,8 +82,8 @@ def rates(config: Config, device: torch.device) -> Row:
             calls = {
                 "forward": partial(rasterize_magnitude, *inputs, grid, "auto", CUTOFF),
                 "forward_backward": partial(with_gradients, inputs, grid, "auto"),
-                "model": partial(model, model.normalise(position.to(device))),
-                "synthesize": partial(model.synthesize, position, batch=batch),
+                "model": partial(model.field, model.field.normalise(position.to(device))),
+                "synthesize": partial(model.synthesize, position),
             }
             row: Row = {"n": n, "batch": batch}
             for name, call in calls.items():
@@ -130,7 +128,7 @@ def training(config: Config, device: torch.device) -> Row:
         "regression": timed(lambda: fit(train, found, device=device, progress=False), device),
         f"gradient, N = {n}, {steps} steps": timed(lambda: fit(train, gradient, device=device, progress=False), device),
         f"network, {network.steps} steps": timed(
-            lambda: AANN(Settings(grid, device=device), network).fit(Mixed.measured(train)), device
+            lambda: AANN(network).fit(Mixed.measured(train), device=device), device
         ),
     }
     print(seconds, flush=True)
@@ -153,12 +151,12 @@ def profiled(config: Config, device: torch.device) -> Row:
     batch, rows = batches[-1], []
     machine = gpu_rates() if device.type == "cuda" else None
     for n in numbers:
-        inputs, model = scene(n, batch, device), model_of(n, grid, device)
-        position = model.normalise(positions(batch).to(device))
+        inputs, field = scene(n, batch, device), model_of(n, grid, device).field
+        position = field.normalise(positions(batch).to(device))
         with torch.no_grad():
             drawing = rate(partial(rasterize_magnitude, *inputs, grid, "auto", CUTOFF), batch, device, config.seconds)
             row: Row = {"n": n, "batch": batch, "forward_per_s": drawing["median"]}
-            row["model"] = kernels_of(partial(model, position), device)
+            row["model"] = kernels_of(partial(field, position), device)
         if machine is not None:
             row["share_of_bounds"] = {
                 "exponentials": drawing["median"] * kernel_values(inputs, grid) / machine["exponentials_per_s"],

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +22,7 @@ from torch import Tensor
 
 from swiftwrf import AngularGrid, ModelConfig, SwiftWRF, rasterize
 from swiftwrf.gp import Kernel
+from swiftwrf.models.swiftwrf.field import DeformableGaussians
 from swiftwrf.rasterize import Backend, rasterize_magnitude
 from tasks.run import choose_device
 
@@ -146,23 +147,26 @@ def with_gradients(inputs: list[Tensor], grid: AngularGrid, backend: Backend) ->
 
 
 def end_to_end(n: int, batch: int, grid: AngularGrid, device: torch.device, seconds: float) -> Rate:
-    """Positions in, magnitudes out, with the motion basis."""
-    model = model_of(n, grid, device)
+    """Return the rate from positions to magnitudes, with the motion basis and without cached kernels."""
+    field = model_of(n, grid, device).field
     with torch.no_grad():
-        position = model.normalise(positions(batch).to(device))
-        return rate(lambda: model(position), batch, device, seconds)
+        position = field.normalise(positions(batch).to(device))
+        return rate(lambda: field(position), batch, device, seconds)
 
 
 def model_of(n: int, grid: AngularGrid, device: torch.device) -> SwiftWRF:
-    """With a motion basis of the responses, and the primitives of `scene`."""
+    """Return a model with a motion basis of the responses and the primitives of `scene`."""
     config = ModelConfig(n_primitives=n, rank=32, cutoff=CUTOFF)
     generator = torch.Generator().manual_seed(0)
-    model = SwiftWRF.make(config, grid, positions(200), Kernel(), generator=generator).to(device)
+    field = DeformableGaussians.initial(config, grid, positions(200), Kernel(), generator=generator)
     with torch.no_grad():
-        mean, cholesky, _ = scene(n, 1, device)
+        mean, cholesky, _ = scene(n, 1, torch.device("cpu"))
         l1, l2, l3 = cholesky.unbind(-1)
-        model.primitives.mean.copy_(mean[0])
-        model.primitives.cholesky.copy_(torch.stack([l1.log(), l2 / l3, l3.log()], dim=-1))
+        field.primitives.mean.copy_(mean[0])
+        field.primitives.cholesky.copy_(torch.stack([l1.log(), l2 / l3, l3.log()], dim=-1))
+    header = {"grid": asdict(grid), "config": asdict(config), "bounds": [[0.0] * 3, [1.0] * 3]}
+    model = SwiftWRF.from_state(field.state_dict(), header | field.deformation.header())
+    model.field.to(device)
     return model
 
 

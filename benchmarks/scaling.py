@@ -28,14 +28,12 @@ from committed import RESULTS, ROOT
 from record import write_result
 
 from augment import Mixed
-from swiftwrf import AngularGrid, Spectra, load_spectra, simulated_room
+from swiftwrf import AngularGrid, Spectra, load_spectra, make_model, simulated_room
 from swiftwrf.data.simulated.spectra import REGION
 from swiftwrf.data.store import stored
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import psnr
-from swiftwrf.models.base import make_model
-from tasks.aoa.estimators import Settings as EstimatorSettings
-from tasks.aoa.estimators.aann import AANN, AANNConfig
+from tasks.aoa.estimators.aann import AANN
 from tasks.page import figures
 
 GRID = AngularGrid.hemisphere(90, 360)
@@ -198,7 +196,7 @@ def predicting(name: str) -> Callable[[Path, int, dict[str, float]], None]:
 def train(folder: Path, n: int, found: dict[str, float]) -> None:
     """Train the network for a few steps."""
     data = load_spectra(folder / "walk")
-    network = AANN(EstimatorSettings(data.grid), AANNConfig(steps=TRAINING_STEPS))
+    network = AANN(steps=TRAINING_STEPS)
     with measuring(found):
         network.fit(Mixed.measured(data))
 

@@ -27,13 +27,13 @@ from swiftwrf import (
     Spectra,
     SwiftWRF,
     fit,
+    make_model,
     project,
     simulated_room,
 )
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import psnr
-from swiftwrf.models.base import make_model
 from swiftwrf.rasterize import Backend, prepare, rasterize_magnitude
 from tasks.page import figures, labels
 from tasks.page.palette import Palette
@@ -235,7 +235,7 @@ def rms(drawn: Tensor, truth: Tensor) -> float:
 def draw(content: dict[str, Any], file: Path) -> None:
     """Draw numerical and held-out error against seconds a spectrum, with the Pareto fronts."""
     figure, axes = figures.new_figure(1, 2, 10.5, 4.2)
-    palette = Palette({name: label.colour for name, label in labels.FIELD_MODELS.items() if label.colour})
+    palette = Palette.of(labels.FIELD_MODELS)
     own = [p for p in content["drawing"] if p["own_grid"]]
     short = {p["setting"]: p["setting"].rsplit(", ", 1)[0] for p in own}
     numerical = {short[p["setting"]]: (p["seconds"]["median"], max(p["numerical"], 1e-9)) for p in own}

@@ -1,6 +1,6 @@
-"""What hard cases do to every backend, to reduced precision and to a fit: errors, goodness or the refusal, measured.
+"""Measure hard cases: errors of every backend and of reduced precision, quality or refusal of fits.
 
-docs/stability.md gives the rules; its tables come from this benchmark's result.
+docs/stability.md gives the rules; its tables come from the result of this benchmark.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from swiftwrf import (
     InputError,
     ModelConfig,
     Spectra,
-    SwiftWRF,
     fit,
     rasterize,
     simulated_room,
@@ -31,6 +30,7 @@ from swiftwrf import (
 from swiftwrf.data.store import Store
 from swiftwrf.gp import Kernel
 from swiftwrf.metrics import psnr
+from swiftwrf.models.swiftwrf.field import DeformableGaussians
 from swiftwrf.rasterize import Backend, rasterize_magnitude
 from swiftwrf.testing.hard_cases import HARD_CASES, field_errors, magnitude_errors
 from swiftwrf.testing.tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
@@ -91,7 +91,7 @@ def precision(device: torch.device) -> list[dict[str, Any]]:
     grid = AngularGrid.hemisphere(90, 360)
     anchor = torch.rand(100, 3, generator=generator)
     config = ModelConfig(n_primitives=200, rank=32, components=("mean", "response", "attenuation", "cholesky"))
-    model = SwiftWRF.make(config, grid, anchor, Kernel(), generator=generator)
+    model = DeformableGaussians.initial(config, grid, anchor, Kernel(), generator=generator)
     for parameter in model.parameters():
         parameter.data += 0.3 * torch.randn(parameter.shape, generator=generator)
     model = model.to(device).requires_grad_(False)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import re
 import statistics
+from dataclasses import replace
 from typing import Any
 
-from committed import RESULTS, ROOT, aoa_shares, interval, load, markdown, rssi_runs
+from committed import RESULTS, ROOT, aoa_shares, interval, load, markdown, rssi_runs, turbo_condition
 from comparison_tables import comparison, comparison_counts, comparison_turbo
 from geometry import SIDES, WALLS, nearest
 from speed_tables import busy, drawing, scaling, scaling_quality, scaling_rssi, size, speed
 from targets import aoa_targets, rssi_targets, synthesis_targets
 
-from tasks.aoa.arms import taken
+from tasks.aoa.condition import Condition
 
 
 def synthesis() -> str:
@@ -42,16 +43,16 @@ def aoa() -> str:
     for share, mix, result in aoa_shares():
         metrics = result["metrics"]
         scene = f"{metrics['data']}, {metrics['split']}, {metrics['moving']}"
-        arms, turbo = mix["methods"], taken(mix["methods"])
-        names = (*fixed, turbo, f"kernel_ridge_{turbo}", "measured_all")
-        cells = [interval(arms[name]["great_circle_deg"]) if name in arms else "" for name in names]
-        rows.append([scene, f"{float(share):.0%}", *cells, _drawn_by(turbo)])
+        methods, turbo = mix["methods"], turbo_condition(mix)
+        names = (*fixed, turbo.method, replace(turbo, estimator="kernel_ridge").method, "measured_all")
+        cells = [interval(methods[name]["great_circle_deg"]) if name in methods else "" for name in names]
+        rows.append([scene, f"{float(share):.0%}", *cells, _synthesizer(turbo)])
     return markdown(columns, rows)
 
 
-def _drawn_by(arm: str) -> str:
-    """The synthesizer of a turbo arm, and whether it drew at further positions."""
-    return arm.removeprefix("turbo_").replace("_", ", ")
+def _synthesizer(condition: Condition) -> str:
+    """Return the field model of a condition, and whether it predicted at further positions."""
+    return f"{condition.synthesizer}{', extra' if condition.training == 'turbo_extra' else ''}"
 
 
 def reliability() -> str:
@@ -82,12 +83,12 @@ def headline() -> str:
         if share != "0.3":
             continue
         metrics, methods = result["metrics"], mix["methods"]
-        turbo = taken(methods)
-        error = {name: methods[name]["great_circle_deg"] for name in ("measured_only", turbo, "measured_all")}
+        turbo = turbo_condition(mix)
+        error = {name: methods[name]["great_circle_deg"] for name in ("measured_only", turbo.method, "measured_all")}
         lower, own, _ = error.values()
         gain = f"{own['median'] / lower['median'] - 1:+.0%}"
         scene = f"{metrics['data']}, {metrics['split']} split, {metrics['moving']} moves"
-        rows.append([scene, *map(interval, error.values()), gain, _drawn_by(turbo)])
+        rows.append([scene, *map(interval, error.values()), gain, _synthesizer(turbo)])
     columns = ["scene", "measured share alone", "with synthetic spectra", "everything measured", "gain", "synthesizer"]
     return markdown(columns, rows)
 

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from committed import aoa_shares, load, markdown, rssi_runs
-
-from tasks.aoa.arms import taken
+from committed import aoa_shares, load, markdown, rssi_runs, turbo_condition
 
 # by scene and split: SSIM and PSNR [dB], with the digits they were asked for
 SYNTHESIS: dict[str, tuple[str, str]] = {
@@ -72,7 +70,7 @@ def aoa_targets() -> str:
         scene = f"{metrics['data']} {metrics['split']}"
         lower, below_all = TURBO[scene]
         median = {name: arm["great_circle_deg"]["median"] for name, arm in mix["methods"].items()}
-        turbo = taken(mix["methods"])
+        turbo = turbo_condition(mix).method
         change = median[turbo] / median["measured_only"] - 1
         aim = lower.get(share)
         missed = [] if aim is None or change <= -aim else [f"{change + aim:.0%}"]

@@ -181,10 +181,10 @@ def _check_scheduler(address: str) -> None:
     try:
         kind = asyncio.run(identity())
     except Exception as error:  # another server may answer anything
-        reason = str(error) or f"nothing in {CONNECT_S} s"
-        raise InputError(
-            f"no Dask scheduler answers at {address} ({reason}); start one with `dask scheduler` and give its address"
-        ) from None
+        reason, cure = str(error) or f"nothing in {CONNECT_S} s", "start one with `dask scheduler` and give its address"
+        if address.startswith("tls"):
+            cure += ", with the certificates of Dask's configuration (distributed.comm.tls)"
+        raise InputError(f"no Dask scheduler answers at {address} ({reason}); {cure}") from None
     if kind != "Scheduler":
         raise InputError(f"a Dask {kind} answers at {address}; --scheduler takes the address of its scheduler")
 

@@ -1,4 +1,4 @@
-"""The options of all commands that say how files are read, where they leave it open."""
+"""Options of all commands that state how files are read, where the files leave it open."""
 
 from __future__ import annotations
 
@@ -8,44 +8,42 @@ from typing import Annotated
 from swiftwrf import AngularGrid, InputError
 from swiftwrf.array.beamforming import BEAMFORMERS
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data import Reading
+from swiftwrf.data import ReadOptions
 from tasks.run import choice
 
-MOST_ELEMENTS = 32  # a side of an array: its spectra have 7,938 numbers
+MAX_SIDE = 32  # elements: spectra of 32 x 32 elements have 7,938 independent numbers
 
 
 @dataclass(frozen=True, kw_only=True)
 class SpectraSource:
-    """How spectra are read."""
+    """Options of reading spectra."""
 
-    array: tuple[int, float, float] | None = None
-    """square array that took the spectra, where the data do not say, or that ray paths are computed for: elements a side,
-    spacing [m], carrier [Hz]"""
-    beamformer: Annotated[
-        str | None, choice("what makes spectra of array snapshots (phase unless given)", BEAMFORMERS)
-    ] = None
+    array: tuple[int, float, float] | tuple[int, int, float, float] | None = None
+    """array of the spectra if the data do not describe it, or for which spectra of ray paths are computed: elements a side,
+    spacing [m], carrier [Hz] of a square array, or rows, columns, spacing [m], carrier [Hz]"""
+    beamformer: Annotated[str | None, choice("beamformer for array snapshots (default: phase)", BEAMFORMERS)] = None
     grid: tuple[int, int] | None = None
-    """elevations and azimuths of spectra that are computed (90 360 unless given)"""
+    """elevations and azimuths of computed spectra (default: 90 360)"""
     every: int | None = None
-    """takes one measurement of so many"""
+    """reads one measurement of that many"""
     station: int | None = None
-    """which array of a file with several, counted from 1"""
+    """number of the array in a file with several, counted from 1"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TableSource:
-    """How survey tables are read."""
+    """Options of reading survey tables."""
 
     columns: tuple[str, ...] = ()
-    """of a survey table whose columns are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME ... (several with
+    """names of columns of a survey table that are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME ... (several with
     rssi='WAP*')"""
 
 
-def reading(config: SpectraSource | TableSource) -> Reading:
-    """What the options say.
+def reading(config: SpectraSource | TableSource) -> ReadOptions:
+    """Return the options of a command line for reading.
 
     Raises:
-        InputError: one that makes no sense whatever the data.
+        InputError: An option that makes no sense whatever the data.
     """
     array = beamformer = grid = every = station = columns = None
     if isinstance(config, SpectraSource):
@@ -58,18 +56,21 @@ def reading(config: SpectraSource | TableSource) -> Reading:
                 raise InputError(f"--{name} must be at least 1, got {value}")
     if isinstance(config, TableSource):
         columns = _columns(config.columns)
-    return Reading(array, beamformer, grid, every, station, columns)
+    return ReadOptions(array, beamformer, grid, every, station, columns)
 
 
 def _array(config: SpectraSource) -> PlanarArray | None:
     if config.array is None:
         return None
-    side, spacing, frequency = config.array
-    if not (2 <= side <= MOST_ELEMENTS and min(spacing, frequency) > 0):
-        raise InputError(
-            f"--array takes 2 to {MOST_ELEMENTS} elements a side, a spacing [m] and a carrier [Hz], got {config.array}"
-        )
-    return PlanarArray.square(side, frequency, spacing)
+    *sides, spacing, frequency = config.array
+    rows, columns = (int(side) for side in (sides[0], sides[-1]))
+    if not (1 <= min(rows, columns) <= max(rows, columns) <= MAX_SIDE and max(rows, columns) >= 2):
+        raise InputError(f"--array takes 2 to {MAX_SIDE} elements a side, got {rows} x {columns}")
+    if min(spacing, frequency) <= 0:
+        raise InputError(f"--array takes a spacing [m] and a carrier [Hz] above 0, got {spacing:g} and {frequency:g}")
+    if rows == columns:
+        return PlanarArray.square(rows, frequency, spacing)
+    return PlanarArray.grid(rows, columns, spacing, frequency)
 
 
 def _grid(config: SpectraSource) -> AngularGrid | None:

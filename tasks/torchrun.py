@@ -58,7 +58,8 @@ def together(command: Callable[[], int]) -> int:
         Exit code of the command, in all processes.
     """
     global _control
-    if int(os.environ.get("WORLD_SIZE", "1")) == 1 or not dist.is_torchelastic_launched():
+    alone = int(os.environ.get("WORLD_SIZE", "1")) == 1 or not dist.is_torchelastic_launched()
+    if alone or _control is not None:  # the second for a command that runs others
         return command()
     if (gpu := int(os.environ["LOCAL_RANK"])) < torch.cuda.device_count():
         torch.cuda.set_device(gpu)

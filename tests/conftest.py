@@ -8,7 +8,7 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-import quick
+import small
 import torch
 from PIL import Image
 
@@ -71,15 +71,15 @@ def measured_data() -> Path:
 
 @pytest.fixture
 def small_published() -> Iterator[None]:
-    """The methods of comparison in their smallest size, for the time of a test."""
-    with quick.small_published():
+    """Small methods of comparison during a test."""
+    with small.small_published():
         yield
 
 
 @pytest.fixture
 def glances() -> Iterator[None]:
-    """No long search for rooms, for the time of a test."""
-    with quick.glances():
+    """Short searches for rooms during a test."""
+    with small.glances():
         yield
 
 
@@ -91,6 +91,8 @@ def generator() -> torch.Generator:
 @pytest.fixture(scope="session")
 def aoa_run(tmp_path_factory: pytest.TempPathFactory, room: Spectra) -> Path:
     """A run of angle of arrival on files, whose second model knows its deviation."""
+    import quick  # the tasks are imported by the tests that run them
+
     folder = tmp_path_factory.mktemp("aoa")
     (folder / "data").mkdir()
     write_spectra(room, folder / "data")
@@ -98,13 +100,15 @@ def aoa_run(tmp_path_factory: pytest.TempPathFactory, room: Spectra) -> Path:
     with mock.patch("tasks.aoa.steps.candidates", return_value=["idw"]):  # finding a room has tests of its own
         assert quick.run("aoa", "--mix", 0.5, 1, *options) == 0
     config = FitConfig(model=ModelConfig(n_primitives=16, rank=4))
-    fit(room, config, progress=False).save(folder / "run" / "model-mix1.safetensors")
+    fit(room, config).save(folder / "run" / "model-mix1.safetensors")
     return folder / "run"
 
 
 @pytest.fixture(scope="session")
 def rssi_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of RSSI at three receivers, over a floor plan."""
+    import quick
+
     folder = tmp_path_factory.mktemp("rssi")
     Image.new("RGB", (40, 30), "white").save(folder / "plan.png")
     plan = ("--floor-plan", folder / "plan.png", "--floor-extent", 0, 20, 0, 15)

@@ -12,26 +12,10 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from unittest import mock
 
-from augment import SYNTHESIZERS
-from swiftwrf import AngularGrid, FitConfig, ModelConfig, RssiConfig, Spectra, rssi_room, simulated_room
-from swiftwrf.comparison import (
-    Config,
-    DcganConfig,
-    DcganSize,
-    NeRF2Config,
-    NeRF2RssiConfig,
-    NeRF2RssiSize,
-    NeRF2Size,
-    VaeConfig,
-    VaeSize,
-    WrfGsConfig,
-    WrfGsSize,
-)
+from small import glances, small_published, small_swiftwrf
+
+from swiftwrf import AngularGrid, RssiConfig, rssi_room, simulated_room
 from swiftwrf.errors import LONGEST
-from swiftwrf.models.geometry import GeometryConfig
-from swiftwrf.models.geometry.fit import search_room
-from swiftwrf.models.geometry.planes import RoomEstimate
-from swiftwrf.models.geometry.search import Search
 from tasks.aoa import experiment as aoa
 from tasks.aoa.arms import NETWORK
 from tasks.aoa.config import AoaConfig
@@ -53,17 +37,6 @@ from tasks.scenes import run as scenes
 from tasks.view import ViewConfig
 from tasks.view import run as view
 
-FIT = FitConfig(model=ModelConfig(n_primitives=4, rank=2), steps=30, check_every=5)
-SHORT = {"steps": 12, "check_every": 6, "batch": 8, "warm_up": 1}
-LONGER = {"steps": 60, "check_every": 30, "batch": 16, "rate": 1e-2}  # a batch says little of so short a fit
-PUBLISHED: dict[str, Config] = {  # methods of comparison, as small as they can be
-    "nerf2": NeRF2Config(size=NeRF2Size(width=8, depth=6, bands=2, samples=6), rays=64, **LONGER),
-    "wrfgs": WrfGsConfig(size=WrfGsSize(n_gaussians=20, width=8, depth=6, bands=2), **SHORT),
-    "vae": VaeConfig(size=VaeSize(latent=2, width=2, hidden=8, bands=2), **LONGER),
-    "dcgan": DcganConfig(size=DcganSize(noise=2, width=2, hidden=8, bands=2), **LONGER),
-}
-PUBLISHED_RSSI = NeRF2RssiConfig(size=NeRF2RssiSize(width=8, bands=2, samples=4, azimuths=4, elevations=2), **LONGER)
-GLANCE = GeometryConfig(reach=0.5, positions=10, width=1, max_order=1, further=0)  # finds little, and soon
 TASKS = {
     "aoa": (AoaConfig, aoa.run),
     "rssi": (rssi.RssiTaskConfig, rssi.run),
@@ -90,32 +63,6 @@ class QuickNetwork(Constant):
 
 
 @contextmanager
-def small_published() -> Iterator[None]:
-    """The methods of comparison in their smallest size."""
-    with ExitStack() as patches:
-        for name, config in PUBLISHED.items():
-            made = staticmethod(lambda config=config: config)
-            patches.enter_context(mock.patch.object(SYNTHESIZERS[name].make, "config", made))
-        patches.enter_context(mock.patch("tasks.rssi.predictors.nerf2.NeRF2RssiConfig", return_value=PUBLISHED_RSSI))
-        yield
-
-
-@contextmanager
-def glances() -> Iterator[None]:
-    """No long search for rooms, which has tests of its own."""
-
-    def glance(train: Spectra, config: GeometryConfig, progress: bool = False) -> RoomEstimate:
-        return search_room(train, replace(GLANCE, seed=config.seed, validation=config.validation), progress)
-
-    with (
-        mock.patch("swiftwrf.models.geometry.model.search_room", glance),
-        mock.patch("swiftwrf.models.geometry.fit.ENOUGH", 1),
-        mock.patch.object(Search, "improve", lambda search, room: room),
-    ):
-        yield
-
-
-@contextmanager
 def quick() -> Iterator[None]:
     """Few spectra, few steps, few methods."""
     spectra = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
@@ -123,10 +70,10 @@ def quick() -> Iterator[None]:
     network = replace(ESTIMATORS[NETWORK], make=QuickNetwork)
     with (
         small_published(),
+        small_swiftwrf(),
         glances(),
         mock.patch.object(aoa, "simulated_room", return_value=spectra),
         mock.patch.object(rssi, "rssi_room", return_value=floor),
-        mock.patch("augment.synthesizers.swiftwrf.FitConfig", return_value=FIT),
         mock.patch(
             "tasks.rssi.predictors.swiftwrf.RssiConfig", lambda **given: RssiConfig(**given, steps=2, n_primitives=0)
         ),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from swiftwrf import rssi_room
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data import Snapshots
-from swiftwrf.data.simulated.room import Room
+from swiftwrf.data.simulated.room import ShoeboxRoom
+from swiftwrf.data.tfrecords import checksum
 
 FREQUENCY = 2.4e9
 WAVELENGTH = LIGHT_SPEED / FREQUENCY
@@ -37,8 +39,7 @@ def snapshots(
         turn = 2 * math.pi / WAVELENGTH * away.norm(dim=1)
         channel += (amplitude * torch.polar(torch.ones_like(phase), phase - turn[:, None]))[:, None]
     channel += noise * torch.randn(channel.shape, dtype=torch.complex128, generator=generator)
-    free = torch.ones(n, dtype=torch.bool)
-    return Snapshots("made", channel.to(torch.complex64), position, array, POSITION, rotation, free, torch.arange(n))
+    return Snapshots(channel, position, array=array, name="made", fixed_position=POSITION, rotation=rotation)
 
 
 def snapshot_arrays(data: Snapshots) -> dict[str, object]:
@@ -48,7 +49,7 @@ def snapshot_arrays(data: Snapshots) -> dict[str, object]:
         "position": data.position.numpy(),
         "element_position": np.pad(data.array.element.numpy(), ((0, 0), (0, 1))),
         "frequency_hz": np.float64(FREQUENCY),
-        "array_position": data.array_position.numpy(),
+        "array_position": data.fixed_position.numpy(),
         "array_orientation": Rotation.from_matrix(data.rotation.numpy()).as_quat(),
     }
 
@@ -71,24 +72,32 @@ def write_snapshots(
 
 
 def write_deepmimo(folder: Path, n: int = 30, tracer: str = "Remcom Wireless Insite", **changes: object) -> Path:
-    """Paths of the simulated room from a transmitter on the ceiling; a change is a function of the arrays."""
+    """Paths of the simulated room from a transmitter on the ceiling; a change computes an array from all, None omits it."""
     generator = torch.Generator().manual_seed(0)
     receiver = torch.tensor([0.5, 0.5, 0.6]) + torch.tensor([5.0, 4.0, 1.0]) * torch.rand(n, 3, generator=generator)
     transmitter = torch.tensor([3.0, 2.5, 2.7])
-    paths = Room(frequency_hz=FREQUENCY).paths(transmitter, receiver)
-    direction, gain = paths.direction.numpy(), paths.gain.numpy()
+    paths = ShoeboxRoom(frequency_hz=FREQUENCY).paths(transmitter[None], receiver)
+    direction, gain, length = (
+        t.reshape(n, 25, *t.shape[1:]).numpy() for t in (paths.direction, paths.gain, paths.length)
+    )
+    blocked = (
+        np.zeros((n, 25)) + 4 * (~paths.line_of_sight).numpy()[:, None]
+    )  # a direct path through a box: transmission
     arrays = {
         "power": 20 * np.log10(abs(gain)),
         "phase": np.rad2deg(np.angle(gain)),
-        "delay": paths.length.numpy() / LIGHT_SPEED,
+        "delay": length / LIGHT_SPEED,
         "aoa_az": np.rad2deg(np.arctan2(direction[..., 1], direction[..., 0])),
         "aoa_el": np.rad2deg(np.arccos(direction[..., 2])),
+        "inter": np.where(np.arange(25) == 0, blocked, np.where(np.arange(25) <= 6, 1.0, 11.0)),
         "rx_pos": receiver.double().numpy(),
         "tx_pos": transmitter[None].double().numpy(),
     }
-    arrays |= {key: change(arrays) for key, change in changes.items()}
+    arrays |= {key: change(arrays) for key, change in changes.items() if change is not None}
     folder.mkdir(exist_ok=True)
     for key, value in arrays.items():
+        if changes.get(key, True) is None:
+            continue
         np.savez_compressed(folder / f"{key}_t000_tx000_r001.npz", **{key: value.astype(np.float32)})
     params = {"rt_params": {"frequency": FREQUENCY, "raytracer_name": tracer}}
     (folder / "params.json").write_text(json.dumps(params))
@@ -120,7 +129,8 @@ def write_records(file: Path, examples: list[dict[str, np.ndarray]]) -> None:
                 feature = _field(1, _field(1, tensor_message(values)))
                 entries += _field(1, _field(1, name.encode()) + _field(2, feature))
             content = _field(1, entries)
-            stream.write(struct.pack("<Q", len(content)) + b"crc1" + content + b"crc2")
+            length = struct.pack("<Q", len(content))
+            stream.write(length + checksum(length) + content + checksum(content))
 
 
 def _seen_from_the_front(data: Snapshots, rows: int, columns: int) -> np.ndarray:
@@ -132,7 +142,7 @@ def _seen_from_the_front(data: Snapshots, rows: int, columns: int) -> np.ndarray
 def _antenna(data: Snapshots) -> dict[str, object]:
     right, up, _ = data.rotation.T.tolist()
     spacing = WAVELENGTH / 2
-    return {"name": "A", "location": data.array_position.tolist(), "rightvector": right, "upvector": up,
+    return {"name": "A", "location": data.fixed_position.tolist(), "rightvector": right, "upvector": up,
             "spacingX": spacing, "spacingY": spacing}  # fmt: skip
 
 
@@ -140,12 +150,10 @@ def record_source(shape: tuple[int, int], n: int = 24, count: int = 3) -> Snapsh
     """Snapshots of an array of this shape that data sets of records can hold."""
     data = snapshots(n, count)
     array = PlanarArray.grid(*shape, WAVELENGTH / 2, FREQUENCY)
-    away = data.position - data.array_position
+    away = data.position - data.fixed_position
     phase = array.phase(away / away.norm(dim=1, keepdim=True) @ data.rotation)[:, None].expand(-1, count, -1)
     channel = torch.polar(torch.ones_like(phase), phase).to(torch.complex64)
-    return Snapshots(
-        "made", channel, data.position, array, data.array_position, data.rotation, data.line_of_sight, data.index
-    )
+    return replace(data, channel=channel, array=array)
 
 
 def write_espargos(folder: Path, arrays: int = 1, **changes: object) -> Path:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from quick import GLANCE, PUBLISHED
+from small import GLANCE, PUBLISHED
 
 from augment import (
     SYNTHESIZERS,
@@ -84,7 +84,7 @@ def test_mix_refuses_a_wrong_number_of_spectra():
 @pytest.mark.parametrize("name", [name for name in SYNTHESIZERS if name not in PUBLISHED])  # they have their own
 def test_synthesizers_draw_unseen_spectra_better_than_the_mean_spectrum(name, glances, monkeypatch):
     monkeypatch.setattr("augment.synthesizers.swiftwrf.FitConfig", lambda: SHORT)
-    monkeypatch.setattr("quick.GLANCE", replace(GLANCE, reach=2.5, positions=24))  # a glance as far as the walls
+    monkeypatch.setattr("small.GLANCE", replace(GLANCE, reach=2.5, positions=24))  # a glance as far as the walls
     synthesizer = make_synthesizer(name)
     synthesizer.fit(TRAIN)
     drawn = synthesizer.synthesize(TEST.position)

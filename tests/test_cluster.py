@@ -269,6 +269,7 @@ def scheduler(tmp_path):
         process.wait()
 
 
+@pytest.mark.long
 def test_aoa_survives_its_scheduler(scheduler, whole, tmp_path, monkeypatch, capsys):
     process, address = scheduler
     with monkeypatch.context() as patch:
@@ -304,7 +305,7 @@ def test_another_server_is_no_scheduler(monkeypatch):
         ("127.0.0.1", "takes tcp://HOST:PORT"),
         ("http://127.0.0.1:1", "takes tcp://HOST:PORT"),
         ("inproc://1/2", "takes tcp://HOST:PORT"),
-        ("tls://127.0.0.1:1", "ssl_context"),
+        ("tls://127.0.0.1:1", "with the certificates of Dask's configuration"),
     ],
 )
 def test_addresses_that_lead_nowhere(tmp_path, capsys, monkeypatch, address, says):
@@ -335,7 +336,7 @@ def test_tls_with_the_certificates_of_dask(tmp_path, monkeypatch):
             with pytest.raises(InputError, match="has no workers"):
                 Cluster(empty.scheduler_address, CPU)
         dask.config.set({"distributed.comm.tls.ca-file": str(tmp_path / "gone.pem")})
-        with pytest.raises(InputError, match=r"gone\.pem"):
+        with pytest.raises(InputError, match="with the certificates of Dask's configuration"):
             Cluster("tls://127.0.0.1:1", CPU)
 
 

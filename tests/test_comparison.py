@@ -9,36 +9,45 @@ from itertools import pairwise
 
 import pytest
 import torch
-from quick import PUBLISHED, PUBLISHED_RSSI
+from small import PUBLISHED, PUBLISHED_RSSI
 from torch.nn import functional
 
-from swiftwrf import AngularGrid, FitError, InputError, Spectra, load, rasterize_magnitude, rssi_room, simulated_room
+from swiftwrf import (
+    FIELD_MODELS,
+    AngularGrid,
+    FitError,
+    InputError,
+    Spectra,
+    load,
+    make_model,
+    rasterize_magnitude,
+    rssi_room,
+    simulated_room,
+)
 from swiftwrf.comparison import (
     DcganConfig,
     DcganSize,
-    NeRF2,
     NeRF2Config,
+    NeRF2Rssi,
     NeRF2Size,
     VaeConfig,
     VaeSize,
-    WrfGs,
     WrfGsConfig,
     WrfGsSize,
-    fit,
-    fit_rssi,
     wrfgs,
 )
 from swiftwrf.comparison.base import Training
 from swiftwrf.comparison.convolution import Double, Halve, stages
-from swiftwrf.comparison.dcgan import Dcgan
-from swiftwrf.comparison.drawing import draw_parameters
-from swiftwrf.comparison.nerf2 import Field, received
+from swiftwrf.comparison.dcgan import DcganNetwork
+from swiftwrf.comparison.nerf2 import Field, NeRF2Network, received
+from swiftwrf.comparison.network import draw_parameters
 from swiftwrf.comparison.sphere import on_sphere
 from swiftwrf.comparison.vae import Normal
 from swiftwrf.comparison.volume import FIRST_PHASE, PATH_GAIN, Medium, integrate
+from swiftwrf.comparison.wrfgs import WrfGsNetwork
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import psnr
-from swiftwrf.models.swiftwrf.encoding import encode
+from swiftwrf.models.swiftwrf.mlp import encode
 from swiftwrf.runtime.checkpoint import read, write
 
 GRID = AngularGrid.hemisphere(90, 360)
@@ -61,17 +70,22 @@ def blob(n=40) -> Spectra:
     return replace(room, position=position, store=Store(rasterize_magnitude(mean, cholesky, weight, grid, cutoff=None)))
 
 
+def fit(train, name, config=None, **arguments):
+    """A fitted model, of the small configuration if there is no other."""
+    return FIELD_MODELS[name](config or PUBLISHED[name]).fit(train, **arguments)
+
+
 def count(model):
     return sum(parameter.numel() for parameter in model.parameters())
 
 
 def test_the_published_sizes_are_the_publications():
-    assert count(NeRF2(NeRF2Config.paper().size, GRID, "transmitter")) == 690_564
+    assert count(NeRF2Network(NeRF2Config.paper().size, GRID, "transmitter")) == 690_564
     assert (
-        count(WrfGs(WrfGsConfig.paper().size, GRID, "transmitter").network)
+        count(WrfGsNetwork(WrfGsConfig.paper().size, GRID, "transmitter").network)
         == 126 * 128 + 6 * 128**2 + 254 * 128 + 8 * 128
     )
-    generator = Dcgan(DcganConfig.paper().size, GRID).generator
+    generator = DcganNetwork(DcganConfig.paper().size, GRID).generator
     assert [m.in_channels for m in generator.modules() if isinstance(m, Double)] == [1024, 512, 256, 128]
     paper = NeRF2Config.paper()
     assert (paper.batch * paper.rays, paper.rate, paper.weight_decay, paper.steps) == (8192, 8e-4, 5e-5, 30_000)
@@ -222,7 +236,7 @@ def test_convolutions_are_periodic_in_azimuth():
 
 def test_convolutions_refuse_specks(room):
     with pytest.raises(InputError, match="at least 4 x 4"):
-        fit(room.coarsen(5), PUBLISHED["vae"], progress=False)
+        fit(room.coarsen(5), "vae")
 
 
 def test_divergence_is_that_of_normal_distributions(generator):
@@ -244,14 +258,14 @@ def test_gaussians_that_are_pulled_at_are_doubled(room):
     training.pull[:] = 0
     training.pull[[3, 5]] = 1
     with torch.no_grad():
-        model.log_scale[5] = math.log(wrfgs.DENSE * model.size.spread) - 1  # small: cloned
+        model.log_scale[5] = math.log(wrfgs.MAX_CLONED * model.size.spread) - 1  # small: cloned
         model.opacity[7] = -20  # hardly seen: removed
     training._grow()
     # 20, 1 removed, 1 cloned, 1 split into two
     assert len(model.mean) == len(model.opacity) == model.size.n_gaussians == 21
     assert len(training.result.mean) == 21
     torch.testing.assert_close(model.mean[18], model.mean[4])  # the clone, after 18 that stayed
-    torch.testing.assert_close(model.log_scale[-2:], (old[3] - math.log(wrfgs.SPLIT)).expand(2, 3))
+    torch.testing.assert_close(model.log_scale[-2:], (old[3] - math.log(wrfgs.SPLIT_FACTOR)).expand(2, 3))
     assert (model.mean[-1] != model.mean[-2]).all()
     kept = training.optimiser.state[model.log_scale]["exp_avg"]
     torch.testing.assert_close(kept[:3], state[:3])
@@ -262,13 +276,13 @@ def test_gaussians_that_are_pulled_at_are_doubled(room):
 def test_an_interrupted_fit_that_grew_goes_on_to_the_same_bits(room, tmp_path, monkeypatch):
     monkeypatch.setattr(wrfgs, "GROW_FROM", 2)
     monkeypatch.setattr(wrfgs, "GROW_EVERY", 3)
-    monkeypatch.setattr(wrfgs, "PULL", 1e-9)
+    monkeypatch.setattr(wrfgs, "MIN_PULL", 1e-9)
     config = replace(PUBLISHED["wrfgs"], grows=True)
-    whole = fit(room, config, progress=False)
-    assert len(whole.mean) > 40
+    whole = fit(room, "wrfgs", config)
+    assert len(whole.network.mean) > 40
     with pytest.raises(KeyboardInterrupt):
-        fit(room, config, progress=False, checkpoint=tmp_path / "state", on_record=interrupt)
-    again = fit(room, config, progress=False, checkpoint=tmp_path / "state")
+        fit(room, "wrfgs", config, checkpoint=tmp_path / "state", on_record=interrupt)
+    again = fit(room, "wrfgs", config, checkpoint=tmp_path / "state")
     assert torch.equal(again.synthesize(room.position), whole.synthesize(room.position))
     whole.save(tmp_path / "model")
     assert torch.equal(load(tmp_path / "model").synthesize(room.position), whole.synthesize(room.position))
@@ -289,36 +303,41 @@ def test_learns_a_source_that_moves(name):
     data = blob()
     rows = torch.arange(len(data))
     train, test = data.subset(rows[rows % 4 != 2]), data.subset(rows[rows % 4 == 2])
-    drawn = fit(train, LEARNS[name], progress=False).synthesize(test.position)
+    predicted = fit(train, name, LEARNS[name]).synthesize(test.position)
     mean = psnr(train.spectrum.mean(dim=0), test.spectrum).median()
-    assert psnr(drawn, test.spectrum).median() > mean + 4
+    assert psnr(predicted, test.spectrum).median() > mean + 4
 
 
 @every
 def test_same_seed_same_model_and_interruptions_do_not_show(room, tmp_path, name):
     config = PUBLISHED[name]
-    whole = fit(room, config, progress=False).synthesize(room.position)
+    whole = fit(room, name).synthesize(room.position)
     records = []
     with pytest.raises(KeyboardInterrupt):
-        fit(room, config, progress=False, checkpoint=tmp_path / "state", on_record=interrupt)
-    again = fit(room, config, progress=False, checkpoint=tmp_path / "state", on_record=records.append)
+        fit(room, name, checkpoint=tmp_path / "state", on_record=interrupt)
+    again = fit(room, name, checkpoint=tmp_path / "state", on_record=records.append)
     assert [record["step"] for record in records] == [config.check_every, config.steps]
     assert torch.equal(again.synthesize(room.position), whole)
-    other = fit(room, replace(config, seed=1), progress=False)
+    other = fit(room, name, replace(config, seed=1))
     assert not torch.equal(other.synthesize(room.position), whole)
     with pytest.raises(InputError, match="another fit"):
-        fit(room, replace(config, seed=1), progress=False, checkpoint=tmp_path / "state")
+        fit(room, name, replace(config, seed=1), checkpoint=tmp_path / "state")
 
 
 @every
-def test_saved_and_loaded_it_draws_the_same(room, tmp_path, name):
-    model = fit(room, PUBLISHED[name], progress=False)
-    model.save(tmp_path / "model")
-    drawn = model.synthesize(room.position)
-    assert drawn.shape == room.spectrum.shape
-    assert drawn.dtype == torch.float32
-    torch.testing.assert_close(load(tmp_path / "model").synthesize(room.position), drawn, rtol=0, atol=0)
-    torch.testing.assert_close(model.synthesize(room.position, batch=7), drawn)
+def test_the_paper_preset_has_the_publications_settings(name):
+    config = type(PUBLISHED[name])
+    assert make_model(name, preset="paper", seed=3, validation="block").config == config.paper(seed=3)
+    assert make_model(name, seed=3).config == config(seed=3)
+
+
+@every
+@pytest.mark.parametrize(
+    "change", [{"steps": -5}, {"batch": 0}, {"rate": -1}, {"averaging": 1.0}, {"check_every": 0}, {"size": None}]
+)
+def test_options_outside_their_ranges_are_refused(name, change):
+    with pytest.raises(InputError, match=f"{next(iter(change))} must be"):
+        FIELD_MODELS[name](**change)
 
 
 @every
@@ -327,8 +346,8 @@ def test_both_ends_may_move(name):
     training = PUBLISHED[name].training(data, torch.device("cpu"))
     for _ in range(3):
         training.advance()
-    drawn = training.result.eval().synthesize(data.position)
-    assert (drawn[0] - drawn[1]).abs().max() > 0
+    rendered = training.result.eval().render(data.position, data.grid)
+    assert (rendered[0] - rendered[1]).abs().max() > 0
 
 
 @every
@@ -336,54 +355,54 @@ def test_what_is_not_finite_stops_the_fit(room, monkeypatch, name):
     broken = room.spectrum.clone()
     broken[7, 3, 3] = float("nan")
     with pytest.raises(InputError, match="training spectrum 7"):
-        fit(replace(room, store=Store(broken)), PUBLISHED[name], progress=False)
+        fit(replace(room, store=Store(broken)), name)
     monkeypatch.setattr(Training, "rate", lambda self, step: 1e30)
     with pytest.raises(FitError, match="rate below"):
-        fit(room, PUBLISHED[name], progress=False)
+        fit(room, name)
 
 
 def test_one_field_for_all_receivers(tmp_path):
     """Averaged over rays, in dBm; where nothing was heard nothing is learnt."""
     train = rssi_room(n=40).receivers(["1", "2", "3"])
     train.rssi_dbm[::3, 1] = torch.nan
-    model = fit_rssi(train, PUBLISHED_RSSI, progress=False)
+    model = NeRF2Rssi(PUBLISHED_RSSI).fit(train)
     model.save(tmp_path / "model")
     position = train.transmitter_position
-    predicted = load(tmp_path / "model").predict(position)
+    predicted = load(tmp_path / "model").predict(position).mean
     assert predicted.shape == (40, 3)
-    torch.testing.assert_close(predicted, model.predict(position))
+    torch.testing.assert_close(predicted, model.predict(position).mean)
+    network = model.network
     rays = AngularGrid.hemisphere(2, 4).direction.flatten(0, 1).float()
-    place, receiver = model.local(position[7:8]), model.local(train.receiver_position[2:])
-    waves = received(model.field, model.size, place, receiver, rays).mean(dim=1)
-    torch.testing.assert_close(predicted[7, 2].float(), 100 * (torch.hypot(*waves) - 1))
+    transmitter, receiver = network.local(position[7:8]), network.local(train.receiver_position[2:])
+    signal = received(network.field, network.size, transmitter, receiver, rays).mean(dim=1)
+    torch.testing.assert_close(predicted[7, 2].float(), 100 * (torch.hypot(*signal) - 1))
     with pytest.raises(KeyboardInterrupt):
-        fit_rssi(train, PUBLISHED_RSSI, progress=False, checkpoint=tmp_path / "state", on_record=interrupt)
-    again = fit_rssi(train, PUBLISHED_RSSI, progress=False, checkpoint=tmp_path / "state")
-    assert torch.equal(again.predict(position), model.predict(position))
+        NeRF2Rssi(PUBLISHED_RSSI).fit(train, checkpoint=tmp_path / "state", on_record=interrupt)
+    again = NeRF2Rssi(PUBLISHED_RSSI).fit(train, checkpoint=tmp_path / "state")
+    assert torch.equal(again.predict(position).mean, predicted)
 
 
 @pytest.mark.parametrize("name", ["nerf2", "wrfgs"])
 def test_any_resolution(room, name):
     """Every other pixel of the doubled grid is one of the grid."""
-    model = fit(room, PUBLISHED[name], progress=False)
-    drawn, fine = (model.synthesize(room.position[:3], grid) for grid in (None, AngularGrid.hemisphere(30, 120)))
-    torch.testing.assert_close(fine[:, 1::2, ::2], drawn, atol=1e-5, rtol=1e-4)
+    model = fit(room, name)
+    coarse, fine = (model.synthesize(room.position[:3], grid) for grid in (None, AngularGrid.hemisphere(30, 120)))
+    torch.testing.assert_close(fine[:, 1::2, ::2], coarse, atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["nerf2", "wrfgs"])
 def test_rays_need_to_know_where_they_start(room, name):
-    with pytest.raises(InputError, match="where the fixed end stands"):
-        fit(replace(room, fixed_position=None), PUBLISHED[name], progress=False)
+    with pytest.raises(InputError, match="needs the fixed end"):
+        fit(replace(room, fixed_position=None), name)
 
 
 @pytest.mark.parametrize("name", ["vae", "dcgan"])
 def test_samples_differ_and_scatter_about_the_mean(room, name):
-    model = fit(room, PUBLISHED[name], progress=False)
-    draws = torch.stack(
-        [model.synthesize(room.position[:4], generator=torch.Generator().manual_seed(seed)) for seed in range(30)]
-    )
-    assert (draws[0] - draws[1]).abs().max() > 0
-    assert (draws.mean(dim=0) - model.synthesize(room.position[:4])).abs().mean() < draws.std(dim=0).mean()
+    model = fit(room, name)
+    position = room.position[:4]
+    samples = torch.stack([model.sample(position, generator=torch.Generator().manual_seed(seed)) for seed in range(30)])
+    assert (samples[0] - samples[1]).abs().max() > 0
+    assert (samples.mean(dim=0) - model.synthesize(position)).abs().mean() < samples.std(dim=0).mean()
 
 
 def test_the_compiled_field_is_the_field(room, monkeypatch):
@@ -398,7 +417,7 @@ def test_the_compiled_field_is_the_field(room, monkeypatch):
 @pytest.fixture(scope="module")
 def fitted(room):
     """A fitted model of each name, once."""
-    return cache(lambda name: fit(room, PUBLISHED[name], progress=False))
+    return cache(lambda name: fit(room, name))
 
 
 @every

@@ -23,7 +23,7 @@ from test_calibration import spoilt
 
 from swiftwrf import AngularGrid, InputError, load_rssi, load_spectra, simulated_room
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data import Reading
+from swiftwrf.data import ReadOptions
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.data.writing import write_rssi, write_spectra
 
@@ -151,7 +151,7 @@ def test_calibration_sees_the_training_part_alone(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("{source}", "{taken}"), "exists already"),
+        (("{source}", "{taken}"), "never overwritten; choose another directory"),
         (("/nowhere", "{new}"), "is not a folder or file"),
         (("{source}", "{new}", "--columns", "x"), "x=NAME"),
         (("{source}", "{new}", "--columns", "x=a"), "takes no columns"),
@@ -182,5 +182,5 @@ def test_every_format_is_described():
     for formats in (SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS):
         for name in formats:
             assert f"[{name}](#" in text, f"describe {name} in docs/formats.md"
-    for option in Reading.__dataclass_fields__:
+    for option in ReadOptions.__dataclass_fields__:
         assert f"`--{option} " in text, f"describe --{option} in docs/formats.md"

@@ -10,8 +10,8 @@ import torch
 from samples import FREQUENCY, WAVELENGTH, write_deepmimo
 
 from swiftwrf import AngularGrid, InputError, load_spectra
-from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.simulated.room import Room
+from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
+from swiftwrf.data.simulated.room import ShoeboxRoom
 
 GRID = AngularGrid.hemisphere(24, 96)
 
@@ -27,13 +27,27 @@ def passband(arrays):
 
 def test_spectra_are_those_of_the_traced_paths(tmp_path):
     data = load(tmp_path / "town")
-    paths = Room(frequency_hz=FREQUENCY).paths(data.fixed_position, data.position)
+    paths = ShoeboxRoom(frequency_hz=FREQUENCY).paths(data.fixed_position, data.position)
     array = PlanarArray.square(4, FREQUENCY)
-    owner = torch.arange(30).repeat_interleave(25)
-    expected = array.spectrum(array.channel(paths.direction.flatten(0, 1), paths.gain.flatten(), owner, 30), GRID)
+    expected = array.spectrum(paths.channel(array), GRID)
+    assert torch.equal(data.line_of_sight, paths.line_of_sight)
     torch.testing.assert_close(data.spectrum, expected, atol=2e-3, rtol=0)
     assert (data.moving, data.name, data.notes) == ("receiver", "town", ())
     assert data.fixed_position.tolist() == pytest.approx([3, 2.5, 2.7], abs=1e-6)
+
+
+def test_interactions_tell_line_of_sight(tmp_path):
+    """Diffracted paths that are 0.5 % longer than the distance are no line of sight."""
+
+    def longer(arrays):
+        distance = np.linalg.norm(arrays["tx_pos"] - arrays["rx_pos"], axis=1)[:, None] / LIGHT_SPEED
+        return np.where(np.arange(25) == 0, 1.005 * distance, arrays["delay"])
+
+    diffracted = {"delay": longer, "inter": lambda a: np.where(np.arange(25) == 0, 2, a["inter"])}
+    assert not load(tmp_path / "a", **diffracted).line_of_sight.any()
+    guessed = load(tmp_path / "b", delay=longer, inter=None)
+    assert guessed.line_of_sight.all()
+    assert any("no interactions (inter)" in note for note in guessed.notes)
 
 
 def test_phases_of_passband_coefficients_get_the_propagation(tmp_path):
@@ -45,7 +59,7 @@ def test_phases_of_passband_coefficients_get_the_propagation(tmp_path):
 @pytest.mark.parametrize(("tracer", "noted"), [("Sionna Ray Tracing", True), ("Remcom Wireless Insite", False)])
 def test_without_direct_paths_the_ray_tracer_tells(tmp_path, tracer, noted):
     blocked = {key: lambda a, k=key: np.where(np.arange(25) == 0, np.nan, a[k]) for key in
-               ("power", "phase", "delay", "aoa_az", "aoa_el")}  # fmt: skip
+               ("power", "phase", "delay", "aoa_az", "aoa_el", "inter")}  # fmt: skip
     data = load(tmp_path / "a", tracer=tracer, **blocked)
     assert any("passband" in note for note in data.notes) == noted
     assert not data.line_of_sight.any()

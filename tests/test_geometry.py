@@ -11,18 +11,18 @@ import torch
 from swiftwrf import AngularGrid, InputError, load, simulated_room
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.store import Store
-from swiftwrf.gp import Kernel
+from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.metrics import psnr
 from swiftwrf.models.geometry import GeometryConfig, GeometryModel, Plane, fit_geometry, refit_geometry
-from swiftwrf.models.geometry.ambiguity import _Table, turned
-from swiftwrf.models.geometry.fit import _completed, _settled, observe, split
+from swiftwrf.models.geometry.ambiguity import _AlternativeTable, phase_alternatives
+from swiftwrf.models.geometry.fit import _with_weak_planes, _without_aliases, observe, split
 from swiftwrf.models.geometry.hybrid import HybridModel, fit_hybrid
-from swiftwrf.models.geometry.images import Scene, field, image_gain, images, mirror, sequences
+from swiftwrf.models.geometry.images import PhaseObservations, field, image_gain, images, mirror, sequences
 from swiftwrf.models.geometry.path_gains import PathGains, fit_path_gains
-from swiftwrf.models.geometry.phase_retrieval import autocorrelation, correlations, element_phases
-from swiftwrf.models.geometry.planes import Planes
+from swiftwrf.models.geometry.phase_retrieval import autocorrelation, correlations, retrieve_phases
+from swiftwrf.models.geometry.planes import PlaneSet
 from swiftwrf.models.geometry.refine import derivatives
-from swiftwrf.models.geometry.responses import Waves
+from swiftwrf.models.geometry.responses import SteeringResponses
 from swiftwrf.models.geometry.search import SIGNS
 from swiftwrf.models.nearest import NearestModel
 from swiftwrf.runtime.checkpoint import write
@@ -82,7 +82,7 @@ def test_phases_of_the_elements_follow_from_the_spectra():
     channel = torch.polar(torch.ones_like(angle), angle)
     data = replace(mirror_room({}, n=30), store=Store(ARRAY.spectrum(channel, GRID)))
     torch.testing.assert_close(correlations(data), autocorrelation(channel, ARRAY), atol=1e-5, rtol=0)
-    found, error = element_phases(correlations(data), ARRAY)
+    found, error = retrieve_phases(correlations(data), ARRAY)
     match = torch.stack([(channel.conj() * f).mean(1).abs() for f in (found, found.conj().flip(1))]).amax(0)
     assert float(error.max()) < 1e-3
     assert float(match.min()) > 0.999
@@ -90,7 +90,9 @@ def test_phases_of_the_elements_follow_from_the_spectra():
 
 def test_derivatives_of_the_field_are_its_differences():
     data = mirror_room(SIX, n=5)
-    scene = Scene.of(data.position, data.fixed_position, "receiver", ARRAY, data.rotation, torch.ones(5, 16))
+    scene = PhaseObservations.of(
+        data.position, data.fixed_position, "receiver", ARRAY, data.rotation, torch.ones(5, 16)
+    )
     normal = torch.tensor([list(SIX)], dtype=torch.float64)
     offset, gain = torch.tensor([list(SIX.values())], dtype=torch.float64), torch.full((1, 6), -0.6)
     chain, step = sequences(normal[0], 2), 1e-3
@@ -142,17 +144,17 @@ def test_a_sign_does_not_change_for_a_little():
     """Half a turn away the wrong sign explains a weak wall better by chance, but not clearly."""
     scene, _ = observe(mirror_room({(1, 0, 0): 4.6, (0, 0, -1): 0.0}, (-0.6, -0.2), n=40, noise=0.5))
     normal, offset = torch.tensor([[[1, 0, 0], [0, 0, -1]]]).double(), torch.tensor([[4.6, 0.0]]).double()
-    room = Planes(normal, offset, torch.tensor([[-0.6, -0.2]]), 2).refined(scene)
-    other = turned(scene, room)[0]
+    room = PlaneSet(normal, offset, torch.tensor([[-0.6, -0.2]]), 2).refined(scene)
+    other = phase_alternatives(scene, room)[0]
     assert float(scene.score(other.field(scene))) < 0.99 * float(scene.score(room.field(scene)))
-    assert _settled(room, scene) is room
+    assert _without_aliases(room, scene, QUICK) is room
 
 
 def test_a_plane_among_the_positions_has_no_turns():
     """Wavelengths inside of the furthest one, where refinement may leave an oblique plane."""
     scene, _ = observe(mirror_room({(1, 0, 0): 4.6}, n=12, array=PlanarArray.square(4, 60e9)))
     normal, offset = torch.tensor([[[1.0, 0, 0]]]).double(), torch.tensor([[2.0]]).double()
-    assert turned(scene, Planes(normal, offset, torch.tensor([[-0.6]]), 1)) == []
+    assert phase_alternatives(scene, PlaneSet(normal, offset, torch.tensor([[-0.6]]), 1)) == []
 
 
 @pytest.mark.parametrize("away", [(8, 8, 6, 6, 0, 2), (3, 3, 4, 4, 0, 3)], ids=["whole turns", "half turns"])
@@ -161,24 +163,24 @@ def test_planes_that_are_turns_away_together_return(away):
     gain = (-0.4, -0.3, -0.65, -0.75, 0.25, 0.4)
     scene, _ = observe(mirror_room(SIX, gain, "transmitter", n=40))
     normal, offset = torch.tensor([list(SIX)]).double(), torch.tensor([list(SIX.values())]).double()
-    true = Planes(normal, offset, torch.tensor([gain]), 2)
-    wrong = _Table(scene, true).room(away).refined(scene, 20)
+    true = PlaneSet(normal, offset, torch.tensor([gain]), 2)
+    wrong = _AlternativeTable(scene, true).room(away).refined(scene, 20)
     assert float((wrong.offset - offset).abs().max()) > 0.2
     assert float(scene.score(wrong.field(scene))) < 0.02  # explains nearly all
-    assert float((_settled(wrong, scene).offset - offset).abs().max()) < 1e-3
+    assert float((_without_aliases(wrong, scene, QUICK).offset - offset).abs().max()) < 1e-3
 
 
 def test_a_weak_wall_beside_strong_ones_is_added():
     gain = (-0.6, -0.6, -0.12, -0.6, -0.6, -0.6)
     scene, _ = observe(mirror_room(SIX, gain, n=60, noise=0.1))
     normal, offset = torch.tensor([list(SIX)]).double(), torch.tensor([list(SIX.values())]).double()
-    rest = Planes(normal, offset, torch.tensor([gain]), 2).without(2).refined(scene)
+    rest = PlaneSet(normal, offset, torch.tensor([gain]), 2).without(2).refined(scene)
     folds = split(scene, torch.arange(60) % 5)
-    whole = _completed(rest, scene, scene, folds, SIGNS[0], reach=2.0)
+    whole = _with_weak_planes(rest, scene, scene, folds, SIGNS[0], QUICK)
     assert whole.normal.shape[1] == 6
     assert float((whole.offset - offset).abs().max()) < 0.02
     assert abs(float(whole.gain[0, 2]) + 0.12) < 0.05
-    assert _completed(whole, scene, scene, folds, SIGNS[0], reach=2.0) is whole
+    assert _with_weak_planes(whole, scene, scene, folds, SIGNS[0], QUICK) is whole
 
 
 def test_scores_of_combinations_are_those_of_their_rooms():
@@ -186,13 +188,13 @@ def test_scores_of_combinations_are_those_of_their_rooms():
     normal = torch.tensor(list(SIX)).double()
     offset = [o + 0.05 * torch.arange(1 + i % 3, dtype=torch.float64) for i, o in enumerate(SIX.values())]
     gain = [torch.linspace(-0.6, 0.4, len(o)) for o in offset]
-    direct, waves = scene.wave(scene.transmitter), Waves.of(scene, normal, offset, gain)
+    direct, waves = scene.wave(scene.transmitter), SteeringResponses.of(scene, normal, offset, gain)
     score = waves.scores(scene, direct)
     base, moving = waves.moved(direct, (1, 2, 4, 5))
     torch.testing.assert_close(moving.scores(scene, base), score[0, :, :, 0])
     for choice in ((0, 0, 0, 0, 0, 0), (0, 1, 2, 0, 1, 2), (0, 1, 0, 0, 0, 1)):
         own = ([t[c] for t, c in zip(table, choice, strict=True)] for table in (offset, gain))
-        room = Planes(normal[None], *(torch.stack(row)[None] for row in own), 2)
+        room = PlaneSet(normal[None], *(torch.stack(row)[None] for row in own), 2)
         torch.testing.assert_close(score[choice], scene.score(room.field(scene)), atol=1e-5, rtol=0)
 
 
@@ -211,7 +213,7 @@ def test_images_are_mirrored_in_one_plane_after_another():
     normal = torch.nn.functional.normalize(torch.randn(2, 3, 3, generator=generator, dtype=torch.float64), dim=-1)
     offset, gain = torch.rand(2, 3, generator=generator, dtype=torch.float64), torch.rand(2, 3, generator=generator)
     position = torch.rand(5, 3, generator=generator, dtype=torch.float64)
-    scene = Scene.of(position, torch.zeros(3), "transmitter", ARRAY, torch.eye(3), torch.ones(5, 16))
+    scene = PhaseObservations.of(position, torch.zeros(3), "transmitter", ARRAY, torch.eye(3), torch.ones(5, 16))
     chain = [(1, 0, 2), (2,), (0, 1)]
     found, strength = images(scene, normal, offset, chain), image_gain(gain, chain)
     for row, sequence in enumerate(chain):
@@ -346,7 +348,9 @@ def test_path_gains_follow_a_shadow():
     assert hybrid.path_gains is not None
     gained = psnr(hybrid.synthesize(test.position), test.spectrum) - psnr(room.synthesize(test.position), test.spectrum)
     assert float(gained.median()) > 5
-    one = replace(hybrid.path_gains, readout=hybrid.path_gains.readout[:, :1])  # one of the fields that are averaged
+    process, paths = hybrid.path_gains.process, hybrid.path_gains.n_paths
+    first = process.coefficient[:, : 2 * paths]  # one of the fields that are averaged
+    one = PathGains(GaussianProcess(process.kernel, process.known, first), paths)
     sample = hybrid.sample(test.position, generator=torch.Generator().manual_seed(0))
     for worse in (with_path_gains(hybrid, one).synthesize(test.position), sample):
         assert float(psnr(worse, test.spectrum).median()) < float(
@@ -356,20 +360,20 @@ def test_path_gains_follow_a_shadow():
     assert torch.equal(again.synthesize(test.position), hybrid.synthesize(test.position))
     like = HybridModel().fit(train.subset(torch.arange(60)), like=hybrid)
     assert like.path_gains is not None
-    assert like.path_gains.kernel == hybrid.path_gains.kernel
+    assert like.path_gains.process.kernel == hybrid.path_gains.process.kernel
     assert [plane.normal for plane in like.room.planes] == [plane.normal for plane in room.planes]
 
 
-def test_path_gains_are_held_out_from_spectra_without_observed_phases_too(monkeypatch):
+def test_path_gains_are_held_out_from_spectra_without_observed_phases_too():
     """What stands for predictions of one fold follows from the observed spectra of the other folds."""
-    monkeypatch.setattr("swiftwrf.models.geometry.fit.MOST", 40)
     data, fold = mirror_room(SIX, n=80), torch.arange(80) % 3
     kernel = Kernel(long=0.5, short=1.0, share=1.0, noise=1e-3)
-    hybrid, like = HybridModel(), HybridModel()
-    hybrid._room, hybrid.grid = fit(data, further=0, width=1), data.grid
-    like.path_gains = PathGains(kernel, data.position, torch.zeros(80, 1, 1, 2))
+    few = GeometryConfig(max_spectra=40)
+    hybrid, like = HybridModel(few), HybridModel()
+    hybrid._room, hybrid.grid = fit(data, further=0, width=1, max_spectra=40), data.grid
+    like.path_gains = PathGains(GaussianProcess(kernel, data.position, torch.zeros(80, 2)), 1)
     known = hybrid._fit_path_gains(data, fold, like)
-    scene, rows = observe(data)
+    scene, rows = observe(data, few)
     assert len(rows) <= 40
     for number in range(3):
         fitted = fit_path_gains(hybrid.room, scene.subset((fold[rows] != number).nonzero()[:, 0]), kernel)
@@ -405,7 +409,7 @@ def test_spectra_are_differentiable_in_the_position(moving):
     room = GeometryModel.of_planes(data, walls)
     hybrid = fit_hybrid(data, room)
     assert hybrid.mixing_weight > 0
-    assert hybrid.readout.shape[1]
+    assert hybrid.process.coefficient.shape[1]
     position = data.position[:3] + 0.02
     for model in (room, hybrid):
         weight = torch.rand(3, *data.grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -426,11 +430,21 @@ def test_room_predicts_any_grid(noisy, room):
 
 @pytest.mark.parametrize(
     "name",
-    ["element", "rotation", "fixed_position", "covariance", "position", "readout", "component", "path_gains.readout"],
+    [
+        "element",
+        "rotation",
+        "fixed_position",
+        "covariance",
+        "position",
+        "coefficient",
+        "component",
+        "path_gains.coefficient",
+    ],
 )
 def test_states_of_wrong_sizes_are_refused(hybrid, name, tmp_path):
     """Also tensors that only `predict` would need."""
-    some = PathGains(hybrid.kernel, hybrid.position.clone(), torch.zeros(len(hybrid.position), 2, 25, 2))
+    known, kernel = hybrid.process.known.clone(), hybrid.process.kernel
+    some = PathGains(GaussianProcess(kernel, known, torch.zeros(len(known), 2 * 25 * 2)), 25)
     tensors, header = with_path_gains(hybrid, some).state()
     HybridModel.from_state(tensors, header)
     cut = tensors[name][:, :1] if name == "element" else tensors[name][:-1]

@@ -11,7 +11,7 @@ from sklearn.gaussian_process.kernels import Matern
 from swiftwrf.gp import (
     GaussianProcess,
     Kernel,
-    NearbyField,
+    LeaveGroupOut,
     SmoothField,
     choose_kernel,
     choose_rank,
@@ -29,7 +29,10 @@ def test_regression_is_that_of_scikit_learn(generator):
     kernel = 0.6 * Matern(1.0, nu=0.5) + 0.4 * Matern(0.3, nu=1.5)
     theirs = GaussianProcessRegressor(kernel, alpha=1e-2, optimizer=None).fit(known, values)
     mean, deviation = theirs.predict(asked, return_std=True)
-    np.testing.assert_allclose(process.weights(asked) @ values, mean, rtol=1e-8, atol=1e-9)
+    rows, weight = process.weights(asked)
+    np.testing.assert_allclose(weight @ values[rows], mean, rtol=1e-8, atol=1e-9)
+    regressed = GaussianProcess.regress(KERNEL, known, values[:, None])
+    np.testing.assert_allclose(regressed.mean(asked)[:, 0], mean, rtol=1e-8, atol=1e-9)
     np.testing.assert_allclose(process.variance(asked).sqrt(), deviation, rtol=1e-6)
 
 
@@ -82,9 +85,37 @@ def test_held_out_predictions_are_those_of_a_process_without_the_fold(generator,
     predicted, variance = held_out(KERNEL, position, fold, value)
     for number in range(n_folds):
         out, kept = fold == number, fold != number
-        process = GaussianProcess(KERNEL, position[kept])
-        torch.testing.assert_close(predicted[out], process.weights(position[out]) @ value[kept])
+        process = GaussianProcess.regress(KERNEL, position[kept], value[kept])
+        torch.testing.assert_close(predicted[out], process.mean(position[out]))
         torch.testing.assert_close(variance[out], process.variance(position[out]) + KERNEL.noise)
+        group = LeaveGroupOut(torch.linalg.inv(KERNEL.covariance(position)), out.nonzero()[:, 0])
+        torch.testing.assert_close(group.weights, process.weights(position[out])[1])
+        torch.testing.assert_close(group.errors(group.precision @ value), value[out] - predicted[out])
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_local_process_of_all_neighbours_is_the_exact_one(generator, dtype):
+    known, asked = (torch.rand(n, 3, generator=generator, dtype=torch.float64) for n in (40, 6))
+    value = torch.randn(40, 3, generator=generator, dtype=torch.float64)
+    exact, local = (GaussianProcess.regress(KERNEL, known, value, e, dtype) for e in (True, False))
+    torch.testing.assert_close(local.mean(asked), exact.mean(asked).double(), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(local.variance(asked), exact.variance(asked))
+    for process in (exact, local):
+        again = GaussianProcess.from_state(*process.state("a."), dtype, process.exact, prefix="a.")
+        assert torch.equal(again.mean(asked), process.mean(asked))
+        rows, weight = process.weights(asked)
+        assert len(rows) == 40
+        torch.testing.assert_close((weight @ value[rows]), exact.mean(asked).double(), atol=1e-4, rtol=1e-4)
+
+
+def test_local_predictions_condition_on_the_nearest_positions(generator):
+    known = torch.rand(300, 3, generator=generator, dtype=torch.float64)
+    value = torch.sin(5 * known)
+    asked = known[:20] + 0.01
+    exact, local = (GaussianProcess.regress(KERNEL, known, value, e) for e in (True, False))
+    torch.testing.assert_close(local.mean(asked), exact.mean(asked), atol=0.02, rtol=0)
+    rows, weight = local.weights(asked)
+    torch.testing.assert_close(weight @ value[rows], local.mean(asked))
 
 
 def test_smooth_fields_are_the_process(generator):
@@ -93,11 +124,11 @@ def test_smooth_fields_are_the_process(generator):
     value = torch.sin(position @ torch.randn(3, 2, generator=generator))
     kernel = Kernel(long=8.0, short=0.4, share=0.05, noise=1e-2)
     new = 1.6 * torch.rand(50, 3, generator=generator) - 0.8
-    process = GaussianProcess(kernel, position)
-    wanted = (process.weights(new) @ value.double()).float()
+    process = GaussianProcess.regress(kernel, position, value)
+    wanted = process.mean(new).float()
     for field, tolerance in (
         (SmoothField.regress(position, kernel, value), 1e-4),
-        (NearbyField(position, kernel, value), 0.02),
+        (SmoothField(position, kernel, 2, value=value), 0.02),
     ):
         torch.testing.assert_close(field(new), wanted, atol=tolerance, rtol=0)
         torch.testing.assert_close(field.variance(new), process.variance(new).float(), atol=tolerance, rtol=0)

@@ -17,6 +17,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+pytestmark = pytest.mark.long
 HERE = Path(__file__).parent
 AOA = ("aoa", "--mix", "0.5", "--extra", "20")
 RSSI = ("rssi", "--rx", "1")

@@ -10,7 +10,7 @@ import torch
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, SwiftWRF, fit, load
 from swiftwrf.data.store import Store
 from swiftwrf.gp import Kernel
-from swiftwrf.models.base import make_model
+from swiftwrf.models.base import bounding_box, make_model
 from swiftwrf.models.swiftwrf.deformation.base import COMPONENTS
 from swiftwrf.models.swiftwrf.deformation.per_primitive_mlp import PerPrimitiveMLP
 from swiftwrf.models.swiftwrf.field import DeformableGaussians
@@ -34,7 +34,7 @@ def model(**changes):
     gaussians, anchor = field(**changes)
     shake(gaussians)
     wrf = SwiftWRF()
-    wrf.grid = GRID
+    wrf.grid, wrf.bounds = GRID, bounding_box(anchor)
     wrf._take(gaussians)
     return wrf, anchor
 
@@ -177,7 +177,7 @@ def test_load_refuses_other_files(tmp_path):
     with pytest.raises(InputError, match="not a readable"):
         load(tmp_path / "text")
     checkpoint.write(tmp_path / "other", "fit state", {"a": torch.zeros(1)}, {})
-    with pytest.raises(InputError, match=r"expected .*'swiftwrf model'"):
+    with pytest.raises(InputError, match="holds 'fit state' in format 1; expected '"):
         load(tmp_path / "other")
 
 

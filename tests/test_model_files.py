@@ -1,14 +1,19 @@
-"""Model files and states of fits that are damaged or ask for more than they hold; what models draw at their limits."""
+"""Damaged model files and checkpoints of fits, files that claim more than they contain, and predictions at far positions."""
 
 from __future__ import annotations
 
+import os
 import resource
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 import torch
 
-from augment import SYNTHESIZERS, Settings
 from swiftwrf import (
+    FIELD_MODELS,
     CoarrayModel,
     FitConfig,
     InputError,
@@ -16,9 +21,11 @@ from swiftwrf import (
     fit,
     fit_coarray,
     load,
+    make_model,
 )
-from swiftwrf.runtime.checkpoint import read, write
+from swiftwrf.runtime.checkpoint import Saved, read, write
 
+ROOT = Path(__file__).parent.parent
 TINY = FitConfig(model=ModelConfig(n_primitives=4, rank=2), steps=10, check_every=5)
 
 
@@ -26,8 +33,8 @@ TINY = FitConfig(model=ModelConfig(n_primitives=4, rank=2), steps=10, check_ever
 def models(room, tmp_path_factory):
     """A file of each kind of model."""
     folder = tmp_path_factory.mktemp("models")
-    fit(room, TINY, progress=False).save(folder / "swiftwrf")
-    fit_coarray(room, progress=False).save(folder / "coarray")
+    fit(room, TINY).save(folder / "swiftwrf")
+    fit_coarray(room).save(folder / "coarray")
     return folder
 
 
@@ -89,7 +96,7 @@ DAMAGE = {
         _set("wavelength", to="x"),
         _set("grid", to=3),
         _set("kernel", "share", to=7),
-        _tensor("anchor", lambda t: t[:, :2]),
+        _tensor("position", lambda t: t[:, :2]),
         _tensor("readout", lambda t: t * torch.inf),
         _tensor("form", lambda t: t[:-1]),
         _tensor("offset", lambda t: t.repeat(2)),
@@ -109,7 +116,7 @@ def test_damaged_models_are_refused(models, kind, number):
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 2**20  # KiB
 
 
-def test_models_whose_numbers_overflow_draw_nothing(models, room):
+def test_models_whose_parameters_overflow_are_refused(models, room):
     model = load(_changed(models / "coarray", _tensor("form", lambda t: 3e38 * t.sign())))
     with pytest.raises(InputError, match="not finite"):
         model.synthesize(room.position[:1])
@@ -126,15 +133,15 @@ def test_a_header_that_is_no_header(tmp_path):
 
 def test_a_damaged_state_of_a_fit_is_refused(room, tmp_path):
     state = tmp_path / "state"
-    fit(room, TINY, progress=False, checkpoint=state)
+    fit(room, TINY, checkpoint=state)
     kind, tensors, header = read(state, "fit state")
     for change in ({"losses": None}, {"records": 3}, {"step": "x"}, {"fingerprint": 1}):
         write(state, kind, tensors, header | change)
         with pytest.raises(InputError):
-            fit(room, TINY, progress=False, checkpoint=state)
+            fit(room, TINY, checkpoint=state)
     write(state, kind, {name: t for name, t in tensors.items() if "mean" not in name}, header)
     with pytest.raises(InputError):
-        fit(room, TINY, progress=False, checkpoint=state)
+        fit(room, TINY, checkpoint=state)
 
 
 def test_an_interrupted_fit_has_its_whole_history(room, tmp_path):
@@ -142,15 +149,15 @@ def test_an_interrupted_fit_has_its_whole_history(room, tmp_path):
         pass
 
     whole, first, second = [], [], []
-    fit(room, TINY, progress=False, on_record=whole.append)
+    fit(room, TINY, on_record=whole.append)
 
     def cut(record):
         first.append(record)
         raise Cut
 
     with pytest.raises(Cut):
-        fit(room, TINY, progress=False, checkpoint=tmp_path / "state", on_record=cut)
-    fit(room, TINY, progress=False, checkpoint=tmp_path / "state", on_record=second.append)
+        fit(room, TINY, checkpoint=tmp_path / "state", on_record=cut)
+    fit(room, TINY, checkpoint=tmp_path / "state", on_record=second.append)
     assert [(r["step"], r["loss"]) for r in second] == [(r["step"], r["loss"]) for r in whole]
     assert second[0] == first[0]
     elapsed = [record["elapsed"] for record in second]
@@ -158,20 +165,49 @@ def test_an_interrupted_fit_has_its_whole_history(room, tmp_path):
     assert elapsed[1] > elapsed[0] >= first[0]["seconds"]
 
 
-@pytest.mark.parametrize("far", [1e12, 1e20, 1e200, 1e308])
-@pytest.mark.parametrize("name", list(SYNTHESIZERS))
-def test_far_positions_draw_finite_spectra(room, models, small_published, glances, name, far):
-    if name in ("swiftwrf", "coarray"):
-        synthesize = load(models / name).synthesize
-    else:
-        synthesizer = SYNTHESIZERS[name].make(Settings(progress=False))
-        synthesizer.fit(room)
-        synthesize = synthesizer.synthesize
-    assert synthesize(torch.full((1, 3), far, dtype=torch.float64)).isfinite().all()
+@pytest.mark.parametrize("name", list(FIELD_MODELS))
+def test_far_positions_give_finite_spectra(room, small_published, glances, name):
+    model = make_model(name).fit(room)
+    for far in (1e12, 1e20, 1e200, 1e308):
+        assert model.synthesize(torch.full((1, 3), far, dtype=torch.float64)).isfinite().all()
 
 
-@pytest.mark.parametrize("batch", [0, -1])
-def test_a_batch_has_positions(models, room, batch):
-    for name in ("swiftwrf", "coarray"):
-        with pytest.raises(InputError, match="batch"):
-            load(models / name).synthesize(room.position[:3], batch=batch)
+ONLY_SWIFTWRF = """
+import sys, swiftwrf
+print(type(swiftwrf.load(sys.argv[1])).__name__)
+"""
+
+
+def test_models_of_every_kind_are_opened_with_swiftwrf_alone(room, tmp_path, small_published):
+    for name in ("gp", "coarray", "vae"):
+        make_model(name).fit(room).save(tmp_path / name)
+        opened = subprocess.run(
+            [sys.executable, "-c", ONLY_SWIFTWRF, tmp_path / name], capture_output=True, text=True, check=True
+        )
+        assert opened.stdout.strip() == FIELD_MODELS[name].__name__
+
+
+def test_estimators_are_opened_with_swiftwrf_alone(tmp_path):
+    """By the entry points that pyproject.toml declares, as an installation has them."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    points = project["entry-points"]["swiftwrf.estimators"]
+    installed = tmp_path / "project-1.dist-info"
+    installed.mkdir()
+    (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: project\nVersion: 1\n")
+    lines = [f"{name} = {value}" for name, value in points.items()]
+    (installed / "entry_points.txt").write_text("\n".join(["[swiftwrf.estimators]", *lines]))
+    from tasks.aoa import estimators  # noqa: F401 (defines the kinds)
+
+    kinds = {kind for kind, made in Saved.kinds.items() if made.__module__.startswith("tasks.aoa.estimators")}
+    assert kinds
+    script = "import swiftwrf; from swiftwrf.runtime import checkpoint; checkpoint._import_extensions()"
+    script += "; print(*checkpoint.Saved.kinds, sep='|')"
+    path = os.pathsep.join([str(tmp_path), str(ROOT)])
+    opened = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"PYTHONPATH": path},
+    )
+    assert kinds <= set(opened.stdout.strip().split("|"))

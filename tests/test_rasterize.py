@@ -63,10 +63,7 @@ def test_torch_keeps_its_threads():
 
 def test_the_first_rendering_keeps_the_number_of_threads():
     """Numba starts its threads once a process, and they are as many as the processor has."""
-    code = (
-        "import torch, swiftwrf; from swiftwrf.rssi.head import Head; "
-        "Head(1, 2, 0).requires_grad_(False).draw(); print(torch.get_num_threads())"
-    )
+    code = "import torch; from swiftwrf.rasterize import prepare; prepare('cpu'); print(torch.get_num_threads())"
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True, check=True)
     assert done.stdout == "1\n"
@@ -185,33 +182,41 @@ def test_magnitude_has_no_gradient_at_zero():
     assert torch.equal(field.grad, torch.zeros_like(field))
 
 
-def test_who_is_timed_has_compiled_before():
+def test_prepared_backends_compile_nothing_more():
+    """So that measured times do not include a compilation."""
     code = """
-from augment import Settings as OfSynthesizers, make_synthesizer
-from swiftwrf import rssi_room, simulated_room
-from swiftwrf.rasterize import cpu
-from tasks.rssi.predictors import PREDICTORS, Settings
+import torch
+from swiftwrf.rasterize import cpu, prepare, rasterize
+from swiftwrf.testing.scenes import GRID, random_scene
 
-predictor = PREDICTORS["swiftwrf"].make(Settings())
-synthesizer = make_synthesizer("swiftwrf", OfSynthesizers(progress=False))
+prepare("cpu")
 print(len(cpu.render.signatures))
-room = simulated_room(n=30)
-predictor.fit(rssi_room(30)), synthesizer.fit(room)
-predictor.predict(room.position), synthesizer.synthesize(room.position)
+with torch.no_grad():
+    for per_position in (True, False):
+        mean, cholesky, weight = random_scene(per_position=per_position)
+        rasterize(mean[:1].expand_as(mean), cholesky, weight, GRID, cutoff=None)
 print(len(cpu.render.signatures))
 """
     done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True)
     assert done.stdout.split() == ["1", "1"]
 
 
+def test_default_fits_and_predictions_of_spectra_need_no_numba():
+    code = """
+import sys
+from swiftwrf import SwiftWRF, simulated_room
+
+room = simulated_room(n=30)
+SwiftWRF().fit(room).predict(room.position)
+print("numba" in sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True)
+    assert done.stdout.split() == ["False"]
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU's rasterizer speaks to torch's compiler")
 def test_importing_and_rendering_leave_torchs_compiler_alone():
-    """It would be a third of the seconds before a command says anything, and half of those of a small fit."""
-    code = (
-        "import sys, tasks.rssi.__main__\n"
-        "from swiftwrf.rasterize import prepare\n"
-        "prepare('cpu')\n"
-        "print('torch._dynamo' in sys.modules)"
-    )
+    """Importing it takes a third of the start of a command, and half the time of a small fit."""
+    code = "import sys\nfrom swiftwrf.rasterize import prepare\nprepare('cpu')\nprint('torch._dynamo' in sys.modules)"
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert child.stdout.strip() == "False"

@@ -200,6 +200,7 @@ def test_report_leaves_the_interrupted_work_of_others(finished, tmp_path):
     assert {file.name for file in tmp_path.iterdir()} == {"one", "long", "long.partial"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("task", "first", "second", "figures"),
     [("rssi", ("--rx", "1"), ("--rx", "2"), 6), ("aoa", ("--mix", 0.5), ("--mix", 0.5, "--repeats", 2), 4)],

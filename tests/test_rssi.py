@@ -33,7 +33,7 @@ def law_only(n=60, noise=0.0, level=-50.0, exponent=2.0, seed=0):
     position = torch.rand(n, 3, generator=generator, dtype=torch.float64) * torch.tensor([10.0, 10.0, 1.0])
     clean = level - 10 * exponent * torch.cdist(position, receiver).log10()
     rssi = clean + noise * torch.randn(n, 3, generator=generator)
-    return Rssi("law", ("a", "b", "c"), receiver, position, rssi, torch.arange(n))
+    return Rssi(rssi, position, receiver_position=receiver, receiver_names="abc", name="law")
 
 
 @pytest.mark.parametrize("name", [n for n in PREDICTORS if n.startswith(("mri", "gp"))])
@@ -47,14 +47,7 @@ def test_predictors_with_a_law_recover_it(name):
 
 def test_pooled_law_is_one_law():
     data = law_only()
-    shifted = Rssi(
-        "s",
-        data.receiver_names,
-        data.receiver_position,
-        data.transmitter_position,
-        data.rssi_dbm + torch.tensor([0.0, 3, 6]),
-        data.index,
-    )
+    shifted = replace(data, rssi_dbm=data.rssi_dbm + torch.tensor([0.0, 3, 6]))
     pooled = PREDICTORS["mri_pooled"].make(Settings())
     pooled.fit(shifted)
     place = torch.tensor([[5.0, 5.0, 2.0]], dtype=torch.float64)  # equally far from all receivers

@@ -36,10 +36,10 @@ def test_receivers_by_number_name_and_all(folder):
         data.receivers(["4"])
     every = data.receivers(["all"])
     assert every.receiver_names == ("a", "b")
-    assert every.notes == ("receivers heard in fewer than 10 rows are left out: c",)
+    assert every.notes == ("receivers that detected fewer than 10 rows are left out: c",)
     with pytest.raises(InputError, match=r"'c'.*5 rows"):
         data.receivers(["c"])
-    with pytest.raises(InputError, match="was heard in 10 rows"):
+    with pytest.raises(InputError, match="detected the transmitter in 10 rows"):
         data.columns([2]).receivers(["all"])
     with pytest.raises(InputError, match="once"):
         data.receivers(["a", "1"])

@@ -7,15 +7,15 @@ from dataclasses import replace
 import pytest
 import torch
 from scipy.optimize import minimize
+from swiftwrf.rssi.choose import mixing_weights
+from swiftwrf.rssi.law import Law, fit_law, harmonics, log_distance
+from swiftwrf.rssi.sites import gather
+from swiftwrf.rssi.solve import DIRECTIVITY_DB, LAW_DB, Group, solve
 
 from swiftwrf import InputError, Rssi, RssiConfig, fit_rssi, load, rssi_room
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi import fit as rssi_fit
-from swiftwrf.rssi.choose import mixing_weights
 from swiftwrf.rssi.head import Head, Table, pooled
-from swiftwrf.rssi.law import Law, fit_law, harmonics, log_distance
-from swiftwrf.rssi.sites import gather
-from swiftwrf.rssi.solve import DIRECTIVITY_DB, LAW_DB, Group, solve
 from swiftwrf.runtime.threads import threads_kept
 
 KERNEL = Kernel(long=4.0, short=1.0, share=0.6, noise=1.0)
@@ -30,7 +30,7 @@ def law_only(n=60, noise=0.0, level=-50.0, exponent=2.0, seed=0):
     position = torch.rand(n, 3, generator=generator, dtype=torch.float64) * torch.tensor([10.0, 10.0, 1.0])
     clean = level - 10 * exponent * log_distance(position, receiver)
     rssi = clean + noise * torch.randn(n, 3, generator=generator)
-    return Rssi("law", ("a", "b", "c"), receiver, position, rssi, torch.arange(n))
+    return Rssi(rssi, position, receiver_position=receiver, receiver_names="abc", name="law")
 
 
 def with_field(n=150, noise=0.5, seed=0):

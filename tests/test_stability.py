@@ -47,7 +47,7 @@ def test_what_is_not_finite_is_refused(name, value, backend):
     case = HARD_CASES["both sides of the seam"]
     inputs = dict(zip(("mean", "cholesky", "weight"), (x.clone() for x in case.inputs), strict=True))
     inputs[name].view(-1)[1] = value
-    with pytest.raises(InputError, match=f"{name} holds a value that is not finite"):
+    with pytest.raises(InputError, match=f"{name} contains a value that is not finite"):
         rasterize(**inputs, grid=case.grid, backend=backend)
 
 

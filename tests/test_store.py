@@ -12,20 +12,16 @@ import pytest
 import torch
 from PIL import Image
 
-from augment import SYNTHESIZERS, Settings
-from augment.synthesizers import gp as pixels
 from swiftwrf import AngularGrid, InputError, fit_coarray, load, load_spectra, positions, simulated_room
 from swiftwrf.data import store
 from swiftwrf.data.formats import nerf2
 from swiftwrf.data.spectra import check_training, fingerprint
 from swiftwrf.data.store import Store, stored
 from swiftwrf.data.writing import write_spectra
-from swiftwrf.gp import GaussianProcess, Kernel, NearbyProcess
-from swiftwrf.gp.pca import principal_components
+from swiftwrf.gp import principal_components, process
 from swiftwrf.metrics import psnr
-from swiftwrf.models import coarray
+from swiftwrf.models import coarray, idw, make_model
 from swiftwrf.models.geometry import fit_hybrid, hybrid
-from swiftwrf.models.swiftwrf import regression
 from swiftwrf.positions import distance, nearest
 
 N = 30
@@ -212,14 +208,14 @@ def test_what_is_not_finite_is_found_in_any_batch(cache):
 def test_sketched_components_are_the_exact_ones(generator):
     low = torch.randn(200, 12, generator=generator) * torch.logspace(1, -1, 12)
     rows = low @ torch.randn(12, 150, generator=generator) + 0.3
-    mean, score, component = principal_components(lambda: rows.split(64), rank=8, least=1e-6)
+    mean, score, component = principal_components(lambda: rows.split(64), rank=8, min_variance=1e-6)
     left = rows - rows.mean(dim=0)
     u, s, v = torch.linalg.svd(left, full_matrices=False)
     best = (u[:, :8] * s[:8]) @ v[:8]
     torch.testing.assert_close(mean, rows.mean(dim=0))
     torch.testing.assert_close(score.float() @ component, best, atol=2e-3, rtol=1e-3)
     torch.testing.assert_close(score.T @ score, torch.eye(8).double(), atol=1e-6, rtol=0)
-    assert len(principal_components(lambda: rows.split(64), rank=64, least=1e-6).component) == 12
+    assert len(principal_components(lambda: rows.split(64), rank=64, min_variance=1e-6).component) == 12
 
 
 def test_the_tree_finds_the_nearest(generator):
@@ -231,30 +227,24 @@ def test_the_tree_finds_the_nearest(generator):
     assert torch.equal(number, expected.indices)
 
 
-def test_a_process_of_neighbours_is_the_whole_one_where_they_are_all(generator):
-    kernel = Kernel(long=1.0, short=0.3, share=0.6, noise=1e-2)
-    known, asked = (torch.rand(n, 3, generator=generator, dtype=torch.float64) for n in (40, 6))
-    whole, near = GaussianProcess(kernel, known), NearbyProcess(kernel, known)
-    number, weight, variance = near.weights(asked)
-    torch.testing.assert_close(torch.zeros(6, 40).double().scatter(1, number, weight), whole.weights(asked))
-    torch.testing.assert_close(variance, whole.variance(asked))
-
-
 @pytest.fixture
 def exact(monkeypatch):
     """Sets from how many spectra on methods are no longer exact."""
 
     def to(n):
-        for module, name in ((coarray, "EXACT"), (pixels, "EXACT"), (regression, "EXACT"), (positions, "MANY")):
+        for module, name in (
+            (process, "MAX_EXACT"),
+            (coarray, "MAX_EXACT_ROWS"),
+            (idw, "MAX_CHOICE_SPECTRA"),
+            (positions, "MANY"),
+        ):
             monkeypatch.setattr(module, name, n)
 
     return to
 
 
 def fitted(name, train):
-    synthesizer = SYNTHESIZERS[name].make(Settings(progress=False))
-    synthesizer.fit(train)
-    return synthesizer
+    return make_model(name).fit(train)
 
 
 @pytest.mark.parametrize("name", ["gp", "coarray", "swiftwrf", "idw", "nearest"])
@@ -264,8 +254,8 @@ def test_what_is_not_exact_predicts_nearly_as_well(name, exact):
     score = []
     for n in (400, 240):
         exact(n)
-        synthesizer = fitted(name, train)
-        score.append(float(psnr(synthesizer.synthesize(test.position), test.spectrum).median()))
+        model = fitted(name, train)
+        score.append(float(psnr(model.synthesize(test.position), test.spectrum).median()))
     assert score[1] == pytest.approx(score[0], abs=0.5)
 
 
@@ -273,13 +263,12 @@ def test_what_is_not_exact_predicts_nearly_as_well(name, exact):
 def test_models_of_many_spectra_come_back_from_their_files(name, exact, tmp_path):
     data = simulated_room(n=400, grid=AngularGrid.hemisphere(8, 32))
     exact(240)
-    model = fitted(name, data).model
+    model = fitted(name, data)
     model.save(tmp_path / "model.safetensors")
     again, position = load(tmp_path / "model.safetensors"), data.position[::7] + 0.03
     torch.testing.assert_close(again.synthesize(position), model.synthesize(position), atol=0, rtol=0)
     if name == "swiftwrf":
-        for kept, own in zip(*(m.synthesize(position, return_std=True) for m in (again, model)), strict=True):
-            torch.testing.assert_close(kept, own, atol=0, rtol=0)
+        torch.testing.assert_close(again.predict(position).std, model.predict(position).std, atol=0, rtol=0)
 
 
 @pytest.mark.parametrize("name", ["gp", "coarray"])
@@ -289,16 +278,16 @@ def test_draws_scatter_as_those_of_the_exact_method(name, exact):
     scatter = []
     for n in (400, 240):
         exact(n)
-        synthesizer = fitted(name, train)
-        drawn = synthesizer.synthesize(test.position, torch.Generator().manual_seed(0))
-        scatter.append(float((drawn - synthesizer.synthesize(test.position)).std()))
+        model = fitted(name, train)
+        sample = model.sample(test.position, generator=torch.Generator().manual_seed(0))
+        scatter.append(float((sample - model.synthesize(test.position)).std()))
     assert scatter[1] == pytest.approx(scatter[0], rel=0.2)
 
 
 def test_inner_products_of_too_many_spectra_are_refused(room, monkeypatch):
-    monkeypatch.setattr(hybrid, "MOST", 39)
+    monkeypatch.setattr(hybrid, "MAX_SPECTRA", 39)
     with pytest.raises(InputError, match="at most 39"):
-        fit_hybrid(room, None)
+        fit_hybrid(room)
 
 
 def test_a_fit_is_the_same_in_memory_and_in_a_file(cache, monkeypatch):

@@ -102,7 +102,7 @@ def test_uji_indoor_loc(tmp_path):
     assert data.transmitter_position[2].tolist() == [-7539.2, 4864923.0, 8.0]
     assert data.rssi_dbm[1].isnan().tolist() == [False, True]
     notes = " ".join(data.notes)
-    assert "never heard are left out: 1" in notes
+    assert "never detected the transmitter are left out: 1" in notes
     assert "BUILDINGID, SPACEID, USERID" in notes
     assert "each floor of column FLOOR counts as 4 m" in notes
 
@@ -174,7 +174,7 @@ REFUSED = {
         "row 3, receiver a: 31 dBm",
     ),
     "no receiver": (_table("x,y,receiver,rssi", "1,2,a,-50", "1,2,,-50"), "row 2 has no receiver in column receiver"),
-    "never heard": (_table("x,y,a", "1,2,-100"), "no heard value"),
+    "never heard": (_table("x,y,a", "1,2,-100"), "no RSSI that a receiver detected"),
     "ragged": (lambda f: write_survey(f) and (f / "walk.csv").write_text("x,y,a\n1,2\n"), "has 2 values"),
     "no rows": (lambda f: write_survey(f) and (f / "walk.csv").write_text("x,y,a\n"), "no rows"),
     "two tables": (lambda f: (write_survey(f), write_survey(f, "b.csv")), "2 tables"),

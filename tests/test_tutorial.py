@@ -9,7 +9,8 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-from quick import PREDICTORS_KEPT, TASKS, QuickNetwork, glances
+from quick import PREDICTORS_KEPT, TASKS, QuickNetwork
+from small import glances
 
 from swiftwrf import RssiConfig
 from tasks.aoa.arms import NETWORK

@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import quick
+import small
 import torch
 from fuzz import kinds
 from PIL import Image
@@ -134,14 +135,14 @@ def saved(kind, folder, room) -> Path:
         if kind == "hybrid":
             model = fit_hybrid(room, model, progress=False)
         model.save(folder / "model")
-    elif kind in quick.PUBLISHED:
+    elif kind in small.PUBLISHED:
         kinds.model_published(kind, folder)
     else:
         getattr(kinds, f"model_{kind}")(folder)
     return folder / "model"
 
 
-@pytest.mark.parametrize("kind", ["swiftwrf", "coarray", "geometry", "hybrid", *quick.PUBLISHED])
+@pytest.mark.parametrize("kind", ["swiftwrf", "coarray", "geometry", "hybrid", *small.PUBLISHED])
 def test_a_model_by_itself(tmp_path, room, kind):
     view = open_source(saved(kind, tmp_path, room))
     shown = view.predict(view.models[0], view.start, dragging=True)
@@ -199,22 +200,22 @@ def test_maps_are_those_of_the_model(rssi_run):
     view = open_source(rssi_run)
     assert view.receivers == ("receiver01", "receiver06", "receiver12")
     assert view.floor.plan[1] == (0, 20, 0, 15)
-    maps = view.maps(1.2)
     i, j = 5, 17
-    at = torch.tensor([[maps.x[j], maps.y[i], 1.2]], dtype=torch.float64)
+    place = view.cells[0][j], view.cells[1][i]
+    at = torch.tensor([[*place, 1.2]], dtype=torch.float64)
     predicted = load(rssi_run / "model.safetensors").predict(at)
-    np.testing.assert_allclose(maps.rssi.mean[:, i, j], predicted.mean[0], atol=1e-3)
-    assert maps.best[i, j] == predicted.mean[0].argmax()
-    selection, place = MapSelection("RSSI", 1, 1.2), (maps.x[j], maps.y[i])
+    np.testing.assert_allclose(view.map(1.2).mean[:, i, j], predicted.mean[0], atol=1e-3)
+    selection = MapSelection("RSSI", 1, 1.2)
     for shown, expected in zip(view.at(selection, *place).interval(0.8), predicted.interval(0.8), strict=True):
         np.testing.assert_allclose(shown, expected[0])
-    assert f"receiver06: {predicted.mean[0, 1]:.1f} dBm" in view.describe(selection, *place)
-    assert f"best receiver: {view.receivers[maps.best[i, j]]}" in view.describe(selection, *place)
+    described = view.describe(selection, *place)
+    assert f"receiver06: {predicted.mean[0, 1]:.1f} dBm" in described
+    assert f"best receiver: {view.receivers[predicted.mean[0].argmax()]}" in described
 
 
 def test_certainty_is_that_of_the_interval(rssi_run):
     """90 % of a normal variable lie above the lower end of its 80 % interval, half above its mean."""
-    rssi = open_source(rssi_run).maps(1.2).rssi
+    rssi = open_source(rssi_run).map(1.2)
     for threshold, certainty in ((rssi.interval(0.8)[0], 0.9), (rssi.mean, 0.5)):
         selection = MapSelection("coverage", 0, 1.2, threshold)
         np.testing.assert_allclose(probability_above(rssi, selection), certainty, atol=1e-4)
@@ -222,15 +223,14 @@ def test_certainty_is_that_of_the_interval(rssi_run):
 
 def test_coverage_is_where_the_probability_is_high_enough(rssi_run):
     view = open_source(rssi_run)
-    maps = view.maps(1.2)
-    threshold = float(maps.rssi.interval(0.8)[0][2].median())
+    threshold = float(view.map(1.2).interval(0.8)[0][2].median())
     selection = MapSelection("coverage", 2, 1.2, threshold, 0.9)
     covered = np.isfinite(view.coloured(selection).values)
     assert covered.mean() == pytest.approx(0.5, abs=0.01)
     assert view.sentence(selection).startswith("50% of the map")
     for cells, sign in ((covered, 1), (~covered, -1)):
         i, j = np.argwhere(cells)[0]
-        above = float(probability_above(view.at(selection, maps.x[j], maps.y[i]), selection)[2])
+        above = float(probability_above(view.at(selection, view.cells[0][j], view.cells[1][i]), selection)[2])
         assert sign * above >= sign * 0.9 - 1e-3
 
 
@@ -239,11 +239,11 @@ def test_exports(rssi_run):
     for kind in view.kinds:
         assert Image.open(io.BytesIO(view.picture(MapSelection(kind, 1, 1.2)))).format == "PNG"
     table = pd.read_csv(io.StringIO(view.table(MapSelection("coverage", 1, 1.2, -70.0, 0.9))))
-    maps = view.maps(1.2)
-    assert len(table) == maps.best.size
-    np.testing.assert_allclose(table["predicted_dbm"], maps.rssi.mean[1].ravel(), atol=0.006)
-    low = maps.rssi.interval(0.8)[0][1].ravel()
-    np.testing.assert_array_equal(table["above_-70_dbm_with_90%"], low >= -70)
+    rssi = view.map(1.2)
+    assert len(table) == rssi.mean[0].numel()
+    np.testing.assert_allclose(table["predicted_dbm"], rssi.mean[1].flatten(), atol=0.006)
+    np.testing.assert_array_equal(table["above_-70_dbm_with_90%"], rssi.interval(0.8)[0][1].flatten() >= -70)
+    assert list(table["best_receiver"]) == [view.receivers[best] for best in rssi.mean.argmax(dim=0).flatten()]
 
 
 def test_one_receiver_has_no_best(rssi_run):

@@ -170,7 +170,11 @@ def test_page_of_rssi(browser, serve, rssi_run, tmp_path):
     told = until(lambda: "dBm" in said(browser, "here") and said(browser, "here"))
     pointer(browser).move_by_offset(-150, 60).perform()
     until(lambda: said(browser, "here") != told)
-    for kind, sentence in (("coverage", "% of the map"), ("best receiver", "hears best"), ("uncertainty", "interval")):
+    for kind, sentence in (
+        ("coverage", "% of the map"),
+        ("best receiver", "highest prediction"),
+        ("uncertainty", "interval"),
+    ):
         press(browser, kind)
         until(lambda sentence=sentence: sentence in said(browser, "sentence"))
     press(browser, "PNG")

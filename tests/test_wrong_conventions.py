@@ -12,12 +12,12 @@ from samples import FACING_X, snapshots, survey_rows, write_deepmimo, write_snap
 from scipy.spatial.transform import Rotation
 
 from swiftwrf import AngularGrid, InputError, load_rssi, load_snapshots, load_spectra, rssi_room
-from swiftwrf.data import Reading
+from swiftwrf.data import ReadOptions
 from swiftwrf.data.store import Store
 from tasks.inspect.findings import inspect
 
 GRID = AngularGrid.hemisphere(24, 96)
-HOW = Reading(grid=GRID)
+HOW = ReadOptions(grid=GRID)
 DATA = snapshots(n=150)
 SPECTRA = DATA.spectra(GRID)
 ROOM = rssi_room(n=300)
@@ -61,7 +61,7 @@ def shrunk(p):
     return p * 1000
 
 
-ALL_SHRUNK = replace(DATA, position=shrunk(DATA.position), array_position=shrunk(DATA.array_position))
+ALL_SHRUNK = replace(DATA, position=shrunk(DATA.position), fixed_position=shrunk(DATA.fixed_position))
 REPEATED = moved(lambda p: p.roll(1, 0).where(torch.arange(150)[:, None] == 3, p))
 FLIP_Y = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
 TURNED = oriented(FACING_X * Rotation.from_euler("x", 20, degrees=True))
@@ -107,7 +107,7 @@ def test_inspection_names_nothing_where_all_is_right(data):
 def test_inspection_names_a_sign_of_not_heard_that_is_not_known():
     rssi = ROOM.rssi_dbm.clone()
     rssi[torch.rand(rssi.shape, generator=torch.Generator().manual_seed(0)) < 0.3] = torch.nan
-    assert "does it mean not heard" in warnings(replace(ROOM, rssi_dbm=rssi.nan_to_num(-127.0)))
+    assert "does it mean not detected" in warnings(replace(ROOM, rssi_dbm=rssi.nan_to_num(-127.0)))
 
 
 def _deepmimo(**changes):

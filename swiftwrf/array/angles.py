@@ -23,7 +23,7 @@ MAX_GRID_PIXELS = 2**24  # of one spectrum
 
 @dataclass(frozen=True)
 class AngularGrid:
-    """Directions of the pixels of a spectrum: evenly spaced elevations (rows, lowest first) and azimuths (columns, periodic).
+    """Directions of the pixels of a spectrum: evenly spaced elevations (rows) and azimuths (columns, periodic).
 
     Args:
         elevation_start: Elevation of row 0 [rad].

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +16,6 @@ from swiftwrf.comparison.network import Frame, Network, draw_parameters
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
 from swiftwrf.models.swiftwrf.mlp import encode
-from swiftwrf.runtime.descent import Model
 from swiftwrf.runtime.validation import configuration
 
 MAX_HALVINGS = 4
@@ -130,7 +129,10 @@ class ConvolutionalNetwork(Network):
         return encode(self.frame(position), self.size.bands)
 
 
-class PairedTraining(Training[AnyConfig, Model]):
+AnyNetwork = TypeVar("AnyNetwork", bound=ConvolutionalNetwork)
+
+
+class PairedTraining(Training[AnyConfig, AnyNetwork]):
     """Training on pairs of spectrum and position.
 
     Args:
@@ -144,7 +146,7 @@ class PairedTraining(Training[AnyConfig, Model]):
     def __init__(
         self,
         config: AnyConfig,
-        network_type: type[Any],
+        network_type: type[AnyNetwork],
         train: Spectra,
         device: torch.device,
         betas: tuple[float, float] = (0.9, 0.99),

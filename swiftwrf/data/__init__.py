@@ -1,4 +1,4 @@
-"""Measurements: spectra, array snapshots and RSSI at known positions, their splits, their formats, and simulated rooms."""
+"""Measurements at known positions: spectra, array snapshots and RSSI, their splits, formats, and simulated rooms."""
 
 from __future__ import annotations
 
@@ -8,72 +8,83 @@ from pathlib import Path
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
-from swiftwrf.data.reading import Reading
+from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, ReadOptions, read
+from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
+from swiftwrf.runtime.validation import PositiveInt, checked
 
 
+@checked
 def load_spectra(
     path: str | Path,
     *,
     array: PlanarArray | None = None,
     beamformer: str | None = None,
     grid: AngularGrid | None = None,
-    every: int | None = None,
-    station: int | None = None,
+    every: PositiveInt | None = None,
+    station: PositiveInt | None = None,
 ) -> Spectra:
-    """Reads spectra in any format of docs/formats.md: images or arrays of spectra, ray paths, array snapshots.
+    """Read spectra in any format of docs/formats.md: images or arrays of spectra, ray paths, array snapshots.
 
     Args:
-        path: a folder or file.
-        array: that took the spectra where the files do not say, or that ray paths are computed for (4 x 4 elements at half
-            a wavelength unless given).
-        beamformer: that makes spectra of array snapshots: phase (unless given), bartlett or capon.
-        grid: directions of computed spectra; 90 x 360 unless given.
-        every: takes one measurement of so many.
-        station: which array of a file with several, counted from 1.
+        path: Folder or file.
+        array: Array of the spectra if the files do not describe it, or for which spectra of ray paths are computed. Defaults
+            to 4 x 4 elements at half a wavelength.
+        beamformer: Beamformer for array snapshots: phase (default), bartlett or capon.
+        grid: Directions of computed spectra. Defaults to 90 x 360.
+        every: Reads one measurement of that many.
+        station: Number of the array in a file with several, counted from 1.
 
     Raises:
-        InputError: what is missing, does not fit together or is not what the layout says; an argument that does not apply.
+        InputError: A part that is missing or invalid, parts that do not match, or an argument that does not apply.
+
+    Example:
+        >>> load_spectra("nowhere")
+        Traceback (most recent call last):
+        swiftwrf.errors.InputError: nowhere is not a folder or file; expected measurements (formats: ...)
     """
-    return read_spectra(path, Reading(array, beamformer, grid, every, station))
+    return read_spectra(path, ReadOptions(array, beamformer, grid, every, station))
 
 
-def read_spectra(path: str | Path, how: Reading) -> Spectra:
-    """`load_spectra` with its arguments in one.
+def read_spectra(path: str | Path, options: ReadOptions) -> Spectra:
+    """Read spectra as `load_spectra`, with its arguments in one object.
 
     Raises:
-        InputError: as `load_spectra`.
+        InputError: As `load_spectra`.
     """
-    data = read(path, how, SPECTRA_FORMATS, SNAPSHOT_FORMATS)
-    return data.spectra(how.grid, how.beamformer or PHASE) if isinstance(data, Snapshots) else data
+    data = read(path, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS)
+    return data.spectra(options.grid, options.beamformer or PHASE) if isinstance(data, Snapshots) else data
 
 
-def load_snapshots(path: str | Path, *, every: int | None = None, station: int | None = None) -> Snapshots:
-    """Reads array snapshots; arguments as of `load_spectra`.
+@checked
+def load_snapshots(
+    path: str | Path, *, every: PositiveInt | None = None, station: PositiveInt | None = None
+) -> Snapshots:
+    """Read array snapshots, with arguments as in `load_spectra`.
 
     Raises:
-        InputError: as `load_spectra`.
+        InputError: As `load_spectra`.
     """
-    data: Snapshots = read(path, Reading(every=every, station=station), SNAPSHOT_FORMATS)
+    data: Snapshots = read(path, ReadOptions(every=every, station=station), SNAPSHOT_FORMATS)
     return data
 
 
+@checked
 def load_rssi(path: str | Path, *, columns: Mapping[str, str] | None = None) -> Rssi:
-    """Reads RSSI in any format of docs/formats.md: the NeRF2 layout, or a survey table (CSV, Parquet).
+    """Read RSSI in any format of docs/formats.md: the NeRF2 layout, or a survey table (CSV, Parquet).
 
     Args:
-        path: a folder or file.
-        columns: what the columns of a table are called there, where their names are not recognised, by what they hold: x,
-            y, z, time, receiver, rssi.
+        path: Folder or file.
+        columns: Names of columns of a table that are not recognised, by role: x, y, z, time, receiver, rssi.
 
     Raises:
-        InputError: what is missing, does not fit together or is not what the layout says; an argument that does not apply.
+        InputError: A part that is missing or invalid, parts that do not match, or an argument that does not apply.
     """
-    data: Rssi = read(path, Reading(columns=columns), RSSI_FORMATS)
+    data: Rssi = read(path, ReadOptions(columns=columns), RSSI_FORMATS)
     return data
 
 
-__all__ = ["Reading", "Rssi", "Snapshots", "Spectra", "load_rssi", "load_snapshots", "load_spectra", "read_spectra"]
+__all__ = ["PropagationPaths", "ReadOptions", "Rssi", "Snapshots", "Spectra"]
+__all__ += ["load_rssi", "load_snapshots", "load_spectra", "read_spectra"]

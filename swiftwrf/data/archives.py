@@ -1,4 +1,4 @@
-"""Arrays in files of others: npy files, npz archives and HDF5, never pickled, their sizes checked before memory is taken."""
+"""Arrays in npy files, npz archives and HDF5: never unpickled, with sizes checked before memory is allocated."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from swiftwrf.errors import InputError
 
-MOST_BYTES, MOST_STORED = 2**30, 2**33  # unpacked, and as they lie in the file
-MOST_IN_ROWS = 2**36  # as they lie in a file that is read some rows at a time
+MAX_UNPACKED_BYTES, MAX_STORED_BYTES = 2**30, 2**33  # of arrays that are compressed, and not
+MAX_ROWS_BYTES = 2**36  # of an array that is read some rows at a time
 NUMPY, HDF5 = (".npz",), (".h5", ".hdf5")
 ARCHIVES = (*NUMPY, *HDF5)  # suffixes of files that hold arrays by name
 Arrays = dict[str, NDArray[Any]]
 
-# what zipfile, zlib, NumPy and h5py raise on broken files
+# exceptions of zipfile, zlib, NumPy, h5py and Pillow on broken files
 BROKEN = (
     OSError,
     EOFError,
@@ -46,13 +46,13 @@ BROKEN = (
 
 
 def array_names(file: Path) -> set[str]:
-    """Names of the arrays in an npz archive or HDF5 file; none where it is no such file."""
+    """Return the names of the arrays in an npz archive or HDF5 file, none if it is no such file."""
     try:
         if file.suffix in HDF5:
             with _hdf5(file) as content:
                 return set(content)
         with zipfile.ZipFile(file) as archive:
-            return {name.removesuffix(".npy") for name in archive.namelist()}
+            return _stored(archive)
     except InputError:
         raise
     except BROKEN:
@@ -60,11 +60,11 @@ def array_names(file: Path) -> set[str]:
 
 
 def read_arrays(file: Path, needed: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
-    """Arrays of numbers from an npz archive or HDF5 file.
+    """Return arrays of numbers from an npz archive or HDF5 file.
 
     Raises:
-        InputError: no such file, one that is broken, an array that is missing or holds something else than numbers, or
-            more than a gigabyte that the file itself does not have.
+        InputError: No such file, a broken one, an array that is missing or holds no numbers, or one that unpacks to more
+            than 1 GiB from a smaller file.
     """
     if not file.is_file():
         raise InputError(f"{file} is missing")
@@ -74,18 +74,17 @@ def read_arrays(file: Path, needed: Sequence[str], optional: Sequence[str] = ())
                 names = _choose(file, set(content), needed, optional)
                 return _read_hdf5(content, names, file)
         with zipfile.ZipFile(file) as archive:
-            stored = {name.removesuffix(".npy") for name in archive.namelist()}
-            names = _choose(file, stored, needed, optional)
+            names = _choose(file, _stored(archive), needed, optional)
             members = {name: archive.getinfo(f"{name}.npy") for name in names}
             _check_total(sum(member.file_size for member in members.values()), file)
             return {name: _read_member(archive, member) for name, member in members.items()}
 
 
 def array_header(file: Path, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type of the array in an npy file, or of the array of that name in an npz archive.
+    """Return shape and type of the array in an npy file, or of the array of that name in an npz archive.
 
     Raises:
-        InputError: as `read_rows`.
+        InputError: As `read_rows`.
     """
     with _opened(file, name) as (stream, size):
         shape, _, dtype = _header(stream, name, size)
@@ -93,14 +92,14 @@ def array_header(file: Path, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]
 
 
 def read_rows(file: Path, name: str, rows: int) -> Iterator[NDArray[Any]]:
-    """The same array, so many rows at a time.
+    """Yield the array of `array_header`, at most `rows` rows at a time.
 
     Raises:
-        InputError: no such file, one that is broken or holds something else than numbers, or more than 64 gigabytes.
+        InputError: No such file, one that is broken or holds no numbers, or more than 64 GiB.
     """
     with _opened(file, name) as (stream, size):
         shape, by_columns, dtype = _header(stream, name, size)
-        if by_columns:  # no row lies in one piece
+        if by_columns:  # rows are not contiguous
             _check_total(size, file)
             yield np.frombuffer(stream.read(), dtype).reshape(shape, order="F")
             return
@@ -112,25 +111,25 @@ def read_rows(file: Path, name: str, rows: int) -> Iterator[NDArray[Any]]:
 
 @contextmanager
 def _opened(file: Path, name: str) -> Iterator[tuple[Any, int]]:
-    """A stream of an npy file or of a member of an npz archive, and its length."""
+    """Open an npy file or a member of an npz archive; yield the stream and its length."""
     if not file.is_file():
         raise InputError(f"{file} is missing")
     if file.suffix not in NUMPY:
         with refusing_broken(file, "an npy file"), file.open("rb") as stream:
-            _check_total(file.stat().st_size, file, MOST_IN_ROWS)
+            _check_total(file.stat().st_size, file, MAX_ROWS_BYTES)
             yield stream, file.stat().st_size
         return
     with refusing_broken(file, "an npz archive"), zipfile.ZipFile(file) as archive:
-        _choose(file, {member.removesuffix(".npy") for member in archive.namelist()}, [name], ())
+        _choose(file, _stored(archive), [name], ())
         member = archive.getinfo(f"{name}.npy")
-        _check_total(member.file_size, file, MOST_IN_ROWS)
+        _check_total(member.file_size, file, MAX_ROWS_BYTES)
         with archive.open(member) as stream:
             yield stream, member.file_size
 
 
 @contextmanager
 def refusing_broken(file: Path, kind: str) -> Iterator[None]:
-    """Says in a sentence that a file is not what its name promises."""
+    """Turn exceptions on a broken file into an InputError that names the file and its expected kind."""
     try:
         yield
     except InputError as error:
@@ -146,26 +145,25 @@ def _choose(file: Path, stored: set[str], needed: Sequence[str], optional: Seque
     return [*needed, *(name for name in optional if name in stored)]
 
 
-def _check_total(total: int, file: Path, most: int = MOST_STORED) -> None:
-    """Refuses what unpacks to far more than the file has, and what fills any memory."""
-    most = max(MOST_BYTES, min(file.stat().st_size, most))
+def _check_total(total: int, file: Path, most: int = MAX_STORED_BYTES) -> None:
+    """Refuse arrays that unpack to far more than the size of the file, or exceed any memory."""
+    most = max(MAX_UNPACKED_BYTES, min(file.stat().st_size, most))
     if total > most:
         raise InputError(f"it unpacks to {total} bytes; at most {most} are read, so split the data")
 
 
+def _stored(archive: zipfile.ZipFile) -> set[str]:
+    return {name.removesuffix(".npy") for name in archive.namelist()}
+
+
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
     with archive.open(member) as stream:
-        return _read_stream(stream, member.filename, member.file_size)
-
-
-def _read_stream(stream: Any, name: str, size: int) -> NDArray[Any]:
-    """One array."""
-    shape, by_columns, dtype = _header(stream, name, size)
-    return np.frombuffer(stream.read(), dtype).reshape(shape, order="F" if by_columns else "C")
+        shape, by_columns, dtype = _header(stream, member.filename, member.file_size)
+        return np.frombuffer(stream.read(), dtype).reshape(shape, order="F" if by_columns else "C")
 
 
 def _header(stream: Any, name: str, size: int) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, order and type of an array; what its header claims must lie behind it before memory is taken for it."""
+    """Return shape, order and type of an array, once the stream is as long as the header claims."""
     readers = {(1, 0): read_array_header_1_0, (2, 0): read_array_header_2_0}
     shape, by_columns, dtype = readers[read_magic(stream)](stream)
     if dtype.kind not in "biufc":
@@ -186,7 +184,7 @@ def _hdf5(file: Path) -> Any:
 
 
 def _read_hdf5(content: Any, names: Sequence[str], file: Path) -> Arrays:
-    """Datasets of an HDF5 file; none may lie in another file, which HDF5 would open without a word."""
+    """Return datasets of an HDF5 file. Links to other files are refused, because HDF5 follows them silently."""
     import h5py
 
     for name in names:

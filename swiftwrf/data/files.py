@@ -1,4 +1,4 @@
-"""Files as they come from the field: read without running code, refused with a sentence that names file and row."""
+"""Text files of measurements: read without running code, refused in one sentence that names file and row."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from torch import Tensor
 
 from swiftwrf.errors import InputError
 
-MOST_BYTES = 2**28  # of a text file: a million rows of positions take a tenth of it
-FARTHEST = 1e9  # [m] from the origin: beyond, float64 no longer keeps a wavelength apart
+MAX_TEXT_BYTES = 2**28  # a million rows of positions take a tenth of it
+MAX_COORDINATE_M = 1e9  # beyond, float64 does not resolve a wavelength
 CARRIERS_HZ = (1e6, 1e13)
 DECIMAL_COMMA = re.compile(r"^(\s*[+-]?\d+),(\d+\s*)$")
 PLAIN_TAGS = {
@@ -29,19 +29,29 @@ PLAIN_TAGS = {
 
 
 def sha256(file: Path) -> str:
-    """Hex digest of a file's bytes, which may be more than fit into memory."""
+    """Return the hex digest of a file, which may be larger than the memory.
+
+    Raises:
+        InputError: The file is missing or may not be read.
+    """
     with _refusing_unreadable(file), file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def sha256_of_all(digests: Iterable[tuple[str, str]]) -> str:
-    """One digest for many files, of their names and digests."""
+    """Return one digest for many files, from pairs of their names and digests."""
     return hashlib.sha256("".join(f"{digest}  {name}\n" for name, digest in digests).encode()).hexdigest()
+
+
+def digests(files: Iterable[Path], split_folder: Path | None = None) -> dict[str, str]:
+    """Return sha256 by name of the given files, and of all split files in a folder."""
+    splits = sorted(split_folder.glob("*_index*.txt")) if split_folder else []
+    return {file.name: sha256(file) for file in [*files, *splits]}
 
 
 @contextmanager
 def _refusing_unreadable(file: Path) -> Iterator[None]:
-    """Says in a sentence that a file is not there or may not be read."""
+    """Raise InputError if a file is missing or may not be read."""
     if not file.is_file():
         raise InputError(f"{file} is missing")
     try:
@@ -52,23 +62,23 @@ def _refusing_unreadable(file: Path) -> Iterator[None]:
 
 
 def read_bytes(file: Path) -> bytes:
-    """The content of a file.
+    """Return the content of a file.
 
     Raises:
-        InputError: it is not there or may not be read.
+        InputError: The file is missing or may not be read.
     """
     with _refusing_unreadable(file):
         return file.read_bytes()
 
 
 def read_text(file: Path) -> str:
-    """A text in UTF-8, with or without a byte-order mark.
+    """Return a text in UTF-8, with or without a byte-order mark.
 
     Raises:
-        InputError: no such file, one too large, or another encoding.
+        InputError: The file is missing, larger than 256 MiB, or in another encoding.
     """
-    if file.is_file() and file.stat().st_size > MOST_BYTES:
-        raise InputError(f"{file} has {file.stat().st_size} bytes; a table or list has at most {MOST_BYTES}")
+    if file.is_file() and file.stat().st_size > MAX_TEXT_BYTES:
+        raise InputError(f"{file} has {file.stat().st_size} bytes; a table or list has at most {MAX_TEXT_BYTES}")
     try:
         text = read_bytes(file).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -79,7 +89,7 @@ def read_text(file: Path) -> str:
 
 
 def number(text: object) -> float:
-    """The number that a text says, nan where it says none: Python also takes 1_0 for 10."""
+    """Return the number in a text, nan if there is none. Unlike Python's float, it refuses 1_0."""
     try:
         return float(text) if isinstance(text, str) and "_" not in text else math.nan
     except ValueError:
@@ -87,11 +97,10 @@ def number(text: object) -> float:
 
 
 def read_yaml(file: Path) -> dict[str, Any]:
-    """A YAML mapping; all that is no list or mapping is text, so that names are names whatever they look like and nothing
-    is read as a date.
+    """Return a YAML mapping. Scalars stay text, so that a name such as `NA` or `2001-01-01` stays a name.
 
     Raises:
-        InputError: no such file, not YAML, not a mapping, a name twice, or a tag (YAML's way to make objects).
+        InputError: No such file, not YAML, not a mapping, a name twice, or a tag (YAML's way to create objects).
     """
     text = read_text(file)
     try:
@@ -104,8 +113,8 @@ def read_yaml(file: Path) -> dict[str, Any]:
 
 
 def _plain(node: yaml.Node | None, done: dict[int, Any]) -> Any:
-    """The text, list or mapping that a node describes; what is referred to twice is built once, or lists of references to
-    lists of references would grow without bound."""
+    """Return the text, list or mapping of a node. Nodes referred to twice are built once, because nested references would
+    grow without bound."""
     if node is None or id(node) in done:
         return done.get(id(node))
     if node.tag not in PLAIN_TAGS:
@@ -126,20 +135,21 @@ def _plain(node: yaml.Node | None, done: dict[int, Any]) -> Any:
 
 
 def numbers(value: Any, count: int) -> tuple[float, ...] | None:
-    """So many finite numbers from a list of `read_yaml`; None where it is something else."""
+    """Return `count` finite numbers from a list of `read_yaml`, None if it is something else."""
     found = tuple(number(item) for item in value) if isinstance(value, list) and len(value) == count else (math.nan,)
     return found if all(map(math.isfinite, found)) else None
 
 
 def read_cells(file: Path, separators: str = ",") -> tuple[list[str], list[list[str]]]:
-    """Header and rows of a table, as text.
+    """Return header and rows of a table, as text.
 
     Args:
-        file: with one row a line and values between separators.
-        separators: of these, the one that the header has most of; numbers may have a decimal comma if it is another.
+        file: One row a line, with separators between values.
+        separators: Possible separators; the most frequent one in the header counts. Numbers may have a decimal comma if it
+            is not the comma.
 
     Raises:
-        InputError: no such file, a column without name or a name twice, rows of unequal length, no rows.
+        InputError: No such file, a column without name or a name twice, rows of unequal length, no rows.
     """
     text = read_text(file)
     first = text.split("\n", 1)[0]
@@ -168,10 +178,10 @@ def read_cells(file: Path, separators: str = ",") -> tuple[list[str], list[list[
 
 
 def read_table(file: Path, columns: list[str] | None = None) -> tuple[list[str], Tensor]:
-    """Header and numbers of a comma-separated file, float64 (rows, columns); numbers may be nan.
+    """Return header and numbers of a comma-separated file, float64 (rows, columns). Numbers may be nan.
 
     Raises:
-        InputError: as `read_cells`, another header than `columns`, text in a number's place.
+        InputError: As `read_cells`, another header than `columns`, or text in place of a number.
     """
     header, rows = read_cells(file)
     if columns is not None and header != columns:
@@ -179,35 +189,34 @@ def read_table(file: Path, columns: list[str] | None = None) -> tuple[list[str],
     values = np.empty((len(rows), len(header)))
     for row, line in enumerate(rows, start=1):
         try:
-            values[row - 1] = [float(text) for text in line]
+            values[row - 1] = [float(text.replace("_", "x")) for text in line]  # float accepts 1_0
         except ValueError:
             raise InputError(f"{file} row {row} holds text where a number is expected: {','.join(line)}") from None
-        if any("_" in text for text in line):  # Python takes 1_0 for 10
-            raise InputError(f"{file} row {row} holds text where a number is expected: {','.join(line)}")
     return header, torch.from_numpy(values)
 
 
 def read_positions(file: Path) -> Tensor:
-    """Positions, float64 (n, 3) [m], of a file with the header x,y,z.
+    """Return the positions in a file with the header x,y,z, float64 (n, 3) [m].
 
     Raises:
-        InputError: as `read_table`, or a position that is not finite or too far away.
+        InputError: As `read_table`, or a coordinate that is not finite or beyond 1e9 m.
     """
     _, position = read_table(file, ["x", "y", "z"])
-    bad = (~(position.abs() <= FARTHEST)).any(dim=1).nonzero()  # nan compares false, so it is bad too
+    bad = (~(position.abs() <= MAX_COORDINATE_M)).any(dim=1).nonzero()  # nan compares false, so it is bad too
     if len(bad):
         row = int(bad[0])
         raise InputError(
-            f"{file} row {row + 1} is {position[row].tolist()}; positions must be finite numbers [m], at most {FARTHEST:g}"
+            f"{file} row {row + 1} is {position[row].tolist()}; positions must be finite numbers [m], at most "
+            f"{MAX_COORDINATE_M:g}"
         )
     return position
 
 
 def check_carrier(file: Path, frequency_hz: float) -> None:
-    """Refuses what is no carrier in Hz.
+    """Refuse a value that is no carrier in Hz.
 
     Raises:
-        InputError: below 1 MHz, above 10 THz, or not finite.
+        InputError: Below 1 MHz, above 10 THz, or not finite.
     """
     low, high = CARRIERS_HZ
     if not low <= frequency_hz <= high:

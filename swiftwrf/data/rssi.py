@@ -2,102 +2,165 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
+import numpy as np
+import pandas as pd
+import torch
 from torch import Tensor
 
-from swiftwrf.data.splits import MIN_TRAINING, choose_split
+from swiftwrf.data.dataset import Numbers, PositionedData, Splits, to_positions
+from swiftwrf.data.splits import MIN_TRAINING
+from swiftwrf.data.survey import read_survey
 from swiftwrf.errors import InputError, listed
 
 
-@dataclass(frozen=True, eq=False)
-class Rssi:
-    """RSSI of a moving transmitter at fixed receivers.
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class Rssi(PositionedData):
+    """RSSI of a moving transmitter at R fixed receivers.
 
     Args:
-        name: of the data set.
-        receiver_names: R names, in file order.
-        receiver_position: float64 (R, 3) [m]; nan where it is unknown, for all receivers or none.
-        transmitter_position: float64 (n, 3) [m].
-        rssi_dbm: float64 (n, R) [dBm], nan where the receiver did not hear the transmitter.
-        index: number of each row in the data set, counted from 0, int64 (n,).
-        named_splits: training and test rows of the splits that came with the data.
-        source: sha256 of each file that says what the data are, by file name.
-        notes: what the reader found or did that a user should know, a sentence each.
+        rssi_dbm: RSSI, (n, R) [dBm], nan where a receiver did not detect the transmitter.
+        transmitter_position: Positions of the transmitter, (n, 3) [m].
+        receiver_position: Positions of the receivers, (R, 3) [m]. Defaults to nan for all, which stands for unknown.
+        receiver_names: Names of the receivers. Defaults to receiver1, receiver2, ...
+        name: Name of the data set.
+        index, named_splits, source, notes: As attributes of `PositionedData`.
+
+    Raises:
+        InputError: A length that does not match, an infinite number, or positions of some receivers only.
+
+    Example:
+        >>> data = Rssi([[-60.0, float("nan")]] * 20, torch.rand(20, 3), receiver_names=["hall", "office"])
+        >>> data
+        <Rssi 'rssi': 20 rows at 2 receivers, 50% detected, positions over ... m>
     """
 
-    name: str
-    receiver_names: tuple[str, ...]
-    receiver_position: Tensor
-    transmitter_position: Tensor
     rssi_dbm: Tensor
-    index: Tensor
-    named_splits: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
-    source: dict[str, str] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    transmitter_position: Tensor
+    receiver_position: Tensor
+    receiver_names: tuple[str, ...]
 
-    def __len__(self) -> int:
-        return len(self.transmitter_position)
+    row_fields: ClassVar[tuple[str, ...]] = ("transmitter_position", "rssi_dbm", "index")
+
+    def __init__(
+        self,
+        rssi_dbm: Numbers,
+        transmitter_position: Numbers,
+        *,
+        receiver_position: Numbers | None = None,
+        receiver_names: Sequence[str] | None = None,
+        name: str = "rssi",
+        index: Numbers | None = None,
+        named_splits: Splits | None = None,
+        source: Mapping[str, str] | None = None,
+        notes: tuple[str, ...] = (),
+    ) -> None:
+        position = to_positions("transmitter_position", transmitter_position)
+        rssi = rssi_dbm if isinstance(rssi_dbm, Tensor) else torch.from_numpy(np.array(rssi_dbm, dtype=np.float64))
+        if rssi.dim() != 2:
+            raise InputError(f"rssi_dbm must have shape (n, receivers), got {tuple(rssi.shape)}")
+        if bool(rssi.isinf().any()):
+            raise InputError(f"{name}: RSSI must be finite [dBm], or nan where a receiver detected nothing")
+        count = rssi.shape[1]
+        names = tuple(receiver_names or (f"receiver{number}" for number in range(1, count + 1)))
+        if len(names) != count or len(set(names)) < count:
+            raise InputError(
+                f"{name} has {count} receivers, but the names {listed(names)}; give each receiver one of its own"
+            )
+        places = torch.full((count, 3), torch.nan, dtype=torch.float64)
+        if receiver_position is not None:
+            places = torch.as_tensor(receiver_position, dtype=torch.float64)
+        if places.shape != (count, 3) or not (bool(places.isfinite().all()) or bool(places.isnan().all())):
+            raise InputError(
+                f"receiver_position must hold ({count}, 3) finite numbers [m], or nan for all receivers, got shape "
+                f"{tuple(places.shape)}"
+            )
+        super().__init__(
+            name, index, named_splits, source, notes,
+            rssi_dbm=rssi.double(), transmitter_position=position, receiver_position=places, receiver_names=names,
+        )  # fmt: skip
+
+    @classmethod
+    def from_frame(
+        cls,
+        frame: pd.DataFrame,
+        *,
+        columns: Mapping[str, str] | None = None,
+        receiver_position: Mapping[str, Sequence[float]] | None = None,
+        name: str = "rssi",
+    ) -> Rssi:
+        """Return the RSSI of a table: one column a receiver (wide) or one row a packet (long).
+
+        Args:
+            frame: Columns of positions [m] and RSSI [dBm], recognised by their names as in docs/formats.md.
+            columns: Names of columns that are not recognised, by role: x, y, z, time, receiver, rssi.
+            receiver_position: Positions [m] by name of the receiver.
+            name: Name of the data set.
+
+        Raises:
+            InputError: A column that is missing or ambiguous, a value that is no position or received power, or a receiver
+                without a position.
+
+        Example:
+            >>> Rssi.from_frame(pd.DataFrame({"x": [0, 1], "y": [0, 1], "z": [1, 1], "hall": [-50, -60]})).receiver_names
+            ('hall',)
+        """
+        names, rssi, position, notes = read_survey("the table", frame, columns or {})
+        if receiver_position is not None and (missing := [r for r in names if r not in receiver_position]):
+            raise InputError(f"receiver_position lacks {listed(missing)}")
+        places = None if receiver_position is None else [list(receiver_position[receiver]) for receiver in names]
+        return cls(rssi, position, receiver_position=places, receiver_names=names, name=name, notes=notes)
 
     @property
     def located(self) -> bool:
-        """Whether the positions of the receivers are known."""
+        """True if the positions of the receivers are known."""
         return bool(self.receiver_position.isfinite().all())
 
-    def subset(self, rows: Tensor) -> Rssi:
-        """The given rows, in the given order; splits named for the whole set are dropped."""
-        return replace(
-            self,
-            transmitter_position=self.transmitter_position[rows],
-            rssi_dbm=self.rssi_dbm[rows],
-            index=self.index[rows],
-            named_splits={},
-        )
-
-    def split(self, name: str = "random", seed: int = 0) -> tuple[Rssi, Rssi]:
-        """Training and test part: a split that came with the data, or a seeded `random` or `block` one.
-
-        Raises:
-            InputError: an unknown name; fewer than 10 training rows.
-        """
-        train, test = choose_split(name, seed, self.transmitter_position, self.named_splits, self.name)
-        return self.subset(train), self.subset(test)
+    @property
+    def detected(self) -> Tensor:
+        """Whether a receiver detected the transmitter, bool (n, R)."""
+        return ~self.rssi_dbm.isnan()
 
     def receivers(self, asked: Sequence[str]) -> Rssi:
-        """Only the receivers asked for: names, numbers counted from 1 in file order, or `all`, which leaves out those that
-        were heard in fewer than 10 rows and says so in `notes`.
+        """Return the data of some receivers.
+
+        Args:
+            asked: Names, numbers counted from 1 in file order, or "all", which omits receivers that detected the transmitter
+                in fewer than 10 rows and adds a note.
 
         Raises:
-            InputError: a receiver that there is not, one asked for twice, or one heard in fewer than 10 rows.
+            InputError: An unknown receiver, one asked for twice, or one that detected the transmitter in fewer than 10 rows.
         """
         if list(asked) == ["all"]:
-            return self._heard_enough()
+            return self._detected_enough()
         columns = [self._column(a) for a in asked]
         if not columns or len(set(columns)) < len(columns):
             raise InputError(f"ask for each receiver once, got {' '.join(asked) or 'none'}")
         for column in columns:
-            heard = int((~self.rssi_dbm[:, column].isnan()).sum())
-            if heard < MIN_TRAINING:
+            count = int(self.detected[:, column].sum())
+            if count < MIN_TRAINING:
                 raise InputError(
-                    f"receiver {self.receiver_names[column]!r} of {self.name} was heard in {heard} rows; "
+                    f"receiver {self.receiver_names[column]!r} of {self.name} detected the transmitter in {count} rows; "
                     f"at least {MIN_TRAINING} are needed"
                 )
         return self.columns(columns)
 
-    def _heard_enough(self) -> Rssi:
-        enough = (~self.rssi_dbm.isnan()).sum(dim=0) >= MIN_TRAINING
+    def _detected_enough(self) -> Rssi:
+        enough = self.detected.sum(dim=0) >= MIN_TRAINING
         if not bool(enough.any()):
-            raise InputError(f"no receiver of {self.name} was heard in {MIN_TRAINING} rows")
+            raise InputError(f"no receiver of {self.name} detected the transmitter in {MIN_TRAINING} rows")
         found = self.columns(enough.nonzero()[:, 0].tolist())
-        rare = [name for name, heard in zip(self.receiver_names, enough.tolist(), strict=True) if not heard]
+        rare = [name for name, is_enough in zip(self.receiver_names, enough.tolist(), strict=True) if not is_enough]
         if not rare:
             return found
-        note = f"receivers heard in fewer than {MIN_TRAINING} rows are left out: {listed(rare)}"
+        note = f"receivers that detected fewer than {MIN_TRAINING} rows are left out: {listed(rare)}"
         return replace(found, notes=(*found.notes, note))
 
     def columns(self, columns: list[int]) -> Rssi:
-        """The receivers of these columns, in this order."""
+        """Return the data of the receivers of these columns, in this order."""
         return replace(
             self,
             receiver_names=tuple(self.receiver_names[c] for c in columns),
@@ -110,5 +173,12 @@ class Rssi:
             return self.receiver_names.index(asked)
         if asked.isdecimal() and 1 <= int(asked) <= len(self.receiver_names):
             return int(asked) - 1
-        listed = ", ".join(f"{i} {name}" for i, name in enumerate(self.receiver_names, start=1))
-        raise InputError(f"{self.name} has no receiver {asked!r}; there are {listed}")
+        known = ", ".join(f"{i} {name}" for i, name in enumerate(self.receiver_names, start=1))
+        raise InputError(f"{self.name} has no receiver {asked!r}; there are {known}")
+
+    def _columns(self) -> dict[str, Any]:
+        return dict(zip(self.receiver_names, self.rssi_dbm.numpy().T, strict=True))
+
+    def _summary(self) -> str:
+        share = float(self.detected.double().mean()) if len(self) else 0.0
+        return f"{len(self)} rows at {len(self.receiver_names)} receivers, {share:.0%} detected"

@@ -1,124 +1,143 @@
-"""What an antenna array heard, element by element, from known positions: channel state information or IQ samples."""
+"""Array snapshots: the channel of each antenna element at known positions (channel state information or IQ samples)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from swiftwrf.array.angles import AngularGrid, to_angles
+from swiftwrf.array.angles import AngularGrid, ArrayPose
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data.dataset import Numbers, PositionedData, Splits, to_positions, to_tensor
 from swiftwrf.data.spectra import GRID, Spectra, array_spectra, check_pixels
-from swiftwrf.data.splits import choose_split
 from swiftwrf.errors import InputError
 
-SPACING = (0.01, 20.0)  # [wavelengths] between neighbours: beyond, positions are in another unit than metres
+SPACING_WAVELENGTHS = (0.01, 20.0)  # of neighbouring elements: beyond, positions are in another unit than metres
 
 
-@dataclass(frozen=True, eq=False)
-class Snapshots:
-    """Complex channels at a fixed array, and where the transmitter stood when each was taken.
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class Snapshots(PositionedData):
+    """Complex channels of a fixed array for n positions of the transmitter.
 
     Args:
-        name: of the data set.
-        channel: of each element in several snapshots (subcarriers or packets), complex64 (n, S, K).
-        position: of the transmitter, float64 (n, 3) [m].
-        array: K elements and the carrier's wavelength.
-        array_position: of the origin of the elements' coordinates, float64 (3,) [m].
-        rotation: turns array into world coordinates, float64 (3, 3).
-        line_of_sight: whether the direct path is free, bool (n,); where it is unknown it is taken to be.
-        index: number of each row in the data set it comes from, counted from 0, int64 (n,).
-        time: of each row [s], float64 (n,), where it is known.
-        named_splits, source, notes: as of `Spectra`.
+        channel: Channel of each of the K elements in S snapshots (subcarriers or packets), complex (n, S, K) or (n, K).
+        position: Positions of the transmitter, (n, 3) [m].
+        array: The K elements and the wavelength of the carrier.
+        pose: Position and orientation of the array.
+        line_of_sight: Whether the direct path is unobstructed, bool (n,). Defaults to True for all.
+        time: Time of each row, (n,) [s], if it is known.
+        name: Name of the data set.
+        fixed_position: Position of the array, (3,) [m], in place of `pose`.
+        rotation: Matrix that rotates array into world coordinates, (3, 3), in place of `pose`.
+        index, named_splits, source, notes: As attributes of `PositionedData`.
+
+    Raises:
+        InputError: A shape that does not match, a number that is not finite, or no pose.
+
+    Example:
+        >>> array = PlanarArray.grid(2, 2, spacing=0.06, frequency_hz=2.4e9)
+        >>> channel, position = torch.ones(20, 4, dtype=torch.complex64), torch.rand(20, 3)
+        >>> Snapshots(channel, position, array=array, pose=ArrayPose((0.0, 2.0, 1.0))).spectra().store.shape
+        (20, 90, 360)
     """
 
-    name: str
     channel: Tensor
     position: Tensor
     array: PlanarArray
-    array_position: Tensor
+    fixed_position: Tensor
     rotation: Tensor
     line_of_sight: Tensor
-    index: Tensor
-    time: Tensor | None = None
-    named_splits: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
-    source: dict[str, str] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    time: Tensor | None
 
-    def __len__(self) -> int:
-        return len(self.position)
+    row_fields: ClassVar[tuple[str, ...]] = ("position", "channel", "line_of_sight", "time", "index")
 
-    def subset(self, rows: Tensor) -> Snapshots:
-        """The given rows, in the given order; splits named for the whole set are dropped."""
-        return replace(
-            self,
-            channel=self.channel[rows],
-            position=self.position[rows],
-            line_of_sight=self.line_of_sight[rows],
-            index=self.index[rows],
-            time=None if self.time is None else self.time[rows],
-            named_splits={},
-        )
-
-    def split(self, name: str = "random", seed: int = 0) -> tuple[Snapshots, Snapshots]:
-        """Training and test part, as `Spectra.split`.
-
-        Raises:
-            InputError: an unknown name; fewer than 10 training rows.
-        """
-        train, test = choose_split(name, seed, self.position, self.named_splits, self.name)
-        return self.subset(train), self.subset(test)
+    def __init__(
+        self,
+        channel: Numbers,
+        position: Numbers,
+        *,
+        array: PlanarArray,
+        pose: ArrayPose | None = None,
+        line_of_sight: Numbers | None = None,
+        time: Numbers | None = None,
+        name: str = "snapshots",
+        fixed_position: Numbers | None = None,
+        rotation: Numbers | None = None,
+        index: Numbers | None = None,
+        named_splits: Splits | None = None,
+        source: Mapping[str, str] | None = None,
+        notes: tuple[str, ...] = (),
+    ) -> None:
+        if pose is not None:
+            fixed_position, rotation = pose.position, pose.rotation
+        if fixed_position is None or rotation is None:
+            raise InputError(f"{name} needs the pose of the array: pose=ArrayPose(position, orientation)")
+        position = to_positions("position", position)
+        channel = torch.as_tensor(channel)
+        shape = (len(position), None, len(array.element))
+        channel = to_tensor("channel", channel[:, None] if channel.dim() == 2 else channel, torch.complex64, shape)
+        free = torch.ones(len(position)) if line_of_sight is None else line_of_sight
+        super().__init__(
+            name, index, named_splits, source, notes,
+            channel=channel, position=position, array=array,
+            fixed_position=to_tensor("fixed_position", fixed_position, torch.float64, (3,)),
+            rotation=to_tensor("rotation", rotation, torch.float64, (3, 3)),
+            line_of_sight=to_tensor("line_of_sight", free, torch.bool, (None,)),
+            time=None if time is None else to_tensor("time", time, torch.float64, (None,)),
+        )  # fmt: skip
 
     @property
     def direction(self) -> Tensor:
-        """Unit vectors of the line of sight in array coordinates, float64 (n, 3); z may be negative."""
-        away = self.position - self.array_position
+        """Unit vectors of the line of sight in array coordinates, float64 (n, 3). z may be negative."""
+        away = self.position - self.fixed_position
         direction: Tensor = away / away.norm(dim=1, keepdim=True) @ self.rotation
         return direction
 
     def spectra(self, grid: AngularGrid | None = None, beamformer: str = PHASE) -> Spectra:
-        """The spectra of the array, all snapshots of a position together.
+        """Return the spectra of the array, from all snapshots of a position together.
 
         Args:
-            grid: directions; 90 x 360 unless given.
-            beamformer: phase, bartlett or capon, see `swiftwrf.array.beamforming`.
+            grid: Directions. Defaults to 90 x 360.
+            beamformer: Name in `swiftwrf.array.beamforming`: phase, bartlett or capon.
 
         Raises:
-            InputError: an unknown beamformer, too few snapshots for it, or spectra of too many pixels.
+            InputError: An unknown beamformer, too few snapshots for it, or spectra of too many pixels.
         """
         grid = grid or GRID
         check_pixels(self.name, len(self), grid)
+        same = ("position", "line_of_sight", "index", "named_splits", "array", "source", "fixed_position", "rotation")
         return Spectra(
-            name=self.name,
-            position=self.position,
             store=array_spectra(self.array, self.channel, grid, beamformer),
             grid=grid,
-            label=torch.stack(to_angles(self.direction), dim=-1),
-            line_of_sight=self.line_of_sight,
             moving="transmitter",
-            index=self.index,
-            named_splits=self.named_splits,
-            array=self.array,
-            source=self.source,
-            fixed_position=self.array_position,
-            rotation=self.rotation,
+            name=self.name,
             notes=self.notes,
+            **{field: getattr(self, field) for field in same},
         )
+
+    def _columns(self) -> dict[str, Any]:
+        time = {} if self.time is None else {"time_s": self.time.numpy()}
+        return time | {"line_of_sight": self.line_of_sight.numpy()}
+
+    def _summary(self) -> str:
+        return f"{len(self)} channels of {self.channel.shape[1]} snapshots, {self.array}"
 
 
 def check_spacing(file: Path, array: PlanarArray) -> None:
-    """Refuses elements at distances that no array has, as positions in millimetres give.
+    """Refuse elements at distances that no array has, e.g. because positions are in millimetres.
 
     Raises:
-        InputError: such distances.
+        InputError: One element only, or neighbours outside 0.01 to 20 wavelengths.
     """
     if len(array.element) < 2:
         raise InputError(f"{file} describes an array of one element, which sees no directions; at least 2 are needed")
     apart = torch.cdist(array.element, array.element).fill_diagonal_(torch.inf).amin(dim=1).median() / array.wavelength
-    low, high = SPACING
+    low, high = SPACING_WAVELENGTHS
     if not low <= float(apart) <= high:
         raise InputError(
             f"{file}: neighbouring elements are {float(apart) * array.wavelength:.4g} m, {float(apart):.3g} wavelengths "

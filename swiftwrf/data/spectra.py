@@ -5,72 +5,135 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
 
-from swiftwrf.array.angles import AngularGrid, to_angles
+from swiftwrf.array.angles import AngularGrid, ArrayPose, to_angles
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.splits import MIN_TRAINING, choose_split
+from swiftwrf.data.dataset import Numbers, PositionedData, Splits, to_positions, to_tensor
+from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.data.store import AT_ONCE, MOST_PIXELS, Store, stored, too_many
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
+from swiftwrf.runtime.validation import check_value
 
 Moving = Literal["transmitter", "receiver"]
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
+MAGNITUDE_TOLERANCE = 1e-6  # beyond [0, 1], from rounding
 
 
-@dataclass(frozen=True, eq=False)
-class Spectra:
-    """Spectra and where the moving end of the link stood when each was taken.
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class Spectra(PositionedData):
+    """Spatial spectra at n positions of the moving end of a link.
 
     Args:
-        name: of the data set.
-        position: of the moving end, float64 (n, 3) [m].
-        store: the spectra as they were measured, (n, n_elevation, n_azimuth); by the batch or all at once float32.
-        grid: the directions of a spectrum's pixels.
-        label: azimuth and elevation of the line of sight in array coordinates, float64 (n, 2) [rad].
-        line_of_sight: whether the direct path is free, bool (n,); where it is unknown it is taken to be.
-        moving: which end moves.
-        index: number of each spectrum in the data set it comes from, counted from 0, int64 (n,).
-        named_splits: training and test rows of the splits that came with the data.
-        array: the antenna array, where it is known.
-        source: sha256 of each file that says what the data are, by file name.
-        fixed_position: of the end that does not move, float64 (3,) [m]; None where it is unknown or both ends move.
-        rotation: turns array into world coordinates, float64 (3, 3); the array stands at the fixed end when the
-            transmitter moves, and else moves with constant orientation. None where it is unknown.
-        notes: what the reader found or did that a user should know, a sentence each.
+        spectra: Magnitudes in [0, 1], or bytes of which 255 stands for 1, (n, n_elevation, n_azimuth).
+        position: Positions of the moving end, (n, 3) [m].
+        array: The antenna array, if it is known.
+        pose: Pose of the array. If the transmitter moves, its position is that of the fixed end; if the receiver moves, only
+            its orientation counts.
+        moving: The end that moves: "transmitter" or "receiver". The array is at the receiver.
+        grid: Directions of the pixels. Defaults to elevations up to 90 degrees and azimuths from 0 on.
+        label: Azimuth and elevation of the line of sight in array coordinates, (n, 2) [rad]. Defaults to the directions that
+            follow from the pose and the fixed end, nan if these are unknown.
+        line_of_sight: Whether the direct path is unobstructed, bool (n,). Defaults to True for all.
+        name: Name of the data set.
+        fixed_position: Position of the end that does not move, (3,) [m], if it does not follow from `pose`.
+        rotation: Matrix that rotates array into world coordinates, (3, 3), in place of `pose`.
+        store: Spectra as a `Store`, in place of `spectra`; readers of files give one.
+        index, named_splits, source, notes: As attributes of `PositionedData`.
+
+    Raises:
+        InputError: A length that does not match, a number that is not finite, a magnitude outside [0, 1], another `moving`.
+
+    Example:
+        >>> spectra, position = torch.rand(20, 9, 36), torch.rand(20, 3)
+        >>> data = Spectra(spectra, position, pose=ArrayPose((0.0, 2.0, 1.0)), moving="transmitter")
+        >>> data.grid.shape, data.label.shape
+        ((9, 36), torch.Size([20, 2]))
     """
 
-    name: str
     position: Tensor
     store: Store
     grid: AngularGrid
     label: Tensor
     line_of_sight: Tensor
     moving: Moving
-    index: Tensor
-    named_splits: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
-    array: PlanarArray | None = None
-    source: dict[str, str] = field(default_factory=dict)
-    fixed_position: Tensor | None = None
-    rotation: Tensor | None = None
-    notes: tuple[str, ...] = ()
+    array: PlanarArray | None
+    fixed_position: Tensor | None
+    rotation: Tensor | None
 
-    def __len__(self) -> int:
-        return len(self.position)
+    row_fields: ClassVar[tuple[str, ...]] = ("position", "store", "label", "line_of_sight", "index")
+
+    def __init__(
+        self,
+        spectra: Numbers | None = None,
+        position: Numbers | None = None,
+        *,
+        array: PlanarArray | None = None,
+        pose: ArrayPose | None = None,
+        moving: Moving = "transmitter",
+        grid: AngularGrid | None = None,
+        label: Numbers | None = None,
+        line_of_sight: Numbers | None = None,
+        name: str = "spectra",
+        fixed_position: Numbers | None = None,
+        rotation: Numbers | None = None,
+        store: Store | None = None,
+        index: Numbers | None = None,
+        named_splits: Splits | None = None,
+        source: Mapping[str, str] | None = None,
+        notes: tuple[str, ...] = (),
+    ) -> None:
+        check_value("moving", moving, Moving)
+        if position is None or (spectra is None) == (store is None):
+            raise InputError("Spectra takes spectra and their positions: Spectra(spectra, position, ...)")
+        position = to_positions("position", position)
+        store = store or _checked_store(spectra)
+        grid = grid or AngularGrid.hemisphere(*store.shape[1:])
+        if grid.shape != store.shape[1:]:
+            raise InputError(f"spectra of shape {store.shape} do not fit a grid of {grid.shape} directions")
+        if pose is not None:
+            if rotation is not None or (fixed_position is not None and moving == "transmitter"):
+                raise InputError(
+                    "pose gives the orientation and, if the transmitter moves, the fixed position; leave them out"
+                )
+            rotation = pose.rotation
+            fixed_position = pose.position if moving == "transmitter" else fixed_position
+        if fixed_position is not None:
+            fixed_position = to_tensor("fixed_position", fixed_position, torch.float64, (3,))
+        if rotation is not None:
+            rotation = to_tensor("rotation", rotation, torch.float64, (3, 3))
+        if label is not None:
+            label = torch.as_tensor(label, dtype=torch.float64)
+        elif fixed_position is not None and rotation is not None:
+            if bool((same := (position == fixed_position).all(dim=1)).any()):
+                raise InputError(f"position {int(same.nonzero()[0])} is that of the fixed end, so it has no direction")
+            label = direction_of_link(position, fixed_position, rotation, moving)
+        else:
+            label = torch.full((len(position), 2), torch.nan, dtype=torch.float64)
+        if label.dim() != 2 or label.shape[1] != 2:
+            raise InputError(f"label must have shape ({len(position)}, 2), got {tuple(label.shape)}")
+        free = torch.ones(len(position)) if line_of_sight is None else line_of_sight
+        super().__init__(
+            name, index, named_splits, source, notes,
+            position=position, store=store, grid=grid, label=label,
+            line_of_sight=to_tensor("line_of_sight", free, torch.bool, (None,)),
+            moving=moving, array=array, fixed_position=fixed_position, rotation=rotation,
+        )  # fmt: skip
 
     @property
     def spectrum(self) -> Tensor:
         """All magnitudes, float32 (n, n_elevation, n_azimuth) in [0, 1].
 
         Raises:
-            InputError: more than fit into memory.
+            InputError: More spectra than fit into memory.
         """
         if math.prod(self.store.shape) > MOST_PIXELS:
             raise InputError(
@@ -80,48 +143,27 @@ class Spectra:
         return self.store[:]
 
     def in_memory(self) -> Spectra:
-        """The same with their spectra as float32, for those who look at them again and again."""
+        """Return the data with the spectra as float32 in memory, for repeated access."""
         return replace(self, store=Store(self.spectrum))
 
-    def subset(self, rows: Tensor) -> Spectra:
-        """The given rows, in the given order; splits named for the whole set are dropped."""
-        return replace(
-            self,
-            position=self.position[rows],
-            store=self.store.subset(rows),
-            label=self.label[rows],
-            line_of_sight=self.line_of_sight[rows],
-            index=self.index[rows],
-            named_splits={},
-        )
-
-    def split(self, name: str = "random", seed: int = 0) -> tuple[Spectra, Spectra]:
-        """Training and test part: a split that came with the data, or a seeded `random` or `block` one.
-
-        Raises:
-            InputError: an unknown name; fewer than 10 training spectra.
-        """
-        train, test = choose_split(name, seed, self.position, self.named_splits, self.name)
-        return self.subset(train), self.subset(test)
-
     def direction_at(self, position: Tensor) -> Tensor:
-        """Azimuth and elevation (n, 2) [rad] of the line of sight with the moving end at positions (n, 3) [m].
+        """Return azimuth and elevation (n, 2) [rad] of the line of sight with the moving end at positions (n, 3) [m].
 
         Raises:
-            InputError: the fixed end or the array's orientation is unknown.
+            InputError: The fixed end or the array's orientation is unknown.
         """
         if self.fixed_position is None or self.rotation is None:
             raise InputError(
-                f"{self.name} does not say where the fixed end stands and how the array is turned, so the direction at "
-                "further positions is unknown"
+                f"{self.name} does not describe the position of the fixed end and the orientation of the array, so the "
+                "direction at synthetic positions is unknown"
             )
         return direction_of_link(position, self.fixed_position, self.rotation, self.moving)
 
     def coarsen(self, factor: int) -> Spectra:
-        """The same spectra averaged over squares of factor x factor pixels.
+        """Return the spectra averaged over squares of factor x factor pixels.
 
         Raises:
-            InputError: the numbers of rows and columns are not multiples of the factor.
+            InputError: The numbers of rows and columns are not multiples of the factor.
         """
         if factor == 1:
             return self
@@ -130,15 +172,33 @@ class Spectra:
         return replace(self, store=self.store.coarsen(factor), grid=self.grid.coarsen(factor))
 
     def at_most(self, azimuths: int) -> Spectra:
-        """The same spectra averaged down to at most so many columns, with rows enough for SSIM; 0 keeps all pixels."""
+        """Return the spectra averaged to at most that many columns, with enough rows for SSIM; 0 keeps all pixels."""
         return self.coarsen(coarsening(self.grid.shape, azimuths, least_rows=WINDOW))
+
+    def _columns(self) -> dict[str, Any]:
+        azimuth, elevation = self.label.rad2deg().numpy().T
+        return {"azimuth_deg": azimuth, "elevation_deg": elevation, "line_of_sight": self.line_of_sight.numpy()}
+
+    def _summary(self) -> str:
+        rows, columns = self.grid.shape
+        return f"{len(self)} spectra of {rows} x {columns} directions, {self.array}, moving {self.moving}"
+
+
+def _checked_store(spectra: Numbers) -> Store:
+    """Return magnitudes in [0, 1] as float32, or bytes, in memory."""
+    is_bytes = getattr(spectra, "dtype", None) in (torch.uint8, "uint8")
+    values = to_tensor("spectra", spectra, torch.uint8 if is_bytes else torch.float32, (None, None, None))
+    low, high = (0.0, 1.0) if is_bytes or not values.numel() else (float(end) for end in values.aminmax())
+    if low < -MAGNITUDE_TOLERANCE or high > 1 + MAGNITUDE_TOLERANCE:
+        raise InputError(f"spectra are magnitudes in [0, 1], got {low:.4g} to {high:.4g}; divide them by the largest")
+    return Store(values if is_bytes else values.clamp(0, 1))
 
 
 def array_spectra(array: PlanarArray, channel: Tensor, grid: AngularGrid, beamformer: str = PHASE) -> Store:
-    """What an array reports of channels, as `PlanarArray.spectrum`, whatever their number.
+    """Return the spectra of channels, as `PlanarArray.spectrum` for any number of them.
 
     Raises:
-        InputError: as there; a cache directory without room.
+        InputError: As `PlanarArray.spectrum`, or a cache directory without room.
     """
 
     def key() -> str:
@@ -153,18 +213,17 @@ def array_spectra(array: PlanarArray, channel: Tensor, grid: AngularGrid, beamfo
 
 
 def direction_of_link(position: Tensor, fixed_position: Tensor, rotation: Tensor, moving: Moving) -> Tensor:
-    """Azimuth and elevation (n, 2) [rad] at which the array sees the transmitter, with the moving end at positions
-    (n, 3) [m]; the other arguments as in `Spectra`."""
+    """Return azimuth and elevation (n, 2) [rad] of the transmitter in array coordinates, with arguments as in `Spectra`."""
     away = position.double() - fixed_position
     towards = away if moving == "transmitter" else -away
     return torch.stack(to_angles(towards @ rotation), dim=-1)
 
 
 def check_pixels(name: str, n: int, grid: AngularGrid) -> None:
-    """Refuses more spectra than anybody measures.
+    """Refuse more spectra than a measurement has.
 
     Raises:
-        InputError: so many.
+        InputError: The spectra exceed 2^34 pixels, or 2^29 pixels at more than 2^20 pixels each.
     """
     if too_many((n, *grid.shape)):
         raise InputError(
@@ -174,37 +233,37 @@ def check_pixels(name: str, n: int, grid: AngularGrid) -> None:
 
 
 def coarsening(shape: Sequence[int], max_azimuths: int, least_rows: int = 1) -> int:
-    """The smallest factor that brings spectra of `shape` (rows, columns) to at most `max_azimuths` columns and divides
-    both sizes; 1 where there is none that leaves `least_rows`, and for `max_azimuths` 0, which stands for all pixels."""
+    """Return the smallest factor that divides both sizes and brings spectra to at most `max_azimuths` columns.
+
+    Args:
+        shape: Rows and columns of the spectra.
+        max_azimuths: Largest number of columns. 0 stands for all pixels.
+        least_rows: Smallest number of rows. If no factor leaves that many, the result is 1.
+    """
     least = math.ceil(shape[1] / max_azimuths) if max_azimuths else 1
     factors = range(least, shape[0] // least_rows + 1)
     return next((factor for factor in factors if all(size % factor == 0 for size in shape)), 1)
 
 
 def check_training(train: Spectra) -> None:
-    """Enough spectra to learn from, all finite.
+    """Refuse spectra that no model can be fitted to.
 
     Raises:
-        InputError: fewer than 10, or the first that is not finite.
+        InputError: Fewer than 10 spectra, or a spectrum that is not finite.
     """
     if len(train) < MIN_TRAINING:
         raise InputError(f"a fit needs at least {MIN_TRAINING} spectra, got {len(train)}")
-    bad = [("position", int(row)) for row in _not_finite(train.position)[:1]]
     if train.store.values.is_floating_point():
         for rows in train.store.parts():
-            bad += [("spectrum", rows.start + int(row)) for row in _not_finite(train.store[rows])[:1]]
-    if bad:
-        name, row = bad[0]
-        raise InputError(f"{name} of training spectrum {row} is not finite; mend or leave it out")
-
-
-def _not_finite(values: Tensor) -> Tensor:
-    """Rows of values (n, ...) that hold something not finite."""
-    return (~values.isfinite()).flatten(1).any(dim=1).nonzero()[:, 0]
+            bad = (~train.store[rows].isfinite()).flatten(1).any(dim=1).nonzero()
+            if len(bad):
+                raise InputError(
+                    f"spectrum of training spectrum {rows.start + int(bad[0])} is not finite; mend or leave it out"
+                )
 
 
 def fingerprint(train: Spectra, *settings: Any) -> str:
-    """Tells whether something kept belongs to these spectra, what is known of their scene, and settings (plain values)."""
+    """Return a digest of the spectra, the description of their scene, and settings (plain values)."""
     array = train.array and [train.array.wavelength, train.array.element.tolist()]
     known = [None if value is None else value.tolist() for value in (train.rotation, train.fixed_position)]
     scene = [asdict(train.grid), train.moving, array, *known]

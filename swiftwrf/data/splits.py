@@ -1,4 +1,4 @@
-"""Which measurements train a model and which test it: named splits from files, seeded random and blocked ones."""
+"""Training and test rows of measurements: named splits from files, seeded random and block splits, and folds."""
 
 from __future__ import annotations
 
@@ -10,34 +10,37 @@ from torch import Tensor
 
 from swiftwrf.data.files import read_text
 from swiftwrf.errors import InputError
+from swiftwrf.runtime.validation import checked
 
 TEST_SHARE = 0.2
-MIN_TRAINING = 10
-MOST_DIGITS = 18  # of an index
-FOLDS = 5  # parts of the training rows that are held out in turn to choose settings
+MIN_TRAINING = 10  # measurements
+MAX_INDEX_DIGITS = 18
+FOLDS = 5
 
 Validation = Literal["random", "block"]
 
 
 def split_names(folder: Path) -> list[str]:
-    """Names of the splits that a folder offers: `train_index_NAME.txt` is NAME, `train_index.txt` is random."""
+    """Return the names of the splits in a folder: `train_index_NAME.txt` is NAME, `train_index.txt` is random."""
     files = [*folder.glob("train_index.txt"), *sorted(folder.glob("train_index_?*.txt"))]
     return [file.stem.removeprefix("train_index").removeprefix("_") or "random" for file in files]
 
 
-def read_split(folder: Path, name: str, n: int, first: int) -> tuple[Tensor, Tensor]:
-    """Rows of the training and of the test part, int64, in file order and counted from 0.
+def read_splits(folder: Path, n: int, first: int) -> dict[str, tuple[Tensor, Tensor]]:
+    """Return training and test rows of all splits in a folder, int64, in file order and counted from 0.
 
     Args:
-        folder: where `train_index[_NAME].txt` and `test_index[_NAME].txt` lie.
-        name: of the split; `random` also stands for files without a name.
-        n: number of measurements.
-        first: what the files call the first measurement (spectra count from 1, RSSI rows from 0).
+        folder: Folder of `train_index[_NAME].txt` and `test_index[_NAME].txt`. Files without a name are the split random.
+        n: Number of measurements.
+        first: Number of the first measurement in the files: 1 for spectra, 0 for RSSI.
 
     Raises:
-        InputError: a file that is missing or holds something else than whole numbers; an index out of range, twice in a
-            part or in both parts.
+        InputError: A missing file, a value that is no whole number, an index out of range, twice in a part or in both parts.
     """
+    return {name: _read_split(folder, name, n, first) for name in split_names(folder)}
+
+
+def _read_split(folder: Path, name: str, n: int, first: int) -> tuple[Tensor, Tensor]:
     named = name != "random" or (folder / "train_index_random.txt").is_file()
     suffix = f"_{name}" if named else ""
     train, test = (_read_indices(folder / f"{part}_index{suffix}.txt", n, first) for part in ("train", "test"))
@@ -53,57 +56,71 @@ def read_split(folder: Path, name: str, n: int, first: int) -> tuple[Tensor, Ten
 def _read_indices(file: Path, n: int, first: int) -> list[int]:
     if not file.is_file():
         raise InputError(f"split file {file} is missing; a split needs both its train_index and its test_index file")
-    rows: list[int] = []
-    seen: set[int] = set()
+    rows: dict[int, None] = {}
     for line, text in enumerate(read_text(file).split(), start=1):
         digits = text.lstrip("0") or "0"
-        if not (text.isascii() and text.isdecimal() and len(digits) <= MOST_DIGITS):
+        if not (text.isascii() and text.isdecimal() and len(digits) <= MAX_INDEX_DIGITS):
             raise InputError(f"{file} entry {line} is {text!r}; expected a whole number, {first} to {n - 1 + first}")
         row = int(digits) - first
         if not 0 <= row < n:
             raise InputError(
                 f"{file} entry {line} is {text}; expected {first} to {n - 1 + first}, the measurements there are"
             )
-        if row in seen:
+        if row in rows:
             raise InputError(f"{file} lists index {text} twice; each measurement belongs to a part once")
-        seen.add(row)
-        rows.append(row)
+        rows[row] = None
     if not rows:
         raise InputError(f"{file} is empty; expected one index a line")
-    return rows
+    return list(rows)
 
 
 def random_split(n: int, seed: int) -> tuple[Tensor, Tensor]:
-    """A random fifth for testing; both parts ascending. Honest only where positions are independent draws."""
+    """Return training rows and a random fifth as test rows, both ascending. Suits positions drawn independently."""
     order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))
     n_test = round(TEST_SHARE * n)
     return order[n_test:].sort().values, order[:n_test].sort().values
 
 
 def slabs(position: Tensor, n_slabs: int) -> Tensor:
-    """Number of the slab, 0 to n_slabs - 1, of each position (n, 3): equally many positions in each, cut across the
-    direction in which the positions extend most. Neighbours share a slab, and repeats at one place do, so a slab held out
-    is a place held out."""
+    """Return the slab of each position (n, 3), 0 to n_slabs - 1, across the direction of the largest extent.
+
+    Slabs hold equal numbers of positions. Neighbours and repeated measurements at one position share a slab, so holding out
+    a slab holds out a region.
+    """
     centred = position.double() - position.double().mean(dim=0)
     direction = torch.linalg.svd(centred, full_matrices=False).Vh[0]
     rank = (centred @ direction).argsort(stable=True).argsort()
     _, spot, times = position.unique(dim=0, return_inverse=True, return_counts=True)
     middle = torch.zeros_like(times).index_add_(0, spot, rank) // times
     slab: Tensor = middle[spot] * n_slabs // len(position)
-    if len(slab.unique()) < n_slabs:  # few places cannot be held out whole
+    if len(slab.unique()) < n_slabs:  # few distinct positions cannot be held out whole
         slab = rank * n_slabs // len(position)
     return slab
 
 
 def block_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:
-    """One slab out of five for testing, chosen by the seed; both parts ascending."""
+    """Return training rows and one slab out of five as test rows, chosen by the seed, both ascending."""
     n_slabs = round(1 / TEST_SHARE)
     held_out = slabs(position, n_slabs) == seed % n_slabs
     return (~held_out).nonzero()[:, 0], held_out.nonzero()[:, 0]
 
 
+@checked
 def folds(position: Tensor, validation: Validation, seed: int) -> Tensor:
-    """Number of the fold, 0 to 4, of each training position (n, 3): drawn at random, or slabs."""
+    """Return the fold of each training position (n, 3), 0 to 4.
+
+    Args:
+        position: Training positions, (n, 3) [m].
+        validation: "random" for random folds, "block" for slabs.
+        seed: Seed of random folds.
+
+    Raises:
+        InputError: Another `validation`.
+
+    Example:
+        >>> folds(torch.rand(20, 3), "random", seed=0).bincount().tolist()
+        [4, 4, 4, 4, 4]
+    """
     if validation == "block":
         return slabs(position, FOLDS)
     order = torch.randperm(len(position), generator=torch.Generator().manual_seed(seed))
@@ -111,18 +128,17 @@ def folds(position: Tensor, validation: Validation, seed: int) -> Tensor:
 
 
 def validation_for(split: str) -> Validation:
-    """How training rows are held out so that it is like the split: single rows where test rows lie among training rows,
-    whole regions where the test part is a place of its own or its making is unknown."""
+    """Return the kind of folds that resembles a split: single rows for random splits, regions for all others."""
     return "random" if split == "random" else "block"
 
 
 def choose_split(
     name: str, seed: int, position: Tensor, named: dict[str, tuple[Tensor, Tensor]], data: str
 ) -> tuple[Tensor, Tensor]:
-    """Training and test rows of the split `name`: one that came with the data, or else a seeded `random` or `block`.
+    """Return training and test rows of a split that came with the data, or of a seeded random or block split.
 
     Raises:
-        InputError: a name that the data does not have; fewer than 10 training measurements.
+        InputError: An unknown name, or fewer than 10 training measurements.
     """
     if name in named:
         train, test = named[name]

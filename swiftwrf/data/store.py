@@ -1,8 +1,8 @@
-"""Spectra as they were measured, and as float32 by the batch.
+"""Spectra in the type of their source, and as float32 by the batch.
 
 100,000 spectra of 90 x 360 pixels are 3 GB in the eight bits of images and 13 GB in float32, which no step of a fit needs at
-once. So they stay as they came, few in memory and many in a file of the cache that the operating system reads where it is
-looked at (memory-mapped), and become float32 where they are computed with.
+once. They keep the type of their source, few in memory and many in a memory-mapped file of the cache, and are converted to
+float32 in batches.
 """
 
 from __future__ import annotations
@@ -36,12 +36,16 @@ TYPES = {torch.uint8: np.uint8, torch.float16: np.float16, torch.float32: np.flo
 
 
 class Store:
-    """n spectra (n, H, W): indexing gives float32 magnitudes in [0, 1]; nothing is converted or copied before.
+    """n spectra (n, H, W). Indexing converts to float32 magnitudes in [0, 1]; nothing is converted or copied before.
 
     Args:
-        values: bytes, which count 255 as 1, or float16 or float32 magnitudes, (m, H, W); in memory or mapped from a file.
-        rows: which of the values these spectra are, in order, int64 (n,); all unless given.
-        factor: they are averaged over squares of so many pixels.
+        values: Bytes, of which 255 stands for 1, or magnitudes in floating point, (m, H, W), in memory or memory-mapped.
+        rows: Rows of the values that belong to the store, in order, int64 (n,). Defaults to all.
+        factor: Spectra are averaged over squares of factor x factor pixels.
+
+    Example:
+        >>> Store(torch.full((3, 2, 4), 255, dtype=torch.uint8))[:].shape
+        torch.Size([3, 2, 4])
     """
 
     def __init__(self, values: Tensor, rows: Tensor | None = None, factor: int = 1) -> None:
@@ -52,12 +56,12 @@ class Store:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """n, H, W."""
+        """Number of spectra, of rows and of columns (n, H, W)."""
         rows, columns = self.values.shape[1:]
         return len(self), rows // self.factor, columns // self.factor
 
     def __getitem__(self, rows: Tensor | slice) -> Tensor:
-        """Some of the spectra, float32; of float64 values float64, for those who compute in it."""
+        """Return some of the spectra as float32, or as float64 if the values are float64."""
         measured = self.measured(rows)
         spectrum = measured if measured.dtype == torch.float64 else measured.float()
         if measured.dtype == torch.uint8:
@@ -65,36 +69,36 @@ class Store:
         return spectrum if self.factor == 1 else functional.avg_pool2d(spectrum[:, None], self.factor)[:, 0]
 
     def measured(self, rows: Tensor | slice) -> Tensor:
-        """Some of the spectra as they were measured, before any averaging."""
+        """Return some of the spectra in the type of the values, before averaging."""
         return self.values[rows if self.rows is None else self.rows[rows]]
 
     def exact(self) -> tuple[torch.dtype, Iterator[Tensor]]:
-        """All spectra in order, by the batch, in the smallest type that loses nothing, and that type."""
+        """Return the smallest type that keeps all digits, and all spectra in order in that type, by the batch."""
         if self.factor == 1 and self.values.dtype in TYPES:
             return self.values.dtype, (self.measured(rows) for rows in self.parts())
         return torch.float32, (batch.float() for batch in self.batches())
 
     def subset(self, rows: Tensor) -> Store:
-        """The given rows, in the given order."""
+        """Return the given rows in the given order."""
         if rows.dtype == torch.bool:
             rows = rows.nonzero()[:, 0]
         return Store(self.values, rows if self.rows is None else self.rows[rows], self.factor)
 
     def coarsen(self, factor: int) -> Store:
-        """The same spectra averaged over squares of factor x factor pixels."""
+        """Return the spectra averaged over squares of factor x factor pixels."""
         return Store(self.values, self.rows, self.factor * factor)
 
     def parts(self) -> Iterator[slice]:
-        """Rows that may become float32 at once: all, where they are few."""
+        """Yield slices of rows that are converted at a time."""
         step = max(1, AT_ONCE // math.prod(self.values.shape[1:]))
         return (slice(start, min(start + step, len(self))) for start in range(0, len(self), step))
 
     def batches(self) -> Iterator[Tensor]:
-        """All spectra in order, float32, so many at once as `parts` says."""
+        """Yield all spectra in order as float32, in the slices of `parts`."""
         return (self[rows] for rows in self.parts())
 
     def mean(self) -> Tensor:
-        """Of all spectra, (H, W)."""
+        """Return the mean of all spectra, (H, W)."""
         if len(parts := list(self.parts())) == 1:
             return self[:].mean(dim=0)
         total = sum(
@@ -103,7 +107,7 @@ class Store:
         return (total / len(self)).float()
 
     def digest(self) -> str:
-        """Of what was measured, however it is kept, and of what these spectra take from it."""
+        """Return a digest of the values, wherever they are stored, of the rows and of the averaging."""
         digest = hashlib.sha256(repr((str(self.values.dtype), self.shape, self.factor)).encode())
         for rows in self.parts():
             digest.update(self.measured(rows).contiguous().numpy().data)
@@ -111,32 +115,32 @@ class Store:
 
 
 def too_many(shape: tuple[int, int, int]) -> bool:
-    """Whether spectra (n, H, W) are more than anybody measures, and rather a wrong size."""
+    """Return True if spectra (n, H, W) exceed any measurement, so that their size is an error."""
     pixels, each = math.prod(shape), math.prod(shape[1:])
     return pixels > MOST_STORED or (pixels > MOST_PIXELS and each > MOST_EACH)
 
 
 def in_file(shape: tuple[int, int, int]) -> bool:
-    """Whether so many spectra (n, H, W) lie in a file."""
+    """Return True if spectra (n, H, W) are stored in a file."""
     return shape[0] >= MANY or math.prod(shape) > MOST_PIXELS
 
 
 def stored(
     shape: tuple[int, int, int], dtype: torch.dtype, key: Callable[[], str], make: Callable[[], Iterable[Tensor]]
 ) -> Store:
-    """A store of spectra that come by the batch: in memory, or where there are many in a file.
+    """Return a store of spectra that are made in batches: in memory, or in a file from 20,000 spectra on.
 
-    The file lies in the cache directory, `$XDG_CACHE_HOME/swiftwrf` or `~/.cache/swiftwrf`, and is called after its content,
-    so that the same data are read or computed once. It goes when it was not used for a month.
+    The file lies in the cache directory, `$XDG_CACHE_HOME/swiftwrf` or `~/.cache/swiftwrf`. Its name is the digest of its
+    content, so that the same data are read or computed once. It is deleted after a month without use.
 
     Args:
-        shape: of all, (n, H, W).
-        dtype: of the batches: uint8, float16 or float32.
-        key: digest of what the spectra follow from, asked for where there is a file.
-        make: the batches in order; called unless they are there already.
+        shape: Shape of all spectra, (n, H, W).
+        dtype: Type of the batches: uint8, float16 or float32.
+        key: Returns a digest of the source of the spectra; called if they are stored in a file.
+        make: Returns the batches in order; called if the file does not exist.
 
     Raises:
-        InputError: the cache directory cannot be written or has not enough room.
+        InputError: The cache directory cannot be written or has too little room.
     """
     if not in_file(shape):
         values, start = torch.empty(shape, dtype=dtype), 0
@@ -162,9 +166,9 @@ def stored(
 
 
 def _mapped(file: Path, shape: tuple[int, int, int], dtype: torch.dtype) -> Tensor | None:
-    """The spectra in a file, read where they are looked at; None where it is not there or not whole."""
+    """Return the memory-mapped spectra of a file, None if it is missing or incomplete."""
     try:
-        values = np.load(file, mmap_mode="c")  # copy on write, for torch knows no read-only memory
+        values = np.load(file, mmap_mode="c")  # copy on write, because torch has no read-only memory
         os.utime(file)
     except (OSError, ValueError, EOFError):
         return None
@@ -172,7 +176,7 @@ def _mapped(file: Path, shape: tuple[int, int, int], dtype: torch.dtype) -> Tens
 
 
 def _write(file: Path, shape: tuple[int, int, int], dtype: torch.dtype, make: Callable[[], Iterable[Tensor]]) -> None:
-    """Written and not mapped: where the disk is full, that is an error and not a signal that ends the process."""
+    """Write the file without mapping it, because a full disk under a map ends the process by a signal."""
     size, free = math.prod(shape) * dtype.itemsize, shutil.disk_usage(file.parent).free
     if size > free:
         raise InputError(
@@ -191,7 +195,7 @@ def write_npy(
     batches: Iterable[Tensor],
     advance: Callable[[int], None] = lambda count: None,
 ) -> None:
-    """An npy file of spectra (n, H, W) that come by the batch; `advance` hears how many were written."""
+    """Write an npy file of spectra (n, H, W) in batches; call `advance` with the size of each."""
     header = {"shape": shape, "fortran_order": False, "descr": dtype_to_descr(np.dtype(TYPES[dtype]))}
     write_array_header_2_0(stream, header)
     for batch in batches:
@@ -200,7 +204,7 @@ def write_npy(
 
 
 def _prune(folder: Path) -> None:
-    """Removes what nobody used for a month, and what a process that was killed left behind."""
+    """Remove files that were not used for a month, and unfinished files of processes that were killed."""
     for file in folder.glob("*spectra-*"):
         with suppress(OSError):  # another process may be faster
             if time.time() - file.stat().st_mtime > KEPT_DAYS * 86_400:

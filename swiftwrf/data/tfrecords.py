@@ -1,4 +1,4 @@
-"""TFRecord files without TensorFlow: a frame around each record, protocol buffers inside, of which four messages are needed.
+"""TFRecord files without TensorFlow: a frame around each record, and four protocol-buffer messages inside.
 
     record:     length (8 bytes, little-endian), its checksum (4), data, checksum of the data (4)
     Example:    1: Features
@@ -6,7 +6,7 @@
     Feature:    1: BytesList, 2: FloatList, 3: Int64List, each with 1: value
     TensorProto 1: dtype, 2: shape, with 2: dimension, with 1: size; 4: the numbers, little-endian
 
-Checksums are not compared: CRC-32C is not in Python's library.
+A checksum is the CRC-32C, rotated right by 15 bits, plus 0xa282ead8.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import google_crc32c
 import numpy as np
 from numpy.typing import NDArray
 
 from swiftwrf.errors import InputError
 
-LONGEST = 2**28  # bytes of a record
+MAX_RECORD_BYTES = 2**28
 DTYPES: dict[int, np.dtype[Any]] = {
     1: np.dtype("<f4"),
     2: np.dtype("<f8"),
@@ -35,30 +36,46 @@ VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5  # wire types
 
 
 def records(file: Path) -> Iterator[dict[str, bytes]]:
-    """The features of each record: those of bytes, and of numbers the message that holds them.
+    """Yield the features of each record: bytes, or the message of a feature of numbers.
 
     Raises:
-        InputError: the file ends within a record, or holds something else.
+        InputError: The file ends within a record, a checksum does not match, or a record is no example.
     """
     with file.open("rb") as stream:
         number = 0
         while head := stream.read(12):
             number += 1
-            length = struct.unpack("<Q", head[:8])[0] if len(head) == 12 else LONGEST + 1
-            content = stream.read(length) if length <= LONGEST else b""
-            if len(content) != length or len(stream.read(4)) != 4:
+            length = struct.unpack("<Q", head[:8])[0] if len(head) == 12 else MAX_RECORD_BYTES + 1
+            content = stream.read(length) if length <= MAX_RECORD_BYTES else b""
+            tail = stream.read(4)
+            if len(content) != length or len(tail) != 4:
                 raise InputError(f"{file} is no TFRecord file, or ends within record {number}")
+            if head[8:] != checksum(head[:8]) or tail != checksum(content):
+                raise InputError(
+                    f"{file}: record {number} is damaged, its checksum does not match; copy the file again"
+                )
             try:
                 yield _features(content)
             except (ValueError, IndexError, UnicodeDecodeError) as error:
                 raise InputError(f"{file}: record {number} is no example of features ({error})") from None
 
 
+def checksum(content: bytes) -> bytes:
+    """Return the masked CRC-32C of a record's length or data, 4 bytes.
+
+    Example:
+        >>> checksum(b"123456789").hex()
+        'e5b08ac7'
+    """
+    crc = google_crc32c.value(content)
+    return struct.pack("<I", ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF)
+
+
 def tensor(content: bytes) -> NDArray[Any]:
-    """The numbers of a serialized tensor.
+    """Return the numbers of a serialized tensor.
 
     Raises:
-        ValueError: no tensor of numbers, or another number of them than its shape calls for.
+        ValueError: No tensor of numbers, or a number of them that does not match its shape.
     """
     dtype: np.dtype[Any] | None = None
     shape: list[int] = []
@@ -72,7 +89,7 @@ def tensor(content: bytes) -> NDArray[Any]:
             numbers = value
     if dtype is None:
         raise ValueError("a tensor of another type than numbers")
-    values: NDArray[Any] = np.frombuffer(numbers, dtype)  # refuses parts of numbers
+    values: NDArray[Any] = np.frombuffer(numbers, dtype)  # raises for an incomplete number
     if len(values) != math.prod(shape):
         raise ValueError(f"a tensor of shape {tuple(shape)[:8]} with {len(values)} numbers")
     return values.reshape(shape)
@@ -97,7 +114,7 @@ def _features(example: bytes) -> dict[str, bytes]:
 
 
 def _value(feature: bytes) -> bytes:
-    """The first value of a feature of bytes, and the packed numbers of others."""
+    """Return the first value of a feature of bytes, or the packed numbers of others."""
     for _, values in _fields(feature):
         for _, value in _fields(values) if isinstance(values, bytes) else ():
             if isinstance(value, bytes):
@@ -106,7 +123,7 @@ def _value(feature: bytes) -> bytes:
 
 
 def _fields(message: bytes) -> Iterator[tuple[int, int | bytes]]:
-    """Numbers and values of the fields of a protocol-buffer message."""
+    """Yield numbers and values of the fields of a protocol-buffer message."""
     at = 0
     while at < len(message):
         key, at = _varint(message, at)

@@ -1,4 +1,4 @@
-"""Measurements written in the toolkit's own layout, which `load_spectra` and `load_rssi` read back as they were."""
+"""Write measurements in the toolkit's own layout, which `load_spectra` and `load_rssi` read back unchanged."""
 
 from __future__ import annotations
 
@@ -13,30 +13,27 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.data.formats.nerf2_rssi import NOT_HEARD
-from swiftwrf.data.raytraced import TracedPaths
+from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.spectra import Moving, Spectra
+from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.store import write_npy
+from swiftwrf.data.survey import NOT_DETECTED_DBM
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.durable import replacing, write_bytes, write_text
 
 
 def write_spectra(data: Spectra, folder: Path) -> None:
-    """gateway_info.yml, tx_pos.csv or rx_pos.csv, spectrum.npz and the splits.
+    """Write gateway_info.yml, tx_pos.csv or rx_pos.csv, spectrum.npz and the splits.
 
     Args:
-        data: with known fixed end and orientation.
-        folder: to write to, which exists.
+        data: Spectra with known fixed end and orientation.
+        folder: Existing folder.
 
     Raises:
-        InputError: both ends move, the orientation is unknown, or the grid is not one of the layout.
+        InputError: Both ends move, the orientation is unknown, or the layout does not have the grid.
     """
     if data.fixed_position is None or data.rotation is None:
-        raise InputError(
-            f"{data.name} has no end that stays at one place with one orientation, which the layout needs; it cannot be "
-            "written"
-        )
+        raise InputError(f"{data.name} has no fixed end and orientation, which the layout needs; it cannot be written")
     if data.grid != AngularGrid.hemisphere(*data.grid.shape):
         raise InputError(f"{data.name} has another grid than elevations up to 90 degrees and azimuths from 0 on")
     gateway: dict[str, Any] = {
@@ -57,17 +54,17 @@ def write_spectra(data: Spectra, folder: Path) -> None:
 
 
 def write_rssi(data: Rssi, folder: Path) -> None:
-    """tx_pos.csv, gateway_rssi.csv, gateway_position.yml where the receivers' positions are known, and the splits.
+    """Write tx_pos.csv, gateway_rssi.csv, the splits, and gateway_position.yml if the receivers' positions are known.
 
-    What was measured at -100 dBm sharp, which means not heard in the layout, is written a hundredth of a dB above.
+    Measurements of exactly -100 dBm, which the layout uses for not detected, are written as -99.99.
 
     Args:
-        data: RSSI, nan where not heard.
-        folder: to write to, which exists.
+        data: RSSI, nan where not detected.
+        folder: Existing folder.
     """
-    rssi = data.rssi_dbm.where(data.rssi_dbm != NOT_HEARD, NOT_HEARD + 0.01)
+    rssi = data.rssi_dbm.where(data.rssi_dbm != NOT_DETECTED_DBM, NOT_DETECTED_DBM + 0.01)
     quoted = ",".join('"' + name.replace('"', '""') + '"' for name in data.receiver_names)
-    write_text(folder / "gateway_rssi.csv", _csv(quoted, rssi.nan_to_num(NOT_HEARD)))
+    write_text(folder / "gateway_rssi.csv", _csv(quoted, rssi.nan_to_num(NOT_DETECTED_DBM)))
     write_text(folder / "tx_pos.csv", _csv("x,y,z", data.transmitter_position))
     if data.located:
         places = dict(zip(data.receiver_names, data.receiver_position.tolist(), strict=True))
@@ -75,31 +72,23 @@ def write_rssi(data: Rssi, folder: Path) -> None:
     _write_splits(data.named_splits, folder, first=0)
 
 
-def write_paths(
-    folder: Path, paths: TracedPaths, fixed: Tensor, position: Tensor, moving: Moving, frequency_hz: float
-) -> None:
-    """paths.npz.
+def write_paths(paths: PropagationPaths, folder: Path) -> None:
+    """Write paths.npz.
 
     Args:
-        folder: to write to, which exists.
-        paths: of all positions, at least one each.
-        fixed: position of the end that stays, (3,) [m].
-        position: of the end that moves, (n, 3) [m].
-        moving: which end that is.
-        frequency_hz: of the carrier.
+        paths: At least one path a link, with known corners.
+        folder: Existing folder.
     """
-    ends = (position, fixed.expand_as(position))
-    transmitter, receiver = ends if moving == "transmitter" else ends[::-1]
     stream = io.BytesIO()
     np.savez_compressed(
         stream,
-        transmitter_position=transmitter.numpy(),
-        receiver_position=receiver.numpy(),
+        transmitter_position=paths.transmitter.numpy(),
+        receiver_position=paths.receiver.numpy(),
         path_count=paths.count.numpy(),
-        last_point=paths.last_point(transmitter).numpy(),
+        last_point=paths.last_point().numpy(),
         gain=paths.gain.numpy(),
         line_of_sight=paths.line_of_sight.numpy(),
-        frequency_hz=np.float64(frequency_hz),
+        frequency_hz=np.float64(paths.frequency_hz),
     )
     write_bytes(folder / "paths.npz", stream.getvalue())
 

@@ -1,13 +1,13 @@
-"""Whether spectra and positions are in one frame, and if not, which error would explain it.
+"""Check that spectra and positions share one coordinate frame, and diagnose the error if not.
 
-The strongest direction of a spectrum is often that of the line of sight. How often is told by the agreement
+The peak of a spectrum is often in the direction of the line of sight. The score of a frame is the agreement
 
     a(frame) = mean over positions of exp(-theta^2 / (2 sigma^2)),    sigma = 10 degrees,
 
-with theta the angle between peak and line of sight in that frame. What spectra of other positions would agree by chance is
-the same mean over pairs of different positions; only what exceeds it is evidence, and there is none where all positions lie
-in one direction. An error of frames (axes swapped, a quaternion in another order, millimetres, azimuths clockwise, ...) is
-named where it explains clearly more than the declared frame does; so is any other constant rotation.
+with theta the angle between peak and line of sight in that frame. Its chance level is the mean over pairs of different
+positions; only the excess counts as evidence, and there is none if all positions lie in one direction. An error of frames
+(axes swapped, a quaternion in another order, millimetres, azimuths clockwise, ...) is named if its agreement clearly exceeds
+that of the declared frame, and so is any other constant rotation.
 """
 
 from __future__ import annotations
@@ -26,33 +26,33 @@ from torch import Tensor
 from swiftwrf.array.angles import angular_distance, to_angles, to_direction
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.rssi.law import fit_law, log_distance
+from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
 
-WIDTH = math.radians(10)
-MOST_POSITIONS = 300
-EVIDENCE = 0.15  # beyond chance, that a frame needs to be believed, and to be preferred to the declared one
-TIED = 0.02  # of agreement, within which explanations cannot be told from each other
-ROTATIONS = 4000  # that are scanned
-LEAST_TURN = math.radians(5)  # of a constant rotation that is worth a word
-GAIN = 0.03  # in agreement that it needs
+SIGMA = math.radians(10)
+MAX_POSITIONS = 300
+MIN_EVIDENCE = 0.15  # agreement above chance to accept a frame, and above the declared frame to prefer another one
+TIE = 0.02  # difference in agreement of explanations that are not distinguished
+SCANNED_ROTATIONS = 4000
+MIN_TURN = math.radians(5)  # of a constant rotation that is reported
+MIN_TURN_GAIN = 0.03  # in agreement, of such a rotation
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
 SWAPS = {"x and y": [1, 0, 2], "y and z": [0, 2, 1], "x and z": [2, 1, 0]}
-FEW = 20  # positions that tell frames
-EXPLAINED = 0.1  # of the variance of RSSI, by which another frame must be better
+MIN_CLEAR_POSITIONS = 20  # with line of sight, to check frames
+MIN_VARIANCE_GAIN = 0.1  # in explained variance of RSSI, to prefer another frame
 
 
 @dataclass(frozen=True)
 class FrameReport:
-    """What `check_frames` found.
+    """Result of `check_frames`.
 
     Args:
-        agreement: of the declared frame, in [0, 1].
-        chance: what spectra of other positions would have.
-        angle_deg: median angle between peak and line of sight.
-        explanations: errors that explain clearly more than the declared frame, each in words; several cannot be told apart.
-        explained: agreement with them.
-        turn_deg: constant rotation that explains more, a rotation vector in array coordinates; None where there is none.
-        positions: number that was used.
+        agreement: Agreement in the declared frame, in [0, 1].
+        chance: Chance level of the agreement.
+        angle_deg: Median angle between peak and line of sight [deg].
+        explanations: Errors with clearly more agreement than the declared frame, in words; several are not distinguished.
+        explained: Agreement with them.
+        turn_deg: Constant rotation with more agreement, as a rotation vector in array coordinates [deg], or None.
+        positions: Number of positions used.
     """
 
     agreement: float
@@ -65,13 +65,13 @@ class FrameReport:
 
     @property
     def fits(self) -> bool:
-        """Whether the declared frame explains the peaks, and no other does clearly better."""
-        return self.agreement - self.chance >= EVIDENCE and not self.explanations and self.turn_deg is None
+        """True if the declared frame explains the peaks, and no other frame does clearly better."""
+        return self.agreement - self.chance >= MIN_EVIDENCE and not self.explanations and self.turn_deg is None
 
 
 @dataclass(frozen=True, eq=False)
-class _Scene:
-    """Positions (n, 3) of the moving end, that of the fixed one (3,), rotation (3, 3), sign of the line of sight."""
+class _Frame:
+    """Positions of the moving end (n, 3) and of the fixed one (3,), rotation (3, 3), sign of the line of sight."""
 
     position: Tensor
     fixed: Tensor
@@ -79,7 +79,7 @@ class _Scene:
     sign: float
 
     def direction(self) -> Tensor:
-        """Unit vectors of the line of sight in array coordinates, folded above the plane, (n, 3)."""
+        """Return unit vectors of the line of sight in array coordinates, folded to the front of the array, (n, 3)."""
         away = self.sign * (self.position - self.fixed) @ self.rotation
         return _folded(away / away.norm(dim=1, keepdim=True).clamp_min(1e-12))
 
@@ -88,39 +88,44 @@ class _Scene:
         position: Callable[[Tensor], Tensor] = lambda p: p,
         fixed: Callable[[Tensor], Tensor] = lambda p: p,
         rotation: Callable[[Tensor], Tensor] = lambda r: r,
-    ) -> _Scene:
-        return _Scene(position(self.position), fixed(self.fixed), rotation(self.rotation), self.sign)
+    ) -> _Frame:
+        return _Frame(position(self.position), fixed(self.fixed), rotation(self.rotation), self.sign)
 
 
 def check_frames(spectra: Spectra) -> FrameReport | None:
-    """Compares the peaks of the spectra with the lines of sight, in the declared frame and in others.
+    """Compare the peaks of the spectra with the lines of sight, in the declared frame and in others.
 
     Args:
-        spectra: with known fixed end and orientation; positions known to be without line of sight are left out.
+        spectra: Spectra with known fixed end and orientation. Positions without line of sight are omitted.
 
     Returns:
-        None where there are fewer than 20 such positions, or the frame is not known.
+        The report, or None with fewer than 20 such positions or an unknown frame.
+
+    Example:
+        >>> from swiftwrf.data.simulated import simulated_room
+        >>> check_frames(simulated_room(n=40)).fits
+        True
     """
     rows = spectra.line_of_sight.nonzero()[:, 0]
-    if len(rows) < FEW or spectra.fixed_position is None or spectra.rotation is None:
+    if len(rows) < MIN_CLEAR_POSITIONS or spectra.fixed_position is None or spectra.rotation is None:
         return None
-    rows = rows[torch.linspace(0, len(rows) - 1, min(MOST_POSITIONS, len(rows))).round().long()]
+    rows = rows[torch.linspace(0, len(rows) - 1, min(MAX_POSITIONS, len(rows))).round().long()]
     peak = to_direction(*spectra.grid.peak_direction(spectra.store[rows]).unbind(-1))
     sign = 1.0 if spectra.moving == "transmitter" else -1.0
-    scene = _Scene(spectra.position[rows], spectra.fixed_position, spectra.rotation, sign)
-    declared = scene.direction()
+    frame = _Frame(spectra.position[rows], spectra.fixed_position, spectra.rotation, sign)
+    declared = frame.direction()
     agreement, chance = _agreement(declared, peak)
-    found = {meaning: _agreement(direction, peak) for meaning, direction in _others(scene).items()}
+    found = {meaning: _agreement(direction, peak) for meaning, direction in _others(frame).items()}
     named, by_chance = max(found.values())
-    turn, angle = _constant_turn(scene, peak)
-    turned, turned_by_chance = _agreement(_folded(_turned(scene, turn)), peak)
-    error = named - by_chance >= EVIDENCE and named - agreement >= EVIDENCE and named >= turned - GAIN
-    rotates = turned - turned_by_chance >= EVIDENCE and turned - agreement >= GAIN and angle >= LEAST_TURN
+    turn, angle = _constant_turn(frame, peak)
+    turned, turned_by_chance = _agreement(_folded(_turned(frame, turn)), peak)
+    error = named - by_chance >= MIN_EVIDENCE and named - agreement >= MIN_EVIDENCE and named >= turned - MIN_TURN_GAIN
+    rotates = turned - turned_by_chance >= MIN_EVIDENCE and turned - agreement >= MIN_TURN_GAIN and angle >= MIN_TURN
     return FrameReport(
         agreement=agreement,
         chance=chance,
         angle_deg=math.degrees(float(angular_distance(declared, peak).median())),
-        explanations=tuple(name for name, (value, _) in found.items() if value >= named - TIED) if error else (),
+        explanations=tuple(name for name, (value, _) in found.items() if value >= named - TIE) if error else (),
         explained=named if error else turned if rotates else agreement,
         turn_deg=tuple(np.degrees(turn).tolist()) if rotates and not error else None,
         positions=len(rows),
@@ -132,17 +137,17 @@ def _folded(direction: Tensor) -> Tensor:
 
 
 def _agreement(direction: Tensor, peak: Tensor) -> tuple[float, float]:
-    """Agreement of directions and peaks (n, 3) of the same positions, and of different ones."""
+    """Return the agreement of directions and peaks (n, 3) of the same positions, and of different ones."""
     angle = angular_distance(peak[:, None].expand(-1, len(direction), -1), direction.expand(len(peak), -1, -1))
-    kernel = torch.exp(-0.5 * (angle / WIDTH).square())
+    kernel = torch.exp(-0.5 * (angle / SIGMA).square())
     n = len(peak)
     same = float(kernel.diagonal().mean())
     return same, float((kernel.sum() - kernel.diagonal().sum()) / (n * (n - 1)))
 
 
-def _others(scene: _Scene) -> dict[str, Tensor]:
-    """Directions (n, 3) of the line of sight, had one error been made."""
-    quaternion = Rotation.from_matrix(scene.rotation.numpy()).as_quat()
+def _others(frame: _Frame) -> dict[str, Tensor]:
+    """Return the directions (n, 3) of the line of sight under each error."""
+    quaternion = Rotation.from_matrix(frame.rotation.numpy()).as_quat()
 
     def reordered(_: Tensor) -> Tensor:
         return torch.from_numpy(Rotation.from_quat(np.roll(quaternion, -1)).as_matrix())
@@ -158,29 +163,29 @@ def _others(scene: _Scene) -> dict[str, Tensor]:
     def scaled(scale: float) -> Callable[[Tensor], Tensor]:
         return lambda p: p * scale
 
-    scenes = {
-        "the quaternion is in the order w, x, y, z; it must be x, y, z, w": scene.of(rotation=reordered),
-        "the quaternion turns world into array coordinates; it must turn array into world": scene.of(
+    frames = {
+        "the quaternion is in the order w, x, y, z; it must be x, y, z, w": frame.of(rotation=reordered),
+        "the quaternion turns world into array coordinates; it must turn array into world": frame.of(
             rotation=lambda r: r.T
         ),
     }
     for names, order in SWAPS.items():
         swap = columns(order)
-        scenes[f"{names} of the positions are swapped"] = scene.of(position=swap)
-        scenes[f"{names} of positions and array are swapped against the orientation"] = scene.of(
+        frames[f"{names} of the positions are swapped"] = frame.of(position=swap)
+        frames[f"{names} of positions and array are swapped against the orientation"] = frame.of(
             position=swap, fixed=swap
         )
     for name, axis in (("x", 0), ("y", 1), ("z", 2)):
         mirror = mirrored(axis)
-        scenes[f"{name} of the positions has the wrong sign"] = scene.of(position=mirror)
-        scenes[f"{name} of positions and array has the wrong sign against the orientation"] = scene.of(
+        frames[f"{name} of the positions has the wrong sign"] = frame.of(position=mirror)
+        frames[f"{name} of positions and array has the wrong sign against the orientation"] = frame.of(
             position=mirror, fixed=mirror
         )
     for unit, scale in UNITS.items():
-        scenes[f"the positions are in {unit}, the array's is in metres"] = scene.of(position=scaled(scale))
-        scenes[f"the array's position is in {unit}, the others are in metres"] = scene.of(fixed=scaled(scale))
-    found = {meaning: other.direction() for meaning, other in scenes.items()}
-    x, y, z = scene.direction().unbind(1)
+        frames[f"the positions are in {unit}, the array's is in metres"] = frame.of(position=scaled(scale))
+        frames[f"the array's position is in {unit}, the others are in metres"] = frame.of(fixed=scaled(scale))
+    found = {meaning: other.direction() for meaning, other in frames.items()}
+    x, y, z = frame.direction().unbind(1)
     found |= {
         "azimuths of the spectra turn clockwise (or the array's y axis is reversed)": torch.stack([x, -y, z], 1),
         "azimuths of the spectra turn clockwise from -x (or the array's x axis is reversed)": torch.stack(
@@ -193,30 +198,32 @@ def _others(scene: _Scene) -> dict[str, Tensor]:
             [y, x, z], 1
         ),
     }
-    azimuth, elevation = to_angles(scene.direction())
+    azimuth, elevation = to_angles(frame.direction())
     found["rows of the spectra run from the zenith down; row 0 must be the lowest elevation"] = to_direction(
         azimuth, math.pi / 2 - elevation
     )
     return found
 
 
-def _turned(scene: _Scene, turn: NDArray[np.float64]) -> Tensor:
-    """Directions with the array turned by a rotation vector in its own coordinates, not folded."""
-    away = scene.sign * (scene.position - scene.fixed) @ scene.rotation
+def _turned(frame: _Frame, turn: NDArray[np.float64]) -> Tensor:
+    """Return unfolded directions for an array rotated by a rotation vector in its coordinates."""
+    away = frame.sign * (frame.position - frame.fixed) @ frame.rotation
     matrix = torch.from_numpy(Rotation.from_rotvec(turn).as_matrix())
     direction: Tensor = away / away.norm(dim=1, keepdim=True) @ matrix
     return direction
 
 
-def _constant_turn(scene: _Scene, peak: Tensor) -> tuple[NDArray[np.float64], float]:
-    """The rotation of the array that agrees best, as a rotation vector in its coordinates, and its angle."""
-    away = _turned(scene, np.zeros(3)).float()
-    turns = Rotation.concatenate([Rotation.identity(), Rotation.random(ROTATIONS, random_state=0)])
+def _constant_turn(frame: _Frame, peak: Tensor) -> tuple[NDArray[np.float64], float]:
+    """Return the rotation of the array with most agreement, as a rotation vector in its coordinates, and its angle."""
+    away = _turned(frame, np.zeros(3)).float()
+    turns = Rotation.concatenate(
+        [Rotation.identity(), Rotation.random(SCANNED_ROTATIONS, rng=np.random.default_rng(0))]
+    )
     matrices = torch.from_numpy(turns.as_matrix()).float()
     score = torch.cat([_mean_kernel(_folded(away @ part), peak.float()) for part in matrices.split(200)])
 
     def miss(turn: NDArray[np.float64]) -> float:
-        return -float(_mean_kernel(_folded(_turned(scene, turn)), peak))
+        return -float(_mean_kernel(_folded(_turned(frame, turn)), peak))
 
     starts = [np.zeros(3), *(turns[int(i)].as_rotvec() for i in score.topk(3).indices)]
     simplex = [np.vstack([start, start + 0.1 * np.eye(3)]) for start in starts]
@@ -230,21 +237,21 @@ def _constant_turn(scene: _Scene, peak: Tensor) -> tuple[NDArray[np.float64], fl
 
 
 def _mean_kernel(direction: Tensor, peak: Tensor) -> Tensor:
-    """Agreement of directions (..., n, 3) and peaks (n, 3), (...)."""
+    """Return the agreement of directions (..., n, 3) and peaks (n, 3), (...)."""
     angle = angular_distance(direction, peak.expand_as(direction))
-    mean: Tensor = torch.exp(-0.5 * (angle / WIDTH).square()).mean(-1)
+    mean: Tensor = torch.exp(-0.5 * (angle / SIGMA).square()).mean(-1)
     return mean
 
 
 @dataclass(frozen=True)
-class LawReport:
-    """What `check_law` found.
+class PathLossReport:
+    """Result of `check_path_loss`.
 
     Args:
-        explained: share of the variance of RSSI that a law of the distance from each receiver explains.
-        level_dbm: RSSI at 1 m by one law for all receivers.
-        exponent: of the distance in it.
-        explanation: error of frames under which the laws explain clearly more, in words; nothing where there is none.
+        explained: Fraction of the variance of RSSI that path-loss models of each receiver explain.
+        level_dbm: RSSI at 1 m by one path-loss model of all receivers [dBm].
+        exponent: Path-loss exponent of that model.
+        explanation: Error of frames with clearly more explained variance, in words, or an empty text.
     """
 
     explained: float
@@ -253,11 +260,11 @@ class LawReport:
     explanation: str
 
 
-def check_law(data: Rssi) -> LawReport | None:
-    """Compares RSSI with the distances from the receivers, in the declared frame and in others.
+def check_path_loss(data: Rssi) -> PathLossReport | None:
+    """Compare RSSI with the distances from the receivers, in the declared frame and in others.
 
     Returns:
-        None where the receivers' positions are unknown.
+        The report, or None if the receivers' positions are unknown.
     """
     if not data.located:
         return None
@@ -269,19 +276,19 @@ def check_law(data: Rssi) -> LawReport | None:
     declared = _explained(place, data)
     found = {meaning: _explained(other, data) for meaning, other in others.items()}
     meaning, best = max(found.items(), key=lambda pair: pair[1])
-    law = fit_law(log_distance(place, data.receiver_position), data.rssi_dbm, pooled=True)
-    return LawReport(
+    model = fit_path_loss(log_distance(place, data.receiver_position), data.rssi_dbm, shared=True)
+    return PathLossReport(
         explained=declared,
-        level_dbm=float(law.level),
-        exponent=float(-law.slope / 10),
-        explanation=meaning if best - declared >= EXPLAINED else "",
+        level_dbm=float(model.level),
+        exponent=float(-model.slope / 10),
+        explanation=meaning if best - declared >= MIN_VARIANCE_GAIN else "",
     )
 
 
 def _explained(position: Tensor, data: Rssi) -> float:
-    """Share of the variance of RSSI that laws of the distance explain, where they fall with it."""
+    """Return the fraction of the variance of RSSI that path-loss models explain, if RSSI decreases with distance."""
     distance = log_distance(position, data.receiver_position)
-    law = fit_law(distance, data.rssi_dbm)
-    law = law._replace(level=law.level.where(law.slope < 0, data.rssi_dbm.nanmean(dim=0)), slope=law.slope.clamp(max=0))
-    left = (data.rssi_dbm - law(distance)).square().nansum()
-    return 1 - float(left / (data.rssi_dbm - data.rssi_dbm.nanmean(dim=0)).square().nansum().clamp_min(1e-12))
+    constant = PathLoss(data.rssi_dbm.nanmean(dim=0), torch.zeros(data.rssi_dbm.shape[1], dtype=torch.float64))
+    model = fit_path_loss(distance, data.rssi_dbm)
+    residual = data.rssi_dbm - model.where(model.slope < 0, constant)(distance)
+    return 1 - float(residual.square().nansum() / (data.rssi_dbm - constant.level).square().nansum().clamp_min(1e-12))

@@ -1,25 +1,25 @@
-"""The one Gaussian process: its kernel and how it is chosen, regression, and smooth fields under its prior."""
+"""Gaussian processes over positions: the kernel and its choice, regression, smooth fields, and principal components."""
 
 from swiftwrf.gp.choice import choose_kernel, choose_rank, inner_products, most_informative, squared_errors, thinned
-from swiftwrf.gp.field import NearbyField, SmoothField
+from swiftwrf.gp.field import SmoothField
 from swiftwrf.gp.kernel import Kernel, candidates
-from swiftwrf.gp.process import EXACT, GaussianProcess, NearbyProcess, held_out, held_out_errors, held_out_weights
+from swiftwrf.gp.pca import Components, principal_components
+from swiftwrf.gp.process import GaussianProcess, LeaveGroupOut, dense_weights, held_out
 
 __all__ = [
-    "EXACT",
+    "Components",
     "GaussianProcess",
     "Kernel",
-    "NearbyField",
-    "NearbyProcess",
+    "LeaveGroupOut",
     "SmoothField",
     "candidates",
     "choose_kernel",
     "choose_rank",
+    "dense_weights",
     "held_out",
-    "held_out_errors",
-    "held_out_weights",
     "inner_products",
     "most_informative",
+    "principal_components",
     "squared_errors",
     "thinned",
 ]

@@ -1,9 +1,8 @@
-"""What training spectra choose: the kernel, the number of their components, and where to measure next.
+"""Choices that training spectra make: the kernel, the number of components, and where to measure next.
 
-Positions whose spectra resemble each other should move alike. So the kernel is the one under which a Gaussian process on
-the spectra's pixels best predicts training spectra that are held out: at random, or a whole region at a time where the
-model will be asked for regions nobody measured. Everything follows from the spectra's inner products, hence a candidate
-costs a few small linear solves and no rendering (C. E. Rasmussen and C. K. I. Williams, "Gaussian Processes for Machine
+The kernel is that of the pixel Gaussian process with the smallest error at held-out training spectra: held out at random, or
+a region at a time if the model has to predict unmeasured regions. All errors follow from the inner products of the spectra,
+so a candidate costs a few small linear solves (C. E. Rasmussen and C. K. I. Williams, "Gaussian Processes for Machine
 Learning", 2006, chapters 2 and 5).
 """
 
@@ -14,44 +13,45 @@ from torch import Tensor
 
 from swiftwrf.data.store import Store
 from swiftwrf.gp.kernel import Kernel, candidates
-from swiftwrf.gp.process import held_out, held_out_weights
+from swiftwrf.gp.process import LeaveGroupOut, held_out
 from swiftwrf.runtime.threads import single_thread
 
-NOISES = (1e-3, 1e-2, 1e-1)  # of spectra: little of a measured one is not a function of position
-NEGLIGIBLE = 5e-4  # share of the error at held-out positions that components may add which are left out
-JITTER = 1e-6  # relative variance below which a place counts as measured
-MAX_ROWS = 400  # more do not change the choice, and a candidate costs their number cubed
+NOISE_CANDIDATES = (1e-3, 1e-2, 1e-1)  # variance of spectra that does not depend on position
+MAX_RANK_ERROR = 5e-4  # fraction of the held-out error that omitted components may add
+MIN_ERROR = 1e-12  # squared error, for logarithms
+JITTER = 1e-6  # relative variance below which a position counts as measured
+MAX_ROWS = 400  # spectra that choose; a candidate costs their number cubed
 
 
 @single_thread()
 def choose_kernel(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> Kernel:
-    """The candidate with the highest mean logarithm of 1 / MSE over held-out spectra.
+    """Return the candidate with the highest mean logarithm of 1 / MSE over held-out spectra.
 
     Args:
-        position: of the training spectra [m], (n, 3).
-        spectrum: the training spectra, (n, H, W).
-        fold: number of the part that each is held out with, (n,).
+        position: Positions of the training spectra (n, 3) [m].
+        spectrum: Training spectra (n, H, W).
+        fold: Number of the group that each is held out with, (n,).
     """
     position, spectrum, fold = thinned(position, spectrum, fold)
     gram = inner_products(spectrum)
 
     def score(kernel: Kernel) -> float:
         total = 0.0
-        for out, kept, gain in held_out_weights(kernel, position, fold):
-            total -= float(squared_errors(gram, out, kept, gain).clamp_min(1e-12).log().sum())
+        for group in LeaveGroupOut.each(kernel, position, fold):
+            error = squared_errors(gram, group.out, group.kept, group.weights)
+            total -= float(error.clamp_min(MIN_ERROR).log().sum())
         return total
 
-    return max(candidates(position, NOISES), key=score)
+    return max(candidates(position, NOISE_CANDIDATES), key=score)
 
 
 @single_thread()
 def choose_rank(position: Tensor, spectrum: Tensor | Store, fold: Tensor, kernel: Kernel) -> int:
-    """How many principal components of the spectra it takes until the variance of the others no longer counts beside the
-    error at positions that are held out.
+    """Return the number of principal components whose omitted variance is negligible beside the error at held-out positions.
 
     Args:
-        position, spectrum, fold: as for `choose_kernel`.
-        kernel: what it chose.
+        position, spectrum, fold: See `choose_kernel`.
+        kernel: Chosen kernel.
     """
     position, spectrum, fold = thinned(position, spectrum, fold)
     variance, vector = torch.linalg.eigh(inner_products(spectrum))
@@ -59,28 +59,29 @@ def choose_rank(position: Tensor, spectrum: Tensor | Store, fold: Tensor, kernel
     component = vector.flip(1) * variance.sqrt()  # (n, n), one column a component
     predicted, _ = held_out(kernel, position, fold, component)
     left_out = variance.flip(0).cumsum(0).flip(0)  # by 0, 1, ... components
-    enough = left_out <= NEGLIGIBLE * (component - predicted).square().sum()
+    enough = left_out <= MAX_RANK_ERROR * (component - predicted).square().sum()
     return int((~enough).sum())
 
 
 @single_thread()
 def most_informative(kernel: Kernel, known: Tensor, candidate: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Where measuring lowers the mean variance over the candidates most, one after the other (greedy variance reduction;
-    Krause, Singh and Guestrin 2008 on its near-optimality).
+    """Choose positions whose measurement lowers the mean posterior variance most, one after the other.
+
+    Greedy variance reduction is nearly optimal (Krause, Singh and Guestrin 2008).
 
     Args:
-        kernel: of the field, with its noise.
-        known: positions (n, 3) that are measured already.
-        candidate: positions (m, 3) to choose from, evenly over the region.
-        count: how many, at most m.
+        kernel: Kernel of the field, with its noise.
+        known: Measured positions (n, 3).
+        candidate: Positions (m, 3) to choose from, evenly over the region.
+        count: Number of positions to choose, at most m.
 
     Returns:
-        Numbers of the chosen candidates in order, (count,), and the mean variance before any and after each of them,
+        Numbers of the chosen candidates in order, (count,), and the mean variance before the first and after each of them,
         relative to k(0) = 1, float64 (1 + count,).
     """
     candidate = candidate.double()
     cross = kernel(candidate, known.double())
-    covariance = kernel(candidate, candidate) - cross @ torch.linalg.solve(kernel.noisy_gram(known), cross.T)
+    covariance = kernel(candidate, candidate) - cross @ torch.linalg.solve(kernel.covariance(known), cross.T)
     chosen: list[int] = []
     left = [covariance.diagonal().mean()]
     for _ in range(count):
@@ -95,26 +96,27 @@ def most_informative(kernel: Kernel, known: Tensor, candidate: Tensor, count: in
 
 
 def thinned(*tensors: Tensor | Store, rows: int = MAX_ROWS) -> list[Tensor]:
-    """At most so many rows of each, the same ones, evenly spread."""
+    """Return at most `rows` evenly spread rows of each tensor, the same rows of all."""
     n = len(tensors[0])
     some = torch.linspace(0, n - 1, rows).long() if n > rows else slice(None)
     return [t[some] for t in tensors]
 
 
 def inner_products(spectrum: Tensor) -> Tensor:
-    """Of the spectra's differences from their mean, a pixel, float64 (n, n)."""
+    """Return the inner products of the spectra's differences from their mean, per pixel, float64 (n, n)."""
     flat = spectrum.flatten(1)
-    flat = flat - flat.mean(dim=0, dtype=torch.float64)  # what it takes of memory is this difference
+    flat = flat - flat.mean(dim=0, dtype=torch.float64)  # the largest tensor in memory
     return flat @ flat.T / flat.shape[1]
 
 
 def squared_errors(gram: Tensor, out: Tensor, kept: Tensor, weight: Tensor) -> Tensor:
-    """Of sums of spectra against spectra that are held out, a pixel, from the inner products of all, (o,).
+    """Return the squared errors per pixel, (o,), of weighted sums of spectra from the inner products of all spectra.
 
     Args:
-        gram: inner products, (n, n).
-        out, kept: which spectra are held out and which are summed, bool (n,).
-        weight: of each one kept in each sum, (o, k); the mean spectrum makes up for what the weights lack of 1.
+        gram: Inner products (n, n).
+        out: Rows that are predicted, as numbers (o,) or a mask (n,).
+        kept: Rows that are summed, as numbers (k,) or a mask (n,).
+        weight: Weights (o, k). The mean spectrum has the weight that a row lacks of 1.
     """
     own = gram.diagonal()[out]
     return own - 2 * (weight * gram[out][:, kept]).sum(1) + ((weight @ gram[kept][:, kept]) * weight).sum(1)

@@ -15,20 +15,25 @@ from swiftwrf.positions import distance
 
 @dataclass(frozen=True)
 class Kernel:
-    """How alike a field is at two positions, by their distance r: a rough long-range and a smooth short-range part.
+    """Covariance of a field at two positions by their distance r: a rough long-range and a smooth short-range part.
 
         k(r) = share exp(-r / long) + (1 - share) (1 + sqrt(3) r / short) exp(-sqrt(3) r / short)
 
     The long part (Matern 1/2) carries the rough field between rooms' positions, the short one (Matern 3/2) follows a path
-    sampled densely.
+    that is sampled densely.
 
     Args:
-        long, short: correlation lengths, in the unit of the positions.
-        share: of the long part, in [0, 1].
-        noise: variance of what is not a function of position, relative to k(0) = 1.
+        long: Correlation length of the rough part, in the unit of the positions.
+        short: Correlation length of the smooth part.
+        share: Variance of the rough part, in [0, 1].
+        noise: Variance that does not depend on position, relative to k(0) = 1.
 
     Raises:
-        InputError: a length, share or noise that makes no kernel.
+        InputError: A value outside its range.
+
+    Example:
+        >>> Kernel(long=1.0, share=1.0)(torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.0]]))
+        tensor([[0.3679]])
     """
 
     long: float = 0.5
@@ -42,11 +47,11 @@ class Kernel:
             raise InputError(f"a kernel needs lengths above 0, a share in [0, 1] and a noise from 0, got {self}")
 
     def scaled(self, factor: float) -> Kernel:
-        """The same kernel on positions multiplied by `factor`."""
+        """Return the equivalent kernel for positions that are multiplied by `factor`."""
         return replace(self, long=self.long * factor, short=self.short * factor)
 
     def __call__(self, a: Tensor, b: Tensor) -> Tensor:
-        """k between positions (n, 3) and (m, 3), (n, m)."""
+        """Return k between positions (n, 3) and (m, 3), (n, m)."""
         r = distance(a, b)
         if self.share == 1:
             return torch.exp(-r / self.long)
@@ -54,15 +59,15 @@ class Kernel:
         value: Tensor = self.share * torch.exp(-r / self.long) + (1 - self.share) * (1 + near) * torch.exp(-near)
         return value
 
-    def noisy_gram(self, position: Tensor) -> Tensor:
-        """Covariance of noisy values at positions (n, 3), float64 (n, n)."""
+    def covariance(self, position: Tensor) -> Tensor:
+        """Return the covariance of noisy values at positions (n, 3), float64 (n, n)."""
         position = position.double()
         noisy: Tensor = self(position, position) + self.noise * torch.eye(len(position)).to(position)
         return noisy
 
 
 def candidates(position: Tensor, noises: Sequence[float]) -> Iterator[Kernel]:
-    """Kernels with lengths from the extent of the positions (n, 3) [m] down, with and without a short-range part."""
+    """Yield kernels with lengths from the extent of the positions (n, 3) [m] down, with and without a smooth part."""
     extent = float((position.max(0).values - position.min(0).values).max()) or 1.0
     for noise in noises:
         for k in range(5):

@@ -1,4 +1,4 @@
-"""Principal components of spectra that come by the batch."""
+"""Principal component analysis of spectra, in memory or by the batch."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-OVERSAMPLING = 16  # directions beyond the components that the sketch holds
+N_OVERSAMPLING = 16  # directions of the sketch beyond the components
+MIN_VARIANCE = 1e-6  # fraction of the variance below which a component is left out
 
 
 class Components(NamedTuple):
@@ -19,24 +20,42 @@ class Components(NamedTuple):
     component: Tensor  # float32 (K, P)
 
 
-def principal_components(batches: Callable[[], Iterable[Tensor]], rank: int, least: float, seed: int = 0) -> Components:
-    """The largest principal components of rows, of which a batch at a time is in memory.
+def principal_components(
+    rows: Tensor | Callable[[], Iterable[Tensor]], rank: int, min_variance: float = MIN_VARIANCE, seed: int = 0
+) -> Components:
+    """Return the largest principal components of rows.
 
-    A random sketch of the rows' covariance spans them, after one power iteration (N. Halko, P. G. Martinsson and
-    J. A. Tropp, "Finding structure with randomness", SIAM Review 53, 2011, algorithms 4.3 and 5.1). Time grows with the
-    number of rows; they are read three times.
+    The components of a tensor follow from the inner products of its rows. Those of batches follow from a random sketch of
+    the covariance after one power iteration (N. Halko, P. G. Martinsson and J. A. Tropp, "Finding structure with
+    randomness", SIAM Review 53, 2011, algorithms 4.3 and 5.1), whose time grows with the number of rows.
 
     Args:
-        batches: gives the rows (b, P) in order, float32, each time the same.
-        rank: components at most.
-        least: share of the variance below which a component is left out.
-        seed: of the sketch.
+        rows: Rows (n, P), float32, or a function that yields them in order by the batch, equal at each of three calls.
+        rank: Maximum number of components.
+        min_variance: Fraction of the variance below which a component is left out.
+        seed: Seed of the sketch.
+
+    Example:
+        >>> rows = torch.outer(torch.arange(5.0), torch.ones(8))
+        >>> principal_components(rows, rank=3).component.shape
+        torch.Size([1, 8])
     """
+    if not isinstance(rows, Tensor):
+        return _sketched(rows, rank, min_variance, seed)
+    mean = rows.mean(dim=0)
+    change = rows - mean
+    value, vector = torch.linalg.eigh((change @ change.T).double())
+    kept = (value > min_variance * value.sum()).nonzero()[:, 0]
+    vector = vector[:, kept[max(len(kept) - rank, 0) :]]
+    return Components(mean, vector, vector.T.float() @ change)
+
+
+def _sketched(batches: Callable[[], Iterable[Tensor]], rank: int, min_variance: float, seed: int) -> Components:
     total, n = torch.zeros((), dtype=torch.float64), 0
     for batch in batches():
         total, n = total + batch.sum(dim=0, dtype=torch.float64), n + len(batch)
     mean = (total / n).float()
-    width = min(rank + OVERSAMPLING, len(mean))
+    width = min(rank + N_OVERSAMPLING, len(mean))
     random = torch.randn(len(mean), width, generator=torch.Generator().manual_seed(seed))
     sketch = torch.zeros(len(mean), width, dtype=torch.float64)
     variance = 0.0
@@ -47,7 +66,8 @@ def principal_components(batches: Callable[[], Iterable[Tensor]], rank: int, lea
     span = torch.linalg.qr(sketch).Q.float()
     score = torch.cat([(batch - mean) @ span for batch in batches()]).double()
     value, vector = torch.linalg.eigh(score.T @ score)
-    kept = (value > least * variance).nonzero()[:, 0][-rank:]
+    kept = (value > min_variance * variance).nonzero()[:, 0]
+    kept = kept[max(len(kept) - rank, 0) :]
     scale = value[kept].sqrt()
     component = (vector[:, kept] * scale).T.float() @ span.T
     return Components(mean, score @ vector[:, kept] / scale, component)

@@ -1,8 +1,9 @@
-"""Regression: exact among few positions, by the nearest ones among many, and what it says of values that are held out."""
+"""Gaussian-process regression: exact among few positions, local among many, and leave-group-out predictions."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from functools import cached_property
 
 import torch
@@ -10,114 +11,181 @@ from torch import Tensor
 
 from swiftwrf.gp.kernel import Kernel
 from swiftwrf.positions import Neighbours
+from swiftwrf.runtime.checkpoint import Header, expect
 
-EXACT = 2000  # positions up to which a process is exact; beyond, time and memory would grow with their cube and square
-NEAR = 64  # positions that tell of one among many: farther ones hardly change the mean
+MAX_EXACT = 2000  # positions up to which a process is exact; time and memory grow with their cube and square
+N_NEIGHBOURS = 64  # positions that a local prediction conditions on; farther ones hardly change the mean
 
 
 class GaussianProcess:
-    """Regression with a given kernel and mean 0: values at any position as a weighted sum of those at known ones.
+    """Regression with a given kernel and prior mean 0.
+
+    Among more than 2000 positions, a prediction conditions on the nearest 64 only (local Gaussian process: R. B. Gramacy and
+    D. W. Apley, Journal of Computational and Graphical Statistics 24, 2015).
 
     Args:
-        kernel: with its noise.
-        known: positions (n, 3) of the values.
+        kernel: Kernel with its noise.
+        known: Positions of the values (n, 3).
+        coefficient: Dual coefficients of an exact process, values of a local one, (n, K); needed by `mean` only. See
+            `regress`.
+        exact: Whether every prediction conditions on all positions. Defaults to n <= 2000.
+
+    Example:
+        >>> position = torch.rand(20, 3, dtype=torch.float64)
+        >>> process = GaussianProcess.regress(Kernel(noise=1e-6), position, position.sum(dim=1, keepdim=True))
+        >>> bool((process.mean(position)[:, 0] - position.sum(dim=1)).abs().max() < 1e-2)
+        True
     """
 
-    def __init__(self, kernel: Kernel, known: Tensor) -> None:
-        self.kernel, self.known = kernel, known.double()
+    def __init__(
+        self, kernel: Kernel, known: Tensor, coefficient: Tensor | None = None, exact: bool | None = None
+    ) -> None:
+        self.kernel, self.known, self.coefficient = kernel, known.double(), coefficient
+        self.exact = len(known) <= MAX_EXACT if exact is None else exact
+
+    @classmethod
+    def regress(
+        cls,
+        kernel: Kernel,
+        known: Tensor,
+        value: Tensor,
+        exact: bool | None = None,
+        dtype: torch.dtype = torch.float64,
+    ) -> GaussianProcess:
+        """Return the process of values (n, K) at known positions (n, 3), with coefficients of the given type."""
+        process = cls(kernel, known, value.to(dtype), exact)
+        if process.exact:
+            process.coefficient = torch.linalg.solve(kernel.covariance(known), value.double()).to(dtype)
+        return process
+
+    def mean(self, position: Tensor) -> Tensor:
+        """Return the posterior mean at positions (m, 3), (m, K), in the precision of the coefficients."""
+        assert self.coefficient is not None
+        if self.exact:
+            mean: Tensor = self.kernel(position.double(), self.known).to(self.coefficient) @ self.coefficient
+            return mean
+        number, weight, _ = self._local(position)
+        return torch.einsum("mk,mkc->mc", weight, self.coefficient[number].double())
+
+    def weights(self, position: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the posterior mean at positions (m, 3) as a linear function of the values.
+
+        Returns:
+            Row numbers (r,) of the values that count, and their weights, float64 (m, r).
+        """
+        if self.exact:
+            cross = self.kernel(position.double(), self.known)
+            return torch.arange(len(self.known)), cross @ self._inverse
+        number, weight, _ = self._local(position)
+        return dense_weights(number, weight)
+
+    def variance(self, position: Tensor) -> Tensor:
+        """Return the posterior variance, without noise, at positions (m, 3), relative to k(0) = 1, float64 (m,)."""
+        if not self.exact:
+            return self._local(position)[2]
+        cross = self.kernel(position.double(), self.known)
+        variance: Tensor = 1 - (cross @ self._inverse * cross).sum(dim=1)
+        return variance.clamp(0, 1)
+
+    def state(self, prefix: str = "") -> tuple[dict[str, Tensor], Header]:
+        """Return positions and coefficients, and the kernel as plain values, with names that begin with `prefix`."""
+        assert self.coefficient is not None
+        tensors = {f"{prefix}position": self.known, f"{prefix}coefficient": self.coefficient}
+        return tensors, {f"{prefix}kernel": asdict(self.kernel)}
+
+    @classmethod
+    def from_state(
+        cls, tensors: dict[str, Tensor], header: Header, dtype: torch.dtype, exact: bool | None = None, prefix: str = ""
+    ) -> GaussianProcess:
+        """Return the process of a state, with coefficients of the given type.
+
+        Raises:
+            InputError: Tensors of other sizes, or a kernel outside its range.
+        """
+        known, coefficient = tensors[f"{prefix}position"], tensors[f"{prefix}coefficient"]
+        n = len(known)
+        expect(tensors, {f"{prefix}position": (n, 3), f"{prefix}coefficient": (n, *coefficient.shape[1:2])})
+        return cls(Kernel(**header[f"{prefix}kernel"]), known, coefficient.to(dtype), exact)
 
     @cached_property
     @torch.inference_mode(False)
-    def inverse(self) -> Tensor:
-        """Of the covariance of the noisy values, (n, n)."""
-        inverse: Tensor = torch.linalg.inv(self.kernel.noisy_gram(self.known))
+    def _inverse(self) -> Tensor:
+        inverse: Tensor = torch.linalg.inv(self.kernel.covariance(self.known))
         return inverse
 
-    def weights(self, position: Tensor) -> Tensor:
-        """By which the known values make up the mean at positions (m, 3), float64 (m, n)."""
-        weights: Tensor = self.kernel(position.double(), self.known) @ self.inverse
-        return weights
+    @cached_property
+    def _neighbours(self) -> Neighbours:
+        return Neighbours(self.known)
 
-    def variance(self, position: Tensor) -> Tensor:
-        """Of the field (without noise) at positions (m, 3), relative to k(0) = 1, float64 (m,)."""
-        cross = self.kernel(position.double(), self.known)
-        variance: Tensor = 1 - (cross @ self.inverse * cross).sum(dim=1)
-        return variance.clamp(0, 1)
-
-
-class NearbyProcess:
-    """The same for any number of known positions: each position is told of by the nearest of them alone (local Gaussian
-    processes: R. B. Gramacy and D. W. Apley, Journal of Computational and Graphical Statistics 24, 2015).
-
-    Args:
-        kernel: with its noise.
-        known: positions (n, 3) of the values.
-    """
-
-    def __init__(self, kernel: Kernel, known: Tensor) -> None:
-        self.kernel, self.known, self._neighbours = kernel, known.double(), Neighbours(known)
-
-    def weights(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """At positions (m, 3): numbers of the known values that make up the mean, (m, k), by which weights, float64 (m, k),
-        and the variance of the field (without noise), relative to k(0) = 1, float64 (m,)."""
+    def _local(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return row numbers (m, k), weights (m, k) and posterior variance (m,) from the nearest positions."""
         position = position.to(self.known)
-        number = self._neighbours(position, min(NEAR, len(self.known)))[1].to(self.known.device)
+        number = self._neighbours(position, min(N_NEIGHBOURS, len(self.known)))[1].to(self.known.device)
         near = self.known[number]
         noisy = self.kernel(near, near) + self.kernel.noise * torch.eye(number.shape[1]).to(near)
         cross = self.kernel(position[:, None], near)[:, 0]
         weight = torch.linalg.solve(noisy, cross)
         return number, weight, (1 - (weight * cross).sum(dim=1)).clamp(0, 1)
 
-    def mean(self, position: Tensor, value: Tensor) -> Tensor:
-        """Of functions with known values (n, K) at positions (m, 3), float64 (m, K)."""
-        number, weight, _ = self.weights(position)
-        return torch.einsum("mk,mkc->mc", weight, value[number].double())
 
-    def variance(self, position: Tensor) -> Tensor:
-        """Of the field (without noise) at positions (m, 3), relative to k(0) = 1, float64 (m,)."""
-        return self.weights(position)[2]
+def dense_weights(number: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Return weights (m, k) of rows `number` (m, k) as unique row numbers (r,) and one weight of each, (m, r)."""
+    rows, column = number.unique(return_inverse=True)
+    return rows, weight.new_zeros(len(weight), len(rows)).scatter(1, column, weight)
 
 
-def held_out_errors(precision: Tensor, dual: Tensor, part: Tensor) -> Tensor:
-    """Errors of what all other rows say of some, without another fit: P_part^-1 (P y)_part for a Gaussian vector y with
-    precision P, whatever the part's own values and noise (Rasmussen and Williams 2006, eq. 5.12, for more than one row).
+class LeaveGroupOut:
+    """Prediction of a group of rows from all other rows without another fit.
+
+    For a Gaussian vector y with precision P, the errors at the rows g are inv(P[g, g]) @ (P @ y)[g], with covariance
+    inv(P[g, g]) (C. E. Rasmussen and C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006, eq. 5.12).
 
     Args:
-        precision: of the noisy values, (n, n).
-        dual: precision @ values, (n,).
-        part: numbers of the rows, (k,).
+        precision: Inverse covariance of the noisy values (n, n).
+        out: Numbers of the rows that are held out, (o,).
     """
-    error: Tensor = torch.linalg.solve(precision.index_select(0, part).index_select(1, part), dual[part])
-    return error
+
+    def __init__(self, precision: Tensor, out: Tensor) -> None:
+        self.precision, self.out = precision, out
+        self.covariance: Tensor = torch.linalg.inv(precision.index_select(0, out).index_select(1, out))
+
+    @classmethod
+    def each(cls, kernel: Kernel, position: Tensor, fold: Tensor) -> Iterator[LeaveGroupOut]:
+        """Yield one group for each fold of a process with mean 0 at positions (n, 3) with fold numbers (n,)."""
+        precision = torch.linalg.inv(kernel.covariance(position))
+        for number in fold.unique():
+            yield cls(precision, (fold == number).nonzero()[:, 0])
+
+    @cached_property
+    def kept(self) -> Tensor:
+        """Numbers of the other rows, (k,)."""
+        held = torch.zeros(len(self.precision), dtype=torch.bool)
+        held[self.out] = True
+        return (~held).nonzero()[:, 0]
+
+    @property
+    def weights(self) -> Tensor:
+        """Weights (o, k) with which the other rows predict the group."""
+        return -self.covariance @ self.precision.index_select(0, self.out).index_select(1, self.kept)
+
+    def errors(self, dual: Tensor) -> Tensor:
+        """Return true minus predicted values (o, ...) from precision @ values (n, ...)."""
+        return self.covariance @ dual[self.out]
 
 
 def held_out(kernel: Kernel, position: Tensor, fold: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
-    """What regression with mean 0 predicts of values whose fold is left out, all folds from one inverse (Rasmussen and
-    Williams 2006, section 5.4.2; Golub, Heath and Wahba 1979).
+    """Return predictions (n, K) of values (n, K) without their folds, and variances of the noisy values, float64 (n,).
 
     Args:
-        position: (n, 3).
-        fold: number of the part that each is held out with, (n,).
-        value: (n, K).
-
-    Returns:
-        Predictions (n, K), and variances of the noisy values about them, relative to k(0) = 1, (n,); float64.
+        kernel: Kernel of a process with mean 0.
+        position: Positions (n, 3).
+        fold: Number of the group that each row is held out with, (n,).
+        value: Values (n, K).
     """
-    inverse = torch.linalg.inv(kernel.noisy_gram(position))
-    weighted = inverse @ value.double()
-    predicted, variance = torch.empty_like(weighted), torch.empty(len(value), dtype=torch.float64)
-    for number in fold.unique():
-        out = (fold == number).nonzero()[:, 0]
-        covariance = torch.linalg.inv(inverse[out][:, out])
-        predicted[out] = value[out].double() - covariance @ weighted[out]
-        variance[out] = covariance.diagonal()
+    predicted, variance = torch.empty_like(value, dtype=torch.float64), torch.empty(len(value), dtype=torch.float64)
+    dual: Tensor | None = None
+    for group in LeaveGroupOut.each(kernel, position, fold):
+        dual = group.precision @ value.double() if dual is None else dual
+        predicted[group.out] = value[group.out].double() - group.errors(dual)
+        variance[group.out] = group.covariance.diagonal()
     return predicted, variance
-
-
-def held_out_weights(kernel: Kernel, position: Tensor, fold: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """For each fold: which rows are out and which are kept, and the weights (out, kept) that predict the former."""
-    noisy = kernel.noisy_gram(position)
-    covariance = noisy - kernel.noise * torch.eye(len(position), dtype=noisy.dtype)
-    for number in fold.unique():
-        out, kept = fold == number, fold != number
-        yield out, kept, torch.linalg.solve(noisy[kept][:, kept], covariance[kept][:, out]).T

@@ -28,7 +28,7 @@ from swiftwrf.locate.spectrum_likelihood import (
 )
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry import GeometryModel
-from swiftwrf.models.geometry.fit import observe
+from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.path_gains import PathGains, fit_path_gains, prior
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
@@ -109,7 +109,7 @@ class MatchedField:
         self.grid, self.room = train.grid, own
         assert train.array is not None
         features = SpectrumFeatures.of(train.store.batches(), train.array, train.grid, self.config.seed)
-        scene, rows = observe(train, self.config.seed)
+        scene, rows = observe(train, GeometryConfig(seed=self.config.seed))
         kernel = prior(scene.moving)
 
         def fitted(kept: Tensor) -> _Fit:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.data.spectra import Spectra, check_training
+from swiftwrf.data.spectra import Moving, Spectra, check_training
 from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions
@@ -261,6 +261,12 @@ class FieldModel(Saved):
         """Room that the model found or uses; None for models without one."""
         return None
 
+    @property
+    def fixed_end(self) -> tuple[Tensor, Tensor, Moving] | None:
+        """Position of the fixed end (3,) [m], rotation of the array (3, 3) and moving end; None if the model lacks them."""
+        room = self.room
+        return None if room is None else (room.fixed_position, room.rotation, room.moving)
+
     def region(self) -> Tensor:
         """Return positions (n, 3) [m] around which the model was fitted.
 
@@ -378,6 +384,7 @@ def check_finite(spectrum: Tensor) -> Tensor:
 FIELD_MODELS: Registry[FieldModel] = Registry("field model", "swiftwrf.models")
 
 
+@checked
 def make_model(name: str, preset: Preset = "quick", **options: Any) -> FieldModel:
     """Return a field model by its name, with those of the options that it has.
 
@@ -396,7 +403,8 @@ def make_model(name: str, preset: Preset = "quick", **options: Any) -> FieldMode
     model_type = FIELD_MODELS[name]
     known = {field.name for field in fields(model_type.config_type)}
     chosen = {option: value for option, value in options.items() if option in known}
-    return model_type(preset=preset, **chosen)
+    model: FieldModel = model_type(preset=preset, **chosen)
+    return model
 
 
 def model_types(names: Iterable[str] | None = None) -> dict[str, type[FieldModel]]:

@@ -1,18 +1,16 @@
-"""What a planar array can report at all: the linear space of its squared spectra, and a model that lives in it.
+"""The linear space of the squared spectra of a planar array, projection onto it, and a model in it.
 
     |S(k)|^2 = sum over element differences l of r(l) exp(j 2 pi l . k / wavelength),    r(-l) = conj(r(l))
 
 The differences form the array's *difference co-array* (Hoctor and Kassam 1990). A 4 x 4 array has 49 of them, so its squared
-spectrum is exactly 49 real numbers, at any resolution, at the pole and around the azimuth: a constant and, for each pair
-l, -l, a cosine and a sine. Gaussians need neither the array's geometry nor its carrier; this needs both.
+spectrum is exactly 49 real coefficients at any resolution: a constant and, for each pair l, -l, a cosine and a sine.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 
 import torch
@@ -23,40 +21,45 @@ from swiftwrf.array.planar import PlanarArray, basis, differences
 from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
-from swiftwrf.gp import EXACT, GaussianProcess, Kernel, NearbyProcess, choose_kernel
-from swiftwrf.gp.pca import Components, principal_components
+from swiftwrf.gp import GaussianProcess, choose_kernel, principal_components
 from swiftwrf.models.base import ARRAY, FIELD_MODELS, FieldModel, FitContext, Record
 from swiftwrf.runtime.checkpoint import Header, expect, refusing, restore
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
 
 MAX_COMPONENTS = 64  # principal components of the training magnitudes
-MIN_VARIANCE = 1e-6  # fraction of the variance below which a component is left out
+MAX_EXACT_ROWS = 2000  # spectra whose principal components are computed in memory
 
 
 @lru_cache(maxsize=4)
 @torch.inference_mode(False)
 def _inverse(array: PlanarArray, grid: AngularGrid) -> Tensor:
-    """Squared spectra to coefficients by least squares, float64 (pixels, 1 + 2 P)."""
+    """Return the matrix from squared spectra to coefficients by least squares, float64 (pixels, 1 + 2 P)."""
     inverse: Tensor = torch.linalg.pinv(basis(array, grid))
     return inverse
 
 
 def project(spectrum: Tensor, array: PlanarArray, grid: AngularGrid, *, stretched: bool = False) -> Tensor:
-    """The nearest spectra that the array can produce: least squares on the squares.
+    """Return the nearest spectra that the array can produce, by least squares on the squared magnitudes.
 
     Args:
-        spectrum: magnitudes in [0, 1], (n, n_elevation, n_azimuth), from any synthesizer.
-        array: with its geometry and carrier.
-        grid: of the spectra.
-        stretched: each spectrum was stretched to [0, 1] by itself, which took an offset from it; it is found, added for
-            the projection and taken off again.
+        spectrum: Magnitudes in [0, 1], (n, n_elevation, n_azimuth).
+        array: Antenna array with its carrier.
+        grid: Grid of the spectra.
+        stretched: Whether each spectrum was stretched to [0, 1], which removed an offset. The offset is estimated, added for
+            the projection and subtracted again.
 
     Returns:
-        float32, of the same shape, in [0, 1].
+        Magnitudes in [0, 1], float32 of the shape of `spectrum`.
 
     Raises:
-        InputError: spectra of another shape than the grid's.
+        InputError: Spectra of another shape than that of the grid.
+
+    Example:
+        >>> import swiftwrf
+        >>> data = swiftwrf.simulated_room(n=10)
+        >>> bool((project(data.spectrum, data.array, data.grid) - data.spectrum).abs().max() < 1e-2)
+        True
     """
     if spectrum.dim() != 3 or tuple(spectrum.shape[1:]) != grid.shape:
         raise InputError(
@@ -71,9 +74,9 @@ def project(spectrum: Tensor, array: PlanarArray, grid: AngularGrid, *, stretche
 
 
 def _offset(flat: Tensor, functions: Tensor, inverse: Tensor) -> Tensor:
-    """What has to be added to each spectrum (n, pixels) so that its square comes closest to the array's space, (n, 1).
+    """Return the offset (n, 1) that brings the square of each spectrum (n, pixels) closest to the array's space.
 
-    The residual of (s + c)^2 is that of s^2 plus 2 c times that of s: a line in c, whose shortest point is known.
+    The residual of (s + c)^2 is that of s^2 plus 2 c times that of s, linear in c.
     """
     residual, of_square = (x - x @ inverse @ functions for x in (flat, flat.square()))
     least = -(residual * of_square).sum(1) / (2 * residual.square().sum(1)).clamp_min(torch.finfo(flat.dtype).tiny)
@@ -103,12 +106,8 @@ class CoarrayModel(FieldModel):
     batch = 32  # spectra that stay in the processor's cache
 
     array: PlanarArray
-    kernel: Kernel
-    """kernel of the process, lengths in [m]"""
-    position: Tensor
-    """training positions, float64 (n, 3) [m]"""
-    readout: Tensor
-    """kernel weights to K component scores and the offset, or these values for a local process, float64 (n, K + 1)"""
+    process: GaussianProcess
+    """process of the K component scores and the offset"""
     offset: Tensor
     """mean offset that stretching removed from a spectrum, float32 (1,)"""
     form: Tensor
@@ -117,10 +116,11 @@ class CoarrayModel(FieldModel):
     @property
     def n_parameters(self) -> int:
         """Number of fitted values."""
-        return self.readout.numel() + self.form.numel()
+        assert self.process.coefficient is not None
+        return self.process.coefficient.numel() + self.form.numel()
 
     def region(self) -> Tensor:
-        return self.position
+        return self.process.known
 
     def _fit(self, train: Spectra, context: FitContext) -> None:
         assert train.array is not None
@@ -155,27 +155,14 @@ class CoarrayModel(FieldModel):
         def batches() -> Iterator[Tensor]:
             return (train.store[rows].flatten(1) + offset[rows] for rows in parts)
 
-        few = len(train) <= EXACT
-        if few:
-            mean, vector, component = _components(torch.cat(list(batches())))
-        else:
-            mean, vector, component = principal_components(batches, MAX_COMPONENTS, MIN_VARIANCE)
+        few = len(train) <= MAX_EXACT_ROWS
+        mean, score, component = principal_components(torch.cat(list(batches())) if few else batches, MAX_COMPONENTS)
         self.form = _quadratic_form(torch.cat([mean[None], component]), inverse)
         fold = folds(train.position, self.config.validation, self.config.seed)
-        self.kernel = choose_kernel(train.position, train.store, fold)
-        target = torch.cat([vector, (offset - offset.mean()).double()], dim=1)
-        self.readout = torch.linalg.solve(self.kernel.noisy_gram(train.position), target) if few else target
-        self.array, self.position, self.offset = array, train.position, offset.mean()[None]
-
-    @cached_property
-    def _process(self) -> GaussianProcess | NearbyProcess:
-        return (GaussianProcess if len(self.position) <= EXACT else NearbyProcess)(self.kernel, self.position)
-
-    def _scores(self, position: Tensor) -> Tensor:
-        """Return the mean of the component scores and the offset, float32 (n, K + 1)."""
-        if isinstance(self._process, NearbyProcess):
-            return self._process.mean(position, self.readout).float()
-        return (self.kernel(position, self.position) @ self.readout).float()
+        kernel = choose_kernel(train.position, train.store, fold)
+        target = torch.cat([score, (offset - offset.mean()).double()], dim=1)
+        self.process = GaussianProcess.regress(kernel, train.position, target)
+        self.array, self.offset = array, offset.mean()[None]
 
     def _spectra(self, score: Tensor, grid: AngularGrid) -> Tensor:
         """Return the spectra (b, H, W) of component scores with an offset (b, K + 1)."""
@@ -187,27 +174,26 @@ class CoarrayModel(FieldModel):
         return spectrum.reshape(-1, *grid.shape)
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
-        return self._spectra(self._scores(position), grid), None
+        return self._spectra(self.process.mean(position).float(), grid), None
 
     def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
-        score = self._scores(position)
+        score = self.process.mean(position).float()
         # a score's variance is 1 over the number of training positions
-        unknown = (self._process.variance(position) / len(self.position)).sqrt().float()
+        unknown = (self.process.variance(position) / len(self.process.known)).sqrt().float()
         score[:, :-1] += unknown[:, None] * torch.randn(len(position), score.shape[1] - 1, generator=generator)
         return self._spectra(score, grid)
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
-        tensors = {name: getattr(self, name) for name in ("position", "readout", "offset", "form")}
-        header = {"kernel": asdict(self.kernel), "wavelength": self.array.wavelength}
-        return tensors | {"element": self.array.element}, header
+        tensors, header = self.process.state()
+        tensors |= {"offset": self.offset, "form": self.form, "element": self.array.element}
+        return tensors, header | {"wavelength": self.array.wavelength}
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         self.array = PlanarArray(tensors["element"], header["wavelength"])
-        n, scores = len(tensors["position"]), tensors["readout"].shape[-1]
-        form = (1 + 2 * len(differences(self.array)), scores, scores)
-        expect(tensors, {"position": (n, 3), "readout": (n, scores), "offset": (1,), "form": form})
-        self.kernel = Kernel(**header["kernel"])
-        self.position, self.readout = tensors["position"].double(), tensors["readout"].double()
+        self.process = GaussianProcess.from_state(tensors, header, torch.float64)
+        n_scores = tensors["coefficient"].shape[-1]
+        form = (1 + 2 * len(differences(self.array)), n_scores, n_scores)
+        expect(tensors, {"offset": (1,), "form": form})
         self.offset, self.form = tensors["offset"].float(), tensors["form"].float()
 
 
@@ -242,16 +228,8 @@ def fit_coarray(
     return model.fit(train, checkpoint=checkpoint, on_record=on_record, progress=progress)
 
 
-def _components(flat: Tensor) -> Components:
-    """Principal components from the rows' inner products, of which there are far fewer than pixels."""
-    mean = flat.mean(dim=0)
-    value, vector = torch.linalg.eigh(((flat - mean) @ (flat - mean).T).double())
-    vector = vector[:, value > MIN_VARIANCE * value.sum()][:, -MAX_COMPONENTS:]
-    return Components(mean, vector, vector.T.float() @ (flat - mean))
-
-
 def _quadratic_form(component: Tensor, inverse: Tensor) -> Tensor:
-    """Coefficients of the products of all pairs of components (K + 1, pixels), (coefficients, K + 1, K + 1)."""
+    """Return the coefficients of the products of all pairs of components (K + 1, pixels), (1 + 2 P, K + 1, K + 1)."""
     n = len(component)
     form = torch.empty(n, n, inverse.shape[1])
     for i in range(n):

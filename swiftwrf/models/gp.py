@@ -11,7 +11,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import folds
-from swiftwrf.gp import EXACT, GaussianProcess, Kernel, NearbyProcess, choose_kernel, thinned
+from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, thinned
 from swiftwrf.models.base import FIELD_MODELS, FitContext
 from swiftwrf.models.nearest import MemoryModel
 from swiftwrf.runtime.checkpoint import Header
@@ -46,31 +46,25 @@ class GPModel(MemoryModel):
     def _prepare(self) -> None:
         """Precompute what predictions share: mean, process, and differences from the mean, if they are few."""
         self._mean = self.store.mean()
-        self._exact = len(self.position) <= EXACT
-        process = GaussianProcess if self._exact else NearbyProcess
-        self._process: GaussianProcess | NearbyProcess = process(self.kernel, self.position)
-        some = self.store[:] if self._exact else thinned(self.store)[0]
+        self._process = GaussianProcess(self.kernel, self.position)
+        some = self.store[:] if self._process.exact else thinned(self.store)[0]
         self._change = (some - self._mean).flatten(1)
 
-    def _weighted(self, position: Tensor) -> tuple[Tensor, Tensor]:
-        """Return differences from the mean spectrum (b, pixels), and the posterior variance (b,)."""
-        if isinstance(self._process, GaussianProcess):
-            return self._process.weights(position).float() @ self._change, self._process.variance(position)
-        number, weight, variance = self._process.weights(position)
-        rows, column = number.unique(return_inverse=True)
-        dense = torch.zeros(len(position), len(rows)).scatter(1, column, weight.float())
-        return dense @ (self.store[rows] - self._mean).flatten(1), variance
+    def _mean_change(self, position: Tensor) -> Tensor:
+        """Return predicted differences from the mean spectrum (b, pixels)."""
+        rows, weight = self._process.weights(position)
+        change = self._change if self._process.exact else (self.store[rows] - self._mean).flatten(1)
+        return weight.float() @ change
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
-        return self._mean + self._weighted(position)[0].reshape(-1, *grid.shape), None
+        return self._mean + self._mean_change(position).reshape(-1, *grid.shape), None
 
     def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
-        change, variance = self._weighted(position)
-        n = len(self._change)
+        variance, n = self._process.variance(position), len(self._change)
         # the covariance of the training spectra between pixels, scaled by the posterior variance of each position
         scale = variance.sqrt().float()[:, None] / math.sqrt(n)
         noise = scale * torch.randn(len(position), n, generator=generator)
-        return self._mean + (change + noise @ self._change).reshape(-1, *grid.shape)
+        return self._mean + (self._mean_change(position) + noise @ self._change).reshape(-1, *grid.shape)
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         return super()._state()[0], {"kernel": asdict(self.kernel)}

@@ -8,7 +8,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import folds
-from swiftwrf.gp import EXACT, inner_products, squared_errors, thinned
+from swiftwrf.gp import dense_weights, inner_products, squared_errors, thinned
 from swiftwrf.models.base import FIELD_MODELS, FitContext
 from swiftwrf.models.nearest import MemoryModel
 from swiftwrf.positions import distance, nearest
@@ -16,6 +16,7 @@ from swiftwrf.runtime.checkpoint import Header
 
 NEIGHBOUR_CANDIDATES = (1, 2, 3, 5, 8, 13, 20, 30)
 MIN_DISTANCE_M = 1e-9
+MAX_CHOICE_SPECTRA = 2000  # that choose the number of neighbours
 
 
 @FIELD_MODELS.register("idw")
@@ -37,7 +38,7 @@ class IDWModel(MemoryModel):
 
     def _fit(self, train: Spectra, context: FitContext) -> None:
         super()._fit(train, context)
-        (rows,) = thinned(torch.arange(len(train)), rows=EXACT)
+        (rows,) = thinned(torch.arange(len(train)), rows=MAX_CHOICE_SPECTRA)
         fold = folds(train.position, self.config.validation, self.config.seed)[rows]
         candidates = [k for k in NEIGHBOUR_CANDIDATES if k <= len(rows) - int(fold.bincount().max())]
         some = train.subset(rows)
@@ -45,10 +46,8 @@ class IDWModel(MemoryModel):
         self.k = min(candidates, key=lambda k: _held_out_loss(k, some.position, gram, fold))
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
-        number, weight = weights(position, self.position, self.k)
-        rows, column = number.unique(return_inverse=True)
-        dense = torch.zeros(len(position), len(rows)).scatter(1, column, weight)
-        return torch.tensordot(dense, self.store[rows], dims=1), None
+        rows, weight = dense_weights(*weights(position, self.position, self.k))
+        return torch.tensordot(weight, self.store[rows], dims=1), None
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         return super()._state()[0], {"k": self.k}

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.raytraced import ROOMS, SCENE_FILE, Material, Scene, Surface, Tracing, sionna, trace
+from swiftwrf.data.raytraced import Material, Scene, Surface, Tracing, open_scene, sionna, trace
 from swiftwrf.data.raytraced.surfaces import rectangle
 from swiftwrf.data.spectra import Moving, Spectra
 from swiftwrf.models.base import ARRAY, FIELD_MODELS, FIXED_END, FieldModel, FitContext
@@ -63,6 +62,10 @@ class RaytraceModel(FieldModel):
         """Room that is traced; None if a scene is given."""
         return self._room
 
+    @property
+    def fixed_end(self) -> tuple[Tensor, Tensor, Moving]:
+        return self.fixed_position, self.rotation, self.moving
+
     def _fit(self, train: Spectra, context: FitContext) -> None:
         sionna()  # refuses before a room is searched
         assert train.array is not None
@@ -103,7 +106,7 @@ class RaytraceModel(FieldModel):
             Tracing(seed=self.config.seed),
             self.progress,
         )
-        channel = self.array.channel(paths.direction @ self.rotation, paths.gain, paths.owner, len(near))
+        channel = paths.channel(self.array, self.rotation)
         reached = paths.count > 0
         spectrum[near[reached]] = self.array.spectrum(channel[reached], grid)
         return spectrum, None
@@ -123,17 +126,6 @@ class RaytraceModel(FieldModel):
         if self.config.scene is None:
             self._room = GeometryModel.within(self, tensors, header)
         self._build()
-
-
-def open_scene(name: str, frequency_hz: float) -> Scene:
-    """Return a built-in room by its name, or a scene by its file, at a carrier frequency.
-
-    Raises:
-        InputError: An unknown room, or a file that is no scene.
-    """
-    if name.endswith(SCENE_FILE):
-        return Scene.read(Path(name), frequency_hz)
-    return Scene(ROOMS[name]().surfaces(), frequency_hz)
 
 
 def surfaces(room: GeometryModel) -> list[Surface]:

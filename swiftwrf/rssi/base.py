@@ -22,14 +22,15 @@ from swiftwrf.runtime.threads import side_by_side
 from swiftwrf.runtime.validation import NonNegativeInt, configuration
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+ITEMS_PER_THREAD = 4  # between two results that are kept: starting threads costs milliseconds
 RECEIVER_POSITIONS = "positions of the receivers"
 
 
 def map_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
-    """Apply a function to items as `map` does, as many at a time as torch has threads."""
-    waiting, n_threads = list(items), torch.get_num_threads()
-    for start in range(0, len(waiting), n_threads):
-        yield from side_by_side(function, waiting[start : start + n_threads])
+    """Apply a function to items as `map` does, in as many threads as torch has."""
+    waiting, n_items = list(items), ITEMS_PER_THREAD * torch.get_num_threads()
+    for start in range(0, len(waiting), n_items):
+        yield from side_by_side(function, waiting[start : start + n_items])
 
 
 @configuration

@@ -10,6 +10,7 @@ fixed, A and B are rendered once, and m is one convex function of one number.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor, nn
@@ -42,18 +43,21 @@ class Head(nn.Module):
         self.primitives = Primitives(n_primitives, HEAD_GRID, generator=generator)
         self.basis = nn.Parameter(1 + RESPONSE_SPREAD * torch.randn(n_primitives, generator=generator))
 
-    def render(self) -> Tensor:
-        """Return A and B, (2, 2, directions): which field, real and imaginary part."""
-        if not len(self.primitives):
-            return torch.zeros(2, 2, N_DIRECTIONS)
-        mean, cholesky, attenuation, response = self.primitives()
-        canonical = attenuation[:, None] * response
-        weight = torch.stack([canonical, self.basis[:, None] * canonical])  # (2, N, 2)
-        means, choleskys = (x.expand(2, -1, -1) for x in (mean, cholesky))
-        fixed, varying = rasterize(means, choleskys, weight, HEAD_GRID).flatten(-2)
-        phase = fixed / magnitude(fixed[..., None]).squeeze(-1).clamp_min(1e-6)
-        gain = DB_PER_UNIT * (phase * varying).sum(dim=0).mean()
-        return torch.stack([fixed, varying / gain.clamp_min(1e-3)])
+
+def render(heads: Iterable[Head]) -> Tensor:
+    """Return A and B of R heads with equally many primitives, (R, 2, 2, directions): field, real and imaginary part."""
+    heads = list(heads)
+    if not len(heads[0].primitives):
+        return torch.zeros(len(heads), 2, 2, N_DIRECTIONS)
+    mean, cholesky, attenuation, response = map(torch.stack, zip(*(head.primitives() for head in heads), strict=True))
+    canonical = attenuation[..., None] * response
+    basis = torch.stack([head.basis for head in heads])
+    weight = torch.stack([canonical, basis[..., None] * canonical], dim=1)  # (R, 2, N, 2)
+    means, choleskys = (x[:, None].expand(-1, 2, -1, -1) for x in (mean, cholesky))
+    fixed, varying = rasterize(means, choleskys, weight, HEAD_GRID).flatten(-2).unbind(1)
+    phase = fixed / magnitude(fixed[..., None]).squeeze(-1).unsqueeze(-2).clamp_min(1e-6)
+    gain = DB_PER_UNIT * (phase * varying).sum(dim=-2).mean(dim=-1)
+    return torch.stack([fixed, varying / gain.clamp_min(1e-3)[:, None, None]], dim=1)
 
 
 def mean_magnitude(rendered: Tensor, latent: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -27,7 +27,7 @@ from swiftwrf.models.base import Record
 from swiftwrf.rssi.base import Map, RssiFitContext, RssiPredictor, fingerprint, map_threads
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
-from swiftwrf.rssi.paper_head import HELD_OUT_FOLD, learn_receiver
+from swiftwrf.rssi.paper_head import HELD_OUT_FOLD, learn_receivers
 from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
 from swiftwrf.rssi.regression import fit_receiver
 from swiftwrf.rssi.stacking import MIN_STACKING_ROWS, comparable, receiver_weights
@@ -40,6 +40,7 @@ from swiftwrf.runtime.threads import single_thread
 
 LEVEL = 0.8  # nominal coverage of the interval that the standard deviation is calibrated for
 MAX_DISTANCE_M = 1e9  # from the measurements: float32 ends beyond, and so does any receiver's range
+PAPER_RECEIVERS = 4  # receivers that the paper's head is learnt for together, which saves time
 MAX_VARIANCE_POSITIONS = 200  # measured positions that determine where the field is known
 
 
@@ -105,26 +106,27 @@ class RssiModel(RssiPredictor, Saved):
             if not session.records:
                 session.evaluated(record | {"seconds": time.perf_counter() - began}, {}, {})
             with files.refusing(f"{context.checkpoint} is no state that a fit can go on from"):
-                fitted = _saved_receivers(session)
-            pending = [r for r in range(len(training.receiver_names)) if r not in fitted]
-            fit_one: Any = learn_receiver if self.config.paper_head else fit_receiver
+                fitted = _saved_fits(session)
+            fit_some, size = (learn_receivers, PAPER_RECEIVERS) if self.config.paper_head else (fit_receiver, 1)
             # compiled rasterizers are not safe in several threads, and only the paper's head needs them here
             parallel: Map = context.parallel or (map if self.config.paper_head else map_threads)
-            task = partial(fit_one, config=self.config, device=context.device)
-            results = zip(pending, parallel(task, [training.column(r) for r in pending]), strict=True)
-            for r, fitted[r] in bar.track(results, total=len(pending), description="receivers"):
-                error = fitted[r]["held_out"].where(_held_out_mask(training, self.config)[:, r], torch.nan)
-                record = {"stage": "final", "receiver": training.receiver_names[r], "n_primitives": training.n_primitives}
-                record["validation"] = float((error - training.rssi[:, r]).abs().nanmean())
+            task = partial(fit_some, config=self.config, device=context.device)
+            starts = [start for start in range(0, len(training.receiver_names), size) if start not in fitted]
+            groups = [training.columns(slice(start, start + size)) for start in starts]
+            results = zip(starts, groups, parallel(task, groups), strict=True)
+            for start, group, fitted[start] in bar.track(results, total=len(starts), description="receivers"):
+                record |= {"stage": "final", "receivers": list(group.receiver_names)}
+                error = fitted[start]["held_out"].T.where(_held_out_mask(group, self.config), torch.nan) - group.rssi
                 tensors = {f"{i}.{name}": value for i, found in fitted.items() for name, value in found.items()}
-                session.evaluated(record | {"seconds": time.perf_counter() - began}, tensors, {})
-        self._assemble(train, training, fitted)
+                record |= {"validation": float(error.abs().nanmean()), "seconds": time.perf_counter() - began}
+                session.evaluated(record, tensors, {})
+        self._assemble(
+            train, training, {name: torch.cat([fitted[i][name] for i in sorted(fitted)]) for name in fitted[0]}
+        )
 
     @single_thread()
-    def _assemble(self, train: Rssi, training: RssiTraining, fitted: dict[int, dict[str, Tensor]]) -> None:
-        """Take the fits of all receivers over: mix them with the simpler predictors, and calibrate the standard deviation."""
-        columns = [fitted[r] for r in range(len(fitted))]
-        found = {name: torch.stack([column[name] for column in columns]) for name in columns[0]}
+    def _assemble(self, train: Rssi, training: RssiTraining, found: dict[str, Tensor]) -> None:
+        """Mix the fits of all receivers with the simpler predictors, and calibrate the standard deviation."""
         held_out = found["held_out"].T.where(_held_out_mask(training, self.config), torch.nan)
         predictors = torch.cat([held_out[None], training.baseline_held_out])  # (4, n, R)
         measured, row = train.rssi_dbm, training.bin_of_row
@@ -133,7 +135,7 @@ class RssiModel(RssiPredictor, Saved):
                 "no rows can be held out to estimate the error of the model: all measurements are in one part of the "
                 'region; measure elsewhere, too, give a pool of more receivers, or take validation="random"'
             )
-        weight = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)[:, None].expand(-1, len(columns)).contiguous()
+        weight = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)[:, None].repeat(1, len(training.receiver_names))
         if not self.config.paper_head:
             weight = receiver_weights(predictors, measured, row)
         predicted = (weight[:, None] * predictors).where(weight[:, None] > 0, 0.0).sum(dim=0)
@@ -159,7 +161,7 @@ class RssiModel(RssiPredictor, Saved):
         self._table = HeadTable(self.rendered)
         at_zero = self._table(torch.zeros(1, len(self.level)))[0]
         self._offset = torch.zeros_like(at_zero) if self.config.paper_head else at_zero
-        self._process = GaussianProcess(self.kernel, *thinned(self.anchor.double(), rows=MAX_VARIANCE_POSITIONS))
+        self._process = GaussianProcess(self.kernel, thinned(self.anchor.double(), rows=MAX_VARIANCE_POSITIONS)[0])
 
     @single_thread()
     def _predict(self, position: Tensor) -> tuple[Tensor, Tensor]:
@@ -190,7 +192,10 @@ class RssiModel(RssiPredictor, Saved):
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         model = cls(RssiConfig(**header["options"]))
-        model.receiver_names, model.n_primitives = tuple(map(str, header["receiver_names"])), int(header["n_primitives"])
+        model.receiver_names, model.n_primitives = (
+            tuple(map(str, header["receiver_names"])),
+            int(header["n_primitives"]),
+        )
         model.kernel = Kernel(**header["kernel"])
         shapes = _shapes(len(model.receiver_names), len(tensors["anchor"]))
         files.expect(tensors, shapes)
@@ -243,12 +248,12 @@ def _shapes(n_receivers: int, n_anchors: int) -> dict[str, tuple[int, ...]]:
     }
 
 
-def _saved_receivers(session: Session) -> dict[int, dict[str, Tensor]]:
-    """Return the fits of the receivers that an interrupted fit has finished, by their number."""
+def _saved_fits(session: Session) -> dict[int, dict[str, Tensor]]:
+    """Return the fits that an interrupted session has finished, by the number of their first receiver."""
     fitted: dict[int, dict[str, Tensor]] = {}
     for key, tensor in (session.saved.tensors if session.saved else {}).items():
-        number, name = key.split(".")
-        fitted.setdefault(int(number), {})[name] = tensor
+        start, name = key.split(".")
+        fitted.setdefault(int(start), {})[name] = tensor
     return fitted
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.errors import FitError
-from swiftwrf.gp import held_out_errors
+from swiftwrf.gp import LeaveGroupOut
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import HeadTable
 from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
@@ -37,9 +37,9 @@ def fit_receiver(data: RssiTraining, config: RssiConfig, device: torch.device) -
         device: Device to compute on.
 
     Returns:
-        level () [dBm], slope () [dB a decade] and directivity (8,) [dB]; coefficient (n,) of the kernel to the bins, whose
-        sum is the latent field [dB]; rendered fields of the head (2, 2, directions); held_out (n,), predictions of detected
-        bins by all other folds [dBm].
+        With R = 1: level (R,) [dBm], slope (R,) [dB a decade] and directivity (R, 8) [dB]; coefficient (R, n) of the kernel
+        to the bins, whose sum is the latent field [dB]; rendered fields of the heads (R, 2, 2, directions); held_out (R, n),
+        predictions of detected bins by all other folds [dBm].
 
     Raises:
         FitError: A system that cannot be solved, for positions or values beyond any measurement.
@@ -71,12 +71,12 @@ def fit_receiver(data: RssiTraining, config: RssiConfig, device: torch.device) -
         coefficient[detected] = variance * (slope * dual).cpu()
         linear = scale * (dual.cpu() @ feature[detected])
     return {
-        "level": data.prior_mean.level[0] + linear[0],
-        "slope": data.prior_mean.slope[0] + linear[1],
-        "directivity": linear[2:],
-        "coefficient": coefficient,
-        "rendered": data.rendered[0],
-        "held_out": rssi.nan_to_num() - error,
+        "level": data.prior_mean.level + linear[0],
+        "slope": data.prior_mean.slope + linear[1],
+        "directivity": linear[None, 2:],
+        "coefficient": coefficient[None],
+        "rendered": data.rendered,
+        "held_out": (rssi.nan_to_num() - error)[None],
     }
 
 
@@ -94,8 +94,8 @@ def solve(
         huber: See `RssiConfig`.
 
     Returns:
-        The dual coefficients (n,), which are the inverse covariance of the data times the data, the slope of the tangent (n,)
-        and the Cholesky factor of the covariance of the data (n, n).
+        Dual coefficients (n,), i.e. the inverse covariance of the data times the data; the slope of the tangent (n,); the
+        Cholesky factor of the covariance of the data (n, n).
     """
     zero = table(torch.zeros(1, 1, dtype=torch.float64, device=residual.device))[0][0, 0]
     weight, latent = torch.ones_like(residual), torch.zeros_like(residual)
@@ -127,5 +127,5 @@ def fold_errors(factor: Tensor, dual: Tensor, fold: Tensor) -> Tensor:
     error = torch.empty_like(dual)
     for number in fold.unique():
         part = (fold == number).nonzero()[:, 0]
-        error[part] = held_out_errors(precision, dual, part)
+        error[part] = LeaveGroupOut(precision, part).errors(dual)
     return error

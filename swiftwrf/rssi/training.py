@@ -9,9 +9,9 @@ from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
-from swiftwrf.gp import Kernel, candidates, held_out_errors, thinned
+from swiftwrf.gp import Kernel, LeaveGroupOut, candidates, thinned
 from swiftwrf.rssi.config import RssiConfig
-from swiftwrf.rssi.head import Head
+from swiftwrf.rssi.head import Head, render
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
 from swiftwrf.runtime.threads import single_thread
 
@@ -62,21 +62,20 @@ class RssiTraining:
     baselines: PathLoss
     baseline_held_out: Tensor
 
-    def column(self, r: int) -> RssiTraining:
-        """Return the part of receiver r that its fit needs."""
-        one = slice(r, r + 1)
+    def columns(self, some: slice) -> RssiTraining:
+        """Return the part that the fit of some receivers needs."""
         return replace(
             self,
-            receiver_names=self.receiver_names[one],
-            receiver=self.receiver[one],
-            rssi=self.rssi[:, one].clone(),
-            count=self.count[:, one].clone(),
-            rendered=self.rendered[one].clone(),
-            prior_mean=PathLoss(self.prior_mean.level[one], self.prior_mean.slope[one]),
-            field_db=self.field_db[one],
-            noise_db=self.noise_db[one],
-            baselines=PathLoss(self.baselines.level[:, one], self.baselines.slope[:, one]),
-            baseline_held_out=self.baseline_held_out[..., one].clone(),
+            receiver_names=self.receiver_names[some],
+            receiver=self.receiver[some],
+            rssi=self.rssi[:, some].clone(),
+            count=self.count[:, some].clone(),
+            rendered=self.rendered[some].clone(),
+            prior_mean=PathLoss(self.prior_mean.level[some], self.prior_mean.slope[some]),
+            field_db=self.field_db[some],
+            noise_db=self.noise_db[some],
+            baselines=PathLoss(self.baselines.level[:, some], self.baselines.slope[:, some]),
+            baseline_held_out=self.baseline_held_out[..., some].clone(),
         )
 
 
@@ -129,7 +128,7 @@ def prepare(train: Rssi, pool: Rssi, config: RssiConfig) -> RssiTraining:
         count=count,
         kernel=kernel,
         n_primitives=n_primitives,
-        rendered=torch.stack([Head(name, n_primitives, config.seed).requires_grad_(False).render() for name in names]),
+        rendered=render([Head(name, n_primitives, config.seed).requires_grad_(False) for name in names]),
         prior_mean=prior_mean,
         field_db=((1 - noise) * variance).sqrt(),
         noise_db=(noise * variance).sqrt(),
@@ -197,9 +196,10 @@ def choose_residual_kernel(position: Tensor, residual: Tensor, fold: Tensor) -> 
         held_out += [(r, len(part), torch.cat([part, gaps])) for part in parts if len(part)]
 
     def error(kernel: Kernel) -> float:
-        precision = torch.linalg.inv(kernel.noisy_gram(position))
+        precision = torch.linalg.inv(kernel.covariance(position))
         dual = precision @ residual.nan_to_num()
-        return float(torch.cat([held_out_errors(precision, dual[:, r], out)[:n] for r, n, out in held_out]).abs().mean())
+        errors = [LeaveGroupOut(precision, out).errors(dual[:, r])[:n] for r, n, out in held_out]
+        return float(torch.cat(errors).abs().mean())
 
     # rough fields only: a choice among mixtures with a smooth part follows chance, and its errors are no lower
     rough = (kernel for kernel in candidates(position, RELATIVE_NOISE_VARIANCES) if kernel.share == 1)

@@ -59,9 +59,7 @@ def read(path: str | Path, *kinds: str) -> tuple[str, dict[str, Tensor], Header]
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
             for name, tensor in tensors.items():
                 if not bool(torch.isfinite(tensor).all()):
-                    raise InputError(
-                        f"{path}: {name} holds a value that is not finite; create the file again"
-                    )
+                    raise InputError(f"{path}: {name} holds a value that is not finite; create the file again")
     except InputError:
         raise
     except (OSError, SafetensorError, ValueError, RecursionError, RuntimeError, TypeError) as error:

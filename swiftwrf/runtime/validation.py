@@ -135,7 +135,7 @@ def configuration(cls: type[Class]) -> type[Class]:
 
     cls.__post_init__ = check_fields  # type: ignore[attr-defined]
     made = dataclass(frozen=True)(cls)
-    made.__init__.__no_type_check__ = True  # type: ignore[misc,attr-defined]  # the check above has the better message
+    made.__init__.__no_type_check__ = True  # type: ignore[attr-defined]  # the check above has the better message
     return made
 
 

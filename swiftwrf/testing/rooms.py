@@ -11,7 +11,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.spectra import Moving, Spectra
 from swiftwrf.data.store import Store
-from swiftwrf.models.geometry.images import Scene, field, sequences
+from swiftwrf.models.geometry.images import PhaseObservations, field, sequences
 
 Normal = tuple[float, float, float]
 GRID = AngularGrid.hemisphere(10, 40)
@@ -48,7 +48,7 @@ def mirror_room(
     position = least + (most - least) * torch.rand(n, 3, dtype=torch.float64, generator=generator)
     fixed = torch.tensor([2.6, 2.2, 2.4 if moving == "receiver" else 0.3], dtype=torch.float64)
     rotation = torch.eye(3, dtype=torch.float64)
-    scene = Scene.of(position, fixed, moving, array, rotation, torch.ones(n, len(array.element)))
+    scene = PhaseObservations.of(position, fixed, moving, array, rotation, torch.ones(n, len(array.element)))
     channel = scene.wave(scene.transmitter)
     if planes:
         normal = torch.tensor(list(planes), dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Measurements of any known format, written in the toolkit's own layout."""
+"""Convert measurements of any known format to the toolkit's own layout."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import tyro
 
 from swiftwrf import InputError
 from swiftwrf.array.beamforming import PHASE
-from swiftwrf.data import Reading, Rssi, Snapshots, Spectra
+from swiftwrf.data import ReadOptions, Rssi, Snapshots, Spectra
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
 from swiftwrf.data.writing import write_rssi, write_spectra
 from swiftwrf.diagnostics.calibration import Calibration, calibrate
@@ -23,38 +23,38 @@ from tasks.source import SpectraSource, TableSource, reading
 
 @dataclass(frozen=True)
 class ConvertConfig(SpectraSource, TableSource):
-    """Measurements of any known format, written in the toolkit's own layout (see docs/formats.md)."""
+    """Convert measurements of any known format to the toolkit's own layout (see docs/formats.md)."""
 
     source: Annotated[str, tyro.conf.Positional]
     """folder or file of measurements"""
     out: Annotated[str, tyro.conf.Positional]
     """directory to write; must not exist"""
     calibrate: bool = False
-    """estimate phases of the elements and the array's orientation from the training positions of array snapshots, and take
-    them out"""
+    """whether to estimate the elements' phases and the array's orientation from the training positions of array snapshots,
+    and to correct them"""
     split: str | None = None
-    """with --calibrate: the split whose training part it sees (random unless given); it is written beside the spectra"""
+    """with --calibrate: split whose training part is used (default: random); it is written beside the spectra"""
     seed: int = 0
-    """of that split"""
+    """seed of that split"""
 
 
 def run(config: ConvertConfig) -> None:
-    """Reads, calibrates where asked, and writes.
+    """Read measurements, calibrate them on request, and write them.
 
     Raises:
-        InputError: what cannot be read, calibrated or written in the layout.
+        InputError: Measurements that cannot be read, calibrated or written in the layout.
     """
-    how = reading(config)
+    options = reading(config)
     if (config.split is not None or config.seed) and not config.calibrate:
         raise InputError("--split and --seed are of the calibration; give --calibrate, too")
     with new_directory(Path(config.out), "a directory") as folder:
-        data = read(config.source, how, SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
+        data = read(config.source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
         found = None
         if config.calibrate:
             data, found = _calibrated(data, config)
         for note in data.notes:
             console.print(f"{data.name}: {note}")
-        written = _write(data, how, folder)
+        written = _write(data, options, folder)
         record = {
             "command": invocation("convert"),
             "options": asdict(config),
@@ -74,18 +74,18 @@ def _calibrated(data: Spectra | Snapshots | Rssi, config: ConvertConfig) -> tupl
     found = calibrate(train)
     phase, turn = float(found.phase_std.rad2deg().max()), float(found.turn.rad2deg().norm())
     console.print(
-        f"calibrated on {found.clear} training positions: phases to {phase:.1f} deg, turned by {turn:.1f} deg (+- "
-        f"{float(found.turn_std.rad2deg().max()):.1f}); along the line of sight comes {found.after:.0%} of what is heard at "
-        f"positions held out, {found.before:.0%} before"
+        f"calibrated on {found.clear} training positions: phases to {phase:.1f} deg, rotated by {turn:.1f} deg (+- "
+        f"{float(found.turn_std.rad2deg().max()):.1f}); at held-out positions, {found.after:.0%} of the received power "
+        f"arrives along the line of sight, {found.before:.0%} without calibration"
     )
     rows = torch.searchsorted(data.index, train.index), torch.searchsorted(data.index, test.index)
     return replace(found.apply(data), named_splits={**data.named_splits, name: rows}), found
 
 
-def _write(data: Spectra | Snapshots | Rssi, how: Reading, folder: Path) -> str:
+def _write(data: Spectra | Snapshots | Rssi, options: ReadOptions, folder: Path) -> str:
     if isinstance(data, Rssi):
         write_rssi(data, folder)
         return f"{len(data)} rows of RSSI at {len(data.receiver_names)} receivers"
-    spectra = data.spectra(how.grid, how.beamformer or PHASE) if isinstance(data, Snapshots) else data
+    spectra = data.spectra(options.grid, options.beamformer or PHASE) if isinstance(data, Snapshots) else data
     write_spectra(spectra, folder)
     return f"{len(spectra)} spectra of {spectra.grid.shape[0]} x {spectra.grid.shape[1]} pixels"

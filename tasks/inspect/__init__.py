@@ -1,4 +1,4 @@
-"""What measurements hold, before anything is learnt from them."""
+"""Inspect measurements before a model is fitted."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ class InspectConfig(SpectraSource, TableSource):
 
 
 def run(config: InspectConfig) -> None:
-    """Says what it sees, and writes a page and inspect.json.
+    """Print the findings, and write a page and inspect.json.
 
     Raises:
-        InputError: what cannot be read.
+        InputError: Measurements that cannot be read.
     """
-    how = reading(config)
+    options = reading(config)
     out = Path(config.out) if config.out else Path("runs") / "inspect" / f"{datetime.now():%Y%m%d-%H%M%S}"
     with new_directory(out, "an inspection") as folder:
-        data = read(config.source, how, SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
+        data = read(config.source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
         kind = "RSSI" if isinstance(data, Rssi) else "array snapshots" if isinstance(data, Snapshots) else "spectra"
-        findings, shown = inspect(data, how)
+        findings, shown = inspect(data, options)
         content = {
             "source": config.source,
             "kind": kind,

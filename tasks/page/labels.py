@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 from swiftwrf.runtime.registry import Registry
 
@@ -67,7 +68,7 @@ PREDICTORS = {
 }
 
 
-def labels(registry: Registry[object], known: dict[str, Label], names: Iterable[str] | None = None) -> dict[str, Label]:
+def labels(registry: Registry[Any], known: dict[str, Label], names: Iterable[str] | None = None) -> dict[str, Label]:
     """Return the labels of registered methods; a method of another package has the first line of its docstring.
 
     Args:
@@ -77,9 +78,3 @@ def labels(registry: Registry[object], known: dict[str, Label], names: Iterable[
     """
     found = registry if names is None else [name for name in names if name in registry]
     return {name: known.get(name) or Label(registry.summary(name)) for name in found}
-
-
-def colour_of(name: str, known: dict[str, Label]) -> str:
-    """Return the colour of a method, for an unlabelled one a colour that follows from its name."""
-    label = known.get(name)
-    return (label and label.colour) or OTHER_COLOURS[sum(name.encode()) % len(OTHER_COLOURS)]

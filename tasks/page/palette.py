@@ -1,38 +1,38 @@
-"""What each method looks like, the same in all figures."""
+"""Colours and line styles of methods, the same in all figures."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
-from swiftwrf.runtime.registry import Entry
-
-# colour-blind safe (P. Tol, "bright"), for names without a colour of their own
-OTHERS = ("#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")
+from tasks.page.labels import OTHER_COLOURS, Label
 
 
 @dataclass(frozen=True)
 class Palette:
-    """Colours and lines of methods.
+    """Colours and line styles of methods.
 
     Args:
-        colours: `#rrggbb` by name.
-        dashed: names whose lines are dashed.
+        colours: Colours `#rrggbb` by name.
+        dashed: Names whose lines are dashed.
+
+    Example:
+        >>> Palette({"gp": "#ee8866"}, frozenset({"peak"})).line("peak")
+        '--'
     """
 
     colours: Mapping[str, str] = field(default_factory=dict)
     dashed: frozenset[str] = frozenset()
 
     @classmethod
-    def of(cls, entries: Iterable[Entry[Any]], dashed: Iterable[str] = ()) -> Palette:
-        """The colours of the entries of a registry."""
-        return cls({entry.name: entry.colour for entry in entries if entry.colour}, frozenset(dashed))
+    def of(cls, labels: Mapping[str, Label], dashed: Iterable[str] = ()) -> Palette:
+        """Return the palette of labelled methods."""
+        return cls({name: label.colour for name, label in labels.items() if label.colour}, frozenset(dashed))
 
     def colour(self, name: str) -> str:
-        """The colour of that name; one without its own gets one that depends on the name alone."""
-        return self.colours.get(name) or OTHERS[sum(name.encode()) % len(OTHERS)]
+        """Return the colour of a method. A method without a label has a colour that follows from its name."""
+        return self.colours.get(name) or OTHER_COLOURS[sum(name.encode()) % len(OTHER_COLOURS)]
 
     def line(self, name: str) -> str:
-        """The line style of that name."""
+        """Return the line style of a method."""
         return "--" if name in self.dashed else "-"

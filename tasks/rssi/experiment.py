@@ -1,4 +1,4 @@
-"""RSSI at the receivers asked for, at positions nobody measured: SwiftWRF against what practitioners use."""
+"""RSSI of a moving transmitter at fixed receivers: SwiftWRF against the predictors that practitioners use."""
 
 from __future__ import annotations
 
@@ -15,29 +15,30 @@ from PIL import Image, UnidentifiedImageError
 from swiftwrf import InputError, Rssi, load_rssi, rssi_room
 from swiftwrf.data.files import sha256
 from swiftwrf.data.splits import validation_for
+from swiftwrf.models.base import Prediction
 from swiftwrf.positions import distance
-from swiftwrf.rssi import LEVEL
+from swiftwrf.rasterize import prepare
+from swiftwrf.rssi import LEVEL, RssiModel
 from tasks.cluster import connected
 from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
 from tasks.page.page import reporting
 from tasks.rssi.page import page
-from tasks.rssi.predictors import PREDICTORS, SLOW, Settings, lacks
-from tasks.rssi.predictors.swiftwrf import SwiftWRFPredictor
+from tasks.rssi.predictors import PREDICTORS, make_predictor
 from tasks.run import Preset, Row, Run, choose_device, console
 from tasks.source import TableSource, reading
 from tasks.summarise import error_summary, grouped
 
 MODEL = "model.safetensors"
 MAP_CELLS = 80  # along the longer side of the floor
-MOST_PLAN_PIXELS = 2**24
+MAX_PLAN_PIXELS = 2**24
 
 
 @dataclass(frozen=True)
 class RssiTaskConfig(TableSource):
     """RSSI of a moving transmitter at fixed receivers, against baselines.
 
-    Without --data the built-in simulated floor is used. An interrupted run goes on with --resume DIR.partial, here or where
-    a --scheduler beside it says.
+    Without --data the built-in simulated floor is used. Continue an interrupted run with --resume DIR.partial, and with
+    --scheduler ADDRESS to continue on a cluster.
     """
 
     rx: tuple[str, ...]
@@ -49,7 +50,7 @@ class RssiTaskConfig(TableSource):
     also: tuple[str, ...] = ()
     """predictors that take minutes and are compared only when named: nerf2, blend"""
     preset: Preset = "quick"
-    """of SwiftWRF: quick corrects a log-distance law; paper is the plain head"""
+    """of SwiftWRF and NeRF2: quick, or paper for the published head and field"""
     floor_plan: str | None = None
     """an image to draw behind the maps, PNG or JPEG"""
     floor_extent: tuple[float, float, float, float] | None = None
@@ -57,7 +58,7 @@ class RssiTaskConfig(TableSource):
     scheduler: str | None = None
     """address of a Dask scheduler whose workers fit groups of receivers (extra: cluster)"""
     seed: int = 0
-    """of everything random"""
+    """seed of everything random"""
     out: str | None = None
     """directory of the run; must not exist (default: a new one under runs/rssi)"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -65,10 +66,10 @@ class RssiTaskConfig(TableSource):
 
 
 def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
-    """Runs the experiment and writes its directory, or goes on with an interrupted one.
+    """Run the experiment and write its directory, or continue an interrupted one.
 
     Raises:
-        InputError: what the configuration asks for is not there or makes no sense.
+        InputError: A configuration that the data cannot meet or that contradicts itself.
     """
     device = choose_device("cpu" if config.device == "auto" else config.device)
     for name in config.also:
@@ -80,18 +81,18 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         console.print(f"{data.name}: {note}")
     train, test = data.split(config.split, config.seed)
     if not bool((~test.rssi_dbm.isnan()).any()):
-        raise InputError(f"split {config.split!r} of {data.name} has no heard test rows for these receivers")
+        raise InputError(f"split {config.split!r} of {data.name} has no test rows that detect these receivers")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
+    prepare(device)  # compiles, which no predictor's time should contain
     with (
         connected(config.scheduler, device) as cluster,
         Run("rssi", config.out, label, config, device, source, resume) as directory,
     ):
-        parallel = cluster.map if cluster else map
-        settings = Settings(validation_for(config.split), config.seed, config.preset, device, parallel, pool)
-        tables = _Tables(data, train, test, plan, directory, settings)
-        compared = [name for name in PREDICTORS if name not in SLOW or name in config.also]
-        left_out = {name: reason for name in compared if (reason := lacks(name, data))}
+        options = {"pool": pool, "device": device, "parallel": cluster.map if cluster else None}
+        tables = _Tables(config, train, test, plan, directory, options)
+        compared = [name for name in PREDICTORS if not PREDICTORS[name].slow or name in config.also]
+        left_out = {name: reason for name in compared if (reason := PREDICTORS[name].lacking(data))}
         for name in compared:
             if name in left_out:
                 console.print(f"left out: {left_out[name]}")
@@ -128,7 +129,7 @@ def _load(config: RssiTaskConfig) -> Rssi:
 
 
 def _read_floor_plan(config: RssiTaskConfig) -> dict[str, Any]:
-    """The floor plan and where it lies, as maps.npz keeps them; nothing where there is none."""
+    """Return the floor plan and its corners as maps.npz stores them, or nothing if there is no plan."""
     if (config.floor_plan is None) != (config.floor_extent is None):
         raise InputError("--floor-plan needs --floor-extent x0 x1 y0 y1 [m], and the other way round")
     if config.floor_plan is None or config.floor_extent is None:
@@ -137,12 +138,12 @@ def _read_floor_plan(config: RssiTaskConfig) -> dict[str, Any]:
     if not (x0 < x1 and y0 < y1):
         raise InputError(f"--floor-extent must be x0 x1 y0 y1 with x0 < x1 and y0 < y1, got {config.floor_extent}")
     try:
-        # few formats, for Pillow starts other programs for some; the pixels now, for a file may end before they do
+        # two formats only: Pillow starts other programs for some; the pixels are read here, since the file may be truncated
         with Image.open(config.floor_plan, formats=("PNG", "JPEG")) as image:
-            if image.width * image.height > MOST_PLAN_PIXELS:
+            if image.width * image.height > MAX_PLAN_PIXELS:
                 raise InputError(
                     f"--floor-plan {config.floor_plan} has {image.width} x {image.height} pixels; give one of at most "
-                    f"{MOST_PLAN_PIXELS}"
+                    f"{MAX_PLAN_PIXELS}"
                 )
             return {"plan": np.asarray(image.convert("RGB")), "plan_extent": np.array(config.floor_extent)}
     except InputError:
@@ -152,82 +153,82 @@ def _read_floor_plan(config: RssiTaskConfig) -> dict[str, Any]:
 
 
 def _rows(**columns: torch.Tensor | list[str]) -> list[Row]:
-    """The rows of a table with these columns."""
+    """Return the rows of a table with these columns."""
     values = (c.tolist() if isinstance(c, torch.Tensor) else c for c in columns.values())
     return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
 
 
 class _Tables:
-    """Fits and tests every predictor, each a step of the run's directory, and gathers the tables of the run."""
+    """Fits and tests every predictor, each a step of the run's directory, and collects the tables of the run."""
 
     def __init__(
-        self, data: Rssi, train: Rssi, test: Rssi, plan: dict[str, Any], directory: Run, settings: Settings
+        self,
+        config: RssiTaskConfig,
+        train: Rssi,
+        test: Rssi,
+        plan: dict[str, Any],
+        directory: Run,
+        options: dict[str, Any],
     ) -> None:
-        self.train, self.test, self.plan, self.directory, self.settings = train, test, plan, directory, settings
+        self.config, self.train, self.test, self.plan = config, train, test, plan
+        self.directory, self.options = directory, options
         self.errors: list[Row] = []
         self.predictions: list[Row] = []
         self.seconds: dict[str, PredictorSeconds] = {}
         self.coverage = float("nan")
         self.n_primitives = 0
-        self.heard = ~test.rssi_dbm.isnan()
-        self.row, column = self.heard.nonzero(as_tuple=True)
+        self.detected = ~test.rssi_dbm.isnan()
+        self.row, column = self.detected.nonzero(as_tuple=True)
         self.receiver = [test.receiver_names[number] for number in column.tolist()]
-        test_position = test.transmitter_position
-        self.from_receiver = distance(test_position, data.receiver_position)
-        self.from_training = distance(test_position, train.transmitter_position).min(dim=1).values
+        self.from_receiver = distance(test.transmitter_position, test.receiver_position)
+        self.from_training = distance(test.transmitter_position, train.transmitter_position).min(dim=1).values
 
     def add(self, name: str) -> None:
-        """One predictor."""
+        """Fit and test one predictor."""
 
         def compute() -> Row:
-            predictor = PREDICTORS[name].make(self.settings)
+            config = self.config
+            options = {"validation": validation_for(config.split), "seed": config.seed}
+            predictor = make_predictor(name, config.preset, **options)
             began = time.perf_counter()
-            predictor.fit(self.train)
+            predictor.fit(self.train, progress=True, **self.options)
             fitted = time.perf_counter()
-            result: Row = {"predicted": predictor.predict(self.test.transmitter_position)}
-            result |= {"fit": fitted - began, "predict": time.perf_counter() - fitted}
-            if isinstance(predictor, SwiftWRFPredictor):
-                _, low, high = predictor.model.predict(self.test.transmitter_position)
-                result |= {"low": low, "high": high, "n_primitives": predictor.model.n_primitives}
-                predictor.model.save(self.directory.path(MODEL))
-                self._keep_maps(predictor)
-            return result
+            prediction = predictor.predict(self.test.transmitter_position)
+            result: Row = {"fit": fitted - began, "predict": time.perf_counter() - fitted}
+            if isinstance(predictor, RssiModel):
+                result["n_primitives"] = predictor.n_primitives
+                predictor.save(self.directory.path(MODEL))
+                self._write_maps(predictor)
+            return result | {"predicted": prediction.mean, "std": prediction.std}
 
         value = self.directory.step(name, compute)
         self.seconds[name] = {"fit": value["fit"], "predict": value["predict"]}
-        predicted = torch.tensor(value["predicted"], dtype=torch.float64)
-        measured = self.test.rssi_dbm
+        predicted, measured = torch.tensor(value["predicted"], dtype=torch.float64), self.test.rssi_dbm
         self.errors += _rows(
             method=[name] * len(self.row),
             receiver=self.receiver,
             index=self.test.index[self.row],
-            measured_dbm=measured[self.heard],
-            predicted_dbm=predicted[self.heard],
-            abs_error_db=(predicted - measured)[self.heard].abs(),
-            from_receiver_m=self.from_receiver[self.heard],
+            measured_dbm=measured[self.detected],
+            predicted_dbm=predicted[self.detected],
+            abs_error_db=(predicted - measured)[self.detected].abs(),
+            from_receiver_m=self.from_receiver[self.detected],
             from_training_m=self.from_training[self.row],
         )
         if name == "swiftwrf":
-            self._predict_rows(predicted, torch.tensor(value["low"]), torch.tensor(value["high"]))
             self.n_primitives = value["n_primitives"]
+            self._add_predictions(Prediction(predicted, torch.tensor(value["std"], dtype=torch.float64)))
 
-    def _predict_rows(self, predicted: torch.Tensor, low: torch.Tensor, high: torch.Tensor) -> None:
-        measured, heard = self.test.rssi_dbm, self.heard
-        self.coverage = float(((measured >= low) & (measured <= high))[heard].double().mean())
+    def _add_predictions(self, prediction: Prediction) -> None:
+        measured, detected = self.test.rssi_dbm, self.detected
+        low, high = prediction.interval(LEVEL)
+        self.coverage = float(((measured >= low) & (measured <= high))[detected].double().mean())
         x, y, z = self.test.transmitter_position[self.row].unbind(dim=1)
-        self.predictions += _rows(
-            x=x,
-            y=y,
-            z=z,
-            receiver=self.receiver,
-            measured=measured[heard],
-            predicted=predicted[heard],
-            low=low[heard],
-            high=high[heard],
-        )
+        values = {"measured": measured, "predicted": prediction.mean, "low": low, "high": high}
+        columns = {name: value[detected] for name, value in values.items()}
+        self.predictions += _rows(x=x, y=y, z=z, receiver=self.receiver, **columns)
 
-    def _keep_maps(self, predictor: SwiftWRFPredictor) -> None:
-        """Predicted field and width of the interval over the floor, at the median height of the measurements."""
+    def _write_maps(self, model: RssiModel) -> None:
+        """Write the prediction and the width of its interval over the floor, at the median height of the measurements."""
         position = self.train.transmitter_position
         shown = torch.cat([position, self.test.transmitter_position])
         if self.train.located:
@@ -239,14 +240,15 @@ class _Tables:
             for a, b in zip(low[:2], high[:2], strict=True)
         )
         grid = torch.stack([*torch.meshgrid(xs, ys, indexing="xy")], dim=-1).reshape(-1, 2)
-        places = torch.cat([grid, position[:, 2].median().expand(len(grid), 1)], dim=1)
-        middle, lower, upper = (p.T.reshape(-1, len(ys), len(xs)).numpy() for p in predictor.model.predict(places))
+        prediction = model.predict(torch.cat([grid, position[:, 2].median().expand(len(grid), 1)], dim=1))
+        lower, upper = prediction.interval(LEVEL)
+        predicted, width = (x.T.reshape(-1, len(ys), len(xs)).numpy() for x in (prediction.mean, upper - lower))
         maps = {
             "x": xs.numpy(),
             "y": ys.numpy(),
-            "predicted": middle.astype(np.float32),
-            "width": (upper - lower).astype(np.float32),
-            "measured_position": self.train.transmitter_position.numpy(),
+            "predicted": predicted,
+            "width": width,
+            "measured_position": position.numpy(),
             "measured": self.train.rssi_dbm.numpy(),
             "receiver": self.train.receiver_position.numpy(),
             "receiver_names": np.array(self.train.receiver_names),
@@ -254,12 +256,12 @@ class _Tables:
         self.directory.write_npz("maps.npz", maps | self.plan)
 
     def overall(self) -> dict[str, PredictorMetrics]:
-        """What metrics.json says of each method."""
+        """Return the entries of each method for metrics.json."""
         errors = grouped(DataFrame(self.errors), ["method"], "abs_error_db")
         return {name: {"abs_error_db": errors[name,], "seconds": self.seconds[name]} for name in self.seconds}
 
     def receivers(self) -> dict[str, dict[str, ReceiverMetrics]]:
-        """What metrics.json says of each method at each receiver; one that no test row heard has no errors."""
+        """Return the entries of each method at each receiver for metrics.json; without errors if no test row detects it."""
         errors, none = grouped(DataFrame(self.errors), ["receiver", "method"], "abs_error_db"), error_summary([])
         return {
             receiver: {name: {"abs_error_db": errors.get((receiver, name), none)} for name in self.seconds}

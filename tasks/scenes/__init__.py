@@ -1,4 +1,4 @@
-"""Ray paths traced in a furnished room or a scene file, written as `load_spectra` reads them."""
+"""Trace ray paths in a furnished room or a scene file, and write them as `load_spectra` reads them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 import torch
+import tyro
 from torch import Tensor
 
 from swiftwrf import InputError
@@ -20,11 +21,13 @@ from tasks.directory import console, new_directory
 from tasks.environment import invocation
 from tasks.page.page import write_page
 from tasks.records import write_json
-from tasks.run import choice
 from tasks.scenes.page import page
 
-MOST_POSITIONS, MOST_ORDER = 100_000, 8
-ATTEMPTS = 100  # draws a position before the region counts as full
+MAX_POSITIONS, MAX_ORDER = 100_000, 8
+ROOM_HELP = "a Mitsuba scene with radio materials (FILE.xml), or a built-in room: " + "; ".join(
+    f"{name}: {room.summary}" for name, room in ROOMS.items()
+)
+MAX_ATTEMPTS = 100  # draws of all positions before the region counts as full
 
 
 @dataclass(frozen=True)
@@ -35,42 +38,42 @@ class ScenesConfig:
     paths of one position.
     """
 
-    room: Annotated[str, choice("a Mitsuba scene with radio materials (FILE.xml), or a built-in room", ROOMS)]
+    room: Annotated[str, tyro.conf.arg(help=ROOM_HELP)]
     moving: Moving
     """which end moves; the array lies level at the receiver"""
     positions: int
-    """how many, at random in the region, none of them in furniture"""
+    """number of random positions in the region, none of them in furniture"""
     out: str
     """directory to write; must not exist"""
     frequency: float = 2.4e9
     """carrier [Hz]; ITU-R P.2040 knows most materials from 1 GHz on"""
     walls: str | None = None
-    """material of the room's walls, of ITU-R P.2040: concrete, brick, plasterboard, wood, glass, metal, ... (default: the
-    room's own)"""
+    """material of the room's walls, of ITU-R P.2040: concrete, brick, plasterboard, wood, glass, metal, ... (default: that
+    of the room)"""
     floor: str | None = None
     """material of its floor"""
     ceiling: str | None = None
     """material of its ceiling"""
     order: int = 3
-    """most reflections (and other interactions) of a path"""
+    """largest number of reflections (and other interactions) of a path"""
     scattering: float = 0.0
-    """share of the reflected amplitude that surfaces scatter, 0 to 1; 0 scatters nothing"""
+    """fraction of the reflected amplitude that surfaces scatter, 0 to 1"""
     diffraction: bool = False
-    """also paths by way of one edge"""
+    """whether to trace paths diffracted at one edge"""
     fixed: tuple[float, float, float] | None = None
-    """position of the end that stays [m] (default: the room's own)"""
+    """position of the fixed end [m] (default: that of the room)"""
     region: tuple[float, float, float, float, float, float] | None = None
-    """where the other end goes: opposite corners x y z x y z [m] (default: the room's own)"""
+    """region of the moving end: opposite corners x y z x y z [m] (default: that of the room)"""
     seed: int = 0
-    """of positions, rays and scattered phases"""
+    """seed of positions, rays and scattered phases"""
 
 
 def run(config: ScenesConfig) -> None:
-    """Draws positions, traces, and writes.
+    """Draw positions, trace the paths to them, and write paths, record and page.
 
     Raises:
-        InputError: an option that makes no sense, no such room or scene, positions outside of it, a material that is not
-            known at the carrier; Sionna RT or LLVM is missing.
+        InputError: An option that makes no sense, no such room or scene, positions outside of it, a material that has no
+            constants at the carrier, or no Sionna RT or LLVM.
     """
     check(config)
     room, fixed, region = where(config)
@@ -81,18 +84,19 @@ def run(config: ScenesConfig) -> None:
         else:
             scene = Scene(room.surfaces(), config.frequency, config.scattering)
         began = time.perf_counter()
-        how = Tracing(config.order, config.scattering > 0, config.diffraction, config.seed)
-        paths = trace(scene, fixed, position, config.moving, how)
+        tracing = Tracing(config.order, config.scattering > 0, config.diffraction, config.seed)
+        paths = trace(scene, fixed, position, config.moving, tracing)
         seconds = time.perf_counter() - began
-        heard = paths.count > 0
-        if not bool(heard.any()):
+        without = int((paths.count == 0).sum())
+        if without == len(position):
             raise InputError(
                 f"no path reaches any of the {len(position)} positions; is the fixed end inside the scene?"
             )
-        if not bool(heard.all()):
-            console.print(f"positions that no path reaches are left out: {int((~heard).sum())}")
-            position, paths = position[heard], paths.reached
-        write_paths(folder, paths, fixed, position, config.moving, config.frequency)
+        if without:
+            console.print(f"positions that no path reaches are left out: {without}")
+            paths = paths.reached
+        write_paths(paths, folder)
+        each = float(paths.count.double().mean())
         record = {
             "command": invocation("scenes"),
             "options": asdict(config),
@@ -100,30 +104,29 @@ def run(config: ScenesConfig) -> None:
             "fixed": fixed.tolist(),
             "region": region.tolist(),
             "surfaces": {s.name: s.material.name for s in scene.surfaces},
-            "positions": len(position),
+            "positions": len(paths.count),
             "line_of_sight": int(paths.line_of_sight.sum()),
-            "paths_per_position": float(paths.count.double().mean()),
+            "paths_per_position": each,
             "seconds": seconds,
             "sionna_rt": version("sionna-rt"),
         }
         write_json(folder / "scene.json", record)
-        write_page(folder, page(Path(config.room).stem, scene, fixed, position, config.moving, paths))
-    each = float(paths.count.double().mean())
-    print(f"{len(position)} positions with {each:.0f} paths each, traced in {seconds:.0f} s: {config.out}")
+        write_page(folder, page(Path(config.room).stem, scene.surfaces, config.moving, paths))
+    print(f"{len(paths.count)} positions with {each:.0f} paths each, traced in {seconds:.0f} s: {config.out}")
 
 
 def check(config: ScenesConfig) -> None:
-    """Refuses what makes no sense whatever the room.
+    """Refuse options that make no sense in any room.
 
     Raises:
-        InputError: such an option.
+        InputError: Such an option.
     """
-    if not 2 <= config.positions <= MOST_POSITIONS:
-        raise InputError(f"--positions takes 2 to {MOST_POSITIONS}, got {config.positions}")
+    if not 2 <= config.positions <= MAX_POSITIONS:
+        raise InputError(f"--positions takes 2 to {MAX_POSITIONS}, got {config.positions}")
     if not CARRIERS_HZ[0] <= config.frequency <= CARRIERS_HZ[1]:
         raise InputError(f"--frequency takes the carrier in Hz, e.g. 2.4e9, got {config.frequency:g}")
-    if not 0 <= config.order <= MOST_ORDER:
-        raise InputError(f"--order takes 0 to {MOST_ORDER} reflections, got {config.order}")
+    if not 0 <= config.order <= MAX_ORDER:
+        raise InputError(f"--order takes 0 to {MAX_ORDER} reflections, got {config.order}")
     if not 0 <= config.scattering <= 1:
         raise InputError(f"--scattering takes 0 to 1, got {config.scattering:g}")
     if config.order == 0 and (config.scattering or config.diffraction):
@@ -134,20 +137,17 @@ def check(config: ScenesConfig) -> None:
     for name in ("walls", "floor", "ceiling"):
         if getattr(config, name) is not None:
             raise InputError(f"--{name} is for the rooms ({', '.join(ROOMS)}); {config.room} names its own materials")
-    for name in ("fixed", "region"):
-        if getattr(config, name) is None:
-            raise InputError(
-                f"{config.room} does not say where the ends are; give --fixed X Y Z and --region X Y Z X Y Z"
-            )
+    if config.fixed is None or config.region is None:
+        raise InputError(f"{config.room} does not say where the ends are; give --fixed X Y Z and --region X Y Z X Y Z")
 
 
 def where(config: ScenesConfig) -> tuple[FurnishedRoom | None, Tensor, Tensor]:
-    """The room, where one end stays (3,) and the region where the other goes (2, 3) [m].
+    """Return the room, the position of the fixed end (3,) and the region of the moving one (2, 3) [m].
 
     Raises:
-        InputError: either is outside the room, or the fixed end is in its furniture.
+        InputError: Either is outside the room, or the fixed end is in its furniture.
     """
-    room = None if config.room.endswith(SCENE_FILE) else ROOMS[config.room]()
+    room = ROOMS.get(config.room)
     corners = (config.region[:3], config.region[3:]) if config.region else room.region if room else ()
     region = torch.tensor(corners, dtype=torch.float64).sort(dim=0).values
     fixed = torch.tensor(config.fixed or (room.fixed if room else ()), dtype=torch.float64)
@@ -167,14 +167,14 @@ def _listed(numbers: Tensor) -> str:
 
 
 def draw_positions(room: FurnishedRoom | None, region: Tensor, count: int, seed: int) -> Tensor:
-    """Random positions in the region, away from walls and furniture, float64 (count, 3) [m].
+    """Return random positions in the region, away from walls and furniture, float64 (count, 3) [m].
 
     Raises:
-        InputError: furniture takes (nearly) all of the region.
+        InputError: Furniture takes (nearly) all of the region.
     """
     generator = torch.Generator().manual_seed(seed)
     found = torch.empty(0, 3, dtype=torch.float64)
-    for _ in range(ATTEMPTS):
+    for _ in range(MAX_ATTEMPTS):
         drawn = region[0] + (region[1] - region[0]) * torch.rand(count, 3, dtype=torch.float64, generator=generator)
         found = torch.cat([found, drawn if room is None else drawn[room.free(drawn)]])
         if len(found) >= count:

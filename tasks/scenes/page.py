@@ -16,7 +16,8 @@ from pandas import DataFrame
 from torch import Tensor
 
 from swiftwrf.array.angles import to_angles
-from swiftwrf.data.raytraced import Scene, Surface, TracedPaths, outline
+from swiftwrf.data.paths import PropagationPaths
+from swiftwrf.data.raytraced import Surface
 from swiftwrf.data.spectra import Moving
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table
@@ -37,13 +38,15 @@ MATERIALS = {  # any other is grey
     "wood": "#aa7744",
 }
 OTHER = "#999999"
-STRONGEST = 25  # paths of one position that are drawn
-MOST_DOTS = 1000
-ENCLOSING = 0.95  # of the scene's extent: a surface that is as large encloses it and is drawn as outline only
+MAX_PATHS = 25  # of one position that are drawn
+MAX_DOTS = 1000
+ENCLOSING_EXTENT = 0.95  # of the scene: a surface from that size on is drawn as outline only
 
 
-def page(name: str, scene: Scene, fixed: Tensor, position: Tensor, moving: Moving, paths: TracedPaths) -> Page:
-    """The room, where the ends are, and the paths of the position in the middle of the others."""
+def page(name: str, surfaces: list[Surface], moving: Moving, paths: PropagationPaths) -> Page:
+    """Return the page: the room, both ends, and the paths of the position nearest to the centre of all."""
+    ends = (paths.transmitter, paths.receiver)
+    position, fixed = ends if moving == "transmitter" else ends[::-1]
     sight = f"{float(paths.line_of_sight.double().mean()):.0%}"
     numbers = [
         Number(str(len(position)), f"positions of the {moving}, {sight} of them with line of sight"),
@@ -52,44 +55,48 @@ def page(name: str, scene: Scene, fixed: Tensor, position: Tensor, moving: Movin
     ]
     other = "receiver" if moving == "transmitter" else "transmitter"
     meaning = [
-        f"Ray paths between a {moving} that moves and a {other} that stays, traced by Sionna RT. Gains and phases are those "
-        "of isotropic, vertically polarised ends; nothing is transmitted through what stands in the way."
+        f"Ray paths between a moving {moving} and a fixed {other}, traced by Sionna RT. Both ends are isotropic and "
+        "vertically polarised; obstacles block without transmission."
     ]
     steps = [
         "Go on with python -m tasks.aoa --mix 0.3 --data and this directory; the array lies level at the receiver."
     ]
-    summary = Summary(numbers, _room(scene, fixed, position, moving, paths), meaning, steps)
-    materials = sorted({(s.material.name, s.material.thickness_m) for s in scene.surfaces})
+    summary = Summary(numbers, _room(surfaces, fixed[0], position, moving, paths), meaning, steps)
+    materials = sorted({(s.material.name, s.material.thickness_m) for s in surfaces})
     rows = [[material, f"{1e3 * thickness:g}"] for material, thickness in materials]
-    table = Table(["material", "thickness [mm]"], rows, "What the surfaces are made of.")
+    table = Table(["material", "thickness [mm]"], rows, "Materials of the surfaces.")
     middle = int((position - position.mean(dim=0)).norm(dim=1).argmin())
-    rays = _rays(scene, fixed, position[middle], paths, middle, moving)
+    rays = _rays(surfaces, fixed[0], position[middle], paths, middle, moving)
     return Page(
         f"Scene: {name}", summary, [Section("One position", plots=[rays]), Section("Materials", tables=[table])]
     )
 
 
-def _room(scene: Scene, fixed: Tensor, position: Tensor, moving: Moving, paths: TracedPaths) -> Plot:
+def _room(surfaces: list[Surface], fixed: Tensor, position: Tensor, moving: Moving, paths: PropagationPaths) -> Plot:
     figure, plan, space = _pair()
-    _draw(scene.surfaces, plan, space)
-    dots = position[:MOST_DOTS]
-    plan.plot(*dots[:, :2].T, ".", color=MOVING, markersize=2.5, label=f"{moving}, moves")
-    plan.plot(*fixed[:2], "*", color=FIXED, markersize=12, label="end that stays", linestyle="")
+    _draw(surfaces, plan, space)
+    dots = position[:MAX_DOTS]
+    plan.plot(*dots[:, :2].T, ".", color=MOVING, markersize=2.5, label=f"moving {moving}")
+    plan.plot(*fixed[:2], "*", color=FIXED, markersize=12, label="fixed end", linestyle="")
     space.scatter(*dots.T, s=2, color=MOVING, depthshade=False)
     space.scatter(*fixed, s=80, marker="*", color=FIXED, depthshade=False)
     figures.legend_below(figure, plan)
     table = DataFrame(position.numpy(), columns=["x_m", "y_m", "z_m"]).assign(
         line_of_sight=paths.line_of_sight.numpy(), paths=paths.count.numpy(), power_db=paths.power_db.numpy()
     )
-    return Plot("room", figure, "In plan and in space: surfaces, positions (blue), the end that stays (star).", table)
+    return Plot("room", figure, "In plan and in space: surfaces, positions (blue), the fixed end (star).", table)
 
 
-def _rays(scene: Scene, fixed: Tensor, place: Tensor, paths: TracedPaths, number: int, moving: Moving) -> Plot:
+def _rays(
+    surfaces: list[Surface], fixed: Tensor, place: Tensor, paths: PropagationPaths, number: int, moving: Moving
+) -> Plot:
+    assert paths.corner is not None
+    assert paths.length is not None
     figure, plan, space = _pair()
-    _draw(scene.surfaces, plan, space)
+    _draw(surfaces, plan, space)
     own = (paths.owner == number).nonzero()[:, 0]
-    own = own[paths.gain[own].abs().argsort()[-STRONGEST:]]  # the strongest on top
-    start, end = (fixed, place) if moving == "receiver" else (place, fixed)
+    own = own[paths.gain[own].abs().argsort()[-MAX_PATHS:]]  # the strongest on top
+    start, end = paths.transmitter[number], paths.receiver[number]
     level = 20 * paths.gain[own].abs().log10().numpy()
     width = 0.3 + 1.9 * Normalize(level.min(), max(level.max(), level.min() + 1), clip=True)(level)
     order = paths.order[own].clamp(max=len(ORDERS) - 1).tolist()
@@ -106,14 +113,13 @@ def _rays(scene: Scene, fixed: Tensor, place: Tensor, paths: TracedPaths, number
     named = {0: "direct", 1: "1 interaction", len(ORDERS) - 1: f"{len(ORDERS) - 1} and more"}
     entries = [Line2D([], [], color=ORDERS[k], label=named.get(k, f"{k} interactions")) for k in sorted(set(order))]
     entries += [
-        Line2D([], [], color=FIXED, marker="*", markersize=10, linestyle="", label="end that stays"),
-        Line2D([], [], color=MOVING, marker="o", linestyle="", label=f"{moving}, moves"),
+        Line2D([], [], color=FIXED, marker="*", markersize=10, linestyle="", label="fixed end"),
+        Line2D([], [], color=MOVING, marker="o", linestyle="", label=f"moving {moving}"),
     ]
     figure.legend(handles=entries, loc="outside lower center", ncols=6, frameon=False)
     caption = (
-        f"The strongest paths (at most {STRONGEST}) of the position nearest to the middle of all, coloured by their number "
-        "of reflections and other interactions; thick lines are strong. The numbers say where each comes from, seen from "
-        "the receiver."
+        f"The strongest paths (at most {MAX_PATHS}) of the position nearest to the middle of all, coloured by their number "
+        "of reflections and other interactions; thick lines are strong. The angles are those of arrival at the receiver."
     )
     azimuth, elevation = (angle.rad2deg() for angle in to_angles(paths.direction[own]))
     table = DataFrame(
@@ -129,18 +135,18 @@ def _rays(scene: Scene, fixed: Tensor, place: Tensor, paths: TracedPaths, number
 
 
 def _pair() -> tuple[Figure, Axes, Any]:
-    """Axes of a plan and of a view in space."""
+    """Return axes of a plan and of a view in space."""
     figure, axes = figures.new_figure(1, 2, 12, 5)
     return figure, axes[0], figures.in_space(figure, axes[1])
 
 
 def _draw(surfaces: list[Surface], plan: Axes, space: Any) -> None:
-    """What stands in the room, filled; what encloses it, as outline."""
+    """Draw furniture filled, and surfaces that enclose the scene as outline."""
     every = np.concatenate([surface.vertex for surface in surfaces])
     low, high = every.min(axis=0), every.max(axis=0)
     for surface in surfaces:
-        edges, colour = outline(surface), MATERIALS.get(surface.material.name, OTHER)
-        encloses = bool((np.ptp(surface.vertex, axis=0)[:2] > ENCLOSING * (high - low)[:2]).all())
+        edges, colour = surface.outline(), MATERIALS.get(surface.material.name, OTHER)
+        encloses = bool((np.ptp(surface.vertex, axis=0)[:2] > ENCLOSING_EXTENT * (high - low)[:2]).all())
         plan.add_collection(
             LineCollection(
                 list(edges[..., :2]), colors="black" if encloses else colour, linewidths=1.0 if encloses else 0.6

@@ -6,6 +6,7 @@ import io
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -14,8 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf import RssiModel
-from swiftwrf.models.base import Prediction
+from swiftwrf import Prediction, RssiModel
 from swiftwrf.rssi import LEVEL
 from tasks.page import figures
 from tasks.records import as_table
@@ -60,40 +60,6 @@ class MeasuredFloor:
         """Return the positions that a model contains, without the RSSI measured there."""
         position = (model.anchor + model.centre).numpy()
         return cls(position, np.full((len(position), len(model.receiver_names)), np.nan), model.receiver.numpy())
-
-
-@dataclass(frozen=True, eq=False)
-class RssiMaps:
-    """Predicted RSSI over the floor at one height of the transmitter.
-
-    Args:
-        x: Centres of the columns [m].
-        y: Centres of the rows [m].
-        height: Height of the transmitter [m].
-        rssi: Predicted RSSI [dBm] and its standard deviation [dB], (R, len(y), len(x)).
-    """
-
-    x: Values
-    y: Values
-    height: float
-    rssi: Prediction
-
-    @property
-    def corners(self) -> Corners:
-        """Corners of the picture of all cells."""
-        half_x, half_y = (self.x[1] - self.x[0]) / 2, (self.y[1] - self.y[0]) / 2
-        return self.x[0] - half_x, self.x[-1] + half_x, self.y[0] - half_y, self.y[-1] + half_y
-
-    @property
-    def width(self) -> Values:
-        """Width of the intervals [dB]."""
-        low, high = self.rssi.interval(LEVEL)
-        return (high - low).numpy()
-
-    @property
-    def best(self) -> NDArray[np.integer]:
-        """Number of the receiver with the highest prediction, (len(y), len(x))."""
-        return self.rssi.mean.argmax(dim=0).numpy()
 
 
 @dataclass(frozen=True)
@@ -147,7 +113,7 @@ class RssiView:
     title: str
     model: RssiModel
     floor: MeasuredFloor
-    _last: RssiMaps | None = field(default=None, init=False, repr=False)
+    _last: tuple[float, Prediction] | None = field(default=None, init=False, repr=False)
 
     @property
     def receivers(self) -> tuple[str, ...]:
@@ -171,44 +137,62 @@ class RssiView:
         corners = np.array(self.floor.plan[1]).reshape(2, 2).T if self.floor.plan else self.floor.position
         return PlanProjection.around(self.floor.position, self.floor.receiver, corners, max_px=max_px)
 
-    def maps(self, height: float) -> RssiMaps:
-        """Return the predictions at a height [m]. Those of the last height are cached."""
-        if self._last is None or self._last.height != height:
-            self._last = self._predicted(height)
-        return self._last
-
-    def _predicted(self, height: float) -> RssiMaps:
+    @cached_property
+    def cells(self) -> tuple[Values, Values]:
+        """Centres of the columns and of the rows of a map [m]."""
         plan = self.plan()
         x, y = (
-            low + (np.arange(cells) + 0.5) / cells * (high - low)
-            for low, high, cells in zip(plan.low, plan.high, plan.size, strict=True)
+            low + (np.arange(number) + 0.5) / number * (high - low)
+            for low, high, number in zip(plan.low, plan.high, plan.size, strict=True)
         )
-        cells = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), height)], axis=-1).reshape(-1, 3)
-        found = self.model.predict(torch.from_numpy(cells))
+        return x, y
+
+    @property
+    def corners(self) -> Corners:
+        """Corners of the picture of all cells."""
+        (x0, y0), (x1, y1) = self.plan().low.tolist(), self.plan().high.tolist()
+        return x0, x1, y0, y1
+
+    def map(self, height: float) -> Prediction:
+        """Return predicted RSSI [dBm] (R, rows, columns) at a height of the transmitter [m]; the last one is cached."""
+        if self._last is None or self._last[0] != height:
+            x, y = self.cells
+            position = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), height)], axis=-1).reshape(-1, 3)
+            found = self._predict(position)
+            self._last = height, Prediction(*(values.T.reshape(-1, len(y), len(x)) for values in found))
+        return self._last[1]
+
+    def _predict(self, position: Values) -> tuple[Tensor, Tensor]:
+        with torch.no_grad():
+            found = self.model.predict(torch.from_numpy(position))
         assert found.std is not None
-        mean, std = (values.T.reshape(-1, len(y), len(x)) for values in (found.mean, found.std))
-        return RssiMaps(x, y, height, Prediction(mean, std))
+        return found.mean, found.std
+
+    def _width(self, height: float) -> Values:
+        """Return the width of the intervals [dB], (R, rows, columns)."""
+        low, high = self.map(height).interval(LEVEL)
+        return (high - low).numpy()
 
     def coloured(self, selection: MapSelection) -> ColouredMap:
         """Return values and colours of the selected map."""
-        maps, receiver = self.maps(selection.height), selection.receiver
+        mean, receiver = self.map(selection.height).mean.numpy(), selection.receiver
         match selection.kind:
             case "RSSI":
                 measured = self.floor.rssi_dbm[np.isfinite(self.floor.rssi_dbm)]
-                predicted = maps.rssi.mean.numpy()
-                low, high = np.percentile(measured if len(measured) else predicted, (1, 99)).tolist()
-                return ColouredMap(predicted[receiver], "viridis", low, high, "predicted RSSI [dBm]")
+                low, high = np.percentile(measured if len(measured) else mean, (1, 99)).tolist()
+                return ColouredMap(mean[receiver], "viridis", low, high, "predicted RSSI [dBm]")
             case "interval":
-                high = float(np.percentile(maps.width, 99))
-                return ColouredMap(maps.width[receiver], "magma", 0.0, high, f"width of the {LEVEL:.0%} interval [dB]")
+                width = self._width(selection.height)
+                high = float(np.percentile(width, 99))
+                return ColouredMap(width[receiver], "magma", 0.0, high, f"width of the {LEVEL:.0%} interval [dB]")
             case "coverage":
                 return ColouredMap(np.where(self._covered(selection), 0.7, np.nan), "GnBu", 0.0, 1.0, "")
             case "best receiver":
-                values = maps.best % N_RECEIVER_COLOURS + 0.5
+                values = mean.argmax(axis=0) % N_RECEIVER_COLOURS + 0.5
                 return ColouredMap(values, RECEIVER_COLOURS, 0, N_RECEIVER_COLOURS, "")
 
     def _covered(self, selection: MapSelection) -> NDArray[np.bool_]:
-        rssi = self.maps(selection.height).rssi
+        rssi = self.map(selection.height)
         return (probability_above(rssi, selection)[selection.receiver] >= selection.certainty).numpy()
 
     def sentence(self, selection: MapSelection) -> str:
@@ -226,17 +210,16 @@ class RssiView:
                     f"{selection.threshold:g} dBm with {selection.certainty:.0%} certainty, if it is detected at all."
                 )
             case "best receiver":
-                best = self.maps(selection.height).best
-                counts = np.bincount(best.ravel(), minlength=len(self.receivers))
+                best = self.map(selection.height).mean.argmax(dim=0)
+                counts = best.flatten().bincount()
                 first = int(counts.argmax())
-                fraction = counts[first] / best.size
+                fraction = counts[first] / best.numel()
                 return f"Receiver with the highest prediction: {self.receivers[first]} on {fraction:.0%} of the map."
 
     def at(self, selection: MapSelection, x: float, y: float) -> Prediction:
         """Return the predictions of all receivers (R,) at a position [m], at the height of the selected map."""
-        found = self.model.predict(torch.tensor([[x, y, selection.height]], dtype=torch.float64))
-        assert found.std is not None
-        return Prediction(found.mean[0], found.std[0])
+        mean, std = self._predict(np.array([[x, y, selection.height]]))
+        return Prediction(mean[0], std[0])
 
     def describe(self, selection: MapSelection, x: float, y: float) -> str:
         """Describe the predictions at a position [m] in lines of text."""
@@ -254,10 +237,10 @@ class RssiView:
 
     def table(self, selection: MapSelection) -> str:
         """Return the selected map as comma-separated values, a row a cell."""
-        maps, r = self.maps(selection.height), selection.receiver
-        low, high = maps.rssi.interval(LEVEL)
-        x, y = np.meshgrid(maps.x.round(4), maps.y.round(4))
-        columns = {"predicted_dbm": maps.rssi.mean[r], "low_dbm": low[r], "high_dbm": high[r]}
+        rssi, r = self.map(selection.height), selection.receiver
+        low, high = rssi.interval(LEVEL)
+        x, y = np.meshgrid(*(centres.round(4) for centres in self.cells))
+        columns = {"predicted_dbm": rssi.mean[r], "low_dbm": low[r], "high_dbm": high[r]}
         table = pd.DataFrame(
             {
                 "x_m": x.ravel(),
@@ -268,14 +251,14 @@ class RssiView:
                 f"above_{selection.threshold:g}_dbm_with_{selection.certainty:.0%}": self._covered(selection)
                 .ravel()
                 .astype(int),
-                "best_receiver": np.array(self.receivers)[maps.best.ravel()],
+                "best_receiver": np.array(self.receivers)[rssi.mean.argmax(dim=0).flatten()],
             }
         )
         return as_table(table.to_dict("records"))
 
     def picture(self, selection: MapSelection) -> bytes:
         """Return the selected map as PNG with axes and legend."""
-        coloured, corners = self.coloured(selection), self.maps(selection.height).corners
+        coloured, corners = self.coloured(selection), self.corners
         width, height = self.plan().size
         figure, (ax,) = figures.new_figure(1, 1, 8, 1 + 7 * height / width)
         if self.floor.plan:
@@ -308,4 +291,5 @@ class RssiView:
 def probability_above(rssi: Prediction, selection: MapSelection) -> Tensor:
     """Return the probability that a measurement exceeds the threshold, of the shape of the prediction."""
     assert rssi.std is not None
-    return torch.special.ndtr((rssi.mean - selection.threshold) / rssi.std.clamp_min(MIN_STD_DB))
+    probability: Tensor = torch.special.ndtr((rssi.mean - selection.threshold) / rssi.std.clamp_min(MIN_STD_DB))
+    return probability

@@ -82,10 +82,10 @@ class RssiPage:
         self._picture.set_content(self._map_svg(selection, coloured))
 
     def _map_svg(self, selection: MapSelection, coloured: ColouredMap) -> str:
-        plan, floor, corners = self._plan, self._view.floor, self._view.maps(selection.height).corners
+        plan, floor = self._plan, self._view.floor
         parts = [plan.picture(Image.fromarray(floor.plan[0]), floor.plan[1])] if floor.plan else []
         image = colour_image(coloured.values[::-1], coloured.colours, coloured.low, coloured.high)
-        parts.append(plan.picture(image, corners, 0.7 if floor.plan else 1.0))
+        parts.append(plan.picture(image, self._view.corners, 0.7 if floor.plan else 1.0))
         if selection.kind == "RSSI":
             parts.append(self._measured_svg(selection.receiver, coloured))
         every = selection.kind == "best receiver"

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from augment import withhold
-from swiftwrf import InputError, RssiModel, Spectra, load
-from swiftwrf.models.base import FIELD_MODELS, FieldModel
+from swiftwrf import FIELD_MODELS, FieldModel, InputError, RssiModel, Spectra, load
 from swiftwrf.runtime.checkpoint import Saved, refusing
 from tasks.aoa.config import AoaConfig
 from tasks.aoa.experiment import measurements
@@ -81,7 +80,7 @@ def _aoa_run(folder: Path, content: Row) -> SpectraView:
             for name, file in kept_models(folder, fraction):
                 model = _field_model(load(file))
                 planes = _planes(model) or _planes_of_run(folder, fraction)
-                models.append(LoadedModel(f"{name}, {fraction:.0%} measured", model, planes, in_training))
+                models.append(LoadedModel(f"{name}, {100 * fraction:g}% measured", model, planes, in_training))
     if not models:
         raise InputError(f"{folder} holds no model; run tasks.aoa with a --synthesizer that can be saved")
     return SpectraView(folder.name, models, data, notes)

@@ -12,17 +12,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf import AngularGrid, Spectra
+from swiftwrf import AngularGrid, FieldModel, Spectra
 from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.data.spectra import Moving, direction_of_link
-from swiftwrf.models.base import FieldModel
 from swiftwrf.positions import distance
 from tasks.aoa.page.room import MARGIN, extent
 
 MAX_DRAG_SECONDS = 0.02  # of one prediction while the moving end is dragged
 MAX_BEYOND_DATA = 1.5  # margin of the page around the measured positions, in units of their extent
 Direction = tuple[float, float]  # azimuth, elevation [deg]
-Link = tuple[Tensor, Tensor, Moving]  # position of the fixed end (3,) [m], rotation of the array (3, 3), moving end
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,14 +46,6 @@ class LoadedModel:
         factors = range(1, min(grid.shape) + 1) if self.model.any_grid else (1,)
         grids = [grid.coarsen(factor) for factor in factors if not any(size % factor for size in grid.shape)]
         return next((grid for grid in grids if _seconds(self.model, position, grid) <= MAX_DRAG_SECONDS), grids[-1])
-
-    @property
-    def link(self) -> Link | None:
-        """Fixed end, rotation of the array and moving end. None if the model does not contain them."""
-        if (room := self.model.room) is not None:
-            return room.fixed_position, room.rotation, room.moving
-        link = getattr(self.model, "link", None)
-        return None if link is None else (link.fixed, link.rotation, link.moving)
 
 
 def _seconds(model: FieldModel, position: Tensor, grid: AngularGrid) -> float:
@@ -107,10 +97,10 @@ class SpectraView:
     notes: list[str] = field(default_factory=list)
 
     @cached_property
-    def link(self) -> Link | None:
+    def fixed_end(self) -> tuple[Tensor, Tensor, Moving] | None:
         """Fixed end, rotation of the array and moving end, from the data, else from a model. None if unknown."""
         if self.data is None:
-            return next((loaded.link for loaded in self.models if loaded.link is not None), None)
+            return next((end for loaded in self.models if (end := loaded.model.fixed_end) is not None), None)
         if self.data.fixed_position is None or self.data.rotation is None:
             return None
         return self.data.fixed_position, self.data.rotation, self.data.moving
@@ -120,12 +110,12 @@ class SpectraView:
         """Name of the moving end."""
         if self.data is not None:
             return self.data.moving
-        return "moving end" if self.link is None else self.link[2]
+        return "moving end" if self.fixed_end is None else self.fixed_end[2]
 
     @property
     def fixed(self) -> NDArray[np.floating] | None:
         """Position of the fixed end [m], (3,). None if unknown."""
-        return None if self.link is None else self.link[0].numpy()
+        return None if self.fixed_end is None else self.fixed_end[0].numpy()
 
     @cached_property
     def positions(self) -> NDArray[np.floating]:
@@ -165,7 +155,7 @@ class SpectraView:
             prediction.mean[0].numpy(),
             None if prediction.std is None else prediction.std[0].numpy(),
             peak(prediction.mean[0], grid),
-            None if self.link is None else _degrees(direction_of_link(query, *self.link)[0]),
+            None if self.fixed_end is None else _degrees(direction_of_link(query, *self.fixed_end)[0]),
             seconds,
         )
 

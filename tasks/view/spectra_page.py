@@ -257,7 +257,8 @@ class SpectraPage:
         if index != self._shown_measurement:
             self._shown_measurement = index
             azimuth, elevation = data.label[index].rad2deg().tolist()
-            self._measured.show(spectrum.numpy(), data.grid, 1.0, (found, (azimuth, elevation)))
+            sight = None if np.isnan(azimuth) else (azimuth, elevation)
+            self._measured.show(spectrum.numpy(), data.grid, 1.0, (found, sight))
 
     def _describe(self, predicted: PredictedSpectrum, seconds: float) -> None:
         x, y, z = predicted.position.tolist()

@@ -16,30 +16,31 @@ import numpy as np
 import pandas as pd
 import torch
 from PIL import Image
-from quick import GLANCE, PUBLISHED, PUBLISHED_RSSI
 from samples import snapshots as made_snapshots
 from samples import survey_rows, write_deepmimo, write_dichasus, write_espargos, write_snapshots, write_survey
+from small import GLANCE, PUBLISHED, PUBLISHED_RSSI
 
 from augment import Mixed
 from swiftwrf import (
+    FIELD_MODELS,
     AngularGrid,
     FitConfig,
     ModelConfig,
     Rssi,
     Spectra,
-    comparison,
     fit,
     fit_coarray,
     fit_rssi,
     load,
     load_rssi,
     load_spectra,
+    make_model,
     rssi_room,
     simulated_room,
 )
+from swiftwrf.comparison import NeRF2Rssi
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.gp import Kernel
-from swiftwrf.models.base import make_model
 from swiftwrf.models.geometry import fit_geometry, fit_hybrid
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.path_gains import fit_path_gains
@@ -135,12 +136,12 @@ def model_hybrid(folder: Path) -> None:
 
 
 def model_published(name: str, folder: Path) -> None:
-    comparison.fit(_room(), PUBLISHED[name], progress=False).save(folder / "model")
+    FIELD_MODELS[name](PUBLISHED[name]).fit(_room()).save(folder / "model")
 
 
 def model_nerf2_rssi(folder: Path) -> None:
     train = rssi_room(n=40).receivers(["1", "2"])
-    comparison.fit_rssi(train, PUBLISHED_RSSI, progress=False).save(folder / "model")
+    NeRF2Rssi(PUBLISHED_RSSI).fit(train).save(folder / "model")
 
 
 def model_rssi(folder: Path) -> None:

@@ -1,7 +1,7 @@
-"""File formats: one reader a file of this folder, found by what the folder or file of the data holds."""
+"""Readers, one a file of this package, found by what a folder or file holds."""
 
-from swiftwrf.data.formats.base import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, Format, read
+from swiftwrf.data.formats.base import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, Format, ReadOptions, read
 
-SPECTRA_FORMATS.discover(__name__, __path__)  # and with them the other formats: they lie in one folder
+SPECTRA_FORMATS.discover(__name__, __path__)  # and with them all other formats of this package
 
-__all__ = ["RSSI_FORMATS", "SNAPSHOT_FORMATS", "SPECTRA_FORMATS", "Format", "read"]
+__all__ = ["RSSI_FORMATS", "SNAPSHOT_FORMATS", "SPECTRA_FORMATS", "Format", "ReadOptions", "read"]

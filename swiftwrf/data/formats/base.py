@@ -1,37 +1,82 @@
-"""What every format is, and how the one that fits is found."""
+"""The interface of a reader, and the search for the one that recognises a source."""
 
 from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
-from swiftwrf.data.reading import Reading
+from swiftwrf.array.angles import AngularGrid
+from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.registry import Registry
+from swiftwrf.runtime.validation import PositiveInt, configuration
 
-Data = TypeVar("Data")
+Data = TypeVar("Data", bound=Spectra | Snapshots | Rssi)
+
+
+@configuration
+class ReadOptions:
+    """What a user states about files that leave it open. A reader names the options it takes; others are refused.
+
+    Example:
+        >>> ReadOptions(every=2).given
+        ['every']
+    """
+
+    array: PlanarArray | None = None
+    """array of the spectra, or for which spectra of paths are computed (default: 4 x 4 at half a wavelength)"""
+    beamformer: str | None = None
+    """beamformer for array snapshots (default: phase)"""
+    grid: AngularGrid | None = None
+    """directions of computed spectra (default: 90 x 360)"""
+    every: PositiveInt | None = None
+    """reads one measurement of that many"""
+    station: PositiveInt | None = None
+    """number of the array in a file with several, counted from 1"""
+    columns: Mapping[str, str] | None = None
+    """names of the columns of a table, by what they hold"""
+
+    @property
+    def given(self) -> list[str]:
+        """Names of the options that are set."""
+        return [field.name for field in fields(self) if getattr(self, field.name) is not None]
 
 
 class Format(ABC, Generic[Data]):
-    """A layout of files that measurements come in; `takes` names what a user may say of them (`Reading`)."""
+    """Reader of one layout of files. A subclass needs two methods and an entry in a registry.
+
+    Readers of other packages are entry points of the groups `swiftwrf.readers.spectra`, `swiftwrf.readers.snapshots` and
+    `swiftwrf.readers.rssi`, each naming such a class.
+
+    Example:
+        >>> class Archive(Format[Spectra]):
+        ...     def recognises(self, path: Path) -> bool:
+        ...         return path.suffix == ".pt"
+        ...     def read(self, path: Path, options: ReadOptions) -> Spectra:
+        ...         content = torch.load(path, weights_only=True)
+        ...         return Spectra(content["spectra"], content["position"], name=path.stem)
+    """
 
     takes: ClassVar[frozenset[str]] = frozenset()
+    """names of the `ReadOptions` that the reader uses"""
 
     @abstractmethod
     def recognises(self, path: Path) -> bool:
-        """Whether the folder or file is of this layout; `read` may still find it wanting."""
+        """Return True if the folder or file is of this layout, though `read` may find it incomplete."""
 
     @abstractmethod
-    def read(self, path: Path, how: Reading) -> Data:
-        """The measurements.
+    def read(self, path: Path, options: ReadOptions) -> Data:
+        """Return the measurements.
 
         Raises:
-            InputError: what is missing, does not fit together or is not what the layout says.
+            InputError: A part that is missing or invalid, or parts that do not match.
         """
 
 
@@ -40,30 +85,35 @@ SNAPSHOT_FORMATS: Registry[Format[Snapshots]] = Registry("format of array snapsh
 RSSI_FORMATS: Registry[Format[Rssi]] = Registry("format of RSSI", "swiftwrf.readers.rssi")
 
 
-def read(path: str | Path, how: Reading, *registries: Registry[Format[Any]]) -> Any:
-    """The measurements in a folder or file, by the format that recognises it.
+def read(path: str | Path, options: ReadOptions, *registries: Registry[Format[Any]]) -> Any:
+    """Return the measurements in a folder or file, read by the format that recognises it.
+
+    Args:
+        path: Folder or file.
+        options: What the user states about the files.
+        registries: Formats to try.
 
     Raises:
-        InputError: nothing there, no format that recognises it or more than one, what the format refuses, or something in
-            `how` that does not apply to it.
+        InputError: No such source, none or several formats that recognise it, an option that the format does not take, or
+            what the format refuses.
     """
     source = Path(path)
     known = ", ".join(name for registry in registries for name in registry)
-    if not os.path.isdir(source) and not os.path.isfile(source):  # Path.is_dir raises where a name is too long
+    if not os.path.isdir(source) and not os.path.isfile(source):  # Path.is_dir raises for a name that is too long
         raise InputError(f"{source} is not a folder or file; expected measurements (formats: {known})")
     try:
         name, reader = _find(source, known, registries)
-        for option in how.given:
+        for option in options.given:
             if option not in reader.takes:
                 raise InputError(f"{source} is read as {name}, which takes no {option}; leave it out")
-        return reader.read(source, how)
+        return reader.read(source, options)
     except OSError as error:
         reason = "no permission to read it" if isinstance(error, PermissionError) else error.strerror
         raise InputError(f"{error.filename or source} cannot be read ({reason})") from None
 
 
 def _find(source: Path, known: str, registries: tuple[Registry[Any], ...]) -> tuple[str, Format[Any]]:
-    """The one format that recognises the source: of two, either would be a guess."""
+    """Return the only format that recognises the source; with two, either would be a guess."""
     readers = [(name, registry[name]()) for registry in registries for name in registry]
     found = [(name, reader) for name, reader in readers if reader.recognises(source)]
     if not found:

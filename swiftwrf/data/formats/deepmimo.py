@@ -1,11 +1,12 @@
 """Reader of DeepMIMO v4 folders, the exchange format of ray tracers (Sionna RT, Wireless InSite, AODT): one array a file.
 
 `{key}_t{set}_tx{index}_r{set}.npz` holds `key`: power [dB], phase [deg], delay [s], aoa_az, aoa_el [deg] of up to 25 paths a
-receiver, nan where there are fewer, and rx_pos, tx_pos [m]; params.json the carrier and the ray tracer. aoa_el is the angle
-from the zenith. The angles point from the receiver to where the path comes from, in world coordinates.
+receiver, nan for missing ones; inter, the interactions of a path as digits (0: line of sight, 1: reflection, 2: diffraction,
+3: scattering, 4: transmission); rx_pos and tx_pos [m]. params.json holds the carrier and the name of the ray tracer. aoa_el
+is the angle from the zenith. Angles point from the receiver to where a path arrives from, in world coordinates.
 
-Wireless InSite gives the phase of a path over its whole length; Sionna that of its passband coefficient, to which the phase
--2 pi f delay of the propagation is to be added. Which it is shows at the direct paths, whose phase is the propagation's.
+Wireless InSite gives the phase of a path over its whole length. Sionna gives that of the passband coefficient, to which the
+phase -2 pi f delay of the propagation is added here. The line-of-sight paths, whose phase is known, show the convention.
 """
 
 from __future__ import annotations
@@ -20,46 +21,71 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.data.archives import read_arrays
-from swiftwrf.data.files import FARTHEST, check_carrier, read_text
-from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format
-from swiftwrf.data.rays import Rays
-from swiftwrf.data.reading import Reading
+from swiftwrf.data.files import MAX_COORDINATE_M, check_carrier, digests, read_text
+from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
+from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.spectra import GRID, Spectra, check_pixels
 from swiftwrf.errors import InputError
 
+Floats = NDArray[np.float64]
 KEYS = ("power", "phase", "delay", "aoa_az", "aoa_el")
+INTERACTIONS, LINE_OF_SIGHT = "inter", 0
 FILE = re.compile(r"power_(t\d+_tx\d+_r\d+)\.npz")
 SIONNA = "sionna"  # in the name of the ray tracer
-SHORTEST, LONGEST = 0.9, 100.0  # that the shortest path may be, in distances: beyond, units are wrong
-DIRECT = 0.01  # relative: a path hardly longer than the distance is the direct one
-STEADY = 0.5  # mean resultant length of phases beyond which they are one phase
-OFF = 15.0  # [deg] that direct paths may come from beside the line of sight
-FEW = 10  # direct paths that tell the conventions
+MIN_DETOUR, MAX_DETOUR = 0.9, 100.0  # median length of the shortest paths, in distances: beyond, units are wrong
+DIRECT_DETOUR = 0.01  # relative: without interactions, a path that is at most this much longer counts as direct
+STEADY_RESULTANT = 0.5  # mean resultant length above which phases count as constant
+MAX_ANGLE_OFFSET_DEG = 15.0  # median angle between direct paths and the line of sight
+MIN_DIRECT_PATHS = 10  # that show the conventions
+NO_INTERACTIONS = (
+    "there are no interactions (inter), so a receiver counts as line of sight if a path is at most "
+    f"{DIRECT_DETOUR:.0%} longer than the distance"
+)
 
 
 @SPECTRA_FORMATS.register("deepmimo")
 class DeepMimo(Format[Spectra]):
-    """Paths of a ray tracer, turned into spectra; of several pairs of transmitter and receivers, the one asked for."""
+    """Paths of a ray tracer, from which spectra are computed; `station` chooses a pair of transmitter and receivers."""
 
     takes = frozenset({"array", "grid", "every", "station"})
 
     def recognises(self, path: Path) -> bool:
         return bool(_pairs(path))
 
-    def read(self, path: Path, how: Reading) -> Spectra:
+    def read(self, path: Path, options: ReadOptions) -> Spectra:
         pairs = _pairs(path)
-        if (how.station is None and len(pairs) > 1) or not 1 <= (how.station or 1) <= len(pairs):
+        if (options.station is None and len(pairs) > 1) or not 1 <= (options.station or 1) <= len(pairs):
             listed = ", ".join(f"{number} {pair}" for number, pair in enumerate(pairs[:8], start=1))
             raise InputError(
                 f"{path} holds {len(pairs)} pairs of transmitter and receivers; choose one by its number: station ({listed})"
             )
-        pair = pairs[(how.station or 1) - 1]
+        pair = pairs[(options.station or 1) - 1]
         frequency, tracer = _params(path / "params.json")
-        rays, notes = _rays(path, pair, frequency, tracer, how)
-        files = [path / "params.json", *(path / f"{key}_{pair}.npz" for key in (*KEYS, "rx_pos", "tx_pos"))]
-        return rays.spectra(path, how, files, notes=notes)
+        table, receiver, transmitter = _tables(path, pair)
+        files = [path / f"{key}_{pair}.npz" for key in (*table, "rx_pos", "tx_pos")]
+        stride = options.every or 1
+        index = np.arange(0, len(receiver), stride)
+        table, receiver = {key: values[::stride] for key, values in table.items()}, receiver[::stride]
+        known = np.isfinite(np.stack([table[key] for key in KEYS])).all(axis=0) & (table["power"] > -math.inf)
+        reached = known.any(axis=1)
+        if not reached.any():
+            raise InputError(f"{path} has no receiver with a path for pair {pair}")
+        notes = [] if reached.all() else [f"receivers without a path are left out: {int((~reached).sum())}"]
+        index, receiver, known = index[reached], receiver[reached], known[reached]
+        check_pixels(str(path), len(receiver), options.grid or GRID)
+        table = {key: values[reached] for key, values in table.items()}
+        paths, found = _paths(path, table, known, receiver, transmitter, frequency, tracer)
+        return paths.spectra(
+            path.resolve().name,
+            options.array,
+            options.grid,
+            index=torch.from_numpy(index),
+            source=digests([path / "params.json", *files]),
+            notes=(*notes, *found),
+        )
 
 
 def _pairs(path: Path) -> list[str]:
@@ -68,7 +94,7 @@ def _pairs(path: Path) -> list[str]:
 
 
 def _params(file: Path) -> tuple[float, str]:
-    """Carrier [Hz] and name of the ray tracer."""
+    """Return the carrier [Hz] and the name of the ray tracer."""
     try:
         given = json.loads(read_text(file))["rt_params"]
         frequency, tracer = float(given["frequency"]), str(given.get("raytracer_name", ""))
@@ -80,76 +106,16 @@ def _params(file: Path) -> tuple[float, str]:
     return frequency, tracer
 
 
-def _rays(folder: Path, pair: str, frequency: float, tracer: str, how: Reading) -> tuple[Rays, tuple[str, ...]]:
-    table, receiver, transmitter = _tables(folder, pair)
-    rows = np.arange(0, len(receiver), how.every or 1)
-    table, receiver = {key: values[rows] for key, values in table.items()}, receiver[rows]
-    known = np.isfinite(np.stack(list(table.values()))).all(axis=0) & (table["power"] > -math.inf)
-    has_path = known.any(axis=1)
-    notes = []
-    if not has_path.all():
-        notes.append(f"receivers without a path are left out: {int((~has_path).sum())}")
-    if not has_path.any():
-        raise InputError(f"{folder} has no receiver with a path for pair {pair}")
-    rows, receiver, known = rows[has_path], receiver[has_path], known[has_path]
-    table = {key: values[has_path] for key, values in table.items()}
-    check_pixels(str(folder), len(receiver), how.grid or GRID)
-    away = transmitter - receiver
-    distance = np.linalg.norm(away, axis=1)
-    if not (distance > 0).all():
-        raise InputError(
-            f"{folder}: receiver {int(rows[distance.argmin()])} of pair {pair} is at the transmitter; leave it out"
-        )
-    detour = np.where(known, table["delay"] * LIGHT_SPEED / distance[:, None], math.inf)
-    shortest = float(np.median(detour.min(axis=1)))
-    if not SHORTEST <= shortest <= LONGEST:
-        raise InputError(
-            f"{folder}: shortest paths are {shortest:.3g} times as long as the distance (median), so positions are not in "
-            "metres or delays not in seconds"
-        )
-    line, path = np.nonzero(np.abs(detour - 1) < DIRECT)
-    angles = table["aoa_az"], table["aoa_el"]
-    if max(np.abs(angle[known]).max() for angle in angles) <= 2 * math.pi:
-        raise InputError(f"{folder}: no angle is beyond 2 pi, so they look like radians; aoa_az and aoa_el are degrees")
-    if len(line) >= FEW:
-        _check_angles(folder, angles[0][line, path], angles[1][line, path], (away / distance[:, None])[line])
-    direction = _direction(angles[0][known], angles[1][known])
-    phase = np.deg2rad(table["phase"])
-    turned = 2 * math.pi * frequency * table["delay"]
-    said = _convention(phase[line, path], turned[line, path], tracer)
-    if said == "passband":
-        phase = phase - turned
-        notes.append("phases are those of passband coefficients; exp(-j 2 pi f delay) of the propagation is added")
-    elif said == "reversed":
-        phase = -phase
-        notes.append("phases grow with the delay; they are reversed, for a wave lags behind")
-    gain = 10 ** ((table["power"] - table["power"][known].max()) / 20) * np.exp(1j * phase)
-    clear = np.zeros(len(receiver), dtype=bool)
-    clear[line] = True
-    return (
-        Rays(
-            transmitter=torch.from_numpy(np.broadcast_to(transmitter, receiver.shape).copy()),
-            receiver=torch.from_numpy(receiver),
-            count=torch.from_numpy(known.sum(axis=1)),
-            direction=torch.from_numpy(direction),
-            gain=torch.from_numpy(gain[known]),
-            line_of_sight=torch.from_numpy(clear),
-            index=torch.from_numpy(rows),
-            frequency_hz=frequency,
-        ),
-        tuple(notes),
-    )
-
-
-def _tables(folder: Path, pair: str) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64], NDArray[np.float64]]:
-    """Paths by key, (n, paths), and positions of receivers (n, 3) and transmitter (3,)."""
-    arrays: dict[str, NDArray[Any]] = {}
-    for key in (*KEYS, "rx_pos", "tx_pos"):
+def _tables(folder: Path, pair: str) -> tuple[dict[str, Floats], Floats, Floats]:
+    """Return the paths by key, (n, paths), and the positions of receivers (n, 3) and transmitter (3,)."""
+    arrays: dict[str, Floats] = {}
+    keys = [*KEYS, *([INTERACTIONS] if (folder / f"{INTERACTIONS}_{pair}.npz").is_file() else [])]
+    for key in (*keys, "rx_pos", "tx_pos"):
         file = folder / f"{key}_{pair}.npz"
-        arrays[key] = read_arrays(file, [key])[key]
-        if arrays[key].dtype.kind not in "iuf":
-            raise InputError(f"{file} must hold real numbers, got {arrays[key].dtype}")
-        arrays[key] = arrays[key].astype(np.float64)
+        values = read_arrays(file, [key])[key]
+        if values.dtype.kind not in "iuf":
+            raise InputError(f"{file} must hold real numbers, got {values.dtype}")
+        arrays[key] = values.astype(np.float64)
     receiver, transmitter = arrays.pop("rx_pos"), arrays.pop("tx_pos").reshape(-1)
     shape = arrays["power"].shape
     if len(shape) != 2 or 0 in shape or any(values.shape != shape for values in arrays.values()):
@@ -159,58 +125,114 @@ def _tables(folder: Path, pair: str) -> tuple[dict[str, NDArray[np.float64]], ND
         raise InputError(
             f"{folder}: expected rx_pos ({shape[0]}, 3) and tx_pos (3,), got {receiver.shape} and {transmitter.shape}"
         )
-    if not (np.abs(receiver) <= FARTHEST).all() or not (np.abs(transmitter) <= FARTHEST).all():
-        raise InputError(f"{folder}: positions of pair {pair} must be finite numbers [m], at most {FARTHEST:g}")
+    if not (np.abs(receiver) <= MAX_COORDINATE_M).all() or not (np.abs(transmitter) <= MAX_COORDINATE_M).all():
+        raise InputError(f"{folder}: positions of pair {pair} must be finite numbers [m], at most {MAX_COORDINATE_M:g}")
     return arrays, receiver, transmitter
 
 
-def _direction(azimuth: NDArray[Any], zenith: NDArray[Any]) -> NDArray[Any]:
-    """Unit vectors (..., 3) of angles [deg]."""
-    azimuth, zenith = np.deg2rad(azimuth), np.deg2rad(zenith)
-    return np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1)
+def _paths(
+    folder: Path,
+    table: dict[str, Floats],
+    known: NDArray[np.bool_],
+    receiver: Floats,
+    transmitter: Floats,
+    frequency: float,
+    tracer: str,
+) -> tuple[PropagationPaths, list[str]]:
+    """Return the known paths of receivers that have one, and notes on their conventions."""
+    away = transmitter - receiver
+    distance = np.linalg.norm(away, axis=1)
+    if not (distance > 0).all():
+        raise InputError(f"{folder}: a receiver at {receiver[distance.argmin()].tolist()} m is at the transmitter")
+    detour = np.where(known, table["delay"] * LIGHT_SPEED / distance[:, None], math.inf)
+    shortest = float(np.median(detour.min(axis=1)))
+    if not MIN_DETOUR <= shortest <= MAX_DETOUR:
+        raise InputError(
+            f"{folder}: shortest paths are {shortest:.3g} times as long as the distance (median), so positions are not in "
+            "metres or delays not in seconds"
+        )
+    azimuth, zenith = table["aoa_az"], table["aoa_el"]
+    if max(np.abs(azimuth[known]).max(), np.abs(zenith[known]).max()) <= 2 * math.pi:
+        raise InputError(f"{folder}: no angle is beyond 2 pi, so they look like radians; aoa_az and aoa_el are degrees")
+    if INTERACTIONS in table:
+        direct, notes = known & (table[INTERACTIONS] == LINE_OF_SIGHT), []
+    else:
+        direct, notes = np.abs(detour - 1) < DIRECT_DETOUR, [NO_INTERACTIONS]
+    if direct.sum() >= MIN_DIRECT_PATHS:
+        _check_angles(folder, azimuth[direct], zenith[direct], away[direct.nonzero()[0]])
+    phase, lag = np.deg2rad(table["phase"]), 2 * math.pi * frequency * table["delay"]
+    convention = _convention(phase[direct], lag[direct], tracer)
+    if convention == "passband":
+        phase = phase - lag
+        notes.append("phases are those of passband coefficients; exp(-j 2 pi f delay) of the propagation is added")
+    elif convention == "reversed":
+        phase = -phase
+        notes.append("phases grow with the delay; they are reversed, for a wave lags behind")
+    gain = 10 ** ((table["power"] - table["power"][known].max()) / 20) * np.exp(1j * phase)
+    paths = PropagationPaths(
+        transmitter=torch.from_numpy(np.broadcast_to(transmitter, receiver.shape).copy()),
+        receiver=torch.from_numpy(receiver),
+        count=torch.from_numpy(known.sum(axis=1)),
+        direction=torch.from_numpy(_direction(azimuth[known], zenith[known])),
+        gain=torch.from_numpy(gain[known]),
+        line_of_sight=torch.from_numpy(direct.any(axis=1)),
+        frequency_hz=frequency,
+    )
+    return paths, notes
 
 
-def _check_angles(folder: Path, azimuth: NDArray[Any], zenith: NDArray[Any], towards: NDArray[Any]) -> None:
-    """Refuses angles of another convention, which the direct paths betray: they come from the transmitter.
+def _direction(azimuth: Floats, zenith: Floats) -> Floats:
+    """Return unit vectors (..., 3) of angles [deg]."""
+    elevation = torch.from_numpy(90 - zenith).deg2rad()
+    return to_direction(torch.from_numpy(azimuth).deg2rad(), elevation).numpy()
+
+
+def _check_angles(folder: Path, azimuth: Floats, zenith: Floats, away: Floats) -> None:
+    """Refuse angles of another convention, which direct paths reveal: they come from the transmitter.
 
     Args:
-        azimuth, zenith: of direct paths, (m,) [deg].
-        towards: unit vectors from their receivers to the transmitter, (m, 3).
+        folder: Source, for the message.
+        azimuth, zenith: Angles of direct paths, (m,) [deg].
+        away: Vectors from their receivers to the transmitter, (m, 3).
 
     Raises:
-        InputError: an elevation from the horizon, angles that point the other way, or a frame of their own.
+        InputError: An elevation from the horizon, angles that point the other way, or another frame.
     """
 
-    def off(claimed: NDArray[Any]) -> float:
-        return float(np.rad2deg(np.median(np.arccos(np.clip((claimed * towards).sum(1), -1, 1)))))
+    def offset(claimed: Floats) -> float:
+        """Return the median angle [deg] to the transmitter."""
+        return float(angular_distance(torch.from_numpy(claimed), torch.from_numpy(away)).rad2deg().median())
 
-    declared = off(_direction(azimuth, zenith))
-    if declared <= OFF:
+    declared = offset(_direction(azimuth, zenith))
+    if declared <= MAX_ANGLE_OFFSET_DEG:
         return
-    others = {
-        "aoa_el is the angle from the horizon; give that from the zenith, 90 - aoa_el": _direction(
-            azimuth, 90 - zenith
+    others: dict[str, Any] = {
+        "aoa_el is the angle from the horizon; give that from the zenith, 90 - aoa_el": (azimuth, 90 - zenith),
+        "the angles say where a path goes; give those from the receiver to where it comes from": (
+            azimuth + 180,
+            180 - zenith,
         ),
-        "the angles say where a path goes; give those from the receiver to where it comes from": -_direction(
-            azimuth, zenith
-        ),
-        "x and y are swapped in the angles or in the positions": _direction(90 - azimuth, zenith),
-        "aoa_az turns clockwise; give it counter-clockwise from x": _direction(-azimuth, zenith),
+        "x and y are swapped in the angles or in the positions": (90 - azimuth, zenith),
+        "aoa_az turns clockwise; give it counter-clockwise from x": (-azimuth, zenith),
     }
-    meaning, best = min(((meaning, off(claimed)) for meaning, claimed in others.items()), key=lambda found: found[1])
-    reason = f"it would fit if {meaning}" if best <= OFF else "positions and angles are in different frames or units"
+    offsets = {meaning: offset(_direction(*angles)) for meaning, angles in others.items()}
+    meaning = min(offsets, key=lambda meaning: offsets[meaning])
+    fits = offsets[meaning] <= MAX_ANGLE_OFFSET_DEG
+    reason = f"it would fit if {meaning}" if fits else "positions and angles are in different frames or units"
     raise InputError(
         f"{folder}: direct paths come from {declared:.0f} degrees beside the transmitter (median); {reason}"
     )
 
 
-def _convention(phase: NDArray[Any], turned: NDArray[Any], tracer: str) -> str:
-    """What phases [rad] are, by the one constant that is left of the direct paths, and else by the ray tracer's name: of the
-    whole length (`whole`), of the passband coefficient, or of the whole length with the sign `reversed`."""
-    if len(phase) >= FEW:
-        steady = {"whole": phase + turned, "passband": phase, "reversed": phase - turned}
-        length = {name: abs(np.exp(1j * left).mean()) for name, left in steady.items()}
-        best = max(length, key=lambda name: length[name])
-        if length[best] > STEADY:
+def _convention(phase: Floats, lag: Floats, tracer: str) -> str:
+    """Return the convention of phases [rad]: of the whole length (`whole`), of the `passband` coefficient, or `reversed`.
+
+    The right one makes the residual phase of direct paths constant. With few of them the ray tracer's name decides.
+    """
+    if len(phase) >= MIN_DIRECT_PATHS:
+        residual = {"whole": phase + lag, "passband": phase, "reversed": phase - lag}
+        resultant = {name: abs(np.exp(1j * left).mean()) for name, left in residual.items()}
+        best = max(resultant, key=lambda name: resultant[name])
+        if resultant[best] > STEADY_RESULTANT:
             return best
     return "passband" if SIONNA in tracer.lower() else "whole"

@@ -1,9 +1,8 @@
 """Reader of DICHASUS data sets (https://dichasus.inue.uni-stuttgart.de): TFRecord files and a JSON file that describes the
-arrays, with the phase and time offsets of the antennas where reftx-offsets-NAME.json lies beside NAME.tfrecords."""
+arrays, with the phase and time offsets of the antennas if reftx-offsets-NAME.json lies beside NAME.tfrecords."""
 
 from __future__ import annotations
 
-import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -12,87 +11,60 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swiftwrf.data.files import read_text
-from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format
-from swiftwrf.data.reading import Reading
-from swiftwrf.data.snapshots import Snapshots
-from swiftwrf.data.stations import (
-    Record,
-    description,
-    element_array,
-    has_assignments,
-    read_snapshots,
-    read_station,
-    record_files,
-)
+from swiftwrf.data.formats.base import SNAPSHOT_FORMATS
+from swiftwrf.data.stations import Cell, Record, RecordFormat, Station
 from swiftwrf.data.tfrecords import tensor
 from swiftwrf.errors import InputError
 
+NO_OFFSETS = (
+    "no reftx-offsets-NAME.json lies beside the records, so the elements' phases are as measured: calibrate them"
+)
+
 
 @SNAPSHOT_FORMATS.register("dichasus")
-class Dichasus(Format[Snapshots]):
+class Dichasus(RecordFormat):
     """`csi` float32 (antennas, subcarriers, 2) of real and imaginary parts, `pos-tachy` (3,) [m]."""
 
-    takes = frozenset({"beamformer", "grid", "every", "station"})
+    assigned = True
 
-    def recognises(self, path: Path) -> bool:
-        described = description(path) if record_files(path) else None
-        return described is not None and has_assignments(described)
-
-    def read(self, path: Path, how: Reading) -> Snapshots:
-        described = description(path)
-        assert described is not None
-        _, station, frequency = read_station(described, how.station)
-        rows = station.assignments or []
+    def cells(self, station: Station, file: Path) -> tuple[list[Cell], tuple[int, int]]:
+        rows = station.assignments
         if not rows:
-            raise InputError(f"{described}: array {station.name} lacks assignments, the antenna of each row and column")
-        shape = (len(rows), len(rows[0]))
+            raise InputError(f"{file}: array {station.name} lacks assignments, the antenna of each row and column")
         cells = [(r, c, antenna) for r, row in enumerate(rows) for c, antenna in enumerate(row) if antenna is not None]
-        antennas = [antenna for _, _, antenna in cells]
-        offsets = {file: _offsets(file) for file in record_files(path)}
-        known = [_offset_file(file) for file, values in offsets.items() if values is not None]
-        notes = () if len(known) == len(offsets) else (
-            "no reftx-offsets-NAME.json lies beside the records, so the elements' phases are as measured: calibrate them",
-        )  # fmt: skip
-        return read_snapshots(
-            path,
-            how.every or 1,
-            functools.partial(_parse, offsets=offsets),
-            lambda csi: csi[antennas],
-            (station, element_array(described, [station.element(r, c, shape) for r, c, _ in cells], frequency)),
-            [described, *known],
-            notes,
-        )
+        return cells, (len(rows), len(rows[0]))
+
+    def prepare(self, files: list[Path]) -> tuple[list[Path], tuple[str, ...]]:
+        found = {file: file.with_name(f"reftx-offsets-{file.stem}.json") for file in files}
+        self._offsets = {file: _offsets(source) for file, source in found.items() if source.is_file()}
+        return [found[file] for file in self._offsets], () if len(self._offsets) == len(files) else (NO_OFFSETS,)
+
+    def parse(self, features: dict[str, bytes], file: Path) -> Record:
+        parts, position = tensor(features["csi"]), tensor(features["pos-tachy"])
+        fits = parts.ndim == 3 and parts.shape[2] == 2 and parts.dtype.kind == "f" and 0 not in parts.shape
+        if not fits or position.shape != (3,):
+            raise ValueError(f"csi of shape {parts.shape} and pos-tachy of shape {position.shape}")
+        joined = parts.view(np.result_type(parts.dtype, np.complex64))[..., 0]
+        csi = np.fft.fftshift(joined, axes=1)  # from the order of the FFT to that of frequency
+        if (offsets := self._offsets.get(file)) is not None:
+            if len(offsets) != len(csi):
+                raise ValueError(f"{len(csi)} antennas, but offsets of {len(offsets)}")
+            cycles = np.arange(csi.shape[1]) / csi.shape[1]
+            with np.errstate(invalid="ignore", over="ignore"):  # the reader omits channels that are not finite
+                csi = csi * np.exp(1j * (offsets[:, :1] + offsets[:, 1:] * 2 * np.pi * cycles))
+        return Record(csi, position)
+
+    def select(self, csi: NDArray[Any], station: Station, antennas: list[int]) -> NDArray[Any]:
+        return csi[antennas]
 
 
-def _parse(features: dict[str, bytes], file: Path, offsets: dict[Path, NDArray[Any] | None]) -> Record:
-    parts, position = tensor(features["csi"]), tensor(features["pos-tachy"])
-    if parts.ndim != 3 or parts.shape[2] != 2 or parts.dtype.kind != "f" or 0 in parts.shape or position.shape != (3,):
-        raise ValueError(f"csi of shape {parts.shape} and pos-tachy of shape {position.shape}")
-    joined = parts.view(np.result_type(parts.dtype, np.complex64))[..., 0]
-    csi = np.fft.fftshift(joined, axes=1)  # from the order of the FFT to that of frequency
-    if (known := offsets[file]) is not None:
-        if len(known) != len(csi):
-            raise ValueError(f"{len(csi)} antennas, but offsets of {len(known)}")
-        turns = np.arange(csi.shape[1]) / csi.shape[1]
-        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is left out later
-            csi = csi * np.exp(1j * (known[:, :1] + known[:, 1:] * 2 * np.pi * turns))
-    return Record(csi, position)
-
-
-def _offset_file(file: Path) -> Path:
-    return file.with_name(f"reftx-offsets-{file.stem}.json")
-
-
-def _offsets(file: Path) -> NDArray[Any] | None:
-    """Carrier phase [rad] and sampling time [samples] of each antenna that are to be added, (antennas, 2)."""
-    source = _offset_file(file)
-    if not source.is_file():
-        return None
+def _offsets(file: Path) -> NDArray[Any]:
+    """Return carrier phase [rad] and sampling time [samples] to add to each antenna, (antennas, 2)."""
     try:
-        content = json.loads(read_text(source))
+        content = json.loads(read_text(file))
         values = np.array([content["cpo"], content["sto"]], dtype=np.float64).T
     except (ValueError, TypeError, LookupError, RecursionError) as error:
-        raise InputError(f"{source} must hold lists cpo and sto with a number for each antenna ({error})") from None
+        raise InputError(f"{file} must hold lists cpo and sto with a number for each antenna ({error})") from None
     if values.ndim != 2 or not np.isfinite(values).all():
-        raise InputError(f"{source} must hold lists cpo and sto with a finite number for each antenna")
+        raise InputError(f"{file} must hold lists cpo and sto with a finite number for each antenna")
     return values

@@ -3,58 +3,34 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format
-from swiftwrf.data.reading import Reading
-from swiftwrf.data.snapshots import Snapshots
-from swiftwrf.data.stations import (
-    Record,
-    description,
-    element_array,
-    has_assignments,
-    read_snapshots,
-    read_station,
-    record_files,
-)
+from numpy.typing import NDArray
+
+from swiftwrf.data.formats.base import SNAPSHOT_FORMATS
+from swiftwrf.data.stations import Cell, Record, RecordFormat, Station
 from swiftwrf.data.tfrecords import tensor
-from swiftwrf.errors import InputError
 
-SHAPE = (2, 4)  # rows and columns of an array
+ROWS, COLUMNS = 2, 4  # of an array
 
 
 @SNAPSHOT_FORMATS.register("espargos")
-class Espargos(Format[Snapshots]):
+class Espargos(RecordFormat):
     """`csi` complex (arrays, 2, 4, subcarriers), `pos` (3,) [m]."""
 
-    takes = frozenset({"beamformer", "grid", "every", "station"})
+    assigned = False
 
-    def recognises(self, path: Path) -> bool:
-        if not record_files(path):
-            return False
-        described = description(path)
-        return described is None or not has_assignments(described)
+    def cells(self, station: Station, file: Path) -> tuple[list[Cell], tuple[int, int]]:
+        cells = [(row, column, row * COLUMNS + column) for row in range(ROWS) for column in range(COLUMNS)]
+        return cells, (ROWS, COLUMNS)
 
-    def read(self, path: Path, how: Reading) -> Snapshots:
-        described = description(path)
-        if described is None:
-            raise InputError(
-                f"{path} holds records, but no JSON with antennas, which describes their arrays, lies beside them"
-            )
-        index, station, frequency = read_station(described, how.station)
-        places = [station.element(row, column, SHAPE) for row in range(SHAPE[0]) for column in range(SHAPE[1])]
-        return read_snapshots(
-            path,
-            how.every or 1,
-            _parse,
-            lambda csi: csi[index].reshape(len(places), -1),
-            (station, element_array(described, places, frequency)),
-            [described],
-            (),
-        )
+    def parse(self, features: dict[str, bytes], file: Path) -> Record:
+        csi, position = tensor(features["csi"]), tensor(features["pos"])
+        fits = csi.ndim == 4 and csi.shape[1:3] == (ROWS, COLUMNS) and csi.dtype.kind == "c" and 0 not in csi.shape
+        if not fits or position.shape != (3,):
+            raise ValueError(f"csi of shape {csi.shape} and pos of shape {position.shape}")
+        return Record(csi, position)
 
-
-def _parse(features: dict[str, bytes], file: Path) -> Record:
-    csi, position = tensor(features["csi"]), tensor(features["pos"])
-    if csi.ndim != 4 or csi.shape[1:3] != SHAPE or csi.dtype.kind != "c" or 0 in csi.shape or position.shape != (3,):
-        raise ValueError(f"csi of shape {csi.shape} and pos of shape {position.shape}")
-    return Record(csi, position)
+    def select(self, csi: NDArray[Any], station: Station, antennas: list[int]) -> NDArray[Any]:
+        channel: NDArray[Any] = csi[station.number].reshape(len(antennas), -1)
+        return channel

@@ -1,7 +1,7 @@
 """Reader of the NeRF2 layout for spectra: gateway_info.yml, tx_pos.csv or rx_pos.csv, and spectrum/*.png or an array.
 
-An array in spectrum.npy or spectrum.npz keeps what eight bits lose; spectrum.npz may hold line_of_sight beside it, and the
-gateway its frequency_hz and element_position. This is also what `swiftwrf.data.writing` writes.
+An array in spectrum.npy or spectrum.npz keeps more than eight bits. spectrum.npz may hold line_of_sight, and the gateway
+frequency_hz and element_position. `swiftwrf.data.writing` writes this layout.
 """
 
 from __future__ import annotations
@@ -9,9 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import math
-import struct
 import warnings
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,15 +17,16 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, ArrayPose
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
-from swiftwrf.data.archives import array_header, array_names, read_arrays, read_rows
+from swiftwrf.data.archives import BROKEN, array_header, array_names, read_arrays, read_rows
 from swiftwrf.data.files import (
-    FARTHEST,
+    MAX_COORDINATE_M,
     check_carrier,
+    digests,
     number,
     numbers,
     read_bytes,
@@ -36,75 +35,51 @@ from swiftwrf.data.files import (
     sha256,
     sha256_of_all,
 )
-from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format
-from swiftwrf.data.reading import Reading
+from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
 from swiftwrf.data.spectra import Moving, Spectra, check_pixels
-from swiftwrf.data.splits import read_split, split_names
+from swiftwrf.data.splits import read_splits
 from swiftwrf.data.store import AT_ONCE, MOST_EACH, MOST_PIXELS, Store, stored, too_many
 from swiftwrf.errors import InputError
-
-# what Pillow raises on broken files
-BROKEN = (
-    UnidentifiedImageError,
-    Image.DecompressionBombError,
-    OSError,
-    SyntaxError,
-    ValueError,
-    ArithmeticError,
-    LookupError,
-    TypeError,
-    EOFError,
-    struct.error,
-    zlib.error,
-)
 
 
 @SPECTRA_FORMATS.register("nerf2")
 class Nerf2(Format[Spectra]):
-    """Images; row i of the positions belongs to the image numbered i from 1, or to row i of the array."""
+    """Images or an array; row i of the positions belongs to the image numbered i from 1, or to row i of the array."""
 
     takes = frozenset({"array"})
 
     def recognises(self, path: Path) -> bool:
         return (path / "gateway_info.yml").is_file() or (path / "spectrum").is_dir()
 
-    def read(self, path: Path, how: Reading) -> Spectra:
-        return _read(path, how)
-
-
-def _read(folder: Path, how: Reading) -> Spectra:
-    gateway = _read_gateway(folder / "gateway_info.yml")
-    pose = _read_pose(folder / "gateway_info.yml", gateway)
-    array = _read_array(folder / "gateway_info.yml", gateway)
-    if how.array is not None and array is not None and array != how.array:
-        raise InputError(f"{folder / 'gateway_info.yml'} describes another array than was given; leave one of them out")
-    tables = [file for file in (folder / "tx_pos.csv", folder / "rx_pos.csv") if file.is_file()]
-    if len(tables) != 1:
-        raise InputError(f"{folder} must hold one of tx_pos.csv (moving transmitter) and rx_pos.csv (moving receiver)")
-    moving: Moving = "transmitter" if tables[0].name == "tx_pos.csv" else "receiver"
-    position = read_positions(tables[0])
-    store, line_of_sight, digests = _read_spectra(folder, len(position))
-    fixed = torch.tensor(pose.position, dtype=torch.float64)
-    ends = (position, fixed) if moving == "transmitter" else (fixed, position)
-    if bool((position == fixed).all(dim=1).any()):
-        raise InputError(f"{tables[0]} has a position equal to the gateway's, from which there is no direction")
-    splits = {name: read_split(folder, name, len(position), first=1) for name in split_names(folder)}
-    described = [folder / "gateway_info.yml", tables[0], *sorted(folder.glob("*_index*.txt"))]
-    return Spectra(
-        name=folder.resolve().name,
-        position=position,
-        store=store,
-        grid=AngularGrid.hemisphere(*store.shape[1:]),
-        label=pose.line_of_sight(*ends),
-        line_of_sight=line_of_sight,
-        moving=moving,
-        index=torch.arange(len(position)),
-        named_splits=splits,
-        array=array or how.array,
-        source={file.name: sha256(file) for file in described} | digests,
-        fixed_position=fixed,
-        rotation=pose.rotation,
-    )
+    def read(self, path: Path, options: ReadOptions) -> Spectra:
+        described = path / "gateway_info.yml"
+        gateway = _read_gateway(described)
+        pose = _read_pose(described, gateway)
+        array = _read_array(described, gateway)
+        if options.array is not None and array is not None and array != options.array:
+            raise InputError(f"{described} describes another array than was given; leave one of them out")
+        tables = [file for file in (path / "tx_pos.csv", path / "rx_pos.csv") if file.is_file()]
+        if len(tables) != 1:
+            raise InputError(
+                f"{path} must hold one of tx_pos.csv (moving transmitter) and rx_pos.csv (moving receiver)"
+            )
+        moving: Moving = "transmitter" if tables[0].name == "tx_pos.csv" else "receiver"
+        position = read_positions(tables[0])
+        store, line_of_sight, read = _read_spectra(path, len(position))
+        if bool((position == torch.tensor(pose.position, dtype=torch.float64)).all(dim=1).any()):
+            raise InputError(f"{tables[0]} has a position equal to the gateway's, from which there is no direction")
+        return Spectra(
+            store=store,
+            position=position,
+            array=array or options.array,
+            line_of_sight=line_of_sight,
+            moving=moving,
+            name=path.resolve().name,
+            fixed_position=pose.position,
+            rotation=pose.rotation,
+            named_splits=read_splits(path, len(position), first=1),
+            source=digests([described, tables[0]], path) | read,
+        )
 
 
 def _read_gateway(file: Path) -> dict[str, Any]:
@@ -118,10 +93,10 @@ def _read_gateway(file: Path) -> dict[str, Any]:
 
 def _read_pose(file: Path, gateway: dict[str, Any]) -> ArrayPose:
     position, orientation = numbers(gateway.get("position"), 3), numbers(gateway.get("orientation"), 4)
-    if position is None or orientation is None or max(map(abs, position)) > FARTHEST:
+    if position is None or orientation is None or max(map(abs, position)) > MAX_COORDINATE_M:
         raise InputError(
-            f"{file}: the gateway needs a position of 3 numbers [m], at most {FARTHEST:g}, and an orientation (x, y, z, w) "
-            f"of 4, got {gateway.get('position')} and {gateway.get('orientation')}"
+            f"{file}: the gateway needs a position of 3 numbers [m], at most {MAX_COORDINATE_M:g}, and an orientation "
+            f"(x, y, z, w) of 4, got {gateway.get('position')} and {gateway.get('orientation')}"
         )
     try:
         return ArrayPose(position, orientation)  # type: ignore[arg-type]  # the lengths are checked
@@ -130,7 +105,7 @@ def _read_pose(file: Path, gateway: dict[str, Any]) -> ArrayPose:
 
 
 def _read_array(file: Path, gateway: dict[str, Any]) -> PlanarArray | None:
-    """The antenna array, where the gateway tells it."""
+    """Return the antenna array, None if the gateway does not describe it."""
     if "frequency_hz" not in gateway and "element_position" not in gateway:
         return None
     frequency, elements = number(gateway.get("frequency_hz")), gateway.get("element_position")
@@ -144,7 +119,7 @@ def _read_array(file: Path, gateway: dict[str, Any]) -> PlanarArray | None:
 
 
 def _read_spectra(folder: Path, n: int) -> tuple[Store, Tensor, dict[str, str]]:
-    """Spectra (n, H, W) in [0, 1], whether the line of sight is free, and digests of the files."""
+    """Return spectra (n, H, W) in [0, 1], whether the line of sight is unobstructed, and digests of the files."""
     free = torch.ones(n, dtype=torch.bool)
     arrays = [file for file in (folder / "spectrum.npy", folder / "spectrum.npz") if file.is_file()]
     if len(arrays) + (folder / "spectrum").is_dir() > 1:
@@ -163,7 +138,7 @@ def _read_spectra(folder: Path, n: int) -> tuple[Store, Tensor, dict[str, str]]:
 
 
 def _read_values(file: Path, n: int, digest: str) -> Store:
-    """Spectra of an array: magnitudes in [0, 1], or bytes as images have them."""
+    """Return the spectra of an array: magnitudes in [0, 1], or bytes as in images."""
     shape, kind = array_header(file, "spectrum")
     if len(shape) != 3 or shape[0] != n or min(shape) < 2 or kind.kind not in "fu":
         raise InputError(
@@ -187,7 +162,7 @@ def _read_values(file: Path, n: int, digest: str) -> Store:
 
 
 def _checked(file: Path, values: NDArray[Any], kept: torch.dtype) -> Tensor:
-    """Some spectra of an array in the type that they are kept in."""
+    """Return some spectra of an array in the type of the store."""
     if kept == torch.uint8:
         return torch.from_numpy(values.copy())
     if values.dtype.kind == "u":
@@ -203,7 +178,7 @@ def _checked(file: Path, values: NDArray[Any], kept: torch.dtype) -> Tensor:
 
 
 def _read_images(folder: Path, n: int) -> tuple[Store, str]:
-    """`00001.png` to `n`.png as (n, H, W), all grey and of one shape, and the digest of all files."""
+    """Return `00001.png` to `n`.png as (n, H, W), all grey and of one shape, and the digest of all files."""
     if not folder.is_dir():
         raise InputError(f"{folder} is missing; expected one grey image a position, 00001.png to {n:05d}.png")
     found = len(list(folder.glob("*.png")))
@@ -228,18 +203,18 @@ def _read_images(folder: Path, n: int) -> tuple[Store, str]:
 
 
 def _opened(file: Path, content: bytes) -> Image.Image:
-    """Of its header alone is read. No other format than PNG: Pillow starts other programs for some."""
+    """Open a PNG image without decoding it. Other formats are excluded, because Pillow starts programs for some."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is checked below
         return Image.open(io.BytesIO(content), formats=["PNG"])
 
 
 def _check_size(file: Path, content: bytes, n: int, shape: tuple[int, int] | None) -> tuple[int, int]:
-    """Rows and columns, known before anything is decoded: a few kilobytes may claim gigabytes."""
+    """Return rows and columns, checked before anything is decoded: a few kilobytes may claim gigabytes."""
     try:
         with _opened(file, content) as image:
             rows, columns, mode = image.height, image.width, image.mode
-    except BROKEN as error:
+    except (*BROKEN, Image.DecompressionBombError) as error:
         raise InputError(f"{file} is not a complete PNG image ({error})") from None
     if mode != "L":
         raise InputError(f"{file} has mode {mode}; a spectrum is an 8-bit grey image")
@@ -266,5 +241,5 @@ def _decode(file: Path, content: bytes) -> np.ndarray[tuple[int, int], np.dtype[
             image.verify()  # the checksums; loading alone forgives a missing end
         with _opened(file, content) as image:
             return np.asarray(image)
-    except BROKEN as error:
+    except (*BROKEN, Image.DecompressionBombError) as error:
         raise InputError(f"{file} is not a complete PNG image ({error})") from None

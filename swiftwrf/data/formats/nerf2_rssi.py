@@ -1,21 +1,19 @@
-"""Reader of the NeRF2 layout for RSSI: gateway_position.yml, tx_pos.csv, gateway_rssi.csv (-100 = not heard)."""
+"""Reader of the NeRF2 layout for RSSI: gateway_position.yml, tx_pos.csv, gateway_rssi.csv (-100: not detected)."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from swiftwrf.data.files import FARTHEST, numbers, read_positions, read_table, read_yaml, sha256
-from swiftwrf.data.formats.base import RSSI_FORMATS, Format
-from swiftwrf.data.reading import Reading
+from swiftwrf.data.files import MAX_COORDINATE_M, digests, numbers, read_positions, read_table, read_yaml
+from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import read_split, split_names
+from swiftwrf.data.splits import read_splits
+from swiftwrf.data.survey import NOT_DETECTED_DBM, check_powers
 from swiftwrf.errors import InputError
-
-NOT_HEARD = -100.0  # what the files write for a receiver that did not hear the transmitter; it is missing, not weak
-LOWEST, HIGHEST = -150.0, 30.0  # [dBm] beyond which a value cannot be a received power
 
 
 @RSSI_FORMATS.register("nerf2")
@@ -25,56 +23,39 @@ class Nerf2Rssi(Format[Rssi]):
     def recognises(self, path: Path) -> bool:
         return (path / "gateway_rssi.csv").is_file() or (path / "gateway_position.yml").is_file()
 
-    def read(self, path: Path, how: Reading) -> Rssi:
-        return _read(path)
-
-
-def _read(folder: Path) -> Rssi:
-    names, rssi = read_table(folder / "gateway_rssi.csv")
-    position = read_positions(folder / "tx_pos.csv")
-    if len(rssi) != len(position):
-        raise InputError(
-            f"{folder}: gateway_rssi.csv has {len(rssi)} rows, tx_pos.csv {len(position)}; they must match"
+    def read(self, path: Path, options: ReadOptions) -> Rssi:
+        table, positions, receivers = (
+            path / name for name in ("gateway_rssi.csv", "tx_pos.csv", "gateway_position.yml")
         )
-    _check_values(folder / "gateway_rssi.csv", names, rssi)
-    heard = torch.where(rssi == NOT_HEARD, torch.nan, rssi)
-    described = ["tx_pos.csv", "gateway_rssi.csv", "gateway_position.yml"]
-    files = [*(folder / name for name in described if (folder / name).is_file()), *sorted(folder.glob("*_index*.txt"))]
-    return Rssi(
-        name=folder.resolve().name,
-        receiver_names=tuple(names),
-        receiver_position=_read_receivers(folder / "gateway_position.yml", names),
-        transmitter_position=position,
-        rssi_dbm=heard,
-        index=torch.arange(len(position)),
-        named_splits={name: read_split(folder, name, len(position), first=0) for name in split_names(folder)},
-        source={file.name: sha256(file) for file in files},
-    )
-
-
-def _check_values(file: Path, names: list[str], rssi: Tensor) -> None:
-    bad = (~((rssi >= LOWEST) & (rssi <= HIGHEST))).nonzero()  # nan compares false, so it is bad too
-    if len(bad):
-        row, column = bad[0].tolist()
-        raise InputError(
-            f"{file} row {row + 1}, receiver {names[column]}: {float(rssi[row, column]):g} dBm is no received power; "
-            f"expected {LOWEST:g} to {HIGHEST:g}, or {NOT_HEARD:g} for not heard"
+        names, rssi = read_table(table)
+        position = read_positions(positions)
+        if len(rssi) != len(position):
+            raise InputError(
+                f"{path}: gateway_rssi.csv has {len(rssi)} rows, tx_pos.csv {len(position)}; they must match"
+            )
+        check_powers(table, rssi.numpy(), np.array(names, dtype=object), (NOT_DETECTED_DBM,))
+        return Rssi(
+            torch.where(rssi == NOT_DETECTED_DBM, torch.nan, rssi),
+            position,
+            name=path.resolve().name,
+            receiver_names=names,
+            receiver_position=_read_receivers(receivers, names) if receivers.is_file() else None,
+            named_splits=read_splits(path, len(position), first=0),
+            source=digests([f for f in (positions, table, receivers) if f.is_file()], path),
         )
 
 
 def _read_receivers(file: Path, names: list[str]) -> Tensor:
-    """Positions of the receivers, float64 (R, 3) [m]; nan where no file tells them."""
-    if not file.is_file():
-        return torch.full((len(names), 3), torch.nan, dtype=torch.float64)
+    """Return the positions of the receivers, float64 (R, 3) [m]."""
     content = read_yaml(file)
     missing = [name for name in names if name not in content]
     if missing:
         raise InputError(f"{file} has no position of receiver {missing[0]!r}, which gateway_rssi.csv names")
     positions = [numbers(content[name], 3) for name in names]
     for name, position in zip(names, positions, strict=True):
-        if position is None or max(map(abs, position)) > FARTHEST:
+        if position is None or max(map(abs, position)) > MAX_COORDINATE_M:
             raise InputError(
-                f"{file}: receiver {name!r} needs a position of 3 finite numbers [m], at most {FARTHEST:g}, got "
+                f"{file}: receiver {name!r} needs a position of 3 finite numbers [m], at most {MAX_COORDINATE_M:g}, got "
                 f"{content[name]}"
             )
     return torch.tensor(positions, dtype=torch.float64)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,16 +12,15 @@ from torch import Tensor
 from swiftwrf.array.angles import ArrayPose
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import ARCHIVES, Arrays, array_names, read_arrays
-from swiftwrf.data.files import FARTHEST, check_carrier, sha256
-from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format
-from swiftwrf.data.reading import Reading
+from swiftwrf.data.files import MAX_COORDINATE_M, check_carrier, digests
+from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
 from swiftwrf.data.snapshots import Snapshots, check_spacing
-from swiftwrf.data.splits import read_split, split_names
+from swiftwrf.data.splits import read_splits
 from swiftwrf.errors import InputError
 
 NEEDED = ("csi", "position", "frequency_hz", "array_position", "array_orientation")
 OPTIONAL = ("element_position", "rows", "columns", "spacing_m", "line_of_sight", "time")
-FLAT = 1e-3  # [wavelengths] that elements may leave their plane
+MAX_HEIGHT_WAVELENGTHS = 1e-3  # of elements over their plane
 
 
 @SNAPSHOT_FORMATS.register("snapshots")
@@ -34,10 +32,32 @@ class SnapshotArrays(Format[Snapshots]):
     def recognises(self, path: Path) -> bool:
         return _file(path) is not None
 
-    def read(self, path: Path, how: Reading) -> Snapshots:
+    def read(self, path: Path, options: ReadOptions) -> Snapshots:
         file = _file(path)
         assert file is not None
-        return _read(file, how.every or 1)
+        arrays = read_arrays(file, NEEDED, OPTIONAL)
+        for name, values in arrays.items():
+            if name != "csi" and values.dtype.kind == "c":
+                raise InputError(f"{file}: {name} holds complex numbers, expected real ones")
+            if not np.isfinite(values).all():
+                raise InputError(f"{file}: {name} holds a value that is not finite; leave that row out")
+        position, array = _points(file, arrays, "position", 3), _array(file, arrays)
+        n, folder, pose = len(position), file.parent, _pose(file, arrays)
+        channel = _channel(file, arrays["csi"], n, len(array.element))
+        if bool((position == torch.tensor(pose.position, dtype=torch.float64)).all(dim=1).any()):
+            raise InputError(f"{file} has a position equal to array_position, from which there is no direction")
+        data = Snapshots(
+            channel,
+            position,
+            array=array,
+            pose=pose,
+            name=file.stem if file.stem != "snapshots" else folder.resolve().name,
+            named_splits=read_splits(folder, n, first=1) if options.every in (None, 1) else None,
+            source=digests([file], folder),
+            line_of_sight=_one_each(file, arrays, "line_of_sight", n),
+            time=_one_each(file, arrays, "time", n),
+        )
+        return data if options.every in (None, 1) else data.subset(torch.arange(0, n, options.every))
 
 
 def _file(path: Path) -> Path | None:
@@ -48,59 +68,31 @@ def _file(path: Path) -> Path | None:
     return path if path.suffix in ARCHIVES and "csi" in array_names(path) else None
 
 
-def _read(file: Path, every: int) -> Snapshots:
-    arrays = read_arrays(file, NEEDED, OPTIONAL)
-    for name, values in arrays.items():
-        if name != "csi" and values.dtype.kind == "c":
-            raise InputError(f"{file}: {name} holds complex numbers, expected real ones")
-        if not np.isfinite(values).all():
-            raise InputError(f"{file}: {name} holds a value that is not finite; leave that row out")
-    position = _points(file, arrays, "position", 3)
-    array = _array(file, arrays)
-    channel = _channel(file, arrays["csi"], len(position), len(array.element))
-    pose = _pose(file, arrays)
-    fixed = torch.tensor(pose.position, dtype=torch.float64)
-    if bool((position == fixed).all(dim=1).any()):
-        raise InputError(f"{file} has a position equal to array_position, from which there is no direction")
-    n = len(position)
-    folder = file.parent
-    whole = Snapshots(
-        name=file.stem if file.stem != "snapshots" else folder.resolve().name,
-        channel=channel,
-        position=position,
-        array=array,
-        array_position=fixed,
-        rotation=pose.rotation,
-        line_of_sight=_rows(file, arrays, "line_of_sight", n, np.ones(n)).bool(),
-        index=torch.arange(n),
-        time=_rows(file, arrays, "time", n) if "time" in arrays else None,
-        named_splits={name: read_split(folder, name, n, first=1) for name in split_names(folder)} if every == 1 else {},
-        source={f.name: sha256(f) for f in [file, *sorted(folder.glob("*_index*.txt"))]},
-    )
-    return whole if every == 1 else whole.subset(torch.arange(0, n, every))
-
-
 def _points(file: Path, arrays: Arrays, name: str, columns: int) -> Tensor:
-    """Points, float64 (n, columns) [m]."""
+    """Return points, float64 (n, columns) [m]."""
     values = arrays[name]
     if values.ndim != 2 or values.shape[1] != columns or len(values) == 0:
         raise InputError(f"{file}: {name} must have shape (n, {columns}) in metres, got {values.shape}")
-    if float(np.abs(values).max()) > FARTHEST:
-        raise InputError(f"{file}: {name} holds a coordinate beyond {FARTHEST:g} m; give metres from a nearer origin")
+    if float(np.abs(values).max()) > MAX_COORDINATE_M:
+        raise InputError(
+            f"{file}: {name} holds a coordinate beyond {MAX_COORDINATE_M:g} m; give metres from a nearer origin"
+        )
     return torch.from_numpy(values.astype(np.float64))
 
 
-def _rows(file: Path, arrays: Arrays, name: str, n: int, default: NDArray[Any] | None = None) -> Tensor:
-    """One number a position."""
-    values = arrays.get(name, default)
-    assert values is not None
-    if values.shape != (n,):
-        raise InputError(f"{file}: {name} must have one value for each of the {n} positions, got shape {values.shape}")
-    return torch.from_numpy(values.astype(np.float64))
+def _one_each(file: Path, arrays: Arrays, name: str, n: int) -> Tensor | None:
+    """Return one number a position, float64 (n,), None if the file has none."""
+    if name not in arrays:
+        return None
+    if arrays[name].shape != (n,):
+        raise InputError(
+            f"{file}: {name} must have one value for each of the {n} positions, got shape {arrays[name].shape}"
+        )
+    return torch.from_numpy(arrays[name].astype(np.float64))
 
 
-def _channel(file: Path, csi: NDArray[Any], n: int, elements: int) -> Tensor:
-    """complex64 (n, S, K), each row scaled to unit mean power, for snapshots may be in any unit."""
+def _channel(file: Path, csi: NDArray[np.generic], n: int, elements: int) -> Tensor:
+    """Return channels, complex64 (n, S, K), each row scaled to unit mean power, because their unit is arbitrary."""
     if csi.dtype.kind != "c":
         hint = "; join real and imaginary parts as csi[..., 0] + 1j * csi[..., 1]" if csi.shape[-1:] == (2,) else ""
         raise InputError(f"{file}: csi must hold complex numbers, got {csi.dtype}{hint}")
@@ -129,10 +121,10 @@ def _pose(file: Path, arrays: Arrays) -> ArrayPose:
             f"{file}: array_orientation has 3 numbers; Euler angles leave their order open, so give the unit quaternion "
             "(x, y, z, w) that turns array into world coordinates"
         )
-    if position.shape != (3,) or orientation.shape != (4,) or float(np.abs(position).max()) > FARTHEST:
+    if position.shape != (3,) or orientation.shape != (4,) or float(np.abs(position).max()) > MAX_COORDINATE_M:
         raise InputError(
-            f"{file}: expected array_position of shape (3,) in metres, at most {FARTHEST:g}, and array_orientation of "
-            f"shape (4,), got {position.shape} and {orientation.shape}"
+            f"{file}: expected array_position of shape (3,) in metres, at most {MAX_COORDINATE_M:g}, and array_orientation "
+            f"of shape (4,), got {position.shape} and {orientation.shape}"
         )
     try:
         return ArrayPose(tuple(map(float, position)), tuple(map(float, orientation)))  # type: ignore[arg-type]
@@ -141,7 +133,7 @@ def _pose(file: Path, arrays: Arrays) -> ArrayPose:
 
 
 def _array(file: Path, arrays: Arrays) -> PlanarArray:
-    """The array, given by the positions of its elements or by rows, columns and their spacing."""
+    """Return the array, described by the positions of its elements or by rows, columns and spacing."""
     frequency = arrays["frequency_hz"]
     if frequency.shape != ():
         raise InputError(f"{file}: frequency_hz must be one number, the carrier, got shape {frequency.shape}")
@@ -164,10 +156,10 @@ def _array(file: Path, arrays: Arrays) -> PlanarArray:
 
 
 def _plane(file: Path, arrays: Arrays, wavelength: float) -> Tensor:
-    """Positions of the elements in their plane, (K, 2) [m]."""
+    """Return the positions of the elements in their plane, (K, 2) [m]."""
     columns = 2 if arrays["element_position"].shape[1:] == (2,) else 3
     element = _points(file, arrays, "element_position", columns)
-    if columns == 3 and float((height := element[:, 2]).max() - height.min()) > FLAT * wavelength:
+    if columns == 3 and float((height := element[:, 2]).max() - height.min()) > MAX_HEIGHT_WAVELENGTHS * wavelength:
         raise InputError(
             f"{file}: element_position spreads {float(height.max() - height.min()):.3g} m along z; give the elements in "
             "array coordinates, x and y in the array's plane, and let array_orientation turn them into the world"

@@ -1,4 +1,4 @@
-"""A scene as Sionna RT holds it: made of surfaces, or read from a Mitsuba file. Sionna is imported here, and when needed."""
+"""A scene in Sionna RT: made of surfaces, or read from a Mitsuba file. Sionna is imported here, when it is needed."""
 
 from __future__ import annotations
 
@@ -9,19 +9,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from swiftwrf.data.raytraced.rooms import ROOMS
+from swiftwrf.data.raytraced.rooms import ROOMS, SCENE_FILE, check_scene
 from swiftwrf.data.raytraced.surfaces import Material, Surface
 from swiftwrf.errors import InputError
 
-SCENE_FILE = ".xml"  # ends the names of scene files; others are of rooms
 ISOTROPIC = {"num_rows": 1, "num_cols": 1, "pattern": "iso", "polarization": "V"}
 
 
 def sionna() -> Any:
-    """The module `sionna.rt`.
+    """Return the module `sionna.rt`.
 
     Raises:
-        InputError: it is not installed, or finds neither a GPU nor LLVM.
+        InputError: It is not installed, or finds neither a GPU nor LLVM.
     """
     try:
         import drjit
@@ -39,84 +38,79 @@ def sionna() -> Any:
     return sionna.rt
 
 
-def check_scene(name: str, said: str = "") -> None:
-    """Refuses what is neither a room's name nor a scene file, before anything is computed.
-
-    Args:
-        name: of a room, or a path that ends in `.xml`.
-        said: what stands before it in the sentence, e.g. the option.
-
-    Raises:
-        InputError: no such room or file.
-    """
-    if not name.endswith(SCENE_FILE):
-        ROOMS[name]  # refuses an unknown one
-    elif not Path(name).is_file():
-        raise InputError(f"{said}{name} is not there; expected a Mitsuba scene, or one of {', '.join(ROOMS)}")
-
-
 class Scene:
-    """Surfaces of materials at a carrier, ready to be traced.
+    """Surfaces at a carrier frequency, ready to be traced.
 
     Args:
-        surfaces: what the scene consists of.
-        frequency_hz: of the carrier.
-        scattering: share of the reflected amplitude that all materials scatter, Sionna's scattering coefficient.
+        surfaces: Surfaces of the scene.
+        frequency_hz: Frequency of the carrier [Hz].
+        scattering: Scattering coefficient of all materials, the fraction of the reflected amplitude that is scattered.
 
     Raises:
         InputError: Sionna RT or LLVM is missing, or a material is unknown or has no constants at the carrier.
     """
 
     def __init__(self, surfaces: Sequence[Surface], frequency_hz: float, scattering: float = 0.0) -> None:
-        rt = sionna()
-        self._set_up(rt.load_scene(), frequency_hz)
-        materials: dict[Material, Any] = {}
-        for surface in surfaces:
-            if surface.material not in materials:
-                materials[surface.material] = _material(surface.material)
+        self.held = _at(sionna().load_scene(), frequency_hz)
+        self.surfaces = list(surfaces)
+        materials = {surface.material: _material(surface.material) for surface in surfaces}
         try:
             self.held.edit(add=[_object(surface, materials[surface.material]) for surface in surfaces])
         except ValueError as error:
-            raise InputError(_why(surfaces, frequency_hz, error)) from None
+            raise InputError(_reason(surfaces, frequency_hz, error)) from None
         self._scatter(scattering)
-        self.surfaces = list(surfaces)
 
     @classmethod
     def read(cls, file: Path, frequency_hz: float, scattering: float = 0.0) -> Scene:
-        """The scene in a Mitsuba XML file, with the radio materials that it names.
+        """Return the scene in a Mitsuba XML file, with the radio materials that it names.
 
         Raises:
-            InputError: as above; no such file, or it is no scene with objects.
+            InputError: As the constructor, no such file, or a file that is no scene with objects.
         """
         if not file.is_file():
             raise InputError(f"{file} is not there; expected a Mitsuba scene (XML) or the name of a room")
         rt, scene = sionna(), cls.__new__(cls)
         try:
             held = rt.load_scene(str(file))
-        except Exception as error:  # parsers of XML, meshes and materials, each with errors of its own
+        except Exception as error:  # parsers of XML, meshes and materials raise exceptions of their own
             raise InputError(f"{file} is no scene that Sionna RT reads ({error})") from None
         if not held.objects:
             raise InputError(f"{file} is a scene without objects; there is nothing to trace")
         try:
-            scene._set_up(held, frequency_hz)
+            scene.held = _at(held, frequency_hz)
         except ValueError as error:
             raise InputError(f"{file} has a material without constants at {frequency_hz:g} Hz ({error})") from None
         scene._scatter(scattering)
         scene.surfaces = [_surface(name, thing) for name, thing in held.objects.items()]
         return scene
 
-    def _set_up(self, held: Any, frequency_hz: float) -> None:
-        held.frequency = frequency_hz
-        held.tx_array = held.rx_array = sionna().PlanarArray(**ISOTROPIC)
-        self.held = held
-
     def _scatter(self, coefficient: float) -> None:
         for material in self.held.radio_materials.values():
             material.scattering_coefficient = coefficient
 
 
+def open_scene(name: str, frequency_hz: float) -> Scene:
+    """Return the scene of a built-in room, or of a file, at a carrier frequency [Hz].
+
+    Raises:
+        InputError: As `Scene`, or an unknown room.
+    """
+    check_scene(name)
+    return (
+        Scene.read(Path(name), frequency_hz)
+        if name.endswith(SCENE_FILE)
+        else Scene(ROOMS[name].surfaces(), frequency_hz)
+    )
+
+
+def _at(held: Any, frequency_hz: float) -> Any:
+    held.frequency = frequency_hz
+    held.tx_array = held.rx_array = sionna().PlanarArray(**ISOTROPIC)
+    return held
+
+
 def _material(material: Material) -> Any:
-    rt, name = sionna(), f"material-{material.name}"  # a scene has no two things of one name
+    rt, name = sionna(), f"material-{material.name}"  # names of materials and objects must differ
     if material.relative_permittivity is not None:
         return rt.RadioMaterial(
             name,
@@ -127,22 +121,22 @@ def _material(material: Material) -> Any:
     try:
         return rt.ITURadioMaterial(name, material.name, material.thickness_m)
     except ValueError:
-        known = ", ".join(_table())
+        known = ", ".join(_itu_materials())
         raise InputError(f"{material.name!r} is no material of ITU-R P.2040; choose from {known}") from None
 
 
-def _table() -> dict[str, dict[tuple[float, float], Any]]:
-    """Materials of ITU-R P.2040 and the carriers [GHz] at which they are known."""
+def _itu_materials() -> dict[str, dict[tuple[float, float], Any]]:
+    """Return the materials of ITU-R P.2040 with their ranges of carriers [GHz]."""
     from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
 
     table: dict[str, dict[tuple[float, float], Any]] = ITU_MATERIALS_PROPERTIES
     return table
 
 
-def _why(surfaces: Sequence[Surface], frequency_hz: float, error: ValueError) -> str:
-    """The material that is not known at the carrier, and where it is."""
+def _reason(surfaces: Sequence[Surface], frequency_hz: float, error: ValueError) -> str:
+    """Return the material that has no constants at the carrier, and the carriers at which it has."""
     for name in dict.fromkeys(surface.material.name for surface in surfaces):
-        ranges = list(_table().get(name, ()))
+        ranges = list(_itu_materials().get(name, ()))
         if ranges and not any(low <= frequency_hz / 1e9 <= high for low, high in ranges):
             known = ", ".join(f"{low:g} to {high:g}" for low, high in sorted(ranges))
             return f"ITU-R P.2040 knows {name} at {known} GHz, not at {frequency_hz / 1e9:g} GHz; choose another --frequency"
@@ -161,7 +155,7 @@ def _object(surface: Surface, material: Any) -> Any:
 
 
 def _surface(name: str, thing: Any) -> Surface:
-    """What a drawing needs of an object that Sionna read."""
+    """Return the surface of an object that Sionna read."""
     import mitsuba
 
     content = mitsuba.traverse(thing.mi_mesh)

@@ -1,4 +1,4 @@
-"""What a scene consists of: triangles, and the material that they are of."""
+"""Surfaces of a scene: triangles, and their material."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ FACES = [  # of a box, corners counted as x y z bits, counter-clockwise from out
     (0, 2, 6, 4),
     (1, 5, 7, 3),
 ]
+FLAT_COSINE = 0.999  # between normals of faces that form one plane
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]  # vertices (V, 3) [m], triangles (F, 3)
 
 
@@ -25,9 +26,9 @@ class Material:
     """A material of ITU-R P.2040 by its name, or any other by its constants.
 
     Args:
-        name: of the recommendation, or one's own.
-        thickness_m: of the slab that reflects.
-        relative_permittivity, conductivity: where it is none of the recommendation [1, S/m].
+        name: Name in the recommendation, or another one.
+        thickness_m: Thickness of the slab that reflects [m].
+        relative_permittivity, conductivity: Constants [1, S/m] of a material that is not in the recommendation.
     """
 
     name: str
@@ -41,10 +42,14 @@ class Surface:
     """Triangles of one material.
 
     Args:
-        name: of the thing.
-        material: that it is of.
-        vertex: corners (V, 3) [m].
-        triangle: numbers of three corners (F, 3).
+        name: Name of the object.
+        material: Its material.
+        vertex: Corners, (V, 3) [m].
+        triangle: Indices of three corners each, (F, 3).
+
+    Example:
+        >>> Surface.joined("cube", Material("wood", 0.02), [box((0, 0, 0), (1, 1, 1))]).triangle.shape
+        (12, 3)
     """
 
     name: str
@@ -54,40 +59,39 @@ class Surface:
 
     @classmethod
     def joined(cls, name: str, material: Material, meshes: Sequence[Mesh]) -> Surface:
-        """Several meshes as one."""
+        """Return one surface of several meshes."""
         first = np.cumsum([0, *(len(vertex) for vertex, _ in meshes[:-1])])
         triangles = [triangle + start for (_, triangle), start in zip(meshes, first, strict=True)]
         return cls(name, material, np.concatenate([vertex for vertex, _ in meshes]), np.concatenate(triangles))
 
+    def outline(self) -> NDArray[Any]:
+        """Return the segments (E, 2, 3) [m] at which faces meet at an angle or end, for a drawing."""
+        corner = self.vertex[self.triangle]
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+        sides: dict[tuple[int, int], list[int]] = {}
+        for number, (a, b, c) in enumerate(self.triangle.tolist()):
+            for side in ((a, b), (b, c), (c, a)):
+                sides.setdefault((min(side), max(side)), []).append(number)
+        kept = [
+            side
+            for side, (first, *others) in sides.items()
+            if not others or min(abs(normal[first] @ normal[other]) for other in others) < FLAT_COSINE
+        ]
+        return self.vertex[np.array(kept, dtype=np.int64).reshape(-1, 2)]
+
 
 def box(low: Sequence[float], high: Sequence[float]) -> Mesh:
-    """The twelve triangles of an axis-parallel box; they share its eight corners, so its edges are known as such."""
+    """Return the twelve triangles of an axis-parallel box, which share its eight corners so that edges diffract."""
     ends = np.array([low, high], dtype=np.float64)
     vertex = np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     return vertex, _halved(FACES)
 
 
 def rectangle(corner: Sequence[float], a: Sequence[float], b: Sequence[float]) -> Mesh:
-    """Two triangles between a corner and the vectors a and b from it."""
+    """Return two triangles between a corner and the vectors a and b from it."""
     p, u, v = (np.array(x, dtype=np.float64) for x in (corner, a, b))
     return np.array([p, p + u, p + u + v, p + v]), _halved([(0, 1, 2, 3)])
-
-
-def outline(surface: Surface) -> NDArray[Any]:
-    """Segments (E, 2, 3) [m] where faces meet at an angle or end: what a drawing of the surface needs."""
-    corner = surface.vertex[surface.triangle]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    sides: dict[tuple[int, int], list[int]] = {}
-    for number, (a, b, c) in enumerate(surface.triangle.tolist()):
-        for side in ((a, b), (b, c), (c, a)):
-            sides.setdefault((min(side), max(side)), []).append(number)
-    kept = [
-        side
-        for side, (first, *others) in sides.items()
-        if not others or min(abs(normal[first] @ normal[other]) for other in others) < 0.999
-    ]
-    return surface.vertex[np.array(kept, dtype=np.int64).reshape(-1, 2)]
 
 
 def _halved(faces: Sequence[tuple[int, int, int, int]]) -> NDArray[np.int64]:

@@ -1,63 +1,61 @@
 """A simulated room: image sources of a rectangular room with a few boxes in it.
 
-Walls mirror the transmitter; mirrored up to twice that makes 25 sources, each seen along a straight line through the
+Walls mirror the transmitter; up to two reflections give 25 image sources, each visible along a straight line through the
 unfolded rooms (J. B. Allen and D. A. Berkley, "Image method for efficiently simulating small-room acoustics", J. Acoust.
-Soc. Am. 65, 1979). Folding that line back into the room gives the path's corners, and with them what stands in its way.
-It is a toy with exact geometry: no diffraction, no scattering, no materials that depend on the angle.
+Soc. Am. 65, 1979). Folding that line back into the room gives the path's corners, and with them the boxes that block it.
+The geometry is exact. There is no diffraction, no scattering, and no material that depends on the angle.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from swiftwrf.array.planar import LIGHT_SPEED
+from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.errors import InputError
+from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, configuration
 
-MAX_ORDER = 2
-
-
-class Paths(NamedTuple):
-    """Paths from n transmitters to n receivers, one for each of the 25 sources; the first is the direct one."""
-
-    direction: Tensor  # (n, 25, 3) unit vectors from the receiver to where the path comes from
-    length: Tensor  # (n, 25) [m]
-    gain: Tensor  # (n, 25) complex amplitude: free space, reflections, blockage
-    clear: Tensor  # (n, 25) whether no box stands in the way
+MAX_ORDER = 2  # reflections
+Point = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class Room:
+@configuration
+class ShoeboxRoom:
     """A rectangular room with one corner at the origin.
 
-    Args:
-        size: along x, y and z [m].
-        boxes: things that stand in the way, as pairs of opposite corners [m].
-        reflection: amplitude that a wall reflects, with its sign.
-        blockage: amplitude that gets past a box.
-        frequency_hz: of the carrier.
+    Example:
+        >>> room, ends = ShoeboxRoom(boxes=()), torch.tensor([[1.0, 1, 1], [4, 1, 1]])
+        >>> room.paths(ends[:1], ends[1:]).count.tolist()
+        [25]
     """
 
-    size: tuple[float, float, float] = (6.0, 5.0, 3.0)
-    boxes: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...] = (
+    size: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (6.0, 5.0, 3.0)
+    """extent along x, y and z [m]"""
+    boxes: tuple[tuple[Point, Point], ...] = (
         ((1.0, 0.6, 0.0), (1.6, 1.9, 1.3)),
         ((4.6, 3.6, 0.0), (5.4, 4.6, 1.8)),
         ((1.2, 3.0, 0.0), (1.5, 3.2, 2.2)),
     )
+    """obstacles, as pairs of opposite corners [m]"""
     reflection: float = -0.6
-    blockage: float = 0.1
-    frequency_hz: float = 915e6
+    """amplitude factor of a reflection, with its sign"""
+    blockage: NonNegativeFloat = 0.1
+    """amplitude factor of a path that a box blocks"""
+    frequency_hz: PositiveFloat = 915e6
+    """frequency of the carrier [Hz]"""
 
-    def paths(self, transmitter: Tensor, receiver: Tensor) -> Paths:
-        """All paths with at most two reflections between positions (n, 3) [m], which broadcast.
+    def paths(self, transmitter: Tensor, receiver: Tensor) -> PropagationPaths:
+        """Return the 25 paths with at most two reflections of each link, the direct path first.
+
+        Args:
+            transmitter, receiver: Positions, (n, 3) [m], which broadcast.
 
         Raises:
-            InputError: a position outside the room, or both ends at one place.
+            InputError: A position outside the room, or both ends at one position.
         """
         transmitter, receiver = torch.broadcast_tensors(transmitter.double(), receiver.double())
         size = torch.tensor(self.size, dtype=torch.float64)
@@ -75,10 +73,19 @@ class Room:
         amplitude = wavelength / (4 * math.pi * length) * self.reflection ** rooms.abs().sum(-1)
         amplitude = torch.where(clear, amplitude, self.blockage * amplitude)
         gain = amplitude * torch.polar(torch.ones_like(length), -2 * math.pi / wavelength * length)
-        return Paths(ray / length[..., None], length, gain, clear)
+        return PropagationPaths(
+            transmitter=transmitter,
+            receiver=receiver,
+            count=torch.full((len(ray),), len(rooms)),
+            direction=(ray / length[..., None]).flatten(0, 1),
+            gain=gain.flatten(),
+            line_of_sight=clear[:, 0],
+            frequency_hz=self.frequency_hz,
+            length=length.flatten(),
+        )
 
     def _blocked(self, receiver: Tensor, ray: Tensor, rooms: Tensor) -> Tensor:
-        """Whether a box stands in the way of each path, (n, 25)."""
+        """Return whether a box blocks each path, bool (n, 25)."""
         size = torch.tensor(self.size, dtype=torch.float64)
         crossing = [torch.zeros(ray.shape[:2], dtype=torch.float64), torch.ones(ray.shape[:2], dtype=torch.float64)]
         for axis, k in itertools.product(range(3), range(MAX_ORDER)):  # the k-th wall crossed along an axis
@@ -95,7 +102,7 @@ class Room:
 
 
 def _mirrored_rooms() -> list[tuple[int, ...]]:
-    """Mirrored rooms reached by at most two reflections, the room itself first."""
+    """Return the mirrored rooms that at most two reflections reach, the room itself first."""
     steps = range(-MAX_ORDER, MAX_ORDER + 1)
     return sorted(
         (r for r in itertools.product(steps, repeat=3) if sum(map(abs, r)) <= MAX_ORDER), key=lambda r: sum(map(abs, r))
@@ -103,13 +110,13 @@ def _mirrored_rooms() -> list[tuple[int, ...]]:
 
 
 def _fold(point: Tensor, size: Tensor) -> Tensor:
-    """Points of the unfolded rooms brought back into the room."""
+    """Return points of the unfolded rooms, folded back into the room."""
     within = torch.remainder(point, 2 * size)
     return torch.minimum(within, 2 * size - within)
 
 
 def _hits(start: Tensor, end: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Whether segments (..., 3) pass through the box between the corners low and high, (...)."""
+    """Return whether segments (..., 3) pass through the box between the corners low and high, bool (...)."""
     step = end - start
     step = torch.where(step == 0, torch.full_like(step, 1e-300), step)
     a, b = (low - start) / step, (high - start) / step

@@ -1,4 +1,4 @@
-"""The built-in office floor for RSSI: a BLE beacon at random places, twelve receivers, multipath, shadows and misses."""
+"""The built-in office floor for RSSI: a BLE beacon, twelve receivers, multipath, shadowing and missed packets."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.simulated.room import Room
+from swiftwrf.data.simulated.room import ShoeboxRoom
+from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, checked
 
-FLOOR = Room(
+FLOOR = ShoeboxRoom(
     size=(20.0, 16.0, 3.0),
     boxes=(
         ((4.0, 3.0, 0.0), (6.5, 3.4, 2.6)),
@@ -23,20 +24,28 @@ FLOOR = Room(
     blockage=0.3,
     frequency_hz=2.44e9,
 )
-CHANNELS_HZ = (2.402e9, 2.426e9, 2.480e9)  # of BLE advertisements; a receiver cannot tell on which it heard one
+CHANNELS_HZ = (2.402e9, 2.426e9, 2.480e9)  # of BLE advertisements; a receiver does not report the channel
 TRANSMIT_DBM = -8.0
 PACKET_NOISE_DB = 2.0
 SENSITIVITY_DBM = -97.0
-AT_ONCE = 4096  # positions whose paths are found together: half a gigabyte
-MISSED = 0.1  # share of packets lost to scanning gaps and collisions, whatever their power
+BATCH_POSITIONS = 4096  # whose paths take half a gigabyte
+MISSED_SHARE = 0.1  # of packets, lost to scanning gaps and collisions
 
 
-def rssi_room(n: int = 600, seed: int = 0) -> Rssi:
-    """RSSI at twelve receivers in two rows of heights, one packet a row and receiver on a random channel.
+@checked
+def rssi_room(n: PositiveInt = 600, seed: NonNegativeInt = 0) -> Rssi:
+    """Return simulated RSSI at twelve receivers, one packet a row and receiver on a random channel.
 
     Args:
-        n: number of positions of the transmitter.
-        seed: of positions, gains, channels, noise and misses.
+        n: Number of positions of the transmitter.
+        seed: Seed of positions, gains, channels, noise and misses.
+
+    Raises:
+        InputError: An argument outside its range.
+
+    Example:
+        >>> rssi_room(n=20).rssi_dbm.shape
+        torch.Size([20, 12])
     """
     generator = torch.Generator().manual_seed(seed)
     x, y = torch.meshgrid(torch.tensor([2.5, 7.5, 12.5, 17.5]), torch.tensor([1.0, 8.0, 15.0]), indexing="ij")
@@ -49,20 +58,22 @@ def rssi_room(n: int = 600, seed: int = 0) -> Rssi:
     channel = torch.randint(len(CHANNELS_HZ), (n, 12, 1), generator=generator)
     noise = PACKET_NOISE_DB * torch.randn(n, 12, dtype=torch.float64, generator=generator)
     rssi = (TRANSMIT_DBM + gain_db + power.gather(2, channel)[..., 0] + noise).round()
-    missed = (torch.rand(n, 12, generator=generator) < MISSED) | (rssi < SENSITIVITY_DBM)
+    missed = (torch.rand(n, 12, generator=generator) < MISSED_SHARE) | (rssi < SENSITIVITY_DBM)
     return Rssi(
-        name="simulated-floor",
-        receiver_names=tuple(f"receiver{number:02d}" for number in range(1, 13)),
+        torch.where(missed, torch.nan, rssi),
+        position,
         receiver_position=receiver,
-        transmitter_position=position,
-        rssi_dbm=torch.where(missed, torch.nan, rssi),
-        index=torch.arange(n),
+        receiver_names=[f"receiver{number:02d}" for number in range(1, 13)],
+        name="simulated-floor",
     )
 
 
 def _power(position: Tensor, receiver: Tensor) -> Tensor:
-    """Power gain of the coherent sum of all paths on each channel, (n, channels) [dB]."""
+    """Return the power gain of the coherent sum of all paths on each channel, (n, channels) [dB]."""
     floors = [replace(FLOOR, frequency_hz=f) for f in CHANNELS_HZ]
-    parts = position.split(AT_ONCE)
-    sums = [torch.cat([floor.paths(some, receiver).gain.sum(dim=1).abs() for some in parts]) for floor in floors]
+    parts = position.split(BATCH_POSITIONS)
+    sums = [
+        torch.cat([floor.paths(some, receiver).gain.reshape(len(some), -1).sum(dim=1).abs() for some in parts])
+        for floor in floors
+    ]
     return 20 * torch.stack(sums, dim=1).clamp_min(1e-9).log10()

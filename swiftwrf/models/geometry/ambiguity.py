@@ -1,9 +1,10 @@
-"""Rooms whose waves are in step with those of a given one: planes whole and half turns of phase away, several at once.
+"""Phase ambiguity: rooms whose planes are whole and half phase periods away from those of a given room.
 
-A plane that moves by half a wavelength / cosine of incidence turns its wave once around; by half of that, the wave is in
-step with a gain of the other sign. Seen from a small region such rooms look alike, and what several planes reflect one
-after another keeps a single plane from moving while others are as wrong. Hence all combinations are tried, from tables of
-the waves of single and double reflections: half turns close by, whole ones further away, and half ones around the best.
+A plane that moves by half a wavelength / cosine of incidence changes the phase of its wave by a whole period. A plane that
+moves by half of that has a wave of the same phase with a gain of the other sign. Observed from a small region such rooms are
+nearly equal, and higher-order images keep a single plane from moving while others are wrong. Therefore all combinations are
+tried, from the steering responses of single and double reflections: half periods nearby, whole periods farther away, and
+half periods around the best of these.
 """
 
 from __future__ import annotations
@@ -14,85 +15,90 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from swiftwrf.models.geometry.images import Scene, images
-from swiftwrf.models.geometry.planes import Planes
-from swiftwrf.models.geometry.responses import Waves
+from swiftwrf.models.geometry.images import PhaseObservations, images
+from swiftwrf.models.geometry.planes import PlaneSet
+from swiftwrf.models.geometry.responses import SteeringResponses
 
-SIX = 6  # planes that may move: one for each side of a room
-TURNS = 4  # whole ones, to either side
-FEW = 18  # positions that all combinations are scored at
-GRID = 0.125  # wavelengths between the places that half turns are interpolated from
-WIDTH = 32  # combinations of whole turns around which half turns are tried
-REFINED = 24  # rooms that are refined a little
-KEPT = 8  # and fully
-Choice = tuple[int, ...]  # of half turns, for each plane
+MAX_MOVING = 6  # planes, one for each side of a room
+MAX_PERIODS = 4  # to either side
+N_POSITIONS = 18  # that all combinations are scored at
+OFFSET_STEP_WAVELENGTHS = 0.125  # of the grid from which aliases are interpolated
+N_WHOLE = 32  # combinations of whole periods around which half periods are tried
+N_COARSE, N_FINE = 24, 8  # rooms that are refined with some positions, and with all
+HalfPeriods = tuple[int, ...]  # by which each plane is moved
 
 
-def turned(scene: Scene, room: Planes) -> list[Planes]:
-    """Other rooms of the same planes that explain the spectra best, refined, the best first; of more than six planes the
-    first six move."""
+def phase_alternatives(scene: PhaseObservations, room: PlaneSet) -> list[PlaneSet]:
+    """Return the best refined rooms of the same planes at other phase aliases, the best first.
+
+    Of more than six planes the first six move.
+    """
     planes = room.normal.shape[1]
     if not planes:
         return []
-    few, table = scene.few(), _Table(scene.few(FEW), room)
-    near = [[h for h in p if abs(h) <= TURNS] for p in table.places]
-    whole = [[h for h in p if h % 2 == 0] for p in table.places]
-    tried = table.best(near, REFINED)
-    for choice in table.best(whole, WIDTH):
-        around = [[h for h in (c - 1, c, c + 1) if h in p] for c, p in zip(choice, table.places, strict=True)]
-        tried |= table.best(around, REFINED)
+    few, table = scene.few(), _AlternativeTable(scene.few(N_POSITIONS), room)
+    near = [[h for h in p if abs(h) <= MAX_PERIODS] for p in table.offsets]
+    whole = [[h for h in p if h % 2 == 0] for p in table.offsets]
+    tried = table.best(near, N_COARSE)
+    for choice in table.best(whole, N_WHOLE):
+        around = [[h for h in (c - 1, c, c + 1) if h in p] for c, p in zip(choice, table.offsets, strict=True)]
+        tried |= table.best(around, N_COARSE)
     tried.pop((0,) * planes, None)
-    rooms = [table.room(c).refined(few, 4) for c in sorted(tried, key=tried.__getitem__)[:REFINED]]
+    rooms = [table.room(c).refined(few, 4) for c in sorted(tried, key=tried.__getitem__)[:N_COARSE]]
     rooms.sort(key=lambda r: float(few.score(r.field(few))))
-    rooms = [r.refined(scene, 12) for r in rooms[:KEPT]]
+    rooms = [r.refined(scene, 12) for r in rooms[:N_FINE]]
     return sorted(rooms, key=lambda r: float(scene.score(r.field(scene))))
 
 
-def _places(scene: Scene, room: Planes, plane: int) -> dict[int, float]:
-    """Offsets at which a plane's wave is whole and half turns from where it is, by the number of half turns."""
+def _alias_offsets(scene: PhaseObservations, room: PlaneSet, plane: int) -> dict[int, float]:
+    """Return the offsets [m] at which the mean phase of a plane's wave differs by half periods, by their number."""
     here = float(room.offset[0, plane])
-    if plane >= SIX:
+    if plane >= MAX_MOVING:
         return {0: here}
     normal = room.normal[0, plane]
     nearest = float((torch.cat([scene.transmitter, scene.receiver]) @ normal).max())
     wavelength = 2 * math.pi / scene.wavenumber
-    farthest = TURNS * wavelength  # twice as far as at normal incidence
-    if nearest >= here + farthest:  # it stands among the positions, where no turn leads to a place for it
+    farthest = MAX_PERIODS * wavelength  # twice as far as at normal incidence
+    if nearest >= here + farthest:  # it lies among the positions, where no alias is outside of the region
         return {0: here}
-    grid = torch.arange(max(nearest, here - farthest), here + farthest, GRID * wavelength, dtype=torch.float64)
+    grid = torch.arange(
+        max(nearest, here - farthest), here + farthest, OFFSET_STEP_WAVELENGTHS * wavelength, dtype=torch.float64
+    )
     source = images(scene, normal.expand(len(grid), 1, 3), grid[:, None], [(0,)])[:, 0]
     now = images(scene, room.normal, room.offset, [(plane,)])[0, 0]
     longer = (source - scene.receiver).norm(dim=-1).mean(-1) - (now - scene.receiver).norm(dim=-1).mean()
-    half_turns = longer / (wavelength / 2)
-    places = {0: here}
-    for number in range(-2 * TURNS, 2 * TURNS + 1):
-        above = int(torch.searchsorted(half_turns, float(number)))
+    half_periods = longer / (wavelength / 2)
+    offsets = {0: here}
+    for number in range(-2 * MAX_PERIODS, 2 * MAX_PERIODS + 1):
+        above = int(torch.searchsorted(half_periods, float(number)))
         if number and 0 < above < len(grid):
-            share = (number - half_turns[above - 1]) / (half_turns[above] - half_turns[above - 1])
-            places[number] = float(grid[above - 1] + share * (grid[above] - grid[above - 1]))
-    return places
+            share = (number - half_periods[above - 1]) / (half_periods[above] - half_periods[above - 1])
+            offsets[number] = float(grid[above - 1] + share * (grid[above] - grid[above - 1]))
+    return offsets
 
 
-class _Table:
-    """Waves of single and double reflections at all places of the planes."""
+class _AlternativeTable:
+    """Steering responses of single and double reflections at all aliases of the planes."""
 
-    def __init__(self, scene: Scene, room: Planes) -> None:
+    def __init__(self, scene: PhaseObservations, room: PlaneSet) -> None:
         self.scene, self.before, self.direct = scene, room, scene.wave(scene.transmitter)
-        self.places = [_places(scene, room, plane) for plane in range(room.normal.shape[1])]
-        offset = [torch.tensor(list(p.values()), dtype=torch.float64) for p in self.places]
-        gain = [g * (-1.0) ** torch.tensor(list(p)) for g, p in zip(room.gain[0], self.places, strict=True)]
-        self.waves = Waves.of(scene, room.normal[0], offset, gain, room.order)
+        self.offsets = [_alias_offsets(scene, room, plane) for plane in range(room.normal.shape[1])]
+        offset = [torch.tensor(list(p.values()), dtype=torch.float64) for p in self.offsets]
+        gain = [g * (-1.0) ** torch.tensor(list(p)) for g, p in zip(room.gain[0], self.offsets, strict=True)]
+        self.waves = SteeringResponses.of(scene, room.normal[0], offset, gain, room.order)
 
-    def room(self, choice: Choice) -> Planes:
-        """The room of a choice."""
-        offset = torch.tensor([[p[c] for c, p in zip(choice, self.places, strict=True)]], dtype=torch.float64)
+    def room(self, choice: HalfPeriods) -> PlaneSet:
+        """Return the room whose planes are moved by half periods."""
+        offset = torch.tensor([[p[c] for c, p in zip(choice, self.offsets, strict=True)]], dtype=torch.float64)
         return replace(self.before, offset=offset, gain=self.before.gain * (-1.0) ** torch.tensor(choice))
 
-    def best(self, half_turns: list[list[int]], most: int) -> dict[Choice, float]:
-        """The best of all combinations of the given half turns of the planes, and their scores."""
-        rows = [torch.tensor([list(p).index(h) for h in some]) for p, some in zip(self.places, half_turns, strict=True)]
+    def best(self, half_periods: list[list[int]], most: int) -> dict[HalfPeriods, float]:
+        """Return the best combinations of the given half periods of the planes, with their scores."""
+        rows = [
+            torch.tensor([list(p).index(h) for h in some]) for p, some in zip(self.offsets, half_periods, strict=True)
+        ]
         score = self.waves.at(rows).scores(self.scene, self.direct)
         best = score.flatten().argsort()[:most].numpy()
         choices = np.stack(np.unravel_index(best, score.shape), axis=1).tolist()  # torch's own loads its compiler
-        kept = [tuple(some[k] for some, k in zip(half_turns, choice, strict=True)) for choice in choices]
+        kept = [tuple(some[k] for some, k in zip(half_periods, choice, strict=True)) for choice in choices]
         return dict(zip(kept, score.flatten()[best].tolist(), strict=True))

@@ -9,8 +9,6 @@ alone.
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
 import torch
 from torch import Tensor
 
@@ -18,7 +16,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
-from swiftwrf.gp import Kernel, choose_kernel, held_out_weights
+from swiftwrf.gp import GaussianProcess, Kernel, LeaveGroupOut, choose_kernel, principal_components
 from swiftwrf.metrics import psnr
 from swiftwrf.models.base import ARRAY, FIELD_MODELS, FIXED_END, FieldModel, FitContext
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
@@ -30,7 +28,6 @@ from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import Fraction, check_value
 
 MAX_COMPONENTS = 64  # principal components of the residual spectra
-MIN_VARIANCE = 1e-6  # fraction of the variance below which a component is left out
 MAX_PIXELS = 4000  # of a spectrum, to choose kernel and mixing weight
 MAX_SPECTRA = 10_000  # the fit computes all their inner products
 CONSTANT_GAINS_MARGIN = 1.0  # standard errors by which constant path gains must be ahead to be taken
@@ -61,12 +58,8 @@ class HybridModel(FieldModel):
     """gains of the paths; None if they are constant"""
     mixing_weight: float
     """weight of the geometric part, 0 to 1"""
-    kernel: Kernel
-    """kernel of the process on the residual, lengths in [m]"""
-    position: Tensor
-    """training positions, float64 (n, 3) [m]"""
-    readout: Tensor
-    """kernel weights to component scores, float32 (n, k)"""
+    process: GaussianProcess
+    """process of the k component scores of the residual"""
     component: Tensor
     """mean residual spectrum, then its components, float32 (1 + k, pixels)"""
 
@@ -80,7 +73,7 @@ class HybridModel(FieldModel):
         return self._room
 
     def region(self) -> Tensor:
-        return self.position
+        return self.process.known
 
     def _fit(self, train: Spectra, context: FitContext) -> None:
         if len(train) > MAX_SPECTRA:
@@ -98,27 +91,24 @@ class HybridModel(FieldModel):
         seen = train.spectrum.flatten(1)
         stride = max(1, seen.shape[1] // MAX_PIXELS) | 1
         some, some_known = seen[:, ::stride], known[:, ::stride]
-        self.kernel = choose_kernel(train.position, (some - FIRST_WEIGHT * some_known)[:, None], fold)
-        self.position = train.position
-        self.mixing_weight, gains = _mixing_weight(train.position, some, some_known, fold, self.kernel)
-        if not gains:
-            self.mixing_weight, self.component = 1.0, torch.zeros(1, seen.shape[1])
-            self.readout = torch.zeros(len(train), 0)
-            return
-        left = seen - self.mixing_weight * known
-        mean = left.mean(0)
-        value, vector = torch.linalg.eigh(((left - mean) @ (left - mean).T).double())
-        vector = vector[:, value > MIN_VARIANCE * value.sum()][:, -MAX_COMPONENTS:]
-        self.readout = torch.linalg.solve(self.kernel.noisy_gram(train.position), vector).float()
-        self.component = torch.cat([mean[None], vector.T.float() @ (left - mean)])
+        kernel = choose_kernel(train.position, (some - FIRST_WEIGHT * some_known)[:, None], fold)
+        self.mixing_weight, gains = _mixing_weight(train.position, some, some_known, fold, kernel)
+        score = torch.zeros(len(train), 0)
+        self.component = torch.zeros(1, seen.shape[1])
+        if gains:
+            mean, score, component = principal_components(seen - self.mixing_weight * known, MAX_COMPONENTS)
+            self.component = torch.cat([mean[None], component])
+        else:
+            self.mixing_weight = 1.0
+        self.process = GaussianProcess.regress(kernel, train.position, score, exact=True, dtype=torch.float32)
 
     def _fit_path_gains(self, train: Spectra, fold: Tensor, like: HybridModel | None) -> Tensor:
         """Fit the path gains; return the spectra (n, H, W) that the paths predict with each fold held out from the gains."""
         self.path_gains = None
         if not self.room.planes or (like and not like.path_gains):
             return self.room.synthesize(train.position)
-        scene, rows = observe(train, self.config.seed)
-        kernel = like.path_gains.kernel if like and like.path_gains else prior(scene.moving)
+        scene, rows = observe(train, self.config)
+        kernel = like.path_gains.process.kernel if like and like.path_gains else prior(scene.moving)
         known = torch.empty(len(train), *train.grid.shape)
         for number in fold.unique():
             out = (fold == number).nonzero()[:, 0]  # including spectra without observed phases
@@ -143,8 +133,7 @@ class HybridModel(FieldModel):
         return self.room.array.spectrum(channel, self.grid)
 
     def _total(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        score = self.kernel(position, self.position).float() @ self.readout
-        spectrum = (self.component[0] + score @ self.component[1:]).reshape(-1, *self.grid.shape)
+        spectrum = (self.component[0] + self.process.mean(position) @ self.component[1:]).reshape(-1, *self.grid.shape)
         return spectrum + self.mixing_weight * self._paths(position, generator) if self.mixing_weight else spectrum
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
@@ -154,28 +143,29 @@ class HybridModel(FieldModel):
         return self._total(position, generator)
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
-        tensors, header = self.room._state()
-        tensors |= {"position": self.position, "readout": self.readout, "component": self.component}
-        header |= {"mixing_weight": self.mixing_weight, "kernel": asdict(self.kernel), "path_gains": None}
+        parts = [self.room._state(), self.process.state()]
         if self.path_gains is not None:
-            tensors |= {"path_gains.anchor": self.path_gains.anchor, "path_gains.readout": self.path_gains.readout}
-            header["path_gains"] = asdict(self.path_gains.kernel)
-        return tensors, header
+            parts.append(self.path_gains.process.state("path_gains."))
+        tensors, own = {"component": self.component}, {"mixing_weight": self.mixing_weight}
+        for some, header in parts:
+            tensors |= some
+            own |= header
+        return tensors, own
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         self._room = GeometryModel.within(self, tensors, header)
-        expect(tensors, {"position": (n := len(tensors["position"]), 3)})
-        shape = (n, tensors["readout"].shape[-1])
-        expect(tensors, {"readout": shape, "component": (1 + shape[1], self.grid.shape[0] * self.grid.shape[1])})
-        self.position, self.kernel = tensors["position"].double(), Kernel(**header["kernel"])
-        self.readout, self.component = tensors["readout"].float(), tensors["component"].float()
+        self.process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True)
+        n_scores, pixels = tensors["coefficient"].shape[-1], self.grid.shape[0] * self.grid.shape[1]
+        expect(tensors, {"component": (1 + n_scores, pixels)})
         check_value("mixing_weight", header["mixing_weight"], Fraction)
-        self.mixing_weight, self.path_gains = header["mixing_weight"], None
-        if header["path_gains"] is not None:
-            anchor, readout = tensors["path_gains.anchor"], tensors["path_gains.readout"]
-            gains = (len(anchor), *readout.shape[1:2], len(self.room.image_sources()[0]), 2)
-            expect(tensors, {"path_gains.anchor": (len(anchor), 3), "path_gains.readout": gains})
-            self.path_gains = PathGains(Kernel(**header["path_gains"]), anchor.double(), readout.float())
+        self.mixing_weight, self.component, self.path_gains = (
+            header["mixing_weight"],
+            tensors["component"].float(),
+            None,
+        )
+        if "path_gains.kernel" in header:
+            process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True, prefix="path_gains.")
+            self.path_gains = PathGains(process, len(self.room.image_sources()[0]))
 
 
 def fit_hybrid(
@@ -215,10 +205,10 @@ def _mixing_weight(position: Tensor, seen: Tensor, known: Tensor, fold: Tensor, 
     Also return whether weight and process together predict better than `known` alone, by the mean log squared error.
     """
     missed, sharp = torch.empty_like(seen), torch.empty_like(known)
-    for out, kept, weight in held_out_weights(kernel, position, fold):
+    for group in LeaveGroupOut.each(kernel, position, fold):
         for x, left in ((seen, missed), (known, sharp)):
-            mean = x[kept].mean(0)
-            left[out] = x[out] - mean - weight.float() @ (x[kept] - mean)
+            mean = x[group.kept].mean(0)
+            left[group.out] = x[group.out] - mean - group.weights.float() @ (x[group.kept] - mean)
     power = float(sharp.square().sum())
     share = min(1.0, max(0.0, float((missed * sharp).sum()) / power)) if power > 0 else 0.0
     both, alone = ((x.square().mean(1) + 1e-9).log().mean() for x in (missed - share * sharp, seen - known))

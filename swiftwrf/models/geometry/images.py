@@ -1,4 +1,4 @@
-"""Image sources: where paths that mirror planes reflect seem to come from, and the waves they bring to the array.
+"""Image sources of paths that mirror planes reflect, and their waves at the array.
 
 A path reflected by planes one after another arrives as if from the transmitter mirrored in them one after another, along a
 straight line (J. B. Allen and D. A. Berkley, J. Acoust. Soc. Am. 65, 1979). Everything is batched over rooms that have
@@ -18,24 +18,24 @@ from torch import Tensor
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.spectra import Moving
 
-RIGHT = 0.02  # |cosine| below which two planes count as perpendicular, above 1 - RIGHT**2 as parallel
-ROUNDED = 1e-3  # of phase [rad]
-FEW = 36  # positions that many rooms are scored at
+MAX_COSINE = 0.02  # of two planes that count as perpendicular; above 1 - MAX_COSINE**2 they count as parallel
+ROUNDING_RAD = 1e-3  # of phase, to which positions are rounded in a search
+N_POSITIONS = 36  # that many rooms are scored at
 
 Sequence = tuple[int, ...]
 
 
 @dataclass(frozen=True)
-class Scene:
-    """What the waves depend on besides the planes, and what was observed.
+class PhaseObservations:
+    """A link at n positions and the observed phases of its channel.
 
     Args:
-        transmitter, receiver: positions, float64 (n, 3) or, of the fixed end, (1, 3) [m].
-        end: which of them moves.
-        element: phase that a wave from unit vector u gains at each element is element @ u, float32 (K, 3) [rad].
-        wavenumber: [rad / m].
-        channel: observed phases, complex64 (n, 2, K): of unit modulus, and the same seen by an array turned by half a turn,
-            which the spectra cannot tell apart where each element has an opposite one.
+        transmitter, receiver: Positions, float64 (n, 3), of the fixed end (1, 3) [m].
+        end: The end that moves.
+        element: Phase of a wave from unit vector u at each element is element @ u, float32 (K, 3) [rad].
+        wavenumber: Wavenumber [rad / m].
+        channel: Observed phases, complex64 (n, 2, K) of unit modulus: the channel and its alternative, the conjugate
+            observed by an array rotated by half a turn. Spectra cannot distinguish them if each element has an opposite one.
     """
 
     transmitter: Tensor
@@ -48,8 +48,8 @@ class Scene:
     @classmethod
     def of(
         cls, position: Tensor, fixed: Tensor, moving: Moving, array: PlanarArray, rotation: Tensor, channel: Tensor
-    ) -> Scene:
-        """The scene of a moving end at `position` (n, 3) [m] and a fixed one (3,) [m]; `channel` (n, K) of modulus 1."""
+    ) -> PhaseObservations:
+        """Return the link of a moving end (n, 3) [m] and a fixed end (3,) [m], with a channel (n, K) of modulus 1."""
         transmitter, receiver = (position, fixed[None]) if moving == "transmitter" else (fixed[None], position)
         wavenumber = 2 * math.pi / array.wavelength
         element = wavenumber * array.element.double() @ rotation[:, :2].T.double()
@@ -65,47 +65,51 @@ class Scene:
         """Positions of the end that moves, (n, 3) [m]."""
         return self.transmitter if self.end == "transmitter" else self.receiver
 
-    def subset(self, rows: Tensor) -> Scene:
-        """The given positions only."""
+    def subset(self, rows: Tensor) -> PhaseObservations:
+        """Return the given positions."""
         moving = self.moving[rows]
         ends = (moving, self.receiver) if self.end == "transmitter" else (self.transmitter, moving)
         return replace(self, transmitter=ends[0], receiver=ends[1], channel=self.channel[rows])
 
-    def few(self, most: int = FEW) -> Scene:
-        """At most so many of the positions, evenly chosen, to score many rooms at."""
+    def few(self, most: int = N_POSITIONS) -> PhaseObservations:
+        """Return at most `most` of the positions, evenly chosen, to score many rooms at."""
         return self.subset(torch.linspace(0, len(self) - 1, min(most, len(self))).long())
 
-    def around(self, origin: Tensor) -> Scene:
-        """The scene in coordinates from an origin (3,) [m], rounded to a thousandth of a radian of phase: near ties of a
-        search must not hang on digits that another origin would have rounded otherwise."""
-        step = ROUNDED / self.wavenumber
+    def around(self, origin: Tensor) -> PhaseObservations:
+        """Return the link in coordinates from an origin (3,) [m], rounded to a thousandth of a radian of phase.
+
+        Without rounding, near ties of a search would depend on the origin of the world coordinates.
+        """
+        step = ROUNDING_RAD / self.wavenumber
         transmitter, receiver = (((end - origin) / step).round() * step for end in (self.transmitter, self.receiver))
         return replace(self, transmitter=transmitter, receiver=receiver)
 
     def wave(self, source: Tensor) -> Tensor:
-        """What each element hears from sources (..., n or 1, 3) [m]: exp(-j k d) / d, complex64 (..., n, K)."""
+        """Return the wave exp(-j k d) / d of sources (..., n or 1, 3) [m] at each element, complex64 (..., n, K)."""
         ray = (source - self.receiver).float()
         length = ray.norm(dim=-1, keepdim=True)
         return spherical((ray / length) @ self.element.T - self.wavenumber * length, length)
 
     def coherence(self, field: Tensor) -> Tensor:
-        """|x^H h|^2 / K^2 of the observed and the given phases, (..., n, K) to (..., n), in [0, 1]; the better of the two
-        channels that the spectrum cannot tell apart counts."""
+        """Return |x^H h|^2 / K^2 of the observed and the given phases, (..., n, K) to (..., n), in [0, 1].
+
+        The better of the two observed alternatives counts.
+        """
         match = torch.einsum("...nk,nfk->...nf", field.sgn(), self.channel.conj())
         return match.abs().square().amax(-1) / field.shape[-1] ** 2
 
     def score(self, field: Tensor) -> Tensor:
-        """1 - the mean coherence: 0 where all phases agree, (..., n, K) to (...)."""
+        """Return 1 - the mean coherence, 0 if all phases agree, (..., n, K) to (...)."""
         return 1 - self.coherence(field).mean(-1)
 
 
 def spherical(phase: Tensor, length: Tensor) -> Tensor:
-    """exp(j phase) / length, complex64; cosine and sine are vectorised, torch.polar is not."""
+    """Return exp(j phase) / length, complex64; cosine and sine are vectorised, torch.polar is not."""
     return torch.complex(phase.cos() / length, phase.sin() / length)
 
 
 def sequences(normal: Tensor, order: int) -> list[Sequence]:
-    """Which planes, one after another, make the images up to `order`, of planes with outward normals (P, 3).
+    """Return the sequences of reflecting planes, with outward normals (P, 3), of all images up to `order`.
 
     Planes that face alike cannot reflect each other's images, and of perpendicular ones both orders give one image.
     """
@@ -117,7 +121,9 @@ def sequences(normal: Tensor, order: int) -> list[Sequence]:
         last = [
             (*s, i)
             for s, i in itertools.product(last, planes)
-            if cosine[s[-1]][i] < 1 - RIGHT**2 and i != s[-1] and not (abs(cosine[s[-1]][i]) < RIGHT and i < s[-1])
+            if cosine[s[-1]][i] < 1 - MAX_COSINE**2
+            and i != s[-1]
+            and not (abs(cosine[s[-1]][i]) < MAX_COSINE and i < s[-1])
         ]
         found = found + last
     return found
@@ -125,12 +131,11 @@ def sequences(normal: Tensor, order: int) -> list[Sequence]:
 
 @dataclass(frozen=True)
 class Tree:
-    """Sequences, and all that they begin with, by their lengths, so that all images of one order follow at once.
+    """Sequences and their prefixes by length, so that all images of one order are computed at once.
 
     Args:
-        levels: for each length the rows of the sequences without their last plane among those of the length before, and the
-            last planes.
-        rows: of the sequences among those of all lengths, one after the other.
+        levels: For each length, the rows of the prefixes among those of the length before, and the last planes.
+        rows: Rows of the sequences among those of all lengths, one length after the other.
     """
 
     levels: list[tuple[Tensor, Tensor]]
@@ -139,7 +144,7 @@ class Tree:
 
 @lru_cache(maxsize=1024)
 def tree_of(sequence: tuple[Sequence, ...]) -> Tree:
-    """The tree of these sequences."""
+    """Return the tree of these sequences."""
     before: dict[Sequence, int] = {(): 0}
     row: dict[Sequence, int] = {}
     levels = []
@@ -152,13 +157,13 @@ def tree_of(sequence: tuple[Sequence, ...]) -> Tree:
 
 
 def mirror(source: Tensor, normal: Tensor, offset: Tensor) -> Tensor:
-    """Sources (..., 3) [m] mirrored in planes normal . x = offset; the shapes (..., 3) and (...) broadcast."""
+    """Return sources (..., 3) [m] mirrored in planes normal . x = offset; the shapes (..., 3) and (...) broadcast."""
     distance = (source * normal).sum(-1, keepdim=True) - offset[..., None]
     return source - 2 * distance * normal
 
 
-def images(scene: Scene, normal: Tensor, offset: Tensor, sequence: list[Sequence]) -> Tensor:
-    """Where the images are, float64 (B, S, n or 1, 3) [m], in planes (B, P, 3) and (B, P) [m]."""
+def images(scene: PhaseObservations, normal: Tensor, offset: Tensor, sequence: list[Sequence]) -> Tensor:
+    """Return the image positions, float64 (B, S, n or 1, 3) [m], in planes (B, P, 3) and (B, P) [m]."""
     tree, last, found = tree_of(tuple(sequence)), scene.transmitter.expand(len(normal), 1, -1, -1), []
     for parent, plane in tree.levels:
         last = mirror(last[:, parent], normal[:, plane, None], offset[:, plane, None])
@@ -166,16 +171,15 @@ def images(scene: Scene, normal: Tensor, offset: Tensor, sequence: list[Sequence
     return torch.cat(found, dim=1)[:, tree.rows]
 
 
-def turn_of(scene: Scene, normal: Tensor, offset: Tensor, plane: int) -> float:
-    """By how much a plane of the room (1, P, 3), (1, P) moves to turn the phase of its reflection by a full turn, on
-    average [m]."""
+def phase_period_m(scene: PhaseObservations, normal: Tensor, offset: Tensor, plane: int) -> float:
+    """Return the movement [m] of a plane of the room (1, P, 3), (1, P) that changes its phase by 2 pi on average."""
     ray = images(scene, normal, offset, [(plane,)])[0, 0] - scene.receiver
     cosine = float((ray @ normal[0, plane] / ray.norm(dim=-1)).abs().mean().clamp_min(0.3))
     return math.pi / (scene.wavenumber * cosine)
 
 
-def field(scene: Scene, normal: Tensor, offset: Tensor, gain: Tensor, sequence: list[Sequence]) -> Tensor:
-    """Sum of the waves of the given images, complex64 (B, n, K); gains (B, P), real or complex."""
+def field(scene: PhaseObservations, normal: Tensor, offset: Tensor, gain: Tensor, sequence: list[Sequence]) -> Tensor:
+    """Return the sum of the waves of the given images, complex64 (B, n, K); gains (B, P), real or complex."""
     if not sequence:
         shape = (len(normal), len(scene), len(scene.element))
         return torch.zeros(shape, dtype=torch.complex64)
@@ -186,7 +190,7 @@ def field(scene: Scene, normal: Tensor, offset: Tensor, gain: Tensor, sequence: 
 
 
 def image_gain(gain: Tensor, sequence: list[Sequence]) -> Tensor:
-    """Product of the gains (B, P) along each sequence, (B, S)."""
+    """Return the product of the gains (B, P) along each sequence, (B, S)."""
     tree, last, found = tree_of(tuple(sequence)), torch.ones(len(gain), 1), []
     for parent, plane in tree.levels:
         last = last[:, parent] * gain[:, plane]
@@ -194,15 +198,15 @@ def image_gain(gain: Tensor, sequence: list[Sequence]) -> Tensor:
     return torch.cat(found, dim=1)[:, tree.rows]
 
 
-def visibility(scene: Scene, normal: Tensor, offset: Tensor, sequence: list[Sequence]) -> Tensor:
-    """Whether the path of each image exists, float32 (B, S, n or 1).
+def visibility(scene: PhaseObservations, normal: Tensor, offset: Tensor, sequence: list[Sequence]) -> Tensor:
+    """Return 1 where the path of each image exists, else 0, float32 (B, S, n or 1).
 
-    Between planes that are parallel or perpendicular all do, since the region is inside of all planes. Elsewhere the path
-    is followed back from the receiver: it must meet its last plane coming from the inside, and so on.
+    Between parallel or perpendicular planes all paths exist, because the region is inside of all planes. Other paths are
+    followed back from the receiver: they must meet their last plane from the inside, and so on.
     """
     facing = normal[:1] if normal.stride(0) == 0 else normal  # rooms that are expanded from one share their normals
     cosine = (facing @ facing.mT).abs()
-    if not bool(((cosine > RIGHT) & (cosine < 1 - RIGHT**2)).any()):
+    if not bool(((cosine > MAX_COSINE) & (cosine < 1 - MAX_COSINE**2)).any()):
         return torch.ones(len(normal), len(sequence), 1)
     begun = list(dict.fromkeys(s[:end] for s in sequence for end in range(1, len(s) + 1)))
     source = dict(zip(begun, images(scene, normal, offset, begun).unbind(1), strict=True))

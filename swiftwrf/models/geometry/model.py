@@ -15,9 +15,9 @@ from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
 from swiftwrf.models.base import ARRAY, FIELD_MODELS, FIXED_END, FieldModel, FitContext, bounding_box
 from swiftwrf.models.geometry.fit import MAX_ORDER, GeometryConfig, refine_room, search_room
-from swiftwrf.models.geometry.images import Scene, image_gain, images
-from swiftwrf.models.geometry.planes import Plane, Planes, RoomEstimate
-from swiftwrf.models.geometry.sample import Residual, draw
+from swiftwrf.models.geometry.images import PhaseObservations, image_gain, images
+from swiftwrf.models.geometry.planes import Plane, PlaneSet, RoomEstimate
+from swiftwrf.models.geometry.sample import Residual, sample_field
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.validation import check_value
 
@@ -109,7 +109,7 @@ class GeometryModel(FieldModel):
         elif known.fingerprint == owner:
             self.estimate = known.estimate
         else:
-            self.estimate = refine_room(known.estimate, known.tensors(), train, self.config.seed)
+            self.estimate = refine_room(known.estimate, known.tensors(), train, self.config)
         self.fingerprint = owner
 
     @property
@@ -144,21 +144,21 @@ class GeometryModel(FieldModel):
         if generator is None:
             return room.field(scene)
         covariance, residual = self.estimate.covariance, self.estimate.residual
-        return draw(scene, room.normal, room.offset, room.gain, room.sequence, covariance, residual, generator)
+        return sample_field(scene, room.normal, room.offset, room.gain, room.sequence, covariance, residual, generator)
 
-    def scene(self, position: Tensor) -> Scene:
+    def scene(self, position: Tensor) -> PhaseObservations:
         """Return the link at positions (n, 3) [m], without observations. Beyond 10,000 km only the direction counts."""
         away = position - self.fixed_position
         size = away.abs().amax(dim=1, keepdim=True)
         position = torch.where(size > MAX_DISTANCE_M, self.fixed_position + MAX_DISTANCE_M * (away / size), position)
         nothing = torch.ones(len(position), len(self.array.element), dtype=torch.complex64)
-        return Scene.of(position, self.fixed_position, self.moving, self.array, self.rotation, nothing)
+        return PhaseObservations.of(position, self.fixed_position, self.moving, self.array, self.rotation, nothing)
 
-    def tensors(self) -> Planes:
+    def tensors(self) -> PlaneSet:
         """Return the planes as tensors."""
         normal = torch.tensor([p.normal for p in self.planes], dtype=torch.float64).reshape(1, -1, 3)
         offset = torch.tensor([[p.offset_m for p in self.planes]], dtype=torch.float64)
-        return Planes(normal, offset, torch.tensor([[p.gain for p in self.planes]]), self.order)
+        return PlaneSet(normal, offset, torch.tensor([[p.gain for p in self.planes]]), self.order)
 
     def image_sources(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the fixed end and its mirror images: positions (S, 3) [m], gains (S,) and numbers of reflections (S,)."""
@@ -166,7 +166,9 @@ class GeometryModel(FieldModel):
         room = self.tensors()
         if not (chain := room.sequence):
             return at, strength, order
-        scene = Scene.of(at, at[0], "receiver", self.array, self.rotation, torch.ones(1, len(self.array.element)))
+        scene = PhaseObservations.of(
+            at, at[0], "receiver", self.array, self.rotation, torch.ones(1, len(self.array.element))
+        )
         found = images(scene, room.normal, room.offset, chain)[0, :, 0]
         reflections = torch.tensor([len(s) for s in chain])
         return (

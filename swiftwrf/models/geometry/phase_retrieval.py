@@ -1,10 +1,9 @@
-"""What the spectra say of the channel: the phase of each element, up to one phase a spectrum.
+"""Phase retrieval: the phase of each element from the spectra, up to one phase for each spectrum.
 
-A spectrum's square is the Fourier transform of the channel's autocorrelation over the co-array, and the channel that it
-was made from has elements of modulus 1. A 4 x 4 array gives 48 real numbers for 15 unknown phases, so the phases can be
-found: two-dimensional phase retrieval (R. H. T. Bates, "Fourier phase problems are uniquely solvable in more than one
-dimension", Optik 61, 1982). What stays unknown is the phase of the whole, and whether the array was turned by half a turn
-with all phases reversed, which leaves every spectrum as it is.
+A squared spectrum is the Fourier transform of the channel's autocorrelation over the co-array, of a channel whose elements
+have modulus 1. A 4 x 4 array gives 48 real numbers for 15 unknown phases, so two-dimensional phase retrieval has a solution
+(R. H. T. Bates, "Fourier phase problems are uniquely solvable in more than one dimension", Optik 61, 1982). The common phase
+remains unknown. A rotation of the array by half a turn with all phases reversed gives the same spectrum.
 """
 
 from __future__ import annotations
@@ -19,14 +18,13 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray, basis, pairs
 from swiftwrf.data.spectra import Spectra
 
-PIXELS = 6000  # of a spectrum that are enough for its few dozen coefficients
-STEPS = 40
-STARTS = 20
-SOLVED = 5e-3  # relative error of the autocorrelation below which a start counts as the solution
+MAX_PIXELS = 6000  # of a spectrum, for its few dozen coefficients
+N_STEPS, MAX_STARTS = 40, 20
+MAX_ERROR = 5e-3  # relative error of the autocorrelation of a solution
 
 
 def autocorrelation(channel: Tensor, array: PlanarArray) -> Tensor:
-    """r(l) = sum of h_a conj(h_b) over the pairs with difference l, over K^2, (..., K) to (..., P)."""
+    """Return r(l) = sum of h_a conj(h_b) over the pairs with difference l, divided by K^2, (..., K) to (..., P)."""
     a, b, lag = pairs(array)
     r = torch.zeros(*channel.shape[:-1], int(lag.max()) + 1, dtype=channel.dtype)
     return r.index_add(-1, lag, channel[..., a] * channel[..., b].conj()) / channel.shape[-1] ** 2
@@ -42,12 +40,12 @@ def coarray_numbers(spectra: Iterable[Tensor], array: PlanarArray, grid: Angular
     """Return r(l) of each spectrum by least squares on its square, complex128 (n, P).
 
     Args:
-        spectra: Batches (b, H, W) of magnitudes. If there are many pixels, evenly chosen ones are used.
+        spectra: Batches (b, H, W) of magnitudes, of which at most 6000 evenly chosen pixels are used.
         array: Array of the spectra.
         grid: Directions of the pixels.
     """
     functions = basis(array, grid)
-    stride = max(1, functions.shape[1] // PIXELS)
+    stride = max(1, functions.shape[1] // MAX_PIXELS)
     stride += 1 - stride % 2  # odd: an even one would keep to every other column
     inverse = torch.linalg.pinv(functions[:, ::stride])
     coefficient = torch.cat([part.flatten(1)[:, ::stride].double().square() @ inverse for part in spectra])
@@ -55,16 +53,16 @@ def coarray_numbers(spectra: Iterable[Tensor], array: PlanarArray, grid: Angular
     return torch.complex(coefficient[:, 1 : 1 + half], coefficient[:, 1 + half :]) / 2
 
 
-def element_phases(observed: Tensor, array: PlanarArray, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Unit-modulus channels with the observed autocorrelation, by Gauss-Newton steps from several starts.
+def retrieve_phases(observed: Tensor, array: PlanarArray, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Return unit-modulus channels with the observed autocorrelation, by Gauss-Newton steps from several starts.
 
     Args:
         observed: r(l) of each spectrum, complex128 (n, P).
-        array: which took them.
-        seed: of the random starts.
+        array: Antenna array of the spectra.
+        seed: Seed of the random starts.
 
     Returns:
-        Channels, complex128 (n, K), and the relative error of each one's autocorrelation, (n,).
+        Channels, complex128 (n, K), and the relative error of each autocorrelation, (n,).
     """
     a, b, lag = pairs(array)
     n, k = len(observed), len(array.element)
@@ -74,10 +72,10 @@ def element_phases(observed: Tensor, array: PlanarArray, seed: int = 0) -> tuple
     count = torch.bincount(lag).double()
     toeplitz[:, a, b] = observed[:, lag] * k**2 / count[lag] / k
     toeplitz[:, b, a] = toeplitz[:, a, b].conj()
-    phase = torch.linalg.eigh(toeplitz).eigenvectors[..., -1].angle()  # close where one path dominates
+    phase = torch.linalg.eigh(toeplitz).eigenvectors[..., -1].angle()  # close to the solution if one path dominates
     best, error = phase.clone(), torch.full((n,), math.inf, dtype=torch.float64)
-    for start in range(STARTS):
-        rows = (error > SOLVED).nonzero()[:, 0]
+    for start in range(MAX_STARTS):
+        rows = (error > MAX_ERROR).nonzero()[:, 0]
         if not len(rows):
             break
         x = phase[rows] + min(0.7 * start, 2.1) * torch.randn(len(rows), k, dtype=torch.float64, generator=generator)
@@ -88,7 +86,7 @@ def element_phases(observed: Tensor, array: PlanarArray, seed: int = 0) -> tuple
 
 
 def _descend(phase: Tensor, observed: Tensor, a: Tensor, b: Tensor, lag: Tensor) -> tuple[Tensor, Tensor]:
-    """Levenberg-Marquardt on the phases (n, K); returns them and the length of each one's residual, (n,)."""
+    """Return phases (n, K) after Levenberg-Marquardt steps, and the norms of the residuals (n,)."""
     n, k = phase.shape
     difference = torch.zeros(len(a), k, dtype=torch.float64)
     difference[torch.arange(len(a)), a], difference[torch.arange(len(a)), b] = 1, -1
@@ -101,7 +99,7 @@ def _descend(phase: Tensor, observed: Tensor, a: Tensor, b: Tensor, lag: Tensor)
 
     damping = torch.full((n,), 1e-2, dtype=torch.float64)
     product, missed = residual(phase)
-    for _ in range(STEPS):
+    for _ in range(N_STEPS):
         jacobian = torch.einsum("lp,np,pk->nlk", gather.to(product.dtype), 1j * product, difference.to(product.dtype))
         jacobian = torch.view_as_real(jacobian).permute(0, 1, 3, 2).flatten(1, 2)
         normal = jacobian.mT @ jacobian

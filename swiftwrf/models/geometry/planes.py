@@ -1,4 +1,4 @@
-"""A room of mirror planes: its field, its refinement, and how two rooms compare."""
+"""Rooms of mirror planes: their field, their refinement, and the comparison of two rooms."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any
 from torch import Tensor
 
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.models.geometry.images import Scene, Sequence, field, sequences, turn_of
+from swiftwrf.models.geometry.images import PhaseObservations, Sequence, field, phase_period_m, sequences
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation
 from swiftwrf.models.geometry.refine import refine
 from swiftwrf.models.geometry.sample import Residual
-from swiftwrf.models.geometry.search import SIDES, Room
+from swiftwrf.models.geometry.search import SIDES, CandidateRoom
 from swiftwrf.runtime.validation import NonNegativeFloat, configuration
 
-FLOOR = 1e-5  # of what is missing: rounding of spectra, and of the phases that follow from them
+MIN_MISSING = 1e-5  # missing coherence by rounding of spectra and phases
 
 
 @configuration
@@ -43,7 +43,7 @@ class RoomEstimate:
     """Planes of a room with their uncertainty.
 
     Args:
-        planes: Planes, an empty list if none explains the spectra.
+        planes: PlaneSet, an empty list if none explains the spectra.
         order: Highest number of reflections of an image source.
         score_held_out: 1 - correlation of predicted and observed co-array coefficients of the training spectra that were
             held out from the first stage of the search.
@@ -69,8 +69,8 @@ class RoomEstimate:
 
 
 @dataclass(frozen=True)
-class Planes:
-    """Planes (1, P, 3), (1, P) [m] with gains (1, P), and the order of their images."""
+class PlaneSet:
+    """Planes of one room: normals (1, P, 3), offsets (1, P) [m], gains (1, P), and the order of their images."""
 
     normal: Tensor
     offset: Tensor
@@ -78,33 +78,35 @@ class Planes:
     order: int
 
     @classmethod
-    def of(cls, found: Room) -> Planes:
+    def of(cls, found: CandidateRoom) -> PlaneSet:
         normal, offset, gain = found.tensors()
         return cls(normal, offset, gain, 2)
 
-    def by_side(self) -> Room:
-        """As a search has them, each on the side of the region that it faces most, without a score."""
+    def by_side(self) -> CandidateRoom:
+        """Return the candidate room with each plane on the side of the region that it faces most, without a score."""
         sides = (self.normal[0] @ SIDES.T).argmax(1).tolist()
         offset, gain = (dict(zip(sides, values[0].tolist(), strict=True)) for values in (self.offset, self.gain))
-        return Room(0.0, offset, gain)
+        return CandidateRoom(0.0, offset, gain)
 
     @property
     def sequence(self) -> list[Sequence]:
         return sequences(self.normal[0], self.order) if self.normal.shape[1] else []
 
-    def field(self, scene: Scene) -> Tensor:
-        """(n, K)."""
+    def field(self, scene: PhaseObservations) -> Tensor:
+        """Return the field with the direct wave at the positions of a scene, complex64 (n, K)."""
         return scene.wave(scene.transmitter) + field(scene, self.normal, self.offset, self.gain, self.sequence)[0]
 
-    def shifted(self, by: Tensor) -> Planes:
-        """In coordinates from an origin at `-by` (3,) [m]."""
+    def shifted(self, by: Tensor) -> PlaneSet:
+        """Return the planes in coordinates whose origin is at `-by` (3,) [m]."""
         return replace(self, offset=self.offset + self.normal @ by)
 
-    def without(self, plane: int) -> Planes:
+    def without(self, plane: int) -> PlaneSet:
+        """Return the other planes."""
         keep = [i for i in range(self.normal.shape[1]) if i != plane]
         return replace(self, normal=self.normal[:, keep], offset=self.offset[:, keep], gain=self.gain[:, keep])
 
-    def refined(self, scene: Scene, steps: int = 10, tilt: bool = False) -> Planes:
+    def refined(self, scene: PhaseObservations, steps: int = 10, tilt: bool = False) -> PlaneSet:
+        """Return the planes after Levenberg-Marquardt steps on offsets, gains and, with `tilt`, normals."""
         if not self.sequence:
             return self
         _, normal, offset, gain = refine(
@@ -114,27 +116,29 @@ class Planes:
 
 
 def advantage(a: Tensor, b: Tensor) -> float:
-    """By how many standard errors the coherences a (n,) are higher than b."""
+    """Return how many standard errors the mean coherence a (n,) is above b."""
     difference = a - b
     return float(difference.mean() / (difference.std() / math.sqrt(len(difference))).clamp_min(1e-9))
 
 
-def explained(coherence: Tensor) -> Tensor:
-    """How well each spectrum is explained: minus the logarithm of what is missing, (n,)."""
-    return -(1 - coherence + FLOOR).log()
+def log_explained(coherence: Tensor) -> Tensor:
+    """Return minus the logarithm of each spectrum's missing coherence, (n,)."""
+    return -(1 - coherence + MIN_MISSING).log()
 
 
-def clearly(a: Tensor, b: Tensor) -> float:
-    """The larger `advantage` of coherences a over b, as they are or by what is missing: differences of the former are
-    skewed where spectra are few, and those of the latter hide what helps badly explained ones."""
-    return max(advantage(a, b), advantage(explained(a), explained(b)))
+def robust_advantage(a: Tensor, b: Tensor) -> float:
+    """Return the larger `advantage` of coherences a over b, linear or by `log_explained`.
+
+    Linear differences are skewed if spectra are few. Logarithms hide improvements of badly explained spectra.
+    """
+    return max(advantage(a, b), advantage(log_explained(a), log_explained(b)))
 
 
-def in_step(scene: Scene, room: Planes, plane: int = -1) -> list[Planes]:
-    """The rooms in which a plane reflects with the other sign, and its wave is in step again to either side."""
+def sign_alternatives(scene: PhaseObservations, room: PlaneSet, plane: int = -1) -> list[PlaneSet]:
+    """Return the rooms in which a plane has a gain of the other sign and its wave the same phase, to either side."""
     plane %= room.normal.shape[1]
-    turn, rooms = turn_of(scene, room.normal, room.offset, plane), []
-    for step in (-turn / 2, turn / 2):
+    period, rooms = phase_period_m(scene, room.normal, room.offset, plane), []
+    for step in (-period / 2, period / 2):
         offset, gain = room.offset.clone(), room.gain.clone()
         offset[:, plane] += step
         gain[:, plane] *= -1
@@ -142,8 +146,8 @@ def in_step(scene: Scene, room: Planes, plane: int = -1) -> list[Planes]:
     return rooms
 
 
-def correlation_score(scene: Scene, room: Planes, array: PlanarArray) -> float:
-    """1 - correlation of predicted and observed co-array numbers, both scaled freely."""
+def correlation_score(scene: PhaseObservations, room: PlaneSet, array: PlanarArray) -> float:
+    """Return 1 - correlation of predicted and observed co-array coefficients."""
     predicted = autocorrelation(room.field(scene).sgn(), array)
     seen = autocorrelation(scene.channel[:, 0], array)
     power = float(predicted.abs().square().sum() * seen.abs().square().sum())

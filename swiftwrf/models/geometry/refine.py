@@ -1,18 +1,32 @@
-"""Planes and gains brought to the nearest minimum of the score by Levenberg-Marquardt steps, many rooms at once."""
+"""Refinement of planes and gains to the nearest minimum of the score, of many rooms at once."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from swiftwrf.models.geometry.images import Scene, Sequence, image_gain, images, mirror, spherical, tree_of, visibility
+from swiftwrf.models.geometry.images import (
+    PhaseObservations,
+    Sequence,
+    image_gain,
+    images,
+    mirror,
+    spherical,
+    tree_of,
+    visibility,
+)
 
 
 def derivatives(
-    scene: Scene, normal: Tensor, offset: Tensor, gain: Tensor, sequence: list[Sequence], tilt: bool
+    scene: PhaseObservations, normal: Tensor, offset: Tensor, gain: Tensor, sequence: list[Sequence], tilt: bool
 ) -> tuple[Tensor, Tensor]:
-    """The field with the direct wave, (B, n, K), and what it changes by with each plane's offset [m], gain and, with
-    `tilt`, the two angles by which its normal turns [rad], (B, Q, P, n, K); of all `sequences` up to an order."""
+    """Return the field with the direct wave, (B, n, K), and its derivatives (B, Q, P, n, K).
+
+    The Q parameters of each plane are offset [m], gain and, with `tilt`, two rotation angles of its normal [rad].
+
+    Args:
+        sequence: All `sequences` up to an order.
+    """
     source = images(scene, normal, offset, sequence)
     ray = (source - scene.receiver).float()
     length = ray.norm(dim=-1, keepdim=True)
@@ -37,9 +51,13 @@ def derivatives(
 def tangents(
     normal: Tensor, offset: Tensor, transmitter: Tensor, sequence: list[Sequence], tilt: bool
 ) -> list[tuple[Tensor, list[Tensor]]]:
-    """By how much images move with the offset and the tilts of the planes that made them: for the first plane of each
-    sequence, the second of those that have one and so on, its number (R,) and, for the 1 or 3 parameters, how far the
-    image goes, (B, R, n or 1, 3); these R are the last ones of `sequences`."""
+    """Return the derivatives of the image positions with respect to offset and tilts of the planes that make them.
+
+    Returns:
+        One entry for the first plane of the sequences, the second plane of those that have one, and so on: the number of the
+        plane (R,), and for each of the 1 or 3 parameters the derivative (B, R, n or 1, 3). The R sequences are the last ones
+        of `sequence`.
+    """
     across = torch.linalg.svd(normal[:, :, None]).Vh[:, :, 1:].unbind(2) if tilt else ()
     here = offset.new_zeros(())  # displacements are mirrored as points are in planes through the origin
     point = transmitter.expand(len(normal), 1, -1, -1)
@@ -61,12 +79,13 @@ def tangents(
     return whole
 
 
-def normal_equations(scene: Scene, total: Tensor, change: Tensor, exact: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-    """Score (B,), half its gradient at each position (B, Q, n) and its Gauss-Newton matrix (B, Q, Q), times n.
+def normal_equations(
+    scene: PhaseObservations, total: Tensor, change: Tensor, exact: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the score (B,), half its gradient at each position (B, Q, n) and its Gauss-Newton matrix (B, Q, Q), times n.
 
-    With `exact`, the matrix counts how far each phase is off, as deviations need it; it may then have no inverse.
-
-    Only phases count: a field h that changes by dh turns by Im(dh / h), and one phase a position is free.
+    Only phases count: a change dh of the field h changes its phase by Im(dh / h), and one phase of each position is free.
+    With `exact`, the matrix includes the phase errors, as standard deviations require; it may then be singular.
     """
     change = change.flatten(1, 2)
     safe = torch.where(total.abs() < 1e-9, torch.full_like(total, 1e-9), total)
@@ -88,7 +107,7 @@ def normal_equations(scene: Scene, total: Tensor, change: Tensor, exact: bool = 
 
 
 def refine(
-    scene: Scene,
+    scene: PhaseObservations,
     normal: Tensor,
     offset: Tensor,
     gain: Tensor,
@@ -99,11 +118,11 @@ def refine(
     signs: Tensor | None = None,
     limit: float = 0.03,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Score (B,), normals (B, P, 3), offsets and gains (B, P) after some steps.
+    """Return score (B,), normals (B, P, 3), offsets and gains (B, P) after Levenberg-Marquardt steps.
 
     Args:
-        signs: of the gains, (P,); free without them.
-        limit: how far a plane may go [m], or tilt [rad], in one step.
+        signs: Fixed signs of the gains (P,). Defaults to free signs.
+        limit: Maximum movement [m] or tilt [rad] of a plane in one step.
     """
     damping = torch.full((len(normal),), 1e-2)
     total, change = derivatives(scene, normal, offset, gain, sequence, tilt)
@@ -135,9 +154,14 @@ def refine(
     return score, normal, offset, gain
 
 
-def deviations(scene: Scene, normal: Tensor, offset: Tensor, gain: Tensor, sequence: list[Sequence]) -> Tensor:
-    """Covariance of the offsets [m^2], (P, P), of one room (1, P, 3): the curvature's inverse around the scatter of the
-    positions' gradients, so that what the model leaves unexplained counts as noise (P. J. Huber 1967)."""
+def offset_covariance(
+    scene: PhaseObservations, normal: Tensor, offset: Tensor, gain: Tensor, sequence: list[Sequence]
+) -> Tensor:
+    """Return the covariance of the offsets (P, P) [m^2] of one room (1, P, 3).
+
+    The sandwich estimator, inverse curvature around the scatter of the positions' gradients, counts unexplained paths as
+    noise (P. J. Huber 1967).
+    """
     total, change = derivatives(scene, normal, offset, gain, sequence, tilt=False)
     _, slope, curve = normal_equations(scene, total, change, exact=True)
     n, q = len(scene), curve.shape[-1]

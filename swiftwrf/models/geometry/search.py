@@ -1,9 +1,9 @@
-"""Which planes: at most one on each of the six sides of a region, found from nothing.
+"""Search for a room without a start: at most one plane on each of the six sides of a region.
 
-The score of a plane has many minima, about half a wavelength / cosine of incidence apart, and planes at wrong ones hold
-each other in place. Hence several planes move at once: each side keeps a list of alternatives, the minima of its own scans
-and "no plane", and the best of all combinations of two to four sides' alternatives is taken, from tables of the waves of
-all single and double reflections, until none is better; all six sides move at once by whole turns.
+The score of a plane has many minima, about half a wavelength / cosine of incidence apart, and planes at wrong minima hold
+each other in place. Therefore several planes move at once. Each side has a list of alternatives: the minima of its scans,
+and no plane. The best combination of two to four sides' alternatives is taken, from the steering responses of all single and
+double reflections, until none is better. All six sides move together by whole phase periods.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from swiftwrf.models.geometry.images import Scene, field, sequences, turn_of
+from swiftwrf.models.geometry.images import PhaseObservations, field, phase_period_m, sequences
 from swiftwrf.models.geometry.refine import refine
-from swiftwrf.models.geometry.responses import Waves
+from swiftwrf.models.geometry.responses import SteeringResponses
 
 SIDES = torch.tensor(
     [[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], dtype=torch.float64
@@ -28,50 +28,50 @@ SIDES = torch.tensor(
 SIGNS = torch.tensor(
     [[-1, -1, -1, -1, -1, -1], [-1, -1, -1, -1, 1, 1], [1, 1, 1, 1, 1, 1]]
 )  # of the gains: one material, vertical fields (walls turn them round, floor and ceiling do not), anything else
-USUAL, WEAK = 0.7, 0.3  # modulus of a gain that is not known yet, and of a plane that is hidden at times
-BETTER = 0.997  # of the score, for a move to count
-PERFECT = 2e-6  # a score that needs no further moves
-STARTS = 2 * len(SIGNS)  # of a search
-HOPELESS = 1.4  # a start with so many times the best score is given up
+USUAL_GAIN, WEAK_GAIN = 0.7, 0.3  # modulus of a gain that is not known yet, and of a plane that is hidden at times
+MAX_SCORE_RATIO = 0.997  # of the scores after and before a move that counts
+PERFECT_SCORE = 2e-6  # needs no further moves
+N_STARTS = 2 * len(SIGNS)  # of a search
+MAX_START_RATIO = 1.4  # of a start's score and the best one, beyond which the start is given up
 Alternatives = list[list[tuple[float, float]]]  # offset [m] and gain, for each side
-CHUNK = 256  # candidates at a time
-MOVES = {2: 99, 3: 7, 4: 4}  # so many sides move at once, each to so many alternatives
-ORDER = 2  # of the images while planes move together
-TOP = 8  # alternatives of a side
-KEEP = 8  # combinations that are refined
-SWEEPS = 20  # moves at most
+BATCH_SIZE = 256  # candidates
+MAX_ALTERNATIVES = {2: 99, 3: 7, 4: 4}  # of each side, by the number of sides that move at once
+SEARCH_ORDER = 2  # reflections of an image while planes move together
+N_MINIMA = 8  # of a scan, for each side
+N_REFINED = 8  # combinations of each kind of move
+MAX_MOVES = 20
 
 
 @dataclass
-class Room:
-    """At most one plane a side: offset [m] and gain by the number of the side, and the score."""
+class CandidateRoom:
+    """A candidate with at most one plane on each side: offset [m] and gain by the number of the side, and the score."""
 
     score: float
     offset: dict[int, float] = of(default_factory=dict)
     gain: dict[int, float] = of(default_factory=dict)
 
     def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Normals (1, P, 3), offsets and gains (1, P), by ascending side."""
+        """Return normals (1, P, 3), offsets and gains (1, P), by ascending side."""
         sides = sorted(self.offset)
         offset = torch.tensor([[self.offset[i] for i in sides]], dtype=torch.float64)
         return SIDES[sides][None], offset, torch.tensor([[self.gain[i] for i in sides]])
 
     def key(self, step: float) -> tuple[tuple[int, int], ...]:
-        """The same for rooms that are alike."""
+        """Return a key that is equal for rooms with offsets in the same steps [m]."""
         return tuple((i, round(o / step)) for i, o in sorted(self.offset.items()))
 
 
 class Search:
-    """Scans and moves on the planes of a scene.
+    """Scans and moves of planes.
 
     Args:
-        scene: with the positions to search with.
-        reach: how far beyond the region planes are looked for [m].
-        signs: of the gains on the six sides, -1 or 1 each, (6,).
-        usual: modulus of a gain that is not known yet.
+        scene: Observed phases at the positions of the search.
+        reach: Distance beyond the region of both ends up to which planes are searched [m].
+        signs: Signs of the gains on the six sides (6,).
+        usual: Modulus of a gain that is not known yet.
     """
 
-    def __init__(self, scene: Scene, reach: float, signs: Tensor, usual: float = USUAL) -> None:
+    def __init__(self, scene: PhaseObservations, reach: float, signs: Tensor, usual: float = USUAL_GAIN) -> None:
         self.scene, self.reach, self.signs = scene, reach, signs
         self.usual: list[float] = (usual * signs).tolist()
         both = torch.cat([scene.transmitter, scene.receiver])
@@ -82,31 +82,33 @@ class Search:
 
     @cached_property
     def single(self) -> list[Tensor]:
-        """Waves of a plane on each side, at all its offsets."""
+        """Waves of a plane on each side at all its offsets."""
         return [self._waves(SIDES[i : i + 1], o[:, None]) for i, o in enumerate(self.offsets)]
 
     def _waves(self, normal: Tensor, offset: Tensor) -> Tensor:
-        """Unscaled waves of single reflections (C, n, K) at offsets (C, 1)."""
+        """Return the waves of single reflections with gain 1, (C, n, K), at offsets (C, 1)."""
         one = torch.ones(len(offset), 1)
         return field(self.scene, normal.expand(len(offset), 1, 3), offset, one, [(0,)])
 
-    def total(self, room: Room, order: int) -> Tensor:
-        """The field of a room, (n, K)."""
+    def total(self, room: CandidateRoom, order: int) -> Tensor:
+        """Return the field of a room with images up to an order, (n, K)."""
         if not room.offset:
             return self.direct
         normal, offset, gain = room.tensors()
         return self.direct + field(self.scene, normal, offset, gain, sequences(normal[0], order))[0]
 
-    def landscape(self, room: Room, side: int, order: int) -> Tensor:
-        """The score over the offsets of a side, its own plane taken away, (C,)."""
-        rest = Room(0.0, {i: o for i, o in room.offset.items() if i != side}, room.gain)
+    def scan(self, room: CandidateRoom, side: int, order: int) -> Tensor:
+        """Return the scores (C,) over the offsets of a side, without the plane that the room has there."""
+        rest = CandidateRoom(0.0, {i: o for i, o in room.offset.items() if i != side}, room.gain)
         base, gain = self.total(rest, order), room.gain.get(side, self.usual[side])
         sides = sorted([*rest.offset, side])
         own = sides.index(side)
         chain = [s for s in sequences(SIDES[sides], order) if own in s and len(s) > 1]
         gains = torch.tensor([[gain if i == side else rest.gain[i] for i in sides]])
         values = []
-        for waves, offsets in zip(self.single[side].split(CHUNK), self.offsets[side].split(CHUNK), strict=True):
+        for waves, offsets in zip(
+            self.single[side].split(BATCH_SIZE), self.offsets[side].split(BATCH_SIZE), strict=True
+        ):
             h = base + gain * waves
             if chain:
                 offset = torch.tensor([rest.offset.get(i, 0.0) for i in sides], dtype=torch.float64)
@@ -117,22 +119,22 @@ class Search:
             values.append(self.scene.score(h))
         return torch.cat(values)
 
-    def minima(self, room: Room, side: int, order: int, top: int) -> list[tuple[float, float]]:
-        """The lowest local minima of a side's landscape: score and offset."""
-        v = self.landscape(room, side, order)
+    def minima(self, room: CandidateRoom, side: int, order: int, top: int) -> list[tuple[float, float]]:
+        """Return score and offset of the lowest local minima over the offsets of a side."""
+        v = self.scan(room, side, order)
         low = ((v[1:-1] <= v[:-2]) & (v[1:-1] < v[2:])).nonzero()[:, 0] + 1
         low = low[v[low].argsort()[:top]]
         return list(zip(v[low].tolist(), self.offsets[side][low].tolist(), strict=True))
 
-    def refined(self, rooms: list[Room], order: int, steps: int = 6) -> list[Room]:
-        """The rooms after some Levenberg-Marquardt steps; those with equally many planes on the same sides together."""
+    def refined(self, rooms: list[CandidateRoom], order: int, steps: int = 6) -> list[CandidateRoom]:
+        """Return the rooms after Levenberg-Marquardt steps, the best first; equal sides are computed together."""
         done = []
-        by_sides: dict[tuple[int, ...], list[Room]] = {}
+        by_sides: dict[tuple[int, ...], list[CandidateRoom]] = {}
         for room in rooms:
             by_sides.setdefault(tuple(sorted(room.offset)), []).append(room)
         for sides, group in by_sides.items():
             if not sides:
-                done += [Room(float(self.scene.score(self.direct)))]
+                done += [CandidateRoom(float(self.scene.score(self.direct)))]
                 continue
             normal, offset, gain = (torch.cat(t) for t in zip(*[r.tensors() for r in group], strict=True))
             chain = sequences(SIDES[list(sides)], order)
@@ -140,36 +142,38 @@ class Search:
                 self.scene, normal, offset, gain, chain, steps=steps, signs=self.signs[list(sides)], limit=2 * self.step
             )
             for v, o, g in zip(score.tolist(), offset.tolist(), gain.tolist(), strict=True):
-                done.append(Room(v, dict(zip(sides, o, strict=True)), dict(zip(sides, g, strict=True))))
+                done.append(CandidateRoom(v, dict(zip(sides, o, strict=True)), dict(zip(sides, g, strict=True))))
         return sorted(done, key=lambda r: r.score)
 
-    def beam(self, width: int, order: int) -> list[Room]:
-        """Partial rooms of growing number of planes, the best few of each number kept."""
-        rooms = [Room(float(self.scene.score(self.direct)))]
+    def beam(self, width: int, order: int) -> list[CandidateRoom]:
+        """Return the best rooms of a beam search that adds one plane at a time."""
+        rooms = [CandidateRoom(float(self.scene.score(self.direct)))]
         for _ in SIDES:
-            pool: dict[tuple[tuple[int, int], ...], Room] = {}
+            pool: dict[tuple[tuple[int, int], ...], CandidateRoom] = {}
             for room in rooms:
                 for side in set(range(6)) - set(room.offset):
                     for v, o in self.minima(room, side, order, 4):
-                        new = Room(v, {**room.offset, side: o}, {**room.gain, side: self.usual[side]})
+                        new = CandidateRoom(v, {**room.offset, side: o}, {**room.gain, side: self.usual[side]})
                         pool.setdefault(new.key(2 * self.step), new)
             if not pool:  # no side left has a minimum within reach
                 break
             best = sorted(pool.values(), key=lambda r: r.score)[: 3 * width]
-            distinct: dict[tuple[tuple[int, int], ...], Room] = {}
+            distinct: dict[tuple[tuple[int, int], ...], CandidateRoom] = {}
             for r in self.refined(best, order):
                 distinct.setdefault(r.key(2 * self.step), r)
             rooms = list(distinct.values())[:width]
         return rooms
 
-    def alternatives(self, room: Room, top: int) -> Alternatives:
-        """For each side (offset, gain): where it is, nothing (gain 0), and the minima of scans with and without
-        second-order images."""
+    def alternatives(self, room: CandidateRoom, top: int) -> Alternatives:
+        """Return (offset, gain) of each side's alternatives.
+
+        These are the present plane, no plane (gain 0), and the minima of scans with and without second-order images.
+        """
         found = []
         for side in range(6):
             gain = room.gain[side] if side in room.offset else self.usual[side]
             own = [(room.offset[side], gain), (room.offset[side], 0.0)] if side in room.offset else [(0.0, 0.0)]
-            offsets = [o for order in (1, ORDER) for _, o in self.minima(room, side, order, top)]
+            offsets = [o for order in (1, SEARCH_ORDER) for _, o in self.minima(room, side, order, top)]
             far: list[float] = []
             for o in offsets:
                 if all(abs(o - p) > 2 * self.step for p in far):
@@ -177,18 +181,18 @@ class Search:
             found.append(own + [(o, gain) for o in far])
         return found
 
-    def table(self, alternatives: Alternatives) -> Waves:
-        """The waves of all alternatives."""
+    def responses(self, alternatives: Alternatives) -> SteeringResponses:
+        """Return the steering responses of all alternatives."""
         offset = [torch.tensor([o for o, _ in a], dtype=torch.float64) for a in alternatives]
         gain = [torch.tensor([g for _, g in a]) for a in alternatives]
-        return Waves.of(self.scene, SIDES, offset, gain, ORDER)
+        return SteeringResponses.of(self.scene, SIDES, offset, gain, SEARCH_ORDER)
 
-    def moves(self, alternatives: Alternatives, waves: Waves, k: int, keep: int) -> list[Room]:
-        """The best rooms in which k sides take other alternatives, of which the more are tried the fewer sides move."""
+    def moves(self, alternatives: Alternatives, responses: SteeringResponses, k: int, keep: int) -> list[CandidateRoom]:
+        """Return the best rooms in which k sides take other alternatives, of which `MAX_ALTERNATIVES` are tried."""
         pool: list[tuple[float, tuple[int, ...]]] = []
         for which in itertools.combinations(range(6), k):
-            base, moving = waves.moved(self.direct, which)
-            tried = [torch.arange(len(alternatives[i]))[: MOVES.get(k)] for i in which]
+            base, moving = responses.moved(self.direct, which)
+            tried = [torch.arange(len(alternatives[i]))[: MAX_ALTERNATIVES.get(k)] for i in which]
             value = moving.at(tried).scores(self.scene, base)
             for index in value.flatten().argsort()[:keep]:
                 choice = [0] * 6
@@ -198,69 +202,71 @@ class Search:
         rooms = []
         for value_, choice_ in sorted(set(pool))[:keep]:
             picked = {i: alternatives[i][c] for i, c in enumerate(choice_) if alternatives[i][c][1] != 0}
-            rooms.append(Room(value_, {i: p[0] for i, p in picked.items()}, {i: p[1] for i, p in picked.items()}))
+            rooms.append(
+                CandidateRoom(value_, {i: p[0] for i, p in picked.items()}, {i: p[1] for i, p in picked.items()})
+            )
         return rooms
 
-    def wraps(self, room: Room) -> Alternatives:
-        """For each side (offset, gain): where it is and where its wave has the same phase up to one or two turns."""
+    def aliases(self, room: CandidateRoom) -> Alternatives:
+        """Return (offset, gain) of each side's present plane and of its phase aliases up to two periods away."""
         found = []
         for side in range(6):
             if side not in room.offset:
                 found.append([(0.0, 0.0)])
                 continue
-            one = Room(0.0, {side: room.offset[side]}, room.gain)
+            one = CandidateRoom(0.0, {side: room.offset[side]}, room.gain)
             normal, offset, _ = one.tensors()
-            turn = turn_of(self.scene, normal, offset, 0)
+            period = phase_period_m(self.scene, normal, offset, 0)
             low = float(self.offsets[side][0])
-            steps = [room.offset[side] + m * turn for m in (0, -1, 1, -2, 2)]
+            steps = [room.offset[side] + m * period for m in (0, -1, 1, -2, 2)]
             found.append([(o, room.gain[side]) for o in steps if o >= low - self.step])
         return found
 
-    def improve(self, room: Room) -> Room:
-        """Moves several planes at a time, with second-order images, until nothing is better."""
-        best = self.refined([room], ORDER)[0]
-        for _ in range(SWEEPS):
+    def improve(self, room: CandidateRoom) -> CandidateRoom:
+        """Return the room after moves of several planes at a time, with second-order images, until no move is better."""
+        best = self.refined([room], SEARCH_ORDER)[0]
+        for _ in range(MAX_MOVES):
             for tried in self._trials(best):
-                if tried.score < BETTER * best.score:
+                if tried.score < MAX_SCORE_RATIO * best.score:
                     best = tried
                     break
             else:
                 break
         return best
 
-    def _trials(self, room: Room) -> Iterator[Room]:
-        """The best of each kind of move, the cheap ones first."""
-        if room.score < PERFECT:
+    def _trials(self, room: CandidateRoom) -> Iterator[CandidateRoom]:
+        """Yield the best room of each kind of move, cheap kinds first."""
+        if room.score < PERFECT_SCORE:
             return
-        alternatives = self.alternatives(room, TOP)
-        waves = self.table(alternatives)
-        for k in MOVES:
-            yield self.refined(self.moves(alternatives, waves, k, KEEP), ORDER)[0]
-        few, wraps = Search(self.scene.few(), self.reach, self.signs), self.wraps(room)
-        yield self.refined(few.moves(wraps, few.table(wraps), 6, KEEP), ORDER)[0]
+        alternatives = self.alternatives(room, N_MINIMA)
+        responses = self.responses(alternatives)
+        for k in MAX_ALTERNATIVES:
+            yield self.refined(self.moves(alternatives, responses, k, N_REFINED), SEARCH_ORDER)[0]
+        few, aliases = Search(self.scene.few(), self.reach, self.signs), self.aliases(room)
+        yield self.refined(few.moves(aliases, few.responses(aliases), 6, N_REFINED), SEARCH_ORDER)[0]
 
 
 def find_room(
-    scene: Scene, reach: float, width: int = 8, tick: Callable[[], None] | None = None
-) -> tuple[Tensor, Room]:
-    """The signs of the gains and the best room over all SIGNS, from beams with and without second-order images.
+    scene: PhaseObservations, reach: float, width: int = 8, tick: Callable[[], None] | None = None
+) -> tuple[Tensor, CandidateRoom]:
+    """Return the signs of the gains and the best room over all SIGNS, from beams with and without second-order images.
 
     Args:
-        scene: with the positions to search with, best no more than a hundred.
-        reach: how far beyond the region of both ends planes are looked for [m].
-        width: of the beam.
-        tick: called after each of the STARTS starts.
+        scene: Observed phases at the positions of the search, preferably at most 100.
+        reach: Distance beyond the region of both ends up to which planes are searched [m].
+        width: Width of the beam search.
+        tick: Called after each of the N_STARTS starts.
     """
     starts = []
-    nothing = Room(float(scene.score(scene.wave(scene.transmitter))))
-    if nothing.score < PERFECT:
+    nothing = CandidateRoom(float(scene.score(scene.wave(scene.transmitter))))
+    if nothing.score < PERFECT_SCORE:
         return SIGNS[0], nothing
     for signs in SIGNS:
         search = Search(scene, reach, signs)
-        starts += [(search.beam(width, order)[0], search) for order in (ORDER, 1)]
-    best: tuple[Tensor, Room] | None = None
+        starts += [(search.beam(width, order)[0], search) for order in (SEARCH_ORDER, 1)]
+    best: tuple[Tensor, CandidateRoom] | None = None
     for start, search in sorted(starts, key=lambda s: s[0].score):
-        if best is None or PERFECT < start.score < HOPELESS * best[1].score:
+        if best is None or PERFECT_SCORE < start.score < MAX_START_RATIO * best[1].score:
             room = search.improve(start)
             if best is None or room.score < best[1].score:
                 best = search.signs, room

@@ -1,4 +1,4 @@
-"""What is certain about the planes that were found: deviations, rivals, and doubts about the whole."""
+"""Uncertainty of estimated planes: standard deviations, alternatives, and conditions under which no plane is certain."""
 
 from __future__ import annotations
 
@@ -9,28 +9,29 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.models.geometry.ambiguity import turned
-from swiftwrf.models.geometry.images import Scene, field, turn_of
+from swiftwrf.models.geometry.ambiguity import phase_alternatives
+from swiftwrf.models.geometry.images import PhaseObservations, field, phase_period_m
 from swiftwrf.models.geometry.planes import (
     Plane,
-    Planes,
+    PlaneSet,
     RoomEstimate,
     advantage,
     correlation_score,
-    explained,
-    in_step,
+    log_explained,
+    sign_alternatives,
 )
-from swiftwrf.models.geometry.refine import deviations
+from swiftwrf.models.geometry.refine import offset_covariance
 from swiftwrf.models.geometry.sample import Residual, residual_statistics
 
-CERTAIN = 3.0  # standard errors by which a plane must be better than in a rival place to be certain
-VAGUE = 0.5  # deviation [rad of phase] beyond which a plane is not certain
-FLAT = 0.8  # spread of the positions in any direction [rad of phase] up to which they count as flat
-SCALES = (0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05)  # of the carrier that rivals the given one
-MISFIT = 0.02  # wavelengths that planes are off where nothing is explained: what is not modelled is no random noise
+MAX_STD_RAD = 0.5  # of phase, beyond which a plane is not certain
+MIN_SPREAD_RAD = 0.8  # of phase: positions with less spread in any direction count as flat
+CARRIER_SCALES = (0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05)  # of alternative carriers
+SYSTEMATIC_STD_WAVELENGTHS = 0.02  # of planes that explain nothing, because unmodelled paths are no random noise
 
 
-def assess(train: Spectra, scene: Scene, room: Planes, score: float, reach: float) -> RoomEstimate:
+def assess(
+    train: Spectra, scene: PhaseObservations, room: PlaneSet, score: float, reach: float, certainty: float
+) -> RoomEstimate:
     """Return the planes of a room with their standard deviations, and which of them are identifiable.
 
     Args:
@@ -39,27 +40,30 @@ def assess(train: Spectra, scene: Scene, room: Planes, score: float, reach: floa
         room: Refined planes in world coordinates.
         score: Score at held-out positions.
         reach: Standard deviation [m] of planes that are not identifiable.
+        certainty: Standard errors by which a plane must explain the spectra better than its alternatives.
     """
     assert train.array is not None
     unexplained = 1 - (1 - correlation_score(scene, room, train.array)) ** 2
     if not room.normal.shape[1]:
         nothing = torch.zeros(0, 0, dtype=torch.float64)
         return RoomEstimate([], room.order, score, unexplained, "no plane explains the spectra", nothing, Residual())
-    covariance = deviations(scene, room.normal, room.offset, room.gain, room.sequence)
-    systematic = MISFIT * train.array.wavelength * math.sqrt(max(unexplained, 0))
+    covariance = offset_covariance(scene, room.normal, room.offset, room.gain, room.sequence)
+    systematic = SYSTEMATIC_STD_WAVELENGTHS * train.array.wavelength * math.sqrt(max(unexplained, 0))
     covariance = covariance + systematic**2 * torch.eye(len(covariance), dtype=torch.float64)
     direct = float(train.line_of_sight.double().mean())
     residual = residual_statistics(scene, room.normal, room.offset, room.gain, room.sequence, direct)
-    doubt = _flat(scene) or _other_carrier(scene, room)
+    doubt = _flat(scene) or _other_carrier(scene, room, certainty)
     std = covariance.diagonal().clamp_min(0).sqrt().tolist()
-    twins = [(twin, explained(scene.coherence(twin.field(scene)))) for twin in turned(scene, room)]
-    rivals = [_rival(scene, room, i, twins) for i in range(len(std))]
-    lost = [rival <= CERTAIN or s * scene.wavenumber > VAGUE for s, (rival, _) in zip(std, rivals, strict=True)]
-    # rooms most of whose planes could stand elsewhere may be wrong as a whole, each plane holding the others
+    alternatives = [
+        (room_, log_explained(scene.coherence(room_.field(scene)))) for room_ in phase_alternatives(scene, room)
+    ]
+    nearest = [_nearest_alternative(scene, room, i, alternatives) for i in range(len(std))]
+    lost = [lead <= certainty or s * scene.wavenumber > MAX_STD_RAD for s, (lead, _) in zip(std, nearest, strict=True)]
+    # a room most of whose planes have alternatives may be wrong as a whole, because each plane holds the others
     all_lost = bool(doubt) or sum(lost) > len(lost) / 2
     planes = []
-    for i, (rival, distance) in enumerate(rivals):
-        away = reach if all_lost else distance if rival <= CERTAIN else 0.0
+    for i, (lead, distance) in enumerate(nearest):
+        away = reach if all_lost else distance if lead <= certainty else 0.0
         x, y, z = room.normal[0, i].tolist()
         offset, gain = float(room.offset[0, i]), float(room.gain[0, i])
         planes.append(Plane((x, y, z), offset, gain, 1000 * max(std[i], away), not (lost[i] or all_lost)))
@@ -67,15 +71,22 @@ def assess(train: Spectra, scene: Scene, room: Planes, score: float, reach: floa
     return RoomEstimate(planes, room.order, score, unexplained, verdict, covariance, residual)
 
 
-def _rival(scene: Scene, room: Planes, plane: int, twins: list[tuple[Planes, Tensor]]) -> tuple[float, float]:
-    """By how many standard errors the plane's place is better than the best rival's, and how far that is away [m].
+def _nearest_alternative(
+    scene: PhaseObservations, room: PlaneSet, plane: int, alternatives: list[tuple[PlaneSet, Tensor]]
+) -> tuple[float, float]:
+    """Return the standard errors by which a plane explains the spectra better than its best alternative.
 
-    Rivals are the best place of a scan around the plane, and the places where a wave of the other sign is in step, each
-    refined together with all other planes; and `twins`, the rooms in which several planes are flipped, with how
-    well each explains the spectra.
+    Also return the distance of that alternative [m]. Alternatives are the best offset of a scan around the plane and the
+    offsets at which a wave of the other sign has the same phase, each refined together with all other planes.
+
+    Args:
+        scene: Observed phases.
+        room: Refined planes.
+        plane: Number of the plane.
+        alternatives: Rooms in which several planes are moved, and how well each explains the spectra.
     """
-    turn = turn_of(scene, room.normal, room.offset, plane)
-    step = torch.arange(turn / 2, 3.5 * turn, 0.4 / scene.wavenumber, dtype=torch.float64)
+    period = phase_period_m(scene, room.normal, room.offset, plane)
+    step = torch.arange(period / 2, 3.5 * period, 0.4 / scene.wavenumber, dtype=torch.float64)
     beside = torch.cat([-step.flip(0), step])
     offset = room.offset.repeat(len(beside), 1)
     offset[:, plane] += beside
@@ -85,30 +96,30 @@ def _rival(scene: Scene, room: Planes, plane: int, twins: list[tuple[Planes, Ten
     value = torch.stack([scene.score(base + field(scene, room.normal, o[None], room.gain, own)[0]) for o in offset])
     moved = room.offset.clone()
     moved[:, plane] += beside[value.argmin()]
-    here = explained(scene.coherence(room.field(scene)))
+    here = log_explained(scene.coherence(room.field(scene)))
     nearest = math.inf, 0.0
-    near = [other.refined(scene, 5) for other in (replace(room, offset=moved), *in_step(scene, room, plane))]
-    for other, there in [*((other, explained(scene.coherence(other.field(scene)))) for other in near), *twins]:
+    near = [other.refined(scene, 5) for other in (replace(room, offset=moved), *sign_alternatives(scene, room, plane))]
+    for other, there in [*((o, log_explained(scene.coherence(o.field(scene)))) for o in near), *alternatives]:
         distance = abs(float(other.offset[0, plane] - room.offset[0, plane]))
-        if distance > turn / 4:
+        if distance > period / 4:
             nearest = min(nearest, (advantage(here, there), distance))
     return nearest
 
 
-def _flat(scene: Scene) -> str:
-    """A doubt where the positions lie on a line or in a plane, from where many rooms look alike."""
+def _flat(scene: PhaseObservations) -> str:
+    """Return the reason if the positions lie on a line or in a plane, which leaves the room ambiguous, else nothing."""
     extent = torch.linalg.svdvals(scene.moving - scene.moving.mean(0)) / math.sqrt(len(scene))
-    if float(extent[2]) * scene.wavenumber > FLAT:
+    if float(extent[2]) * scene.wavenumber > MIN_SPREAD_RAD:
         return ""
-    shape = "a line" if float(extent[1]) * scene.wavenumber <= FLAT else "a plane"
+    shape = "a line" if float(extent[1]) * scene.wavenumber <= MIN_SPREAD_RAD else "a plane"
     return f"; the positions lie on {shape}, from where many rooms look alike"
 
 
-def _other_carrier(scene: Scene, room: Planes) -> str:
-    """A doubt where another carrier explains the spectra clearly better, else nothing."""
-    for scale in SCALES:
+def _other_carrier(scene: PhaseObservations, room: PlaneSet, certainty: float) -> str:
+    """Return the reason if another carrier explains the spectra significantly better, else nothing."""
+    for scale in CARRIER_SCALES:
         other = replace(scene, wavenumber=scale * scene.wavenumber)
-        rival = other.coherence(room.refined(other, 6).field(other))
-        if advantage(rival, scene.coherence(room.field(scene))) > CERTAIN:
+        explained = other.coherence(room.refined(other, 6).field(other))
+        if advantage(explained, scene.coherence(room.field(scene))) > certainty:
             return f"; a carrier {100 * (scale - 1):+.0f} % from the given one explains the spectra better"
     return ""

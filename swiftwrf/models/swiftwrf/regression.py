@@ -18,7 +18,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.gp import EXACT, Kernel, NearbyField, SmoothField, held_out, thinned
+from swiftwrf.gp import Kernel, SmoothField, held_out, principal_components, thinned
 from swiftwrf.metrics import NORMAL_80
 from swiftwrf.models.swiftwrf.config import FitConfig, ModelConfig
 from swiftwrf.models.swiftwrf.deformation import COMPONENTS, Deformation
@@ -88,8 +88,7 @@ class Regression:
             score = torch.cat([(part - mean).flatten(1) @ flat.T for part in train.store.batches()])
             score = score / flat.square().sum(dim=1)
             position = normalise(train.position, centre, scale)
-            regress = SmoothField.regress if len(train) <= EXACT else NearbyField
-            scores = regress(position, self.kernel.scaled(1 / float(scale)), score)
+            scores = SmoothField.regress(position, self.kernel.scaled(1 / float(scale)), score)
             basis = torch.zeros(len(component), n, sum(COMPONENTS[c] for c in config.components))
             at = sum(COMPONENTS[c] for c in config.components[: config.components.index("response")])
             basis[..., at] = response[1:] / attenuation
@@ -98,12 +97,9 @@ class Regression:
 
     def _components(self, spectra: Spectra) -> tuple[Tensor, Tensor]:
         """Return mean (H, W) and principal components (K, H, W) of spectra, scaled by their standard deviations."""
-        mean = spectra.spectrum.mean(dim=0)
-        change = (spectra.spectrum - mean).flatten(1)
-        variance, vector = torch.linalg.eigh((change @ change.T).double())
-        rank = min(int(self.config.model.rank), int((variance > MIN_VARIANCE * variance.sum()).sum()))
-        component = vector.T[len(vector) - rank :].float() @ change / math.sqrt(len(change))
-        return mean, component.reshape(rank, *mean.shape)
+        flat = spectra.spectrum.flatten(1)
+        mean, _, component = principal_components(flat, int(self.config.model.rank), MIN_VARIANCE)
+        return mean.reshape(spectra.grid.shape), (component / math.sqrt(len(flat))).reshape(-1, *spectra.grid.shape)
 
     def _held_out(self, spectra: Spectra, kernel: Tensor) -> tuple[Tensor, Tensor]:
         """Return held-out predictions (n, H, W) of spectra, and their variances relative to the prior, (n,)."""

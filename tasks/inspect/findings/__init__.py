@@ -1,17 +1,17 @@
-"""What measurements hold, and what about them may be wrong, in sentences."""
+"""Findings on measurements, in sentences: what they hold, and what may be wrong."""
 
 from __future__ import annotations
 
 from swiftwrf.array.beamforming import PHASE
-from swiftwrf.data import Reading, Rssi, Snapshots, Spectra
+from swiftwrf.data import ReadOptions, Rssi, Snapshots, Spectra
 from tasks.inspect.findings.base import Findings
 from tasks.inspect.findings.rssi import check_rssi
 from tasks.inspect.findings.snapshots import check_calibration, check_snapshots
 from tasks.inspect.findings.spectra import check_peaks, check_spectra
 
 
-def inspect(data: Spectra | Snapshots | Rssi, how: Reading) -> tuple[Findings, Spectra | Rssi]:
-    """Findings, and the spectra of snapshots."""
+def inspect(data: Spectra | Snapshots | Rssi, options: ReadOptions) -> tuple[Findings, Spectra | Rssi]:
+    """Return the findings, and the spectra of snapshots."""
     findings = Findings()
     for note in data.notes:
         findings.say(f"{note}.")
@@ -21,7 +21,7 @@ def inspect(data: Spectra | Snapshots | Rssi, how: Reading) -> tuple[Findings, S
     spectra = data
     if isinstance(data, Snapshots):
         check_snapshots(data, findings)
-        spectra = data.spectra(how.grid, how.beamformer or PHASE)
+        spectra = data.spectra(options.grid, options.beamformer or PHASE)
     assert isinstance(spectra, Spectra)
     check_spectra(spectra, findings)
     check_peaks(spectra, findings)

@@ -1,4 +1,4 @@
-"""What RSSI holds, and whether it falls with the distance."""
+"""Findings on RSSI: its values, and whether it decreases with distance."""
 
 from __future__ import annotations
 
@@ -8,56 +8,60 @@ from torch import Tensor
 
 from swiftwrf.data import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
-from swiftwrf.diagnostics.frames import check_law
+from swiftwrf.diagnostics.frames import check_path_loss
 from swiftwrf.errors import listed
 from tasks.inspect.findings.base import Findings
 from tasks.inspect.findings.positions import check_positions, say_splits
 
-STRONG = 10.0  # [dBm] at 1 m, which no usual transmitter reaches
-REPEATED = 0.2  # share of one value at the edge that is no chance
+MAX_LEVEL_DBM = 10.0  # at 1 m, which no usual transmitter reaches
+MAX_EDGE_SHARE = 0.2  # of the weakest value, if it stands apart
 
 
 def check_rssi(data: Rssi, findings: Findings) -> None:
-    """What rows of RSSI hold."""
-    heard = ~data.rssi_dbm.isnan()
-    share = float(heard.double().mean())
-    low, high = float(data.rssi_dbm[heard].min()), float(data.rssi_dbm[heard].max())
+    """Report number, range and suspicious columns of RSSI."""
+    detected = data.detected
+    share = float(detected.double().mean())
+    low, high = float(data.rssi_dbm[detected].min()), float(data.rssi_dbm[detected].max())
     findings.say(
-        f"{len(data)} rows of RSSI at {len(data.receiver_names)} receivers, {share:.0%} heard, {low:g} to {high:g} dBm.",
+        f"{len(data)} rows of RSSI at {len(data.receiver_names)} receivers, {share:.0%} detected, {low:g} to {high:g} dBm.",
         kind="rssi",
         receivers=len(data.receiver_names),
         heard_share=share,
     )
     check_positions(data.transmitter_position, findings)
-    count = heard.sum(dim=0)
+    count = detected.sum(dim=0)
     few = [name for name, n in zip(data.receiver_names, count.tolist(), strict=True) if n < MIN_TRAINING]
     if few:
-        findings.warn(f"Heard in fewer than {MIN_TRAINING} rows, too few to learn from: {listed(few)}.")
-    _columns(data, heard, findings)
-    _law(data, findings)
+        findings.warn(f"Receivers that detected fewer than {MIN_TRAINING} rows, too few to fit a model: {listed(few)}.")
+    _columns(data, detected, findings)
+    _path_loss(data, findings)
     say_splits(data, findings)
 
 
-def _columns(data: Rssi, heard: Tensor, findings: Findings) -> None:
-    """Receivers whose values look like something else than received power."""
+def _columns(data: Rssi, detected: Tensor, findings: Findings) -> None:
+    """Warn of receivers whose values do not look like received power."""
 
     def those(suspicious: Callable[[Tensor], bool]) -> list[str]:
-        columns = ((name, data.rssi_dbm[heard[:, c], c]) for c, name in enumerate(data.receiver_names))
+        columns = ((name, data.rssi_dbm[detected[:, c], c]) for c, name in enumerate(data.receiver_names))
         return [name for name, values in columns if len(values) >= MIN_TRAINING and suspicious(values)]
 
     if constant := those(lambda v: bool(v.min() == v.max())):
         findings.warn(f"Receivers with one value everywhere: {listed(constant)}.")
     if positive := those(lambda v: bool(v.min() < v.max() and v.max() >= 0)):
-        findings.warn(f"Receivers with values of 0 dBm and more, which few hear: {listed(positive)}.")
+        findings.warn(f"Receivers with values of 0 dBm and more, which few receivers measure: {listed(positive)}.")
 
     def edged(values: Tensor) -> bool:
         weakest = values == values.min()
         others = values[~weakest]
-        return len(others) > 0 and float(weakest.double().mean()) > REPEATED and float(others.min() - values.min()) > 3
+        return (
+            len(others) > 0
+            and float(weakest.double().mean()) > MAX_EDGE_SHARE
+            and float(others.min() - values.min()) > 3
+        )
 
     if repeated := those(edged):
         findings.warn(
-            f"The weakest value is frequent and stands apart; does it mean not heard? Receivers: {listed(repeated)}."
+            f"The weakest value is frequent and stands apart; does it mean not detected? Receivers: {listed(repeated)}."
         )
     filled = data.rssi_dbm.nan_to_num(0.0)
     same = [
@@ -70,20 +74,20 @@ def _columns(data: Rssi, heard: Tensor, findings: Findings) -> None:
         findings.warn(f"Receivers with the same values: {listed(same)}.")
 
 
-def _law(data: Rssi, findings: Findings) -> None:
-    report = check_law(data)
+def _path_loss(data: Rssi, findings: Findings) -> None:
+    report = check_path_loss(data)
     if report is None:
-        findings.say("The receivers' positions are unknown, so there is no law of the distance; other predictors work.")
+        findings.say("The receivers' positions are unknown, so there is no path-loss model; other predictors work.")
         return
     findings.say(
-        f"A law of the distance explains {report.explained:.0%} of the variance of RSSI: {report.level_dbm:.0f} dBm at 1 m, "
-        f"falling with {report.exponent:.1f} powers of the distance.",
+        f"Path-loss models explain {report.explained:.0%} of the variance of RSSI: {report.level_dbm:.0f} dBm at 1 m, "
+        f"exponent {report.exponent:.1f}.",
         law_explained=report.explained,
         law_exponent=report.exponent,
     )
     if report.explanation:
         findings.warn(f"It would explain far more if {report.explanation}.", explanation=report.explanation)
-    if report.level_dbm > STRONG:
+    if report.level_dbm > MAX_LEVEL_DBM:
         findings.warn(
             f"{report.level_dbm:.0f} dBm at 1 m is more than usual transmitters give; are positions in millimetres?"
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from swiftwrf.data import Spectra
-from swiftwrf.diagnostics.frames import FEW, check_frames
+from swiftwrf.diagnostics.frames import MIN_CLEAR_POSITIONS, check_frames
 from tasks.inspect.findings.base import Findings
 from tasks.inspect.findings.positions import check_positions, say_splits
 
@@ -26,7 +26,7 @@ def check_spectra(data: Spectra, findings: Findings) -> None:
     )
     if data.array is None:
         findings.say(
-            "The antenna array and its carrier are not described (--array tells them); coarray and geometry need them."
+            "The antenna array and its carrier are not described (give them with --array); coarray and geometry need them."
         )
     least, peak = torch.cat([torch.stack(part.flatten(1).aminmax(dim=1)) for part in data.store.batches()], dim=1)
     if float(peak.min()) < 0.05:
@@ -41,7 +41,8 @@ def check_peaks(data: Spectra, findings: Findings) -> None:
     report = check_frames(data)
     if report is None:
         findings.warn(
-            f"Frames cannot be checked: that needs the fixed end, the orientation and {FEW} positions with line of sight."
+            "Frames cannot be checked: that needs the fixed end, the orientation and "
+            f"{MIN_CLEAR_POSITIONS} positions with line of sight."
         )
         return
     numbers = {

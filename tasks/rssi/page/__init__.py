@@ -1,4 +1,4 @@
-"""The report of RSSI runs, one or several."""
+"""The report of one RSSI run or several."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from pandas import DataFrame
 
 from tasks.page import figures
+from tasks.page.labels import PREDICTORS as LABELS
+from tasks.page.labels import labels
 from tasks.page.page import Page, Plot, Section, Table
 from tasks.page.palette import Palette
 from tasks.page.provenance import number, provenance
@@ -18,18 +20,18 @@ from tasks.rssi.page.summary import OWN, RssiRecords, by_method, summary, varies
 from tasks.rssi.predictors import PREDICTORS
 from tasks.summarise import SHORTEST, paired_difference, running_median
 
-MOST_MAPS = 24  # receivers with a map in the report; all are in the tables
+MAX_MAPS = 24  # receivers with a map in the report; all are in the tables
+MAX_VECTOR_DOTS = 300  # more dots become an image: their white edges hide the colours, and the page grows to megabytes
 _FIELDS = {"predicted": "predicted_dbm", "width": "width_db"}
-MANY = 300  # dots: white edges would hide the colours of so many, and each drawn by itself makes a page of megabytes
 
 
 def palette() -> Palette:
-    """Of the predictors; the mean, which uses no position, is dashed."""
-    return Palette.of(PREDICTORS.entries(), dashed=["mean"])
+    """Return the colours of the predictors; the mean, which uses no position, is dashed."""
+    return Palette.of(labels(PREDICTORS, LABELS), dashed=["mean"])
 
 
 def page(runs: list[RssiRecords]) -> Page:
-    """The page of these runs."""
+    """Return the page of these runs."""
     sections = [section for run in runs for section in _run(run, several=len(runs) > 1)]
     names = ", ".join(dict.fromkeys(run.place for run in runs))
     picture = Plot("summary", _maps(runs[0], "predicted", "predicted RSSI [dBm]", 1), _MAP_CAPTION, _cells(runs[0], 1))
@@ -67,7 +69,7 @@ def _run(run: RssiRecords, several: bool) -> list[Section]:
             [f"Left out: {reason}." for reason in run.metrics.get("left_out", {}).values()],
             [_table(run), _paired(run)],
             plots,
-            {entry.name: entry.meaning for entry in PREDICTORS.entries()},
+            {name: label.meaning for name, label in labels(PREDICTORS, LABELS).items()},
         ),
         Section(f"Maps{suffix}", plots=maps),
         Section(f"Where the errors are{suffix}", plots=[_where(run)]),
@@ -76,18 +78,18 @@ def _run(run: RssiRecords, several: bool) -> list[Section]:
 
 
 _MAP_CAPTION = (
-    "The predicted field with the training measurements in the same colours; a cross marks the receiver where its place is "
-    "known. At the median height of the measurements."
+    "Predicted RSSI and the training measurements in the same colours, at the median height of the measurements. A cross "
+    "marks the receiver if its position is known."
 )
 _WIDER = "Wider away from measurements."
-_EVEN = "Equally wide everywhere: held-out measurements call for no field around these receivers."
+_EVEN = "Equally wide everywhere: a field does not improve the predictions of held-out measurements at these receivers."
 _WHERE_CAPTION = (
-    "Predicted against measured, and the absolute error (dots; line: running median) against the distance from the "
-    "receiver, where its place is known, and from the nearest training position. SwiftWRF, all receivers."
+    "Predicted against measured RSSI, and the absolute error (dots; line: running median) against the distance from the "
+    "receiver, if its position is known, and from the nearest training position. SwiftWRF, all receivers."
 )
 _SPEED_CAPTION = (
     "Seconds to fit and to predict the test rows against the median error, both logarithmic. The line is the Pareto front: "
-    "whatever is not on it is beaten in both by a method that is."
+    "for every method off it, a method on it is faster and more accurate."
 )
 
 
@@ -102,7 +104,7 @@ def _table(run: RssiRecords) -> Table:
     return Table(
         columns,
         rows,
-        "Absolute error over all heard test pairs; median with its 95 % interval.",
+        "Absolute error over all detected test pairs; median with its 95 % interval.",
         frozenset([OWN]),
     )
 
@@ -114,7 +116,9 @@ def _paired(run: RssiRecords) -> Table:
             mean, low, high = paired_difference(errors, OWN, name)
             interval = "" if math.isnan(low) else f" [{low:+.2f}, {high:+.2f}]"
             rows.append([name, f"{mean:+.2f}{interval}"])
-    caption = "Mean of SwiftWRF's absolute error minus the method's on the same pairs; 95 % bootstrap over test rows."
+    caption = (
+        "Mean of SwiftWRF's absolute error minus that of the method on the same pairs; 95 % bootstrap over test rows."
+    )
     return Table(["against", "difference [dB]"], rows, caption)
 
 
@@ -123,7 +127,7 @@ def _receivers(run: RssiRecords) -> list[str]:
 
 
 def _heights(run: RssiRecords) -> dict[str, list[tuple[float, float, float]]]:
-    """Median error and its interval by method, in the order of the receivers."""
+    """Return the median error and its interval by method, in the order of the receivers."""
     heights = {}
     for name in run.metrics["overall"]:
         errors = [methods[name]["abs_error_db"] for methods in run.metrics["receivers"].values()]
@@ -145,30 +149,30 @@ def _cdf(errors: DataFrame) -> Figure:
     groups = {str(name): part["abs_error_db"] for name, part in errors.groupby("method", sort=False)}
     limit = float(errors["abs_error_db"].quantile(0.98))
     figures.cdf(axes[0], palette(), groups, "absolute error [dB]", limit)
-    axes[0].set_ylabel("share of heard test pairs")
+    axes[0].set_ylabel("fraction of detected test pairs")
     figures.legend_below(figure, axes[0])
     return figure
 
 
-def _heard_most(maps: dict[str, NDArray[Any]], most: int) -> list[int]:
-    """Of the receivers, so many that were heard most, in their own order."""
-    heard = (~np.isnan(maps["measured"])).sum(axis=0)
-    return sorted(np.argsort(-heard, kind="stable")[:most].tolist())
+def _most_detected(maps: dict[str, NDArray[Any]], n: int) -> list[int]:
+    """Return the columns of the n receivers that detected most rows, ascending."""
+    detected = (~np.isnan(maps["measured"])).sum(axis=0)
+    return sorted(np.argsort(-detected, kind="stable")[:n].tolist())
 
 
-def _cells(run: RssiRecords, most: int = MOST_MAPS) -> DataFrame:
-    """The maps that `_maps` draws, a row a cell and receiver."""
+def _cells(run: RssiRecords, n_maps: int = MAX_MAPS) -> DataFrame:
+    """Return the numbers of `_maps`, one row for each cell and receiver."""
     maps = run.arrays("maps")
-    shown = _heard_most(maps, most)
+    shown = _most_detected(maps, n_maps)
     names, ys, xs = (a.ravel() for a in np.meshgrid(maps["receiver_names"][shown], maps["y"], maps["x"], indexing="ij"))
     values = {field: maps[kind][shown].ravel().round(2) for kind, field in _FIELDS.items()}
     return DataFrame({"receiver": names, "x_m": xs.round(3), "y_m": ys.round(3)} | values)
 
 
-def _maps(run: RssiRecords, field: str, label: str, most: int = MOST_MAPS) -> Figure:
-    """Of the receivers that were heard most, in their own order."""
+def _maps(run: RssiRecords, field: str, label: str, n_maps: int = MAX_MAPS) -> Figure:
+    """Draw maps of the receivers that detected most rows."""
     maps = run.arrays("maps")
-    shown = _heard_most(maps, most)
+    shown = _most_detected(maps, n_maps)
     n = len(shown)
     columns = min(3, n)
     rows = -(-n // columns)
@@ -180,35 +184,21 @@ def _maps(run: RssiRecords, field: str, label: str, most: int = MOST_MAPS) -> Fi
     extent = (maps["x"][0], maps["x"][-1], maps["y"][0], maps["y"][-1])
     for ax in axes[n:]:
         ax.set_visible(False)
+    style: dict[str, Any] = {"cmap": "viridis" if field == "predicted" else "magma", "vmin": low, "vmax": high}
     for panel, (i, ax) in enumerate(zip(shown, axes, strict=False)):
-        left, bottom = panel % columns == 0, panel + columns >= n  # one ruler serves all panels above and beside it
+        left, bottom = panel % columns == 0, panel + columns >= n  # one axis serves all panels above and beside it
         ax.tick_params(labelleft=left, labelbottom=bottom)
         ax.set(xlabel="x [m]" if bottom else "", ylabel="y [m]" if left else "")
         if "plan" in maps:
             ax.imshow(maps["plan"], extent=tuple(maps["plan_extent"]), aspect="equal", zorder=0)
-        see_through = 0.75 if "plan" in maps else 1.0
-        colours = "viridis" if field == "predicted" else "magma"
-        drawn = ax.imshow(
-            maps[field][i],
-            origin="lower",
-            extent=extent,
-            cmap=colours,
-            vmin=low,
-            vmax=high,
-            alpha=see_through,
-            zorder=1,
-        )
+        alpha = 0.75 if "plan" in maps else 1.0
+        drawn = ax.imshow(maps[field][i], origin="lower", extent=extent, alpha=alpha, zorder=1, **style)
         if field == "predicted":
-            heard = ~np.isnan(maps["measured"][:, i])
-            x, y = maps["measured_position"][heard, :2].T
-            dots = {
-                "cmap": colours,
-                "vmin": low,
-                "vmax": high,
-                "edgecolors": "white",
-                "linewidths": 0.3 if len(x) < MANY else 0,
-            }
-            ax.scatter(x, y, s=9, c=maps["measured"][heard, i], zorder=2, rasterized=len(x) >= MANY, **dots)
+            detected = ~np.isnan(maps["measured"][:, i])
+            x, y = maps["measured_position"][detected, :2].T
+            many, colours = len(x) >= MAX_VECTOR_DOTS, maps["measured"][detected, i]
+            edges: dict[str, Any] = {"edgecolors": "white", "linewidths": 0 if many else 0.3}
+            ax.scatter(x, y, s=9, c=colours, zorder=2, rasterized=many, **edges, **style)
         ax.plot(*maps["receiver"][i, :2], "x", color="#ee6677", markersize=9, markeredgewidth=2, zorder=3)
         ax.set_title(figures.short(str(maps["receiver_names"][i])), fontsize=9)
         ax.grid(visible=False)
@@ -226,7 +216,7 @@ def _where(run: RssiRecords) -> Plot:
     }
     columns = {column: label for column, label in columns.items() if own[column].notna().any()}
     figure, axes = figures.new_figure(1, 1 + len(columns), 4 * (1 + len(columns)), 3.6)
-    many = len(own) >= MANY
+    many = len(own) >= MAX_VECTOR_DOTS
     axes[0].plot(own["measured_dbm"], own["predicted_dbm"], ".", markersize=2, color=colour, rasterized=many)
     ends = [own["measured_dbm"].min(), own["measured_dbm"].max()]
     axes[0].plot(ends, ends, color=figures.RULE, linewidth=1)
@@ -257,13 +247,16 @@ def _speed(run: RssiRecords) -> Plot:
 
 def _limits(run: RssiRecords) -> Section:
     texts = [
-        "Single packets scatter about the mean of their place, BLE packets that do not say their channel by 2 to 3 dB; no "
-        "predictor of the mean can be better than this scatter is in the data at hand.",
-        "Values that were not heard are neither learnt from nor scored; nothing here says where a receiver is out of reach.",
-        "Intervals of medians treat pairs as independent draws; along a walked path they are not, and the intervals are too "
-        "narrow. The paired table draws whole test rows, which mends that in part.",
-        "The paper's table (2.91 dB for SwiftWRF, 6.74 for MRI) is of other data; compare methods here, not with it.",
+        "Single packets scatter about the mean of their position. BLE packets of unknown channel scatter by 2 to 3 dB. No "
+        "predictor of the mean has a lower error than this scatter.",
+        "Values that were not detected are neither training nor test data. The report does not show where a receiver is out "
+        "of range.",
+        "Intervals of medians treat pairs as independent. Along a walked path they are not, and the intervals are too "
+        "narrow. The bootstrap of the paired table samples whole test rows, which corrects this in part.",
+        "The paper's table (2.91 dB for SwiftWRF, 6.74 dB for MRI) is of other data. Compare methods in this report only.",
     ]
     if run.metrics["data"] == "simulated-floor":
-        texts.append("This floor is simulated. It shows that the software works, no more.")
+        texts.append(
+            "This floor is simulated. It shows that the software works, and not how accurate it is on measurements."
+        )
     return Section("What this does not show", texts)

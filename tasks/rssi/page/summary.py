@@ -1,4 +1,4 @@
-"""What the report says first: three numbers, a picture, what they mean, what to do next."""
+"""The summary of a report: three numbers, a picture, their meaning and the next steps."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from tasks.summarise import paired_difference
 
 RssiRecords = Records[RssiMetrics]
 OWN = "swiftwrf"  # the predictor that all others are compared with
-EVEN = 0.01  # difference of widths [dB] up to which an interval counts as equally wide everywhere
-MISCALIBRATED = 0.05  # difference of coverage from what is promised, from which on the report warns
+MAX_EVEN_DB = 0.01  # difference of widths up to which an interval counts as equally wide everywhere
+MAX_COVERAGE_ERROR = 0.05  # difference from the nominal coverage above which the report warns
 
 
 def summary(run: RssiRecords, picture: Plot) -> Summary:
-    """Of one run."""
+    """Return the summary of one run."""
     error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
     own = error[OWN]
     best = min((name for name in error if name != OWN), key=lambda name: error[name]["median"])
     interval = run.metrics["interval"]
-    law = "mri_pooled"
-    law_too = f"; one log-distance law for all receivers: {error[law]['median']:.2f} dB" if law in error else ""
+    shared = error.get("mri_pooled")
+    also = f"; one path-loss model for all receivers: {shared['median']:.2f} dB" if shared else ""
     numbers = [
         Number(
             f"{own['median']:.2f} dB",
             f"SwiftWRF's median absolute error, 95 % interval [{own['low']:.2f}, {own['high']:.2f}]; 90 % of the errors "
             f"are below {own['p90']:.1f} dB",
         ),
-        Number(f"{error[best]['median']:.2f} dB", f"the best baseline, {best}{law_too}"),
+        Number(f"{error[best]['median']:.2f} dB", f"the best baseline, {best}{also}"),
         Number(
             f"{interval['coverage']:.0%}",
             f"of the test measurements lie in the {interval['nominal']:.0%} interval that comes with each prediction",
@@ -41,24 +41,24 @@ def summary(run: RssiRecords, picture: Plot) -> Summary:
     ]
     receivers = len(run.metrics["receivers"])
     meaning = [
-        f"On {run.scene}, {run.metrics['n_train']} rows teach and {run.metrics['n_test']} test: {own['n']} heard pairs at "
-        f"{receivers} {'receiver' if receivers == 1 else 'receivers'}.",
+        f"On {run.scene}: {run.metrics['n_train']} training rows and {run.metrics['n_test']} test rows with {own['n']} "
+        f"detected pairs at {receivers} {'receiver' if receivers == 1 else 'receivers'}.",
         _against(run, best),
     ]
     return Summary(numbers, picture, meaning, _next_steps(run))
 
 
 def _against(run: RssiRecords, best: str) -> str:
-    """Whether the model is better than the best baseline, or whether that is not known."""
+    """Return a sentence that compares the model with the best baseline."""
     mean, low, high = paired_difference(by_method(run), OWN, best)
     if math.isnan(low):
-        return f"{run.metrics['n_test']} test rows are too few to tell SwiftWRF and {best} apart."
+        return f"{run.metrics['n_test']} test rows are too few to compare SwiftWRF with {best}."
     interval = f"{mean:+.2f} dB [{low:+.2f}, {high:+.2f}]"
     if high < 0:
         return f"On the same pairs SwiftWRF's mean error is lower than that of {best}: {interval}."
     if low > 0:
         return f"On the same pairs {best} has the lower mean error: SwiftWRF's differs by {interval}. Take {best} here."
-    return f"On the same pairs SwiftWRF and {best} cannot be told apart: {interval}."
+    return f"On the same pairs the errors of SwiftWRF and {best} do not differ significantly: {interval}."
 
 
 def _next_steps(run: RssiRecords) -> list[str]:
@@ -75,7 +75,7 @@ def _next_steps(run: RssiRecords) -> list[str]:
         )
     steps.append("predictions.csv has every test row with its prediction and interval.")
     interval = run.metrics["interval"]
-    if abs(interval["coverage"] - interval["nominal"]) > MISCALIBRATED:
+    if abs(interval["coverage"] - interval["nominal"]) > MAX_COVERAGE_ERROR:
         ranking = "take their widths as a ranking, not as a promise" if uneven else "do not rely on them"
         steps.append(f"The intervals are not calibrated on these rows; {ranking}.")
     if run.metrics["split"] == "random":
@@ -84,13 +84,12 @@ def _next_steps(run: RssiRecords) -> list[str]:
 
 
 def varies(width: NDArray[np.float64]) -> bool:
-    """Whether an interval is wider in some places than in others: a receiver whose RSSI follows from its law alone has one
-    width everywhere."""
-    return bool(np.ptp(width, axis=(1, 2)).max() > EVEN)
+    """Return True if an interval is wider at some positions than at others. Without a field it has one width everywhere."""
+    return bool(np.ptp(width, axis=(1, 2)).max() > MAX_EVEN_DB)
 
 
 def by_method(run: RssiRecords) -> DataFrame:
-    """Absolute errors, a row a pair, a column a method."""
+    """Return the absolute errors, one row for each pair and one column for each method."""
     errors: DataFrame = run.table("errors").pivot_table(
         index=["index", "receiver"], columns="method", values="abs_error_db"
     )

@@ -1,7 +1,11 @@
-"""Predictors of RSSI at every receiver from the transmitter's position, one or some like each other a file."""
+"""Predictors of RSSI at every receiver from the position of the transmitter."""
 
-from tasks.rssi.predictors.base import PREDICTORS, SLOW, Predictor, Settings, lacks
+from swiftwrf.comparison import NeRF2Rssi
+from swiftwrf.rssi import RssiModel
+from tasks.rssi.predictors.base import PREDICTORS, make_predictor
 
-PREDICTORS.discover(__name__, __path__, first=("swiftwrf", "laws", "regressors"))
+PREDICTORS.register("swiftwrf")(RssiModel)
+PREDICTORS.discover(__name__, __path__, first=("path_loss", "regressors"))
+PREDICTORS.register("nerf2")(NeRF2Rssi)
 
-__all__ = ["PREDICTORS", "SLOW", "Predictor", "Settings", "lacks"]
+__all__ = ["PREDICTORS", "make_predictor"]

@@ -1,58 +1,34 @@
-"""What every predictor of RSSI is."""
+"""The registry of RSSI predictors."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, Protocol
+from dataclasses import fields
+from typing import Any, Literal
 
-import torch
-from torch import Tensor
-
-from swiftwrf import Rssi
-from swiftwrf.data.splits import Validation
-from swiftwrf.rssi import Map
+from swiftwrf.rssi import RssiPredictor
 from swiftwrf.runtime.registry import Registry
 
-RECEIVERS = "positions of the receivers"  # what predictors of the log-distance law need of the data
-SLOW = ("nerf2", "blend")  # compared only where they are asked for
+Preset = Literal["quick", "paper"]
+PREDICTORS: Registry[RssiPredictor] = Registry("predictor", "swiftwrf.rssi_predictors")
 
 
-class Predictor(Protocol):
-    """Learns from rows where RSSI was heard, then tells it at any position."""
-
-    def fit(self, train: Rssi) -> None:
-        """Learns; `train` is all it ever sees."""
-
-    def predict(self, position: Tensor) -> Tensor:
-        """RSSI (n, R) [dBm] at transmitter positions (n, 3) [m]."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What a predictor is made from.
+def make_predictor(name: str, preset: Preset = "quick", **options: Any) -> RssiPredictor:
+    """Return a predictor by its name, with those of the options that it has.
 
     Args:
-        validation: how training rows are held out to choose its settings.
-        seed: of what is random.
-        preset: of SwiftWRF and NeRF2: `quick`, or `paper` for the plain head and the published field.
-        device: where these compute.
-        parallel: how SwiftWRF's groups of receivers are mapped.
-        pool: the training rows at every receiver of the data; those asked for unless given.
+        name: Name in the registry, e.g. "knn".
+        preset: "quick", or "paper" for the published configuration of a predictor that has one.
+        options: Options such as seed and validation. A predictor ignores options that it does not have.
+
+    Raises:
+        InputError: An unknown name, or a value outside its range.
+
+    Example:
+        >>> make_predictor("swiftwrf", "paper", seed=3).config.paper_head
+        True
     """
-
-    validation: Validation = "random"
-    seed: int = 0
-    preset: Literal["quick", "paper"] = "quick"
-    device: torch.device | str = "cpu"
-    parallel: Map = map
-    pool: Rssi | None = None
-
-
-PREDICTORS = Registry[Predictor]("predictor")
-
-
-def lacks(name: str, data: Rssi) -> str:
-    """Why a predictor cannot be had of these data, in a sentence; nothing where it can."""
-    if RECEIVERS in PREDICTORS[name].needs and not data.located:
-        return f"{name} needs the {RECEIVERS}, which {data.name} does not tell"
-    return ""
+    predictor_type = PREDICTORS[name]
+    config_type = predictor_type.config_type
+    config = config_type.paper() if preset == "paper" and hasattr(config_type, "paper") else config_type()
+    known = {field.name for field in fields(config_type)}
+    return predictor_type(config, **{key: value for key, value in options.items() if key in known})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from typing import Any
 
 import numpy as np
@@ -18,71 +18,75 @@ from torch import Tensor
 
 from swiftwrf import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
+from swiftwrf.rssi import RssiFitContext, RssiPredictor
 from swiftwrf.runtime.threads import side_by_side
-from tasks.rssi.predictors.base import PREDICTORS, Predictor, Settings
-from tasks.rssi.predictors.laws import LogDistance, Mean
+from tasks.rssi.predictors.base import PREDICTORS
+from tasks.rssi.predictors.path_loss import Mean, ReceiverPathLoss
 
-# scikit-learn's own choice for many neighbours takes distances from squares and a product, which map coordinates cancel
-SEARCH = "kd_tree"
-NEIGHBOURS = (1, 3, 5, 8, 12, 20, 40, 80, 120)
-TUNED_ROWS, KEPT_ROWS = 500, 1500  # of the Gaussian process: its cost grows with their cube
+# scikit-learn's own choice for many neighbours computes distances from squares and a product, which cancel map coordinates
+NEIGHBOUR_SEARCH = "kd_tree"
+NEIGHBOUR_COUNTS = (1, 3, 5, 8, 12, 20, 40, 80, 120)
+MAX_TUNING_ROWS, MAX_GP_ROWS = 500, 1500  # the cost of the Gaussian process grows with their cube
 
 
-class _PerReceiver(ABC):
-    """One scikit-learn regressor on the position for each receiver, on RSSI itself or on what a simpler predictor leaves."""
+class ReceiverRegressors(RssiPredictor):
+    """Base class: one scikit-learn regressor on the position for each receiver.
 
-    def __init__(self, settings: Settings) -> None:
-        self._validation, self._seed = settings.validation, settings.seed
+    The regressors are fitted to the residual of a simpler predictor, if `_base` returns one, else to the RSSI itself.
+    """
 
-    def _simpler(self, train: Rssi) -> Predictor | None:
-        """The predictor whose residuals are learnt."""
+    batch_size = 2**20  # scikit-learn bounds its memory itself
+
+    def _base(self, train: Rssi) -> RssiPredictor | None:
+        """Return the predictor whose residual is learnt."""
         return None
 
-    def fit(self, train: Rssi) -> None:
-        residual = train.rssi_dbm
-        self._base = self._simpler(train)
-        if self._base is not None:
-            self._base.fit(train)
-            residual = residual - self._base.predict(train.transmitter_position)
-        fold = folds(train.transmitter_position, self._validation, self._seed).numpy()
+    @abstractmethod
+    def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
+        """Return a regressor fitted to positions (n, 3) and values (n,) of one receiver."""
+
+    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+        residual, base = train.rssi_dbm, self._base(train)
+        self._simpler = base and base.fit(train)
+        if self._simpler is not None:
+            residual = residual - self._simpler.predict(train.transmitter_position).mean
+        fold = folds(train.transmitter_position, self.config.validation, self.config.seed).numpy()
         position = train.transmitter_position.numpy()
-        typical = float(residual.nanmean())
+        mean = float(residual.nanmean())
 
         def fit(values: NDArray[Any]) -> Any:
-            heard = ~np.isnan(values)
-            if heard.sum() < MIN_TRAINING:  # too few to choose anything: their mean, or that of all
-                level = float(values[heard].mean()) if heard.any() else typical
+            detected = ~np.isnan(values)
+            if detected.sum() < MIN_TRAINING:  # too few to choose settings: their mean, or that of all receivers
+                level = float(values[detected].mean()) if detected.any() else mean
                 return DummyRegressor(strategy="constant", constant=level).fit(position, 0 * position[:, 0])
-            own = fold[heard]
-            if np.bincount(own).max() == len(own):  # heard in one region alone: no region is left to learn from
+            own = fold[detected]
+            if np.bincount(own).max() == len(own):  # detected in one region only: no other region is left to learn from
                 own = np.arange(len(own)) % (fold.max() + 1)
-            return self._regressor(position[heard], values[heard], own)
+            return self._regressor(position[detected], values[detected], own)
 
         with warnings.catch_warnings():  # around all: threads share the filters
             warnings.simplefilter("ignore", ConvergenceWarning)  # a bound that is reached is the answer
             self._regressors = side_by_side(fit, residual.numpy().T)
 
-    @abstractmethod
-    def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
-        """A regressor fitted to one receiver's positions (n, 3) and values (n,)."""
-
-    def predict(self, position: Tensor) -> Tensor:
-        x = position.double().numpy()
+    def _predict(self, position: Tensor) -> tuple[Tensor, None]:
+        x = position.detach().numpy()
         predicted = torch.from_numpy(np.stack([regressor.predict(x) for regressor in self._regressors], axis=1))
-        return predicted if self._base is None else predicted + self._base.predict(position)
+        return predicted if self._simpler is None else predicted + self._simpler.predict(position.detach()).mean, None
 
 
 @PREDICTORS.register("knn")
-class NearestNeighbours(_PerReceiver):
+class KNNPredictor(ReceiverRegressors):
     """Inverse-distance mean of the k nearest measurements of RSSI; k by cross-validation in the training rows."""
+
+    name = "knn"
 
     def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
         numbers = np.unique(fold)
         fewest = len(y) - int(np.bincount(fold).max())
-        errors = {(k, weights): 0.0 for k in NEIGHBOURS if k <= fewest for weights in ("uniform", "distance")}
-        for number in numbers:  # one search for neighbours serves all settings, as GridSearchCV would not
+        errors = {(k, weights): 0.0 for k in NEIGHBOUR_COUNTS if k <= fewest for weights in ("uniform", "distance")}
+        for number in numbers:  # one search for neighbours serves all settings; GridSearchCV repeats it
             out, kept = fold == number, fold != number
-            search = NearestNeighbors(n_neighbors=max(errors)[0], algorithm=SEARCH)
+            search = NearestNeighbors(n_neighbors=max(errors)[0], algorithm=NEIGHBOUR_SEARCH)
             distance, row = search.fit(x[kept]).kneighbors(x[out])
             near = y[kept][row]
             with np.errstate(divide="ignore"):
@@ -93,32 +97,41 @@ class NearestNeighbours(_PerReceiver):
                 predicted = (weight * near[:, :k]).sum(axis=1) / weight.sum(axis=1)
                 errors[k, weights] += float(np.abs(predicted - y[out]).mean()) / len(numbers)
         k, weights = min(errors, key=lambda setting: errors[setting])
-        return KNeighborsRegressor(k, weights=weights, algorithm=SEARCH).fit(x, y)
+        return KNeighborsRegressor(k, weights=weights, algorithm=NEIGHBOUR_SEARCH).fit(x, y)
 
 
 @PREDICTORS.register("mri_residual")
-class NearestResiduals(NearestNeighbours):
-    """The same of what the log-distance law of the receiver leaves (near to the published MRI: Shin et al., IEEE TMC 14(6),
-    2015)."""
+class ResidualKNNPredictor(KNNPredictor):
+    """The receiver's path-loss model, and the mean of its nearest residuals.
 
-    def _simpler(self, train: Rssi) -> Predictor:
-        return LogDistance(pooled=False)
+    It is close to the published MRI (Shin et al., IEEE Transactions on Mobile Computing 14(6), 2015).
+    """
+
+    name = "mri_residual"
+    requires_receiver_position = True
+
+    def _base(self, train: Rssi) -> RssiPredictor:
+        return ReceiverPathLoss()
 
 
 @PREDICTORS.register("gp")
-class GaussianProcess(_PerReceiver):
-    """A Gaussian process on what the log-distance law of the receiver leaves, or its mean where the receiver's position is
-    unknown: Matern 3/2 and white noise, hyper-parameters by marginal likelihood in the training rows (C. E. Rasmussen and
-    C. K. I. Williams, 2006)."""
+class GPPredictor(ReceiverRegressors):
+    """A Gaussian process on the residual of the receiver's path-loss model.
 
-    def _simpler(self, train: Rssi) -> Predictor:
-        return LogDistance(pooled=False) if train.located else Mean()
+    Without positions of the receivers it is on the residual of the mean. The kernel is Matern 3/2 and white noise, its
+    parameters by marginal likelihood in the training rows (C. E. Rasmussen and C. K. I. Williams, 2006).
+    """
+
+    name = "gp"
+
+    def _base(self, train: Rssi) -> RssiPredictor:
+        return ReceiverPathLoss() if train.located else Mean()
 
     def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
         scale = max(float(np.var(y)), 1e-6)
         kernel = ConstantKernel(scale / 3, (scale * 1e-3, scale * 10)) * Matern(2.0, (0.1, 50.0), nu=1.5)
         kernel = kernel + WhiteKernel(scale / 2, (scale * 1e-3, scale * 10))
-        order = np.random.default_rng(self._seed).permutation(len(y))
-        tuned, kept = order[:TUNED_ROWS], order[:KEPT_ROWS]
-        fitted = GaussianProcessRegressor(kernel, random_state=self._seed).fit(x[tuned], y[tuned])
+        order = np.random.default_rng(self.config.seed).permutation(len(y))
+        tuned, kept = order[:MAX_TUNING_ROWS], order[:MAX_GP_ROWS]
+        fitted = GaussianProcessRegressor(kernel, random_state=self.config.seed).fit(x[tuned], y[tuned])
         return GaussianProcessRegressor(fitted.kernel_, optimizer=None).fit(x[kept], y[kept])

@@ -25,7 +25,7 @@ class LowRankDeformation(Deformation):
     product, for any number of primitives.
 
     Args:
-        field: The smooth functions. A `NearbyField` cannot be fitted by gradient descent.
+        field: The smooth functions. A local field cannot be fitted by gradient descent.
         basis: Offsets of the primitives, (K, N, sum of component sizes).
         components: Parameters that deform.
         deviation: Calibration factor between the prior's standard deviation of a spectrum and the measured one; 0 if
@@ -36,7 +36,7 @@ class LowRankDeformation(Deformation):
 
     def __init__(
         self,
-        field: gp.SmoothField | gp.NearbyField,
+        field: gp.SmoothField,
         basis: Tensor,
         components: tuple[str, ...],
         deviation: float = 0.0,
@@ -63,9 +63,8 @@ class LowRankDeformation(Deformation):
         if not float(tensors["deviation"]) >= 0:
             raise InputError(f"deviation is {float(tensors['deviation'])}, expected 0 or more")
         anchor, basis = tensors["field.anchor"], tensors["basis"].clone()
-        if exact:
-            return cls(gp.SmoothField(anchor, kernel, rank, tensors["field.whiten"]), basis, components)
-        return cls(gp.NearbyField(anchor, kernel, tensors["field.value"]), basis, components)
+        whiten, value = tensors.get("field.whiten"), tensors.get("field.value")
+        return cls(gp.SmoothField(anchor, kernel, rank, whiten, value if not exact else None), basis, components)
 
     def header(self) -> Header:
         return {"kernel": asdict(self.field.kernel)}
@@ -84,9 +83,7 @@ class LowRankDeformation(Deformation):
         return self.deviation * (self.field.variance(position) + self.field.kernel.noise).sqrt()
 
     def prior(self) -> Tensor:
-        assert isinstance(self.field, gp.SmoothField)
         return self.field.prior()
 
     def parameter_groups(self, rate: float, own_rate: float | None) -> list[dict[str, Any]]:
-        assert isinstance(self.field, gp.SmoothField)
         return [{"params": [self.field.coefficient], "peak": rate}, {"params": [self.basis], "peak": rate / 2}]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -33,7 +34,9 @@ class PerPrimitiveMLP(Deformation):
         self.layers = skip_layers(inputs, WIDTH, DEPTH, SKIPS)
         self.output = nn.Linear(WIDTH, sum(COMPONENTS[c] for c in components))
         for layer in self.layers:
-            bound = 1 / math.sqrt(int(layer.in_features))  # torch's default, sampled from the given generator
+            bound = 1 / math.sqrt(
+                cast(nn.Linear, layer).in_features
+            )  # torch's default, sampled from the given generator
             for parameter in layer.parameters():
                 nn.init.uniform_(parameter, -bound, bound, generator=generator)
         nn.init.zeros_(self.output.weight)

@@ -1,0 +1,153 @@
+"""Propagation paths of links, and the spectra that an array computes from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from swiftwrf.array.angles import AngularGrid, to_angles
+from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
+from swiftwrf.data.dataset import Splits
+from swiftwrf.data.spectra import GRID, Moving, Spectra, array_spectra, check_pixels
+from swiftwrf.errors import InputError
+
+ARRAY_SIDE = 4  # elements, of the array that is assumed
+CARRIER_TOLERANCE = 1e-3  # relative difference between the carriers of paths and array
+
+
+@dataclass(frozen=True, eq=False)
+class PropagationPaths:
+    """The P propagation paths of n links, the paths of one link after those of the other.
+
+    Args:
+        transmitter: Position of each link's transmitter, float64 (n, 3) [m].
+        receiver: Position of each link's receiver, float64 (n, 3) [m].
+        count: Number of paths of each link, which may be 0, int64 (n,).
+        direction: Unit vectors from the receiver to where a path arrives from, world coordinates, float64 (P, 3).
+        gain: Complex amplitude of each path at the receiver, with the phase of its whole length, complex128 (P,).
+        line_of_sight: Whether the direct path is unobstructed, bool (n,).
+        frequency_hz: Frequency of the carrier [Hz].
+        length: Length of each path [m], float64 (P,), if it is known.
+        corner: Points of interaction from transmitter to receiver, nan after the last one, float64 (P, order, 3) [m], if
+            they are known.
+
+    Example:
+        >>> ends = torch.zeros(1, 3).double(), torch.tensor([[3.0, 0, 0]]).double()
+        >>> one, up = torch.ones(1), torch.tensor([[-1.0, 0, 0]]).double()
+        >>> PropagationPaths(*ends, one.long(), up, one.cfloat(), one.bool(), 2.4e9).owner
+        tensor([0])
+    """
+
+    transmitter: Tensor
+    receiver: Tensor
+    count: Tensor
+    direction: Tensor
+    gain: Tensor
+    line_of_sight: Tensor
+    frequency_hz: float
+    length: Tensor | None = None
+    corner: Tensor | None = None
+
+    @classmethod
+    def joined(cls, parts: Sequence[PropagationPaths]) -> PropagationPaths:
+        """Return the links of all parts, which have one carrier and the same known fields."""
+        first = parts[0]
+        columns = [f.name for f in fields(cls) if isinstance(getattr(first, f.name), Tensor)]
+        joined: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts]) for name in columns}
+        return replace(first, **joined)
+
+    @property
+    def owner(self) -> Tensor:
+        """Index of the link of each path, int64 (P,)."""
+        return torch.arange(len(self.count)).repeat_interleave(self.count)
+
+    @property
+    def order(self) -> Tensor:
+        """Number of interactions of each path, int64 (P,)."""
+        assert self.corner is not None
+        return self.corner[..., 0].isfinite().sum(dim=1)
+
+    @property
+    def power_db(self) -> Tensor:
+        """Sum of the powers of each link's paths, relative to the transmitted power, float64 (n,)."""
+        return 10 * torch.zeros(len(self.count)).double().index_add(0, self.owner, self.gain.abs().square()).log10()
+
+    @property
+    def reached(self) -> PropagationPaths:
+        """The links that have a path."""
+        some = self.count > 0
+        per_link = ("transmitter", "receiver", "count", "line_of_sight")
+        kept: dict[str, Any] = {name: getattr(self, name)[some] for name in per_link}
+        return replace(self, **kept)
+
+    def last_point(self) -> Tensor:
+        """Return the last point of each path before the receiver, float64 (P, 3) [m]."""
+        assert self.corner is not None
+        order, point = self.order, self.transmitter[self.owner].clone()
+        bent = order > 0
+        point[bent] = self.corner[bent, order[bent] - 1]
+        return point
+
+    def channel(self, array: PlanarArray, rotation: Tensor | None = None) -> Tensor:
+        """Return the channel of an array at each receiver, complex128 (n, K).
+
+        Args:
+            array: The array.
+            rotation: Matrix that rotates array into world coordinates, (3, 3). Defaults to a level array.
+        """
+        direction = self.direction if rotation is None else self.direction @ rotation
+        return array.channel(direction, self.gain, self.owner, len(self.count))
+
+    def spectra(
+        self,
+        name: str,
+        array: PlanarArray | None = None,
+        grid: AngularGrid | None = None,
+        *,
+        index: Tensor | None = None,
+        named_splits: Splits | None = None,
+        source: Mapping[str, str] | None = None,
+        notes: tuple[str, ...] = (),
+    ) -> Spectra:
+        """Return the spectra of a level array at each receiver, which folds paths from below to the upper half space.
+
+        Args:
+            name: Name of the data set.
+            array: The array. Defaults to 4 x 4 elements at half a wavelength.
+            grid: Directions. Defaults to 90 x 360.
+            index, named_splits, source, notes: As attributes of `Spectra`.
+
+        Raises:
+            InputError: An array for another carrier, or spectra of too many pixels.
+        """
+        grid = grid or GRID
+        check_pixels(name, len(self.count), grid)
+        array, wavelength = array or PlanarArray.square(ARRAY_SIDE, self.frequency_hz), LIGHT_SPEED / self.frequency_hz
+        if abs(array.wavelength - wavelength) > CARRIER_TOLERANCE * wavelength:
+            raise InputError(
+                f"{name} has a carrier of {self.frequency_hz:.6g} Hz, but the array was given with a wavelength of "
+                f"{array.wavelength:.4g} m, not {wavelength:.4g} m"
+            )
+        transmitters, receivers = (len(end.unique(dim=0)) for end in (self.transmitter, self.receiver))
+        moving: Moving = "receiver" if receivers >= transmitters else "transmitter"
+        position, fixed = (self.receiver, self.transmitter)[:: 1 if moving == "receiver" else -1]
+        return Spectra(
+            store=array_spectra(array, self.channel(array), grid),
+            position=position,
+            array=array,
+            grid=grid,
+            label=torch.stack(to_angles(self.transmitter - self.receiver), dim=-1),
+            line_of_sight=self.line_of_sight,
+            moving=moving,
+            name=name,
+            fixed_position=fixed[0] if min(transmitters, receivers) == 1 else None,
+            rotation=torch.eye(3, dtype=torch.float64),
+            index=index,
+            named_splits=named_splits,
+            source=source,
+            notes=notes,
+        )

@@ -1,0 +1,83 @@
+"""Field models and RSSI predictors in their smallest size, so that a fit takes a second or less."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import fields, replace
+from typing import Any, get_type_hints
+from unittest import mock
+
+from swiftwrf import FIELD_MODELS, FitConfig, ModelConfig, Spectra
+from swiftwrf.comparison import (
+    Config,
+    DcganConfig,
+    DcganSize,
+    NeRF2Config,
+    NeRF2Rssi,
+    NeRF2RssiConfig,
+    NeRF2RssiSize,
+    NeRF2Size,
+    VaeConfig,
+    VaeSize,
+    WrfGsConfig,
+    WrfGsSize,
+)
+from swiftwrf.models.geometry import GeometryConfig
+from swiftwrf.models.geometry.fit import search_room
+from swiftwrf.models.geometry.planes import RoomEstimate
+from swiftwrf.models.geometry.search import Search
+from swiftwrf.runtime.validation import configuration
+
+FIT = FitConfig(model=ModelConfig(n_primitives=4, rank=2), steps=30, check_every=5)
+SHORT = {"steps": 12, "check_every": 6, "batch": 8, "warm_up": 1}
+LONGER = {"steps": 60, "check_every": 30, "batch": 16, "rate": 1e-2}  # the loss of a batch is noisy in so short a fit
+PUBLISHED: dict[str, Config] = {
+    "nerf2": NeRF2Config(size=NeRF2Size(width=8, depth=6, bands=2, samples=6), rays=64, **LONGER),
+    "wrfgs": WrfGsConfig(size=WrfGsSize(n_gaussians=20, width=8, depth=6, bands=2), **SHORT),
+    "vae": VaeConfig(size=VaeSize(latent=2, width=2, hidden=8, bands=2), **LONGER),
+    "dcgan": DcganConfig(size=DcganSize(noise=2, width=2, hidden=8, bands=2), **LONGER),
+}
+PUBLISHED_RSSI = NeRF2RssiConfig(size=NeRF2RssiSize(width=8, bands=2, samples=4, azimuths=4, elevations=2), **LONGER)
+GLANCE = GeometryConfig(reach=0.5, positions=10, width=1, max_order=1, further=0)  # a short search that finds little
+
+
+def with_defaults(config: Any) -> type[Any]:
+    """Return a subclass of the configuration's class whose defaults are the values of the configuration."""
+    parent = type(config)
+    values = {field.name: getattr(config, field.name) for field in fields(config)}
+    annotations = get_type_hints(parent, include_extras=True)
+    return configuration(type(parent.__name__, (parent,), values | {"__annotations__": annotations}))
+
+
+@contextmanager
+def small_published() -> Iterator[None]:
+    """Give the methods of comparison small defaults."""
+    with ExitStack() as patches:
+        for name, config in PUBLISHED.items():
+            patches.enter_context(mock.patch.object(FIELD_MODELS[name], "config_type", with_defaults(config)))
+        patches.enter_context(mock.patch.object(NeRF2Rssi, "config_type", with_defaults(PUBLISHED_RSSI)))
+        yield
+
+
+@contextmanager
+def small_swiftwrf() -> Iterator[None]:
+    """Give SwiftWRF the defaults of a short fit by gradient descent."""
+    with mock.patch.object(FIELD_MODELS["swiftwrf"], "config_type", with_defaults(FIT)):
+        yield
+
+
+@contextmanager
+def glances() -> Iterator[None]:
+    """Shorten the search for rooms, which has its own tests."""
+
+    def glance(train: Spectra, config: GeometryConfig, progress: bool = False) -> RoomEstimate:
+        return search_room(train, replace(GLANCE, seed=config.seed, validation=config.validation), progress)
+
+    with (
+        mock.patch("swiftwrf.models.geometry.model.search_room", glance),
+        mock.patch("swiftwrf.models.geometry.fit.MIN_HELD_OUT", 1),
+        mock.patch("swiftwrf.models.geometry.fit.turned", return_value=()),
+        mock.patch.object(Search, "improve", lambda search, room: room),
+    ):
+        yield

@@ -1,0 +1,233 @@
+"""The contract of every registered field model, and of one from another package."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from contextlib import ExitStack
+from dataclasses import fields, replace
+from functools import cache
+
+import outside_mean
+import pytest
+import small
+import torch
+
+from swiftwrf import FIELD_MODELS, AngularGrid, FieldModel, InputError, ModelConfig, load, make_model
+from swiftwrf.models.base import ARRAY, FIXED_END
+
+OPTIONS = {"swiftwrf": {"model": ModelConfig(n_primitives=24)}}
+NOT_DIFFERENTIABLE = {
+    "nearest": "piecewise constant",
+    "raytrace": "its paths come from a ray tracer that gives no gradients",
+}
+STEP_M = 1e-3  # of finite differences
+every = pytest.mark.parametrize("name", list(FIELD_MODELS))
+
+
+@pytest.fixture(scope="module")
+def fitted(room):
+    """Fitted models by name, each fitted once, in their smallest size."""
+    with ExitStack() as patches:
+        patches.enter_context(small.small_published())
+        patches.enter_context(small.glances())
+        yield cache(lambda name: make_model(name, **OPTIONS.get(name, {})).fit(room))
+
+
+@pytest.fixture
+def position(room):
+    """Positions between those of the room."""
+    return room.position[:3] + torch.tensor([0.05, -0.03, 0.02], dtype=torch.float64)
+
+
+def other_grid() -> AngularGrid:
+    return AngularGrid.hemisphere(7, 30)
+
+
+@every
+def test_a_model_describes_itself(name):
+    model_type = FIELD_MODELS[name]
+    assert issubclass(model_type, FieldModel)
+    assert model_type.name == name
+    assert FIELD_MODELS.summary(name)
+    assert set(model_type.requires) <= {ARRAY, FIXED_END}
+
+
+@every
+def test_fit_returns_the_model(fitted, name):
+    model = fitted(name)
+    assert type(model) is FIELD_MODELS[name]
+    assert repr(model) == f"{type(model).__name__}(fitted, 15 x 60 directions)"
+    assert model.device == torch.device("cpu")
+    assert not any(parameter.requires_grad for parameter in model.parameters())
+
+
+@every
+def test_predictions_are_spectra(fitted, room, position, name):
+    model = fitted(name)
+    found = model.predict(position)
+    assert found.mean.shape == (3, *room.grid.shape)
+    assert found.mean.dtype == torch.float32
+    assert found.mean.device == model.device
+    assert not found.mean.requires_grad
+    assert ((found.mean >= 0) & (found.mean <= 1)).all()
+    if found.std is not None:
+        assert found.std.shape == found.mean.shape
+        assert (found.std >= 0).all()
+    assert torch.equal(model.predict(position).mean, found.mean)
+    assert torch.equal(model.synthesize(position), found.mean)
+    alone = torch.cat([model.predict(one[None]).mean for one in position])
+    torch.testing.assert_close(alone, found.mean, atol=2e-5, rtol=0)
+    assert model.predict(position[:0]).mean.shape == (0, *room.grid.shape)
+    model.predict(position.float())
+
+
+@every
+def test_samples_are_spectra(fitted, room, position, name):
+    model = fitted(name)
+    if not model.samples:
+        with pytest.raises(InputError, match="cannot be sampled"):
+            model.sample(position, generator=torch.Generator())
+        return
+    first, again, other = (model.sample(position, generator=torch.Generator().manual_seed(seed)) for seed in (0, 0, 1))
+    assert first.shape == (3, *room.grid.shape)
+    assert first.dtype == torch.float32
+    assert ((first >= 0) & (first <= 1)).all()
+    assert torch.equal(first, again)
+    if name not in ("geometry", "hybrid"):  # a short search gives constant path gains, so that a sample is the mean
+        assert not torch.equal(first, other)
+
+
+@every
+def test_a_saved_model_predicts_the_same(fitted, position, tmp_path, name):
+    model = fitted(name)
+    model.save(tmp_path / "model")
+    again = load(tmp_path / "model")
+    assert type(again) is type(model)
+    assert again.config == model.config
+    found, expected = again.predict(position), model.predict(position)
+    torch.testing.assert_close(found.mean, expected.mean, atol=1e-6, rtol=0)
+    assert (found.std is None) == (expected.std is None)
+    if found.std is not None:
+        torch.testing.assert_close(found.std, expected.std)
+
+
+@every
+def test_gradients_are_those_of_finite_differences_in_metres(fitted, room, position, name):
+    model = fitted(name)
+    position = position.requires_grad_()
+    weight = torch.rand(room.grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def total(at):
+        return (model.predict(at).mean.double() * weight).sum(dim=(1, 2))
+
+    if name in NOT_DIFFERENTIABLE:
+        assert not model.predict(position).mean.requires_grad
+        return
+    (gradient,) = torch.autograd.grad(total(position).sum(), position)
+    steps = STEP_M * torch.eye(3, dtype=torch.float64)
+    with torch.no_grad():
+        expected = torch.stack([total(position + step) - total(position - step) for step in steps], dim=1) / (
+            2 * STEP_M
+        )
+    assert gradient.norm() > 0
+    torch.testing.assert_close(gradient, expected, rtol=0, atol=0.03 * float(expected.abs().max()))
+
+
+@every
+def test_other_grids_are_predicted_or_refused(fitted, position, name):
+    model = fitted(name)
+    if model.any_grid:
+        assert model.predict(position, other_grid()).mean.shape == (3, 7, 30)
+    else:
+        with pytest.raises(InputError, match="grid of its training spectra only"):
+            model.predict(position, other_grid())
+
+
+@every
+def test_wrong_positions_are_refused(fitted, name):
+    model = fitted(name)
+    with pytest.raises(InputError, match=r"shape \(n, 3\)"):
+        model.predict(torch.zeros(4, 2))
+    with pytest.raises(InputError, match="finite"):
+        model.predict(torch.tensor([[0.0, float("nan"), 0.0]]))
+
+
+@every
+def test_wrong_training_spectra_are_refused(room, name):
+    with pytest.raises(InputError, match="at least 10"):
+        make_model(name).fit(room.subset(torch.arange(9)))
+    bare = replace(room, array=None, rotation=None, fixed_position=None)
+    for need in FIELD_MODELS[name].requires:
+        with pytest.raises(InputError, match=f"needs the .*{need}"):
+            make_model(name).fit(bare)
+
+
+@every
+def test_a_model_that_is_not_fitted_is_refused(room, name):
+    model = make_model(name)
+    assert repr(model) == f"{type(model).__name__}(not fitted)"
+    with pytest.raises(InputError, match="call fit first"):
+        model.predict(room.position)
+    with pytest.raises(InputError, match="call fit first"):
+        model.state()
+
+
+@every
+def test_wrong_options_are_refused(name):
+    model_type = FIELD_MODELS[name]
+    with pytest.raises(InputError, match="has no option 'sead'"):
+        model_type(sead=1)
+    with pytest.raises(InputError, match="preset must be 'quick' or 'paper'"):
+        make_model(name, preset="Paper")
+    known = {field.name for field in fields(model_type.config_type)}
+    for option, value in {"seed": -1, "validation": "blok", "steps": -5, "batch": 0, "rate": -1.0}.items():
+        if option in known:
+            with pytest.raises(InputError, match=f"{option} must be"):
+                model_type(**{option: value})
+
+
+@every
+def test_structure_is_reused_from_a_model_of_the_same_scene(fitted, room, name):
+    first = fitted(name)
+    if not type(first).accepts_like(first):
+        pytest.skip("has no structure")
+    again = type(first)(first.config).fit(room.subset(torch.arange(30)), like=first)
+    assert again.predict(room.position).mean.isfinite().all()
+    with pytest.raises(InputError, match="cannot reuse the structure"):
+        type(first)(first.config).fit(room, like=outside_mean.Mean().fit(room))
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(InputError, match="unknown field model 'swiftwarf'; choose from"):
+        make_model("swiftwarf")
+
+
+USE = """
+import sys, torch, swiftwrf
+assert "outside_mean" in swiftwrf.FIELD_MODELS
+room = swiftwrf.simulated_room(n=12, grid=swiftwrf.AngularGrid.hemisphere(8, 32))
+model = swiftwrf.make_model("outside_mean", seed=1).fit(room)
+assert torch.equal(model.predict(room.position[:2]).mean[1], room.spectrum.mean(dim=0))
+model.save(sys.argv[1])
+"""
+OPEN = "import sys, swiftwrf; print(type(swiftwrf.load(sys.argv[1])).__module__)"
+
+
+def test_a_model_of_another_package_is_listed_fitted_and_loaded(tmp_path):
+    shutil.copy(outside_mean.__file__, tmp_path)
+    installed = tmp_path / "outside_mean-1.dist-info"
+    installed.mkdir()
+    (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: outside-mean\nVersion: 1\n")
+    (installed / "entry_points.txt").write_text("[swiftwrf.models]\noutside_mean = outside_mean:Mean\n")
+
+    def run(script):
+        setup = f"import sys; sys.path.append({str(tmp_path)!r})\n"
+        command = [sys.executable, "-c", setup + script, tmp_path / "model"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.strip()
+
+    run(USE)
+    assert run(OPEN) == "outside_mean"
