@@ -20,7 +20,7 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.locate.likelihood import Likelihood, ResidualDistribution
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.path_gains import PathGains, paths
-from swiftwrf.models.geometry.phase_retrieval import autocorrelation, coarray_numbers, element_phases
+from swiftwrf.models.geometry.phase_retrieval import autocorrelation, coarray_numbers, retrieve_phases
 
 CHUNK = 50_000  # candidates whose channels are computed together
 PHASE_CHUNK = 4_000  # candidates whose covariances are factorised together
@@ -42,7 +42,7 @@ class SpectrumFeatures:
     def of(cls, spectra: Iterable[Tensor], array: PlanarArray, grid: AngularGrid, seed: int = 0) -> SpectrumFeatures:
         """Compute the features of spectra, batches (b, H, W) of magnitudes."""
         numbers = coarray_numbers(spectra, array, grid)
-        channel, _ = element_phases(numbers, array, seed)
+        channel, _ = retrieve_phases(numbers, array, seed)
         opposite = array.opposite
         twins = [channel] if opposite is None else [channel, channel.conj()[:, opposite]]
         return cls(real_parts(numbers), torch.stack(twins, dim=1).to(torch.complex64))
@@ -224,8 +224,8 @@ def _isotropic(room: GeometryModel) -> Tensor:
 STATISTICS_STEPS = 60
 __all__ = [
     "CoarrayLikelihood",
-    "PhaseLikelihood",
     "PathStatistics",
+    "PhaseLikelihood",
     "SpectrumFeatures",
     "gain_features",
     "room_features",
