@@ -1,22 +1,20 @@
-"""Turbo learning: measured spectra and synthesized ones at positions where none was measured, in one training set."""
+"""Turbo learning: measured spectra, and synthetic spectra at positions without a measurement, in one training set."""
 
-from augment.choose import Choice, Trial, choose_synthesizer
+from augment.choose import Fold, ModelChoice, choose_model
 from augment.mix import Mixed, mix, withhold
-from augment.places import Places, draw_places
-from augment.synthesizers import SYNTHESIZERS, Settings, Synthesizer, lacks, make_synthesizer
+from augment.positions import SyntheticPositions, sample_positions, synthetic_positions
+from augment.suggest import Suggestion, suggest
 
 __all__ = [
-    "SYNTHESIZERS",
-    "Choice",
+    "Fold",
     "Mixed",
-    "Places",
-    "Settings",
-    "Synthesizer",
-    "Trial",
-    "choose_synthesizer",
-    "draw_places",
-    "lacks",
-    "make_synthesizer",
+    "ModelChoice",
+    "Suggestion",
+    "SyntheticPositions",
+    "choose_model",
     "mix",
+    "sample_positions",
+    "suggest",
+    "synthetic_positions",
     "withhold",
 ]

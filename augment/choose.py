@@ -1,103 +1,179 @@
-"""Which synthesizer suits the scene: those that apply, compared on measured spectra that they did not see."""
+"""Choice of a field model by cross-validation on measured spectra.
+
+Some models search for a structure (walls, number of primitives) before they fit parameters. A search takes most of the time,
+so it is not repeated in every fold, but no fold is predicted with a structure that its spectra helped to find: one search
+leaves out folds 0 and 1, another leaves out folds 2 and 3. Each of these four folds is predicted by a model that reuses the
+structure of the search that left it out, with its parameters fitted to all other folds. Fold 4 takes part in both searches
+and is never predicted. If a search without two folds had too few spectra, each fold has a search of its own.
+"""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import torch
+from scipy.stats import trim_mean
+from torch import Tensor
 
-from augment.synthesizers import SYNTHESIZERS, Settings, Synthesizer, lacks, make_synthesizer
 from swiftwrf import FitError, InputError, Spectra
 from swiftwrf.data.spectra import check_training
-from swiftwrf.data.splits import folds
+from swiftwrf.data.splits import FOLDS, MIN_TRAINING, Validation, folds
 from swiftwrf.gp import thinned
 from swiftwrf.metrics import psnr
+from swiftwrf.models import FIELD_MODELS, FieldModel, make_model
 
-JUDGES = 1000  # held-out spectra of a fold that are compared: more do not change the choice
-SLOW = ("nerf2", "wrfgs", "vae", "dcgan", "raytrace")  # compared only where they are asked for by name
+MAX_TEST_SPECTRA = 1000  # predicted spectra of a fold; more do not change the choice
+BLIND_FOLDS = ((0, 1), (2, 3))  # pairs of folds that one structure search leaves out
+TRIMMED_FRACTION = 0.1  # of the held-out spectra with the lowest PSNR, and of those with the highest
 
 
 @dataclass(frozen=True)
-class Trial:
-    """A synthesizer fitted without some measured spectra, and those.
-
-    What a search decides (which planes there are, how many primitives) was decided without the `out` of the first trial
-    only; what is fitted (where the planes are, how they reflect) was fitted without each one's.
+class Fold:
+    """A field model fitted to some of the measured spectra, and the spectra that were held out from it.
 
     Args:
-        synthesizer: fitted to `kept`.
-        kept, out: measured spectra that it was fitted to, and those that it was not.
+        model: Model fitted to `train`. Neither its parameters nor its structure depend on `test`.
+        train: Measured spectra that the model was fitted to.
+        test: Measured spectra that were held out.
     """
 
-    synthesizer: Synthesizer
-    kept: Spectra
-    out: Spectra
+    model: FieldModel
+    train: Spectra
+    test: Spectra
 
 
 @dataclass(frozen=True)
-class Choice:
-    """What was compared and what was best.
+class ModelChoice:
+    """Result of `choose_model`.
 
     Args:
-        name: of the best.
-        psnr_db: median over held-out measured spectra, of each candidate.
-        seconds: that each comparison took.
-        trials: the comparisons of the best, one a fold that was held out.
+        name: Name of the best field model.
+        psnr_db: Trimmed mean of the PSNR over held-out measured spectra [dB] of each candidate.
+        seconds: Time of the cross-validation of each candidate [s]. A shared search counts for each model that uses it.
+        folds: Scored folds of each candidate.
     """
 
     name: str
     psnr_db: dict[str, float]
     seconds: dict[str, float]
-    trials: list[Trial]
+    folds: dict[str, list[Fold]]
 
 
 def candidates(data: Spectra) -> list[str]:
-    """Synthesizers that the data have everything for and that take seconds."""
-    return [name for name in SYNTHESIZERS if name not in SLOW and not lacks(name, data)]
+    """Return the names of the field models whose requirements the data meet and whose fit takes seconds.
+
+    Example:
+        >>> import swiftwrf
+        >>> "gp" in candidates(swiftwrf.simulated_room(n=20))
+        True
+    """
+    return [name for name, model in FIELD_MODELS.items() if not model.slow and not model.lacking(data)]
 
 
-def choose_synthesizer(measured: Spectra, settings: Settings, names: Iterable[str] | None = None) -> Choice:
-    """The synthesizer whose spectra come closest to measured ones that were held out from it, a fifth at a time.
+def choose_model(
+    measured: Spectra,
+    names: Iterable[str] | None = None,
+    *,
+    validation: Validation = "random",
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    **options: Any,
+) -> ModelChoice:
+    """Return the field model with the highest PSNR on held-out measured spectra.
 
-    Those that search (for a room, say) do so once; in the other folds they go on from what was found there.
+    The score is the mean without the lowest and the highest tenth. All candidates predict the same spectra, so differences
+    between their means are paired and have a smaller variance than differences between medians.
 
     Args:
-        measured: the only spectra it sees.
-        settings: of the candidates, and how spectra are held out; all are compared in their quick size.
-        names: of the candidates; all that apply and are fast unless given.
+        measured: Measured spectra, at least 11.
+        names: Candidates. Defaults to all field models that are fast and whose requirements the data meet.
+        validation: Rule by which the spectra are divided into folds.
+        seed: Seed of the folds and of the fits.
+        device: Device to compute on.
+        options: Further options of the models, see `swiftwrf.models.make_model`.
 
     Raises:
-        InputError: fewer than 10 spectra, something not finite, or no candidate that can be fitted.
+        InputError: Fewer than 11 spectra, a value that is not finite, or no candidate that can be fitted.
+
+    Example:
+        >>> import swiftwrf
+        >>> measured = swiftwrf.simulated_room(n=40, grid=swiftwrf.AngularGrid.hemisphere(10, 40))
+        >>> sorted(choose_model(measured, ("nearest", "idw")).psnr_db)
+        ['idw', 'nearest']
     """
     check_training(measured)
-    fold = folds(measured.position, settings.validation, settings.seed)
-    quiet = replace(settings, checkpoint=None, on_record=None, preset="quick", progress=False)
-    score: dict[str, float] = {}
-    trials: dict[str, list[Trial]] = {}
+    fold, blind_folds = _blind_folds(measured, validation, seed)
+    options |= {"validation": validation, "seed": seed}
+    searched: list[list[tuple[FieldModel, float]]] = [[] for _ in blind_folds]
+    psnr_db: dict[str, float] = {}
+    found: dict[str, list[Fold]] = {}
     seconds: dict[str, float] = {}
-    for name in names or candidates(measured):
-        found, trials[name], seconds[name] = [], [], 0.0
-        for number in range(int(fold.max()) + 1):
-            rows = (fold == number).nonzero()[:, 0]
-            kept, out = measured.subset((fold != number).nonzero()[:, 0]), measured.subset(*thinned(rows, rows=JUDGES))
-            synthesizer = make_synthesizer(name, quiet)
-            began = time.perf_counter()
-            try:
-                if trials[name]:
-                    synthesizer.fit_like(trials[name][0].synthesizer, kept)
-                else:
-                    synthesizer.fit(kept)
-                drawn = synthesizer.synthesize(out.position)
-            except (InputError, FitError):  # one that cannot be fitted here is no candidate
-                break
-            seconds[name] += time.perf_counter() - began + synthesizer.shared_seconds
-            trials[name].append(Trial(synthesizer, kept, out))
-            found.append(psnr(drawn, out.spectrum))
-        else:
-            score[name] = float(torch.cat(found).median())
-    if not score:
-        raise InputError(f"no synthesizer can be fitted to {len(measured)} measured spectra of {measured.name}")
-    best = max(score, key=lambda name: score[name])
-    return Choice(best, score, seconds, trials[best])
+    for name in candidates(measured) if names is None else names:
+        scored, score, spent = [], [], 0.0
+        try:
+            for blind, models in zip(blind_folds, searched, strict=True):
+                structure, searching = _structure(name, measured, _without(fold, *blind), models, device, options)
+                spent += searching
+                for number in blind:
+                    train, test = _split(measured, fold, number)
+                    began = time.perf_counter()
+                    model = make_model(name, **options).fit(train, like=structure, device=device)
+                    predicted = model.synthesize(test.position).cpu()
+                    spent += time.perf_counter() - began
+                    scored.append(Fold(model, train, test))
+                    score.append(psnr(predicted, test.spectrum))
+        except (InputError, FitError):  # a model that cannot be fitted here is no candidate
+            continue
+        psnr_db[name] = float(trim_mean(torch.cat(score).numpy(), TRIMMED_FRACTION))
+        found[name], seconds[name] = scored, spent
+    if not psnr_db:
+        raise InputError(f"no field model can be fitted to {len(measured)} measured spectra of {measured.name}")
+    best = max(psnr_db, key=lambda name: psnr_db[name])
+    return ModelChoice(best, psnr_db, seconds, found)
+
+
+def _blind_folds(measured: Spectra, validation: Validation, seed: int) -> tuple[Tensor, tuple[tuple[int, ...], ...]]:
+    """Return the fold of each spectrum, and the folds that each structure search leaves out."""
+    fold, n = folds(measured.position, validation, seed), len(measured)
+    if all(len(_without(fold, *blind)) >= MIN_TRAINING for blind in BLIND_FOLDS):
+        return fold, BLIND_FOLDS
+    if n <= MIN_TRAINING:
+        raise InputError(f"cross-validation of field models needs more than {MIN_TRAINING} measured spectra, got {n}")
+    number = max(FOLDS, math.ceil(n / (n - MIN_TRAINING)))
+    return folds(measured.position, validation, seed, number), tuple((fold,) for fold in range(number))
+
+
+def _structure(
+    name: str,
+    measured: Spectra,
+    rows: Tensor,
+    searched: list[tuple[FieldModel, float]],
+    device: torch.device | str,
+    options: dict[str, Any],
+) -> tuple[FieldModel, float]:
+    """Return a model fitted to these rows whose structure the named model can reuse, and the seconds of its fit.
+
+    Models that are built on the same structure, such as a room, share one search: `searched` collects the fitted models.
+    """
+    for model, seconds in searched:
+        if FIELD_MODELS[name].accepts_like(model):
+            return model, seconds
+    began = time.perf_counter()
+    model = make_model(name, **options).fit(measured.subset(rows), device=device)
+    searched.append((model, time.perf_counter() - began))
+    return searched[-1]
+
+
+def _without(fold: Tensor, *numbers: int) -> Tensor:
+    """Return the rows outside the folds of these numbers."""
+    return (~torch.isin(fold, torch.tensor(numbers))).nonzero()[:, 0]
+
+
+def _split(measured: Spectra, fold: Tensor, number: int) -> tuple[Spectra, Spectra]:
+    """Return training and test spectra of one fold."""
+    test = (fold == number).nonzero()[:, 0]
+    return measured.subset(_without(fold, number)), measured.subset(*thinned(test, rows=MAX_TEST_SPECTRA))

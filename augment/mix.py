@@ -1,4 +1,4 @@
-"""Measured and synthetic spectra at a given share, each labelled by its origin, with nothing withheld leaking in."""
+"""Training sets of measured and synthetic spectra, each spectrum labelled by its origin."""
 
 from __future__ import annotations
 
@@ -8,27 +8,29 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from augment.places import FURTHER, Places
-from swiftwrf import InputError, Spectra
+from augment.positions import NO_INDEX, SyntheticPositions
+from swiftwrf import AngularGrid, InputError, Spectra
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.data.store import Store
 
 
 @dataclass(frozen=True, eq=False)
 class Mixed:
-    """A training set for an estimator of the angle of arrival.
+    """A training set for an estimator of the direction.
 
     Args:
-        stores: of the spectra (n, H, W), one after the other.
-        label: azimuth and elevation [rad], (n, 2).
-        index: number of each sample's place in the data set, -1 for further places, (n,).
-        synthetic: origin of each spectrum: False measured, True synthesized, (n,).
+        stores: Spectra (n, H, W) in parts.
+        label: Azimuth and elevation (n, 2) [rad].
+        index: Number of each spectrum's position in the data set, (n,). -1 for synthetic positions outside of it.
+        synthetic: Origin of each spectrum, bool (n,).
+        grid: Directions of the pixels.
     """
 
     stores: tuple[Store, ...]
     label: Tensor
     index: Tensor
     synthetic: Tensor
+    grid: AngularGrid
 
     def __len__(self) -> int:
         return len(self.label)
@@ -39,63 +41,99 @@ class Mixed:
         return torch.cat([store[:] for store in self.stores])
 
     def batches(self) -> Iterator[Tensor]:
-        """All spectra in order, float32, as many at once as fit into memory."""
+        """Yield all spectra in order, float32, in parts that fit into memory."""
         return (batch for store in self.stores for batch in store.batches())
 
     @classmethod
     def measured(cls, spectra: Spectra) -> Mixed:
-        """Measured spectra alone."""
+        """Return a training set of measured spectra alone."""
         synthetic = torch.zeros(len(spectra), dtype=torch.bool)
-        return cls((spectra.store,), spectra.label, spectra.index, synthetic)
+        return cls((spectra.store,), spectra.label, spectra.index, synthetic, spectra.grid)
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many spectra are measured, synthesized at withheld places, and synthesized at further ones."""
-        further = int((self.index == FURTHER).sum())
+        """Number of measured spectra, of synthetic spectra at withheld positions, and of those at further positions."""
+        further = int((self.index == NO_INDEX).sum())
         synthetic = int(self.synthetic.sum())
         return {"measured": len(self) - synthetic, "withheld": synthetic - further, "further": further}
 
-    def add(self, places: Places, synthetic: Tensor) -> Mixed:
-        """With synthetic spectra (n, H, W) at these places, after those there are; magnitudes, or bytes, where 255 is 1.
+    def select(self, rows: Tensor) -> Tensor:
+        """Return some spectra, float32 (m, H, W).
+
+        Args:
+            rows: Row numbers (m,) in any order.
+        """
+        ends = torch.tensor([len(store) for store in self.stores]).cumsum(0)
+        number = torch.bucketize(rows, ends, right=True)
+        selected = torch.empty(len(rows), *self.grid.shape)
+        for i, store in enumerate(self.stores):
+            selected[number == i] = store[rows[number == i] - (int(ends[i]) - len(store))]
+        return selected
+
+    def add(self, positions: SyntheticPositions, synthetic: Tensor) -> Mixed:
+        """Return the training set with synthetic spectra appended.
+
+        Args:
+            positions: Positions and labels of the synthetic spectra.
+            synthetic: Spectra (n, H, W): magnitudes, or bytes where 255 stands for 1.
 
         Raises:
-            InputError: another number of spectra than places.
+            InputError: The number of spectra is not that of the positions.
         """
-        if len(synthetic) != len(places):
-            raise InputError(f"expected one synthetic spectrum for each of {len(places)} places, got {len(synthetic)}")
+        if len(synthetic) != len(positions):
+            raise InputError(
+                f"expected one synthetic spectrum for each of {len(positions)} positions, got {len(synthetic)}"
+            )
         return Mixed(
             (*self.stores, Store(synthetic)),
-            torch.cat([self.label, places.label]),
-            torch.cat([self.index, places.index]),
+            torch.cat([self.label, positions.label]),
+            torch.cat([self.index, positions.index]),
             torch.cat([self.synthetic, torch.ones(len(synthetic), dtype=torch.bool)]),
+            self.grid,
         )
 
 
-def withhold(train: Spectra, share: float, seed: int) -> tuple[Spectra, Places]:
-    """A random `share` of the training spectra as measured, and the places of the others.
+def withhold(train: Spectra, measured_fraction: float, seed: int) -> tuple[Spectra, SyntheticPositions]:
+    """Return a random fraction of the training spectra as measured, and the positions of the others.
+
+    Args:
+        train: Training spectra.
+        measured_fraction: Fraction of the training spectra that counts as measured, in (0, 1].
+        seed: Seed of the draw.
 
     Raises:
-        InputError: a share outside (0, 1]; fewer than 10 measured spectra left.
+        InputError: A fraction outside (0, 1], or fewer than 10 measured spectra.
+
+    Example:
+        >>> import swiftwrf
+        >>> measured, withheld = withhold(swiftwrf.simulated_room(n=40), 0.3, seed=0)
+        >>> len(measured), len(withheld)
+        (12, 28)
     """
-    if not 0 < share <= 1:
-        raise InputError(f"the measured share must lie in (0, 1], got {share:g}")
-    n = round(share * len(train))
+    if not 0 < measured_fraction <= 1:
+        raise InputError(f"the measured fraction must lie in (0, 1], got {measured_fraction:g}")
+    n = round(measured_fraction * len(train))
     if n < MIN_TRAINING:
         raise InputError(
-            f"a measured share of {share:g} leaves {n} of {len(train)} training spectra; "
-            f"at least {MIN_TRAINING} are needed, a share of {MIN_TRAINING / len(train):.2g}"
+            f"a measured fraction of {measured_fraction:g} leaves {n} of {len(train)} training spectra; "
+            f"at least {MIN_TRAINING} are needed, a fraction of {MIN_TRAINING / len(train):.2g}"
         )
     order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
     measured, others = train.subset(order[:n].sort().values), train.subset(order[n:].sort().values)
-    return measured, Places(others.position, others.label, others.index)
+    return measured, SyntheticPositions(others.position, others.label, others.index)
 
 
-def mix(measured: Spectra, withheld: Places, synthetic: Tensor) -> Mixed:
-    """Measured spectra, and synthetic ones (n, H, W) at the withheld places, in this order.
+def mix(measured: Spectra, withheld: SyntheticPositions, synthetic: Tensor) -> Mixed:
+    """Return a training set of measured spectra, followed by synthetic spectra at the withheld positions.
 
-    The synthesizer that drew them was fitted on `measured` alone, which is all that `withhold` hands out.
+    A field model fitted to `measured`, which `withhold` returns, cannot leak a withheld spectrum into the training set.
+
+    Args:
+        measured: Measured spectra.
+        withheld: Positions of the synthetic spectra.
+        synthetic: Synthetic spectra (n, H, W).
 
     Raises:
-        InputError: another number of spectra than places.
+        InputError: The number of synthetic spectra is not that of the positions.
     """
     return Mixed.measured(measured).add(withheld, synthetic)

@@ -1,4 +1,4 @@
-"""Where to measure next: the positions that tell most about the region, given what is measured."""
+"""Where to measure next: the positions that reduce the predictive variance over the region most."""
 
 from __future__ import annotations
 
@@ -6,48 +6,54 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from augment.places import draw_positions
+from augment.positions import sample_positions
 from swiftwrf import InputError, Spectra
 from swiftwrf.data.spectra import check_training
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import choose_kernel, most_informative, thinned
 
-CANDIDATES = 1500  # positions that are compared
-MOST = 500  # that can be suggested
-KNOWN = 2000  # measured positions that count at most
+N_CANDIDATE_POSITIONS = 1500  # positions that are compared
+MAX_SUGGESTIONS = 500
+MAX_MEASURED_POSITIONS = 2000  # measured positions that the variance is conditioned on
 
 
 @dataclass(frozen=True, eq=False)
 class Suggestion:
-    """Positions to measure, the most telling first.
+    """Positions to measure, the most informative first.
 
     Args:
-        position: (n, 3) [m].
-        left: mean variance of a spectrum over the region, as a share of the spectra's own, before measuring and once the
-            first 1, 2, ... are measured, (1 + n,).
+        position: Positions (n, 3) [m].
+        variance: Mean predictive variance of a spectrum over the region, as a fraction of the spectra's variance, before
+            and after measuring at the first 1, 2, ..., n positions, (1 + n,).
     """
 
     position: Tensor
-    left: Tensor
+    variance: Tensor
 
 
 def suggest(measured: Spectra, count: int, seed: int = 0) -> Suggestion:
-    """Positions in the region of the measured ones where measuring lowers the uncertainty of all spectra there most.
+    """Return positions in the region of the measured ones where a measurement reduces the predictive variance most.
+
+    The variance is that of a Gaussian process whose kernel is chosen by cross-validation on the measured spectra.
 
     Args:
-        measured: spectra; their positions say where the region is, and how fast they change says how far one measurement
-            reaches.
-        count: how many positions, 1 to 500.
-        seed: of the candidates that are compared.
+        measured: Measured spectra.
+        count: Number of positions, 1 to 500.
+        seed: Seed of the candidate positions.
 
     Raises:
-        InputError: fewer than 10 spectra, or another count.
+        InputError: Fewer than 10 spectra, or a number outside 1 to 500.
+
+    Example:
+        >>> import swiftwrf
+        >>> suggest(swiftwrf.simulated_room(n=20), 3).position.shape
+        torch.Size([3, 3])
     """
     check_training(measured)
-    if not 1 <= count <= MOST:
-        raise InputError(f"between 1 and {MOST} positions can be suggested, not {count}")
+    if not 1 <= count <= MAX_SUGGESTIONS:
+        raise InputError(f"between 1 and {MAX_SUGGESTIONS} positions can be suggested, not {count}")
     kernel = choose_kernel(measured.position, measured.store, folds(measured.position, "random", seed))
-    candidate = draw_positions(measured.position, CANDIDATES, seed)
-    (known,) = thinned(measured.position, rows=KNOWN)
-    chosen, left = most_informative(kernel, known, candidate, count)
-    return Suggestion(candidate[chosen], left)
+    candidate = sample_positions(measured.position, N_CANDIDATE_POSITIONS, seed)
+    (known,) = thinned(measured.position, rows=MAX_MEASURED_POSITIONS)
+    chosen, variance = most_informative(kernel, known, candidate, count)
+    return Suggestion(candidate[chosen], variance)

@@ -27,27 +27,6 @@ def check_positions(position: Tensor) -> Tensor:
     return position
 
 
-def check_batch(batch: int) -> None:
-    """Refuses a number of positions at a time that would leave some out.
-
-    Raises:
-        InputError: below 1.
-    """
-    if batch < 1:
-        raise InputError(f"batch must be at least 1 position at a time, got {batch}")
-
-
-def check_drawn(spectrum: Tensor) -> Tensor:
-    """The spectra, none of which may hold something that is not finite.
-
-    Raises:
-        InputError: parameters so large that sums of them overflow.
-    """
-    if not bool(spectrum.isfinite().all()):
-        raise InputError("the model draws values that are not finite; its parameters overflow, so fit it anew")
-    return spectrum
-
-
 def frame(position: Tensor) -> tuple[Tensor, Tensor]:
     """Centre (3,) and half the longest side () of the box around positions (n, 3) [m], float64."""
     low, high = position.double().min(dim=0).values, position.double().max(dim=0).values

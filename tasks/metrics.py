@@ -1,6 +1,6 @@
-"""The keys of metrics.json, shared by the experiments that write it and the pages and tables that read it.
+"""Keys of metrics.json, shared by the experiments that write it and the pages and tables that read it.
 
-Numbers are degrees, dB and seconds; a number that does not exist is nan here and null in the file.
+Units are degrees, dB and seconds. A number that does not exist is nan here and null in the file.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ SCORES: tuple[Score, ...] = get_args(Score)
 
 
 class ErrorSummary(TypedDict):
-    """Of `n` errors or scores; `low` and `high` are the 95 % interval of the median."""
+    """Summary of `n` errors or scores; `low` and `high` are the 95 % interval of the median."""
 
     median: float
     p90: float
@@ -25,7 +25,7 @@ class ErrorSummary(TypedDict):
 
 
 class RunMetrics(TypedDict):
-    """What every task says of a run."""
+    """Metrics of a run of every task."""
 
     task: str
     data: str
@@ -36,48 +36,30 @@ class RunMetrics(TypedDict):
     n_test: int
 
 
-class SynthesisSeconds(TypedDict):
-    """Of one synthesizer, the mean of the repeats."""
-
-    fit: float
-    synthesize: float
-
-
 class SynthesisMetrics(TypedDict):
-    """How well one synthesizer draws the test spectra."""
+    """Quality of one field model at the test positions; seconds to `fit` and to `synthesize`, means of the repeats."""
 
     psnr_db: ErrorSummary
     ssim: ErrorSummary
     l1: ErrorSummary
-    seconds: SynthesisSeconds
+    seconds: dict[str, float]
 
 
-class ArmSeconds(TypedDict):
-    """Of one estimator, the mean of the repeats."""
+class MethodMetrics(TypedDict):
+    """Errors of one condition; seconds to `train` and to `estimate`, means of the repeats."""
 
-    train: float
-    estimate: float
-
-
-class ArmMetrics(TypedDict):
-    """How wrong one estimator is."""
-
+    estimator: str
+    training: str
+    synthesizer: str
+    n_synthetic: int
     azimuth_deg: ErrorSummary
     elevation_deg: ErrorSummary
     great_circle_deg: ErrorSummary
-    seconds: ArmSeconds
-
-
-class MixSeconds(TypedDict):
-    """Of the synthesizers asked for and of all networks together."""
-
-    fit: float
-    synthesize: float
-    train: float
+    seconds: dict[str, float]
 
 
 class ChoiceMetrics(TypedDict):
-    """Which synthesizer was taken: median PSNR [dB] on held-out measured spectra, and seconds, of each candidate."""
+    """Chosen field model; trimmed mean PSNR [dB] on held-out measured spectra and seconds of each candidate."""
 
     name: str
     psnr_db: dict[str, float]
@@ -94,39 +76,44 @@ class ChangeMetrics(TypedDict):
 
 
 class GainMetrics(ChangeMetrics):
-    """The same with so many further positions, drawn or predicted."""
+    """Change by a number of further synthetic spectra, samples or means."""
 
     extra: int
     sampled: bool
 
 
 class AdviceMetrics(TypedDict):
-    """What turbo learning gains on measured spectra that were held out: further positions are recommended where each number
-    of them gains, and it `helps` where the interval excludes no gain, too."""
+    """Cross-validation of one field model: change of the error on held-out measured spectra by further synthetic spectra.
+
+    `gains` has every number that was compared, `rule` the number chosen on other folds than the scored one. Further positions
+    are recommended if every number reduces the error; `helps` requires that the interval of `rule` excludes zero, too.
+    """
 
     stand_in: str
     n_held_out: int
     measured_only_deg: float
     gains: list[GainMetrics]
+    rule: ChangeMetrics | None
     sampled: bool
     recommended_extra: int
     helps: bool
 
 
 class MixMetrics(TypedDict):
-    """One measured share; `choice` and `advice` of the first repeat, `counts` of spectra by origin in each training set."""
+    """One measured fraction; `choice` and `advice` (by field model) of the first repeat, `counts` of spectra by origin in
+    each training set, seconds to `fit` and `synthesize` of the trained field models and to `train` all networks."""
 
     n_measured: int
     counts: dict[str, dict[str, int]]
     choice: ChoiceMetrics | None
-    advice: AdviceMetrics | None
+    advice: dict[str, AdviceMetrics] | None
     synthesis: dict[str, SynthesisMetrics]
-    methods: dict[str, ArmMetrics]
-    seconds: MixSeconds
+    methods: dict[str, MethodMetrics]
+    seconds: dict[str, float]
 
 
 class AoaMetrics(RunMetrics):
-    """Of a run of tasks.aoa; `mixes` by measured share."""
+    """Metrics of a run of tasks.aoa; `mixes` by measured fraction."""
 
     repeats: int
     moving: str

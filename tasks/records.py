@@ -21,7 +21,17 @@ from swiftwrf import InputError
 from swiftwrf.runtime.durable import replacing, write_text
 
 Row = dict[str, Any]
-NAMES = ("method", "receiver", "synthesizer", "stage", "origin")  # columns of text, even if a cell reads NA, 1 or 12:34
+NAMES = (  # columns of text, even if a cell reads NA, 1 or 12:34
+    "method",
+    "estimator",
+    "training",
+    "receiver",
+    "synthesizer",
+    "stage",
+    "origin",
+    "measured_fraction",  # a key, whose last digit counts
+    "mix",
+)
 FORMULA = re.compile(r"^'*[=+\-@\t\r]")
 
 

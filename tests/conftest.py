@@ -26,9 +26,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if item.get_closest_marker("fuzz") and "fuzz" not in config.option.markexpr:
             item.add_marker(pytest.mark.skip(reason="long: run it with -m fuzz"))
-        if "cuda" in item.keywords and not torch.cuda.is_available():
+        if item.get_closest_marker("cuda") and not torch.cuda.is_available():
             item.add_marker(pytest.mark.skip(reason="needs an NVIDIA GPU"))
-        if "data" in item.keywords and not os.environ.get("SWIFTWRF_DATA"):
+        if item.get_closest_marker("data") and not os.environ.get("SWIFTWRF_DATA"):
             item.add_marker(pytest.mark.skip(reason="needs the measured data: set SWIFTWRF_DATA to their folder"))
 
 

@@ -9,18 +9,17 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from unittest import mock
 
-from small import glances, small_published, small_swiftwrf
+from small import glances, small_published, small_swiftwrf, with_defaults
 
-from swiftwrf import AngularGrid, RssiConfig, rssi_room, simulated_room
+from swiftwrf import AngularGrid, RssiConfig, RssiModel, rssi_room, simulated_room
 from swiftwrf.errors import LONGEST
 from tasks.aoa import experiment as aoa
-from tasks.aoa.arms import NETWORK
-from tasks.aoa.config import AoaConfig
+from tasks.aoa.condition import NETWORK
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.estimators.baselines import Constant
+from tasks.aoa.options import AoaConfig
 from tasks.convert import ConvertConfig
 from tasks.convert import run as convert
 from tasks.estimate import EstimateConfig
@@ -52,12 +51,12 @@ PREDICTORS_KEPT = ("swiftwrf", "mean", "mri_pooled", "mri_receiver")
 
 
 class QuickNetwork(Constant):
-    """Stands in for the network; leaves a history as it does."""
+    """Stand-in for the network that leaves a history."""
 
-    learns = True
+    trainable = True
 
-    def fit(self, train):
-        super().fit(train)
+    def _fit(self, train, device):
+        super()._fit(train, device)
         time.sleep(0.05)
         self.history = [{"step": step, "loss": 1 / step, "seconds": 0.01} for step in (1, 2)]
 
@@ -67,21 +66,16 @@ def quick() -> Iterator[None]:
     """Few spectra, few steps, few methods."""
     spectra = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
     floor = rssi_room(n=40)
-    network = replace(ESTIMATORS[NETWORK], make=QuickNetwork)
     with (
         small_published(),
         small_swiftwrf(),
         glances(),
         mock.patch.object(aoa, "simulated_room", return_value=spectra),
         mock.patch.object(rssi, "rssi_room", return_value=floor),
-        mock.patch(
-            "tasks.rssi.predictors.swiftwrf.RssiConfig", lambda **given: RssiConfig(**given, steps=2, n_primitives=0)
-        ),
+        mock.patch.object(RssiModel, "config_type", with_defaults(RssiConfig(steps=2, n_primitives=0))),
         mock.patch("tasks.rssi.experiment.MAP_CELLS", 8),
-        mock.patch.dict(ESTIMATORS._entries, {NETWORK: network}),
-        mock.patch.object(
-            PREDICTORS, "_entries", {name: PREDICTORS[name] for name in PREDICTORS if name in PREDICTORS_KEPT}
-        ),
+        mock.patch.dict(ESTIMATORS._registered, {NETWORK: QuickNetwork}),
+        mock.patch.object(PREDICTORS, "_registered", {name: PREDICTORS[name] for name in PREDICTORS_KEPT}),
     ):
         yield
 

@@ -71,6 +71,21 @@ def write_snapshots(
     return folder
 
 
+def write_paths(folder: Path, n: int = 12, **changes: object) -> Path:
+    """paths.npz of one path a receiver, some arrays replaced."""
+    arrays = {
+        "transmitter_position": np.tile([0.0, 0.0, 2.0], (n, 1)),
+        "receiver_position": np.stack([np.arange(1.0, n + 1), np.zeros(n), np.ones(n)], axis=1),
+        "path_count": np.ones(n, dtype=np.int32),
+        "last_point": np.tile([0.0, 0.0, 2.0], (n, 1)),
+        "gain": np.ones(n, dtype=np.complex64),
+        "line_of_sight": np.ones(n, dtype=bool),
+        "frequency_hz": np.float64(2.4e9),
+    } | changes
+    np.savez(folder / "paths.npz", **arrays)
+    return folder
+
+
 def write_deepmimo(folder: Path, n: int = 30, tracer: str = "Remcom Wireless Insite", **changes: object) -> Path:
     """Paths of the simulated room from a transmitter on the ceiling; a change computes an array from all, None omits it."""
     generator = torch.Generator().manual_seed(0)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -12,19 +14,24 @@ import pandas as pd
 import pytest
 import torch
 from sklearn.model_selection import KFold
+from small import with_defaults
 
-import augment
-from augment import SYNTHESIZERS, Mixed, Synthesizer, Trial, choose, lacks, make_synthesizer
-from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, load, simulated_room
-from swiftwrf.array.angles import to_angles
+from augment import Fold, Mixed, choose, sample_positions
+from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, load, make_model, simulated_room
+from swiftwrf.array.angles import to_angles, to_direction
 from swiftwrf.data.store import Store
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
-from tasks.aoa import advice, arms, experiment, steps
-from tasks.aoa.config import AoaConfig
-from tasks.aoa.estimators import ESTIMATORS, Settings, radial
+from swiftwrf.models import FIELD_MODELS, FieldModel
+from swiftwrf.models.geometry import model as geometry
+from tasks.aoa import cross_validation, experiment, steps
+from tasks.aoa.condition import Condition, MeasuredSubset, conditions_of, fraction_key, headline
+from tasks.aoa.estimators import ESTIMATORS, aann, radial
 from tasks.aoa.estimators.aann import AANN, AANNConfig
 from tasks.aoa.estimators.baselines import Constant, NearestSpectrum, Peak
+from tasks.aoa.estimators.kernel_ridge import KernelRegression
+from tasks.aoa.options import AoaConfig
+from tasks.aoa.page.records import palette
 from tasks.page.palette import Palette
 from tasks.report import merge
 from tasks.run import command_line
@@ -37,45 +44,68 @@ def small(monkeypatch):
     """The task on a toy: few spectra, few steps."""
     room = simulated_room(n=50, grid=AngularGrid.hemisphere(10, 40))
     monkeypatch.setattr(experiment, "simulated_room", lambda **_: room)
-    monkeypatch.setattr("augment.synthesizers.swiftwrf.FitConfig", lambda: TINY_FIT)
-    for place in (steps, choose):  # finding a room has tests of its own
+    monkeypatch.setattr(FIELD_MODELS["swiftwrf"], "config_type", with_defaults(TINY_FIT))
+    for place in (steps, choose):  # the search for a room has its own tests
         monkeypatch.setattr(
-            place, "candidates", lambda data: [n for n in ("idw", "gp", "coarray") if not lacks(n, data)]
+            place,
+            "candidates",
+            lambda data: [name for name in ("idw", "gp", "coarray") if not FIELD_MODELS[name].lacking(data)],
         )
-    monkeypatch.setattr(AANNConfig, "quick", lambda spectra: AANNConfig(steps=2, batch=4))
+    monkeypatch.setattr(AANNConfig, "quick", lambda n_spectra, **options: AANNConfig(steps=2, batch=4, **options))
     return room
 
 
 def run(*arguments):
     if arguments[:1] == ("--mix",) and "--extra" not in arguments:
         arguments = (*arguments, "--extra", 0)
-    return command_line("tasks.aoa", AoaConfig, experiment.run, [str(a) for a in arguments], arms.meaning)
+    return command_line("tasks.aoa", AoaConfig, experiment.run, [str(a) for a in arguments])
+
+
+def labelled(spectrum, label, grid):
+    """Return a training set of these spectra."""
+    n = len(spectrum)
+    return Mixed((Store(spectrum),), label, torch.arange(n), torch.zeros(n).bool(), grid)
 
 
 def test_peak_of_a_known_spectrum():
     grid = AngularGrid.hemisphere(10, 40)
     spectrum = torch.zeros(1, 10, 40)
     spectrum[0, 3, 10] = 1
-    assert Peak(Settings(grid)).estimate(spectrum).rad2deg()[0].tolist() == pytest.approx([90, 36])
+    peak = Peak().fit(labelled(spectrum, torch.zeros(1, 2), grid))
+    assert peak.predict(spectrum).rad2deg()[0].tolist() == pytest.approx([90, 36])
 
 
 def test_constant_is_the_mean_direction_over_the_seam():
-    train = Mixed(
-        (Store(torch.zeros(2, 1, 1)),),
-        torch.tensor([[350.0, 10], [10, 10]]).deg2rad(),
-        torch.arange(2),
-        torch.zeros(2).bool(),
-    )
-    constant = Constant(Settings(AngularGrid.hemisphere(10, 40)))
-    constant.fit(train)
-    azimuth = constant.estimate(torch.zeros(3, 1, 1))[:, 0]
+    label = torch.tensor([[350.0, 10], [10, 10]]).deg2rad()
+    constant = Constant().fit(labelled(torch.zeros(2, 10, 40), label, AngularGrid.hemisphere(10, 40)))
+    azimuth = constant.predict(torch.zeros(3, 10, 40))[:, 0]
     assert (1 - torch.cos(azimuth)).max() < 1e-9
 
 
 def test_nearest_spectrum_returns_the_label_of_a_copy(room):
-    nearest = NearestSpectrum(Settings(room.grid))
-    nearest.fit(Mixed.measured(room))
-    torch.testing.assert_close(nearest.estimate(room.spectrum[5:8]), room.label[5:8])
+    nearest = NearestSpectrum().fit(Mixed.measured(room))
+    torch.testing.assert_close(nearest.predict(room.spectrum[5:8]), room.label[5:8])
+
+
+def test_nearest_spectrum_distinguishes_spectra_that_differ_in_their_last_digits(room):
+    """Inner products of float32 spectra lose these digits."""
+    generator = torch.Generator().manual_seed(0)
+    base = torch.rand(15, 60, generator=generator)
+    close = base + 1e-6 * torch.randn(30, 15, 60, generator=generator)
+    train = labelled(close, room.label[:30], room.grid)
+    query = close[torch.randperm(30, generator=generator)] + 1e-8
+    distance = (query.double()[:, None] - close.double()).square().sum(dim=(2, 3))
+    assert torch.equal(NearestSpectrum().fit(train).predict(query), room.label[distance.argmin(dim=1)])
+
+
+def test_kernel_ridge_reads_only_the_spectra_that_it_keeps(room, monkeypatch):
+    monkeypatch.setattr(radial, "MAX_ROWS", 12)
+    train, read = Mixed.measured(room), []
+    select = Mixed.select
+    monkeypatch.setattr(Mixed, "batches", lambda self: pytest.fail("all spectra were read"))
+    monkeypatch.setattr(Mixed, "select", lambda self, rows: read.append(len(rows)) or select(self, rows))
+    KernelRegression(seed=3).fit(train)
+    assert sum(read) == 12
 
 
 @pytest.mark.parametrize("circular", [False, True])
@@ -85,13 +115,10 @@ def test_aann_learns_a_toy(circular):
     spectrum = torch.zeros(16, 16, 64)
     for i in range(16):
         spectrum[i, 4:10, 16 * (i % 4) : 16 * (i % 4) + 8] = 1
-    train = Mixed((Store(spectrum),), label, torch.arange(16), torch.zeros(16).bool())
-    settings = Settings(AngularGrid.hemisphere(16, 64))
-    network = AANN(settings, AANNConfig(steps=60, batch=8, rate=1e-3, max_azimuths=0, circular=circular))
-    network.fit(train)
-    constant = Constant(settings)
-    constant.fit(train)
-    errors = [angle_errors(e.estimate(spectrum), label)["great_circle"].mean() for e in (network, constant)]
+    train = labelled(spectrum, label, AngularGrid.hemisphere(16, 64))
+    network = AANN(steps=60, batch=8, rate=1e-3, max_azimuths=0, circular=circular).fit(train)
+    constant = Constant().fit(train)
+    errors = [angle_errors(e.predict(spectrum), label)["great_circle"].mean() for e in (network, constant)]
     assert errors[0] < 0.5 * errors[1]
 
 
@@ -100,8 +127,7 @@ def test_every_spectrum_counts_alike_in_the_batch_norms():
     spectrum = torch.rand(65, 8, 32, generator=torch.Generator().manual_seed(0))
     spectrum[-20:] *= 0.1
     label = torch.stack([torch.linspace(0, 3, 65), torch.full((65,), 0.5)], dim=1).double()
-    network = AANN(Settings(AngularGrid.hemisphere(8, 32)), AANNConfig(steps=2, batch=4))
-    network.fit(Mixed((Store(spectrum),), label, torch.arange(65), torch.zeros(65).bool()))
+    network = AANN(steps=2, batch=4).fit(labelled(spectrum, label, AngularGrid.hemisphere(8, 32)))
     first = network._network.conv1(network._prepare(spectrum))
     spread = first.std(dim=(0, 2, 3))
     torch.testing.assert_close(
@@ -118,17 +144,45 @@ def test_circular_padding_makes_rolled_spectra_alike():
 
 
 def test_the_headline_is_of_the_network_that_is_kept():
-    """Named by what trained it, not by its error on test spectra."""
-    names = [
-        "measured_only",
-        "turbo_gp",
-        "kernel_ridge_turbo_gp_extra",
-        "turbo_gp_extra",
-        "turbo_idw_extra",
-        "measured_all",
+    """Named by its training set, not by its error on test spectra."""
+    conditions = [
+        Condition("aann", "measured"),
+        Condition("aann", "turbo", "gp"),
+        Condition("kernel_ridge", "turbo_extra", "gp"),
+        Condition("aann", "turbo_extra", "gp"),
+        Condition("aann", "turbo_extra", "idw"),
+        Condition("aann", "all"),
     ]
-    assert arms.taken(names) == "turbo_gp_extra"
-    assert arms.taken(["turbo_gp", "turbo_idw", "kernel_ridge_turbo_gp"]) == "turbo_gp"
+    assert headline(conditions).method == "turbo_gp_extra"
+    assert headline([conditions[1], Condition("aann", "turbo", "idw"), conditions[2]]).method == "turbo_gp"
+
+
+@pytest.mark.parametrize(
+    ("condition", "method"),
+    [
+        (Condition("aann", "measured"), "measured_only"),
+        (Condition("aann", "all"), "measured_all"),
+        (Condition("aann", "turbo", "hybrid"), "turbo_hybrid"),
+        (Condition("aann", "turbo_extra", "hybrid"), "turbo_hybrid_extra"),
+        (Condition("peak", "measured"), "peak"),
+        (Condition("kernel_ridge", "all"), "kernel_ridge_measured_all"),
+        (Condition("kernel_ridge", "turbo_extra", "gp"), "kernel_ridge_turbo_gp_extra"),
+        (Condition("aann", "turbo", "auto"), "turbo_auto"),
+    ],
+)
+def test_names_of_conditions_are_those_of_metrics_json(condition, method):
+    assert condition.method == method
+    older = conditions_of({method: {"great_circle_deg": {}}})
+    assert older == {method: condition}
+    assert conditions_of({method: condition.description}) == {method: condition}
+
+
+def test_keys_of_fractions_are_exact():
+    fractions = [0.3, 1.0, 0.1, 0.6666667, 0.66666671, 1 / 3, 0.33333334, 1e-5, 0.30000001]
+    keys = [fraction_key(fraction) for fraction in fractions]
+    assert [float(key) for key in keys] == fractions
+    assert len(set(keys)) == len(keys)
+    assert keys[:3] == ["0.3", "1", "0.1"]
 
 
 def test_kernel_ridge_regression_is_what_its_definition_says():
@@ -152,8 +206,8 @@ def test_kernel_ridge_regression_is_what_its_definition_says():
         (width / median, alpha): sum(
             np.abs(told(*fold, width / median, alpha) - target[fold[1]]).mean() for fold in folds
         )
-        for width in radial.WIDTHS
-        for alpha in radial.PENALTIES
+        for width in radial.WIDTH_CANDIDATES
+        for alpha in radial.PENALTY_CANDIDATES
     }
     best = min(errors, key=errors.get)
     assert radial.choose(apart, target, seed=3) == pytest.approx(best)
@@ -213,25 +267,26 @@ def test_convolutions_over_few_pixels_are_matrix_products(size, stride):
 
 @pytest.mark.parametrize(("spectra", "batch", "sizes"), [(11, 64, [5, 5, 5]), (11, 4, [4, 4, 4]), (3, 64, [1, 1, 1])])
 def test_batches_are_at_most_half_of_what_trains(room, monkeypatch, spectra, batch, sizes):
-    network, seen, point = AANN(Settings(room.grid), AANNConfig(steps=3, batch=batch)), [], AANN._point
-    monkeypatch.setattr(
-        AANN, "_point", lambda self, prepared, *how: seen.append(prepared) or point(self, prepared, *how)
-    )
-    network.fit(Mixed.measured(room.subset(torch.arange(spectra))))
-    assert [len(rows) for rows in seen] == sizes
-    assert not torch.equal(seen[0], seen[1])
+    found = []
+    monkeypatch.setattr(aann, "_train", lambda network, config, device, batches, *_: found.extend(batches) or [])
+    AANN(steps=3, batch=batch).fit(Mixed.measured(room.subset(torch.arange(spectra))))
+    assert [len(rows) for rows in found] == sizes
+    assert not torch.equal(found[0], found[1])
 
 
 def test_regression_takes_the_place_of_the_head_that_a_short_training_leaves():
     """On spectra that neither has seen."""
     room = simulated_room(n=300, grid=AngularGrid.hemisphere(10, 40))
     train, test = room.split("random")
-    network = AANN(Settings(room.grid), AANNConfig(steps=5))
-    network.fit(Mixed.measured(train))
+    network = AANN(steps=5).fit(Mixed.measured(train))
+    direction = to_direction(*train.label.unbind(-1)).float()
+    mean = torch.nn.functional.normalize(direction.mean(dim=0), dim=0)
+    spread = (direction - mean).square().sum(dim=1).mean().sqrt()
     with torch.no_grad():
-        pointed = network._point(network._prepare(test.spectrum), network._network).double()
+        offset = network._network(network._prepare(test.spectrum))
+    pointed = torch.nn.functional.normalize(mean + spread * offset, dim=1).double()
     head = torch.stack(to_angles(pointed), dim=-1)
-    own, alone = (angle_errors(e, test.label)["great_circle"].median() for e in (network.estimate(test.spectrum), head))
+    own, alone = (angle_errors(e, test.label)["great_circle"].median() for e in (network.predict(test.spectrum), head))
     assert own < 0.5 * alone
 
 
@@ -239,62 +294,87 @@ def test_regression_takes_the_place_of_the_head_that_a_short_training_leaves():
 def test_spectra_that_are_all_alike_are_in_the_mean_direction(value):
     label = torch.tensor([[0.0, 30], [90, 30]]).deg2rad().repeat(6, 1).double()
     alike = torch.full((12, 8, 32), value)
-    settings = Settings(AngularGrid.hemisphere(8, 32))
-    network, constant = AANN(settings, AANNConfig(steps=2, batch=4)), Constant(settings)
-    estimates = []
-    for estimator in (network, constant):
-        estimator.fit(Mixed((Store(alike),), label, torch.arange(12), torch.zeros(12).bool()))
-        estimates.append(estimator.estimate(alike[:1]))
+    train = labelled(alike, label, AngularGrid.hemisphere(8, 32))
+    estimates = [estimator.fit(train).predict(alike[:1]) for estimator in (AANN(steps=2, batch=4), Constant())]
     torch.testing.assert_close(*estimates, atol=0.05, rtol=0)
 
 
 def test_aann_is_seeded_and_leaves_the_global_generator_alone(room):
     state = torch.get_rng_state()
-    estimates = []
-    for _ in range(2):
-        network = AANN(Settings(room.grid, seed=7), AANNConfig(steps=2, batch=4))
-        network.fit(Mixed.measured(room))
-        estimates.append(network.estimate(room.spectrum))
+    train = Mixed.measured(room)
+    estimates = [AANN(seed=7, steps=2, batch=4).fit(train).predict(room.spectrum) for _ in range(2)]
     assert torch.equal(*estimates)
     assert torch.equal(torch.get_rng_state(), state)
 
 
-@pytest.mark.parametrize(("right", "sampled"), [("means", False), ("draws", True), ("both", False)])
-def test_draws_train_only_where_they_are_better_than_means_beyond_doubt(room, right, sampled):
-    fold = torch.arange(len(room)) % 4 == 0
-    kept, out = room.subset((~fold).nonzero()[:, 0]), room.subset(fold.nonzero()[:, 0])
+@pytest.mark.parametrize(("right", "sampled"), [("means", False), ("samples", True), ("both", False)])
+def test_samples_train_only_if_they_are_significantly_better_than_means(room, right, sampled):
+    known = make_model("gp").fit(room)
 
-    class Told(Synthesizer):
-        """Knows all spectra; what it draws in the wrong way are those of other places."""
+    class Informed(FieldModel):
+        """Knows all spectra. In the wrong way it predicts those of other positions."""
 
+        name = "informed"
+        kind = "informed model"
         samples = True
 
-        def fit(self, train):
-            self.known = make_synthesizer("gp")
-            self.known.fit(room)
+        def _fit(self, train, context):
+            pass
 
-        def synthesize(self, position, generator=None):
-            right_way = right in ("both", "means" if generator is None else "draws")
-            return self.known.synthesize(position if right_way else position.roll(1, dims=0))
+        def _predict(self, position, grid, with_std):
+            return known.synthesize(position if right != "samples" else position.roll(1, dims=0)), None
 
-    synthesizer = Told(augment.Settings())
-    synthesizer.fit(kept)
-    given = advice.advise([Trial(synthesizer, kept, out)], Settings(room.grid), extra=100)
+        def _sample(self, position, grid, generator):
+            return known.synthesize(position if right != "means" else position.roll(1, dims=0))
+
+        def _state(self):
+            return {}, {}
+
+        def _restore(self, tensors, header):
+            pass
+
+    part = torch.arange(len(room)) % 4
+    folds = []
+    for number in range(2):
+        train, test = (room.subset(rows.nonzero()[:, 0]) for rows in (part != number, part == number))
+        folds.append(Fold(Informed().fit(train), train, test))
+    given = cross_validation.advise(folds, n_synthetic=100, seed=0)
     assert given["sampled"] is sampled
     assert [gain["sampled"] for gain in given["gains"]] == [False, True]
+
+
+def pretended(monkeypatch, room, errors):
+    """Return the advice for four folds with these errors by fold and number of synthetic positions."""
+    monkeypatch.setattr(cross_validation, "_errors", lambda fold, number, *_: errors(fold.test, number))
+    model = make_model("idw").fit(room)
+    folds = [SimpleNamespace(model=model, test=fold) for fold in range(4)]
+    return cross_validation.advise(folds, n_synthetic=3000, seed=0)
 
 
 @pytest.mark.parametrize(
     ("factors", "recommended"),
     [((0.9, 0.8, 0.5), 3000), ((0.9, 1.1, 0.5), 0), ((0.9, 0.5, 0.8), 1000), ((1.2, 1.1, 1.3), 0)],
 )
-def test_further_positions_are_recommended_where_each_number_of_them_gains(monkeypatch, room, factors, recommended):
+def test_further_positions_are_recommended_if_each_number_of_them_gains(monkeypatch, room, factors, recommended):
     """With few held-out spectra one number alone gains by chance."""
-    factor = dict(zip((0, *advice.NUMBERS), (1, *factors), strict=True))
-    monkeypatch.setattr(advice, "_errors", lambda trial, extra, *_: factor[extra] * np.linspace(1, 1.01, 20))
-    given = advice.advise([Trial(make_synthesizer("idw"), room, room)], Settings(room.grid), extra=3000)
+    factor = dict(zip((0, *cross_validation.N_SYNTHETIC_CANDIDATES), (1, *factors), strict=True))
+    given = pretended(monkeypatch, room, lambda fold, number: factor[number] * np.linspace(1, 1.01, 20))
     assert given["recommended_extra"] == recommended
     assert given["helps"] == (recommended > 0)
+
+
+def test_the_interval_of_the_advice_is_that_of_the_rule(monkeypatch, room):
+    """Errors without any gain on average: the best number of each fold is chance, and other folds do not confirm it."""
+    generator = np.random.default_rng(1)
+    drawn = {(fold, number): generator.uniform(0.5, 1.5, 4) for fold in range(4) for number in (0, 300, 1000, 3000)}
+    given = pretended(monkeypatch, room, lambda fold, number: drawn[fold, number])
+    best = {}
+    for fold in range(4):
+        others = [other for other in range(4) if other != fold]
+        best[fold] = min((300, 1000, 3000), key=lambda n: np.median([drawn[other, n] for other in others]))
+    expected = np.median([drawn[fold, number] for fold, number in best.items()])
+    assert given["rule"]["median_deg"] == pytest.approx(expected)
+    assert given["rule"]["median_deg"] > min(gain["median_deg"] for gain in given["gains"])
 
 
 def test_a_training_is_as_long_as_the_scene_needs():
@@ -328,12 +408,15 @@ def test_whole_run(small, tmp_path):
     drawn = {"swiftwrf", "idw", "gp", "gp sample", "coarray", "coarray sample"}
     assert set(metrics["mixes"]["0.5"]["synthesis"]) == drawn
     assert metrics["mixes"]["0.5"]["counts"]["turbo_idw_extra"] == {"measured": 20, "withheld": 20, "further": 20}
-    assert metrics["mixes"]["0.5"]["advice"]["n_held_out"] == 20
+    assert metrics["mixes"]["0.5"]["advice"]["swiftwrf"]["n_held_out"] == 16  # of 20: one fold is never scored
     assert set(metrics["mixes"]["1"]["seconds"]) == {"fit", "synthesize", "train"}
 
     errors = pd.read_csv(out / "errors.csv")
     assert len(errors) == 2 * 2 * 20 * 10  # shares, repeats, methods, test spectra
-    own = errors[(errors.mix == 0.5) & (errors.method == "turbo_swiftwrf")]
+    own = errors[(errors.measured_fraction == 0.5) & (errors.method == "turbo_swiftwrf")]
+    assert set(own.estimator) == {"aann"}
+    assert set(own.training) == {"turbo"}
+    assert set(own.synthesizer) == {"swiftwrf"}
     median = own.groupby("index").great_circle_deg.mean().median()
     assert methods["turbo_swiftwrf"]["great_circle_deg"]["median"] == pytest.approx(median)
     assert methods["turbo_swiftwrf"]["great_circle_deg"]["low"] <= median
@@ -368,40 +451,59 @@ def test_whole_run(small, tmp_path):
 
 
 @pytest.fixture
-def registered(monkeypatch):
-    """One more estimator, for the time of a test."""
-    monkeypatch.setattr(ESTIMATORS, "_entries", dict(ESTIMATORS._entries))
+def registered(monkeypatch, tmp_path):
+    """An estimator of another package during a test, found by its entry point."""
+    (tmp_path / "northern.py").write_text(NORTHERN)
+    installed = tmp_path / "northern-1.dist-info"
+    installed.mkdir()
+    (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: northern\nVersion: 1\n")
+    (installed / "entry_points.txt").write_text("[swiftwrf.estimators]\nnorthern = northern:Northern\n")
+    monkeypatch.setattr(ESTIMATORS, "_registered", dict(ESTIMATORS._registered))
+    monkeypatch.syspath_prepend(tmp_path)
 
-    @ESTIMATORS.register("northern", meaning="always due north", colour="#123456")
-    class Northern(Constant):
-        def estimate(self, spectrum):
-            return torch.zeros(len(spectrum), 2, dtype=torch.float64)
+
+NORTHERN = """
+import torch
+from tasks.aoa.estimators import Estimator
 
 
-def test_a_new_estimator_is_in_help_metrics_report_and_colours(small, registered, tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        run("--help")
-    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "northern: always due north" in shown
-    assert "nearest: the spectrum of the nearest" in shown
-    assert arms.palette().colour("northern") == "#123456"
-    assert arms.palette().line("northern") == "--"
+class Northern(Estimator):
+    "Always due north."
+
+    trainable = False
+
+    def _fit(self, train, device):
+        pass
+
+    def predict(self, spectra):
+        return torch.zeros(len(spectra), 2, dtype=torch.float64)
+"""
+
+
+def test_an_estimator_of_another_package_is_in_metrics_report_and_colours(small, registered, tmp_path):
+    colours = palette([Condition("northern", "measured")])
+    assert colours.colour("northern") == Palette().colour("northern")
+    assert colours.line("northern") == "--"
     assert run("--mix", 0.5, "--synthesizer", "nearest", "--extra", 0, "--out", tmp_path / "run") == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["mixes"]["0.5"]["methods"]["northern"]["elevation_deg"]["median"] > 0
     html = (tmp_path / "run" / "report.html").read_text()
-    assert "<dt>northern</dt><dd>always due north</dd>" in html
-    assert "#123456" in html
+    assert "<dt>northern</dt><dd>Always due north</dd>" in html
+    assert colours.colour("northern") in html
 
 
-def test_a_new_synthesizer_is_in_help_report_and_colours(monkeypatch, capsys):
-    monkeypatch.setattr(SYNTHESIZERS, "_entries", dict(SYNTHESIZERS._entries))
-    SYNTHESIZERS.register("dark", meaning="nothing anywhere", colour="#123456")(object)
+def test_a_new_field_model_is_in_help_and_colours(monkeypatch, capsys):
+    monkeypatch.setattr(FIELD_MODELS, "_registered", dict(FIELD_MODELS._registered))
+
+    @FIELD_MODELS.register("dark")
+    class Dark:
+        """No power anywhere."""
+
     with pytest.raises(SystemExit):
         run("--help")
-    assert "dark: nothing anywhere" in " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert arms.synthesizers(["dark", "gone"]) == {"dark": "nothing anywhere"}
-    assert arms.palette().colour("dark") == arms.palette().colour("turbo_dark") == "#123456"
+    assert "dark: No power anywhere" in " ".join(capsys.readouterr().out.replace("│", " ").split())
+    colours = palette([Condition("aann", "turbo", "dark")])
+    assert colours.colour("dark") == colours.colour("turbo_dark") == Palette().colour("dark")
 
 
 def test_a_name_without_colour_has_one_that_depends_on_the_name_alone():
@@ -414,11 +516,11 @@ def test_interrupted_run_goes_on_to_the_same_numbers(small, tmp_path, monkeypatc
 
     honest, calls = AANN.fit, []
 
-    def interrupt(self, train):
+    def interrupt(self, train, **options):
         calls.append(len(train))
         if len(calls) == 2:
             raise KeyboardInterrupt
-        honest(self, train)
+        return honest(self, train, **options)
 
     monkeypatch.setattr(AANN, "fit", interrupt)
     assert run(*arguments, tmp_path / "cut") == 130
@@ -435,6 +537,95 @@ def test_interrupted_run_goes_on_to_the_same_numbers(small, tmp_path, monkeypatc
     assert whole["synthesis"] == cut["synthesis"]
 
 
+def test_fractions_of_many_digits_have_results_of_their_own(small, tmp_path, monkeypatch):
+    """Through to the report, also of a resumed run, for fractions that are equal to six digits, too."""
+    fractions = (0.6666667, 0.66666671, 0.3333333)
+    arguments = (
+        "--mix",
+        *fractions,
+        "--synthesizer",
+        "nearest",
+        "--extra",
+        0,
+        "--suggest",
+        2,
+        "--out",
+        tmp_path / "run",
+    )
+    with monkeypatch.context() as interrupted:
+        interrupted.setattr(experiment, "reporting", lambda page: mock.Mock(side_effect=KeyboardInterrupt))
+        assert run(*arguments) == 130
+    assert run("--resume", tmp_path / "run.partial") == 0
+    mixes = json.loads((tmp_path / "run" / "metrics.json").read_text())["mixes"]
+    assert [float(key) for key in mixes] == list(fractions)
+    for key in mixes:
+        assert mixes[key]["methods"]["turbo_nearest"]["great_circle_deg"]["n"] == 10
+        for name in (f"suggested-mix{key}.csv", f"aann-mix{key}.safetensors"):
+            assert (tmp_path / "run" / name).is_file()
+        assert list((tmp_path / "run" / "figures").glob(f"cdf-mix{key}-*.svg"))
+
+
+def test_labels_of_synthetic_spectra_are_those_of_their_positions(small, tmp_path, monkeypatch):
+    """Stored with the spectra: a program that chooses positions differently does not mislabel those of an earlier one."""
+    given = AoaConfig((0.5,), synthesizer=("idw",), extra=20)
+    train, test = small.split("random", 0)
+    data = steps.Experiment(given, train, test, 20, torch.device("cpu"))
+    synthesis = steps.Synthesis(MeasuredSubset(0.5), "idw", trains=True, n_synthetic=20, sampled=False)
+    (tmp_path / "steps").mkdir()
+    synthesis.compute(data, tmp_path)
+    measured, _ = data.withhold(synthesis.subset)
+    position = sample_positions(measured.position, 20, 0)
+    for place in ("augment.positions.sample_positions", "tasks.aoa.steps.synthetic_positions"):
+        monkeypatch.setattr(place, lambda *_: pytest.fail("positions were computed again"))
+    condition = Condition("kernel_ridge", "turbo_extra", "idw", 20, 0.5)
+    mixed = steps.Evaluation(condition, synthesis)._training_set(data, tmp_path)
+    torch.testing.assert_close(mixed.label[-20:], small.direction_at(position))
+    expected = make_model("idw").fit(measured).synthesize(position)
+    torch.testing.assert_close(mixed.spectrum[-20:], expected, atol=1 / 255, rtol=0)
+
+
+def test_models_for_comparison_are_always_quick(small, monkeypatch):
+    """A field model asked for by name does not bring fits of the published size of others along."""
+    given = AoaConfig((0.5,), synthesizer=("idw",), preset="paper", extra=0)
+    train, test = small.split("random", 0)
+    data = steps.Experiment(given, train, test, 0, torch.device("cpu"))
+    made = []
+    monkeypatch.setattr(steps, "make_model", lambda name, preset, **options: made.append((name, preset)) or mock.Mock())
+    for synthesis in steps._syntheses(data, MeasuredSubset(0.5), ["idw"], {}):
+        synthesis._fitted(data, train, steps._FitHistory(), Path())
+    assert made == [("idw", "paper"), ("gp", "quick"), ("coarray", "quick")]
+
+
+def test_the_room_is_searched_once_for_all_models_with_one(room, glances, tmp_path, monkeypatch):
+    """Its time counts as part of the fit of each of them."""
+    given = AoaConfig((0.5,), synthesizer=("hybrid",), extra=0)
+    train, test = room.split("random", 0)
+    data = steps.Experiment(given, train, test, 0, torch.device("cpu"))
+    monkeypatch.setattr(steps, "candidates", lambda data: ["geometry", "hybrid"])
+    searched, search = [], geometry.search_room
+    monkeypatch.setattr(geometry, "search_room", lambda *given: searched.append(1) or search(*given))
+    (tmp_path / "steps").mkdir()
+    (first,) = steps._syntheses(data, MeasuredSubset(0.7), ["hybrid"], {})
+    value = first.compute(data, tmp_path)
+    syntheses = first.then(data, value)
+    assert [synthesis.synthesizer for synthesis in syntheses] == ["hybrid", "geometry"]
+    for synthesis in syntheses:
+        assert synthesis.reads == (first.file,)
+        assert synthesis.compute(data, tmp_path)["seconds"]["fit"] > value["seconds"]
+    assert len(searched) == 1
+
+
+def test_advice_is_that_of_each_field_model(small):
+    """A model without cross-validation adds no further positions by default."""
+    given = AoaConfig((0.5,), synthesizer=("idw", "gp", "vae"))
+    train, test = small.split("random", 0)
+    data = steps.Experiment(given, train, test, 3000, torch.device("cpu"))
+    advice = {"idw": {"recommended_extra": 300, "sampled": False}, "gp": {"recommended_extra": 0, "sampled": True}}
+    found = {s.synthesizer: s for s in steps._syntheses(data, MeasuredSubset(0.5), given.synthesizer, advice)}
+    assert {name: found[name].n_synthetic for name in given.synthesizer} == {"idw": 3000, "gp": 0, "vae": 0}
+    assert {name: found[name].sampled for name in given.synthesizer} == {"idw": False, "gp": True, "vae": False}
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -443,7 +634,7 @@ def test_interrupted_run_goes_on_to_the_same_numbers(small, tmp_path, monkeypatc
         (("--mix", 0.3, 0.3), "twice"),
         (("--mix", 0.1), "leaves 4 of 40"),
         (("--mix", 0.5, "--split", "nowhere"), "choose one of block, random"),
-        (("--mix", 0.5, "--synthesizer", "oracle"), "unknown synthesizer"),
+        (("--mix", 0.5, "--synthesizer", "oracle"), "unknown field model"),
         (("--mix", 0.5, "--repeats", 0), "--repeats"),
         (("--mix", 0.5, "--suggest", -1), "--suggest"),
         (("--mix", 0.5, "--data", "/nowhere"), "is not a folder"),

@@ -135,6 +135,22 @@ def test_arrays_of_something_else_are_refused(tmp_path, change, says):
         load_spectra(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("asked", "array"),
+    [
+        ((4, 0.06, 2.4e9), PlanarArray.square(4, 2.4e9, 0.06)),
+        ((4, 4, 0.06, 2.4e9), PlanarArray.square(4, 2.4e9, 0.06)),
+        ((2, 8, 0.06, 2.4e9), PlanarArray.grid(2, 8, 0.06, 2.4e9)),
+        ((1, 8, 0.06, 2.4e9), PlanarArray.grid(1, 8, 0.06, 2.4e9)),
+    ],
+)
+def test_an_array_of_any_rows_and_columns(tmp_path, asked, array):
+    write_deepmimo(tmp_path / "source")
+    assert run(tmp_path / "source", tmp_path / "own", *GRID, "--array", *asked) == 0
+    expected = load_spectra(tmp_path / "source", array=array, grid=AngularGrid.hemisphere(24, 96))
+    assert torch.equal(load_spectra(tmp_path / "own").spectrum, expected.spectrum)
+
+
 def test_calibration_sees_the_training_part_alone(tmp_path, capsys):
     data, *_ = spoilt(snapshots(n=150))
     folder = write_snapshots(tmp_path / "source", data=data)
@@ -157,6 +173,10 @@ def test_calibration_sees_the_training_part_alone(tmp_path, capsys):
         (("{source}", "{new}", "--columns", "x=a"), "takes no columns"),
         (("{source}", "{new}", "--grid", 1, 1), "--grid"),
         (("{source}", "{new}", "--every", 0), "--every must be at least 1"),
+        (("{source}", "{new}", "--array", 1, 0.06, 2.4e9), "2 to 32 elements a side"),
+        (("{source}", "{new}", "--array", 2, 64, 0.06, 2.4e9), "2 to 32 elements a side"),
+        (("{source}", "{new}", "--array", 2, 0, 0.06, 2.4e9), "2 to 32 elements a side"),
+        (("{source}", "{new}", "--array", 2, 8, -0.06, 2.4e9), "above 0"),
         (("{survey}", "{new}", "--calibrate"), "takes array snapshots"),
         (("{source}", "{new}", "--split", "block"), "--split and --seed are of the calibration; give --calibrate, too"),
         (("{survey}", "{new}", "--beamformer", "capon"), "takes no beamformer"),

@@ -10,20 +10,18 @@ import zlib
 import numpy as np
 import pytest
 import torch
-from fuzz.kinds import N, spectra_paths
 from PIL import Image
+from samples import write_paths
 
-from swiftwrf import (
-    InputError,
-    load_rssi,
-    load_spectra,
-)
+from swiftwrf import InputError, load_rssi, load_spectra
+
+N = 12
 
 
 def paths(folder, **changes):
     """A folder with ray paths, some of their arrays replaced."""
     folder.mkdir(exist_ok=True)
-    spectra_paths(folder, **changes)
+    write_paths(folder, **changes)
     return folder
 
 

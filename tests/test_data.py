@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from swiftwrf import InputError, load_spectra
+from swiftwrf import InputError, load_spectra, simulated_room
 from swiftwrf.data.spectra import coarsening
 from swiftwrf.data.splits import block_split, random_split, slabs, split_names
 
@@ -248,3 +248,8 @@ def test_measured_spectra_have_the_published_labels(measured_data):
         "random": (160, 40),
         "block": (160, 40),
     }
+
+
+def test_a_subset_without_rows():
+    """With everything measured nothing is withheld."""
+    assert len(simulated_room(n=20).subset(torch.empty(0, dtype=torch.int64))) == 0

@@ -13,8 +13,7 @@ from swiftwrf import AngularGrid, InputError, load, simulated_room
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.runtime.checkpoint import read, write
-from tasks.aoa.estimators import Settings
-from tasks.aoa.estimators.aann import AANN, AANNConfig
+from tasks.aoa.estimators.aann import AANN
 from tasks.aoa.estimators.kernel_ridge import KernelRegression
 
 GRID = AngularGrid.hemisphere(8, 32)
@@ -28,8 +27,7 @@ def small():
 @pytest.fixture(scope="module")
 def network(small, tmp_path_factory):
     """The real one, hardly trained, and its file."""
-    estimator = AANN(Settings(GRID), AANNConfig(steps=3, batch=8))
-    estimator.fit(Mixed.measured(small))
+    estimator = AANN(steps=3, batch=8).fit(Mixed.measured(small))
     file = tmp_path_factory.mktemp("network") / "aann.safetensors"
     estimator.save(file)
     return estimator, file
@@ -44,19 +42,20 @@ def finished(tmp_path_factory):
 
 
 def test_kernel_ridge_comes_back(small, tmp_path):
-    estimator = KernelRegression(Settings(GRID))
-    estimator.fit(Mixed.measured(small))
+    estimator = KernelRegression(seed=3).fit(Mixed.measured(small))
     estimator.save(tmp_path / "model")
-    again = load(tmp_path / "model").estimate(small.spectrum)
-    apart = angle_errors(again, estimator.estimate(small.spectrum))["great_circle"]
+    again = load(tmp_path / "model")
+    assert again.config == estimator.config
+    apart = angle_errors(again.predict(small.spectrum), estimator.predict(small.spectrum))["great_circle"]
     assert float(apart.max()) < 1e-5
 
 
 def test_the_network_comes_back_as_it_was(small, network):
     estimator, file = network
     again = load(file)
-    assert again.settings.grid == GRID
-    apart = angle_errors(again.estimate(small.spectrum), estimator.estimate(small.spectrum))["great_circle"]
+    assert again.grid == GRID
+    assert again.to("cpu") is again
+    apart = angle_errors(again.predict(small.spectrum), estimator.predict(small.spectrum))["great_circle"]
     assert float(apart.rad2deg().max()) < 1e-4  # it was rounded before its last step was found
     assert file.stat().st_size < 60e6
 
@@ -92,7 +91,7 @@ def test_a_run_keeps_the_estimator_that_saw_most(finished):
     errors = pd.read_csv(finished / "errors.csv")
     own = errors[errors.method == "kernel_ridge_turbo_nearest_extra"]
     test = simulated_room(n=30, grid=GRID).subset(torch.tensor(own["index"].tolist()))
-    estimate = estimator.estimate(test.spectrum).rad2deg().numpy()
+    estimate = estimator.predict(test.spectrum).rad2deg().numpy()
     np.testing.assert_allclose(estimate, own[["estimate_azimuth_deg", "estimate_elevation_deg"]], atol=1e-3)
 
 

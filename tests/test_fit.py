@@ -13,8 +13,8 @@ from swiftwrf.data.store import Store
 from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel
 from swiftwrf.metrics import covered, psnr
 from swiftwrf.models.swiftwrf.field import DeformableGaussians
-from swiftwrf.models.swiftwrf.optimise import Optimisation
 from swiftwrf.models.swiftwrf.fit import doubling_search
+from swiftwrf.models.swiftwrf.optimise import Optimisation
 from swiftwrf.rasterize import reference
 
 QUICK = FitConfig(model=ModelConfig(n_primitives=24), steps=80, check_every=20)  # by gradient

@@ -71,15 +71,15 @@ def test_grids_arrays_and_kernels_refuse_what_they_cannot_be():
 
 
 def test_prime_numbers_of_rows_leave_the_network_something():
-    from tasks.aoa.estimators.aann import LEAST_ROWS
+    from tasks.aoa.estimators.aann import MIN_ROWS
 
-    assert coarsening((89, 356), 120, LEAST_ROWS) == 1
-    assert coarsening((90, 360), 120, LEAST_ROWS) == 3
+    assert coarsening((89, 356), 120, MIN_ROWS) == 1
+    assert coarsening((90, 360), 120, MIN_ROWS) == 3
 
 
 def test_small_spectra_are_refused_before_the_training():
     from swiftwrf import simulated_room
-    from tasks.aoa.config import AoaConfig, check_data
+    from tasks.aoa.options import AoaConfig, check_data
 
     with pytest.raises(InputError, match="7 x 7"):
         check_data(simulated_room(n=20, grid=AngularGrid.hemisphere(4, 16)), AoaConfig((0.5,)))

@@ -97,7 +97,7 @@ DAMAGE = {
         _set("grid", to=3),
         _set("kernel", "share", to=7),
         _tensor("position", lambda t: t[:, :2]),
-        _tensor("readout", lambda t: t * torch.inf),
+        _tensor("coefficient", lambda t: t * torch.inf),
         _tensor("form", lambda t: t[:-1]),
         _tensor("offset", lambda t: t.repeat(2)),
         _tensor("element", lambda t: t[:0]),
@@ -179,7 +179,7 @@ print(type(swiftwrf.load(sys.argv[1])).__name__)
 
 
 def test_models_of_every_kind_are_opened_with_swiftwrf_alone(room, tmp_path, small_published):
-    for name in ("gp", "coarray", "vae"):
+    for name in ("gp", "hybrid", "vae"):
         make_model(name).fit(room).save(tmp_path / name)
         opened = subprocess.run(
             [sys.executable, "-c", ONLY_SWIFTWRF, tmp_path / name], capture_output=True, text=True, check=True

@@ -25,6 +25,18 @@ def test_records_come_back(tmp_path, dtype):
     np.testing.assert_array_equal(tensor(read[2]["csi"]), values)
 
 
+@pytest.mark.parametrize("at", [3, 9, 40, -2])
+def test_a_flipped_bit_is_refused(tmp_path, at):
+    """In the length, its checksum, the data, and their checksum."""
+    file = tmp_path / "a.tfrecords"
+    write_records(file, [{"pos": np.zeros(3)}])
+    content = bytearray(file.read_bytes())
+    content[at] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(InputError, match=r"checksum does not match|ends within record 1"):
+        list(records(file))
+
+
 def test_a_tensor_of_another_size_than_it_claims():
     message = tensor_message(np.zeros((2, 3)))
     with pytest.raises(ValueError, match="with 6 numbers"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import subprocess
 from contextlib import suppress
 
 import pandas as pd
@@ -15,6 +16,7 @@ from quick import run, said
 
 from swiftwrf import InputError
 from swiftwrf.runtime import durable
+from tasks import environment
 from tasks.claim import Claim
 from tasks.command import main
 from tasks.page.records import Records
@@ -253,6 +255,21 @@ def test_names_are_text_and_no_formulas(tmp_path):
     assert (table["n"] == 1).all()
     lines = (tmp_path / "t.csv").read_text().splitlines()
     assert not [line for line in lines if line[0] in "=+-@"]
+
+
+def test_whole_numbers_stay_whole_where_other_rows_have_none(tmp_path):
+    write_table(tmp_path / "t.csv", [{"step": 1}, {"step": None, "loss": 0.5}])
+    assert (tmp_path / "t.csv").read_text().splitlines() == ["step,loss", "1,", ",0.5"]
+
+
+def test_the_commit_is_that_of_this_project(tmp_path, monkeypatch):
+    """Not that of a user's repository in which the package is installed."""
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b.c"]
+    subprocess.run([*git, "init", "--quiet"], check=True)
+    subprocess.run([*git, "commit", "--quiet", "--allow-empty", "--message", "empty"], check=True)
+    (tmp_path / "environment.py").write_text("")
+    monkeypatch.setattr(environment, "__file__", str(tmp_path / "environment.py"))
+    assert environment._commit() is None
 
 
 @pytest.mark.filterwarnings("error:constrained_layout")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from importlib.metadata import EntryPoint
 
 import numpy as np
 import pandas as pd
@@ -13,102 +14,132 @@ from PIL import Image
 from samples import write_survey
 from sklearn.model_selection import GridSearchCV, PredefinedSplit
 from sklearn.neighbors import KNeighborsRegressor
+from small import with_defaults
 
 from swiftwrf import InputError, Rssi, fit_rssi, load, rssi_room
-from swiftwrf.comparison import NeRF2RssiConfig, NeRF2RssiSize
+from swiftwrf.comparison import NeRF2Rssi, NeRF2RssiConfig, NeRF2RssiSize
 from swiftwrf.data.splits import folds
+from swiftwrf.rssi import RssiPredictor
+from swiftwrf.runtime import registry
+from tasks.page.labels import PREDICTORS as LABELS
 from tasks.report import merge
 from tasks.rssi import experiment
 from tasks.rssi.page.summary import varies
-from tasks.rssi.predictors import PREDICTORS, Settings, blend, lacks, nerf2
-from tasks.rssi.predictors.regressors import NEIGHBOURS
+from tasks.rssi.predictors import PREDICTORS, make_predictor
+from tasks.rssi.predictors.blend import Blend, BlendConfig
+from tasks.rssi.predictors.regressors import NEIGHBOUR_COUNTS
 from tasks.run import command_line
 from tasks.summarise import paired_difference
 
 
-def law_only(n=60, noise=0.0, level=-50.0, exponent=2.0, seed=0):
-    """Three receivers that follow the log-distance law exactly, but for noise."""
+def path_loss_only(n=60, noise=0.0, level=-50.0, exponent=2.0, seed=0):
+    """Three receivers that follow the path-loss model exactly, except for noise."""
     generator = torch.Generator().manual_seed(seed)
     receiver = torch.tensor([[0.0, 0, 2], [10, 0, 2], [0, 10, 2]], dtype=torch.float64)
     position = torch.rand(n, 3, generator=generator, dtype=torch.float64) * torch.tensor([10.0, 10.0, 1.0])
     clean = level - 10 * exponent * torch.cdist(position, receiver).log10()
     rssi = clean + noise * torch.randn(n, 3, generator=generator)
-    return Rssi(rssi, position, receiver_position=receiver, receiver_names="abc", name="law")
+    return Rssi(rssi, position, receiver_position=receiver, receiver_names="abc", name="path loss")
 
 
 @pytest.mark.parametrize("name", [n for n in PREDICTORS if n.startswith(("mri", "gp"))])
-def test_predictors_with_a_law_recover_it(name):
-    data = law_only()
-    predictor = PREDICTORS[name].make(Settings())
-    predictor.fit(data)
-    place = torch.tensor([[3.0, 4.0, 2.0]], dtype=torch.float64)
-    assert predictor.predict(place)[0, 0].item() == pytest.approx(-50 - 20 * np.log10(5), abs=0.05)
+def test_predictors_with_a_path_loss_model_recover_it(name):
+    position = torch.tensor([[3.0, 4.0, 2.0]], dtype=torch.float64)
+    predictor = make_predictor(name).fit(path_loss_only())
+    assert predictor.predict(position).mean[0, 0].item() == pytest.approx(-50 - 20 * np.log10(5), abs=0.05)
 
 
-def test_pooled_law_is_one_law():
-    data = law_only()
+def test_shared_path_loss_model_is_one_model():
+    data = path_loss_only()
     shifted = replace(data, rssi_dbm=data.rssi_dbm + torch.tensor([0.0, 3, 6]))
-    pooled = PREDICTORS["mri_pooled"].make(Settings())
-    pooled.fit(shifted)
-    place = torch.tensor([[5.0, 5.0, 2.0]], dtype=torch.float64)  # equally far from all receivers
-    assert torch.allclose(pooled.predict(place)[0], pooled.predict(place)[0, 0])
+    position = torch.tensor([[5.0, 5.0, 2.0]], dtype=torch.float64)  # equally far from all receivers
+    predicted = make_predictor("mri_pooled").fit(shifted).predict(position).mean[0]
+    assert torch.allclose(predicted, predicted[0])
 
 
-def test_pooled_law_pools_over_all_receivers_of_the_data():
-    """Asked for one receiver, it learns from the others, too."""
+def test_shared_path_loss_model_is_of_all_receivers_of_the_pool():
     data = rssi_room(n=60)
-    one, every = data.receivers(["6"]), PREDICTORS["mri_pooled"].make(Settings())
-    every.fit(data)
-    pooled = PREDICTORS["mri_pooled"].make(Settings(pool=data))
-    pooled.fit(one)
-    torch.testing.assert_close(
-        pooled.predict(data.transmitter_position)[:, 0], every.predict(data.transmitter_position)[:, 5]
-    )
+    every = make_predictor("mri_pooled").fit(data).predict(data.transmitter_position).mean
+    one = make_predictor("mri_pooled").fit(data.receivers(["6"]), pool=data).predict(data.transmitter_position).mean
+    torch.testing.assert_close(one[:, 0], every[:, 5])
 
 
 @pytest.fixture(autouse=True)
 def short_nerf2(monkeypatch):
     """A field that is fitted in a second."""
     size = NeRF2RssiSize(width=16, bands=2, samples=4, azimuths=4, elevations=2)
-    monkeypatch.setattr(nerf2, "NeRF2RssiConfig", lambda: NeRF2RssiConfig(size=size, steps=300, rate=2e-2))
+    config = NeRF2RssiConfig(size=size, steps=300, rate=2e-2)
+    monkeypatch.setattr(NeRF2Rssi, "config_type", with_defaults(config))
 
 
 @pytest.mark.parametrize("name", list(PREDICTORS))
-def test_predictors_ignore_what_was_not_heard(name):
+def test_predictors_ignore_missing_values(name):
     train, test = rssi_room(n=60).receivers(["1", "2"]).split("random")
-    predictor = PREDICTORS[name].make(Settings("block"))
-    predictor.fit(train)
-    predicted = predictor.predict(test.transmitter_position)
-    assert predicted.shape == (12, 2)
-    assert predicted.isfinite().all()
-    heard = ~test.rssi_dbm.isnan()
-    assert (predicted - test.rssi_dbm)[heard].abs().median() < 9
+    predictor = make_predictor(name, validation="block")
+    with pytest.raises(InputError, match="is not fitted"):
+        predictor.predict(test.transmitter_position)
+    assert predictor.fit(train) is predictor
+    assert predictor.receiver_names == ("receiver01", "receiver02")
+    prediction = predictor.predict(test.transmitter_position)
+    assert prediction.mean.shape == (12, 2)
+    assert prediction.mean.isfinite().all()
+    assert (prediction.std is not None) == (name == "swiftwrf")
+    assert (prediction.mean - test.rssi_dbm).abs().nanmedian() < 9
+    assert predictor.predict(test.transmitter_position[:0]).mean.shape == (0, 2)
 
 
 @pytest.mark.parametrize("name", list(PREDICTORS))
 @pytest.mark.parametrize("validation", ["random", "block"])
-def test_predictors_fall_back_where_a_receiver_is_hardly_heard(name, validation):
+def test_predictors_fall_back_at_a_rarely_detected_receiver(name, validation):
     """Never, once, in one slab only: the others are fitted, and all predictions are finite."""
     data = rssi_room(n=60).columns([0, 1, 2, 3])
     data.rssi_dbm[:, 0] = torch.nan
     data.rssi_dbm[1:, 1] = torch.nan
     data.rssi_dbm[:, 2][data.transmitter_position[:, 0] > 6] = torch.nan
-    predictor = PREDICTORS[name].make(Settings(validation))
-    predictor.fit(data)
-    assert predictor.predict(data.transmitter_position).isfinite().all()
+    predictor = make_predictor(name, validation=validation).fit(data)
+    assert predictor.predict(data.transmitter_position).mean.isfinite().all()
 
 
-def test_predictors_say_what_they_are():
-    for entry in PREDICTORS.entries():
-        assert entry.meaning
-        assert entry.colour is not None
+def test_predictors_describe_themselves():
+    for name, predictor in PREDICTORS.items():
+        assert issubclass(predictor, RssiPredictor)
+        assert predictor.name == name
+        assert PREDICTORS.summary(name)
+        assert LABELS[name].colour
     baselines = ["mean", "mri_pooled", "mri_receiver", "knn", "mri_residual", "gp"]
     assert list(PREDICTORS) == ["swiftwrf", *baselines, "blend", "nerf2"]
 
 
 def test_unknown_predictor():
     with pytest.raises(InputError, match="choose from swiftwrf"):
-        PREDICTORS["forest"]
+        make_predictor("forest")
+    with pytest.raises(InputError, match="validation must be 'random' or 'block'"):
+        make_predictor("knn", validation="blok")
+    with pytest.raises(InputError, match="KNNPredictor has no option 'k'"):
+        PREDICTORS["knn"](k=3)
+
+
+def test_a_predictor_of_another_package(monkeypatch, small, tmp_path):
+    """Registered by an entry point, it takes part in a run."""
+    point = EntryPoint("outside", "test_rssi:Outside", "swiftwrf.rssi_predictors")
+    monkeypatch.setattr(registry, "entry_points", lambda group: [point] if group == point.group else [])
+    monkeypatch.setattr(PREDICTORS, "_registered", {name: PREDICTORS[name] for name in ("swiftwrf", "mean")})
+    assert run("--rx", "1", "--out", tmp_path / "run") == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert list(metrics["overall"]) == ["swiftwrf", "mean", "outside"]
+    assert "Always -70 dBm" in (tmp_path / "run" / "report.html").read_text()
+
+
+class Outside(RssiPredictor):
+    """Always -70 dBm."""
+
+    name = "outside"
+
+    def _fit(self, train, context):
+        self.n = len(train.receiver_names)
+
+    def _predict(self, position):
+        return torch.full((len(position), self.n), -70.0), None
 
 
 @pytest.fixture
@@ -122,7 +153,7 @@ def run(*arguments):
 
 
 def test_whole_run(small, tmp_path, monkeypatch):
-    monkeypatch.setattr(blend, "BLENDED", ("knn", "mri_residual"))
+    monkeypatch.setattr(Blend, "config_type", with_defaults(BlendConfig(members=("knn", "mri_residual"))))
     plan = tmp_path / "plan.png"
     Image.new("RGB", (40, 30), "white").save(plan)
     floor = ("--floor-plan", plan, "--floor-extent", 0, 20, 0, 16)
@@ -182,18 +213,15 @@ def unlocated(n=60):
 
 @pytest.mark.parametrize("name", list(PREDICTORS))
 def test_predictors_without_positions_of_the_receivers(name):
-    data, predictor = unlocated(), PREDICTORS[name].make(Settings())
-    if PREDICTORS[name].needs:
-        assert "needs the positions of the receivers" in lacks(name, data)
-    if name.startswith("mri"):
-        with pytest.raises(
-            InputError, match="needs the positions of the receivers, which simulated-floor does not tell"
-        ):
+    data, predictor = unlocated(), make_predictor(name)
+    if predictor.requires_receiver_position:
+        message = f"{name} needs the positions of the receivers, which simulated-floor does not describe"
+        assert predictor.lacking(data) == message
+        with pytest.raises(InputError, match=message):
             predictor.fit(data)
-    elif not PREDICTORS[name].needs:
-        assert lacks(name, data) == ""
-        predictor.fit(data)
-        assert predictor.predict(data.transmitter_position).isfinite().all()
+    else:
+        assert predictor.lacking(data) == ""
+        assert predictor.fit(data).predict(data.transmitter_position).mean.isfinite().all()
 
 
 def test_model_without_positions_of_the_receivers_is_saved(tmp_path):
@@ -202,8 +230,8 @@ def test_model_without_positions_of_the_receivers_is_saved(tmp_path):
     assert not model.slope.any()
     assert not model.directivity.any()
     model.save(tmp_path / "model")
-    place = data.transmitter_position[:5]
-    torch.testing.assert_close(load(tmp_path / "model").predict(place)[0], model.predict(place)[0])
+    position = data.transmitter_position[:5]
+    torch.testing.assert_close(load(tmp_path / "model").predict(position).mean, model.predict(position).mean)
 
 
 def test_a_survey_table_is_one_command_to_a_map(tmp_path, capsys):
@@ -227,34 +255,29 @@ def test_columns_are_for_tables(small, tmp_path, capsys):
 def test_neighbours_are_those_that_a_grid_search_chooses():
     data = rssi_room(n=150)
     fold = folds(data.transmitter_position, "random", 0).numpy()
-    place, predictor = data.transmitter_position.numpy(), PREDICTORS["knn"].make(Settings())
+    position, predictor = data.transmitter_position.numpy(), make_predictor("knn")
     for values in data.rssi_dbm.numpy().T[:3]:
-        heard = ~np.isnan(values)
-        x, y, own = place[heard], values[heard], fold[heard]
-        grid = {"n_neighbors": [k for k in NEIGHBOURS if k <= 100], "weights": ["uniform", "distance"]}
+        detected = ~np.isnan(values)
+        x, y, own = position[detected], values[detected], fold[detected]
+        grid = {"n_neighbors": [k for k in NEIGHBOUR_COUNTS if k <= 100], "weights": ["uniform", "distance"]}
         search = GridSearchCV(KNeighborsRegressor(), grid, scoring="neg_mean_absolute_error", cv=PredefinedSplit(own))
         found = predictor._regressor(x, y, own)
         assert {"n_neighbors": found.n_neighbors, "weights": found.weights} == search.fit(x, y).best_params_
 
 
-def test_a_blend_takes_the_part_that_is_right(monkeypatch):
-    monkeypatch.setattr(blend, "BLENDED", ("mri_receiver", "mean"))
-    data = law_only()
-    blended = PREDICTORS["blend"].make(Settings(pool=data))
-    blended.fit(data)
+def test_a_blend_takes_the_member_that_is_right():
+    data = path_loss_only()
+    blended = Blend(members=("mri_receiver", "mean")).fit(data)
     assert blended.weights == pytest.approx({"mri_receiver": 1, "mean": 0}, abs=1e-6)
-    torch.testing.assert_close(blended.predict(data.transmitter_position), data.rssi_dbm, atol=1e-3, rtol=0)
+    torch.testing.assert_close(blended.predict(data.transmitter_position).mean, data.rssi_dbm, atol=1e-3, rtol=0)
 
 
-def test_a_blend_weighs_noisy_parts(monkeypatch):
-    """The weights are positive where each part knows something, and sum to 1."""
-    monkeypatch.setattr(blend, "BLENDED", ("knn", "mri_receiver"))
+def test_a_blend_weighs_noisy_members():
     train, test = rssi_room(n=200).receivers(["1", "2"]).split()
-    blended = PREDICTORS["blend"].make(Settings(pool=train))
-    blended.fit(train)
+    blended = Blend(members=("knn", "mri_receiver")).fit(train)
     assert sum(blended.weights.values()) == pytest.approx(1)
     assert min(blended.weights.values()) > 0.05
-    assert blended.predict(test.transmitter_position).shape == test.rssi_dbm.shape
+    assert blended.predict(test.transmitter_position).mean.shape == test.rssi_dbm.shape
 
 
 @pytest.mark.parametrize(("rows", "known"), [(1, False), (9, False), (10, True)])

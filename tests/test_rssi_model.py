@@ -1,4 +1,4 @@
-"""The RSSI model: its closed form against slow definitions, what it promises of intervals, and what it survives."""
+"""The RSSI model: its regression against slow definitions, its intervals, its files, and awkward data."""
 
 from __future__ import annotations
 
@@ -7,62 +7,76 @@ from dataclasses import replace
 import pytest
 import torch
 from scipy.optimize import minimize
-from swiftwrf.rssi.choose import mixing_weights
-from swiftwrf.rssi.law import Law, fit_law, harmonics, log_distance
-from swiftwrf.rssi.sites import gather
-from swiftwrf.rssi.solve import DIRECTIVITY_DB, LAW_DB, Group, solve
 
-from swiftwrf import InputError, Rssi, RssiConfig, fit_rssi, load, rssi_room
+from swiftwrf import InputError, Rssi, RssiConfig, RssiModel, fit_rssi, load, rssi_room
 from swiftwrf.gp import Kernel
-from swiftwrf.rssi import fit as rssi_fit
-from swiftwrf.rssi.head import Head, Table, pooled
+from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
+from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, harmonics, log_distance
+from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, PATH_LOSS_STD_DB, fit_receiver
+from swiftwrf.rssi.stacking import mixing_weights
+from swiftwrf.rssi.training import RssiTraining, bin_locations
+from swiftwrf.runtime import checkpoint
 from swiftwrf.runtime.threads import threads_kept
 
 KERNEL = Kernel(long=4.0, short=1.0, share=0.6, noise=1.0)
 FIELD_DB, NOISE_DB = 3.0, 2.0
-CPU = torch.device("cpu")
+CPU, FIRST = torch.device("cpu"), slice(0, 1)
 
 
-def law_only(n=60, noise=0.0, level=-50.0, exponent=2.0, seed=0):
-    """Three receivers that follow the log-distance law exactly, but for noise."""
+def path_loss_only(n=60, noise=0.0, level=-50.0, exponent=2.0, seed=0):
+    """Three receivers that follow the path-loss model exactly, except for noise."""
     generator = torch.Generator().manual_seed(seed)
     receiver = torch.tensor([[0.0, 0, 2], [10, 0, 2], [0, 10, 2]], dtype=torch.float64)
     position = torch.rand(n, 3, generator=generator, dtype=torch.float64) * torch.tensor([10.0, 10.0, 1.0])
     clean = level - 10 * exponent * log_distance(position, receiver)
     rssi = clean + noise * torch.randn(n, 3, generator=generator)
-    return Rssi(rssi, position, receiver_position=receiver, receiver_names="abc", name="law")
+    return Rssi(rssi, position, receiver_position=receiver, receiver_names="abc", name="path loss")
 
 
 def with_field(n=150, noise=0.5, seed=0):
-    """The law, and a smooth field of some dB on it."""
-    data = law_only(n, noise, seed=seed)
+    """The path-loss model, and a smooth field of some dB."""
+    data = path_loss_only(n, noise, seed=seed)
     x, y = data.transmitter_position[:, :1], data.transmitter_position[:, 1:2]
     return replace(data, name="field", rssi_dbm=data.rssi_dbm + 6 * torch.sin(x / 2) * torch.cos(y / 2))
 
 
+def both(prediction):
+    """Mean and standard deviation in one tensor."""
+    return torch.stack([prediction.mean, prediction.std])
+
+
 def missed(model, test):
     """Median absolute error [dB]."""
-    return (model.predict(test.transmitter_position)[0] - test.rssi_dbm).abs().nanmedian()
+    return (model.predict(test.transmitter_position).mean - test.rssi_dbm).abs().nanmedian()
 
 
-def group_of(data, fold=None):
-    """Its receivers before their fit."""
+def training_of(data, n_primitives=50):
+    """The training data of the receivers, each row a bin."""
     n, r = data.rssi_dbm.shape
+    centre = data.transmitter_position.mean(dim=0)
     distance = log_distance(data.transmitter_position, data.receiver_position)
-    return Group(
-        receiver=data.receiver_position,
-        position=data.transmitter_position,
-        local=data.transmitter_position - data.transmitter_position.mean(dim=0),
+    path_loss = fit_path_loss(distance, data.rssi_dbm)
+    return RssiTraining(
+        receiver_names=data.receiver_names,
+        receiver=data.receiver_position - centre,
+        centre=centre,
+        position=data.transmitter_position - centre,
+        bin_of_row=torch.arange(n),
+        fold=torch.arange(n) % 5,
         rssi=data.rssi_dbm,
         count=torch.ones(n, r, dtype=torch.float64),
-        fold=torch.arange(n) % 5 if fold is None else fold,
-        law=fit_law(distance, data.rssi_dbm),
+        kernel=KERNEL,
+        n_primitives=n_primitives,
+        rendered=render([Head(name, n_primitives, 0).requires_grad_(False) for name in data.receiver_names]),
+        prior_mean=path_loss,
         field_db=torch.full((r,), FIELD_DB, dtype=torch.float64),
         noise_db=torch.full((r,), NOISE_DB, dtype=torch.float64),
+        baselines=PathLoss(*(values.expand(3, -1) for values in path_loss)),
+        baseline_held_out=torch.zeros(3, n, r, dtype=torch.float64),
     )
 
 
-# --- the closed form -------------------------------------------------------------------------------------------------
+# --- the regression -------------------------------------------------------------------------------------------------
 
 
 def test_solution_is_the_maximum_of_the_posterior():
@@ -71,21 +85,21 @@ def test_solution_is_the_maximum_of_the_posterior():
     data = with_field(n=40, noise=2.0).columns([1])
     data.rssi_dbm[3] -= 25.0  # outliers, so that the weights matter
     data.rssi_dbm[20] += 15.0
-    group = group_of(data)
-    config = RssiConfig()
-    found = solve(group, KERNEL, config, 50, CPU)
+    training, config = training_of(data), RssiConfig()
+    found = {name: value[0] for name, value in fit_receiver(FIRST, training, config, CPU).items()}
 
-    drawn = Head(1, 50, config.seed).requires_grad_(False).draw().double()
-    root = torch.linalg.cholesky(KERNEL(group.local, group.local) + 1e-10 * torch.eye(40, dtype=torch.float64))
-    distance = log_distance(group.position, group.receiver)[:, 0]
-    bearing = harmonics(group.position, group.receiver)[:, 0]
+    rendered = training.rendered.double()
+    gram = KERNEL(training.position, training.position)
+    root = torch.linalg.cholesky(gram + 1e-10 * torch.eye(40, dtype=torch.float64))
+    distance = log_distance(training.position, training.receiver)[:, 0]
+    bearing = harmonics(training.position, training.receiver)[:, 0]
 
     def predicted(parameters):
-        level, slope = LAW_DB * parameters[0], LAW_DB * parameters[1]
-        motion = FIELD_DB * root @ parameters[10:]
-        law = group.law.level[0] + level + (group.law.slope[0] + slope) * distance
-        head = pooled(drawn, motion[:, None]) - pooled(drawn, torch.zeros(1, 1).double())
-        return law + DIRECTIVITY_DB * bearing @ parameters[2:10] + head[:, 0]
+        level, slope = PATH_LOSS_STD_DB * parameters[0], PATH_LOSS_STD_DB * parameters[1]
+        latent = FIELD_DB * root @ parameters[10:]
+        path_loss = training.prior_mean.level[0] + level + (training.prior_mean.slope[0] + slope) * distance
+        head = mean_magnitude(rendered, latent[:, None]) - mean_magnitude(rendered, torch.zeros(1, 1).double())
+        return path_loss + DIRECTIVITY_STD_DB * bearing @ parameters[2:10] + head[:, 0]
 
     def objective(x):
         parameters = torch.tensor(x, requires_grad=True)
@@ -102,36 +116,41 @@ def test_solution_is_the_maximum_of_the_posterior():
         method="L-BFGS-B",
         options={"maxiter": 5000, "maxfun": 9000, "ftol": 1e-14},
     )
-    motion = KERNEL(group.local, group.local) @ found.coefficient
-    mine = found.level + found.slope * distance[:, None] + (bearing @ found.directivity[0])[:, None]
-    mine = mine + Table(drawn)(motion)[0] - Table(drawn)(torch.zeros_like(motion))[0]
-    torch.testing.assert_close(mine[:, 0], predicted(torch.tensor(best.x)), atol=0.06, rtol=0)
+    latent = (gram @ found["coefficient"])[:, None]
+    table = HeadTable(training.rendered)
+    mine = found["level"] + found["slope"] * distance + bearing @ found["directivity"]
+    mine = mine + (table(latent)[0] - table(torch.zeros_like(latent))[0])[:, 0]
+    torch.testing.assert_close(mine, predicted(torch.tensor(best.x)), atol=0.06, rtol=0)
 
 
 def test_held_out_is_a_fit_without_the_fold():
     """The formula for held-out rows against fits that never see them; without outliers, so that no weight depends on them,
     and without a head, which the formula takes along its tangent."""
-    data = with_field(n=60)
-    group = group_of(data)
-    gentle = RssiConfig(huber=1e6)
-    whole = solve(group, KERNEL, gentle, 0, CPU)
+    training, gentle = training_of(with_field(n=60).columns([1]), n_primitives=0), RssiConfig(huber=1e6)
+    whole = fit_receiver(FIRST, training, gentle, CPU)["held_out"][0]
     for number in range(5):
-        out = group.fold == number
-        rest = replace(group, rssi=torch.where(out[:, None], torch.nan, data.rssi_dbm))
-        alone = solve(rest, KERNEL, gentle, 0, CPU)
-        distance = log_distance(group.position, group.receiver)
-        told = alone.level + alone.slope * distance
-        told = told + torch.einsum("nrh,rh->nr", harmonics(group.position, group.receiver), alone.directivity)
-        torch.testing.assert_close(whole.held_out[out], told[out], atol=1e-5, rtol=0)
+        out = training.fold == number
+        rest = replace(training, rssi=torch.where(out[:, None], torch.nan, training.rssi))
+        alone = fit_receiver(FIRST, rest, gentle, CPU)
+        distance = log_distance(training.position, training.receiver)
+        expected = alone["level"] + alone["slope"] * distance[:, 0]
+        expected = expected + harmonics(training.position, training.receiver)[:, 0] @ alone["directivity"][0]
+        torch.testing.assert_close(whole[out], expected[out], atol=1e-5, rtol=0)
 
 
 def test_table_is_the_head():
-    drawn = Head(2, 50, 0).requires_grad_(False).draw()
-    motion = torch.linspace(-30, 30, 200)[:, None].expand(-1, 2).contiguous()
-    value, slope = Table(drawn)(motion)
-    torch.testing.assert_close(value, pooled(drawn, motion), atol=2e-3, rtol=0)
-    assert Table(drawn)(torch.zeros(1, 2))[1].sub(1).abs().max() < 0.01  # one dB of motion is one dB of RSSI
+    rendered = render([Head(name, 50, 0).requires_grad_(False) for name in "ab"])
+    latent = torch.linspace(-30, 30, 200)[:, None].expand(-1, 2).contiguous()
+    value, slope = HeadTable(rendered)(latent)
+    torch.testing.assert_close(value, mean_magnitude(rendered, latent), atol=2e-3, rtol=0)
+    assert HeadTable(rendered)(torch.zeros(1, 2))[1].sub(1).abs().max() < 0.01  # 1 dB of the field is 1 dB of RSSI
     assert (slope.diff(dim=0) > -1e-3).all()  # convex
+
+
+def test_heads_are_rendered_alike_alone_and_together():
+    heads = [Head(name, 50, 0).requires_grad_(False) for name in "abc"]
+    torch.testing.assert_close(render(heads)[1], render(heads[1:2])[0])
+    assert not torch.equal(render(heads)[0], render(heads)[1])
 
 
 def test_mixing_weights_find_the_mixture():
@@ -148,21 +167,21 @@ def test_mixing_weights_find_the_mixture():
 # --- the model -------------------------------------------------------------------------------------------------------
 
 
-def test_fit_learns_the_field_that_the_law_leaves():
+def test_fit_learns_the_residual_field():
     train, test = with_field().split("random")
     model = fit_rssi(train)
-    law = fit_law(log_distance(train.transmitter_position, train.receiver_position), train.rssi_dbm)
-    left = law(log_distance(test.transmitter_position, test.receiver_position)) - test.rssi_dbm
+    path_loss = fit_path_loss(log_distance(train.transmitter_position, train.receiver_position), train.rssi_dbm)
+    residual = path_loss(log_distance(test.transmitter_position, test.receiver_position)) - test.rssi_dbm
     assert model.n_primitives == 50
-    assert missed(model, test) < 0.3 * left.abs().median()
+    assert missed(model, test) < 0.3 * residual.abs().median()
 
 
-def test_no_primitives_where_the_law_is_all_there_is():
-    model = fit_rssi(law_only(noise=3.0))
+def test_no_primitives_without_a_field():
+    model = fit_rssi(path_loss_only(noise=3.0))
     assert model.n_primitives == 0
 
 
-def test_plain_head_learns_without_a_law():
+def test_paper_head_learns_without_a_path_loss_model():
     train, test = with_field().split("random")
     model = fit_rssi(train, RssiConfig.paper(steps=200))
     assert not model.slope.any()
@@ -171,12 +190,13 @@ def test_plain_head_learns_without_a_law():
 
 
 @pytest.mark.parametrize("split", ["random", "block"])
-def test_interval_covers_what_it_says(split):
+def test_interval_has_its_nominal_coverage(split):
     """Over five floors with five receivers each."""
     covered = []
     for seed in range(5):
         train, test = rssi_room(n=120, seed=50 + seed).columns([0, 3, 5, 8, 10]).split(split, seed)
-        _, low, high = fit_rssi(train, RssiConfig(validation=split)).predict(test.transmitter_position)
+        model = RssiModel(validation=split).fit(train)
+        low, high = model.predict(test.transmitter_position).interval(0.8)
         heard = ~test.rssi_dbm.isnan()
         covered.append(((test.rssi_dbm >= low) & (test.rssi_dbm <= high))[heard].double())
     width = 0.04 if split == "random" else 0.06
@@ -185,16 +205,16 @@ def test_interval_covers_what_it_says(split):
 
 def test_interval_widens_away_from_measurements():
     model = fit_rssi(with_field())
-    _, low, high = model.predict(torch.tensor([[5.0, 5, 0.5], [40.0, 40, 0.5]]))
-    assert (high[1] - low[1] > 1.3 * (high[0] - low[0])).all()
+    std = model.predict(torch.tensor([[5.0, 5, 0.5], [40.0, 40, 0.5]])).std
+    assert (std[1] > 1.3 * std[0]).all()
 
 
-def test_far_away_only_the_law_is_left():
+def test_far_away_the_prediction_is_the_path_loss_model():
     model = fit_rssi(with_field())
     far = torch.tensor([[4000.0, 0, 0]], dtype=torch.float64)
     bearing = torch.einsum("brh,rh->br", harmonics(far, model.receiver).float(), model.directivity)
-    law = (model.level + model.slope * log_distance(far, model.receiver)).float() + bearing
-    torch.testing.assert_close(model.predict(far)[0], law, atol=1e-3, rtol=0)
+    path_loss = (model.level + model.slope * log_distance(far, model.receiver)).float() + bearing
+    torch.testing.assert_close(model.predict(far).mean, path_loss, atol=1e-3, rtol=0)
 
 
 def test_shift_of_the_coordinates_changes_nothing():
@@ -207,15 +227,16 @@ def test_shift_of_the_coordinates_changes_nothing():
         transmitter_position=data.transmitter_position + shift,
     )
     here, there = fit_rssi(data), fit_rssi(moved)
-    a, b = here.predict(data.transmitter_position)[0], there.predict(moved.transmitter_position)[0]
+    a, b = here.predict(data.transmitter_position).mean, there.predict(moved.transmitter_position).mean
     torch.testing.assert_close(a, b, atol=1e-3, rtol=0)
 
 
-def test_same_data_same_model_and_any_batch():
+def test_same_data_same_model_and_any_batch(monkeypatch):
     data = with_field(n=60)
-    a, b = (fit_rssi(data).predict(data.transmitter_position)[0] for _ in range(2))
+    a, b = (fit_rssi(data).predict(data.transmitter_position).mean for _ in range(2))
     assert torch.equal(a, b)
-    torch.testing.assert_close(fit_rssi(data).predict(data.transmitter_position, batch=7)[0], a)
+    monkeypatch.setattr(RssiModel, "batch_size", 7)
+    torch.testing.assert_close(fit_rssi(data).predict(data.transmitter_position).mean, a)
 
 
 def test_any_number_of_threads_gives_the_same_model():
@@ -224,24 +245,49 @@ def test_any_number_of_threads_gives_the_same_model():
     for threads in (1, 2):
         with threads_kept():
             torch.set_num_threads(threads)
-            predicted.append(fit_rssi(data).predict(here))
+            predicted.append(both(fit_rssi(data).predict(here)))
             assert torch.get_num_threads() == threads
-    assert all(map(torch.equal, *predicted))
+    assert torch.equal(*predicted)
 
 
-def test_many_rows_are_gathered_by_place():
-    data = law_only(n=4000)
+def test_many_rows_are_averaged_by_location():
+    data = path_loss_only(n=4000)
     data.rssi_dbm[::7, 1] = torch.nan
-    sites = gather(data)
-    assert len(sites.position) <= 1500
-    assert len(sites.position) > 1200
-    assert int(sites.count.sum()) == int((~data.rssi_dbm.isnan()).sum())
-    site = int(sites.of_row[0])
-    own = data.subset((sites.of_row == site).nonzero()[:, 0])
-    torch.testing.assert_close(sites.position[site], own.transmitter_position.mean(dim=0))
-    torch.testing.assert_close(sites.rssi[site], own.rssi_dbm.nanmean(dim=0), equal_nan=True)
-    few = gather(data, limit=4000)
-    assert torch.equal(few.position, data.transmitter_position)
+    position, rssi, count, bin_of_row = bin_locations(data, 1500)
+    assert 1200 < len(position) <= 1500
+    assert int(count.sum()) == int((~data.rssi_dbm.isnan()).sum())
+    first = int(bin_of_row[0])
+    own = data.subset((bin_of_row == first).nonzero()[:, 0])
+    torch.testing.assert_close(position[first], own.transmitter_position.mean(dim=0))
+    torch.testing.assert_close(rssi[first], own.rssi_dbm.nanmean(dim=0), equal_nan=True)
+    assert torch.equal(bin_locations(data, 4000)[0], data.transmitter_position)
+
+
+@pytest.mark.parametrize("options", [{}, {"preset": "paper", "steps": 5}], ids=["quick", "paper"])
+def test_a_receiver_does_not_depend_on_the_others(options):
+    """Neither on their number nor on its place among them, with the same pool."""
+    pool = rssi_room(n=200)
+    position = rssi_room(n=20, seed=1).transmitter_position
+    alone = RssiModel(**options).fit(pool.receivers(["6"]), pool=pool).predict(position)
+    for names in (["5", "6"], ["1", "2", "3", "4", "6"]):
+        among = RssiModel(**options).fit(pool.receivers(names), pool=pool).predict(position)
+        torch.testing.assert_close(both(among)[:, :, -1:], both(alone), atol=1e-3, rtol=0)
+
+
+def test_gradients_are_those_of_finite_differences_in_metres():
+    model = fit_rssi(with_field())
+    position = torch.tensor([[5.0, 5.0, 0.5], [2.0, 7.0, 0.4]], dtype=torch.float64, requires_grad=True)
+    prediction = model.predict(position)
+    for values in (prediction.mean, prediction.std):
+        (gradient,) = torch.autograd.grad(values.sum(), position, retain_graph=True)
+        for axis in range(3):
+            step = 0.02 * torch.eye(3, dtype=torch.float64)[axis]
+            ends = [both(model.predict(position.detach() + sign * step)) for sign in (1, -1)]
+            difference = (ends[0] - ends[1])[0 if values is prediction.mean else 1].sum(dim=1) / 0.04
+            torch.testing.assert_close(gradient[:, axis], difference.double(), atol=0.05, rtol=0.02)
+    assert not model.predict(position.detach()).mean.requires_grad
+    with torch.no_grad():
+        assert not model.predict(position).mean.requires_grad
 
 
 # --- files -----------------------------------------------------------------------------------------------------------
@@ -255,79 +301,105 @@ def test_saved_model_predicts_the_same(tmp_path):
     again = load(tmp_path / "model.safetensors")
     assert again.receiver_names == ("NA", "1", "12:34:56")
     assert again.n_primitives == model.n_primitives
-    for a, b in zip(*(m.predict(data.transmitter_position) for m in (again, model)), strict=True):
-        assert torch.equal(a, b)
+    assert again.config == model.config
+    assert torch.equal(*(both(m.predict(data.transmitter_position)) for m in (again, model)))
 
 
-def test_interrupted_fit_goes_on(tmp_path, monkeypatch):
-    """Stopped after the first of two groups, it fits only the second, and ends with the same model."""
-    monkeypatch.setattr(rssi_fit, "GROUP", 2)
+DAMAGE = ("level", "slope", "receiver", "centre", "directivity", "anchor", "coefficient", "rendered")
+
+
+@pytest.mark.parametrize("name", [*DAMAGE, "field_db", "noise_db", "mixing_weight"])
+def test_a_file_with_a_tensor_of_another_shape_is_refused(tmp_path, name):
+    file = tmp_path / "model.safetensors"
+    fit_rssi(with_field(n=30)).save(file)
+    kind, tensors, header = checkpoint.read(file, RssiModel.kind)
+    for damaged in (tensors[name][..., :-1], tensors[name][None]):
+        checkpoint.write(file, kind, tensors | {name: damaged}, header)
+        with pytest.raises(InputError, match="is no rssi model that can be used"):
+            load(file)
+    del tensors[name]
+    checkpoint.write(file, kind, tensors, header)
+    with pytest.raises(InputError, match="is no rssi model that can be used"):
+        load(file)
+
+
+def test_an_incomplete_state_of_a_fit_is_refused(tmp_path):
+    data, state = with_field(n=30), tmp_path / "state"
+    fit_rssi(data, checkpoint=state)
+    kind, tensors, header = checkpoint.read(state, "fit state")
+    checkpoint.write(state, kind, tensors | {"held_out": tensors["held_out"][:, :3]}, header)
+    with pytest.raises(InputError, match="no state that a fit can continue from"):
+        fit_rssi(data, checkpoint=state)
+
+
+def test_interrupted_fit_continues(tmp_path):
+    """Stopped after the first of three receivers, it fits only the others, and ends with the same model."""
     data = with_field(n=60)
     state, fitted = tmp_path / "state", []
 
-    def interrupt(task, groups):
-        yield task(groups[0])
+    def interrupt(task, parts):
+        yield task(parts[0])
         raise KeyboardInterrupt
 
-    def count(task, groups):
-        fitted.extend(groups)
-        return map(task, groups)
+    def count(task, parts):
+        fitted.extend(parts)
+        return map(task, parts)
 
     with pytest.raises(KeyboardInterrupt):
         fit_rssi(data, parallel=interrupt, checkpoint=state)
     records = []
     resumed = fit_rssi(data, parallel=count, checkpoint=state, on_record=records.append)
-    assert len(fitted) == 1
-    assert [r["stage"] for r in records] == ["search", "final"]
-    whole = fit_rssi(data).predict(data.transmitter_position)[0]
-    assert torch.equal(resumed.predict(data.transmitter_position)[0], whole)
+    assert fitted == [slice(1, 2), slice(2, 3)]
+    assert [r["stage"] for r in records] == ["search", "final", "final", "final"]
+    assert [r["receivers"] for r in records[1:]] == [["a"], ["b"], ["c"]]
+    whole = fit_rssi(data).predict(data.transmitter_position).mean
+    assert torch.equal(resumed.predict(data.transmitter_position).mean, whole)
     with pytest.raises(InputError, match="another fit"):
         fit_rssi(data, RssiConfig(huber=2.0), checkpoint=state)
 
 
-@pytest.mark.parametrize("plain", [False, True])
-def test_a_fit_with_gaps_goes_on(tmp_path, plain):
-    """What was not heard is nan, which files do not hold."""
+@pytest.mark.parametrize("paper", [False, True])
+def test_a_fit_with_missing_values_continues(tmp_path, paper):
     data = with_field(n=60)
     data.rssi_dbm[::5, 0] = torch.nan
-    config = RssiConfig(plain=plain, steps=5) if plain else None
-    drawn = [
-        fit_rssi(data, config, checkpoint=tmp_path / "state").predict(data.transmitter_position)[0] for _ in range(2)
+    config = RssiConfig.paper(steps=5) if paper else None
+    found = [
+        fit_rssi(data, config, checkpoint=tmp_path / "state").predict(data.transmitter_position).mean for _ in range(2)
     ]
-    assert torch.equal(*drawn)
+    assert torch.equal(*found)
 
 
-@pytest.mark.parametrize("heard", [12, 0])
-def test_a_receiver_that_few_of_many_rows_heard(heard):
+@pytest.mark.parametrize("n_detected", [12, 0])
+def test_a_receiver_that_few_of_many_rows_detect(n_detected):
     data = with_field(n=700)
-    data.rssi_dbm[torch.randperm(700, generator=torch.Generator().manual_seed(0))[heard:], 0] = torch.nan
-    assert fit_rssi(data).predict(data.transmitter_position[:5])[0].isfinite().all()
+    data.rssi_dbm[torch.randperm(700, generator=torch.Generator().manual_seed(0))[n_detected:], 0] = torch.nan
+    assert fit_rssi(data).predict(data.transmitter_position[:5]).mean.isfinite().all()
 
 
-# --- ordinary input that is awkward ----------------------------------------------------------------------------------
+# --- awkward data ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("heard", [0, 1, 2, 9, 10])
+@pytest.mark.parametrize("n_detected", [0, 1, 2, 9, 10])
 @pytest.mark.parametrize("validation", ["random", "block"])
-def test_a_receiver_heard_rarely_does_not_stop_the_others(heard, validation):
+def test_a_rarely_detected_receiver_does_not_stop_the_others(n_detected, validation):
     data = with_field()
-    data.rssi_dbm[heard:, 1] = torch.nan
+    data.rssi_dbm[n_detected:, 1] = torch.nan
     model = fit_rssi(data, RssiConfig(validation=validation))
-    middle, low, high = model.predict(data.transmitter_position)
-    assert middle.isfinite().all()
-    assert (low < high).all()
-    truth = law_only().rssi_dbm.mean()
-    assert (middle[:, 1] - truth).abs().max() < 30
+    prediction = model.predict(data.transmitter_position)
+    assert prediction.mean.isfinite().all()
+    assert (prediction.std > 0).all()
+    truth = path_loss_only().rssi_dbm.mean()
+    assert (prediction.mean[:, 1] - truth).abs().max() < 30
 
 
-def test_a_receiver_heard_in_one_slab_only():
+def test_a_receiver_detected_in_one_slab_only():
     data = rssi_room(n=200).columns([0, 5])
     slab = data.transmitter_position[:, 0] < 4
     data.rssi_dbm[~slab, 0] = torch.nan
     model = fit_rssi(data, RssiConfig(validation="block"))
-    middle, low, high = model.predict(data.transmitter_position)
-    assert middle.isfinite().all()
-    assert (high - low).max() < 60
+    prediction = model.predict(data.transmitter_position)
+    assert prediction.mean.isfinite().all()
+    assert prediction.std.max() < 23
 
 
 @pytest.mark.parametrize(
@@ -342,40 +414,56 @@ def test_a_receiver_heard_in_one_slab_only():
 def test_degenerate_data_give_finite_predictions(spoil):
     data = with_field(n=40)
     spoil(data)
-    assert torch.stack(fit_rssi(data).predict(with_field(n=10).transmitter_position)).isfinite().all()
+    assert both(fit_rssi(data).predict(with_field(n=10).transmitter_position)).isfinite().all()
 
 
 def test_refuses():
-    data = law_only()
+    data = path_loss_only()
     model = fit_rssi(data)
     with pytest.raises(InputError, match="must be finite numbers"):
         model.predict(torch.tensor([[0.0, 0.0, float("nan")]]))
     with pytest.raises(InputError, match="at most 1e\\+09 m"):
         model.predict(torch.tensor([[1e20, 0.0, 0.0]]))
-    assert torch.stack(model.predict(torch.tensor([[1e8, 0.0, 0.0]]))).isfinite().all()
-    assert model.predict(torch.empty(0, 3))[0].shape == (0, 3)
-    with pytest.raises(InputError, match="heard in 0 training rows"):
+    assert both(model.predict(torch.tensor([[1e8, 0.0, 0.0]]))).isfinite().all()
+    assert model.predict(torch.empty(0, 3)).mean.shape == (0, 3)
+    with pytest.raises(InputError, match="detected in 0 training rows"):
         fit_rssi(replace(data, rssi_dbm=data.rssi_dbm * torch.nan))
     with pytest.raises(InputError, match="RSSI must be finite"):
         fit_rssi(replace(data, rssi_dbm=data.rssi_dbm * torch.inf))
     with pytest.raises(InputError, match="same rows"):
-        fit_rssi(data, pool=law_only(seed=1))
-    for batch in (0, -1):
-        with pytest.raises(InputError, match="batch must be at least 1"):
-            model.predict(data.transmitter_position, batch=batch)
+        fit_rssi(data, pool=path_loss_only(seed=1))
+    with pytest.raises(InputError, match="is not fitted"):
+        RssiModel().predict(data.transmitter_position)
 
 
-def test_a_receiver_alone_heard_in_one_slab_only_is_refused():
-    """Nothing tells how wrong a model is there; with a pool of others something does."""
-    both = rssi_room(n=200).columns([0, 5])
-    both.rssi_dbm[both.transmitter_position[:, 0] >= 4, 0] = torch.nan
-    alone = both.columns([0])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"n_primitives": -1}, "n_primitives must be a whole number at least 0"),
+        ({"huber": 0.0}, "huber must be a number above 0"),
+        ({"steps": -5}, "steps must be"),
+        ({"validation": "blok"}, "validation must be 'random' or 'block'"),
+        ({"max_locations": 3}, "max_locations must be"),
+        ({"plain": True}, "RssiModel has no option 'plain'"),
+        ({"preset": "Paper"}, "preset must be 'quick' or 'paper'"),
+    ],
+)
+def test_refuses_options(options, message):
+    with pytest.raises(InputError, match=message):
+        RssiModel(**options)
+
+
+def test_a_lone_receiver_detected_in_one_slab_only_is_refused():
+    """Its error cannot be estimated without a pool of other receivers."""
+    pool = rssi_room(n=200).columns([0, 5])
+    pool.rssi_dbm[pool.transmitter_position[:, 0] >= 4, 0] = torch.nan
+    alone = pool.columns([0])
     with pytest.raises(InputError, match="in one part of the region"):
         fit_rssi(alone, RssiConfig(validation="block"))
-    assert fit_rssi(alone, RssiConfig(validation="block"), pool=both).widening.isfinite()
+    assert fit_rssi(alone, RssiConfig(validation="block"), pool=pool).noise_db.isfinite()
 
 
-def test_a_fit_does_not_go_on_with_another_pool(tmp_path):
+def test_a_fit_does_not_continue_with_another_pool(tmp_path):
     data = with_field(n=60)
     alone, moved = data.columns([0]), data.receiver_position.clone()
     moved[1] += 5
@@ -384,8 +472,8 @@ def test_a_fit_does_not_go_on_with_another_pool(tmp_path):
         fit_rssi(alone, pool=replace(data, receiver_position=moved), checkpoint=tmp_path / "state")
 
 
-def test_law_of_a_receiver_heard_at_one_distance():
-    law = fit_law(torch.full((5, 1), 0.5), torch.tensor([[-50.0], [-52], [-54], [-52], [torch.nan]]))
-    assert (law.level.item(), law.slope.item()) == (-52.0, 0.0)
-    other = Law(torch.tensor([-40.0]), torch.tensor([-20.0]))
-    assert law.where(torch.tensor([False]), other) == other
+def test_path_loss_model_of_a_receiver_detected_at_one_distance():
+    found = fit_path_loss(torch.full((5, 1), 0.5), torch.tensor([[-50.0], [-52], [-54], [-52], [torch.nan]]))
+    assert (found.level.item(), found.slope.item()) == (-52.0, 0.0)
+    other = PathLoss(torch.tensor([-40.0]), torch.tensor([-20.0]))
+    assert found.where(torch.tensor([False]), other) == other

@@ -32,8 +32,8 @@ BYTES = torch.arange(N * 4 * 8, dtype=torch.int64).remainder(256).to(torch.uint8
 def cache(tmp_path, monkeypatch):
     """An own cache, where thirty spectra are many and come ten at a time."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(store, "MANY", N)
-    monkeypatch.setattr(store, "AT_ONCE", 10 * 4 * 8)
+    monkeypatch.setattr(store, "MIN_FILE_SPECTRA", N)
+    monkeypatch.setattr(store, "BATCH_PIXELS", 10 * 4 * 8)
     return tmp_path / "cache" / "swiftwrf"
 
 
@@ -55,7 +55,7 @@ def write_image(scene, i, seed):
 
 
 def test_bytes_become_what_they_always_became(monkeypatch):
-    monkeypatch.setattr(store, "AT_ONCE", 7 * 4 * 8)
+    monkeypatch.setattr(store, "BATCH_PIXELS", 7 * 4 * 8)
     kept = Store(BYTES)
     expected = BYTES.float() / 255
     assert torch.equal(kept[:], expected)
@@ -89,11 +89,11 @@ def test_many_images_lie_in_a_file_that_is_reused(cache, folder, monkeypatch):
     data = load_spectra(folder)
     (file,) = cache.glob("*")
     assert np.load(file, mmap_mode="r").dtype == np.uint8
-    monkeypatch.setattr(store, "MANY", N + 1)
+    monkeypatch.setattr(store, "MIN_FILE_SPECTRA", N + 1)
     assert torch.equal(data.spectrum, load_spectra(folder).spectrum)
     assert fingerprint(data) == fingerprint(load_spectra(folder))
 
-    monkeypatch.setattr(store, "MANY", N)
+    monkeypatch.setattr(store, "MIN_FILE_SPECTRA", N)
     monkeypatch.setattr(nerf2, "_decode", lambda *_: pytest.fail("decoded again"))
     assert torch.equal(load_spectra(folder).spectrum, data.spectrum)
 
@@ -176,7 +176,7 @@ def test_arrays_are_kept_as_they_came(cache, folder, dtype, suffix, order):
 def test_many_simulated_spectra_are_those_of_memory(cache, monkeypatch):
     many = simulated_room(n=N, grid=AngularGrid.hemisphere(4, 8))
     assert len(list(cache.glob("spectra-*"))) == 1
-    monkeypatch.setattr(store, "MANY", N + 1)
+    monkeypatch.setattr(store, "MIN_FILE_SPECTRA", N + 1)
     torch.testing.assert_close(many.spectrum, simulated_room(n=N, grid=AngularGrid.hemisphere(4, 8)).spectrum)
 
 
@@ -191,7 +191,7 @@ def test_written_spectra_come_back_by_the_batch(cache, folder, tmp_path):
 
 def test_all_at_once_is_refused_where_it_does_not_fit(monkeypatch):
     data = simulated_room(n=N, grid=AngularGrid.hemisphere(4, 8))
-    monkeypatch.setattr("swiftwrf.data.spectra.MOST_PIXELS", N * 4 * 8 - 1)
+    monkeypatch.setattr("swiftwrf.data.spectra.MAX_MEMORY_PIXELS", N * 4 * 8 - 1)
     with pytest.raises(InputError, match="by the batch"):
         _ = data.spectrum
     assert data.subset(torch.arange(5)).spectrum.shape == (5, 4, 8)
@@ -292,7 +292,7 @@ def test_inner_products_of_too_many_spectra_are_refused(room, monkeypatch):
 
 def test_a_fit_is_the_same_in_memory_and_in_a_file(cache, monkeypatch):
     many = simulated_room(n=N, grid=AngularGrid.hemisphere(8, 32))
-    monkeypatch.setattr(store, "MANY", N + 1)
+    monkeypatch.setattr(store, "MIN_FILE_SPECTRA", N + 1)
     few = simulated_room(n=N, grid=AngularGrid.hemisphere(8, 32))
     position = few.position[:5]
     drawn = [fit_coarray(data, progress=False).synthesize(position) for data in (many, few)]

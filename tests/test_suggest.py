@@ -13,8 +13,8 @@ from swiftwrf import AngularGrid, InputError, fit, simulated_room
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import choose_kernel, most_informative
 from swiftwrf.metrics import psnr
-from tasks.aoa.experiment import _Tables
-from tasks.aoa.setting import At
+from tasks.aoa.condition import MeasuredSubset
+from tasks.aoa.results import Results
 from tasks.aoa.steps import Suggestion
 
 
@@ -22,7 +22,7 @@ def test_suggestions_lie_in_the_region_and_lower_the_variance(room):
     found = suggest(room, 12)
     low, high = room.position.min(dim=0).values, room.position.max(dim=0).values
     assert ((found.position >= low) & (found.position <= high)).all()
-    assert (found.left.diff() < 0).all()
+    assert (found.variance.diff() < 0).all()
     assert torch.equal(found.position, suggest(room, 12).position)
     nearest = torch.cdist(found.position, room.position).min(dim=1).values
     assert (
@@ -37,9 +37,9 @@ def test_suggested_positions_keep_the_digits_of_maps(room):
     directory = SimpleNamespace(
         write_csv=lambda name, rows: kept.update({name: rows}), write_npz=lambda name, arrays: None
     )
-    tables = _Tables(SimpleNamespace(test=measured, withhold=lambda at: (measured, None)), directory)
-    step = Suggestion(At(0.5, 0))
-    tables.add(step, {"position": found.position.tolist(), "left": found.left.tolist()})
+    results = Results(SimpleNamespace(test=measured), directory)
+    positions = {"measured": measured.position.tolist(), "position": found.position.tolist()}
+    results.add(Suggestion(MeasuredSubset(0.5)), positions | {"variance": found.variance.tolist()})
     rows = kept["suggested-mix0.5.csv"]
     assert [[row["x_m"], row["y_m"], row["z_m"]] for row in rows] == found.position.tolist()
 

@@ -9,7 +9,7 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from unittest import mock
@@ -20,11 +20,11 @@ import quick
 import torch
 
 from augment import Mixed
-from swiftwrf import AngularGrid, InputError, simulated_room
+from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, simulated_room
 from swiftwrf.data.store import Store
 from swiftwrf.runtime.threads import set_threads
 from tasks import torchrun
-from tasks.aoa.estimators import Settings, aann
+from tasks.aoa.estimators import aann
 from tasks.aoa.estimators.aann import AANN, AANNConfig
 from tasks.cluster import connected
 
@@ -32,16 +32,29 @@ HERE = Path(__file__).parent
 AOA = ("aoa", "--mix", 0.5, "--synthesizer", "swiftwrf", "idw", "--preset", "paper", "--extra", 0, "--device", "cpu")
 
 
-class Network(AANN):
-    """The network of the paper, trained for one step: rounding grows to degrees with more steps."""
+def paper(**options):
+    """Return options of SwiftWRF like those of the paper, with one spectrum a step, but for few steps."""
+    return FitConfig(model=ModelConfig(n_primitives=8, rank=2), steps=60, check_every=30, batch=1, **options)
 
-    def __init__(self, settings):
-        super().__init__(settings, AANNConfig(steps=1, batch=5))
+
+@dataclass(frozen=True)
+class NetworkConfig(AANNConfig):
+    """One step: rounding grows to degrees with more steps."""
+
+    @classmethod
+    def for_scene(cls, n_spectra, preset, **options):
+        return cls(steps=1, batch=5, **options)
+
+
+class Network(AANN):
+    """The network of the paper."""
+
+    config_type = NetworkConfig
 
 
 def run(*arguments):
     """Run a task on the toy, with the network of the paper."""
-    with mock.patch.object(quick, "QuickNetwork", Network):
+    with mock.patch.object(quick, "QuickNetwork", Network), mock.patch.object(FitConfig, "paper", paper):
         return quick.run(*arguments)
 
 
@@ -53,11 +66,11 @@ def learnt():
     set_threads(1)
     room = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
     backbone = aann.backbone
+    train = Mixed.measured(replace(room, store=Store(room.spectrum.double())))
     with mock.patch.object(aann, "backbone", lambda *options: backbone(*options).double()):
-        network = AANN(Settings(room.grid), AANNConfig(steps=2, batch=5))
-    network.fit(Mixed.measured(replace(room, store=Store(room.spectrum.double()))))
+        network = AANN(steps=2, batch=5).fit(Mixed.measured(replace(room, store=Store(room.spectrum.double()))))
     losses = torch.tensor([record["loss"] for record in network.history])
-    return {"losses": losses, "estimate": network.estimate(room.spectrum.double())}
+    return {"losses": losses, "estimate": network.predict(room.spectrum.double())}
 
 
 def commands(folder: Path) -> int:
@@ -118,9 +131,8 @@ def test_all_processes_end_with_the_code_of_the_first_and_it_alone_reports(ended
 def test_a_batch_has_a_row_for_each_process(monkeypatch):
     monkeypatch.setattr(aann, "process_count", lambda: 3)
     room = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
-    network = AANN(Settings(room.grid), AANNConfig(steps=1, batch=2))
     with pytest.raises(InputError, match="3 processes cannot share batches of 2 spectra"):
-        network.fit(Mixed.measured(room))
+        AANN(steps=1, batch=2).fit(Mixed.measured(room))
 
 
 def test_what_torchrun_cannot_spread_is_refused(monkeypatch):

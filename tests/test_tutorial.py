@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import re
 import shlex
-from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
 import pytest
 from quick import PREDICTORS_KEPT, TASKS, QuickNetwork
-from small import glances
+from small import glances, with_defaults
 
-from swiftwrf import RssiConfig
-from tasks.aoa.arms import NETWORK
+from swiftwrf import RssiConfig, RssiModel
+from tasks.aoa.condition import NETWORK
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.rssi.predictors import PREDICTORS
 from tasks.run import command_line
@@ -26,7 +25,6 @@ PARTS = re.split(r"^## ", TEXT, flags=re.MULTILINE)[1:]
 def test_every_block_runs(part, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    quick = replace(ESTIMATORS[NETWORK], make=QuickNetwork)
     for language, block in re.findall(r"```(\w+)\n(.*?)```", part, flags=re.DOTALL):
         if language == "python":
             exec(block, names)
@@ -39,12 +37,9 @@ def test_every_block_runs(part, tmp_path, monkeypatch):
             arguments += ["--extra", "20"]
         with (
             glances(),
-            mock.patch.dict(ESTIMATORS._entries, {NETWORK: quick}),
-            mock.patch(
-                "tasks.rssi.predictors.swiftwrf.RssiConfig",
-                lambda **given: RssiConfig(**given, steps=2, n_primitives=0),
-            ),
-            mock.patch.object(PREDICTORS, "_entries", {name: PREDICTORS[name] for name in PREDICTORS_KEPT}),
+            mock.patch.dict(ESTIMATORS._registered, {NETWORK: QuickNetwork}),
+            mock.patch.object(RssiModel, "config_type", with_defaults(RssiConfig(steps=2, n_primitives=0))),
+            mock.patch.object(PREDICTORS, "_registered", {name: PREDICTORS[name] for name in PREDICTORS_KEPT}),
         ):
             assert command_line(module, config, function, arguments) == 0, block
         out = Path(arguments[arguments.index("--out") + 1])

@@ -35,7 +35,7 @@ class PlanarArray:
 
     Example:
         >>> PlanarArray.grid(2, 8, spacing=0.06, frequency_hz=2.4e9)
-        PlanarArray(16 elements, 2.4 GHz)
+        <PlanarArray: 16 elements at 2.4 GHz>
     """
 
     element: Tensor
@@ -58,7 +58,12 @@ class PlanarArray:
         return hash(self._content)
 
     def __repr__(self) -> str:
-        return f"PlanarArray({len(self.element)} elements, {self.frequency_hz / 1e9:.4g} GHz)"
+        return f"<PlanarArray: {self.summary}>"
+
+    @property
+    def summary(self) -> str:
+        """Number of elements and carrier, in words."""
+        return f"{len(self.element)} elements at {self.frequency_hz / 1e9:.4g} GHz"
 
     @cached_property
     def _content(self) -> tuple[float, ...]:

@@ -26,7 +26,8 @@ from swiftwrf.comparison.base import Config, Count, Training, descend
 from swiftwrf.comparison.nerf2 import MAX_SAMPLES_AT_ONCE, Field, NeRF2Size, received
 from swiftwrf.comparison.network import chunks, draw_parameters, restored
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.positions import check_drawn, frame, normalise
+from swiftwrf.models.base import check_finite, from_plain
+from swiftwrf.positions import frame, normalise
 from swiftwrf.rssi.base import RssiFitContext, RssiPredictor, fingerprint
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
@@ -78,7 +79,7 @@ class NeRF2RssiConfig(Config):
 
 
 class NeRF2RssiNetwork(nn.Module):
-    """The field and the places of the receivers in it.
+    """The field and the positions of the receivers in it.
 
     Args:
         size: Size of the field and its rays.
@@ -112,6 +113,7 @@ class NeRF2Rssi(RssiPredictor, Saved):
 
     Args:
         config: Options as one object. Defaults to `NeRF2RssiConfig()`.
+        preset: "quick" for the defaults, "paper" for `NeRF2RssiConfig.paper()`.
         options: Single options, which replace those of `config`.
 
     Example:
@@ -140,17 +142,16 @@ class NeRF2Rssi(RssiPredictor, Saved):
         some = chunks(len(position), max(1, MAX_SAMPLES_AT_ONCE // rays))
         parts = [network(network.local(position[part])) for part in some]
         empty = torch.zeros(0, len(network.receiver))
-        return check_drawn(100 * (torch.cat([empty, *parts]).double() - 1)), None
+        return check_finite(100 * (torch.cat([empty, *parts]).double() - 1)), None
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         return self.network.state_dict(), {"options": asdict(self.config), "receiver_names": self.receiver_names}
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
-        size = NeRF2RssiSize(**header["options"]["size"])
-        model = cls(**header["options"] | {"size": size})
+        model = cls(from_plain(NeRF2RssiConfig, header["options"]))
         model.receiver_names = tuple(map(str, header["receiver_names"]))
-        model.network = restored(lambda: NeRF2RssiNetwork(size, len(model.receiver_names)), tensors)
+        model.network = restored(lambda: NeRF2RssiNetwork(model.config.size, len(model.receiver_names)), tensors)
         return model
 
 

@@ -15,7 +15,6 @@ from swiftwrf.data.splits import choose_split
 from swiftwrf.errors import InputError
 
 Numbers = Any  # a tensor, array, list or table of numbers
-Splits = Mapping[str, tuple[Tensor, Tensor]]
 Data = TypeVar("Data", bound="PositionedData")
 
 
@@ -43,13 +42,15 @@ class PositionedData:
     def __init__(
         self,
         name: str,
-        index: Numbers | None,
-        named_splits: Splits | None,
-        source: Mapping[str, str] | None,
-        notes: tuple[str, ...],
+        index: Numbers | None = None,
+        named_splits: Mapping[str, tuple[Tensor, Tensor]] | None = None,
+        source: Mapping[str, str] | None = None,
+        notes: tuple[str, ...] = (),
         **values: Any,
     ) -> None:
         """Set all fields of the frozen dataclass, once every row field has the length of the positions."""
+        if unknown := [field for field in values if field not in self.__dataclass_fields__]:
+            raise InputError(f"{type(self).__name__} has no {', '.join(unknown)}")
         n = len(values[self.row_fields[0]])
         values["index"] = torch.arange(n) if index is None else to_tensor("index", index, torch.int64, (n,))
         values |= {"name": name, "named_splits": dict(named_splits or {}), "source": dict(source or {}), "notes": notes}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -11,7 +11,6 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, to_angles
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
-from swiftwrf.data.dataset import Splits
 from swiftwrf.data.spectra import GRID, Moving, Spectra, array_spectra, check_pixels
 from swiftwrf.errors import InputError
 
@@ -107,11 +106,7 @@ class PropagationPaths:
         name: str,
         array: PlanarArray | None = None,
         grid: AngularGrid | None = None,
-        *,
-        index: Tensor | None = None,
-        named_splits: Splits | None = None,
-        source: Mapping[str, str] | None = None,
-        notes: tuple[str, ...] = (),
+        **details: Any,
     ) -> Spectra:
         """Return the spectra of a level array at each receiver, which folds paths from below to the upper half space.
 
@@ -119,7 +114,7 @@ class PropagationPaths:
             name: Name of the data set.
             array: The array. Defaults to 4 x 4 elements at half a wavelength.
             grid: Directions. Defaults to 90 x 360.
-            index, named_splits, source, notes: As attributes of `Spectra`.
+            details: index, named_splits, source and notes of `Spectra`.
 
         Raises:
             InputError: An array for another carrier, or spectra of too many pixels.
@@ -146,8 +141,5 @@ class PropagationPaths:
             name=name,
             fixed_position=fixed[0] if min(transmitters, receivers) == 1 else None,
             rotation=torch.eye(3, dtype=torch.float64),
-            index=index,
-            named_splits=named_splits,
-            source=source,
-            notes=notes,
+            **details,
         )

@@ -11,10 +11,11 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from swiftwrf.data.dataset import Numbers, PositionedData, Splits, to_positions
+from swiftwrf.data.dataset import Numbers, PositionedData, to_positions
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.data.survey import read_survey
 from swiftwrf.errors import InputError, listed
+from swiftwrf.runtime.validation import checked
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -27,7 +28,7 @@ class Rssi(PositionedData):
         receiver_position: Positions of the receivers, (R, 3) [m]. Defaults to nan for all, which stands for unknown.
         receiver_names: Names of the receivers. Defaults to receiver1, receiver2, ...
         name: Name of the data set.
-        index, named_splits, source, notes: As attributes of `PositionedData`.
+        details: index, named_splits, source and notes of `PositionedData`.
 
     Raises:
         InputError: A length that does not match, an infinite number, or positions of some receivers only.
@@ -45,6 +46,7 @@ class Rssi(PositionedData):
 
     row_fields: ClassVar[tuple[str, ...]] = ("transmitter_position", "rssi_dbm", "index")
 
+    @checked
     def __init__(
         self,
         rssi_dbm: Numbers,
@@ -53,10 +55,7 @@ class Rssi(PositionedData):
         receiver_position: Numbers | None = None,
         receiver_names: Sequence[str] | None = None,
         name: str = "rssi",
-        index: Numbers | None = None,
-        named_splits: Splits | None = None,
-        source: Mapping[str, str] | None = None,
-        notes: tuple[str, ...] = (),
+        **details: Any,
     ) -> None:
         position = to_positions("transmitter_position", transmitter_position)
         rssi = rssi_dbm if isinstance(rssi_dbm, Tensor) else torch.from_numpy(np.array(rssi_dbm, dtype=np.float64))
@@ -79,9 +78,13 @@ class Rssi(PositionedData):
                 f"{tuple(places.shape)}"
             )
         super().__init__(
-            name, index, named_splits, source, notes,
-            rssi_dbm=rssi.double(), transmitter_position=position, receiver_position=places, receiver_names=names,
-        )  # fmt: skip
+            name,
+            **details,
+            rssi_dbm=rssi.double(),
+            transmitter_position=position,
+            receiver_position=places,
+            receiver_names=names,
+        )
 
     @classmethod
     def from_frame(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,9 +12,10 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid, ArrayPose
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.dataset import Numbers, PositionedData, Splits, to_positions, to_tensor
+from swiftwrf.data.dataset import Numbers, PositionedData, to_positions, to_tensor
 from swiftwrf.data.spectra import GRID, Spectra, array_spectra, check_pixels
 from swiftwrf.errors import InputError
+from swiftwrf.runtime.validation import checked
 
 SPACING_WAVELENGTHS = (0.01, 20.0)  # of neighbouring elements: beyond, positions are in another unit than metres
 
@@ -34,7 +34,7 @@ class Snapshots(PositionedData):
         name: Name of the data set.
         fixed_position: Position of the array, (3,) [m], in place of `pose`.
         rotation: Matrix that rotates array into world coordinates, (3, 3), in place of `pose`.
-        index, named_splits, source, notes: As attributes of `PositionedData`.
+        details: index, named_splits, source and notes of `PositionedData`.
 
     Raises:
         InputError: A shape that does not match, a number that is not finite, or no pose.
@@ -56,6 +56,7 @@ class Snapshots(PositionedData):
 
     row_fields: ClassVar[tuple[str, ...]] = ("position", "channel", "line_of_sight", "time", "index")
 
+    @checked
     def __init__(
         self,
         channel: Numbers,
@@ -68,10 +69,7 @@ class Snapshots(PositionedData):
         name: str = "snapshots",
         fixed_position: Numbers | None = None,
         rotation: Numbers | None = None,
-        index: Numbers | None = None,
-        named_splits: Splits | None = None,
-        source: Mapping[str, str] | None = None,
-        notes: tuple[str, ...] = (),
+        **details: Any,
     ) -> None:
         if pose is not None:
             fixed_position, rotation = pose.position, pose.rotation
@@ -83,13 +81,16 @@ class Snapshots(PositionedData):
         channel = to_tensor("channel", channel[:, None] if channel.dim() == 2 else channel, torch.complex64, shape)
         free = torch.ones(len(position)) if line_of_sight is None else line_of_sight
         super().__init__(
-            name, index, named_splits, source, notes,
-            channel=channel, position=position, array=array,
+            name,
+            **details,
+            channel=channel,
+            position=position,
+            array=array,
             fixed_position=to_tensor("fixed_position", fixed_position, torch.float64, (3,)),
             rotation=to_tensor("rotation", rotation, torch.float64, (3, 3)),
             line_of_sight=to_tensor("line_of_sight", free, torch.bool, (None,)),
             time=None if time is None else to_tensor("time", time, torch.float64, (None,)),
-        )  # fmt: skip
+        )
 
     @property
     def direction(self) -> Tensor:
@@ -125,7 +126,7 @@ class Snapshots(PositionedData):
         return time | {"line_of_sight": self.line_of_sight.numpy()}
 
     def _summary(self) -> str:
-        return f"{len(self)} channels of {self.channel.shape[1]} snapshots, {self.array}"
+        return f"{len(self)} channels of {self.channel.shape[1]} snapshots, {self.array.summary}"
 
 
 def check_spacing(file: Path, array: PlanarArray) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from typing import Any, ClassVar, Literal
@@ -16,12 +16,12 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid, ArrayPose, to_angles
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.dataset import Numbers, PositionedData, Splits, to_positions, to_tensor
+from swiftwrf.data.dataset import Numbers, PositionedData, to_positions, to_tensor
 from swiftwrf.data.splits import MIN_TRAINING
-from swiftwrf.data.store import AT_ONCE, MOST_PIXELS, Store, stored, too_many
+from swiftwrf.data.store import BATCH_PIXELS, MAX_MEMORY_PIXELS, Store, stored, too_many
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
-from swiftwrf.runtime.validation import check_value
+from swiftwrf.runtime.validation import checked
 
 Moving = Literal["transmitter", "receiver"]
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
@@ -47,7 +47,7 @@ class Spectra(PositionedData):
         fixed_position: Position of the end that does not move, (3,) [m], if it does not follow from `pose`.
         rotation: Matrix that rotates array into world coordinates, (3, 3), in place of `pose`.
         store: Spectra as a `Store`, in place of `spectra`; readers of files give one.
-        index, named_splits, source, notes: As attributes of `PositionedData`.
+        details: index, named_splits, source and notes of `PositionedData`.
 
     Raises:
         InputError: A length that does not match, a number that is not finite, a magnitude outside [0, 1], another `moving`.
@@ -71,6 +71,7 @@ class Spectra(PositionedData):
 
     row_fields: ClassVar[tuple[str, ...]] = ("position", "store", "label", "line_of_sight", "index")
 
+    @checked
     def __init__(
         self,
         spectra: Numbers | None = None,
@@ -86,16 +87,12 @@ class Spectra(PositionedData):
         fixed_position: Numbers | None = None,
         rotation: Numbers | None = None,
         store: Store | None = None,
-        index: Numbers | None = None,
-        named_splits: Splits | None = None,
-        source: Mapping[str, str] | None = None,
-        notes: tuple[str, ...] = (),
+        **details: Any,
     ) -> None:
-        check_value("moving", moving, Moving)
         if position is None or (spectra is None) == (store is None):
             raise InputError("Spectra takes spectra and their positions: Spectra(spectra, position, ...)")
         position = to_positions("position", position)
-        store = store or _checked_store(spectra)
+        store = _checked_store(spectra) if store is None else store
         grid = grid or AngularGrid.hemisphere(*store.shape[1:])
         if grid.shape != store.shape[1:]:
             raise InputError(f"spectra of shape {store.shape} do not fit a grid of {grid.shape} directions")
@@ -122,11 +119,18 @@ class Spectra(PositionedData):
             raise InputError(f"label must have shape ({len(position)}, 2), got {tuple(label.shape)}")
         free = torch.ones(len(position)) if line_of_sight is None else line_of_sight
         super().__init__(
-            name, index, named_splits, source, notes,
-            position=position, store=store, grid=grid, label=label,
+            name,
+            **details,
+            position=position,
+            store=store,
+            grid=grid,
+            label=label,
             line_of_sight=to_tensor("line_of_sight", free, torch.bool, (None,)),
-            moving=moving, array=array, fixed_position=fixed_position, rotation=rotation,
-        )  # fmt: skip
+            moving=moving,
+            array=array,
+            fixed_position=fixed_position,
+            rotation=rotation,
+        )
 
     @property
     def spectrum(self) -> Tensor:
@@ -135,7 +139,7 @@ class Spectra(PositionedData):
         Raises:
             InputError: More spectra than fit into memory.
         """
-        if math.prod(self.store.shape) > MOST_PIXELS:
+        if math.prod(self.store.shape) > MAX_MEMORY_PIXELS:
             raise InputError(
                 f"{self.name} has {len(self)} spectra, which do not fit into memory at once; take some (subset) or read "
                 "them by the batch (store)"
@@ -181,7 +185,8 @@ class Spectra(PositionedData):
 
     def _summary(self) -> str:
         rows, columns = self.grid.shape
-        return f"{len(self)} spectra of {rows} x {columns} directions, {self.array}, moving {self.moving}"
+        array = f", {self.array.summary}" if self.array else ""
+        return f"{len(self)} spectra of {rows} x {columns} directions{array}, moving {self.moving}"
 
 
 def _checked_store(spectra: Numbers) -> Store:
@@ -208,7 +213,7 @@ def array_spectra(array: PlanarArray, channel: Tensor, grid: AngularGrid, beamfo
         return digest.hexdigest()
 
     shape = (len(channel), *grid.shape)
-    rows = torch.arange(len(channel)).split(max(1, AT_ONCE // math.prod(grid.shape)))
+    rows = torch.arange(len(channel)).split(max(1, BATCH_PIXELS // math.prod(grid.shape)))
     return stored(shape, torch.float32, key, lambda: (array.spectrum(channel[r], grid, beamformer) for r in rows))
 
 

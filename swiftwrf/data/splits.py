@@ -10,7 +10,7 @@ from torch import Tensor
 
 from swiftwrf.data.files import read_text
 from swiftwrf.errors import InputError
-from swiftwrf.runtime.validation import checked
+from swiftwrf.runtime.validation import PositiveInt, checked
 
 TEST_SHARE = 0.2
 MIN_TRAINING = 10  # measurements
@@ -106,13 +106,14 @@ def block_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:
 
 
 @checked
-def folds(position: Tensor, validation: Validation, seed: int) -> Tensor:
-    """Return the fold of each training position (n, 3), 0 to 4.
+def folds(position: Tensor, validation: Validation, seed: int, number: PositiveInt = FOLDS) -> Tensor:
+    """Return the fold of each training position (n, 3), counted from 0.
 
     Args:
         position: Training positions, (n, 3) [m].
         validation: "random" for random folds, "block" for slabs.
         seed: Seed of random folds.
+        number: Number of folds.
 
     Raises:
         InputError: Another `validation`.
@@ -122,9 +123,9 @@ def folds(position: Tensor, validation: Validation, seed: int) -> Tensor:
         [4, 4, 4, 4, 4]
     """
     if validation == "block":
-        return slabs(position, FOLDS)
+        return slabs(position, number)
     order = torch.randperm(len(position), generator=torch.Generator().manual_seed(seed))
-    return order % FOLDS
+    return order % number
 
 
 def validation_for(split: str) -> Validation:

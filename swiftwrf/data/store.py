@@ -27,11 +27,11 @@ from swiftwrf.errors import InputError
 from swiftwrf.runtime.durable import cache_folder, replacing
 from swiftwrf.runtime.progress import progress_bar
 
-MANY = 20_000  # spectra from which on they lie in a file
-MOST_PIXELS = 2**29  # in memory: 2 GiB of float32
-MOST_STORED, MOST_EACH = 2**34, 2**20  # in a file, where they are many and not few in all too fine a grid
-AT_ONCE = 2**26  # pixels that become float32 at a time: 256 MiB
-KEPT_DAYS = 30  # without use, after which a file of the cache goes
+MIN_FILE_SPECTRA = 20_000  # from which on spectra are stored in a file
+MAX_MEMORY_PIXELS = 2**29  # 2 GiB of float32
+MAX_FILE_PIXELS, MAX_FINE_PIXELS = 2**34, 2**20  # of all spectra, and of each where they exceed the memory
+BATCH_PIXELS = 2**26  # converted to float32 at a time: 256 MiB
+MAX_UNUSED_DAYS = 30  # after which a file of the cache is deleted
 TYPES = {torch.uint8: np.uint8, torch.float16: np.float16, torch.float32: np.float32}
 
 
@@ -90,7 +90,7 @@ class Store:
 
     def parts(self) -> Iterator[slice]:
         """Yield slices of rows that are converted at a time."""
-        step = max(1, AT_ONCE // math.prod(self.values.shape[1:]))
+        step = max(1, BATCH_PIXELS // math.prod(self.values.shape[1:]))
         return (slice(start, min(start + step, len(self))) for start in range(0, len(self), step))
 
     def batches(self) -> Iterator[Tensor]:
@@ -117,12 +117,12 @@ class Store:
 def too_many(shape: tuple[int, int, int]) -> bool:
     """Return True if spectra (n, H, W) exceed any measurement, so that their size is an error."""
     pixels, each = math.prod(shape), math.prod(shape[1:])
-    return pixels > MOST_STORED or (pixels > MOST_PIXELS and each > MOST_EACH)
+    return pixels > MAX_FILE_PIXELS or (pixels > MAX_MEMORY_PIXELS and each > MAX_FINE_PIXELS)
 
 
 def in_file(shape: tuple[int, int, int]) -> bool:
     """Return True if spectra (n, H, W) are stored in a file."""
-    return shape[0] >= MANY or math.prod(shape) > MOST_PIXELS
+    return shape[0] >= MIN_FILE_SPECTRA or math.prod(shape) > MAX_MEMORY_PIXELS
 
 
 def stored(
@@ -207,5 +207,5 @@ def _prune(folder: Path) -> None:
     """Remove files that were not used for a month, and unfinished files of processes that were killed."""
     for file in folder.glob("*spectra-*"):
         with suppress(OSError):  # another process may be faster
-            if time.time() - file.stat().st_mtime > KEPT_DAYS * 86_400:
+            if time.time() - file.stat().st_mtime > MAX_UNUSED_DAYS * 86_400:
                 file.unlink()

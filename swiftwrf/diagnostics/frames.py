@@ -13,8 +13,7 @@ that of the declared frame, and so is any other constant rotation.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -36,7 +35,17 @@ SCANNED_ROTATIONS = 4000
 MIN_TURN = math.radians(5)  # of a constant rotation that is reported
 MIN_TURN_GAIN = 0.03  # in agreement, of such a rotation
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
-SWAPS = {"x and y": [1, 0, 2], "y and z": [0, 2, 1], "x and z": [2, 1, 0]}
+AXES = torch.eye(3, dtype=torch.float64)
+SWAPS = {"x and y": AXES[[1, 0, 2]], "y and z": AXES[[0, 2, 1]], "x and z": AXES[[2, 1, 0]]}
+MIRRORS = {axis: AXES - 2 * torch.outer(unit, unit) for axis, unit in zip("xyz", AXES, strict=True)}
+AZIMUTH_ERRORS = {  # maps from x, y of the line of sight to those of the peaks
+    "azimuths of the spectra turn clockwise (or the array's y axis is reversed)": ((1, 0), (0, -1)),
+    "azimuths of the spectra turn clockwise from -x (or the array's x axis is reversed)": ((-1, 0), (0, 1)),
+    "azimuths of the spectra are half a turn off (or phases have the wrong sign)": ((-1, 0), (0, -1)),
+    "azimuths of the spectra count from y instead of x": ((0, 1), (-1, 0)),
+    "azimuths of the spectra count from -y instead of x": ((0, -1), (1, 0)),
+    "azimuths turn clockwise from y, as on a compass (or the array's x and y are swapped)": ((0, 1), (1, 0)),
+}
 MIN_CLEAR_POSITIONS = 20  # with line of sight, to check frames
 MIN_VARIANCE_GAIN = 0.1  # in explained variance of RSSI, to prefer another frame
 
@@ -78,18 +87,19 @@ class _Frame:
     rotation: Tensor
     sign: float
 
-    def direction(self) -> Tensor:
-        """Return unit vectors of the line of sight in array coordinates, folded to the front of the array, (n, 3)."""
+    def towards(self) -> Tensor:
+        """Return unit vectors of the line of sight in array coordinates, (n, 3)."""
         away = self.sign * (self.position - self.fixed) @ self.rotation
-        return _folded(away / away.norm(dim=1, keepdim=True).clamp_min(1e-12))
+        direction: Tensor = away / away.norm(dim=1, keepdim=True).clamp_min(1e-12)
+        return direction
 
-    def of(
-        self,
-        position: Callable[[Tensor], Tensor] = lambda p: p,
-        fixed: Callable[[Tensor], Tensor] = lambda p: p,
-        rotation: Callable[[Tensor], Tensor] = lambda r: r,
-    ) -> _Frame:
-        return _Frame(position(self.position), fixed(self.fixed), rotation(self.rotation), self.sign)
+    def direction(self) -> Tensor:
+        """Return `towards`, folded to the front of the array."""
+        return _folded(self.towards())
+
+    def mapped(self, matrix: Tensor, both: bool = False) -> _Frame:
+        """Return the frame with a matrix (3, 3) applied to the positions, and to the fixed one if `both`."""
+        return replace(self, position=self.position @ matrix, fixed=self.fixed @ matrix if both else self.fixed)
 
 
 def check_frames(spectra: Spectra) -> FrameReport | None:
@@ -118,7 +128,7 @@ def check_frames(spectra: Spectra) -> FrameReport | None:
     found = {meaning: _agreement(direction, peak) for meaning, direction in _others(frame).items()}
     named, by_chance = max(found.values())
     turn, angle = _constant_turn(frame, peak)
-    turned, turned_by_chance = _agreement(_folded(_turned(frame, turn)), peak)
+    turned, turned_by_chance = _agreement(_folded(frame.towards() @ _matrix(turn)), peak)
     error = named - by_chance >= MIN_EVIDENCE and named - agreement >= MIN_EVIDENCE and named >= turned - MIN_TURN_GAIN
     rotates = turned - turned_by_chance >= MIN_EVIDENCE and turned - agreement >= MIN_TURN_GAIN and angle >= MIN_TURN
     return FrameReport(
@@ -148,92 +158,56 @@ def _agreement(direction: Tensor, peak: Tensor) -> tuple[float, float]:
 def _others(frame: _Frame) -> dict[str, Tensor]:
     """Return the directions (n, 3) of the line of sight under each error."""
     quaternion = Rotation.from_matrix(frame.rotation.numpy()).as_quat()
-
-    def reordered(_: Tensor) -> Tensor:
-        return torch.from_numpy(Rotation.from_quat(np.roll(quaternion, -1)).as_matrix())
-
-    def columns(order: list[int]) -> Callable[[Tensor], Tensor]:
-        return lambda p: p[..., order]
-
-    def mirrored(axis: int) -> Callable[[Tensor], Tensor]:
-        signs = torch.ones(3, dtype=torch.float64)
-        signs[axis] = -1
-        return lambda p: p * signs
-
-    def scaled(scale: float) -> Callable[[Tensor], Tensor]:
-        return lambda p: p * scale
-
+    reordered = torch.from_numpy(Rotation.from_quat(np.roll(quaternion, -1)).as_matrix())
     frames = {
-        "the quaternion is in the order w, x, y, z; it must be x, y, z, w": frame.of(rotation=reordered),
-        "the quaternion turns world into array coordinates; it must turn array into world": frame.of(
-            rotation=lambda r: r.T
+        "the quaternion is in the order w, x, y, z; it must be x, y, z, w": replace(frame, rotation=reordered),
+        "the quaternion turns world into array coordinates; it must turn array into world": replace(
+            frame, rotation=frame.rotation.T
         ),
     }
-    for names, order in SWAPS.items():
-        swap = columns(order)
-        frames[f"{names} of the positions are swapped"] = frame.of(position=swap)
-        frames[f"{names} of positions and array are swapped against the orientation"] = frame.of(
-            position=swap, fixed=swap
-        )
-    for name, axis in (("x", 0), ("y", 1), ("z", 2)):
-        mirror = mirrored(axis)
-        frames[f"{name} of the positions has the wrong sign"] = frame.of(position=mirror)
-        frames[f"{name} of positions and array has the wrong sign against the orientation"] = frame.of(
-            position=mirror, fixed=mirror
-        )
+    for names, swap in SWAPS.items():
+        frames[f"{names} of the positions are swapped"] = frame.mapped(swap)
+        frames[f"{names} of positions and array are swapped against the orientation"] = frame.mapped(swap, both=True)
+    for axis, mirror in MIRRORS.items():
+        frames[f"{axis} of the positions has the wrong sign"] = frame.mapped(mirror)
+        against = f"{axis} of positions and array has the wrong sign against the orientation"
+        frames[against] = frame.mapped(mirror, both=True)
     for unit, scale in UNITS.items():
-        frames[f"the positions are in {unit}, the array's is in metres"] = frame.of(position=scaled(scale))
-        frames[f"the array's position is in {unit}, the others are in metres"] = frame.of(fixed=scaled(scale))
+        frames[f"the positions are in {unit}, the array's is in metres"] = frame.mapped(scale * AXES)
+        metres = f"the array's position is in {unit}, the others are in metres"
+        frames[metres] = replace(frame, fixed=scale * frame.fixed)
     found = {meaning: other.direction() for meaning, other in frames.items()}
-    x, y, z = frame.direction().unbind(1)
-    found |= {
-        "azimuths of the spectra turn clockwise (or the array's y axis is reversed)": torch.stack([x, -y, z], 1),
-        "azimuths of the spectra turn clockwise from -x (or the array's x axis is reversed)": torch.stack(
-            [-x, y, z], 1
-        ),
-        "azimuths of the spectra are half a turn off (or phases have the wrong sign)": torch.stack([-x, -y, z], 1),
-        "azimuths of the spectra count from y instead of x": torch.stack([y, -x, z], 1),
-        "azimuths of the spectra count from -y instead of x": torch.stack([-y, x, z], 1),
-        "azimuths turn clockwise from y, as on a compass (or the array's x and y are swapped)": torch.stack(
-            [y, x, z], 1
-        ),
-    }
-    azimuth, elevation = to_angles(frame.direction())
-    found["rows of the spectra run from the zenith down; row 0 must be the lowest elevation"] = to_direction(
-        azimuth, math.pi / 2 - elevation
-    )
-    return found
-
-
-def _turned(frame: _Frame, turn: NDArray[np.float64]) -> Tensor:
-    """Return unfolded directions for an array rotated by a rotation vector in its coordinates."""
-    away = frame.sign * (frame.position - frame.fixed) @ frame.rotation
-    matrix = torch.from_numpy(Rotation.from_rotvec(turn).as_matrix())
-    direction: Tensor = away / away.norm(dim=1, keepdim=True) @ matrix
-    return direction
+    declared = frame.direction()
+    for meaning, matrix in AZIMUTH_ERRORS.items():
+        found[meaning] = torch.cat([declared[:, :2] @ torch.tensor(matrix).double().T, declared[:, 2:]], dim=1)
+    azimuth, elevation = to_angles(declared)
+    zenith = "rows of the spectra run from the zenith down; row 0 must be the lowest elevation"
+    return found | {zenith: to_direction(azimuth, math.pi / 2 - elevation)}
 
 
 def _constant_turn(frame: _Frame, peak: Tensor) -> tuple[NDArray[np.float64], float]:
     """Return the rotation of the array with most agreement, as a rotation vector in its coordinates, and its angle."""
-    away = _turned(frame, np.zeros(3)).float()
-    turns = Rotation.concatenate(
-        [Rotation.identity(), Rotation.random(SCANNED_ROTATIONS, rng=np.random.default_rng(0))]
-    )
+    towards = frame.towards()
+    scanned = Rotation.random(SCANNED_ROTATIONS, rng=np.random.default_rng(0))
+    turns = Rotation.concatenate([Rotation.identity(), scanned])
     matrices = torch.from_numpy(turns.as_matrix()).float()
-    score = torch.cat([_mean_kernel(_folded(away @ part), peak.float()) for part in matrices.split(200)])
+    score = torch.cat([_mean_kernel(_folded(towards.float() @ part), peak.float()) for part in matrices.split(200)])
 
     def miss(turn: NDArray[np.float64]) -> float:
-        return -float(_mean_kernel(_folded(_turned(frame, turn)), peak))
+        return -float(_mean_kernel(_folded(towards @ _matrix(turn)), peak))
 
     starts = [np.zeros(3), *(turns[int(i)].as_rotvec() for i in score.topk(3).indices)]
-    simplex = [np.vstack([start, start + 0.1 * np.eye(3)]) for start in starts]
+    options = {"xatol": 1e-4, "fatol": 1e-6}
     results = [
-        minimize(miss, start, method="Nelder-Mead", options={"initial_simplex": s, "xatol": 1e-4, "fatol": 1e-6})
-        for start, s in zip(starts, simplex, strict=True)
+        minimize(miss, start, method="Nelder-Mead", options=options | {"initial_simplex": simplex})
+        for start, simplex in ((s, np.vstack([s, s + 0.1 * np.eye(3)])) for s in starts)
     ]
-    best = min(results, key=lambda result: result.fun)
-    rotation = Rotation.from_rotvec(best.x)
+    rotation = Rotation.from_rotvec(min(results, key=lambda result: result.fun).x)
     return rotation.as_rotvec(), float(rotation.magnitude())
+
+
+def _matrix(turn: NDArray[np.float64]) -> Tensor:
+    return torch.from_numpy(Rotation.from_rotvec(turn).as_matrix())
 
 
 def _mean_kernel(direction: Tensor, peak: Tensor) -> Tensor:
@@ -269,10 +243,9 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
     if not data.located:
         return None
     place = data.transmitter_position
-    flips = dict(zip("xyz", 1 - 2 * torch.eye(3, dtype=place.dtype), strict=True))
-    others = {f"{names} of the positions are swapped": place[:, order] for names, order in SWAPS.items()}
+    others = {f"{names} of the positions are swapped": place @ swap for names, swap in SWAPS.items()}
     others |= {f"the positions are in {unit}, the receivers' in metres": place * scale for unit, scale in UNITS.items()}
-    others |= {f"{axis} of the positions has the wrong sign": place * flip for axis, flip in flips.items()}
+    others |= {f"{axis} of the positions has the wrong sign": place @ mirror for axis, mirror in MIRRORS.items()}
     declared = _explained(place, data)
     found = {meaning: _explained(other, data) for meaning, other in others.items()}
     meaning, best = max(found.items(), key=lambda pair: pair[1])

@@ -19,6 +19,7 @@ from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.registry import Registry
+from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.validation import NonNegativeInt, checked, configuration
 
 if TYPE_CHECKING:
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 
 ARRAY, FIXED_END = "array", "fixed end"  # requirements that a model can declare
 CPU = torch.device("cpu")
-Record = dict[str, Any]  # one evaluation of a fit
 Preset = Literal["quick", "paper"]
 
 
@@ -88,7 +88,42 @@ class FitContext:
     progress: bool = False
 
 
-class FieldModel(Saved):
+class Configured:
+    """Base class of models whose options are keyword arguments of the constructor; `config_type` declares their ranges.
+
+    Args:
+        config: Options as one object. Defaults to those of the preset.
+        preset: "quick" for the defaults, sized for a desktop; "paper" for the settings of the model's publication.
+        options: Single options, which replace those of `config`.
+
+    Raises:
+        InputError: An unknown option, or a value outside its range.
+    """
+
+    config_type: ClassVar[type[Any]] = FieldConfig
+    """dataclass of the options"""
+
+    @checked
+    def __init__(self, config: Any = None, *, preset: Preset = "quick", **options: Any) -> None:
+        known = [field.name for field in fields(self.config_type)]
+        unknown = [name for name in options if name not in known]
+        if unknown:
+            raise InputError(f"{type(self).__name__} has no option {unknown[0]!r}; it has {', '.join(known)}")
+        if config is None:
+            self.config = (self.config_type.paper if preset == "paper" else self.config_type)(**options)
+        elif isinstance(config, self.config_type):
+            self.config = replace(config, **options)
+        else:
+            raise InputError(f"{type(self).__name__} takes a {self.config_type.__name__}, got {type(config).__name__}")
+
+    @classmethod
+    def with_known(cls, preset: Preset, options: Mapping[str, Any]) -> Self:
+        """Return a model with those of the options that it has."""
+        known = {field.name for field in fields(cls.config_type)}
+        return cls(preset=preset, **{option: value for option, value in options.items() if option in known})
+
+
+class FieldModel(Configured, Saved):
     """Base class of all field models.
 
     A subclass sets `name`, `kind` and `config_type`, and implements `_fit`, `_predict`, `state` and `_restore`. Options are
@@ -105,8 +140,6 @@ class FieldModel(Saved):
 
     name: ClassVar[str]
     """name in the registry, on the command line and in reports"""
-    config_type: ClassVar[type[Any]] = FieldConfig
-    """dataclass of the options"""
     requires: ClassVar[tuple[str, ...]] = ()
     """properties of the data that the model needs: ARRAY, FIXED_END"""
     samples: ClassVar[bool] = False
@@ -122,19 +155,6 @@ class FieldModel(Saved):
     """grid of the training spectra, set by `fit`"""
     bounds: Tensor
     """corners of the box around the training positions, float64 (2, 3) [m], set by `fit`"""
-
-    @checked
-    def __init__(self, config: Any = None, *, preset: Preset = "quick", **options: Any) -> None:
-        known = [field.name for field in fields(self.config_type)]
-        unknown = [name for name in options if name not in known]
-        if unknown:
-            raise InputError(f"{type(self).__name__} has no option {unknown[0]!r}; it has {', '.join(known)}")
-        if config is None:
-            self.config = (self.config_type.paper if preset == "paper" else self.config_type)(**options)
-        elif isinstance(config, self.config_type):
-            self.config = replace(config, **options)
-        else:
-            raise InputError(f"{type(self).__name__} takes a {self.config_type.__name__}, got {type(config).__name__}")
 
     @classmethod
     def lacking(cls, data: Spectra) -> list[str]:
@@ -400,11 +420,8 @@ def make_model(name: str, preset: Preset = "quick", **options: Any) -> FieldMode
         >>> make_model("idw", seed=3).config.seed
         3
     """
-    model_type = FIELD_MODELS[name]
-    known = {field.name for field in fields(model_type.config_type)}
-    chosen = {option: value for option, value in options.items() if option in known}
-    model: FieldModel = model_type(preset=preset, **chosen)
-    return model
+    model_type: type[FieldModel] = FIELD_MODELS[name]
+    return model_type.with_known(preset, options)
 
 
 def model_types(names: Iterable[str] | None = None) -> dict[str, type[FieldModel]]:

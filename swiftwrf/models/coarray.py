@@ -222,7 +222,7 @@ def fit_coarray(
     Example:
         >>> import swiftwrf
         >>> fit_coarray(swiftwrf.simulated_room(n=20), progress=False)
-        CoarrayModel(fitted, 90 x 360 directions)
+        CoarrayModel(fitted, 30 x 120 directions)
     """
     model = CoarrayModel(validation=validation, seed=seed)
     return model.fit(train, checkpoint=checkpoint, on_record=on_record, progress=progress)

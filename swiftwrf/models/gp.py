@@ -28,7 +28,7 @@ class GPModel(MemoryModel):
         >>> import swiftwrf
         >>> train, test = swiftwrf.simulated_room(n=50).split()
         >>> GPModel().fit(train).predict(test.position).mean.shape
-        torch.Size([10, 90, 360])
+        torch.Size([10, 30, 120])
     """
 
     name = "gp"

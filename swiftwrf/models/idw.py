@@ -27,7 +27,7 @@ class IDWModel(MemoryModel):
         >>> import swiftwrf
         >>> train, test = swiftwrf.simulated_room(n=50).split()
         >>> IDWModel(seed=1).fit(train).predict(test.position).mean.shape
-        torch.Size([10, 90, 360])
+        torch.Size([10, 30, 120])
     """
 
     name = "idw"

@@ -46,7 +46,7 @@ class NearestModel(MemoryModel):
         >>> import swiftwrf
         >>> train, test = swiftwrf.simulated_room(n=50).split()
         >>> NearestModel().fit(train).predict(test.position).mean.shape
-        torch.Size([10, 90, 360])
+        torch.Size([10, 30, 120])
     """
 
     name = "nearest"

@@ -1,9 +1,9 @@
 """RSSI at fixed receivers from the position of the transmitter."""
 
-from swiftwrf.rssi.base import Map, PredictorConfig, RssiFitContext, RssiPredictor
+from swiftwrf.rssi.base import Map, RssiFitContext, RssiPredictor
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.model import LEVEL, RssiModel, fit_rssi
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
 
-__all__ = ["LEVEL", "Map", "PathLoss", "PredictorConfig", "RssiConfig", "RssiFitContext", "RssiModel", "RssiPredictor"]
+__all__ = ["LEVEL", "Map", "PathLoss", "RssiConfig", "RssiFitContext", "RssiModel", "RssiPredictor"]
 __all__ += ["fit_path_loss", "fit_rssi", "log_distance"]

@@ -6,7 +6,7 @@ import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -14,12 +14,11 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import MIN_TRAINING, Validation
+from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError
-from swiftwrf.models.base import Prediction, Record
+from swiftwrf.models.base import Configured, FitContext, Prediction, Record
 from swiftwrf.positions import check_positions
 from swiftwrf.runtime.threads import side_by_side
-from swiftwrf.runtime.validation import NonNegativeInt, configuration
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 ITEMS_PER_THREAD = 4  # between two results that are kept: starting threads costs milliseconds
@@ -33,36 +32,23 @@ def map_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterabl
         yield from side_by_side(function, waiting[start : start + n_items])
 
 
-@configuration
-class PredictorConfig:
-    """Options of every RSSI predictor."""
-
-    validation: Validation = "random"
-    """training rows held out to choose settings: single ones at random, or one region at a time"""
-    seed: NonNegativeInt = 0
-    """seed of everything random"""
-
-
 @dataclass(frozen=True)
-class RssiFitContext:
+class RssiFitContext(FitContext):
     """Arguments of `RssiPredictor.fit` other than the training rows; see there."""
 
-    pool: Rssi
-    device: torch.device
-    parallel: Map | None
-    checkpoint: Path | None
-    on_record: Callable[[Record], None] | None
-    progress: bool
+    pool: Rssi = field(kw_only=True)
+    parallel: Map | None = None
 
 
-class RssiPredictor(ABC):
+class RssiPredictor(Configured, ABC):
     """Base class of all predictors of RSSI at fixed receivers from the position of the transmitter.
 
     A subclass sets `name` and `config_type`, and implements `_fit` and `_predict`. Options are keyword arguments of the
     constructor; `config_type` declares their ranges.
 
     Args:
-        config: Options as one object. Defaults to `config_type()`.
+        config: Options as one object. Defaults to those of the preset.
+        preset: "quick" for the defaults; "paper" for the published settings, if there are any.
         options: Single options, which replace those of `config`.
 
     Raises:
@@ -77,8 +63,6 @@ class RssiPredictor(ABC):
 
     name: ClassVar[str]
     """name on the command line and in reports"""
-    config_type: ClassVar[type[Any]] = PredictorConfig
-    """dataclass of the options"""
     requires_receiver_position: ClassVar[bool] = False
     """whether the positions of the receivers must be known"""
     slow: ClassVar[bool] = False
@@ -88,13 +72,6 @@ class RssiPredictor(ABC):
 
     receiver_names: tuple[str, ...]
     """names of the receivers, set by `fit`"""
-
-    def __init__(self, config: Any = None, **options: Any) -> None:
-        known = [field.name for field in fields(self.config_type)]
-        unknown = [name for name in options if name not in known]
-        if unknown:
-            raise InputError(f"{type(self).__name__} has no option {unknown[0]!r}; it has {', '.join(known)}")
-        self.config = replace(config or self.config_type(), **options)
 
     @classmethod
     def lacking(cls, data: Rssi) -> str:
@@ -136,7 +113,9 @@ class RssiPredictor(ABC):
         check_training(train, pool)
         if lacking := self.lacking(train):
             raise InputError(lacking)
-        self._fit(train, RssiFitContext(pool, torch.device(device), parallel, checkpoint, on_record, progress))
+        where = torch.device(device)
+        context = RssiFitContext(None, where, checkpoint, on_record, progress, pool=pool, parallel=parallel)
+        self._fit(train, context)
         self.receiver_names = tuple(map(str, train.receiver_names))
         return self
 
@@ -179,16 +158,12 @@ def check_training(train: Rssi, pool: Rssi) -> None:
     """Refuse data that nothing can be fitted to.
 
     Raises:
-        InputError: Fewer than 10 measurements in all, values that are not finite, or a pool of other rows.
+        InputError: Fewer than 10 measurements in all, or a pool of other rows.
     """
-    detected = int((~train.rssi_dbm.isnan()).sum())
+    detected = int(train.detected.sum())
     if detected < MIN_TRAINING:
         names = ", ".join(train.receiver_names)
         raise InputError(f"{names}: detected in {detected} training rows in all; at least {MIN_TRAINING} are needed")
-    if not train.transmitter_position.isfinite().all() or not (train.located or train.receiver_position.isnan().all()):
-        raise InputError("positions of transmitters and receivers must be finite numbers [m], or nan for all receivers")
-    if train.rssi_dbm.isinf().any():
-        raise InputError("RSSI must be finite numbers [dBm], or nan where not detected")
     if not torch.equal(pool.transmitter_position, train.transmitter_position):
         raise InputError("the pool must hold the same rows as the training part, at more receivers")
 
@@ -196,9 +171,7 @@ def check_training(train: Rssi, pool: Rssi) -> None:
 def fingerprint(config: Any, train: Rssi, pool: Rssi) -> str:
     """Return a digest that identifies a fit by its configuration (a dataclass) and its measurements."""
     digest = hashlib.sha256(json.dumps([type(config).__name__, asdict(config), train.receiver_names]).encode())
-    for tensor in (
-        *(train.transmitter_position, train.receiver_position, train.rssi_dbm),
-        *(pool.receiver_position, pool.rssi_dbm),
-    ):
-        digest.update(tensor.contiguous().numpy().tobytes())
+    for data in (train, pool):
+        for tensor in (data.transmitter_position, data.receiver_position, data.rssi_dbm):
+            digest.update(tensor.contiguous().numpy().tobytes())
     return digest.hexdigest()

@@ -7,12 +7,12 @@ from typing import Annotated, Any
 
 from annotated_types import Ge
 
-from swiftwrf.rssi.base import PredictorConfig
+from swiftwrf.models.base import FieldConfig
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
 
 @configuration
-class RssiConfig(PredictorConfig):
+class RssiConfig(FieldConfig):
     """Options of `RssiModel`. The defaults have the lowest error on held-out training rows.
 
     Example:

@@ -23,7 +23,7 @@ from torch import Tensor
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, thinned
-from swiftwrf.models.base import Record
+from swiftwrf.models.base import Record, from_plain
 from swiftwrf.rssi.base import Map, RssiFitContext, RssiPredictor, fingerprint, map_threads
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
@@ -54,6 +54,7 @@ class RssiModel(RssiPredictor, Saved):
 
     Args:
         config: Options as one object. Defaults to `RssiConfig()`.
+        preset: "quick" for the defaults, "paper" for `RssiConfig.paper()`.
         options: Single options, which replace those of `config`.
 
     Example:
@@ -105,24 +106,24 @@ class RssiModel(RssiPredictor, Saved):
             record: Record = {"stage": "search", "n_primitives": training.n_primitives}
             if not session.records:
                 session.evaluated(record | {"seconds": time.perf_counter() - began}, {}, {})
-            with files.refusing(f"{context.checkpoint} is no state that a fit can go on from"):
-                fitted = _saved_fits(session)
+            found = session.saved.tensors if session.saved else {}
+            done = len(found.get("level", ()))
+            with files.refusing(f"{context.checkpoint} is no state that a fit can continue from"):
+                files.expect(found, dict.fromkeys(found and ("held_out", "coefficient"), (done, len(training.rssi))))
             fit_some, size = (learn_receivers, PAPER_RECEIVERS) if self.config.paper_head else (fit_receiver, 1)
             # compiled rasterizers are not safe in several threads, and only the paper's head needs them here
             parallel: Map = context.parallel or (map if self.config.paper_head else map_threads)
-            task = partial(fit_some, config=self.config, device=context.device)
-            starts = [start for start in range(0, len(training.receiver_names), size) if start not in fitted]
-            groups = [training.columns(slice(start, start + size)) for start in starts]
-            results = zip(starts, groups, parallel(task, groups), strict=True)
-            for start, group, fitted[start] in bar.track(results, total=len(starts), description="receivers"):
-                record |= {"stage": "final", "receivers": list(group.receiver_names)}
-                error = fitted[start]["held_out"].T.where(_held_out_mask(group, self.config), torch.nan) - group.rssi
-                tensors = {f"{i}.{name}": value for i, found in fitted.items() for name, value in found.items()}
+            task = partial(fit_some, data=training, config=self.config, device=context.device)
+            parts = [slice(start, start + size) for start in range(done, len(training.receiver_names), size)]
+            mask = _held_out_mask(training, self.config)
+            results = zip(parts, parallel(task, parts), strict=True)
+            for part, result in bar.track(results, total=len(parts), description="receivers"):
+                found = {name: torch.cat([found[name], new]) if found else new for name, new in result.items()}
+                error = result["held_out"].T.where(mask[:, part], torch.nan) - training.rssi[:, part]
+                record |= {"stage": "final", "receivers": list(training.receiver_names[part])}
                 record |= {"validation": float(error.abs().nanmean()), "seconds": time.perf_counter() - began}
-                session.evaluated(record, tensors, {})
-        self._assemble(
-            train, training, {name: torch.cat([fitted[i][name] for i in sorted(fitted)]) for name in fitted[0]}
-        )
+                session.evaluated(record, found, {})
+        self._assemble(train, training, found)
 
     @single_thread()
     def _assemble(self, train: Rssi, training: RssiTraining, found: dict[str, Tensor]) -> None:
@@ -151,7 +152,7 @@ class RssiModel(RssiPredictor, Saved):
         self.level = mixed(found["level"], training.baselines.level)
         self.slope = mixed(found["slope"], training.baselines.slope)
         self.directivity = (weight[0][:, None] * found["directivity"]).float()
-        self.anchor, self.coefficient = training.position.float(), found["coefficient"].T.float()
+        self.anchor, self.coefficient = training.position.float(), found["coefficient"].T.float().contiguous()
         self.rendered = found["rendered"]
         self.field_db, self.noise_db = (scale * training.field_db).float(), (scale * training.noise_db).float()
         self._precompute()
@@ -166,7 +167,7 @@ class RssiModel(RssiPredictor, Saved):
     @single_thread()
     def _predict(self, position: Tensor) -> tuple[Tensor, Tensor]:
         offset = position - self.centre
-        if len(offset) and (farthest := float(offset.abs().amax())) > MAX_DISTANCE_M:
+        if len(offset) and (farthest := float(offset.detach().abs().amax())) > MAX_DISTANCE_M:
             raise InputError(
                 f"a position is {farthest:.3g} m away from the measurements; at most {MAX_DISTANCE_M:g} m make sense"
             )
@@ -191,7 +192,7 @@ class RssiModel(RssiPredictor, Saved):
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
-        model = cls(RssiConfig(**header["options"]))
+        model = cls(from_plain(RssiConfig, header["options"]))
         model.receiver_names, model.n_primitives = (
             tuple(map(str, header["receiver_names"])),
             int(header["n_primitives"]),
@@ -246,15 +247,6 @@ def _shapes(n_receivers: int, n_anchors: int) -> dict[str, tuple[int, ...]]:
         "coefficient": (n_anchors, n_receivers),
         "rendered": (n_receivers, 2, 2, N_DIRECTIONS),
     }
-
-
-def _saved_fits(session: Session) -> dict[int, dict[str, Tensor]]:
-    """Return the fits that an interrupted session has finished, by the number of their first receiver."""
-    fitted: dict[int, dict[str, Tensor]] = {}
-    for key, tensor in (session.saved.tensors if session.saved else {}).items():
-        start, name = key.split(".")
-        fitted.setdefault(int(start), {})[name] = tensor
-    return fitted
 
 
 def _held_out_mask(training: RssiTraining, config: RssiConfig) -> Tensor:

@@ -20,7 +20,7 @@ HELD_OUT_FOLD = 0  # the only fold that is held out: a fit costs minutes
 
 
 @single_thread()
-def learn_receivers(data: RssiTraining, config: RssiConfig, device: torch.device) -> dict[str, Tensor]:
+def learn_receivers(some: slice, data: RssiTraining, config: RssiConfig, device: torch.device) -> dict[str, Tensor]:
     """Fit some receivers twice: without one fold, and with all. Arguments and result as of `regression.fit_receiver`.
 
     The receivers share the steps, which saves time, but no parameter, loss or moment: each is fitted as if alone.
@@ -32,31 +32,32 @@ def learn_receivers(data: RssiTraining, config: RssiConfig, device: torch.device
     covariance.diagonal().add_(PRIOR_JITTER)
     root = torch.linalg.cholesky(covariance)  # the latent field in the bins is this times standard normal numbers
     kept = data.fold != HELD_OUT_FOLD
-    held_out = _descend(data, root.float(), kept, config, device)[0]
-    _, white, rendered = _descend(data, root.float(), torch.ones_like(kept), config, device)
+    held_out = _descend(some, data, root.float(), kept, config, device)[0]
+    _, white, rendered = _descend(some, data, root.float(), torch.ones_like(kept), config, device)
     return {
-        "level": data.prior_mean.level,
-        "slope": data.prior_mean.slope,
+        "level": data.prior_mean.level[some],
+        "slope": data.prior_mean.slope[some],
         "directivity": torch.zeros(len(rendered), N_HARMONICS, dtype=torch.float64),
-        "coefficient": torch.linalg.solve_triangular(root.T, white.double() * data.field_db, upper=True).T,
+        "coefficient": torch.linalg.solve_triangular(root.T, white.double() * data.field_db[some], upper=True).T,
         "rendered": rendered,
         "held_out": held_out.double().T,
     }
 
 
 def _descend(
-    data: RssiTraining, root: Tensor, kept: Tensor, config: RssiConfig, device: torch.device
+    some: slice, data: RssiTraining, root: Tensor, kept: Tensor, config: RssiConfig, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return predictions in all bins (n, R) [dBm], the normal numbers behind the field (n, R), and the rendered heads."""
     generator = torch.Generator().manual_seed(config.seed)
-    heads = nn.ModuleList(Head(name, data.n_primitives, config.seed) for name in data.receiver_names).to(device)
-    white = nn.Parameter(torch.zeros(data.rssi.shape, device=device))
-    level, field_db = (x.float().to(device) for x in (data.prior_mean.level, data.field_db))
-    measured, root = data.rssi.float().to(device), root.to(device)
-    noise_db = (data.noise_db / data.count.clamp_min(1).sqrt()).float().to(device)
+    names = data.receiver_names[some]
+    heads = [Head(name, data.n_primitives, config.seed).to(device) for name in names]
+    level, field_db = (x[some].float().to(device) for x in (data.prior_mean.level, data.field_db))
+    measured, root = data.rssi[:, some].float().to(device), root.to(device)
+    white = nn.Parameter(torch.zeros_like(measured))
+    noise_db = (data.noise_db / data.count.clamp_min(1).sqrt())[:, some].float().to(device)
     rows = kept.nonzero()[:, 0]
     n_detected = (~measured[rows.to(device)].isnan()).sum(dim=0).clamp_min(1)
-    optimiser = torch.optim.Adam([*heads.parameters(), white], lr=config.rate)
+    optimiser = torch.optim.Adam([*(p for head in heads for p in head.parameters()), white], lr=config.rate)
 
     def predict(at: Tensor) -> Tensor:
         return level + mean_magnitude(render(heads), field_db * (root[at] @ white))
@@ -70,7 +71,7 @@ def _descend(
         loss = losses.sum()
         if not math.isfinite(loss.item()):
             raise FitError(
-                f"the RSSI fit of {', '.join(data.receiver_names)} broke at step {step}: loss {loss.item():.3g}; try a rate "
+                f"the RSSI fit of {', '.join(names)} broke at step {step}: loss {loss.item():.3g}; try a rate "
                 f"below {config.rate:g}"
             )
         optimiser.zero_grad()

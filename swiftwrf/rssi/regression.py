@@ -16,7 +16,7 @@ from swiftwrf.errors import FitError
 from swiftwrf.gp import LeaveGroupOut
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import HeadTable
-from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
+from swiftwrf.rssi.path_loss import N_HARMONICS, PathLoss, harmonics, log_distance
 from swiftwrf.rssi.training import RssiTraining
 from swiftwrf.runtime.threads import single_thread
 
@@ -28,11 +28,12 @@ FIELD_TOLERANCE_DB = 0.1  # mean change of the latent field that counts as conve
 
 
 @single_thread()  # several threads add up sums in another order
-def fit_receiver(data: RssiTraining, config: RssiConfig, device: torch.device) -> dict[str, Tensor]:
+def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: torch.device) -> dict[str, Tensor]:
     """Fit one receiver.
 
     Args:
-        data: Training data of one receiver.
+        some: The receiver, as a slice of length 1.
+        data: Training data.
         config: Options.
         device: Device to compute on.
 
@@ -44,38 +45,39 @@ def fit_receiver(data: RssiTraining, config: RssiConfig, device: torch.device) -
     Raises:
         FitError: A system that cannot be solved, for positions or values beyond any measurement.
     """
-    rssi, distance = data.rssi[:, 0], log_distance(data.position, data.receiver)
+    rssi, receiver = data.rssi[:, some][:, 0], data.receiver[some]
+    prior_mean = PathLoss(data.prior_mean.level[some], data.prior_mean.slope[some])
+    distance, bearing = log_distance(data.position, receiver), harmonics(data.position, receiver)[:, 0]
     detected = (~rssi.isnan()).nonzero()[:, 0]
-    bearing = harmonics(data.position, data.receiver)[:, 0]
     scale = torch.tensor([PATH_LOSS_STD_DB] * 2 + [DIRECTIVITY_STD_DB] * N_HARMONICS, dtype=torch.float64)
     feature = torch.cat([torch.ones_like(distance), distance, bearing], dim=1) * scale
-    residual = rssi - data.prior_mean(distance)[:, 0]
+    residual = rssi - prior_mean(distance)[:, 0]
     coefficient, error, linear = torch.zeros_like(rssi), torch.zeros_like(rssi), torch.zeros_like(scale)
     if len(detected):
-        some = data.position[detected].to(device)
-        variance = float(data.field_db[0]) ** 2
+        position = data.position[detected].to(device)
+        variance = float(data.field_db[some]) ** 2
         try:
             dual, slope, factor = solve(
                 residual[detected].to(device),
                 feature[detected].to(device),
-                variance * data.kernel(some, some),
-                (data.noise_db[0] / data.count[detected, 0].sqrt()).to(device),
-                HeadTable(data.rendered.to(device)),
+                variance * data.kernel(position, position),
+                (data.noise_db[some] / data.count[detected, some][:, 0].sqrt()).to(device),
+                HeadTable(data.rendered[some].to(device)),
                 config.huber,
             )
             error[detected] = fold_errors(factor, dual, data.fold[detected].to(device)).cpu()
         except torch.linalg.LinAlgError as reason:  # type: ignore[attr-defined]
             raise FitError(
-                f"the RSSI fit of receiver {data.receiver_names[0]!r} broke ({reason}); are its values sane?"
+                f"the RSSI fit of receiver {data.receiver_names[some][0]!r} broke ({reason}); are its values sane?"
             ) from None
         coefficient[detected] = variance * (slope * dual).cpu()
         linear = scale * (dual.cpu() @ feature[detected])
     return {
-        "level": data.prior_mean.level + linear[0],
-        "slope": data.prior_mean.slope + linear[1],
+        "level": prior_mean.level + linear[0],
+        "slope": prior_mean.slope + linear[1],
         "directivity": linear[None, 2:],
         "coefficient": coefficient[None],
-        "rendered": data.rendered,
+        "rendered": data.rendered[some],
         "held_out": (rssi.nan_to_num() - error)[None],
     }
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -61,22 +61,6 @@ class RssiTraining:
     noise_db: Tensor
     baselines: PathLoss
     baseline_held_out: Tensor
-
-    def columns(self, some: slice) -> RssiTraining:
-        """Return the part that the fit of some receivers needs."""
-        return replace(
-            self,
-            receiver_names=self.receiver_names[some],
-            receiver=self.receiver[some],
-            rssi=self.rssi[:, some].clone(),
-            count=self.count[:, some].clone(),
-            rendered=self.rendered[some].clone(),
-            prior_mean=PathLoss(self.prior_mean.level[some], self.prior_mean.slope[some]),
-            field_db=self.field_db[some],
-            noise_db=self.noise_db[some],
-            baselines=PathLoss(self.baselines.level[:, some], self.baselines.slope[:, some]),
-            baseline_held_out=self.baseline_held_out[..., some].clone(),
-        )
 
 
 @single_thread()

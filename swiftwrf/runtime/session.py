@@ -14,7 +14,7 @@ from torch import Tensor
 from swiftwrf.errors import InputError
 from swiftwrf.runtime import checkpoint
 
-Record = dict[str, Any]
+Record = dict[str, Any]  # one evaluation of a fit
 KIND = "fit state"
 
 

@@ -127,7 +127,7 @@ def configuration(cls: type[Class]) -> type[Class]:
     """
 
     def check_fields(self: Any) -> None:
-        hints = _hints(cls)
+        hints = _hints(cls)  # type: ignore[arg-type]
         for field in fields(self):
             check_value(field.name, getattr(self, field.name), hints[field.name])
         if hasattr(self, "check"):

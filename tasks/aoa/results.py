@@ -1,73 +1,185 @@
-"""From the rows of a run to what metrics.json says of each share."""
+"""Results of a run: tables of errors, scores and histories, and the numbers of metrics.json."""
 
 from __future__ import annotations
 
-from pandas import DataFrame
+from collections.abc import Callable
 
-from tasks.aoa import arms
-from tasks.metrics import ANGLES, SCORES, AdviceMetrics, ArmMetrics, ChoiceMetrics, MixMetrics, SynthesisMetrics
-from tasks.run import Row
+import torch
+from pandas import DataFrame
+from torch import Tensor
+
+from swiftwrf.data.store import Store
+from swiftwrf.metrics import angle_errors, covered, l1, psnr, ssim
+from tasks.aoa.condition import AUTO, Condition, MeasuredSubset, fraction_key, pooled
+from tasks.aoa.steps import CrossValidation, Evaluation, Experiment, Suggestion, Synthesis, as_bytes
+from tasks.metrics import ANGLES, SCORES, MethodMetrics, MixMetrics, SynthesisMetrics
+from tasks.run import Row, Run, console
+from tasks.steps import Step
 from tasks.summarise import averaged, repeats_averaged
 
+SCORE = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
+EXAMPLE_QUANTILES = (
+    1.0,
+    0.8,
+    0.6,
+    0.4,
+    0.2,
+    0.0,
+)  # of the PSNR at the test positions, from the best spectrum to the worst
 
-def mix_metrics(
-    share: float,
-    n_measured: int,
-    counts: dict[str, dict[str, int]],
-    choice: ChoiceMetrics | None,
-    advice: AdviceMetrics | None,
-    rows: dict[str, list[Row]],
-) -> MixMetrics:
-    """What metrics.json says of one share.
+
+class Results:
+    """Results of the steps of a run.
 
     Args:
-        share: measured.
-        n_measured: spectra.
-        counts: of spectra by origin in each training set.
-        choice, advice: of the first repeat, where there are any.
-        rows: `errors` and `arm_seconds` of pooled arms, `training_seconds` of what was trained, `synthesis` and
-            `synthesis_seconds` of all shares, the last with whether the spectra train an arm.
+        experiment: Data and options of the run.
+        run: Directory of the run.
     """
-    own = {name: DataFrame([row for row in table if row["mix"] == share]) for name, table in rows.items()}
-    training, fits = own["training_seconds"], own["synthesis_seconds"]
-    asked_for = fits[fits["trains"]]
-    networks = training[[arms.estimator_of(name) == arms.NETWORK for name in training["method"]]]
-    return {
-        "n_measured": n_measured,
-        "counts": counts,
-        "choice": choice,
-        "advice": advice,
-        "synthesis": _synthesis_metrics(own["synthesis"], fits),
-        "methods": _arm_metrics(own["errors"], own["arm_seconds"]),
-        "seconds": {
-            "fit": float(asked_for["fit"].sum()),
-            "synthesize": float(asked_for["draw"].sum()),
-            "train": float(networks["train"].sum()),
-        },
-    }
+
+    def __init__(self, experiment: Experiment, run: Run) -> None:
+        self.experiment, self.test, self.run = experiment, experiment.test, run
+        self.evaluated: list[tuple[Condition, Row]] = []
+        self.synthesis: list[Row] = []  # scores of each test spectrum
+        self.synthesis_seconds: list[Row] = []
+        self.history: list[Row] = []
+        self.chosen: dict[str, Row] = {}  # by measured fraction, of the first repeat
+        self._examples: set[str] = set()
+
+    def add(self, step: Step[Experiment], value: Row) -> None:
+        """Add the result of one step."""
+        match step:
+            case CrossValidation():
+                self.chosen.setdefault(step.subset.key, value)
+            case Synthesis() if "refused" in value:
+                console.print(f"{step.synthesizer} is left out of the comparison: {value['refused']}")
+            case Synthesis():
+                self._add_synthesis(step, value)
+            case Evaluation():
+                self.evaluated.append((step.condition, value))
+                self.history += [step.condition.columns | row for row in value["history"]]
+            case Suggestion():
+                self._add_suggestion(step, value)
+
+    @property
+    def pooled(self) -> list[tuple[Condition, Row]]:
+        """Results by condition, such that each condition has all repeats."""
+        return pooled(self.evaluated, self.experiment.config.synthesizer == (AUTO,))
+
+    def write(self) -> None:
+        """Write the tables of the run."""
+        self.run.write_csv("errors.csv", self.errors())
+        self.run.write_csv("synthesis.csv", self.synthesis)
+        self.run.write_csv("history.csv", self.history)
+
+    def errors(self) -> list[Row]:
+        """Return one row for each condition and test spectrum: truth, estimate and errors."""
+        rows: list[Row] = []
+        for condition, value in self.pooled:
+            estimate = torch.tensor(value["estimate"], dtype=torch.float64)
+            columns = {
+                "index": self.test.index,
+                "line_of_sight": self.test.line_of_sight,
+                "truth_azimuth_deg": self.test.label[:, 0].rad2deg(),
+                "truth_elevation_deg": self.test.label[:, 1].rad2deg(),
+                "estimate_azimuth_deg": estimate[:, 0].rad2deg(),
+                "estimate_elevation_deg": estimate[:, 1].rad2deg(),
+            }
+            errors = angle_errors(estimate, self.test.label)
+            columns |= {f"{angle}_deg": error.rad2deg() for angle, error in errors.items()}
+            rows += _rows(condition.columns, columns)
+        return rows
+
+    def _add_synthesis(self, step: Synthesis, value: Row) -> None:
+        spectra = step.test_spectra(self.run.folder)
+        for part, name in (("test", step.synthesizer), ("test_sample", f"{step.synthesizer} sample")):
+            if part in spectra:
+                key = step.subset.columns | {"synthesizer": name}
+                scores = {score: self._score(function, spectra[part]) for score, function in SCORE.items()}
+                self.synthesis += _rows(key, {"index": self.test.index} | scores)
+                trains = step.trains and part == "test"
+                self.synthesis_seconds.append(key | value["seconds"] | {"trains": trains})
+        self.history += [step.subset.columns | {"synthesizer": step.synthesizer} | row for row in value["history"]]
+        if step.subset.repeat == 0 and step.trains and step.subset.key not in self._examples:
+            self._examples.add(step.subset.key)
+            self._write_examples(step.subset, step.synthesizer, spectra)
+
+    def _add_suggestion(self, step: Suggestion, value: Row) -> None:
+        name = f"suggested-mix{step.subset.key}"
+        tensors = {key: torch.tensor(value[key], dtype=torch.float64) for key in ("measured", "position", "variance")}
+        coordinates = dict(zip(("x_m", "y_m", "z_m"), tensors["position"].T, strict=True))
+        self.run.write_csv(f"{name}.csv", _rows({}, coordinates | {"variance_left": tensors["variance"][1:]}))
+        names = {"measured": "measured", "suggested": "position", "left": "variance"}
+        self.run.write_npz(f"{name}.npz", {array: tensors[key].numpy() for array, key in names.items()})
+
+    def _score(self, function: Callable[[Tensor, Tensor], Tensor], synthetic: Store) -> Tensor:
+        """Return the score of each spectrum at the test positions."""
+        pairs = zip(synthetic.batches(), self.test.store.batches(), strict=True)
+        return torch.cat([function(*pair) for pair in pairs])
+
+    def _write_examples(self, subset: MeasuredSubset, name: str, spectra: dict[str, Store]) -> None:
+        """Write measured and synthetic spectra at the test positions with given quantiles of the PSNR."""
+        measured, synthetic = self.test.store, spectra["test"]
+        score = self._score(psnr, synthetic)
+        order = score.argsort()
+        chosen = order[[round(q * (len(order) - 1)) for q in EXAMPLE_QUANTILES]]
+        examples = {
+            "measured": as_bytes(measured[chosen]).numpy(),
+            "synthetic": as_bytes(synthetic[chosen]).numpy(),
+            "synthesizer": name,
+            "index": self.test.index[chosen].numpy(),
+            "psnr_db": score[chosen].numpy(),
+        }
+        if "test_std" in spectra:
+            std = spectra["test_std"]
+            examples["deviation"] = as_bytes(std[chosen]).numpy()
+            triples = zip(synthetic.batches(), measured.batches(), std.batches(), strict=True)
+            examples["coverage"] = float(torch.cat([covered(s, d, m) for s, m, d in triples]).mean())
+        self.run.write_npz(f"examples-mix{subset.key}.npz", examples)
+
+    def summary(self, fraction: float) -> MixMetrics:
+        """Return the numbers of metrics.json for one measured fraction."""
+        chosen = self.chosen.get(fraction_key(fraction), {})
+        evaluated = [(c, value) for c, value in self.evaluated if c.measured_fraction == fraction]
+        synthesis, fits = (
+            DataFrame([row for row in rows if row["measured_fraction"] == fraction])
+            for rows in (self.synthesis, self.synthesis_seconds)
+        )
+        trained = fits[fits["trains"]]
+        return {
+            "n_measured": round(fraction * len(self.experiment.train)),
+            "counts": {condition.training_set: value["counts"] for condition, value in evaluated},
+            "choice": chosen.get("choice"),
+            "advice": chosen.get("advice"),
+            "synthesis": _synthesis_metrics(synthesis, fits),
+            "methods": self._method_metrics(fraction),
+            "seconds": {
+                "fit": float(trained["fit"].sum()),
+                "synthesize": float(trained["draw"].sum()),
+                "train": sum(value["seconds"]["train"] for condition, value in evaluated if condition.is_network),
+            },
+        }
+
+    def _method_metrics(self, fraction: float) -> dict[str, MethodMetrics]:
+        own = [(condition, value) for condition, value in self.pooled if condition.measured_fraction == fraction]
+        conditions = {condition.method: condition for condition, _ in reversed(own)}  # of the first repeat
+        errors = DataFrame([row for row in self.errors() if row["measured_fraction"] == fraction])
+        seconds = averaged(
+            DataFrame([c.columns | value["seconds"] for c, value in own]), "method", ("train", "estimate")
+        )
+        return {
+            method: {**conditions[method].description, **summaries, "seconds": seconds[method]}  # type: ignore[typeddict-item]
+            for method, summaries in repeats_averaged(errors, "method", ANGLES).items()
+        }
 
 
 def _synthesis_metrics(scores: DataFrame, seconds: DataFrame) -> dict[str, SynthesisMetrics]:
     spent = averaged(seconds, "synthesizer", ("fit", "synthesize"))
     return {
-        name: {
-            "psnr_db": of["psnr_db"],
-            "ssim": of["ssim"],
-            "l1": of["l1"],
-            "seconds": {"fit": spent[name]["fit"], "synthesize": spent[name]["synthesize"]},
-        }
-        for name, of in repeats_averaged(scores, "synthesizer", SCORES).items()
+        name: {**summaries, "seconds": spent[name]}  # type: ignore[typeddict-item]
+        for name, summaries in repeats_averaged(scores, "synthesizer", SCORES).items()
     }
 
 
-def _arm_metrics(errors: DataFrame, seconds: DataFrame) -> dict[str, ArmMetrics]:
-    spent = averaged(seconds, "method", ("train", "estimate"))
-    return {
-        name: {
-            "azimuth_deg": of["azimuth_deg"],
-            "elevation_deg": of["elevation_deg"],
-            "great_circle_deg": of["great_circle_deg"],
-            "seconds": {"train": spent[name]["train"], "estimate": spent[name]["estimate"]},
-        }
-        for name, of in repeats_averaged(errors, "method", ANGLES).items()
-    }
+def _rows(key: Row, columns: dict[str, Tensor]) -> list[Row]:
+    lists = {name: column.tolist() for name, column in columns.items()}
+    return [key | dict(zip(lists, values, strict=True)) for values in zip(*lists.values(), strict=True)]

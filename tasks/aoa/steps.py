@@ -1,275 +1,400 @@
-"""The steps of the experiment: a synthesizer is chosen, spectra are synthesized, an estimator is trained and tested."""
+"""Steps of the experiment: a field model is chosen, spectra are synthesized, an estimator is trained and tested."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import torch
 from torch import Tensor
 
-from augment import SYNTHESIZERS, Mixed, choose_synthesizer, make_synthesizer, mix
-from augment.choose import SLOW, candidates
-from augment.suggest import suggest
-from swiftwrf import FitError, InputError
+from augment import Mixed, SyntheticPositions, choose_model, mix, suggest, synthetic_positions, withhold
+from augment.choose import candidates
+from swiftwrf import FitError, InputError, Spectra, load
 from swiftwrf.data.store import Store
+from swiftwrf.models import FIELD_MODELS, FieldModel, make_model
 from swiftwrf.runtime.checkpoint import read, write
-from tasks.aoa import arms
-from tasks.aoa.advice import advise
-from tasks.aoa.config import AUTO
-from tasks.aoa.estimators import ESTIMATORS, SavedEstimator, learners
-from tasks.aoa.keep import keep
-from tasks.aoa.setting import At, Setting
+from tasks.aoa.artifacts import save_artifacts
+from tasks.aoa.condition import AUTO, Condition, MeasuredSubset, Training, trainable
+from tasks.aoa.cross_validation import advise
+from tasks.aoa.estimators import ESTIMATORS, SavedEstimator, make_estimator
+from tasks.aoa.options import RAYTRACE, AoaConfig
 from tasks.claim import STEPS
 from tasks.metrics import AdviceMetrics
-from tasks.run import Row
+from tasks.run import Preset, Row
 from tasks.steps import Step
 
 KIND = "synthetic spectra"
-AT_ONCE = 4096  # positions that are drawn before they are rounded: half a gigabyte of 90 x 360 pixels
+ROOM_MODEL = "geometry"  # field model that finds the room for all models with one
+BATCH_POSITIONS = 4096  # spectra predicted before they are rounded: half a gigabyte of 90 x 360 pixels
 
 
-def steps_at(setting: Setting, at: At) -> list[Step[Setting]]:
-    """The bounds, and between them what the turbo arms follow from."""
-    named = [name for name in setting.config.synthesizer if name != AUTO]
-    compared = tuple(name for name in named if name not in SLOW)
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """Data and options that all steps of a run share.
+
+    Args:
+        config: Options of the run.
+        train: Training spectra of the split.
+        test: Test spectra of the split.
+        n_synthetic: Largest number of further synthetic positions.
+        device: Device to compute on.
+    """
+
+    config: AoaConfig
+    train: Spectra
+    test: Spectra
+    n_synthetic: int
+    device: torch.device
+
+    def seed(self, subset: MeasuredSubset) -> int:
+        """Return the seed of a repeat."""
+        return self.config.seed + subset.repeat
+
+    def withhold(self, subset: MeasuredSubset) -> tuple[Spectra, SyntheticPositions]:
+        """Return the measured spectra, and the positions of the others."""
+        return withhold(self.train, subset.measured_fraction, self.seed(subset))
+
+    def make_model(self, name: str, subset: MeasuredSubset, preset: Preset = "quick") -> FieldModel:
+        """Return a field model that is not fitted."""
+        # validation at random: withheld positions lie among the measured ones, whatever the split of the test
+        return make_model(name, preset, seed=self.seed(subset), validation="random", scene=self.config.scene)
+
+    def finds_room(self, name: str) -> bool:
+        """Return True if a field model is built on the room that the spectra show."""
+        has_room = FIELD_MODELS[name].room is not FieldModel.room
+        return has_room and not (name == RAYTRACE and self.config.scene is not None)
+
+
+def first_steps(experiment: Experiment, subset: MeasuredSubset) -> list[Step[Experiment]]:
+    """Return the reference conditions of a measured subset, and the step that the turbo conditions follow from."""
+    fraction, repeat = subset.measured_fraction, subset.repeat
+    named = [name for name in experiment.config.synthesizer if name != AUTO]
+    compared = tuple(name for name in named if not FIELD_MODELS[name].slow)
+
+    def reference(estimator: str, training: Training) -> Evaluation:
+        return Evaluation(Condition(estimator, training, measured_fraction=fraction, repeat=repeat))
+
     return [
-        *(Arm(at, estimator, arms.LOWER.name) for estimator in ESTIMATORS),
-        *(_syntheses(setting, at, named, None) if named and not compared else [Choice(at, compared)]),
-        # the same whatever the share, so its steps are shared by all of them
-        *(Arm(at, estimator, arms.UPPER.name) for estimator in learners()),
+        *(reference(estimator, "measured") for estimator in ESTIMATORS),
+        *(_syntheses(experiment, subset, named, {}) if named and not compared else [CrossValidation(subset, compared)]),
+        # independent of the measured fraction, so all fractions share these steps
+        *(reference(estimator, "all") for estimator in trainable()),
     ]
 
 
-def _syntheses(setting: Setting, at: At, asked_for: list[str], advice: AdviceMetrics | None) -> list[Step[Setting]]:
-    """Of the synthesizers whose spectra train, and of those that are compared with them."""
-    sampled = bool(advice and advice["sampled"])
-    # unless told how many, only where held-out measured spectra gain from them
-    wanted = setting.config.extra is not None or bool(advice and advice["recommended_extra"])
-    further = bool(setting.extra) and wanted
-    names = dict.fromkeys((*asked_for, *candidates(setting.train)))
-    return [Synthesis(at, name, name in asked_for, name in asked_for and further, sampled) for name in names]
+def _syntheses(
+    experiment: Experiment, subset: MeasuredSubset, names: Sequence[str], advice: Mapping[str, AdviceMetrics]
+) -> list[Step[Experiment]]:
+    """Return the syntheses whose spectra are trained on, and those for comparison; models with a room follow its search."""
+    direct: list[Step[Experiment]] = []
+    with_room: list[Synthesis] = []
+    for name in dict.fromkeys((*names, *candidates(experiment.train))):
+        trains, own = name in names, advice.get(name)
+        # by default only where held-out measured spectra gain from further positions
+        wanted = experiment.config.extra is not None or bool(own and own["recommended_extra"])
+        n_synthetic = experiment.n_synthetic if trains and wanted else 0
+        synthesis = Synthesis(subset, name, trains, n_synthetic, bool(own and own["sampled"]))
+        (with_room if experiment.finds_room(name) else direct).append(synthesis)
+    search: list[Step[Experiment]] = [RoomSearch(subset, tuple(with_room))] if with_room else []
+    return search + direct if with_room and with_room[0].trains else direct + search
 
 
 @dataclass(frozen=True)
-class Choice(Step[Setting]):
-    """Compares synthesizers, and says whether turbo learning helps.
+class CrossValidation(Step[Experiment]):
+    """Compare field models on held-out measured spectra, and determine whether turbo learning helps.
 
     Args:
-        at: share and repeat.
-        compared: their names; empty for all that apply and are fast.
+        subset: Measured spectra.
+        compared: Names of the field models. Empty for all that are fast and whose requirements the data meet.
     """
 
-    at: At
+    subset: MeasuredSubset
     compared: tuple[str, ...]
 
     @property
     def name(self) -> str:
-        return f"choice-{self.at}"
+        return f"choice-{self.subset}"
 
-    def compute(self, setting: Setting, folder: Path) -> Row:
-        measured, _ = setting.withhold(self.at)
-        choice = choose_synthesizer(measured, setting.of_synthesizers(self.at), self.compared or None)
-        advice = advise(choice.trials, setting.of_estimators(self.at), setting.extra)
+    def compute(self, experiment: Experiment, folder: Path) -> Row:
+        measured, _ = experiment.withhold(self.subset)
+        seed = experiment.seed(self.subset)
+        try:
+            choice = choose_model(measured, self.compared or None, seed=seed, device=experiment.device)
+        except InputError:
+            if not self.compared:
+                raise
+            return {"choice": None, "advice": {}}  # field models asked for by name need no comparison
+        trained = [name for name in self.compared if name in choice.folds] or [choice.name]
         return {
             "choice": {"name": choice.name, "psnr_db": choice.psnr_db, "seconds": choice.seconds},
-            "advice": advice,
+            "advice": {name: advise(choice.folds[name], experiment.n_synthetic, seed) for name in trained},
         }
 
-    def then(self, setting: Setting, value: Row) -> Sequence[Step[Setting]]:
-        named = [name for name in setting.config.synthesizer if name != AUTO]
-        return _syntheses(setting, self.at, named or [value["choice"]["name"]], value["advice"])
+    def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
+        named = [name for name in experiment.config.synthesizer if name != AUTO]
+        return _syntheses(experiment, self.subset, named or [value["choice"]["name"]], value["advice"])
 
 
 @dataclass(frozen=True)
-class Synthesis(Step[Setting]):
-    """Spectra of one synthesizer at test, withheld and further positions.
+class RoomSearch(Step[Experiment]):
+    """Find the room in the measured spectra, once for all field models that are built on it.
 
     Args:
-        at: share and repeat.
-        synthesizer: its name.
-        trains: whether its spectra train estimators; else it is drawn at the test positions alone, for comparison.
-        further: whether it draws at further positions, too.
-        sampled: draws in place of means at the positions that train.
+        subset: Measured spectra.
+        syntheses: Steps of these models.
     """
 
-    at: At
-    synthesizer: str
-    trains: bool
-    further: bool
-    sampled: bool
+    subset: MeasuredSubset
+    syntheses: tuple[Synthesis, ...]
 
     @property
     def name(self) -> str:
-        return f"synthesis_{self.synthesizer}-{self.at}"
+        return f"room-{self.subset}"
 
     @property
     def file(self) -> str:
-        """Where the spectra are kept."""
+        """File of the fitted model in the run's directory."""
         return f"{STEPS}/{self.name}.safetensors"
 
-    def spectra(self, folder: Path) -> dict[str, Store]:
-        """Those kept in this folder: `test`, `test deviation`, `test sample`, `withheld`, `further`, as far as drawn."""
-        return {key: Store(spectrum) for key, spectrum in read(folder / self.file, KIND)[1].items()}
-
-    def compute(self, setting: Setting, folder: Path) -> Row:
+    def compute(self, experiment: Experiment, folder: Path) -> Row:
+        measured, _ = experiment.withhold(self.subset)
+        began = time.perf_counter()
         try:
-            return self._draw(setting, folder)
+            model = experiment.make_model(ROOM_MODEL, self.subset).fit(
+                measured, device=experiment.device, progress=True
+            )
+        except (InputError, FitError) as error:
+            return {"refused": str(error)}
+        model.save(folder / self.file)
+        return {"seconds": time.perf_counter() - began}
+
+    def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
+        found = None if "refused" in value else self  # without a room the models refuse the spectra themselves
+        return [replace(synthesis, room=found, room_seconds=value.get("seconds", 0.0)) for synthesis in self.syntheses]
+
+
+@dataclass(frozen=True)
+class Synthesis(Step[Experiment]):
+    """Predict spectra by one field model at test, withheld and further positions.
+
+    Args:
+        subset: Measured spectra.
+        synthesizer: Name of the field model.
+        trains: Whether its spectra train estimators. Otherwise it predicts at the test positions alone, for comparison.
+        n_synthetic: Number of further synthetic positions.
+        sampled: Train with samples in place of means.
+        room: Search for the room that the model reuses, if any.
+        room_seconds: Time of that search [s], which counts as part of the fit.
+    """
+
+    subset: MeasuredSubset
+    synthesizer: str
+    trains: bool
+    n_synthetic: int
+    sampled: bool
+    room: RoomSearch | None = None
+    room_seconds: float = 0.0
+
+    @property
+    def name(self) -> str:
+        return f"synthesis_{self.synthesizer}-{self.subset}"
+
+    @property
+    def file(self) -> str:
+        """File of the spectra in the run's directory."""
+        return f"{STEPS}/{self.name}.safetensors"
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return (self.room.file,) if self.room else ()
+
+    def test_spectra(self, folder: Path) -> dict[str, Store]:
+        """Return the spectra at the test positions: `test`, and `test_std` and `test_sample` if the model has them."""
+        tensors = read(folder / self.file, KIND)[1]
+        return {name: Store(tensor) for name, tensor in tensors.items() if name.startswith("test")}
+
+    def training_spectra(self, folder: Path, part: str) -> tuple[SyntheticPositions, Tensor]:
+        """Return positions and spectra of a part, `withheld` or `extra`, as they were synthesized together."""
+        tensors = read(folder / self.file, KIND)[1]
+        positions = (tensors[f"{part}_{name}"] for name in ("position", "label", "index"))
+        return SyntheticPositions(*positions), tensors[part]
+
+    def compute(self, experiment: Experiment, folder: Path) -> Row:
+        try:
+            return self._synthesize(experiment, folder)
         except (InputError, FitError) as error:
             if self.trains:
                 raise
             return {"refused": str(error)}
 
-    def _draw(self, setting: Setting, folder: Path) -> Row:
-        measured, withheld = setting.withhold(self.at)
-        fit = _FitHistory()
-        checkpoint = folder / STEPS / f"{self.name}-fit.safetensors"
-        settings = replace(
-            setting.of_synthesizers(self.at),
-            checkpoint=checkpoint,
-            on_record=fit.add,
-        )
-        synthesizer = make_synthesizer(self.synthesizer, settings)
-        fit.begin()
-        synthesizer.fit(measured)
+    def _synthesize(self, experiment: Experiment, folder: Path) -> Row:
+        measured, withheld = experiment.withhold(self.subset)
+        history = _FitHistory()
+        model = self._fitted(experiment, measured, history, folder)
         fitted = time.perf_counter()
-        generator = torch.Generator().manual_seed(settings.seed)
-        test = setting.test.position
-        drawn = {"test": _as_bytes_at(test, synthesizer.synthesize)}
-        tested = time.perf_counter()  # what every synthesizer draws, whether it trains or not
-        if synthesizer.deviation(test[:1]) is not None:
-            drawn["test deviation"] = _as_bytes_at(test, synthesizer.deviation)
-        if synthesizer.samples:
-            drawn["test sample"] = _as_bytes_at(test, lambda some: synthesizer.synthesize(some, generator))
-        own = generator if self.sampled and synthesizer.samples else None
-        if self.trains:
-            drawn["withheld"] = _as_bytes_at(withheld.position, lambda some: synthesizer.synthesize(some, own))
-        if self.further:
-            places = setting.further(self.at, measured)
-            drawn["further"] = _as_bytes_at(places.position, lambda some: synthesizer.synthesize(some, own))
+        generator = torch.Generator().manual_seed(experiment.seed(self.subset))
+
+        def sample(position: Tensor) -> Tensor:
+            return model.sample(position, generator=generator)
+
+        def std(position: Tensor) -> Tensor:
+            return cast(Tensor, model.predict(position).std)
+
+        test = experiment.test.position
+        tensors = {"test": _as_bytes_at(test, model.synthesize)}
+        tested = time.perf_counter()
+        if model.predict(test[:1]).std is not None:
+            tensors["test_std"] = _as_bytes_at(test, std)
+        if model.samples:
+            tensors["test_sample"] = _as_bytes_at(test, sample)
+        parts = {"withheld": withheld} if self.trains else {}
+        if self.n_synthetic:
+            parts["extra"] = synthetic_positions(measured, self.n_synthetic, experiment.seed(self.subset))
+        for part, positions in parts.items():
+            predict = sample if self.sampled and model.samples else model.synthesize
+            tensors[part] = _as_bytes_at(positions.position, predict)
+            tensors |= {f"{part}_{name}": tensor for name, tensor in vars(positions).items()}
         seconds = {
-            "fit": fitted - fit.began + fit.earlier + synthesizer.shared_seconds,
+            "fit": fitted - history.began + history.earlier + self.room_seconds,
             "synthesize": tested - fitted,
             "draw": time.perf_counter() - fitted,
         }
-        write(folder / self.file, KIND, drawn, {})
-        if self.trains and self.at.repeat == 0:
-            keep(self.synthesizer, synthesizer, self.at.share, measured, setting.test, folder)
-        return {"history": fit.records, "seconds": seconds}
+        write(folder / self.file, KIND, tensors, {})
+        if self.trains and self.subset.repeat == 0:
+            save_artifacts(model, self.subset.key, measured, experiment.test, folder)
+        return {"history": history.records, "seconds": seconds}
 
-    def then(self, setting: Setting, value: Row) -> Sequence[Step[Setting]]:
-        trainings = [arms.turbo(self.synthesizer)] if self.trains else []
-        if self.further:
-            trainings.append(arms.turbo(self.synthesizer, extra=True))
-        return [Arm(self.at, estimator, training, self) for training in trainings for estimator in learners()]
+    def _fitted(self, experiment: Experiment, measured: Spectra, history: _FitHistory, folder: Path) -> FieldModel:
+        # models that are only compared are as small as in the choice
+        preset = experiment.config.preset if self.trains else "quick"
+        room = load(folder / self.room.file) if self.room else None
+        assert room is None or isinstance(room, FieldModel)
+        history.begin()
+        return experiment.make_model(self.synthesizer, self.subset, preset).fit(
+            measured,
+            like=room,
+            device=experiment.device,
+            checkpoint=folder / STEPS / f"{self.name}-fit.safetensors",
+            on_record=history.add,
+            progress=True,
+        )
+
+    def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
+        trainings: list[tuple[Training, int]] = [("turbo", 0)] if self.trains else []
+        if self.n_synthetic:
+            trainings.append(("turbo_extra", self.n_synthetic))
+        fraction, repeat = self.subset.measured_fraction, self.subset.repeat
+        return [
+            Evaluation(Condition(estimator, training, self.synthesizer, number, fraction, repeat), self)
+            for training, number in trainings
+            for estimator in trainable()
+        ]
 
 
 @dataclass(frozen=True)
-class Arm(Step[Setting]):
-    """Trains one estimator on one training set, and tests it.
+class Evaluation(Step[Experiment]):
+    """Train and test one condition.
 
     Args:
-        at: share and repeat.
-        estimator: its name.
-        training: name of the training set.
-        synthesis: of its spectra, where some are synthetic.
+        condition: Estimator and training set.
+        synthesis: Step of the synthetic spectra, if there are any.
     """
 
-    at: At
-    estimator: str
-    training: str
+    condition: Condition
     synthesis: Synthesis | None = None
 
     @property
-    def method(self) -> str:
-        """What the tables call it."""
-        return arms.arm(self.estimator, self.training)
+    def subset(self) -> MeasuredSubset:
+        """Measured spectra of the condition."""
+        return MeasuredSubset(self.condition.measured_fraction, self.condition.repeat)
 
     @property
     def name(self) -> str:
-        return f"{self.method}-r{self.at.repeat}" if self.training == arms.UPPER.name else f"{self.method}-{self.at}"
+        of_all = self.condition.training == "all"
+        return f"{self.condition.method}-{f'r{self.condition.repeat}' if of_all else self.subset}"
 
     @property
     def reads(self) -> tuple[str, ...]:
         return (self.synthesis.file,) if self.synthesis else ()
 
-    def compute(self, setting: Setting, folder: Path) -> Row:
-        train = self._training_set(setting, folder)
-        estimator = ESTIMATORS[self.estimator].make(setting.of_estimators(self.at))
+    def compute(self, experiment: Experiment, folder: Path) -> Row:
+        train = self._training_set(experiment, folder)
+        config, name = experiment.config, self.condition.estimator
+        estimator = make_estimator(name, len(experiment.train), config.preset, seed=experiment.seed(self.subset))
         began = time.perf_counter()
-        estimator.fit(train)
+        estimator.fit(train, device=experiment.device)
         fitted = time.perf_counter()
-        estimate = torch.cat([estimator.estimate(part) for part in setting.test.store.batches()])
-        if isinstance(estimator, SavedEstimator) and self._is_kept(setting):
-            estimator.save(folder / f"{self.estimator}-mix{self.at.share:g}.safetensors")
+        estimate = torch.cat([estimator.predict(part) for part in experiment.test.store.batches()])
+        if isinstance(estimator, SavedEstimator) and self._is_saved(experiment):
+            estimator.save(folder / f"{name}-mix{self.subset.key}.safetensors")
         seconds = {"train": fitted - began, "estimate": time.perf_counter() - fitted}
         return {"estimate": estimate, "seconds": seconds, "history": estimator.history, "counts": train.counts}
 
-    def _is_kept(self, setting: Setting) -> bool:
-        """Whether it is what a user would take: trained on all that the first synthesizer adds."""
-        if self.synthesis is None or self.at.repeat:
+    def _is_saved(self, experiment: Experiment) -> bool:
+        """Return True for the condition that a user would choose: with all spectra of the first field model."""
+        if self.synthesis is None or self.subset.repeat:
             return False
-        first = setting.config.synthesizer[0] in (AUTO, self.synthesis.synthesizer)
-        return first and self.training == arms.turbo(self.synthesis.synthesizer, extra=self.synthesis.further)
+        first = experiment.config.synthesizer[0] in (AUTO, self.synthesis.synthesizer)
+        return first and self.condition.n_synthetic == self.synthesis.n_synthetic
 
-    def _training_set(self, setting: Setting, folder: Path) -> Mixed:
-        if self.training == arms.UPPER.name:
-            return Mixed.measured(setting.train)
-        measured, withheld = setting.withhold(self.at)
+    def _training_set(self, experiment: Experiment, folder: Path) -> Mixed:
+        if self.condition.training == "all":
+            return Mixed.measured(experiment.train)
+        measured, _ = experiment.withhold(self.subset)
         if self.synthesis is None:
             return Mixed.measured(measured)
-        drawn = self.synthesis.spectra(folder)
-        mixed = mix(measured, withheld, drawn["withheld"].values)
-        if self.training == arms.turbo(self.synthesis.synthesizer, extra=True):
-            mixed = mixed.add(setting.further(self.at, measured), drawn["further"].values)
-        return mixed
+        train = mix(measured, *self.synthesis.training_spectra(folder, "withheld"))
+        if self.condition.training == "turbo_extra":
+            train = train.add(*self.synthesis.training_spectra(folder, "extra"))
+        return train
 
 
 @dataclass(frozen=True)
-class Suggestion(Step[Setting]):
-    """Where to measure next.
+class Suggestion(Step[Experiment]):
+    """Suggest positions for the next measurements.
 
     Args:
-        at: share and repeat.
+        subset: Measured spectra.
     """
 
-    at: At
+    subset: MeasuredSubset
 
     @property
     def name(self) -> str:
-        return f"suggestion-mix{self.at.share:g}"
+        return f"suggestion-mix{self.subset.key}"
 
-    def compute(self, setting: Setting, folder: Path) -> Row:
-        measured, _ = setting.withhold(self.at)
-        found = suggest(measured, setting.config.suggest, setting.config.seed)
-        return {"position": found.position, "left": found.left}
+    def compute(self, experiment: Experiment, folder: Path) -> Row:
+        measured, _ = experiment.withhold(self.subset)
+        found = suggest(measured, experiment.config.suggest, experiment.config.seed)
+        return {"measured": measured.position, "position": found.position, "variance": found.variance}
 
 
 class _FitHistory:
-    """The records of a fit, and the seconds that it took in sessions before this one."""
+    """Records of a fit, and the seconds that earlier sessions of the run spent on it."""
 
     def __init__(self) -> None:
         self.records: list[Row] = []
         self.began = self.earlier = 0.0
 
     def begin(self) -> None:
-        """Its time counts from now on."""
+        """Start the clock."""
         self.began = time.perf_counter()
 
     def add(self, record: Row) -> None:
-        """One record; those of earlier sessions come first."""
+        """Append a record; those of earlier sessions come first."""
         self.records.append(record)
         self.earlier = max(self.earlier, record.get("elapsed", 0.0) - (time.perf_counter() - self.began))
 
 
-def _as_bytes_at(position: Tensor, draw: Callable[[Tensor], Tensor | None]) -> Tensor:
-    """What is drawn at positions (n, 3), some at a time."""
-    parts = (draw(some) for some in position.split(AT_ONCE))
-    return torch.cat([as_bytes(part) for part in parts if part is not None])
+def _as_bytes_at(position: Tensor, predict: Callable[[Tensor], Tensor]) -> Tensor:
+    """Return predicted spectra at positions (n, 3), rounded in batches."""
+    return torch.cat([as_bytes(predict(some).cpu()) for some in position.split(BATCH_POSITIONS)])
 
 
 def as_bytes(spectrum: Tensor) -> Tensor:
-    """In 256 steps, as measured spectra come in images."""
+    """Return magnitudes in 256 steps, the resolution of spectra stored as images."""
     return (spectrum.clamp(0, 1) * 255).round().to(torch.uint8)

@@ -54,7 +54,7 @@ def run(config: EstimateConfig) -> None:
         raise InputError(f"{config.source} holds spectra as they are; --{how.given[0]} does not apply")
     store = Store(_read_array(Path(config.source))) if known is None else known.store
     _check_like(estimator, store, known, config.source)
-    estimate = torch.cat([estimator.estimate(part) for part in store.batches()])
+    estimate = torch.cat([estimator.predict(part) for part in store.batches()])
     columns = {"azimuth_deg": estimate[:, 0].rad2deg(), "elevation_deg": estimate[:, 1].rad2deg()}
     if known is not None:
         truth = known.label.rad2deg()
@@ -83,7 +83,7 @@ def _read_array(file: Path) -> Tensor:
 
 def _check_like(estimator: SavedEstimator, store: Store, known: Spectra | None, source: str) -> None:
     """Refuses spectra on another grid than the estimator's."""
-    own = estimator.settings.grid
+    own = estimator.grid
     if store.shape[1:] != own.shape or (known is not None and known.grid != own):
         shape, its = (" x ".join(map(str, s)) for s in (store.shape[1:], own.shape))
         raise InputError(

@@ -1,4 +1,4 @@
-"""The page of an inspection: findings, a plan with the array's axes or the receivers, what was heard against geometry."""
+"""The page of an inspection: findings, a plan with the array's axes or the receivers, measurements against geometry."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ DIRECTIONS = (
 
 
 def page(data: Spectra | Rssi, kind: str, findings: Findings) -> Page:
-    """What was found, and figures of it."""
+    """Return the page: findings and figures."""
     rows = [[finding.level, finding.text] for finding in findings.sentences]
     warnings = [finding.text for finding in findings.sentences if finding.level == "warning"]
     table = Table(["", ""], rows, strong=frozenset(["warning"]), long=True)
@@ -66,7 +66,7 @@ def _rssi(data: Rssi) -> list[Plot]:
 
 
 def _places(position: Tensor, **columns: Tensor) -> DataFrame:
-    """A row a position."""
+    """Return a table with one row a position."""
     own = {name: values.numpy() for name, values in columns.items()}
     return DataFrame(position.numpy(), columns=["x_m", "y_m", "z_m"]).assign(**own)
 
@@ -86,7 +86,7 @@ def _plan(data: Spectra) -> Plot:
 
 
 def _draw_axes(ax: Axes, data: Spectra, a: int, b: int) -> None:
-    """Arrows from the array, or from the middle of the positions where it moves."""
+    """Draw the axes at the array, or at the centre of the positions if it moves."""
     if data.rotation is None:
         return
     still = data.moving == "transmitter" and data.fixed_position is not None
@@ -173,7 +173,7 @@ def _heard(data: Rssi) -> Plot:
     names = [figures.short(data.receiver_names[i]) for i in order]
     figure, axes = figures.new_figure(1, 1, max(4.0, 0.3 * len(order) + 2), 3)
     axes[0].bar(np.arange(len(order)), share[order].numpy(), color=DOTS)
-    axes[0].set(xticks=range(len(order)), xticklabels=names, ylabel="share heard", ylim=(0, 1))
+    axes[0].set(xticks=range(len(order)), xticklabels=names, ylabel="share detected", ylim=(0, 1))
     axes[0].tick_params(axis="x", labelrotation=60)
     table = DataFrame({"receiver": data.receiver_names, "share_heard": share.numpy()})
-    return Plot("heard", figure, "Share of the rows in which each receiver was heard.", table)
+    return Plot("heard", figure, "Share of the rows in which each receiver detected the transmitter.", table)

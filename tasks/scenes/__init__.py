@@ -23,7 +23,7 @@ from tasks.page.page import write_page
 from tasks.records import write_json
 from tasks.scenes.page import page
 
-MAX_POSITIONS, MAX_ORDER = 100_000, 8
+RANGES = {"positions": (2, 100_000), "frequency": CARRIERS_HZ, "order": (0, 8), "scattering": (0, 1)}
 ROOM_HELP = "a Mitsuba scene with radio materials (FILE.xml), or a built-in room: " + "; ".join(
     f"{name}: {room.summary}" for name, room in ROOMS.items()
 )
@@ -121,14 +121,10 @@ def check(config: ScenesConfig) -> None:
     Raises:
         InputError: Such an option.
     """
-    if not 2 <= config.positions <= MAX_POSITIONS:
-        raise InputError(f"--positions takes 2 to {MAX_POSITIONS}, got {config.positions}")
-    if not CARRIERS_HZ[0] <= config.frequency <= CARRIERS_HZ[1]:
-        raise InputError(f"--frequency takes the carrier in Hz, e.g. 2.4e9, got {config.frequency:g}")
-    if not 0 <= config.order <= MAX_ORDER:
-        raise InputError(f"--order takes 0 to {MAX_ORDER} reflections, got {config.order}")
-    if not 0 <= config.scattering <= 1:
-        raise InputError(f"--scattering takes 0 to 1, got {config.scattering:g}")
+    for name, (low, high) in RANGES.items():
+        if not low <= getattr(config, name) <= high:
+            unit = " [Hz]" if name == "frequency" else ""
+            raise InputError(f"--{name} takes {low:g} to {high:g}{unit}, got {getattr(config, name):g}")
     if config.order == 0 and (config.scattering or config.diffraction):
         raise InputError("--order 0 leaves the direct path alone; scattering and diffraction need at least --order 1")
     check_scene(config.room)

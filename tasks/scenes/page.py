@@ -73,13 +73,11 @@ def page(name: str, surfaces: list[Surface], moving: Moving, paths: PropagationP
 
 
 def _room(surfaces: list[Surface], fixed: Tensor, position: Tensor, moving: Moving, paths: PropagationPaths) -> Plot:
-    figure, plan, space = _pair()
-    _draw(surfaces, plan, space)
+    figure, plan, space = _drawing(surfaces)
     dots = position[:MAX_DOTS]
     plan.plot(*dots[:, :2].T, ".", color=MOVING, markersize=2.5, label=f"moving {moving}")
-    plan.plot(*fixed[:2], "*", color=FIXED, markersize=12, label="fixed end", linestyle="")
     space.scatter(*dots.T, s=2, color=MOVING, depthshade=False)
-    space.scatter(*fixed, s=80, marker="*", color=FIXED, depthshade=False)
+    _mark(plan, space, fixed, "*", FIXED, "fixed end")
     figures.legend_below(figure, plan)
     table = DataFrame(position.numpy(), columns=["x_m", "y_m", "z_m"]).assign(
         line_of_sight=paths.line_of_sight.numpy(), paths=paths.count.numpy(), power_db=paths.power_db.numpy()
@@ -92,8 +90,7 @@ def _rays(
 ) -> Plot:
     assert paths.corner is not None
     assert paths.length is not None
-    figure, plan, space = _pair()
-    _draw(surfaces, plan, space)
+    figure, plan, space = _drawing(surfaces)
     own = (paths.owner == number).nonzero()[:, 0]
     own = own[paths.gain[own].abs().argsort()[-MAX_PATHS:]]  # the strongest on top
     start, end = paths.transmitter[number], paths.receiver[number]
@@ -107,16 +104,11 @@ def _rays(
     style: dict[str, Any] = {"colors": [ORDERS[k] for k in order], "linewidths": width, "alpha": 0.8}
     plan.add_collection(LineCollection([line[:, :2] for line in lines], zorder=3, **style))
     space.add_collection3d(Line3DCollection(lines, **style))
-    for at, marker, colour in ((fixed, "*", FIXED), (place, "o", MOVING)):
-        plan.plot(*at[:2], marker, color=colour, markersize=12 if marker == "*" else 7, zorder=4)
-        space.scatter(*at, s=80 if marker == "*" else 40, marker=marker, color=colour, depthshade=False)
+    _mark(plan, space, fixed, "*", FIXED, "fixed end")
+    _mark(plan, space, place, "o", MOVING, f"moving {moving}")
     named = {0: "direct", 1: "1 interaction", len(ORDERS) - 1: f"{len(ORDERS) - 1} and more"}
     entries = [Line2D([], [], color=ORDERS[k], label=named.get(k, f"{k} interactions")) for k in sorted(set(order))]
-    entries += [
-        Line2D([], [], color=FIXED, marker="*", markersize=10, linestyle="", label="fixed end"),
-        Line2D([], [], color=MOVING, marker="o", linestyle="", label=f"moving {moving}"),
-    ]
-    figure.legend(handles=entries, loc="outside lower center", ncols=6, frameon=False)
+    figure.legend(handles=[*entries, *plan.lines], loc="outside lower center", ncols=6, frameon=False)
     caption = (
         f"The strongest paths (at most {MAX_PATHS}) of the position nearest to the middle of all, coloured by their number "
         "of reflections and other interactions; thick lines are strong. The angles are those of arrival at the receiver."
@@ -134,14 +126,17 @@ def _rays(
     return Plot("rays", figure, caption, table[::-1])
 
 
-def _pair() -> tuple[Figure, Axes, Any]:
-    """Return axes of a plan and of a view in space."""
-    figure, axes = figures.new_figure(1, 2, 12, 5)
-    return figure, axes[0], figures.in_space(figure, axes[1])
+def _mark(plan: Axes, space: Any, at: Tensor, marker: str, colour: str, label: str) -> None:
+    """Mark a position in plan and in space."""
+    size = 12 if marker == "*" else 7
+    plan.plot(*at[:2], marker, color=colour, markersize=size, zorder=4, label=label, linestyle="")
+    space.scatter(*at, s=80 if marker == "*" else 40, marker=marker, color=colour, depthshade=False)
 
 
-def _draw(surfaces: list[Surface], plan: Axes, space: Any) -> None:
-    """Draw furniture filled, and surfaces that enclose the scene as outline."""
+def _drawing(surfaces: list[Surface]) -> tuple[Figure, Axes, Any]:
+    """Return a plan and a view in space, with furniture filled and surfaces that enclose the scene as outline."""
+    figure, (plan, corner) = figures.new_figure(1, 2, 12, 5)
+    space = figures.in_space(figure, corner)
     every = np.concatenate([surface.vertex for surface in surfaces])
     low, high = every.min(axis=0), every.max(axis=0)
     for surface in surfaces:
@@ -172,9 +167,12 @@ def _draw(surfaces: list[Surface], plan: Axes, space: Any) -> None:
     space.set_box_aspect(np.maximum(high - low, 0.1 * (high - low).max()))
     names = list(dict.fromkeys(s.material.name for s in surfaces if s.name.startswith("furniture")))
     if names:
-        handles = [
-            Line2D([], [], color=MATERIALS.get(name, OTHER), linewidth=4, alpha=0.6, label=name) for name in names
-        ]
-        plan.legend(
-            handles=handles, fontsize=7, loc="upper left", bbox_to_anchor=(0, -0.12), ncols=len(names), frameon=False
-        )
+        handles = [Line2D([], [], color=MATERIALS.get(n, OTHER), linewidth=4, alpha=0.6, label=n) for n in names]
+        below: dict[str, Any] = {
+            "loc": "upper left",
+            "bbox_to_anchor": (0, -0.12),
+            "ncols": len(names),
+            "frameon": False,
+        }
+        plan.legend(handles=handles, fontsize=7, **below)
+    return figure, plan, space

@@ -10,8 +10,10 @@ import numpy as np
 from augment import withhold
 from swiftwrf import FIELD_MODELS, FieldModel, InputError, RssiModel, Spectra, load
 from swiftwrf.runtime.checkpoint import Saved, refusing
-from tasks.aoa.config import AoaConfig
+from tasks.aoa.artifacts import model_file
+from tasks.aoa.condition import fraction_key
 from tasks.aoa.experiment import measurements
+from tasks.aoa.options import AoaConfig
 from tasks.claim import CONFIG, ENVIRONMENT
 from tasks.records import Row, read_json
 from tasks.rssi.experiment import MODEL
@@ -19,7 +21,7 @@ from tasks.run import configured
 from tasks.view.rssi import MeasuredFloor, RssiView
 from tasks.view.spectra import LoadedModel, SpectraView
 
-EXPECTED = "give the directory of a run of tasks.aoa or tasks.rssi, or a saved model"
+EXPECTED = "give the directory of a run of tasks.aoa or tasks.rssi, or a saved field model or RSSI model"
 
 
 def open_source(source: Path) -> SpectraView | RssiView:
@@ -58,7 +60,7 @@ def _saved_model(file: Path) -> SpectraView | RssiView:
 
 def _field_model(model: Saved) -> FieldModel:
     if not isinstance(model, FieldModel):
-        raise InputError(f"a {model.kind} predicts neither spectra nor RSSI maps; {EXPECTED}")
+        raise InputError(f"a {model.kind} cannot be shown; {EXPECTED}")
     return model
 
 
@@ -77,8 +79,9 @@ def _aoa_run(folder: Path, content: Row) -> SpectraView:
             if data is not None and train is not None:
                 measured, _ = withhold(train, fraction, config.seed)
                 in_training = np.isin(data.index.numpy(), measured.index.numpy())
-            for name, file in kept_models(folder, fraction):
-                model = _field_model(load(file))
+            files = {name: model_file(folder, name, fraction_key(fraction)) for name in FIELD_MODELS}
+            for name in (name for name, file in files.items() if file.is_file()):
+                model = _field_model(load(files[name]))
                 planes = _planes(model) or _planes_of_run(folder, fraction)
                 models.append(LoadedModel(f"{name}, {100 * fraction:g}% measured", model, planes, in_training))
     if not models:
@@ -86,17 +89,9 @@ def _aoa_run(folder: Path, content: Row) -> SpectraView:
     return SpectraView(folder.name, models, data, notes)
 
 
-def kept_models(folder: Path, fraction: float) -> list[tuple[str, Path]]:
-    """Return names and files of the field models that a run kept for one measured fraction."""
-    files = {
-        name: folder / f"{'model' if name == 'swiftwrf' else name}-mix{fraction:g}.safetensors" for name in FIELD_MODELS
-    }
-    return [(name, file) for name, file in files.items() if file.is_file()]
-
-
 def _planes_of_run(folder: Path, fraction: float) -> list[dict[str, Any]]:
     """Return the planes that another model of the run found from the same spectra."""
-    file = folder / f"geometry-mix{fraction:g}.json"
+    file = folder / f"geometry-mix{fraction_key(fraction)}.json"
     planes: list[dict[str, Any]] = read_json(file)["planes"] if file.is_file() else []
     return planes
 

@@ -17,7 +17,15 @@ import pandas as pd
 import torch
 from PIL import Image
 from samples import snapshots as made_snapshots
-from samples import survey_rows, write_deepmimo, write_dichasus, write_espargos, write_snapshots, write_survey
+from samples import (
+    survey_rows,
+    write_deepmimo,
+    write_dichasus,
+    write_espargos,
+    write_paths,
+    write_snapshots,
+    write_survey,
+)
 from small import GLANCE, PUBLISHED, PUBLISHED_RSSI
 
 from augment import Mixed
@@ -45,7 +53,6 @@ from swiftwrf.models.geometry import fit_geometry, fit_hybrid
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.path_gains import fit_path_gains
 from swiftwrf.models.swiftwrf import SwiftWRF
-from tasks.aoa.estimators import Settings
 from tasks.aoa.estimators.kernel_ridge import KernelRegression
 
 N = 12
@@ -62,20 +69,6 @@ def spectra_nerf2(folder: Path) -> None:
     (folder / "test_index.txt").write_text("00011\n00012\n")
     for i in range(N):
         Image.fromarray(np.arange(8 * 32, dtype=np.uint8).reshape(8, 32)).save(folder / "spectrum" / f"{i + 1:05d}.png")
-
-
-def spectra_paths(folder: Path, **changes: object) -> None:
-    """Paths of twelve receivers, some arrays replaced."""
-    arrays = {
-        "transmitter_position": np.tile([0.0, 0.0, 2.0], (N, 1)),
-        "receiver_position": np.stack([np.arange(1.0, N + 1), np.zeros(N), np.ones(N)], axis=1),
-        "path_count": np.ones(N, dtype=np.int32),
-        "last_point": np.tile([0.0, 0.0, 2.0], (N, 1)),
-        "gain": np.ones(N, dtype=np.complex64),
-        "line_of_sight": np.ones(N, dtype=bool),
-        "frequency_hz": np.float64(2.4e9),
-    } | changes
-    np.savez(folder / "paths.npz", **arrays)
 
 
 def rssi_nerf2(folder: Path) -> None:
@@ -149,9 +142,7 @@ def model_rssi(folder: Path) -> None:
 
 
 def model_kernel_ridge(folder: Path) -> None:
-    estimator = KernelRegression(Settings(GRID))
-    estimator.fit(Mixed.measured(_room()))
-    estimator.save(folder / "model")
+    KernelRegression().fit(Mixed.measured(_room())).save(folder / "model")
 
 
 def state_of_a_fit(folder: Path) -> None:
@@ -196,7 +187,7 @@ def read_model(folder: Path) -> object:
 def read_estimator(folder: Path) -> torch.Tensor:
     estimator = load(folder / "model")
     assert isinstance(estimator, KernelRegression)
-    estimate = estimator.estimate(torch.rand(2, *estimator.settings.grid.shape))
+    estimate = estimator.predict(torch.rand(2, *estimator.grid.shape))
     assert estimate.isfinite().all()
     return estimate
 
@@ -214,7 +205,7 @@ def _few() -> Spectra:
 
 KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "format of spectra nerf2": (spectra_nerf2, read_spectra),
-    "format of spectra paths": (spectra_paths, read_spectra),
+    "format of spectra paths": (write_paths, read_spectra),
     "format of spectra deepmimo": (functools.partial(write_deepmimo, n=N), read_snapshots),
     "format of array snapshots snapshots": (snapshot_arrays, read_snapshots),
     "format of array snapshots espargos": (write_espargos, read_snapshots),

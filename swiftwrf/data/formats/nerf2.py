@@ -38,7 +38,7 @@ from swiftwrf.data.files import (
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
 from swiftwrf.data.spectra import Moving, Spectra, check_pixels
 from swiftwrf.data.splits import read_splits
-from swiftwrf.data.store import AT_ONCE, MOST_EACH, MOST_PIXELS, Store, stored, too_many
+from swiftwrf.data.store import BATCH_PIXELS, MAX_FINE_PIXELS, MAX_MEMORY_PIXELS, Store, stored, too_many
 from swiftwrf.errors import InputError
 
 
@@ -153,7 +153,7 @@ def _read_values(file: Path, n: int, digest: str) -> Store:
     kept = {1: torch.uint8, 2: torch.float16}.get(kind.itemsize, torch.float32)
     if kind.kind == "u" and kept == torch.float16:
         kept = torch.float32  # 16 bits in full
-    rows = max(1, AT_ONCE // math.prod(shape[1:]))
+    rows = max(1, BATCH_PIXELS // math.prod(shape[1:]))
 
     def batches() -> Iterator[Tensor]:
         return (_checked(file, values, kept) for values in read_rows(file, "spectrum", rows))
@@ -226,7 +226,7 @@ def _check_size(file: Path, content: bytes, n: int, shape: tuple[int, int] | Non
     if too_many((n, rows, columns)):
         raise InputError(
             f"{file} has {rows} x {columns} pixels, with {n} images {n * rows * columns:.3g}; average them down to "
-            f"at most {MOST_PIXELS:.3g} in all or {MOST_EACH:.3g} each"
+            f"at most {MAX_MEMORY_PIXELS:.3g} in all or {MAX_FINE_PIXELS:.3g} each"
         )
     if shape is not None and (rows, columns) != shape:
         raise InputError(

@@ -44,7 +44,7 @@ class HybridModel(FieldModel):
         >>> import swiftwrf
         >>> train, test = swiftwrf.simulated_room(n=50).split()
         >>> HybridModel(width=1, further=0).fit(train).predict(test.position).mean.shape
-        torch.Size([10, 90, 360])
+        torch.Size([10, 30, 120])
     """
 
     name = "hybrid"

@@ -37,7 +37,7 @@ class GeometryModel(FieldModel):
         >>> train, test = swiftwrf.simulated_room(n=50).split()
         >>> room = GeometryModel(width=1, further=0).fit(train)
         >>> room.predict(test.position).mean.shape
-        torch.Size([10, 90, 360])
+        torch.Size([10, 30, 120])
     """
 
     name = "geometry"

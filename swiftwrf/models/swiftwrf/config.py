@@ -85,7 +85,7 @@ class FitConfig(FieldConfig):
     """structure of the model"""
     steps: NonNegativeInt = 0
     """number of Adam steps, including the coarse stage; 0 fits in closed form and ignores the optimiser's options below"""
-    coarse_share: Fraction = 0.0
+    coarse_fraction: Fraction = 0.0
     """fraction of the steps without deformation (the paper's coarse stage)"""
     batch: PositiveInt = 16
     """spectra per step"""
@@ -139,7 +139,7 @@ class FitConfig(FieldConfig):
         paper = cls(
             model=model,
             steps=110_000,
-            coarse_share=1 / 11,
+            coarse_fraction=1 / 11,
             batch=1,
             rate=1e-2,
             deformation_rate=8e-3,

@@ -35,7 +35,7 @@ class Optimisation(Descent[DeformableGaussians]):
 
     def __init__(self, config: FitConfig, train: Spectra, kernel: Kernel, device: torch.device | str) -> None:
         self.config, steps = config, config.steps
-        self.coarse_steps = round(config.coarse_share * steps)
+        self.coarse_steps = round(config.coarse_fraction * steps)
         generator = torch.Generator().manual_seed(config.seed)
         (anchor,) = thinned(train.position, rows=MAX_ANCHORS)
         field = DeformableGaussians.initial(config.model, train.grid, anchor, kernel, generator=generator).to(device)

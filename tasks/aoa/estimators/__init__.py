@@ -1,7 +1,7 @@
-"""Estimators of the direction of the transmitter from a spectrum, one or some like each other a file."""
+"""Estimators of the direction of the transmitter from a spectrum."""
 
-from tasks.aoa.estimators.base import ESTIMATORS, Estimator, SavedEstimator, Settings, learners
+from tasks.aoa.estimators.base import ESTIMATORS, Estimator, EstimatorConfig, SavedEstimator, make_estimator
 
 ESTIMATORS.discover(__name__, __path__)
 
-__all__ = ["ESTIMATORS", "Estimator", "SavedEstimator", "Settings", "learners"]
+__all__ = ["ESTIMATORS", "Estimator", "EstimatorConfig", "SavedEstimator", "make_estimator"]

@@ -1,71 +1,132 @@
-"""What every estimator of the direction of the transmitter is."""
+"""Interface of the estimators of the direction of the transmitter."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Any, ClassVar, cast
+from dataclasses import asdict, fields, replace
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from augment import Mixed
-from swiftwrf import AngularGrid
-from swiftwrf.runtime.checkpoint import Saved
+from swiftwrf import AngularGrid, InputError
+from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.registry import Registry
+from swiftwrf.runtime.validation import NonNegativeInt, configuration
 from tasks.run import Preset
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What estimators are made with; each takes what it needs.
+@configuration
+class EstimatorConfig:
+    """Options of every estimator."""
 
-    Args:
-        grid: of the spectra.
-        seed: of what is random.
-        device: where to train.
-        preset: how large and how long.
-        spectra: that there would be with everything measured: how long a training lasts, whatever it is given, must follow
-            from one number, or the longer training would win.
-    """
+    seed: NonNegativeInt = 0
+    """seed of everything random"""
 
-    grid: AngularGrid
-    seed: int = 0
-    device: torch.device | str = "cpu"
-    preset: Preset = "quick"
-    spectra: int = 0
+    @classmethod
+    def for_scene(cls, n_spectra: int, preset: Preset, **options: Any) -> Self:
+        """Return the options for a scene with `n_spectra` training spectra if all of them are measured.
+
+        The length of a training depends on the scene alone, not on the training set. Otherwise the condition with the
+        longest training would win.
+        """
+        return cls(**options)
 
 
 class Estimator(ABC):
-    """Learns from spectra and labels, then estimates the direction behind a spectrum.
+    """Base class of all estimators: fit to labelled spectra, then predict the direction behind a spectrum.
 
     Args:
-        settings: what it is made with.
+        config: Options as one object. Defaults to `config_type()`.
+        options: Single options, which replace those of `config`.
+
+    Raises:
+        InputError: An unknown option, or a value outside its range.
     """
 
-    learns: ClassVar[bool] = True
-    """whether more labelled spectra can make it better"""
+    config_type: ClassVar[type[Any]] = EstimatorConfig
+    """dataclass of the options"""
+    trainable: ClassVar[bool] = True
+    """whether more labelled spectra can reduce the error"""
 
-    def __init__(self, settings: Settings) -> None:
-        self.settings = settings
-        self.history: list[dict[str, Any]] = []  # step, loss and seconds as training goes on
+    grid: AngularGrid
+    """grid of the training spectra, set by `fit`"""
+
+    def __init__(self, config: Any = None, **options: Any) -> None:
+        known = [field.name for field in fields(self.config_type)]
+        unknown = [name for name in options if name not in known]
+        if unknown:
+            raise InputError(f"{type(self).__name__} has no option {unknown[0]!r}; it has {', '.join(known)}")
+        self.config = replace(config or self.config_type(), **options)
+        self.history: list[dict[str, Any]] = []  # step, loss and seconds during the training
+
+    def fit(self, train: Mixed, *, device: torch.device | str = "cpu") -> Self:
+        """Fit the estimator to labelled spectra and return it.
+
+        Args:
+            train: Training set.
+            device: Device to compute on.
+        """
+        self.grid = train.grid
+        self._fit(train, torch.device(device))
+        return self
 
     @abstractmethod
-    def fit(self, train: Mixed) -> None:
-        """Learns from labelled spectra."""
+    def _fit(self, train: Mixed, device: torch.device) -> None:
+        """Fit to a training set on the grid `self.grid`."""
 
     @abstractmethod
-    def estimate(self, spectrum: Tensor) -> Tensor:
-        """Azimuth and elevation (n, 2) [rad] of spectra (n, H, W)."""
+    def predict(self, spectra: Tensor) -> Tensor:
+        """Return azimuth and elevation (n, 2) [rad] of spectra (n, H, W)."""
 
 
 class SavedEstimator(Estimator, Saved):
-    """One that a file can hold once it is trained: `swiftwrf.load` brings it back, ready to estimate."""
+    """Base class of estimators that `save` writes to a file and `swiftwrf.load` reads, on the CPU.
+
+    A subclass sets `kind`, and implements `_state` and `_restore`.
+    """
+
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        """Return the fitted tensors by name, and plain values."""
+        tensors, header = self._state()
+        return tensors, header | {"config": asdict(self.config), "grid": asdict(self.grid)}
+
+    @classmethod
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
+        """Return the estimator that `state` describes."""
+        estimator = cls(cls.config_type(**header.get("config", {})))
+        estimator.grid = AngularGrid(**header["grid"])
+        estimator._restore(tensors, header)
+        return estimator
+
+    @abstractmethod
+    def _state(self) -> tuple[dict[str, Tensor], Header]:
+        """Return the fitted tensors by name, and plain values beside options and grid."""
+
+    @abstractmethod
+    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
+        """Take the fitted state over from `_state`, checking every shape first."""
 
 
-ESTIMATORS: Registry[Estimator] = Registry("estimator")
+ESTIMATORS: Registry[Estimator] = Registry("estimator", "swiftwrf.estimators")
 
 
-def learners() -> list[str]:
-    """Names of the estimators that more labelled spectra can make better."""
-    return [entry.name for entry in ESTIMATORS.entries() if cast(type[Estimator], entry.make).learns]
+def make_estimator(name: str, n_spectra: int = 0, preset: Preset = "quick", **options: Any) -> Estimator:
+    """Return an estimator by its name.
+
+    Args:
+        name: Name in the registry, e.g. "kernel_ridge".
+        n_spectra: Number of training spectra of the scene, which determines the length of a training.
+        preset: Size and length of the training.
+        options: Options such as the seed.
+
+    Raises:
+        InputError: An unknown name, or a value outside its range.
+
+    Example:
+        >>> make_estimator("kernel_ridge", seed=3).config.seed
+        3
+    """
+    estimator: type[Estimator] = ESTIMATORS[name]
+    return estimator(estimator.config_type.for_scene(n_spectra, preset, **options))

@@ -1,8 +1,7 @@
-"""Regression that is strong where spectra are few."""
+"""Kernel ridge regression from coarse spectra to directions."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -11,38 +10,44 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from augment import Mixed
-from swiftwrf.array.angles import AngularGrid, to_angles, to_direction
+from swiftwrf.array.angles import to_angles, to_direction
 from swiftwrf.runtime.checkpoint import Header
-from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator, Settings
+from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator
 from tasks.aoa.estimators.radial import RadialRegression, coarse_pixels, kept_rows
+
+BATCH_SPECTRA = 512  # spectra that are loaded at a time
 
 
 @ESTIMATORS.register("kernel_ridge")
 class KernelRegression(SavedEstimator):
-    """Kernel ridge regression from coarse spectra to directions: strong where spectra are few."""
+    """Kernel ridge regression from coarse spectra to directions, accurate for few training spectra.
+
+    Example:
+        >>> import swiftwrf
+        >>> room = swiftwrf.simulated_room(n=40)
+        >>> KernelRegression(seed=1).fit(Mixed.measured(room)).predict(room.spectrum).shape
+        torch.Size([40, 2])
+    """
 
     kind = "kernel ridge regression"
 
-    def fit(self, train: Mixed) -> None:
-        rows, seed = kept_rows(len(train), self.settings.seed), self.settings.seed
-        feature = np.concatenate([self._feature(part) for part in train.batches()])[rows]
-        direction = to_direction(*train.label.unbind(-1)).numpy()[rows]
-        self._direction = RadialRegression.fit(feature, direction, seed)
+    def _fit(self, train: Mixed, device: torch.device) -> None:
+        rows = torch.from_numpy(kept_rows(len(train), self.config.seed))
+        features = np.concatenate([_features(train.select(some)) for some in rows.split(BATCH_SPECTRA)])
+        direction = to_direction(*train.label[rows].unbind(-1)).numpy()
+        self._direction = RadialRegression.fit(features, direction, self.config.seed)
 
-    def estimate(self, spectrum: Tensor) -> Tensor:
-        return torch.stack(to_angles(torch.from_numpy(self._direction(self._feature(spectrum)))), dim=-1)
+    def predict(self, spectra: Tensor) -> Tensor:
+        return torch.stack(to_angles(torch.from_numpy(self._direction(_features(spectra)))), dim=-1)
 
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        tensors, header = self._direction.state()
-        return tensors, header | {"grid": asdict(self.settings.grid)}
+    def _state(self) -> tuple[dict[str, Tensor], Header]:
+        return self._direction.state()
 
-    @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> KernelRegression:
-        own = cls(Settings(AngularGrid(**header["grid"])))
-        pixels = own._feature(torch.zeros(1, *own.settings.grid.shape)).shape[1]
-        own._direction = RadialRegression.from_state(tensors, header, pixels, 3)
-        return own
+    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
+        pixels = _features(torch.zeros(1, *self.grid.shape)).shape[1]
+        self._direction = RadialRegression.from_state(tensors, header, pixels, 3)
 
-    def _feature(self, spectrum: Tensor) -> NDArray[Any]:
-        coarse: NDArray[Any] = coarse_pixels(spectrum).double().numpy()
-        return coarse
+
+def _features(spectra: Tensor) -> NDArray[Any]:
+    coarse: NDArray[Any] = coarse_pixels(spectra).double().numpy()
+    return coarse

@@ -1,8 +1,8 @@
 """Kernel ridge regression (Saunders et al. 1998) with a normalised Gaussian kernel, width and penalty by cross-validation.
 
-A measured spectrum differs from every synthetic one by noise and by what the synthesizer does not know, which adds much the
-same to all its distances. A Gaussian kernel shrinks by it, and what a regression has balanced between many rows no longer
-holds. Normalised (Nadaraya 1964, Watson 1964; Moody and Darken 1989) it is as it was, and a narrow one looks at few rows.
+Measurement noise and model error add a nearly constant offset to the squared distances between a measured spectrum and all
+synthetic ones, which multiplies every Gaussian kernel value by the same factor. Normalising each kernel row cancels that
+factor (Nadaraya 1964, Watson 1964; Moody and Darken 1989).
 """
 
 from __future__ import annotations
@@ -26,71 +26,81 @@ from swiftwrf import InputError
 from swiftwrf.data.spectra import coarsening
 from swiftwrf.runtime.checkpoint import Header, expect
 
-WIDTHS = (10.0, 20.0, 40.0, 80.0)  # of the kernel, as gamma times the median squared distance: narrow ones alone
-PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
-CHOSEN_ROWS = 600  # choose both; where there are more rows, fewer would choose too large a penalty
-KEPT_ROWS = 4000  # its cost grows with their cube
-AZIMUTHS = 60  # an array's beams are wider than these columns
+WIDTH_CANDIDATES = (10.0, 20.0, 40.0, 80.0)  # gamma times the median squared distance
+PENALTY_CANDIDATES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
+MAX_CHOICE_ROWS = 600  # rows of the cross-validation; with fewer rows it chooses too large a penalty
+MAX_ROWS = 4000  # training rows; the time of a fit grows with their cube
+MAX_AZIMUTHS = 60  # columns of coarse spectra; the beams of an array are wider than one of them
 
 
 def kept_rows(n: int, seed: int) -> NDArray[np.int64]:
-    """The rows of so many that a regression is fitted to, in the order in which it looks at them."""
-    return np.random.default_rng(seed).permutation(n)[:KEPT_ROWS]
+    """Return the row numbers, of n rows in random order, that a regression is fitted to."""
+    return np.random.default_rng(seed).permutation(n)[:MAX_ROWS]
 
 
 def coarse_pixels(spectrum: Tensor) -> Tensor:
-    """Of spectra (n, H, W), as features (n, p) of them."""
-    return functional.avg_pool2d(spectrum[:, None], coarsening(spectrum.shape[1:], AZIMUTHS)).flatten(1)
+    """Return spectra (n, H, W) averaged to at most 60 azimuths, as features (n, p)."""
+    return functional.avg_pool2d(spectrum[:, None], coarsening(spectrum.shape[1:], MAX_AZIMUTHS)).flatten(1)
 
 
 @dataclass(frozen=True, eq=False)
 class RadialRegression:
-    """A function of features that `fit` found: a mean over the rows that it knows, the near ones above all.
+    """A fitted regression: the prediction is the mean of dual coefficients, weighted by the normalised kernel.
 
     Args:
-        known: features of those rows, (n, p).
-        says: what each of them says, (n, k).
-        gamma: of the kernel exp(-gamma |a - b|^2).
+        known: Features of the training rows, (n, p).
+        dual: Dual coefficients of the training rows, (n, k).
+        gamma: Inverse squared width of the kernel exp(-gamma |a - b|^2).
+
+    Example:
+        >>> x = np.linspace(0, 1, 20)[:, None]
+        >>> bool(np.abs(RadialRegression.fit(x, x, seed=0)(x) - x).max() < 0.05)
+        True
     """
 
     known: NDArray[Any]
-    says: NDArray[Any]
+    dual: NDArray[Any]
     gamma: float
 
     @classmethod
     def fit(cls, feature: NDArray[Any], target: NDArray[Any], seed: int) -> RadialRegression:
-        """From features (n, p) to values (n, k).
+        """Fit a regression from features (n, p) to values (n, k).
 
         Args:
-            feature, target: of at least two rows; the first of many choose width and penalty.
-            seed: of the folds.
+            feature: Features of at least two rows. The first 600 rows choose width and penalty.
+            target: Values of these rows.
+            seed: Seed of the folds.
         """
-        apart = euclidean_distances(feature, squared=True)
-        gamma, alpha = choose(apart[:CHOSEN_ROWS, :CHOSEN_ROWS], target[:CHOSEN_ROWS], seed)
-        return cls(feature, _says(np.exp(-gamma * apart), target, alpha), gamma)
+        distance = euclidean_distances(feature, squared=True)
+        some = slice(MAX_CHOICE_ROWS)
+        gamma, alpha = choose(distance[some, some], target[some], seed)
+        return cls(feature, _dual_coefficients(np.exp(-gamma * distance), target, alpha), gamma)
 
     def __call__(self, feature: NDArray[Any]) -> NDArray[Any]:
-        """Values (m, k) of features (m, p)."""
-        values: NDArray[Any] = _near(euclidean_distances(feature, self.known, squared=True), self.gamma) @ self.says
+        """Return the predicted values (m, k) of features (m, p)."""
+        distance = euclidean_distances(feature, self.known, squared=True)
+        values: NDArray[Any] = _normalised_kernel(distance, self.gamma) @ self.dual
         return values
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
-        """What a file keeps: tensors in single precision, and plain values."""
-        arrays = {"known": self.known, "says": self.says}
+        """Return tensors in single precision, and plain values."""
+        arrays = {"known": self.known, "says": self.dual}
         return {name: torch.from_numpy(array.astype(np.float32)) for name, array in arrays.items()}, {
             "gamma": self.gamma
         }
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header, features: int, values: int) -> RadialRegression:
-        """That of which `state` gave these.
+        """Return the regression that `state` describes.
 
         Args:
-            tensors, header: from a file; others among them play no part.
-            features, values: p and k.
+            tensors: Tensors by name; other names are ignored.
+            header: Plain values.
+            features: Number p of features.
+            values: Number k of values.
 
         Raises:
-            InputError: they do not fit together.
+            InputError: Shapes or values that do not fit together.
         """
         expect(tensors, {"known": (n := len(tensors["known"]), features), "says": (n, values)})
         gamma = float(header["gamma"])
@@ -99,40 +109,41 @@ class RadialRegression:
         return cls(tensors["known"].double().numpy(), tensors["says"].double().numpy(), gamma)
 
 
-def choose(apart: NDArray[Any], target: NDArray[Any], seed: int) -> tuple[float, float]:
-    """Width gamma and penalty alpha with the least mean absolute error on held-out rows.
+def choose(distance: NDArray[Any], target: NDArray[Any], seed: int) -> tuple[float, float]:
+    """Return the width gamma and the penalty alpha with the least mean absolute error on held-out rows.
 
     Args:
-        apart: squared distances of rows from each other, (n, n).
-        target: their values, (n, k).
-        seed: of the folds.
+        distance: Squared distances between the rows, (n, n).
+        target: Values of the rows, (n, k).
+        seed: Seed of the folds.
     """
-    width = 1 / max(float(np.median(apart[~np.eye(len(apart), dtype=bool)])), 1e-9)
-    folds = KFold(min(5, len(apart)), shuffle=True, random_state=seed)
+    width = 1 / max(float(np.median(distance[~np.eye(len(distance), dtype=bool)])), 1e-9)
+    folds = KFold(min(5, len(distance)), shuffle=True, random_state=seed)
     errors: dict[tuple[float, float], float] = {}
     with threadpool_limits(1):  # many small problems: several threads would mostly wait for each other
-        for gamma in (factor * width for factor in WIDTHS):
-            kernel = np.exp(-gamma * apart)
+        for gamma in (factor * width for factor in WIDTH_CANDIDATES):
+            kernel = np.exp(-gamma * distance)
             for kept, out in folds.split(kernel):
-                known, near = kernel[np.ix_(kept, kept)], _near(apart[np.ix_(out, kept)], gamma)  # for all penalties
-                for alpha in PENALTIES:
-                    error = float(np.abs(near @ _says(known, target[kept], alpha) - target[out]).mean())
+                known, weight = kernel[np.ix_(kept, kept)], _normalised_kernel(distance[np.ix_(out, kept)], gamma)
+                for alpha in PENALTY_CANDIDATES:
+                    predicted = weight @ _dual_coefficients(known, target[kept], alpha)
+                    error = float(np.abs(predicted - target[out]).mean())
                     errors[gamma, alpha] = errors.get((gamma, alpha), 0.0) + error
     return min(errors, key=errors.__getitem__)
 
 
-def _near(apart: NDArray[Any], gamma: float) -> NDArray[Any]:
-    """How much each known row counts, (m, n), by squared distances from it: the kernel divided by the sums of its rows."""
-    near: NDArray[Any] = softmax(-gamma * apart, axis=1)
-    return near
+def _normalised_kernel(distance: NDArray[Any], gamma: float) -> NDArray[Any]:
+    """Return the kernel (m, n) divided by its row sums, from squared distances (m, n) to the training rows."""
+    weight: NDArray[Any] = softmax(-gamma * distance, axis=1)
+    return weight
 
 
-def _says(kernel: NDArray[Any], target: NDArray[Any], alpha: float) -> NDArray[Any]:
-    """What rows have to say, (n, k), for means of it to come to their values.
+def _dual_coefficients(kernel: NDArray[Any], target: NDArray[Any], alpha: float) -> NDArray[Any]:
+    """Return dual coefficients (n, k) whose row-normalised kernel average reproduces the targets.
 
-    With K, the kernel (n, n) divided by the sums of its rows, these are (1 + alpha) (K + alpha)^-1 times the values: where
-    the penalty is small means go through all values, where it is large rows say their values, and constants stay anyway.
+    With K, the kernel (n, n) divided by its row sums, they are (1 + alpha) (K + alpha)^-1 times the targets. A small penalty
+    interpolates the targets, a large one gives the targets themselves, and constant targets are reproduced exactly.
     """
     sums = kernel.sum(axis=1)
-    says: NDArray[Any] = solve(kernel + np.diag(alpha * sums), sums[:, None] * target, assume_a="pos")
-    return (1 + alpha) * says
+    dual: NDArray[Any] = solve(kernel + np.diag(alpha * sums), sums[:, None] * target, assume_a="pos")
+    return (1 + alpha) * dual

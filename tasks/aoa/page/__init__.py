@@ -4,37 +4,36 @@ from __future__ import annotations
 
 from tasks.aoa.page.cost import sizes, speed_section, time_section, trainings
 from tasks.aoa.page.field import field_section
-from tasks.aoa.page.results import over_estimators, over_shares, results_section
+from tasks.aoa.page.records import AoaRecords, FractionRecords
+from tasks.aoa.page.results import over_estimators, over_fractions, results_section
 from tasks.aoa.page.room import choice_section, room_section
 from tasks.aoa.page.suggest import suggestion_section
 from tasks.aoa.page.summary import summary
 from tasks.aoa.page.synthesis import examples_section, synthesis_section
-from tasks.aoa.share import AoaRecords, Share
 from tasks.page.page import Page, Section
 from tasks.page.provenance import provenance
 
 
 def page(runs: list[AoaRecords]) -> Page:
-    """The page of these runs."""
+    """Return the page of these runs."""
     several = len(runs) > 1
-    shares = [share for run in runs for share in Share.of(run)]
-    sections = [results_section(share, several) for share in shares]
-    if len(shares) > 1:
-        sections.insert(0, Section("Error against the measured share", plots=[over_shares(shares, "shares")]))
-    for share in shares:
-        sections += [
-            section for section in (choice_section(share), room_section(share), suggestion_section(share)) if section
-        ]
-    sections += [synthesis_section(shares, several), *(examples_section(share) for share in shares)]
-    sections += [section for share in shares if (section := field_section(share))]
+    fractions = [fraction for run in runs for fraction in FractionRecords.of(run)]
+    sections = [results_section(fraction, several) for fraction in fractions]
+    if len(fractions) > 1:
+        sections.insert(0, Section("Error against the measured fraction", plots=[over_fractions(fractions, "shares")]))
+    for fraction in fractions:
+        found = choice_section(fraction), room_section(fraction), suggestion_section(fraction)
+        sections += [section for section in found if section]
+    sections += [synthesis_section(fractions, several), *(examples_section(fraction) for fraction in fractions)]
+    sections += [section for fraction in fractions if (section := field_section(fraction))]
     sections += [
-        *(speed_section(share) for share in shares),
+        *(speed_section(fraction) for fraction in fractions),
         Section("Training and size", plots=[*sizes(runs), *trainings(runs)]),
     ]
-    sections += [time_section(shares, several), _limits(runs[0]), provenance(runs)]
+    sections += [time_section(fractions, several), _limits(runs[0]), provenance(runs)]
     names = ", ".join(dict.fromkeys(run.place for run in runs))
-    picture = over_shares(shares, "summary") if len(shares) > 1 else over_estimators(shares[0])
-    return Page(f"Angle of arrival: {names}", summary(shares[0], picture), sections)
+    picture = over_fractions(fractions, "summary") if len(fractions) > 1 else over_estimators(fractions[0])
+    return Page(f"Angle of arrival: {names}", summary(fractions[0], picture), sections)
 
 
 def _limits(run: AoaRecords) -> Section:

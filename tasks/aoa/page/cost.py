@@ -4,37 +4,35 @@ from __future__ import annotations
 
 from pandas import DataFrame, concat
 
-from augment import SYNTHESIZERS
+from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.swiftwrf.fit import MIN_GAIN
-from tasks.aoa import arms
-from tasks.aoa.estimators import ESTIMATORS
-from tasks.aoa.share import AoaRecords, Share, first_history, fits
+from tasks.aoa.page.records import AoaRecords, FractionRecords, first_history, fits
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
 from tasks.page.provenance import number
 from tasks.summarise import SHORTEST, rms_of_psnr
 
 
-def speed_section(share: Share) -> Section:
-    """What each synthesizer and estimator takes against how wrong it is."""
-    synthesis = {name: scores for name, scores in share.mix["synthesis"].items() if name in SYNTHESIZERS}
-    methods = {n: a for n, a in share.mix["methods"].items() if arms.is_network(n) or n in ESTIMATORS}
+def speed_section(fraction: FractionRecords) -> Section:
+    """Return the time of each field model and estimator against its error."""
+    synthesis = {name: scores for name, scores in fraction.mix["synthesis"].items() if name in FIELD_MODELS}
+    methods = {name: fraction.mix["methods"][name] for name in fraction.in_overviews}
     error = {name: rms_of_psnr(scores["psnr_db"]["median"]) for name, scores in synthesis.items()}
     fit = {name: max(scores["seconds"]["fit"], SHORTEST) for name, scores in synthesis.items()}
     draw = {name: max(scores["seconds"]["synthesize"], SHORTEST) for name, scores in synthesis.items()}
     estimators = {
-        name: (max(arm["seconds"]["train"] + arm["seconds"]["estimate"], SHORTEST), arm["great_circle_deg"]["median"])
-        for name, arm in methods.items()
+        name: (max(sum(method["seconds"].values()), SHORTEST), method["great_circle_deg"]["median"])
+        for name, method in methods.items()
     }
-    palette = arms.palette()
+    palette = fraction.palette
     figure, axes = figures.new_figure(1, 3, 12, 4.2)
     for ax, stage, seconds in zip(axes, ("fit", "synthesize"), (fit, draw), strict=False):
         points = {name: (seconds[name], error[name]) for name in synthesis}
         figures.speed(ax, palette, points, f"seconds to {stage}", "RMS error of a spectrum", also=["swiftwrf"])
     figures.speed(axes[2], palette, estimators, "seconds to train and estimate", "median great-circle error [deg]")
     caption = (
-        "Left and middle: synthesizers, seconds to fit and to draw the test spectra. Right: estimators, "
-        "the synthesizer's time not counted. The line is the Pareto front: what is not on it is beaten in both."
+        "Left and middle: synthesizers, seconds to fit and to predict the test spectra. Right: estimators, without the "
+        "synthesizer's time. The line is the Pareto front."
     )
     figures.legend_of(figure, palette, [*synthesis, *methods])
     data = concat(
@@ -48,12 +46,12 @@ def speed_section(share: Share) -> Section:
             for name, (cost, wrong) in estimators.items()
         ]
     )
-    plot = Plot(f"speed-{share.file_name}", figure, caption, data)
-    return Section(f"Speed against error ({share.title})", plots=[plot])
+    plot = Plot(f"speed-{fraction.file_name}", figure, caption, data)
+    return Section(f"Speed against error ({fraction.title})", plots=[plot])
 
 
 def sizes(runs: list[AoaRecords]) -> list[Plot]:
-    """Quality against size: what the fit of SwiftWRF tried, and what it took."""
+    """Return plots of the held-out loss against the number of primitives that the fits of SwiftWRF tried."""
     plots = []
     for run in runs:
         search, final = fits(run)
@@ -68,21 +66,22 @@ def sizes(runs: list[AoaRecords]) -> list[Plot]:
         axes[0].xaxis.set_major_formatter("{x:g}")
         axes[0].set(xlabel="primitives", ylabel="loss on held-out spectra")
         caption = (
-            f"First share of {run.scene}. Loss on measured spectra that each size did not see, at coarse resolution; the "
-            f"model took the smallest within {MIN_GAIN:.1%} of the best: {n} primitives (line)."
+            f"First measured fraction of {run.scene}. Loss on held-out measured spectra at coarse resolution. The model has "
+            f"the smallest number within {MIN_GAIN:.1%} of the best: {n} primitives (line)."
         )
         data = by_size[["n_primitives", "validation"]]
-        plots.append(Plot(f"size-{Share.of(run)[0].file_name}", figure, caption, data))
+        plots.append(Plot(f"size-{FractionRecords.of(run)[0].file_name}", figure, caption, data))
     return plots
 
 
 def trainings(runs: list[AoaRecords]) -> list[Plot]:
-    """Loss of what was trained by steps."""
+    """Return plots of the loss of networks, and of field models that are fitted by gradient."""
     plots = []
     for run in runs:
         history = first_history(run)
-        by_arm = history.groupby("method", sort=False) if "method" in history else ()
-        networks = {str(name): (part["step"], part["loss"]) for name, part in by_arm}
+        palette = FractionRecords.of(run)[0].palette
+        by_method = history.groupby("method", sort=False) if "method" in history else ()
+        networks = {str(name): (part["step"], part["loss"]) for name, part in by_method}
         # fits by gradient; others have no steps
         descents = history[(history["stage"] == "final") & (history["steps"] > 0)] if "steps" in history else None
         by_fit = () if descents is None else descents.groupby("synthesizer", sort=False)
@@ -91,22 +90,22 @@ def trainings(runs: list[AoaRecords]) -> list[Plot]:
         panels = {label: lines for label, lines in panels.items() if lines}
         figure, axes = figures.new_figure(1, max(len(panels), 1), 6 * max(len(panels), 1), 3.2)
         for ax, (label, lines) in zip(axes, panels.items(), strict=False):
-            figures.curves(ax, arms.palette(), lines, "step", label)
-        caption = f"First share and repeat of {run.scene}: the networks, and synthesizers that are fitted by gradient."
+            figures.curves(ax, palette, lines, "step", label)
+        caption = f"First measured fraction and repeat of {run.scene}: networks, and synthesizers fitted by gradient."
         curves = {f"network, {name}": line for name, line in networks.items()}
         curves |= {f"synthesizer, {name}": line for name, line in fitted.items()}
         parts = [DataFrame({"what": what, "step": steps, "loss": loss}) for what, (steps, loss) in curves.items()]
         data = concat(parts) if parts else DataFrame(columns=["what", "step", "loss"])
-        plots.append(Plot(f"training-{Share.of(run)[0].file_name}", figure, caption, data))
+        plots.append(Plot(f"training-{FractionRecords.of(run)[0].file_name}", figure, caption, data))
     return plots
 
 
-def time_section(shares: list[Share], several: bool) -> Section:
-    """Seconds by share and stage."""
+def time_section(fractions: list[FractionRecords], several: bool) -> Section:
+    """Return the seconds by measured fraction and stage."""
     rows = []
-    for share in shares:
-        seconds = share.mix["seconds"]
+    for fraction in fractions:
+        seconds = fraction.mix["seconds"]
         cells = (number(value, 1) for value in (seconds["fit"], seconds["synthesize"], seconds["train"]))
-        rows.append([share.percent + (f", {share.run.scene}" if several else ""), *cells])
-    caption = "Seconds on the machine named below; train: the networks of all arms together."
-    return Section("Where the time went", tables=[Table(["share", "fit", "synthesize", "train"], rows, caption)])
+        rows.append([fraction.percent + (f", {fraction.run.scene}" if several else ""), *cells])
+    caption = "Seconds on the machine named below; train: all networks together."
+    return Section("Where the time went", tables=[Table(["fraction", "fit", "synthesize", "train"], rows, caption)])

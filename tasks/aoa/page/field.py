@@ -11,28 +11,28 @@ from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 from pandas import DataFrame
 
-from tasks.aoa.share import Share
+from tasks.aoa.page.records import FractionRecords
 from tasks.page import figures
 from tasks.page.page import Plot, Section
 
-STILL = np.deg2rad(0.1)  # means that move less along the walk than this stay where they are
+MIN_SHIFT_RAD = np.deg2rad(0.1)  # smallest visible shift of a primitive's mean along the walk
 
 
-def field_section(share: Share) -> Section | None:
-    """Maps of the strongest direction, and the primitives' change along a walk; None where neither was kept."""
-    names = share.drawn_by(share.mix["methods"])
-    plots = [_map(share, name, field) for name in names if (field := _stored(share, f"field-{name}")) is not None]
-    if (motion := _stored(share, "motion")) is not None:
-        plots.append(_motion(share, motion))
-    return Section(f"The field over the region ({share.title})", plots=plots) if plots else None
+def field_section(fraction: FractionRecords) -> Section | None:
+    """Return maps of the peak direction, and the primitives along a walk; None if the run has neither."""
+    names = fraction.synthesizers(fraction.mix["methods"])
+    plots = [_map(fraction, name, field) for name in names if (field := _stored(fraction, f"field-{name}")) is not None]
+    if (motion := _stored(fraction, "motion")) is not None:
+        plots.append(_motion(fraction, motion))
+    return Section(f"The field over the region ({fraction.title})", plots=plots) if plots else None
 
 
-def _stored(share: Share, kind: str) -> dict[str, NDArray[Any]] | None:
-    name = f"{kind}-mix{share.key}"
-    return share.run.arrays(name) if share.run.holds(name) else None
+def _stored(fraction: FractionRecords, kind: str) -> dict[str, NDArray[Any]] | None:
+    name = f"{kind}-mix{fraction.key}"
+    return fraction.run.arrays(name) if fraction.run.holds(name) else None
 
 
-def _map(share: Share, name: str, field: dict[str, NDArray[Any]]) -> Plot:
+def _map(fraction: FractionRecords, name: str, field: dict[str, NDArray[Any]]) -> Plot:
     x, y, z = field["position"].T
     data = DataFrame(
         {
@@ -62,14 +62,14 @@ def _map(share: Share, name: str, field: dict[str, NDArray[Any]]) -> Plot:
         f"Where the strongest signal comes from, as {name} predicts it, at {len(x)} places in the region of the "
         "measured positions, at their median height: azimuth, elevation, magnitude."
     )
-    return Plot(f"field-{name}-{share.file_name}", figure, caption, data)
+    return Plot(f"field-{name}-{fraction.file_name}", figure, caption, data)
 
 
-def _motion(share: Share, motion: dict[str, NDArray[Any]]) -> Plot:
+def _motion(fraction: FractionRecords, motion: dict[str, NDArray[Any]]) -> Plot:
     mean, strength = np.rad2deg(motion["mean"]), motion["strength"]
     walked = np.linalg.norm(motion["walk"] - motion["walk"][0], axis=1)
     figure, axes = figures.new_figure(1, 2, 12, 3.6)
-    moves = np.ptp(motion["mean"], axis=0).max() > STILL
+    moves = np.ptp(motion["mean"], axis=0).max() > MIN_SHIFT_RAD
     _draw_primitives(axes[0], mean, np.rad2deg(1.0) ** 2 * motion["covariance"], strength.mean(axis=0))
     if moves:
         for k in range(mean.shape[1]):
@@ -90,7 +90,7 @@ def _motion(share: Share, motion: dict[str, NDArray[Any]]) -> Plot:
             "strength": strength.ravel(),
         }
     )
-    return Plot(f"motion-{share.file_name}", figure, caption, data)
+    return Plot(f"motion-{fraction.file_name}", figure, caption, data)
 
 
 def _draw_primitives(ax: Axes, mean: NDArray[Any], covariance: NDArray[Any], strength: NDArray[Any]) -> None:

@@ -1,13 +1,13 @@
-"""Errors of the arms: tables, distributions, over shares and over estimators."""
+"""Errors of the conditions: tables, distributions, over measured fractions and over estimators."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from augment import SYNTHESIZERS
-from tasks.aoa import arms
-from tasks.aoa.estimators import learners
-from tasks.aoa.share import Share
+from tasks.aoa.condition import NETWORK, terms, trainable
+from tasks.aoa.page.records import FractionRecords, palette
 from tasks.metrics import Angle, ErrorSummary
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
@@ -18,110 +18,111 @@ ERRORS: dict[Angle, str] = {
     "elevation_deg": "elevation",
     "great_circle_deg": "great circle",
 }
-# median elevation and azimuth errors in degrees by measured share (paper, table of the AoA case study)
+# median elevation and azimuth errors in degrees by measured fraction (paper, table of the AoA case study)
 PAPER = {"0.1": (0.592, 1.769), "0.3": (0.5527, 1.7369), "0.5": (0.410, 1.498), "0.7": (0.370, 1.173)}
-OFF_SCALE = ("peak", "constant")  # so far off, as a rule, that they would hide the differences of the others
+OFF_SCALE = ("peak", "constant")  # with errors so large that they would hide the differences of the others
 
 
-def results_section(share: Share, several: bool) -> Section:
-    """Errors of all arms of a share, the training sets behind them, and their distributions."""
-    title = f"{share.percent} measured" + (f" - {share.run.scene}, seed {share.run.metrics['seed']}" if several else "")
+def results_section(fraction: FractionRecords, several: bool) -> Section:
+    """Return the errors of all conditions, their training sets, and the distributions of the errors."""
+    title = f"{fraction.percent} measured" + (
+        f" - {fraction.run.scene}, seed {fraction.run.metrics['seed']}" if several else ""
+    )
     rows = [
-        [name, *(_with_interval(arm[column]) for column in ERRORS), number(arm["great_circle_deg"]["p90"])]
-        for name, arm in share.mix["methods"].items()
+        [name, *(_with_interval(method[column]) for column in ERRORS), number(method["great_circle_deg"]["p90"])]
+        for name, method in fraction.mix["methods"].items()
     ]
     columns = ["method", *(f"{name} [deg]" for name in ERRORS.values()), "great circle, 90 %"]
-    strong = frozenset(name for name in share.mix["methods"] if arms.is_turbo(name))
+    strong = frozenset(name for name, condition in fraction.conditions.items() if condition.is_turbo)
     paragraphs = []
-    if share.key in PAPER:
-        elevation, azimuth = PAPER[share.key]
+    if fraction.key in PAPER:
+        elevation, azimuth = PAPER[fraction.key]
         paragraphs.append(
             f"For orientation: the paper reports medians of {elevation} (elevation) and {azimuth} degrees (azimuth) at this "
-            "share, on its own 6,123 spectra and an unnamed split; the numbers are not comparable with these."
+            "fraction, on its own 6,123 spectra and an unnamed split; the numbers are not comparable with these."
         )
     table = Table(columns, rows, "Median error with its 95 % interval over the test spectra.", strong)
-    parts = [[name, *(str(n) for n in counts.values())] for name, counts in share.mix["counts"].items()]
+    parts = [[name, *(str(n) for n in counts.values())] for name, counts in fraction.mix["counts"].items()]
     origin = Table(["training set", "measured", "withheld positions", "further positions"], parts, "Spectra by origin.")
-    return Section(title, paragraphs, [table, origin], [_cdf(share), *_turbo_cdf(share)], arms.terms())
+    return Section(title, paragraphs, [table, origin], [_cdf(fraction), *_turbo_cdf(fraction)], terms())
 
 
 def _with_interval(summary: ErrorSummary) -> str:
     return f"{number(summary['median'])} [{number(summary['low'])}, {number(summary['high'])}]"
 
 
-def _cdf(share: Share) -> Plot:
-    table = share.run.table("errors")
-    own = table[table["mix"] == float(share.key)]
-    own = own[
-        [arms.is_network(name) or name in arms.baselines() for name in own["method"]]
-    ]  # more would hide each other
+def _cdf(fraction: FractionRecords) -> Plot:
+    table = fraction.table("errors")
+    own = table[table["method"].isin(fraction.in_overviews)]
     figure, axes = figures.new_figure(1, 3, 12, 3.8)
     for ax, (column, name) in zip(axes, ERRORS.items(), strict=True):
         groups = {str(method): part[column] for method, part in own.groupby("method", sort=False)}
         shown = [float(part.quantile(0.95)) for method, part in groups.items() if method not in OFF_SCALE]
-        figures.cdf(ax, arms.palette(), groups, f"{name} error [deg]", limit=max(*shown, 1e-3))
+        figures.cdf(ax, fraction.palette, groups, f"{name} error [deg]", limit=max(*shown, 1e-3))
     axes[1].set_ylabel("")
     axes[2].set_ylabel("")
     figures.legend_below(figure, axes[0])
     caption = "Distribution of the errors; full lines are networks, dashed ones baselines, which may leave the axes."
-    return Plot(f"cdf-{share.file_name}", figure, caption, own[["repeat", "index", "method", *ERRORS]])
+    return Plot(f"cdf-{fraction.file_name}", figure, caption, own[["repeat", "index", "method", *ERRORS]])
 
 
-def _turbo_cdf(share: Share) -> list[Plot]:
-    """The paper's figure: the network between its bounds, one curve a synthesizer, where there are several."""
-    turbo = [name for name in share.mix["methods"] if name in map(arms.turbo, SYNTHESIZERS)]
-    if len(turbo) < 2:
+def _turbo_cdf(fraction: FractionRecords) -> list[Plot]:
+    """Return the paper's figure if there are several field models: the network between its references, one curve a model."""
+    networks = {name: condition for name, condition in fraction.conditions.items() if condition.is_network}
+    if sum(condition.training == "turbo" for condition in networks.values()) < 2:
         return []
-    table = share.run.table("errors")
-    own = table[table["mix"] == float(share.key)]
+    shown = [name for name, condition in networks.items() if condition.training != "turbo_extra"]
+    own = fraction.table("errors")
+    own = own[own["method"].isin(shown)]
     figure, axes = figures.new_figure(1, 2, 12, 3.8)
     for ax, (column, name) in zip(axes, ERRORS.items(), strict=False):  # azimuth and elevation
-        groups = {arm: own[own["method"] == arm][column] for arm in (arms.LOWER.name, *turbo, arms.UPPER.name)}
+        groups = {method: own[own["method"] == method][column] for method in shown}
         limit = max(*(float(part.quantile(0.95)) for part in groups.values()), 1e-3)
-        figures.cdf(ax, arms.palette(), groups, f"{name} error [deg]", limit=limit)
+        figures.cdf(ax, fraction.palette, groups, f"{name} error [deg]", limit=limit)
     axes[1].set_ylabel("")
     figures.legend_below(figure, axes[0])
-    caption = "The network with spectra of each synthesizer at the withheld positions, between its bounds."
-    shown = own[own["method"].isin([arms.LOWER.name, *turbo, arms.UPPER.name])]
-    return [Plot(f"turbo-{share.file_name}", figure, caption, shown[["repeat", "index", "method", *ERRORS]])]
+    caption = "The network with spectra of each synthesizer at the withheld positions, between its references."
+    return [Plot(f"turbo-{fraction.file_name}", figure, caption, own[["repeat", "index", "method", *ERRORS]])]
 
 
-def over_shares(shares: list[Share], name: str) -> Plot:
-    """Median error of each arm against the measured share."""
-    every = (arm for share in shares for arm in share.mix["methods"])
-    names = dict.fromkeys(
-        arm for arm in every if arm not in OFF_SCALE and (arms.is_network(arm) or arm in arms.baselines())
-    )
-    labels = [share.percent for share in shares]
-    if len({share.run.place for share in shares}) > 1:
-        labels = [figures.short(f"{s.percent}\n{s.run.metrics['data']}\n{s.run.metrics['split']}") for s in shares]
-    heights = {arm: [_median_and_interval(share, arm) for share in shares] for arm in names}
-    figure, axes = figures.new_figure(1, 1, 7.2, 4)
-    figures.bars(axes[0], arms.palette(), labels, heights, "median great-circle error [deg]")
-    figures.legend_below(figure, axes[0])
-    caption = "Median error of each arm against the measured share; whiskers: 95 % intervals."
-    return Plot(name, figure, caption, figures.bars_data("share", labels, heights, "deg"))
-
-
-def over_estimators(share: Share) -> Plot:
-    """Of one share: each estimator on the measured spectra, with the synthetic ones, on everything."""
-    trainings = dict.fromkeys(map(arms.training_of, share.mix["methods"]))
-    estimators = [arms.NETWORK, *(name for name in learners() if name != arms.NETWORK)]
-    heights = {
-        training: [_median_and_interval(share, arms.arm(estimator, training)) for estimator in estimators]
-        for training in trainings
+def over_fractions(fractions: list[FractionRecords], name: str) -> Plot:
+    """Return the median error of each condition against the measured fraction."""
+    conditions = {
+        name: fraction.conditions[name]
+        for fraction in fractions
+        for name in fraction.in_overviews
+        if name not in OFF_SCALE
     }
+    labels = [fraction.percent for fraction in fractions]
+    if len({fraction.run.place for fraction in fractions}) > 1:
+        labels = [figures.short(f"{s.percent}\n{s.run.metrics['data']}\n{s.run.metrics['split']}") for s in fractions]
+    heights = {method: [_median_and_interval(fraction, method) for fraction in fractions] for method in conditions}
     figure, axes = figures.new_figure(1, 1, 7.2, 4)
-    labels = [f"network ({name})" if name == arms.NETWORK else name.replace("_", " ") for name in estimators]
-    figures.bars(axes[0], arms.palette(), labels, heights, "median great-circle error [deg]")
+    figures.bars(axes[0], palette(conditions.values()), labels, heights, "median great-circle error [deg]")
     figures.legend_below(figure, axes[0])
-    caption = f"Median error of each estimator on each training set, {share.title}; whiskers: 95 % intervals."
+    caption = "Median error of each condition against the measured fraction; whiskers: 95 % intervals."
+    return Plot(name, figure, caption, figures.bars_data("measured_fraction", labels, heights, "deg"))
+
+
+def over_estimators(fraction: FractionRecords) -> Plot:
+    """Return the errors of each trainable estimator on the measured spectra, with synthetic ones, and on all spectra."""
+    estimators, heights = trainable(), {}
+    trainings = {condition.training_set: condition for condition in fraction.conditions.values()}
+    for name, condition in trainings.items():
+        methods = [replace(condition, estimator=estimator).method for estimator in estimators]
+        heights[name] = [_median_and_interval(fraction, method) for method in methods]
+    colours = palette(replace(condition, estimator=NETWORK) for condition in trainings.values())
+    figure, axes = figures.new_figure(1, 1, 7.2, 4)
+    labels = [f"network ({name})" if name == NETWORK else name.replace("_", " ") for name in estimators]
+    figures.bars(axes[0], colours, labels, heights, "median great-circle error [deg]")
+    figures.legend_below(figure, axes[0])
+    caption = f"Median error of each estimator on each training set, {fraction.title}; whiskers: 95 % intervals."
     return Plot("summary", figure, caption, figures.bars_data("estimator", estimators, heights, "deg"))
 
 
-def _median_and_interval(share: Share, arm: str) -> tuple[float, float, float]:
-    """Of the great-circle errors; nan where the run has no such arm."""
-    if arm not in share.mix["methods"]:
+def _median_and_interval(fraction: FractionRecords, method: str) -> tuple[float, float, float]:
+    """Return median and interval of the angular errors, nan if the run does not have the method."""
+    if method not in fraction.mix["methods"]:
         return np.nan, np.nan, np.nan
-    error = share.mix["methods"][arm]["great_circle_deg"]
+    error = fraction.mix["methods"][method]["great_circle_deg"]
     return error["median"], error["low"], error["high"]

@@ -1,4 +1,4 @@
-"""The report's sections on the synthesizer: why it was chosen, what it gains, the room it found."""
+"""The report's sections on the field model: why it was chosen, what it gains, the room that it found."""
 
 from __future__ import annotations
 
@@ -11,43 +11,54 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pandas import DataFrame, concat
 
-from augment import SYNTHESIZERS
-from tasks.aoa import arms
-from tasks.aoa.advice import best_gain
-from tasks.aoa.share import Share
+from swiftwrf.models import FIELD_MODELS
+from tasks.aoa.page.records import FractionRecords
 from tasks.metrics import AdviceMetrics, GainMetrics
-from tasks.page import figures
+from tasks.page import figures, labels
 from tasks.page.page import Plot, Section, Table
 from tasks.page.provenance import number
 
-MARGIN = 0.5  # [m] that a plan shows beyond the room
+MARGIN = 0.5  # [m] around the room in a plan
 FIXED, MEASURED, IMAGE = "#cc3311", "#4477aa", "#ee8866"
 
 
-def advice_sentence(share: Share) -> str | None:
-    """Whether turbo learning helps, in a sentence; None where nothing was compared."""
-    advice = share.mix["advice"]
-    best = best_gain(advice["gains"], advice["sampled"]) if advice else None
-    if advice is None or best is None:
-        return None
-    change = f"{best['change']:+.0%} [{best['low']:+.0%}, {best['high']:+.0%}]"
-    found = (
-        f"Cross-validation inside the measured share ({advice['n_held_out']} spectra held out, {advice['stand_in']} as "
-        f"stand-in for the network): {best['extra']} synthetic spectra {'drawn' if best['sampled'] else 'predicted'} at "
-        f"further positions change the median error by {change}, from {advice['measured_only_deg']:.2f} to "
-        f"{best['median_deg']:.2f} degrees."
-    )
-    if advice["helps"]:
-        return f"{found} Turbo learning helps here: use --extra {advice['recommended_extra']} with this share."
-    if best["low"] > 0:
-        return f"{found} Turbo learning harms here: measure more instead, or use another synthesizer."
-    return f"{found} That is not beyond doubt: more measured positions are the safer way."
+def advice_of(fraction: FractionRecords) -> dict[str, AdviceMetrics]:
+    """Return the cross-validation of each field model, if it has further positions. Older runs have the chosen one alone."""
+    advice: dict[str, Any] = dict(fraction.mix["advice"] or {})
+    choice = fraction.mix["choice"]
+    if "stand_in" in advice and choice is not None:
+        advice = {choice["name"]: advice}
+    return {name: entry for name, entry in advice.items() if entry["gains"]}
 
 
-def choice_section(share: Share) -> Section | None:
-    """Which synthesizer was taken, and what it gains over the number of further positions."""
-    choice, advice = share.mix["choice"], share.mix["advice"]
-    if choice is None or advice is None:
+def advice_sentences(fraction: FractionRecords) -> list[str]:
+    """Return a text for each field model that was compared: does turbo learning help?"""
+    texts = []
+    for name, advice in advice_of(fraction).items():
+        gains = [gain for gain in advice["gains"] if gain["sampled"] == advice["sampled"]]
+        best = min(gains, key=lambda gain: gain["median_deg"])
+        rule = advice.get("rule") or best
+        found = (
+            f"Cross-validation inside the measured fraction ({advice['n_held_out']} spectra held out, {advice['stand_in']} "
+            f"as stand-in for the network): spectra {'sampled' if advice['sampled'] else 'predicted'} by {name} at further "
+            f"positions change the median error by {rule['change']:+.0%} [{rule['low']:+.0%}, {rule['high']:+.0%}], from "
+            f"{advice['measured_only_deg']:.2f} to {rule['median_deg']:.2f} degrees, if their number is chosen on other "
+            f"held-out spectra. The best number is {best['extra']}."
+        )
+        if advice["helps"]:
+            verdict = f"Turbo learning helps here: use --extra {advice['recommended_extra']} with this fraction."
+        elif rule["low"] > 0:
+            verdict = "Turbo learning harms here: measure more instead, or use another synthesizer."
+        else:
+            verdict = "The change is not significant: more measured positions are the safer way."
+        texts.append(f"{found} {verdict}")
+    return texts
+
+
+def choice_section(fraction: FractionRecords) -> Section | None:
+    """Return the comparison of the field models, and the gain over the number of further positions."""
+    choice = fraction.mix["choice"]
+    if choice is None:
         return None
     rows = [
         [name, number(db, 1), number(choice["seconds"].get(name), 1)]
@@ -56,29 +67,28 @@ def choice_section(share: Share) -> Section | None:
     table = Table(
         ["synthesizer", "held-out PSNR [dB]", "seconds"],
         rows,
-        "Median over measured spectra that were held out from each candidate.",
+        "Mean over held-out measured spectra, without the lowest and the highest tenth. Neither the fit nor the structure of "
+        "the model depends on them.",
         frozenset({choice["name"]}),
     )
-    text = f"{choice['name']} predicts held-out measured spectra best: {SYNTHESIZERS[choice['name']].meaning}."
-    sentence = advice_sentence(share)
-    plots = [_gain(share, advice)] if advice["gains"] else []
-    paragraphs = [text, *([sentence] if sentence else [])]
-    return Section(f"Which synthesizer, and does it help? ({share.percent} measured)", paragraphs, [table], plots)
+    name = choice["name"]
+    meaning = labels.labels(FIELD_MODELS, labels.FIELD_MODELS, [name])
+    text = f"{name} predicts held-out measured spectra best" + (f": {meaning[name].meaning}." if meaning else ".")
+    plots = [_gain(fraction, *item) for item in advice_of(fraction).items()]
+    title = f"Which synthesizer, and does it help? ({fraction.percent} measured)"
+    return Section(title, [text, *advice_sentences(fraction)], [table], plots)
 
 
-def _gain(share: Share, advice: AdviceMetrics) -> Plot:
+def _gain(fraction: FractionRecords, name: str, advice: AdviceMetrics) -> Plot:
     figure, axes = figures.new_figure(1, 1, 7, 3.2)
-    ax = axes[0]
-    name = share.mix["choice"]["name"] if share.mix["choice"] else ""
-    colour = arms.palette().colour(name)
-    for sampled, line, label in ((False, "-", "most plausible spectra"), (True, "--", "drawn spectra")):
+    ax, colour = axes[0], fraction.palette.colour(name)
+    for sampled, line, label in ((False, "-", "predicted spectra"), (True, "--", "sampled spectra")):
         own = [gain for gain in advice["gains"] if gain["sampled"] == sampled]
         gains = sorted(own, key=lambda gain: gain["extra"])
         if gains:
             at = [0, *(gain["extra"] for gain in gains)]
-            ax.plot(
-                at, [0, *(100 * g["change"] for g in gains)], line, marker="o", markersize=4, color=colour, label=label
-            )
+            change = [0, *(100 * gain["change"] for gain in gains)]
+            ax.plot(at, change, line, marker="o", markersize=4, color=colour, label=label)
             ax.fill_between(at, *_band(gains), color=colour, alpha=0.12, linewidth=0)
     ax.axhline(0, color=figures.RULE, linewidth=1)
     ax.set_xscale("symlog", linthresh=100)
@@ -87,23 +97,23 @@ def _gain(share: Share, advice: AdviceMetrics) -> Plot:
     ax.set(xlabel="further positions with synthetic spectra", ylabel="change of the median error [%]")
     figures.legend_below(figure, ax)
     caption = (
-        f"Measured spectra held out, {advice['stand_in']} trained on the others and on synthetic ones; bands: 95 % "
-        "bootstrap intervals of the change. Below zero turbo learning helps."
+        f"Held-out measured spectra, {advice['stand_in']} trained on the other measured spectra and on spectra by {name}. "
+        "Bands: 95 % bootstrap intervals of the change. Turbo learning helps below zero."
     )
-    return Plot(f"gain-{share.file_name}", figure, caption, DataFrame(advice["gains"]))
+    return Plot(f"gain-{name}-{fraction.file_name}", figure, caption, DataFrame(advice["gains"]))
 
 
 def _band(gains: list[GainMetrics]) -> tuple[list[float], list[float]]:
     return [0, *(100 * gain["low"] for gain in gains)], [0, *(100 * gain["high"] for gain in gains)]
 
 
-def room_section(share: Share) -> Section | None:
-    """The planes that the spectra show, in plan and in space; None where none were sought."""
-    file = share.run.folder / f"geometry-mix{share.key}.json"
+def room_section(fraction: FractionRecords) -> Section | None:
+    """Return the planes of the room, in plan and in space; None if no model searched for them."""
+    file = fraction.run.folder / f"geometry-mix{fraction.key}.json"
     if not file.is_file():
         return None
     room = json.loads(file.read_text())
-    title = f"The room that the spectra show ({share.percent} measured)"
+    title = f"The room that the spectra show ({fraction.percent} measured)"
     if not room["planes"]:
         return Section(title, ["No plane predicts held-out spectra: the direct path is all that was found."])
     rows = [
@@ -124,11 +134,11 @@ def room_section(share: Share) -> Section | None:
     text = (
         f"1 - correlation with spectra held out from the search's first stage: {room['score_held_out']:.3f}; share of the "
         f"spectra's power that the room leaves unexplained: {room['unexplained']:.0%}. The planes stand in "
-        f"geometry-mix{share.key}.json."
+        f"geometry-mix{fraction.key}.json."
     )
-    points = share.run.arrays(f"room-mix{share.key}")
+    points = fraction.run.arrays(f"room-mix{fraction.key}")
     plot = Plot(
-        f"room-{share.file_name}",
+        f"room-{fraction.file_name}",
         _room_figure(room["planes"], points),
         "In plan and in space: the planes (dashed: uncertain), measured positions, the fixed end and its images of first "
         "order. The images of a moving transmitter are those of the array that sees it.",

@@ -1,23 +1,23 @@
-"""What the report says first: three numbers, a picture, what they mean, what to do next."""
+"""Summary of the report: three numbers, a picture, their meaning, next steps."""
 
 from __future__ import annotations
 
-from tasks.aoa import arms
+from tasks.aoa.condition import headline
 from tasks.aoa.estimators import ESTIMATORS
-from tasks.aoa.page.room import advice_sentence
-from tasks.aoa.share import Share
+from tasks.aoa.page.records import FractionRecords
+from tasks.aoa.page.room import advice_sentences
 from tasks.page.page import Number, Plot, Summary
 
 
-def summary(share: Share, picture: Plot) -> Summary:
-    """Of one share."""
-    metrics, mix = share.run.metrics, share.mix
-    error = {name: arm["great_circle_deg"] for name, arm in mix["methods"].items()}
-    turbo = arms.taken(error)
-    lower, upper = error[arms.LOWER.name]["median"], error[arms.UPPER.name]["median"]
+def summary(fraction: FractionRecords, picture: Plot) -> Summary:
+    """Return the summary of one measured fraction."""
+    metrics, mix = fraction.run.metrics, fraction.mix
+    error = {name: method["great_circle_deg"] for name, method in mix["methods"].items()}
+    turbo = headline(fraction.conditions.values()).method
+    lower, upper = error["measured_only"]["median"], error["measured_all"]["median"]
     own, best = error[turbo], min(error, key=lambda name: error[name]["median"])
-    drawn_by = share.drawn_by([turbo])[0]
-    quality = mix["synthesis"][drawn_by]["psnr_db"]
+    synthesizer = fraction.synthesizers([turbo])[0]
+    quality = mix["synthesis"][synthesizer]["psnr_db"]
     numbers = [
         Number(
             f"{own['median']:.2f}\N{DEGREE SIGN}",
@@ -26,42 +26,41 @@ def summary(share: Share, picture: Plot) -> Summary:
         ),
         Number(
             f"{own['median'] / lower - 1:+.0%}".replace("-", "\N{MINUS SIGN}"),
-            f"against {lower:.2f} degrees with the measured share alone; everything measured: {upper:.2f}",
+            f"against {lower:.2f} degrees with the measured fraction alone; everything measured: {upper:.2f}",
         ),
         Number(
             f"{quality['median']:.1f} dB",
-            f"median PSNR of the spectra that {drawn_by} synthesizes where nobody measured",
+            f"median PSNR of the spectra that {synthesizer} predicts at positions without a measurement",
         ),
     ]
     meaning = [
-        f"On {share.run.scene}, {mix['n_measured']} of {metrics['n_train']} training spectra are measured "
-        f"({share.percent}); the spectra at the other positions are synthesized, and the network learns from both. "
-        f"It is tested on {metrics['n_test']} spectra that nothing here has seen.",
-        f"The best of all arms is {best} with a median error of {error[best]['median']:.2f} degrees.",
-        *filter(None, [advice_sentence(share)]),
+        f"On {fraction.run.scene}, {mix['n_measured']} of {metrics['n_train']} training spectra are measured "
+        f"({fraction.percent}); the spectra at the other positions are synthesized, and the network learns from both. "
+        f"It is tested on {metrics['n_test']} spectra that take no part in any fit.",
+        f"The best of all methods is {best} with a median error of {error[best]['median']:.2f} degrees.",
+        *advice_sentences(fraction),
     ]
-    return Summary(numbers, picture, meaning, _next_steps(share, best))
+    return Summary(numbers, picture, meaning, _next_steps(fraction, best))
 
 
-def _next_steps(share: Share, best: str) -> list[str]:
-    metrics, key = share.run.metrics, share.key
+def _next_steps(fraction: FractionRecords, best: str) -> list[str]:
+    metrics, key = fraction.run.metrics, fraction.key
     steps = []
-    if arms.estimator_of(best) != arms.NETWORK:
-        steps.append(
-            f"Use {arms.estimator_of(best)} rather than the network here: it is more accurate and cheaper to train."
-        )
+    if best in fraction.conditions and not fraction.conditions[best].is_network:
+        estimator = fraction.conditions[best].estimator
+        steps.append(f"Use {estimator} rather than the network here: it is more accurate and cheaper to train.")
     if metrics["repeats"] == 1:
         steps.append(
-            "One draw of the measured share proves little: repeat with --repeats 3 before you rely on a difference."
+            "One draw of the measured fraction proves little: repeat with --repeats 3 before you rely on a difference."
         )
     if metrics["split"] == "random" and metrics["data"] != "simulated-room":
         steps.append("Run --split block: it shows the error in a region where nothing was measured.")
-    if (share.run.folder / f"suggested-mix{key}.csv").is_file():
+    if (fraction.run.folder / f"suggested-mix{key}.csv").is_file():
         steps.append(f"Measure next at the positions in suggested-mix{key}.csv; the section below has their map.")
     else:
         steps.append("Ask where to measure next with --suggest 20.")
     files = {
-        file.name.removesuffix(f"-mix{key}.safetensors") for file in share.run.folder.glob(f"*-mix{key}.safetensors")
+        file.name.removesuffix(f"-mix{key}.safetensors") for file in fraction.run.folder.glob(f"*-mix{key}.safetensors")
     }
     estimators = sorted(files & set(ESTIMATORS))
     steps += [

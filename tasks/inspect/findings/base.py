@@ -1,4 +1,4 @@
-"""What is found, in sentences and numbers."""
+"""Findings: sentences and numbers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Level = Literal["is", "warning"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One sentence: what is so, or a warning."""
+    """One sentence: a fact or a warning."""
 
     level: Level
     text: str
@@ -18,17 +18,17 @@ class Finding:
 
 @dataclass
 class Findings:
-    """Sentences and numbers, in the order in which they were found."""
+    """Sentences and numbers, in the order of the checks."""
 
     sentences: list[Finding] = field(default_factory=list)
     numbers: dict[str, Any] = field(default_factory=dict)
 
     def say(self, text: str, **numbers: Any) -> None:
-        """What is so."""
+        """Add a fact."""
         self.sentences.append(Finding("is", text))
         self.numbers |= numbers
 
     def warn(self, text: str, **numbers: Any) -> None:
-        """What may be wrong."""
+        """Add a warning."""
         self.sentences.append(Finding("warning", text))
         self.numbers |= numbers

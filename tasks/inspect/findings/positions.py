@@ -1,4 +1,4 @@
-"""Where was measured, and in which parts."""
+"""Findings on positions and splits."""
 
 from __future__ import annotations
 
@@ -9,26 +9,24 @@ from swiftwrf.data import Rssi, Snapshots, Spectra
 from swiftwrf.positions import distance
 from tasks.inspect.findings.base import Findings
 
-MOST_POSITIONS = 3000  # whose neighbours are looked for at once
-SMOOTH, ROUGH = 0.25, 0.5  # [wavelengths] between neighbours: below, fields are smooth; above, fringes are lost
-WIDE = 1000.0  # [m] beyond which coordinates may be millimetres
+MAX_POSITIONS = 3000  # whose neighbours are searched
+SMOOTH, ROUGH = 0.25, 0.5  # wavelengths between neighbours: below, fields are smooth; above, fringes are lost
+MAX_EXTENT_M = 1000.0  # beyond, coordinates may be millimetres
 
 
 def check_positions(position: Tensor, findings: Findings, wavelength: float | None = None) -> None:
-    """Extent and density of positions (n, 3) [m]; against the wavelength [m], where it is known."""
+    """Report extent and density of positions (n, 3) [m], in wavelengths [m] if the carrier is known."""
     low, high = position.amin(dim=0), position.amax(dim=0)
     extent = (high - low).tolist()
     ranges = ", ".join(
         f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", low.tolist(), high.tolist(), strict=True)
     )
     findings.say(f"{len(position)} positions, {ranges} m.", n=len(position), extent_m=extent)
-    if max(extent) > WIDE:
+    if max(extent) > MAX_EXTENT_M:
         findings.warn(f"Positions extend over {max(extent):.0f} m; are they millimetres? The toolkit takes metres.")
     flat = [axis for axis, size in zip("xyz", extent, strict=True) if size < 1e-9]
     if {"x", "y"} & set(flat):
-        findings.warn(
-            f"All positions have one {' and one '.join(flat)}; directions and planes cannot be told from them."
-        )
+        findings.warn(f"All positions have one {' and one '.join(flat)}; directions and planes are not identifiable.")
     if len(position) < 2:
         return
     _, near = nearest(position)
@@ -53,14 +51,14 @@ def check_positions(position: Tensor, findings: Findings, wavelength: float | No
 
 
 def nearest(position: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows of positions (n, 3), all or, of many, some, and the distance from each to the nearest other one [m]."""
-    some = torch.linspace(0, len(position) - 1, min(MOST_POSITIONS, len(position))).round().long()
+    """Return rows of positions (n, 3), a subset of many, and the distance from each to the nearest other one [m]."""
+    some = torch.linspace(0, len(position) - 1, min(MAX_POSITIONS, len(position))).round().long()
     apart = torch.cat([distance(position[rows], position) for rows in some.split(500)])
     apart[torch.arange(len(some)), some] = torch.inf
     return some, apart.amin(dim=1)
 
 
 def say_splits(data: Spectra | Snapshots | Rssi, findings: Findings) -> None:
-    """The splits that come with the measurements."""
+    """Report the splits that came with the measurements."""
     for name, (train, test) in data.named_splits.items():
         findings.say(f"Split {name}: {len(train)} for training, {len(test)} for testing.")

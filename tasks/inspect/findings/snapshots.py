@@ -1,4 +1,4 @@
-"""What array snapshots hold, and whether the array is calibrated."""
+"""Findings on array snapshots: their size, and whether the array is calibrated."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from swiftwrf.positions import distance
 from tasks.inspect.findings.base import Findings
 from tasks.inspect.findings.positions import ROUGH
 
-HELPS = 0.1  # in the share along the line of sight, that a calibration must gain to be recommended
+MIN_GAIN = 0.1  # of a recommended calibration, in the fraction of the power along the line of sight
 
 
 def check_snapshots(data: Snapshots, findings: Findings) -> None:
-    """What snapshots hold."""
+    """Report number, spacing and times of snapshots."""
     count, elements = data.channel.shape[1:]
     apart = distance(*(2 * [torch.nn.functional.pad(data.array.element, (0, 1))])).fill_diagonal_(torch.inf).amin(dim=1)
     spacing = float(apart.median() / data.array.wavelength)
@@ -40,15 +40,15 @@ def check_snapshots(data: Snapshots, findings: Findings) -> None:
 
 
 def check_calibration(data: Snapshots, findings: Findings) -> None:
-    """Whether the array needs a calibration."""
+    """Report whether the array needs a calibration."""
     try:
         found = calibrate(data)
     except InputError as error:
         findings.say(f"No calibration: {error}.")
         return
-    gain = f"from {found.before:.0%} to {found.after:.0%} of what is heard, at positions held out"
-    text = f"a calibration of phases and orientation brings what comes along the line of sight {gain}"
-    if found.after - found.before >= HELPS:
+    gain = f"from {found.before:.0%} to {found.after:.0%} of the received power, at held-out positions"
+    text = f"a calibration of phases and orientation changes the part along the line of sight {gain}"
+    if found.after - found.before >= MIN_GAIN:
         findings.warn(
             f"The array is not calibrated: {text} (turned by {float(found.turn.rad2deg().norm()):.1f} degrees). Use "
             "python -m tasks.convert SOURCE OUT --calibrate.",

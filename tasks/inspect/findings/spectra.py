@@ -1,4 +1,4 @@
-"""What spectra hold, and whether their frames fit."""
+"""Findings on spectra: their size and range, and whether their frames match."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tasks.inspect.findings.positions import check_positions, say_splits
 
 
 def check_spectra(data: Spectra, findings: Findings) -> None:
-    """What spectra hold."""
+    """Report number, grid, positions and range of spectra."""
     rows, columns = data.grid.shape
     findings.say(
         f"{len(data)} spectra of {rows} elevations x {columns} azimuths; the {data.moving} moves.",
@@ -37,7 +37,7 @@ def check_spectra(data: Spectra, findings: Findings) -> None:
 
 
 def check_peaks(data: Spectra, findings: Findings) -> None:
-    """Whether the peaks of the spectra fit the lines of sight."""
+    """Report whether the peaks of the spectra follow the lines of sight."""
     report = check_frames(data)
     if report is None:
         findings.warn(

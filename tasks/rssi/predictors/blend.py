@@ -2,37 +2,41 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
+from typing import Any
+
 import torch
-from scipy.optimize import linprog
-from scipy.sparse import csr_array, eye_array, hstack, vstack
 from torch import Tensor
 
 from swiftwrf import Rssi
 from swiftwrf.data.splits import folds
-from swiftwrf.rssi import PredictorConfig, RssiFitContext, RssiPredictor
+from swiftwrf.models.base import FieldConfig, Preset
+from swiftwrf.rssi import RssiFitContext, RssiPredictor
+from swiftwrf.rssi.stacking import mixing_weights
 from swiftwrf.runtime.validation import configuration
-from tasks.rssi.predictors.base import PREDICTORS, Preset, make_predictor
-
-MAX_PAIRS = 5000  # that the weights of a blend are found on
+from tasks.rssi.predictors.base import PREDICTORS, make_predictor
 
 
 @configuration
-class BlendConfig(PredictorConfig):
+class BlendConfig(FieldConfig):
     """Options of `Blend`."""
 
     members: tuple[str, ...] = ("swiftwrf", "gp", "knn", "mri_residual")
     """names of the predictors; those whose requirements the data do not meet are left out"""
-    preset: Preset = "quick"
-    """configuration of the members"""
+    member_preset: Preset = "quick"
+    """preset of the members"""
+
+    @classmethod
+    def paper(cls, **changes: Any) -> BlendConfig:
+        """Return a blend of members with published settings."""
+        return replace(cls(member_preset="paper"), **changes)
 
 
 @PREDICTORS.register("blend")
 class Blend(RssiPredictor):
     """A weighted mean of other predictors, weights by cross-validation.
 
-    The weights, the same at all receivers, have the lowest absolute error on held-out training rows (stacking: L. Breiman,
-    "Stacked regressions", Machine Learning 24, 1996).
+    The weights, the same at all receivers, have the lowest mean absolute error on held-out training rows (stacking).
     """
 
     name = "blend"
@@ -51,38 +55,19 @@ class Blend(RssiPredictor):
             position = train.transmitter_position[out]
             for i, name in enumerate(names):
                 held_out[i, out] = self._member(name, train, context, ~out).predict(position).mean.double()
-        detected = ~train.rssi_dbm.isnan()
-        weights = self._weights(held_out[:, detected].T, train.rssi_dbm[detected])
-        self.weights = dict(zip(names, weights, strict=True))
+        self.weights = dict(zip(names, mixing_weights(held_out, train.rssi_dbm).tolist(), strict=True))
         every = torch.ones_like(fold, dtype=torch.bool)
         self._members = {name: self._member(name, train, context, every) for name in names if self.weights[name] > 0}
 
     def _member(self, name: str, train: Rssi, context: RssiFitContext, kept: Tensor) -> RssiPredictor:
         """Return a member, fitted to the kept rows (rows,)."""
         rows = kept.nonzero()[:, 0]
-        member = make_predictor(name, self.config.preset, validation=self.config.validation, seed=self.config.seed)
+        member = make_predictor(
+            name, self.config.member_preset, validation=self.config.validation, seed=self.config.seed
+        )
         return member.fit(
             train.subset(rows), pool=context.pool.subset(rows), device=context.device, parallel=context.parallel
         )
-
-    def _weights(self, predicted: Tensor, measured: Tensor) -> list[float]:
-        """Return non-negative weights of sum 1 for predictions (n, m) of n values, by a linear programme.
-
-        Its variables are the weights and the absolute errors.
-        """
-        some = np.random.default_rng(self.config.seed).permutation(len(measured))[:MAX_PAIRS]
-        matrix, values = csr_array(predicted.numpy()[some]), measured.numpy()[some]
-        n, m = matrix.shape
-        size = eye_array(n)
-        result = linprog(
-            c=np.concatenate([np.zeros(m), np.ones(n)]),
-            A_ub=vstack([hstack([matrix, -size]), hstack([-matrix, -size])]),
-            b_ub=np.concatenate([values, -values]),
-            A_eq=np.concatenate([np.ones(m), np.zeros(n)])[None],
-            b_eq=[1.0],
-        )
-        weight: list[float] = result.x[:m].tolist()
-        return weight
 
     def _predict(self, position: Tensor) -> tuple[Tensor, None]:
         parts = [self.weights[name] * member.predict(position).mean.double() for name, member in self._members.items()]

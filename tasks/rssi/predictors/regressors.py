@@ -69,6 +69,8 @@ class ReceiverRegressors(RssiPredictor):
             self._regressors = side_by_side(fit, residual.numpy().T)
 
     def _predict(self, position: Tensor) -> tuple[Tensor, None]:
+        if not len(position):  # scikit-learn refuses it
+            return torch.zeros(0, len(self._regressors), dtype=torch.float64), None
         x = position.detach().numpy()
         predicted = torch.from_numpy(np.stack([regressor.predict(x) for regressor in self._regressors], axis=1))
         return predicted if self._simpler is None else predicted + self._simpler.predict(position.detach()).mean, None

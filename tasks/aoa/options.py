@@ -1,34 +1,35 @@
-"""The options of python -m tasks.aoa, and what is wrong with them."""
+"""Options of python -m tasks.aoa, and their checks."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from augment import SYNTHESIZERS, lacks
-from augment.suggest import MOST as MOST_SUGGESTED
+from augment.suggest import MAX_SUGGESTIONS
 from swiftwrf import InputError, Spectra
 from swiftwrf.data.raytraced import check_scene, sionna
 from swiftwrf.data.spectra import Moving
 from swiftwrf.metrics import WINDOW
+from swiftwrf.models import FIELD_MODELS
+from tasks.aoa.condition import AUTO, fraction_key
+from tasks.page import labels
 from tasks.run import SEEDS, Preset, choice
 from tasks.source import SpectraSource, reading
 
-AUTO = "auto"  # the synthesizer that suits the scene
-RAYTRACE = "raytrace"  # the synthesizer that takes --scene
-EXTRA = 3000  # further positions unless told otherwise
+RAYTRACE = "raytrace"  # the field model that takes --scene
+DEFAULT_EXTRA = 3000  # further synthetic positions where cross-validation recommends some
 
 
 @dataclass(frozen=True)
 class AoaConfig(SpectraSource):
-    """Angle of arrival with few measured spectra: turbo learning against its bounds and baselines.
+    """Angle of arrival with few measured spectra: turbo learning against its references and baselines.
 
-    Without --data the built-in simulated room is used. An interrupted run goes on with --resume DIR.partial, here or where
-    a --scheduler beside it says.
+    Without --data the built-in simulated room is used. --resume DIR.partial continues an interrupted run, on a cluster with
+    --scheduler.
     """
 
     mix: tuple[float, ...]
-    """measured shares, each in (0, 1]: 0.3 keeps 30 % of the training spectra and synthesizes the others"""
+    """measured fractions, each in (0, 1]: 0.3 keeps 30 % of the training spectra and synthesizes the others"""
     data: str | None = None
     """folder or file of spectra, ray paths or array snapshots, see docs/formats.md"""
     split: str = "random"
@@ -36,39 +37,40 @@ class AoaConfig(SpectraSource):
     synthesizer: Annotated[
         tuple[str, ...],
         choice(
-            f"methods that draw the synthetic spectra; {AUTO} takes the one that predicts held-out measured spectra best",
-            SYNTHESIZERS,
+            f"field models of the synthetic spectra; {AUTO} chooses the one that predicts held-out measured spectra best",
+            FIELD_MODELS,
+            labels.FIELD_MODELS,
         ),
     ] = (AUTO,)
     scene: str | None = None
-    """room of tasks.scenes or Mitsuba scene (FILE.xml) that synthesizer raytrace traces, in the coordinates of the data
-    (default: the room that it finds from the spectra)"""
+    """room of tasks.scenes or Mitsuba scene (FILE.xml) for --synthesizer raytrace, in the coordinates of the data (default:
+    the room that it estimates from the spectra)"""
     extra: int | None = None
-    """further positions in the region of the measured ones at which spectra are synthesized, too (default: 3000 where
-    held-out measured spectra gain from them, else none)"""
+    """number of further synthetic positions in the region of the measured ones (default: 3000 if cross-validation on the
+    measured spectra shows a gain, else none)"""
     suggest: int = 0
-    """also say where to measure next: so many positions that lower the uncertainty over the region most"""
+    """number of positions to suggest for the next measurements, those that reduce the uncertainty over the region most"""
     moving: Moving | None = None
     """which end moves in the built-in room (default: transmitter)"""
     preset: Preset = "quick"
     """quick: sized for a CPU; paper: the paper's model and a long training, for a GPU"""
     repeats: int = 1
-    """runs with different random shares and networks, pooled"""
+    """runs with different measured spectra and networks, pooled"""
     scheduler: str | None = None
     """address of a Dask scheduler whose workers compute the steps of the run (extra: cluster)"""
     seed: int = 0
-    """of everything random"""
+    """seed of everything random"""
     out: str | None = None
     """directory of the run; must not exist (default: a new one under runs/aoa)"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """where to compute"""
+    """device to compute on"""
 
 
 def check(config: AoaConfig) -> None:
-    """Refuses what makes no sense whatever the data.
+    """Refuse options that are wrong whatever the data.
 
     Raises:
-        InputError: such an option.
+        InputError: The first such option.
     """
     if not config.synthesizer:
         raise InputError("--synthesizer takes at least one name")
@@ -76,29 +78,31 @@ def check(config: AoaConfig) -> None:
         raise InputError(f"--synthesizer takes {AUTO} or names, not both: {' '.join(config.synthesizer)}")
     for name in config.synthesizer:
         if name != AUTO:
-            SYNTHESIZERS[name]  # refuses an unknown one
+            FIELD_MODELS[name]  # refuses an unknown name
     if RAYTRACE in config.synthesizer:
         sionna()  # refuses before anything is computed
     if config.scene is not None:
         _check_scene(config.scene, config.synthesizer)
     if config.extra is not None and config.extra < 0:
         raise InputError(f"--extra takes a number of positions, got {config.extra}")
-    if not 0 <= config.suggest <= MOST_SUGGESTED:
-        raise InputError(f"--suggest takes 0 to {MOST_SUGGESTED} positions, got {config.suggest}")
+    if not 0 <= config.suggest <= MAX_SUGGESTIONS:
+        raise InputError(f"--suggest takes 0 to {MAX_SUGGESTIONS} positions, got {config.suggest}")
     if config.moving is not None and config.data is not None:
         raise InputError("--moving is for the built-in room; with --data the data say which end moves")
-    if not config.mix or not all(0 < share <= 1 for share in config.mix):
-        raise InputError(
-            f"--mix takes measured shares in (0, 1], got {' '.join(f'{s:g}' for s in config.mix) or 'none'}"
-        )
+    if not config.mix or not all(0 < fraction <= 1 for fraction in config.mix):
+        raise InputError(f"--mix takes measured fractions in (0, 1], got {_listed(config.mix) or 'none'}")
     if len(set(config.mix)) < len(config.mix):
-        raise InputError(f"--mix names a share twice: {' '.join(f'{s:g}' for s in config.mix)}")
+        raise InputError(f"--mix names a fraction twice: {_listed(config.mix)}")
     if reading(config).given and config.data is None:
         raise InputError(f"--{reading(config).given[0]} says how --data is read; give it with --data")
     if config.repeats < 1:
         raise InputError(f"--repeats must be at least 1, got {config.repeats}")
     if config.seed + config.repeats > SEEDS:
         raise InputError(f"--seed {config.seed} leaves no seeds for {config.repeats} repeats; choose a smaller one")
+
+
+def _listed(fractions: tuple[float, ...]) -> str:
+    return " ".join(map(fraction_key, fractions))
 
 
 def _check_scene(scene: str, synthesizers: tuple[str, ...]) -> None:
@@ -108,31 +112,31 @@ def _check_scene(scene: str, synthesizers: tuple[str, ...]) -> None:
 
 
 def check_data(data: Spectra, config: AoaConfig) -> None:
-    """Refuses data that what is asked for cannot work with.
+    """Refuse data that do not meet the requirements of the options.
 
     Raises:
-        InputError: spectra too small to be compared; a synthesizer needs the array, and neither data nor command line
-            describe it.
+        InputError: Spectra too small to compute their SSIM, or a field model needs the array or the fixed end, and neither
+            data nor command line describe it.
     """
     if min(data.grid.shape) < WINDOW:
         raise InputError(
-            f"spectra of {data.name} have {data.grid.shape[0]} x {data.grid.shape[1]} pixels; SSIM, by which they are "
-            f"learnt and judged, needs at least {WINDOW} x {WINDOW}"
+            f"spectra of {data.name} have {data.grid.shape[0]} x {data.grid.shape[1]} pixels; SSIM, the measure "
+            f"of their quality, needs at least {WINDOW} x {WINDOW}"
         )
     for name in config.synthesizer:
-        missing = [] if name == AUTO else lacks(name, data)
+        missing = [] if name == AUTO else FIELD_MODELS[name].lacking(data)
         if missing:
             hint = "give it with --array" if "array" in missing else "the data must say where it stands"
             raise InputError(f"synthesizer {name} needs the {missing[0]}, which {data.name} does not describe; {hint}")
 
 
-def further_positions(data: Spectra, config: AoaConfig) -> int:
-    """How many further positions are synthesized at.
+def n_synthetic(data: Spectra, config: AoaConfig) -> int:
+    """Return the largest number of further synthetic positions.
 
     Raises:
-        InputError: some were asked for, but the directions there are unknown.
+        InputError: --extra asks for some, but the direction at other positions is unknown.
     """
     if config.extra:
-        data.direction_at(data.position[:1])  # refuses
+        data.direction_at(data.position[:1])  # refuses unknown geometry
     known = data.fixed_position is not None and data.rotation is not None
-    return config.extra if config.extra is not None else EXTRA if known else 0
+    return config.extra if config.extra is not None else DEFAULT_EXTRA if known else 0

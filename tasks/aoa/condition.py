@@ -1,0 +1,208 @@
+"""Conditions of the experiment: which estimator is trained on which spectra. They are the key of every result."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from typing import Any, Literal, TypeVar, get_args
+
+from swiftwrf.models import FIELD_MODELS
+from tasks.aoa.estimators import ESTIMATORS
+from tasks.page import labels
+from tasks.run import Row
+
+Training = Literal["measured", "turbo", "turbo_extra", "all"]
+NETWORK = "aann"  # estimator of the paper; names of its conditions omit it
+AUTO = "auto"  # --synthesizer: the field model that cross-validation chooses
+Value = TypeVar("Value")
+
+
+def fraction_key(fraction: float) -> str:
+    """Return the shortest text that reads back as the same number, for keys and file names.
+
+    Example:
+        >>> fraction_key(0.3), fraction_key(1.0), fraction_key(0.6666667)
+        ('0.3', '1', '0.6666667')
+    """
+    short = f"{fraction:g}"
+    return short if float(short) == fraction else repr(fraction)
+
+
+@dataclass(frozen=True)
+class MeasuredSubset:
+    """A random part of the training spectra that counts as measured.
+
+    Args:
+        measured_fraction: Fraction of the training spectra, in (0, 1].
+        repeat: Number of the repeat, which has its own seed.
+    """
+
+    measured_fraction: float
+    repeat: int = 0
+
+    def __str__(self) -> str:
+        return f"mix{self.key}-r{self.repeat}"
+
+    @property
+    def key(self) -> str:
+        """Measured fraction in metrics.json and in file names."""
+        return fraction_key(self.measured_fraction)
+
+    @property
+    def columns(self) -> Row:
+        """Columns of the result tables."""
+        return {"measured_fraction": self.measured_fraction, "repeat": self.repeat}
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One estimator on one training set.
+
+    Args:
+        estimator: Name of the estimator.
+        training: Training set. "measured": the measured spectra. "turbo": these and synthetic spectra at the withheld
+            positions. "turbo_extra": these and synthetic spectra at further positions. "all": all spectra, measured.
+        synthesizer: Name of the field model of the synthetic spectra, empty without any.
+        n_synthetic: Number of further synthetic positions.
+        measured_fraction: Fraction of the training spectra that is measured.
+        repeat: Number of the repeat.
+
+    Example:
+        >>> Condition("kernel_ridge", "turbo_extra", "hybrid", 3000).method
+        'kernel_ridge_turbo_hybrid_extra'
+    """
+
+    estimator: str
+    training: Training
+    synthesizer: str = ""
+    n_synthetic: int = 0
+    measured_fraction: float = 1.0
+    repeat: int = 0
+
+    @property
+    def training_set(self) -> str:
+        """Name of the training set in metrics.json and in reports."""
+        match self.training:
+            case "measured":
+                return "measured_only"
+            case "all":
+                return "measured_all"
+            case "turbo":
+                return f"turbo_{self.synthesizer}"
+            case "turbo_extra":
+                return f"turbo_{self.synthesizer}_extra"
+
+    @property
+    def method(self) -> str:
+        """Name of the condition in metrics.json and in reports, the same for all fractions and repeats."""
+        if self.estimator == NETWORK:
+            return self.training_set
+        return self.estimator if self.training == "measured" else f"{self.estimator}_{self.training_set}"
+
+    @property
+    def is_turbo(self) -> bool:
+        """Whether synthetic spectra are part of the training set."""
+        return bool(self.synthesizer)
+
+    @property
+    def is_network(self) -> bool:
+        """Whether the estimator is the network."""
+        return self.estimator == NETWORK
+
+    @property
+    def columns(self) -> Row:
+        """Columns of the result tables."""
+        return asdict(self) | {"method": self.method}
+
+    @property
+    def description(self) -> Row:
+        """Columns that do not depend on measured fraction and repeat, for metrics.json."""
+        return {name: getattr(self, name) for name in DESCRIPTION}
+
+
+DESCRIPTION = ("estimator", "training", "synthesizer", "n_synthetic")
+
+
+def trainable() -> list[str]:
+    """Return the names of the estimators that improve with the number of training spectra, the network first."""
+    names = [name for name, estimator in ESTIMATORS.items() if estimator.trainable]
+    return sorted(names, key=lambda name: name != NETWORK)
+
+
+def conditions_of(methods: Mapping[str, Mapping[str, Any]]) -> dict[str, Condition]:
+    """Return the condition of each method of metrics.json.
+
+    Older runs do not store the condition. There a method is found by its name among those of all registered estimators and
+    field models; other methods are left out.
+    """
+    known: dict[str, Condition] = {}
+    if any("estimator" not in entry for entry in methods.values()):
+        for estimator, training in product(ESTIMATORS, get_args(Training)):
+            for synthesizer in ("",) if training in ("measured", "all") else (*FIELD_MODELS, AUTO):
+                condition = Condition(estimator, training, synthesizer)
+                known[condition.method] = condition
+    found = {}
+    for method, entry in methods.items():
+        if "estimator" in entry:
+            found[method] = Condition(**{name: entry[name] for name in DESCRIPTION})
+        elif method in known:
+            found[method] = known[method]
+    return found
+
+
+def headline(conditions: Iterable[Condition]) -> Condition:
+    """Return the condition that a user would choose: the network with all spectra of the first field model.
+
+    Errors on test spectra are not considered: the best of several would be too optimistic.
+
+    Raises:
+        ValueError: No network was trained with synthetic spectra.
+    """
+    return max((c for c in conditions if c.is_turbo and c.is_network), key=lambda c: c.training == "turbo_extra")
+
+
+def pooled(results: list[tuple[Condition, Value]], auto: bool) -> list[tuple[Condition, Value]]:
+    """Return results such that every condition with synthetic spectra has all repeats of its measured fraction.
+
+    A repeat stands for a user, who chooses a field model and the number of further positions by cross-validation. Where
+    repeats chose differently, the choices of all repeats become one condition.
+
+    Args:
+        results: Results by condition.
+        auto: Whether the repeats choose their field model. Their choices then become the condition `turbo_auto`. Otherwise
+            `turbo_NAME_extra` contains the result without further positions of those repeats that were advised against them.
+    """
+    trainings: dict[float, dict[int, set[tuple[str, str]]]] = {}
+    for condition, _ in results:
+        if condition.is_turbo:
+            repeats = trainings.setdefault(condition.measured_fraction, {})
+            repeats.setdefault(condition.repeat, set()).add((condition.synthesizer, condition.training))
+    found: list[tuple[Condition, Value]] = []
+    for condition, value in results:
+        repeats = trainings.get(condition.measured_fraction, {})
+        if not condition.is_turbo or len({frozenset(names) for names in repeats.values()}) == 1:
+            found.append((condition, value))
+            continue
+        own, extra = repeats[condition.repeat], (condition.synthesizer, "turbo_extra")
+        if auto:
+            if condition.training == "turbo_extra" or not any(training == "turbo_extra" for _, training in own):
+                found.append((replace(condition, training="turbo", synthesizer=AUTO), value))
+            continue
+        found.append((condition, value))
+        if extra not in own and any(extra in others for others in repeats.values()):
+            found.append((replace(condition, training="turbo_extra"), value))
+    return found
+
+
+def terms() -> dict[str, str]:
+    """Return what the parts of the names of methods mean."""
+    return {
+        "measured_only": "lower reference: trained on the measured spectra alone",
+        "measured_all": "upper reference: trained on all training spectra, measured",
+        "turbo_NAME": "trained on the measured spectra and on spectra that NAME predicts at the withheld positions",
+        "turbo_NAME_extra": "turbo_NAME with synthetic spectra at further positions, their number by --extra",
+        "turbo_auto": "the choice of each repeat by cross-validation, where repeats chose differently",
+        **{name: label.meaning for name, label in labels.labels(ESTIMATORS, labels.ESTIMATORS).items()},
+        "no estimator's name": f"the network ({NETWORK}); the name of another estimator alone: trained on measured spectra",
+    }

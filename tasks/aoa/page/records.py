@@ -1,0 +1,137 @@
+"""One measured fraction of one run, as the report shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+from pandas import DataFrame
+
+from swiftwrf.models import FIELD_MODELS
+from tasks.aoa.condition import AUTO, Condition, conditions_of, fraction_key
+from tasks.metrics import AoaMetrics, MixMetrics
+from tasks.page import labels
+from tasks.page.palette import Palette
+from tasks.page.records import Records
+
+AoaRecords = Records[AoaMetrics]
+LOWER_REFERENCE, UPPER_REFERENCE, CHOSEN = (
+    "#ee6677",
+    "#228833",
+    "#332288",
+)  # colours of conditions without a field model
+
+
+@dataclass(frozen=True)
+class FractionRecords:
+    """One measured fraction of one run.
+
+    Args:
+        run: Records of the run.
+        key: Measured fraction in metrics.json and in file names.
+    """
+
+    run: AoaRecords
+    key: str
+
+    @classmethod
+    def of(cls, run: AoaRecords) -> list[FractionRecords]:
+        """Return all measured fractions of a run."""
+        return [cls(run, key) for key in run.metrics["mixes"]]
+
+    @property
+    def mix(self) -> MixMetrics:
+        """Metrics of the measured fraction."""
+        return self.run.metrics["mixes"][self.key]
+
+    @cached_property
+    def conditions(self) -> dict[str, Condition]:
+        """Condition of each method."""
+        return conditions_of(self.mix["methods"])
+
+    @property
+    def in_overviews(self) -> list[str]:
+        """Methods of overviews: networks, and other estimators on the measured spectra. More would hide each other."""
+        return [name for name, c in self.conditions.items() if c.is_network or c.training == "measured"]
+
+    def table(self, name: str) -> DataFrame:
+        """Return the rows of a table of the run, e.g. `errors`, with this measured fraction."""
+        return of_fraction(self.run.table(name), self.key)
+
+    def synthesizers(self, methods: Iterable[str]) -> list[str]:
+        """Return the field models behind these methods, that of the first repeat where repeats chose differently."""
+        found = dict.fromkeys(self.conditions[name].synthesizer for name in methods if name in self.conditions)
+        choice = self.mix["choice"]
+        return [name for name in found if name not in ("", AUTO)] or ([choice["name"]] if choice else [])
+
+    @property
+    def percent(self) -> str:
+        """The measured fraction in percent."""
+        return f"{float(self.key):.0%}"
+
+    @property
+    def file_name(self) -> str:
+        """Last part of the names of its figures."""
+        return f"mix{self.key}-{self.run.file_name}"
+
+    @property
+    def title(self) -> str:
+        """The measured fraction, and the number of the run if there are several."""
+        return f"{self.percent} measured{self.run.label}"
+
+    @property
+    def palette(self) -> Palette:
+        """Colours of its field models and conditions."""
+        return palette(self.conditions.values())
+
+
+def of_fraction(table: DataFrame, key: str) -> DataFrame:
+    """Return the rows of a measured fraction. Older runs call the column `mix`."""
+    column = table["measured_fraction" if "measured_fraction" in table else "mix"]
+    return table[[fraction_key(float(text)) == key for text in column]]
+
+
+def palette(conditions: Iterable[Condition]) -> Palette:
+    """Return colours of all field models and of these conditions.
+
+    Conditions without the network are dashed, those with further positions are darker.
+    """
+    models = Palette.of(labels.labels(FIELD_MODELS, labels.FIELD_MODELS))
+    estimators = Palette.of(labels.ESTIMATORS)
+    colours, dashed = dict(models.colours), set()
+    for condition in conditions:
+        match condition.training:
+            case "measured" if condition.is_network:
+                colour = LOWER_REFERENCE
+            case "measured":
+                colour = estimators.colour(condition.estimator)
+            case "all":
+                colour = UPPER_REFERENCE
+            case _:
+                colour = CHOSEN if condition.synthesizer == AUTO else models.colour(condition.synthesizer)
+        colours[condition.method] = _darker(colour) if condition.training == "turbo_extra" else colour
+        if not condition.is_network:
+            dashed.add(condition.method)
+    return Palette(colours, frozenset(dashed))
+
+
+def _darker(colour: str) -> str:
+    return "#" + "".join(f"{int(int(colour[i : i + 2], 16) * 0.7):02x}" for i in (1, 3, 5))
+
+
+def first_history(run: AoaRecords) -> DataFrame:
+    """Return the history of every training and fit of the first measured fraction and repeat."""
+    history = run.table("history")
+    if not len(history):
+        return history
+    return of_fraction(history[history["repeat"] == 0], next(iter(run.metrics["mixes"])))
+
+
+def fits(run: AoaRecords) -> tuple[DataFrame, DataFrame]:
+    """Return the history of the SwiftWRF fits of the first measured fraction: all sizes of the search, the final fit."""
+    history = first_history(run)
+    if "n_primitives" not in history:
+        return history.iloc[:0].assign(steps=0), history.iloc[:0].assign(steps=0)
+    own = history[(history["synthesizer"] == "swiftwrf") & history["stage"].notna()]
+    return own[own["stage"] == "search"], own[own["stage"] == "final"]

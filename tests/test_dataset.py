@@ -1,0 +1,265 @@
+"""Data sets from arrays and tables: what they compute, print and refuse; readers from other packages."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import math
+import os
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from swiftwrf import (
+    AngularGrid,
+    ArrayPose,
+    InputError,
+    Rssi,
+    Snapshots,
+    Spectra,
+    load_spectra,
+    rssi_room,
+    simulated_room,
+)
+from swiftwrf.array import planar
+from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data import load_snapshots
+from swiftwrf.data.formats import SPECTRA_FORMATS
+from swiftwrf.data.raytraced import Tracing
+from swiftwrf.data.simulated.room import ShoeboxRoom
+from swiftwrf.data.splits import folds
+from swiftwrf.runtime import cache, durable
+
+ROOM = simulated_room(n=24, grid=AngularGrid.hemisphere(9, 36))
+FACING_X = ArrayPose((0.1, 2.4, 1.2), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)))
+CONVERTED = {
+    "tensors": lambda t: t,
+    "arrays": lambda t: t.numpy(),
+    "lists": lambda t: t.tolist(),
+}
+
+
+@pytest.mark.parametrize("kind", CONVERTED)
+def test_spectra_from_arrays_are_those_of_the_room(kind):
+    to = CONVERTED[kind]
+    data = Spectra(to(ROOM.spectrum), to(ROOM.position), array=ROOM.array, pose=FACING_X, name="own")
+    torch.testing.assert_close(data.spectrum, ROOM.spectrum)
+    torch.testing.assert_close(data.label, ROOM.label)
+    assert torch.equal(data.fixed_position, ROOM.fixed_position)
+    assert (data.grid, data.moving, len(data.split()[0])) == (ROOM.grid, "transmitter", 19)
+    assert torch.equal(data.index, torch.arange(24))
+    assert data.line_of_sight.all()
+
+
+def test_the_pose_of_a_moving_array_is_its_orientation():
+    room = simulated_room(n=12, moving="receiver", grid=ROOM.grid)
+    level = ArrayPose((0.0, 0.0, 0.0))
+    data = Spectra(room.spectrum, room.position, pose=level, moving="receiver", fixed_position=(3.0, 2.5, 2.7))
+    torch.testing.assert_close(data.label, room.label)
+    unknown = Spectra(room.spectrum, room.position, pose=level, moving="receiver")
+    assert unknown.label.isnan().all()
+    with pytest.raises(InputError, match="direction at synthetic positions is unknown"):
+        unknown.direction_at(room.position)
+
+
+def test_bytes_of_images_count_255_as_1():
+    data = Spectra((255 * ROOM.spectrum).round().byte().numpy(), ROOM.position.float())
+    assert data.store.values.dtype == torch.uint8
+    torch.testing.assert_close(data.spectrum, ROOM.spectrum, rtol=0, atol=0.5 / 255)
+
+
+def test_snapshots_from_arrays():
+    array = PlanarArray.grid(2, 2, 0.06, 2.4e9)
+    channel = torch.polar(torch.ones(20, 4), torch.rand(20, 4)).numpy()
+    data = Snapshots(channel, torch.rand(20, 3), array=array, pose=FACING_X, time=range(20))
+    assert data.channel.shape == (20, 1, 4)
+    spectra = data.spectra(ROOM.grid)
+    torch.testing.assert_close(spectra.label, spectra.direction_at(data.position))
+    assert data.subset(torch.tensor([3, 1])).time.tolist() == [3, 1]
+    assert repr(data).startswith(
+        "<Snapshots 'snapshots': 20 channels of 1 snapshots, 4 elements at 2.4 GHz, positions over"
+    )
+
+
+NAN_POSITION = ROOM.position.where(torch.arange(24)[:, None] != 3, torch.nan)
+WRONG = {
+    "other number of positions": (lambda: Spectra(ROOM.spectrum, ROOM.position[:5]), "5 positions, but store has 24"),
+    "flat spectra": (lambda: Spectra(ROOM.spectrum[0], ROOM.position), r"spectra must have shape \(n, n, n\)"),
+    "decibels": (lambda: Spectra(-20 * ROOM.spectrum, ROOM.position), r"magnitudes in \[0, 1\]"),
+    "a spectrum is nan": (lambda: Spectra(ROOM.spectrum * torch.nan, ROOM.position), "spectra must be finite; row 0"),
+    "a position is nan": (lambda: Spectra(ROOM.spectrum, NAN_POSITION), "position must be finite; row 3"),
+    "positions in a plane": (
+        lambda: Spectra(ROOM.spectrum, ROOM.position[:, :2]),
+        r"position must have shape \(n, 3\)",
+    ),
+    "text": (lambda: Spectra(ROOM.spectrum, [["a", "b", "c"]] * 24), "position must be numbers"),
+    "labels of others": (lambda: replace(ROOM, label=ROOM.label[:7]), "label has 7 rows"),
+    "labels of one angle": (
+        lambda: Spectra(ROOM.spectrum, ROOM.position, label=ROOM.label[:, 0]),
+        "label must have shape",
+    ),
+    "visibility of others": (lambda: replace(ROOM, line_of_sight=torch.ones(3)), "line_of_sight has 3 rows"),
+    "another end": (
+        lambda: Spectra(ROOM.spectrum, ROOM.position, moving="reciever"),
+        "moving must be 'transmitter' or",
+    ),
+    "another grid": (
+        lambda: Spectra(ROOM.spectrum, ROOM.position, grid=AngularGrid.hemisphere(9, 30)),
+        "do not fit a grid",
+    ),
+    "pose twice": (
+        lambda: Spectra(ROOM.spectrum, ROOM.position, pose=FACING_X, fixed_position=(0, 0, 0)),
+        "leave them out",
+    ),
+    "at the array": (
+        lambda: Spectra(ROOM.spectrum, ROOM.position, pose=ArrayPose(tuple(ROOM.position[2].tolist()))),
+        "position 2 is that of the fixed end",
+    ),
+    "a field of others": (lambda: Spectra(ROOM.spectrum, ROOM.position, colour="red"), "Spectra has no colour"),
+    "no positions": (lambda: Spectra(ROOM.spectrum), "spectra and their positions"),
+    "a split of others": (
+        lambda: replace(ROOM, named_splits={"day": (torch.arange(20), torch.tensor([24]))}),
+        "split 'day' .* outside 0 to 23",
+    ),
+    "no pose": (
+        lambda: Snapshots(torch.ones(5, 4).cfloat(), torch.rand(5, 3), array=PlanarArray.square(2, 1e9)),
+        "needs the pose",
+    ),
+    "other elements": (
+        lambda: Snapshots(torch.ones(5, 3).cfloat(), torch.rand(5, 3), array=PlanarArray.square(2, 1e9), pose=FACING_X),
+        r"channel must have shape \(5, n, 4\)",
+    ),
+    "infinite RSSI": (lambda: Rssi([[-math.inf]], [[0, 0, 0]]), "RSSI must be finite"),
+    "RSSI of others": (lambda: Rssi([[-50.0]] * 3, torch.rand(4, 3)), "4 positions, but rssi_dbm has 3 rows"),
+    "one name for two": (
+        lambda: Rssi([[-50.0, -60]], [[0, 0, 0]], receiver_names=["a", "a"]),
+        "2 receivers, but the names",
+    ),
+    "some places": (
+        lambda: Rssi([[-50.0, -60]], [[0, 0, 0]], receiver_position=[[0, 0, 0], [math.nan] * 3]),
+        "or nan for all",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_refuses_arrays(name):
+    make, says = WRONG[name]
+    with pytest.raises(InputError, match=says):
+        make()
+
+
+def test_rssi_from_a_table_and_back():
+    data = rssi_room(n=30)
+    places = dict(zip(data.receiver_names, data.receiver_position.tolist(), strict=True))
+    back = Rssi.from_frame(data.to_frame(), receiver_position=places)
+    assert back.receiver_names == data.receiver_names
+    assert torch.equal(back.rssi_dbm.nan_to_num(), data.rssi_dbm.nan_to_num())
+    assert torch.equal(back.transmitter_position, data.transmitter_position)
+    assert torch.equal(back.receiver_position, data.receiver_position)
+    with pytest.raises(InputError, match="receiver_position lacks receiver02"):
+        Rssi.from_frame(data.to_frame(), receiver_position={"receiver01": (0, 0, 0)})
+    long = pd.DataFrame({"x": [0, 0, 1], "y": 0, "z": 1, "receiver": ["a", "b", "a"], "rssi": [-50, -60, -70]})
+    assert Rssi.from_frame(long).rssi_dbm.nan_to_num(0).tolist() == [[-50, -60], [-70, 0]]
+    with pytest.raises(InputError, match="the table row 2, receiver a: 40 dBm"):
+        Rssi.from_frame(pd.DataFrame({"x": [0, 1, 2], "y": 0, "a": [-50, 40, -60]}))
+
+
+def test_tables_and_one_line_of_a_data_set():
+    frame = ROOM.subset(torch.tensor([5, 2])).to_frame()
+    assert frame.index.tolist() == [5, 2]
+    assert list(frame) == ["x_m", "y_m", "z_m", "azimuth_deg", "elevation_deg", "line_of_sight"]
+    assert frame.loc[2, "azimuth_deg"] == pytest.approx(math.degrees(ROOM.label[2, 0]))
+    assert repr(ROOM) == (
+        "<Spectra 'simulated-room': 24 spectra of 9 x 36 directions, 16 elements at 0.915 GHz, moving transmitter, "
+        f"positions over {' x '.join(f'{s:.2f}' for s in np.ptp(ROOM.position.numpy(), axis=0))} m>"
+    )
+    assert "30 rows at 12 receivers" in repr(rssi_room(n=30))
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: simulated_room(moving="reciever"), "moving must be"),
+        (lambda: simulated_room(n=0), "n must be a whole number at least 1"),
+        (lambda: simulated_room(phase_noise=-1.0), "phase_noise must be"),
+        (lambda: rssi_room(n=-1), "n must be"),
+        (lambda: folds(ROOM.position, "blok", 0), "validation must be 'random' or 'block'"),
+        (lambda: load_spectra("x", every=0), "every must be"),
+        (lambda: load_snapshots("x", station=-1), "station must be"),
+        (lambda: Tracing(order=-1), "order must be"),
+        (lambda: ShoeboxRoom(size=(0.0, 1.0, 1.0)), "size must be"),
+    ],
+)
+def test_declared_ranges_are_checked(call, says):
+    with pytest.raises(InputError, match=says):
+        call()
+
+
+READER = """
+import torch
+from swiftwrf import Spectra
+from swiftwrf.data.formats import Format
+
+class Saved(Format):
+    def recognises(self, path):
+        return path.suffix == ".pt"
+    def read(self, path, options):
+        content = torch.load(path, weights_only=True)
+        return Spectra(content["spectra"], content["position"], name=path.stem)
+"""
+
+
+def test_a_reader_comes_from_another_package(tmp_path, monkeypatch):
+    (tmp_path / "saved_reader.py").write_text(READER)
+    described = tmp_path / "saved_reader-1.0.dist-info"
+    described.mkdir()
+    (described / "METADATA").write_text("Metadata-Version: 2.1\nName: saved-reader\nVersion: 1.0\n")
+    (described / "entry_points.txt").write_text("[swiftwrf.readers.spectra]\nsaved = saved_reader:Saved\n")
+    torch.save({"spectra": ROOM.spectrum, "position": ROOM.position}, tmp_path / "room.pt")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(SPECTRA_FORMATS, "_registered", dict(SPECTRA_FORMATS._registered))
+    importlib.invalidate_caches()
+    data = load_spectra(tmp_path / "room.pt")
+    torch.testing.assert_close(data.spectrum, ROOM.spectrum)
+    assert "saved" in SPECTRA_FORMATS
+    with pytest.raises(InputError, match="read as saved, which takes no grid"):
+        load_spectra(tmp_path / "room.pt", grid=ROOM.grid)
+
+
+def test_what_is_cached_is_bounded_in_bytes(monkeypatch):
+    array, made = PlanarArray.square(2, 1e9), []
+    monkeypatch.setattr(cache, "MAX_CACHE_BYTES", 100_000)
+
+    @cache.cached_tensors
+    def basis(array, grid):
+        made.append(grid)
+        return planar.basis.__wrapped__(array, grid)
+
+    small, other, large = (AngularGrid.hemisphere(n, 4 * n) for n in (10, 12, 40))
+    assert basis(array, small) is basis(array, small)
+    basis(array, other)  # 41 and 29 kB
+    assert basis(array, small) is basis(array, small)
+    basis(array, large)
+    basis(array, large)  # too large to be kept
+    assert made == [small, other, large, large]
+    assert basis(array, AngularGrid.hemisphere(11, 44)) is not None
+    basis(array, other)  # the least recently used one made room
+    assert made[4:] == [AngularGrid.hemisphere(11, 44), other]
+
+
+@pytest.mark.parametrize(("code", "ignored"), [(errno.EINVAL, True), (errno.ENOTSUP, True), (errno.EIO, False)])
+def test_file_systems_that_cannot_sync_a_directory(tmp_path, monkeypatch, code, ignored):
+    def fsync(descriptor):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    if ignored:
+        durable.write_text(tmp_path / "a", "text")
+        assert (tmp_path / "a").read_text() == "text"
+    else:
+        with pytest.raises(OSError, match=os.strerror(code)):
+            durable.write_text(tmp_path / "a", "text")
