@@ -59,7 +59,9 @@ class ResidualDistribution:
             total = 0.0
             for number in range(FOLDS):
                 root = _root(residual[fold != number], size, *setting)
-                distance = torch.linalg.solve_triangular(root, residual[fold == number].T, upper=False).square().sum(dim=0)
+                distance = (
+                    torch.linalg.solve_triangular(root, residual[fold == number].T, upper=False).square().sum(dim=0)
+                )
                 density = _log_density(distance, len(root), setting[1]) - root.diagonal().log().sum()
                 total += float(density.sum())
             return total

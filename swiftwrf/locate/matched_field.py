@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import to_angles, to_direction
+from swiftwrf.array.planar import differences
 from swiftwrf.data.spectra import Spectra, check_training, direction_of_link
 from swiftwrf.errors import InputError
-from swiftwrf.gp import thinned
+from swiftwrf.gp import GaussianProcess, thinned
 from swiftwrf.locate.pool import pooled_weights
 from swiftwrf.locate.posterior import Posterior, normalised
 from swiftwrf.locate.region import Cells, Region, outside_mass
@@ -30,6 +31,7 @@ from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.path_gains import PathGains, fit_path_gains, prior
+from swiftwrf.runtime.checkpoint import Header, Saved, expect
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
 FOLDS = 5
@@ -68,7 +70,7 @@ class _Fit:
     statistics: PathStatistics
 
 
-class MatchedField:
+class MatchedField(Saved):
     """Posterior over the position of the moving end, given a spectrum.
 
     Three likelihoods are pooled: co-array numbers predicted by constant path gains, by position-dependent path gains, and
@@ -149,7 +151,9 @@ class MatchedField:
         self.likelihoods = self._likelihoods(self._fit)
         self._whitened = self.likelihoods[0].whitened(self.cells.position)
 
-    def _likelihoods(self, fit: _Fit, kept: Tensor | None = None) -> tuple[CoarrayLikelihood, CoarrayLikelihood, PhaseLikelihood]:
+    def _likelihoods(
+        self, fit: _Fit, kept: Tensor | None = None
+    ) -> tuple[CoarrayLikelihood, CoarrayLikelihood, PhaseLikelihood]:
         residual = self.residual if kept is None else self.residual[:, kept]
         return (
             CoarrayLikelihood(room_features(fit.room), residual[0], self.observed_power),
@@ -166,7 +170,9 @@ class MatchedField:
             if not len(rows):
                 continue
             likelihoods, observed = self._likelihoods(part, fold != number), features.subset(rows)
-            truth.append(torch.stack([one.log_likelihood(position[rows][:, None], observed)[:, 0] for one in likelihoods]))
+            truth.append(
+                torch.stack([one.log_likelihood(position[rows][:, None], observed)[:, 0] for one in likelihoods])
+            )
             for cells, value in self._searched(observed, likelihoods):
                 values.append(value)
                 volume.append(cells.log_volume)
@@ -226,5 +232,38 @@ class MatchedField:
         vectors = to_direction(*label.unbind(-1)).reshape(at.shape)
         return torch.stack(to_angles(posterior.direction(vectors)), dim=-1)
 
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        """Return the fitted tensors by name, and plain values."""
+        tensors, header = self.room.state()
+        gains, values = self._fit.gains.process.state("path_gains.")
+        own = {
+            "statistics": self._fit.statistics.raw,
+            "residual": self.residual,
+            "known": self.known,
+            "weight": self.weight,
+        }
+        plain = {"locator": asdict(self.config), "outside": self.outside, "observed_power": self.observed_power}
+        return tensors | gains | own, header | values | plain
 
-__all__ = ["MatchedField", "MatchedFieldConfig"]
+    @classmethod
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
+        """Return the locator that `state` describes."""
+        locator = cls(MatchedFieldConfig(**header["locator"]))
+        room = GeometryModel.from_state(tensors, header)
+        features = 2 * len(differences(room.array))
+        n, known = tensors["residual"].shape[1], len(tensors["known"])
+        shapes = {
+            "statistics": (4 + len(room.planes),),
+            "residual": (2, n, features),
+            "known": (known, 3),
+            "weight": (3,),
+        }
+        expect(tensors, shapes)
+        process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True, prefix="path_gains.")
+        gains = PathGains(process, len(room.image_sources()[0]))
+        locator.grid, locator.room = room.grid, room
+        locator._fit = _Fit(room, gains, PathStatistics.of(tensors["statistics"]))
+        locator.residual, locator.known, locator.weight = (tensors[name] for name in ("residual", "known", "weight"))
+        locator.outside, locator.observed_power = float(header["outside"]), float(header["observed_power"])
+        locator._prepare()
+        return locator

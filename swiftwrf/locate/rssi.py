@@ -1,8 +1,9 @@
-"""Position from RSSI: the locator by radio maps, and weighted nearest neighbours, its baseline and one of its likelihoods."""
+"""Position of the transmitter from its RSSI, by the radio maps of all receivers."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, Self
 
 import torch
@@ -16,6 +17,7 @@ from swiftwrf.locate.posterior import Posterior, normalised
 from swiftwrf.locate.region import Region, outside_mass
 from swiftwrf.locate.rssi_likelihood import DetectionLikelihood, FingerprintLikelihood, RssiMaps, ValueLikelihood
 from swiftwrf.rssi import RssiModel
+from swiftwrf.runtime.checkpoint import Header, Saved, expect
 from swiftwrf.runtime.progress import progress as tracked
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 
@@ -48,7 +50,7 @@ class _Part:
     maps: RssiMaps
 
 
-class RssiLocator:
+class RssiLocator(Saved):
     """Posterior over the position of the transmitter, given its RSSI at the receivers.
 
     Three likelihoods are pooled: the values under the radio maps with their uncertainty and correlated errors, which
@@ -107,9 +109,7 @@ class RssiLocator:
         model = RssiModel(validation=self.config.validation, seed=self.config.seed).fit(train.subset(kept))
         return _Part(out, kept, model, RssiMaps.of(model.predict(train.transmitter_position[out])))
 
-    def _likelihoods(
-        self, train: Rssi, parts: list[_Part]
-    ) -> tuple[ValueLikelihood, DetectionLikelihood, int, Tensor]:
+    def _likelihoods(self, train: Rssi, parts: list[_Part]) -> tuple[ValueLikelihood, DetectionLikelihood, int, Tensor]:
         """Fit the distributions to held-out folds: of values, of detections, and of the error of k nearest neighbours."""
         rssi = torch.cat([train.rssi_dbm[part.out] for part in parts])
         mean, std = (torch.cat([getattr(part.maps, name) for part in parts]) for name in ("mean", "std"))
@@ -160,7 +160,11 @@ class RssiLocator:
                 two: DetectionLikelihood = detection,
                 three: FingerprintLikelihood = fingerprints,
             ) -> Tensor:
-                parts = (one.log_likelihood(maps, rows), two.log_likelihood(maps, rows), three.log_likelihood(position, rows))
+                parts = (
+                    one.log_likelihood(maps, rows),
+                    two.log_likelihood(maps, rows),
+                    three.log_likelihood(position, rows),
+                )
                 return torch.stack([value.double() for value in parts])
 
             values.append(all_of(maps, self.cells.position, rssi))
@@ -197,3 +201,50 @@ class RssiLocator:
         log_mass = sum(weight * part.double() for weight, part in zip(self.weight.tolist(), parts, strict=True))
         edge = float(self.cells.edge.norm(dim=1).max()) if len(self.cells.edge) else 0.0
         return Posterior(at[None], normalised(log_mass + self.cells.log_volume), edge)
+
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        """Return the fitted tensors by name, and plain values."""
+        tensors, header = self.model.state()
+        own = {
+            "known": self.fingerprints.position,
+            "fingerprint": self.fingerprints.rssi,
+            "scale_m": self.fingerprints.scale_m,
+            "correlation": self.values.correlation,
+            "weight": self.weight,
+        }
+        plain = {
+            "locator": asdict(self.config),
+            "floor_dbm": self.floor_dbm,
+            "k": self.fingerprints.k,
+            "degrees": None if math.isinf(self.values.degrees) else self.values.degrees,
+            "detections": asdict(self.detections),
+            "margin": self.region.margin,
+            "outside": self.region.outside,
+        }
+        return tensors | own, header | plain
+
+    @classmethod
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
+        """Return the locator that `state` describes."""
+        locator = cls(RssiLocatorConfig(**header["locator"]))
+        locator.model = RssiModel.from_state(tensors, header)
+        locator.receiver_names = locator.model.receiver_names
+        n, r = len(tensors["known"]), len(locator.receiver_names)
+        expect(
+            tensors,
+            {"known": (n, 3), "fingerprint": (n, r), "scale_m": (3,), "correlation": (r, r), "weight": (3,)},
+        )
+        degrees, k = header["degrees"], int(header["k"])
+        if not 1 <= k <= n:
+            raise InputError(f"k must be between 1 and the number of rows, got {k}")
+        locator.values = ValueLikelihood(tensors["correlation"], math.inf if degrees is None else float(degrees))
+        locator.detections = DetectionLikelihood(**header["detections"])
+        locator.floor_dbm = float(header["floor_dbm"])
+        locator.fingerprints = FingerprintLikelihood(
+            tensors["known"], tensors["fingerprint"], locator.floor_dbm, k, tensors["scale_m"]
+        )
+        locator.region = Region(tensors["known"], float(header["margin"]), float(header["outside"]))
+        locator.cells = locator.region.cells(locator.config.n_cells)
+        locator.weight = tensors["weight"]
+        locator._maps = RssiMaps.of(locator.model.predict(locator.cells.position))
+        return locator

@@ -143,16 +143,23 @@ class PathStatistics:
         wave = paths(room, room.scene(position))
         with torch.enable_grad():
             for _ in range(STATISTICS_STEPS):
-                model = PhaseLikelihood(room, cls._of(raw, planes))
+                model = PhaseLikelihood(room, cls.of(raw))
                 loss = -model.paired_from(*wave, phases).mean() + 0.01 * raw.square().mean()
                 optimiser.zero_grad()
                 loss.backward()
                 optimiser.step()
-        return cls._of(raw.detach(), planes)
+        return cls.of(raw.detach())
+
+    @property
+    def raw(self) -> Tensor:
+        """Logarithms of all variances, (4 + P,)."""
+        rest = torch.stack([self.order, self.diffuse, self.floor])
+        return torch.cat([self.direct[None], self.plane, rest]).log()
 
     @classmethod
-    def _of(cls, raw: Tensor, planes: int) -> PathStatistics:
-        value = raw.exp()
+    def of(cls, raw: Tensor) -> PathStatistics:
+        """Return the statistics of logarithms (4 + P,)."""
+        value, planes = raw.exp(), len(raw) - 4
         return cls(value[0], value[1 : 1 + planes], value[1 + planes], value[2 + planes], value[3 + planes])
 
     def of_paths(self, room: GeometryModel) -> Tensor:
