@@ -67,8 +67,8 @@ def choice_section(fraction: FractionRecords) -> Section | None:
     table = Table(
         ["synthesizer", "held-out PSNR [dB]", "seconds"],
         rows,
-        "Mean over held-out measured spectra, without the lowest and the highest tenth. Neither the fit nor the structure of "
-        "the model depends on them.",
+        "Mean over held-out measured spectra, without the lowest and the highest tenth. Neither the fit nor the structure "
+        "of the model depends on them.",
         frozenset({choice["name"]}),
     )
     name = choice["name"]
