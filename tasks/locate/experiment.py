@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -135,8 +136,6 @@ class Results:
     def metrics(self, data: str, n_undetected: int) -> LocateMetrics:
         """Return the content of metrics.json."""
         train, test = self.experiment.train, self.experiment.test
-        studied = {study["localizer"] for step, study in self._studies if not step.is_whole}
-        studies = [(step, study) for step, study in self._studies if study["localizer"] in studied]
         return {
             "task": "locate",
             "data": data,
@@ -149,6 +148,12 @@ class Results:
             "overall": self._overall,
             "calibration": self._coverage,
             "weights": self._weights,
-            "by_rows": [study for step, study in studies if step.receivers == 1],
-            "by_receivers": [study for step, study in studies if step.rows == 1],
+            "by_rows": self._studied(lambda step: step.receivers == 1),
+            "by_receivers": self._studied(lambda step: step.rows == 1),
         }
+
+    def _studied(self, belongs: Callable[[Localization], bool]) -> list[StudyMetrics]:
+        """Return the study of localizers that some of these steps fit to parts of the data."""
+        studies = [(step, study) for step, study in self._studies if belongs(step)]
+        names = {step.localizer for step, _ in studies if not step.is_whole}
+        return [study for step, study in studies if step.localizer in names]

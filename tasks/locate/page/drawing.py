@@ -125,7 +125,7 @@ def posteriors(maps: Mapping[str, NDArray[Any]]) -> Figure:
         ax.plot(*truth[:2], "x", color=TRUTH, markersize=8, markeredgewidth=2)
         error = float(np.linalg.norm(estimate - truth))
         ax.set_title(f"row {maps['index'][i]}: {error:.2f} m", fontsize=9)
-        ax.set(xlabel="x [m]", ylabel="y [m]")
+        ax.set(xlabel="x [m]", ylabel="y [m]", xlim=extent[:2], ylim=extent[2:])
         ax.grid(visible=False)
     figure.colorbar(drawn, ax=axes[:n], label="posterior relative to its maximum", fraction=0.03, pad=0.02)
     return figure
