@@ -15,7 +15,7 @@ import torch
 from quick import said
 from small import glances
 
-from swiftwrf import AngularGrid, InputError, RssiConfig, RssiModel, load, make_model, rssi_room, simulated_room
+from swiftwrf import AngularGrid, InputError, RssiModel, load, make_model, rssi_room, simulated_room
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
 from swiftwrf.runtime.registry import Registry
@@ -302,7 +302,7 @@ def test_the_benchmark_measures_every_localizer(monkeypatch):
     cheap = Registry("localizer")
     cheap._registered = {name: LOCALIZERS[name] for name in ("posterior", "knn")}
     monkeypatch.setattr(locating, "LOCALIZERS", cheap)
-    with mock.patch.object(RssiModel, "config_type", quick.with_defaults(RssiConfig(steps=2, n_primitives=0))):
+    with mock.patch.object(RssiModel, "config_type", quick.QuickRssiConfig):
         locating.main(locating.Config(("floor:block",), cells=60))
     (result,) = written["locating_rssi"]["sets"].values()
     assert set(result["localizers"]) == {"posterior", "knn"}

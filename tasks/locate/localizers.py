@@ -166,7 +166,7 @@ class NearestFingerprints(FingerprintLocalizer):
             for k in counts:
                 estimate = _weighted(distance[:, :k], position[kept][row[:, :k]])
                 errors[k].append(np.linalg.norm(estimate - position[out], axis=1))
-        self.k = min(counts, key=lambda k: float(np.median(np.concatenate(errors[k]))))
+        self.k = min(counts, key=lambda k: float(np.concatenate(errors[k]).mean()))
         self._search, self._position = NearestNeighbors(n_neighbors=self.k).fit(x), position
 
     def _estimate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
