@@ -23,9 +23,9 @@ class LocateConfig(SpectraSource, TableSource):
     With MODEL and SOURCE: write the positions of new observations to a table.
     """
 
-    model: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")] = None
+    model: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[MODEL]")] = None
     """file of a locator of RSSI or spectra, e.g. runs/locate/first/locator.safetensors"""
-    source: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
+    source: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[SOURCE]")] = None
     """RSSI of any format that tasks.rssi takes, a table without positions included; or spectra of any format that tasks.aoa
     takes, or a .npy file (n, elevations, azimuths) of magnitudes in [0, 1]"""
     data: str | None = None
