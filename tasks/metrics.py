@@ -30,7 +30,6 @@ class RunMetrics(TypedDict):
     task: str
     data: str
     split: str
-    preset: str
     seed: int
     n_train: int
     n_test: int
@@ -115,6 +114,7 @@ class MixMetrics(TypedDict):
 class AoaMetrics(RunMetrics):
     """Metrics of a run of tasks.aoa; `mixes` by measured fraction."""
 
+    preset: str
     repeats: int
     moving: str
     extra: int
@@ -158,9 +158,43 @@ class ChosenMetrics(TypedDict):
 class RssiMetrics(RunMetrics):
     """Of a run of tasks.rssi; `receivers` by receiver and method; `left_out` says why a method is not there."""
 
+    preset: str
     overall: dict[str, PredictorMetrics]
     left_out: dict[str, str]
     receivers: dict[str, dict[str, ReceiverMetrics]]
     seconds: PredictorSeconds
     interval: IntervalMetrics
     chosen: ChosenMetrics
+
+
+class LocalizerMetrics(TypedDict):
+    """Position errors of one localizer, in space and in plan, and its seconds."""
+
+    position_error_m: ErrorSummary
+    horizontal_error_m: ErrorSummary
+    seconds: PredictorSeconds
+
+
+class StudyMetrics(TypedDict):
+    """Position errors of one localizer fitted to a part of the training rows or of the receivers."""
+
+    localizer: str
+    n_train: int
+    n_receivers: int
+    position_error_m: ErrorSummary
+
+
+class LocateMetrics(RunMetrics):
+    """Metrics of a run of tasks.locate.
+
+    `n_undetected` test rows are left out, because no receiver detected them. `calibration` is the fraction of the test
+    positions in the posterior's credible regions by their probability. `weights` are those of its likelihoods.
+    """
+
+    n_receivers: int
+    n_undetected: int
+    overall: dict[str, LocalizerMetrics]
+    calibration: dict[str, float]
+    weights: dict[str, float]
+    by_rows: list[StudyMetrics]
+    by_receivers: list[StudyMetrics]

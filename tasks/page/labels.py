@@ -67,6 +67,17 @@ PREDICTORS = {
     "blend": Label("a weighted mean of other predictors, weights by cross-validation", "#aa3377"),
 }
 
+LOCALIZERS = {
+    "posterior": Label(
+        "the median of the posterior over positions: radio maps with their uncertainty, detections, similar training rows",
+        "#4477aa",
+    ),
+    "knn": Label("the inverse-distance mean position of the k training rows with the most similar RSSI", "#66ccee"),
+    "knn_difference": Label("knn on differences to the row's strongest value, without the device's offset", "#ee8866"),
+    "gp": Label("Gaussian-process regression from RSSI to coordinates", "#228833"),
+    "mean": Label("the mean training position", "#bbbbbb"),
+}
+
 
 def labels(registry: Registry[Any], known: dict[str, Label], names: Iterable[str] | None = None) -> dict[str, Label]:
     """Return the labels of registered methods; a method of another package has the first line of its docstring.
