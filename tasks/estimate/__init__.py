@@ -14,6 +14,7 @@ from torch import Tensor
 from swiftwrf import InputError, Spectra, load
 from swiftwrf.data import read_spectra
 from swiftwrf.data.store import Store
+from swiftwrf.locate import MatchedField
 from swiftwrf.metrics import angle_errors
 from tasks.aoa.estimators import SavedEstimator
 from tasks.records import write_table
@@ -25,7 +26,7 @@ class EstimateConfig(SpectraSource):
     """Directions from spectra, by an estimator that `python -m tasks.aoa` trained and left in its run's directory."""
 
     estimator: Annotated[str, tyro.conf.Positional]
-    """file of the estimator, e.g. runs/aoa/first/aann-mix0.3.safetensors"""
+    """file of the estimator, e.g. runs/aoa/first/aann-mix0.3.safetensors or matched_field-mix0.3.safetensors"""
     source: Annotated[str, tyro.conf.Positional]
     """measurements of any format that tasks.aoa takes, or spectra of unknown positions: a .npy file (n, elevations,
     azimuths) of magnitudes in [0, 1]"""
@@ -45,7 +46,7 @@ def run(config: EstimateConfig) -> None:
     if not out.parent.is_dir():
         raise InputError(f"--out {out} lies in {out.parent}, which is no directory")
     estimator = load(config.estimator)
-    if not isinstance(estimator, SavedEstimator):
+    if not isinstance(estimator, SavedEstimator | MatchedField):
         raise InputError(f"{config.estimator} holds a {estimator.kind}; give an estimator that tasks.aoa trained")
     how, known = reading(config), None
     if not config.source.endswith(".npy"):
@@ -81,7 +82,7 @@ def _read_array(file: Path) -> Tensor:
     return spectrum
 
 
-def _check_like(estimator: SavedEstimator, store: Store, known: Spectra | None, source: str) -> None:
+def _check_like(estimator: SavedEstimator | MatchedField, store: Store, known: Spectra | None, source: str) -> None:
     """Refuses spectra on another grid than the estimator's."""
     own = estimator.grid
     if store.shape[1:] != own.shape or (known is not None and known.grid != own):
