@@ -22,6 +22,7 @@ from tasks.run import Row
 from tasks.steps import Step
 
 LEVEL = 0.8  # of the credible regions
+NO_PLANE = "no plane explains the spectra"  # why there is nothing to locate by
 EXAMPLE_QUANTILES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # of the position error, from the best spectrum to the worst
 MAX_CANDIDATES = 300  # candidate positions of largest mass that are stored of an example
 BATCH_SPECTRA = 256  # spectra located at a time: a posterior has a thousand candidates

@@ -13,7 +13,7 @@ from swiftwrf.metrics import angle_errors, covered, l1, psnr, ssim
 from swiftwrf.models import FIELD_MODELS
 from tasks.aoa.condition import AUTO, EVERYTHING, LOCATOR, Condition, MeasuredSubset, fraction_key, pooled
 from tasks.aoa.context import ROOM_MODEL, Experiment
-from tasks.aoa.locating import LEVEL, Locating
+from tasks.aoa.locating import LEVEL, NO_PLANE, Locating
 from tasks.aoa.steps import CrossValidation, Evaluation, RoomSearch, Suggestion, Synthesis, as_bytes
 from tasks.metrics import ANGLES, SCORES, LocatingMetrics, MethodMetrics, MixMetrics, SynthesisMetrics
 from tasks.run import Row, Run, console
@@ -65,7 +65,7 @@ class Results:
             case Synthesis():
                 self._add_synthesis(step, value)
             case RoomSearch() if not value.get("planes"):
-                self._leave_out(step.located, value.get("refused", "no plane explains the spectra"))
+                self._leave_out(step.located, value.get("refused", NO_PLANE))
             case Locating() if "refused" in value:
                 self._leave_out((step.condition,), value["refused"])
             case Evaluation() | Locating():
