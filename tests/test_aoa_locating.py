@@ -54,6 +54,7 @@ def quickly(data, planes=PLANES):
         for patch in (
             mock.patch.object(geometry, "search_room", known),
             mock.patch.object(matched_field, "MatchedFieldConfig", with_defaults(FEW_CELLS)),
+            mock.patch.object(cross_validation, "FOLD_LOCATOR", FEW_CELLS),
             mock.patch.object(experiment, "simulated_room", return_value=data),
             mock.patch.dict(ESTIMATORS._registered, {NETWORK: QuickNetwork}),
             *(
