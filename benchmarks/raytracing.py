@@ -15,8 +15,7 @@ from typing import Any, get_args
 import tyro
 from record import write_result
 
-from augment import Settings, make_synthesizer
-from swiftwrf import AngularGrid, Spectra, load_spectra
+from swiftwrf import AngularGrid, Spectra, load_spectra, make_model
 from swiftwrf.data.raytraced import ROOMS
 from swiftwrf.data.spectra import Moving
 from swiftwrf.metrics import psnr, ssim, summary
@@ -51,28 +50,28 @@ def main(config: Config) -> None:
 
 
 def measure(folder: Path) -> dict[str, Any]:
-    """Scores of every method at the test positions, the room that was found, and the seconds."""
+    """Return the scores of every method at the test positions, the estimated room, and the seconds."""
     scene = json.loads((folder / "scene.json").read_text())
     train, test = load_spectra(folder, grid=GRID).split("random")
     scores: dict[str, Any] = {"mean": score(train.spectrum.mean(dim=0).expand_as(test.spectrum), test)}
     found = None
     for name in METHODS:
-        synthesizer, began = make_synthesizer(name, Settings(progress=False)), time.perf_counter()
-        synthesizer.fit(train)
+        model, began = make_model(name), time.perf_counter()
+        model.fit(train)
         fitted = time.perf_counter()
-        drawn = synthesizer.synthesize(test.position)
-        seconds = {"fit": fitted - began + synthesizer.shared_seconds, "synthesize": time.perf_counter() - fitted}
-        scores[name] = score(drawn, test) | {"seconds": seconds}
-        if name == "geometry" and synthesizer.model is not None:
-            found = synthesizer.model.state()[1]["planes"]
+        predicted = model.synthesize(test.position)
+        seconds = {"fit": fitted - began, "synthesize": time.perf_counter() - fitted}
+        scores[name] = score(predicted, test) | {"seconds": seconds}
+        if name == "geometry" and model.room is not None:
+            found = model.room.to_json()["planes"]
         print(f"{folder.name} {name}: {scores[name]['psnr_db']['median']:.2f} dB, {seconds['fit']:.0f} s", flush=True)
     kept = ("positions", "line_of_sight", "paths_per_position", "seconds")
     return {"traced": {key: scene[key] for key in kept}, "n_train": len(train), "planes": found, "methods": scores}
 
 
-def score(drawn: Any, test: Spectra) -> dict[str, Any]:
-    """Of the drawn spectra."""
-    return {"psnr_db": summary(psnr(drawn, test.spectrum)), "ssim": summary(ssim(drawn, test.spectrum))}
+def score(predicted: Any, test: Spectra) -> dict[str, Any]:
+    """Return PSNR and SSIM of predicted spectra."""
+    return {"psnr_db": summary(psnr(predicted, test.spectrum)), "ssim": summary(ssim(predicted, test.spectrum))}
 
 
 if __name__ == "__main__":

@@ -85,9 +85,8 @@ class GainMetrics(ChangeMetrics):
 class AdviceMetrics(TypedDict):
     """Cross-validation of one field model: change of the error on held-out measured spectra by further synthetic spectra.
 
-    `gains` has every number that was compared, `rule` the number chosen on other folds than the scored one. Further
-    positions are recommended if every number reduces the error; `helps` requires that the interval of `rule` excludes
-    zero, too.
+    `gains` has every number that was compared, `rule` the number chosen on the other folds. Further positions
+    are recommended if every number reduces the error; `helps` requires that the interval of `rule` excludes zero, too.
     """
 
     stand_in: str

@@ -146,7 +146,7 @@ def test_positions_are_drawn_between_spots_that_were_measured_again_and_again(ji
 
 
 def test_direction_needs_to_know_the_fixed_end():
-    with pytest.raises(InputError, match="where the fixed end stands"):
+    with pytest.raises(InputError, match="position of the fixed end"):
         synthetic_positions(replace(ROOM, fixed_position=None), 10, seed=0)
 
 

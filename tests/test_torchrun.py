@@ -66,7 +66,6 @@ def learnt():
     set_threads(1)
     room = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
     backbone = aann.backbone
-    train = Mixed.measured(replace(room, store=Store(room.spectrum.double())))
     with mock.patch.object(aann, "backbone", lambda *options: backbone(*options).double()):
         network = AANN(steps=2, batch=5).fit(Mixed.measured(replace(room, store=Store(room.spectrum.double()))))
     losses = torch.tensor([record["loss"] for record in network.history])

@@ -131,10 +131,6 @@ class PlanarArray:
             spectrum[rows] = squared.clamp(0, 1).sqrt().float()
         return spectrum
 
-    def responses(self, matrix: Tensor, grid: AngularGrid) -> Tensor:
-        """Return a^H M a, float64 (n, n_elevation, n_azimuth), of Hermitian matrices (n, K, K) and steering vectors a."""
-        return (self._coefficients(matrix) @ basis(self, grid)).reshape(-1, *grid.shape)
-
     def _coefficients(self, matrix: Tensor) -> Tensor:
         """Return the coefficients (n, 1 + 2 P) of a^H M a in the co-array basis: sums of entries with one difference."""
         a, b, lag = pairs(self)

@@ -120,11 +120,6 @@ def too_many(shape: tuple[int, int, int]) -> bool:
     return pixels > MAX_FILE_PIXELS or (pixels > MAX_MEMORY_PIXELS and each > MAX_FINE_PIXELS)
 
 
-def in_file(shape: tuple[int, int, int]) -> bool:
-    """Return True if spectra (n, H, W) are stored in a file."""
-    return shape[0] >= MIN_FILE_SPECTRA or math.prod(shape) > MAX_MEMORY_PIXELS
-
-
 def stored(
     shape: tuple[int, int, int], dtype: torch.dtype, key: Callable[[], str], make: Callable[[], Iterable[Tensor]]
 ) -> Store:
@@ -142,7 +137,7 @@ def stored(
     Raises:
         InputError: The cache directory cannot be written or has too little room.
     """
-    if not in_file(shape):
+    if shape[0] < MIN_FILE_SPECTRA and math.prod(shape) <= MAX_MEMORY_PIXELS:
         values, start = torch.empty(shape, dtype=dtype), 0
         for batch in make():
             values[start : start + len(batch)] = batch

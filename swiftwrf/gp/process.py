@@ -147,7 +147,7 @@ class LeaveGroupOut:
 
     def __init__(self, precision: Tensor, out: Tensor) -> None:
         self.precision, self.out = precision, out
-        self.covariance: Tensor = torch.linalg.inv(precision.index_select(0, out).index_select(1, out))
+        self._block = precision.index_select(0, out).index_select(1, out)
 
     @classmethod
     def each(cls, kernel: Kernel, position: Tensor, fold: Tensor) -> Iterator[LeaveGroupOut]:
@@ -155,6 +155,12 @@ class LeaveGroupOut:
         precision = torch.linalg.inv(kernel.covariance(position))
         for number in fold.unique():
             yield cls(precision, (fold == number).nonzero()[:, 0])
+
+    @cached_property
+    def covariance(self) -> Tensor:
+        """Covariance of the errors (o, o)."""
+        covariance: Tensor = torch.linalg.inv(self._block)
+        return covariance
 
     @cached_property
     def kept(self) -> Tensor:
@@ -170,7 +176,8 @@ class LeaveGroupOut:
 
     def errors(self, dual: Tensor) -> Tensor:
         """Return true minus predicted values (o, ...) from precision @ values (n, ...)."""
-        return self.covariance @ dual[self.out]
+        errors: Tensor = torch.linalg.solve(self._block, dual[self.out])
+        return errors
 
 
 def held_out(kernel: Kernel, position: Tensor, fold: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,7 +15,7 @@ from swiftwrf.array.planar import differences
 from swiftwrf.data.spectra import Spectra, check_training, direction_of_link
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, thinned
-from swiftwrf.locate.pool import pooled_weights
+from swiftwrf.locate.pool import pooled_weights, tempered
 from swiftwrf.locate.posterior import Posterior, normalised
 from swiftwrf.locate.region import Cells, Region, outside_mass
 from swiftwrf.locate.search import best_cells, refined
@@ -162,21 +162,25 @@ class MatchedField(Saved):
         )
 
     def _calibrated(self, position: Tensor, features: SpectrumFeatures, fold: Tensor, parts: list[_Fit]) -> Tensor:
-        """Return the weights of the likelihoods that maximise the posterior density at held-out positions."""
+        """Return the weights of the likelihoods that calibrate the posterior of held-out positions."""
         (some,) = thinned(torch.arange(len(position)), rows=self.config.n_calibration)
-        truth, values, volume = [], [], []
-        for number, part in enumerate(parts):
-            rows = some[fold[some] == number]
-            if not len(rows):
-                continue
-            likelihoods, observed = self._likelihoods(part, fold != number), features.subset(rows)
-            truth.append(
-                torch.stack([one.log_likelihood(position[rows][:, None], observed)[:, 0] for one in likelihoods])
-            )
+        rows_of = [some[fold[some] == number] for number in range(FOLDS)]
+        at_truth, values, volumes, candidates = [], [], [], []
+        for number, rows in enumerate(rows_of):
+            likelihoods, observed = self._likelihoods(parts[number], fold != number), features.subset(rows)
+            truth = position[rows][:, None]
+            at_truth.append(torch.stack([one.log_likelihood(truth, observed)[:, 0] for one in likelihoods]))
             for cells, value in self._searched(observed, likelihoods):
                 values.append(value)
-                volume.append(cells.log_volume)
-        return pooled_weights(torch.cat(truth, dim=1), torch.cat(values, dim=1), torch.cat(volume))
+                volumes.append(cells.log_volume)
+                candidates.append(cells.position)
+        value, volume, at = torch.cat(values, dim=1).double(), torch.cat(volumes), torch.cat(candidates)
+        weight = pooled_weights(torch.cat(at_truth, dim=1), value, volume)
+
+        def posterior(weight: Tensor) -> Posterior:
+            return Posterior(at, normalised(torch.einsum("k,knm->nm", weight, value) + volume), self._resolution_m)
+
+        return tempered(weight, posterior, position[torch.cat(rows_of)])
 
     def _searched(self, observed: SpectrumFeatures, likelihoods: Any) -> Iterator[tuple[Cells, Tensor]]:
         """Yield cells (b, m) and log-likelihoods (k, b, m) of some observations at a time."""
@@ -218,8 +222,12 @@ class MatchedField(Saved):
         parts = list(self._searched(observed, self.likelihoods))
         position = torch.cat([cells.position for cells, _ in parts])
         log_weight = torch.cat([self._log_mass(cells, values) for cells, values in parts])
-        edge = float(self.cells.edge.norm(dim=1).max()) if len(self.cells.edge) else 0.0
-        return Posterior(position, log_weight, edge / 2**self.config.n_rounds)
+        return Posterior(position, log_weight, self._resolution_m)
+
+    @property
+    def _resolution_m(self) -> float:
+        """Edge of the smallest cells [m]."""
+        return float(self.cells.edge_m / 2**self.config.n_rounds)
 
     def predict(self, spectrum: Tensor) -> Tensor:
         """Return azimuth and elevation (n, 2) [rad] of the transmitter that minimise the expected angular error."""

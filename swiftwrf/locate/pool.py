@@ -1,6 +1,8 @@
-"""Combination of several likelihoods into one calibrated posterior: log-linear pooling with weights from held-out data."""
+"""Combination of several likelihoods into one calibrated posterior, with weights from held-out data."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -8,6 +10,10 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
+from swiftwrf.locate.posterior import Posterior
+
+BISECTIONS = 6  # of the tempering factor
+MIN_LOG2_FACTOR, MAX_LOG2_FACTOR = -2.0, 1.0
 RIDGE = 1e-3  # of the weights: keeps those that the data do not determine near their start
 START = 0.3  # sum of the weights
 
@@ -45,3 +51,23 @@ def pooled_weights(at_truth: Tensor, at_candidates: Tensor, log_volume: Tensor) 
     first = np.full(len(at_truth), START / len(at_truth))
     found = minimize(loss, first, jac=True, method="L-BFGS-B", bounds=[(0, None)] * len(first))
     return torch.from_numpy(found.x)
+
+
+def tempered(weight: Tensor, posterior: Callable[[Tensor], Posterior], truth: Tensor, level: float = 0.8) -> Tensor:
+    """Return the weights scaled so that credible regions of `level` contain that fraction of held-out positions.
+
+    Maximum likelihood alone leaves regions too small if the likelihoods are wrong in ways that weights cannot mend.
+
+    Args:
+        weight: Weights of the pool, (k,).
+        posterior: Returns the posterior of the held-out observations for weights (k,).
+        truth: Held-out true positions, (n, 3) [m].
+        level: Nominal coverage.
+    """
+    low, high = MIN_LOG2_FACTOR, MAX_LOG2_FACTOR
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        found = posterior(weight * 2**middle)
+        inside = (found.median - truth).norm(dim=1) <= found.credible_radius(level)
+        low, high = (middle, high) if float(inside.double().mean()) > level else (low, middle)
+    return weight * 2 ** ((low + high) / 2)

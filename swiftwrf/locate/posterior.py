@@ -93,7 +93,8 @@ class Posterior:
         vectors = vectors.expand(len(self), -1, -1)
         start = torch.einsum("nm,nmk->nk", self.weight, vectors)
         found = _geometric_median(vectors, self.weight, start, 1e-4)
-        return found / found.norm(dim=1, keepdim=True).clamp_min(1e-12)
+        unit: Tensor = found / found.norm(dim=1, keepdim=True).clamp_min(1e-12)
+        return unit
 
     @property
     def ambiguous(self) -> Tensor:
@@ -103,7 +104,8 @@ class Posterior:
         scale = self.credible_radius(0.5)
         inner = (self.weight * (away <= scale[:, None])).sum(dim=1)
         second = (self.weight * (away > 3 * torch.minimum(scale, away.amax(dim=1) / 4)[:, None])).sum(dim=1)
-        return (second > MODE_MASS) & (inner > MODE_MASS)
+        found: Tensor = (second > MODE_MASS) & (inner > MODE_MASS)
+        return found
 
 
 def _geometric_median(point: Tensor, weight: Tensor, start: Tensor, smallest: float) -> Tensor:

@@ -32,6 +32,11 @@ class Cells:
     edge: Tensor
     level: Tensor
 
+    @property
+    def edge_m(self) -> float:
+        """Length of the longest edge of a cell of level 0 [m]."""
+        return float(self.edge.norm(dim=1).max()) if len(self.edge) else 0.0
+
 
 @dataclass(frozen=True, eq=False)
 class Region:
@@ -94,7 +99,8 @@ class Region:
         centre, axes, half = self._box
         away = position - centre
         flat = (away - away @ axes.T @ axes).norm(dim=1)
-        return ((away @ axes.T).abs() <= half).all(dim=1) & (flat <= self.scale_m)
+        inside: Tensor = ((away @ axes.T).abs() <= half).all(dim=1) & (flat <= self.scale_m)
+        return inside
 
     def is_near(self, position: Tensor) -> Tensor:
         """Return True for each position (n, 3) [m] in the neighbourhood of the known positions, (n,)."""

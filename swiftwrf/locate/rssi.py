@@ -12,7 +12,7 @@ from torch import Tensor
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
-from swiftwrf.locate.pool import pooled_weights
+from swiftwrf.locate.pool import pooled_weights, tempered
 from swiftwrf.locate.posterior import Posterior, normalised
 from swiftwrf.locate.region import Region, outside_mass
 from swiftwrf.locate.rssi_likelihood import DetectionLikelihood, FingerprintLikelihood, RssiMaps, ValueLikelihood
@@ -21,8 +21,10 @@ from swiftwrf.runtime.checkpoint import Header, Saved, expect
 from swiftwrf.runtime.progress import progress as tracked
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 
+MAX_TEMPERING = 200  # held-out rows that determine the coverage of credible regions
 NEIGHBOUR_COUNTS = (1, 2, 3, 5, 8, 13, 20)
 BLOCK_MARGIN = 0.25  # of the region: a block of a fifth may lie beyond the known positions
+MIN_SCALE_M = 0.05  # of the error of nearest neighbours
 UNDETECTED_BELOW_DB = 5.0  # below the weakest value, of what is not detected, in the space of fingerprints
 
 
@@ -115,8 +117,7 @@ class RssiLocator(Saved):
         mean, std = (torch.cat([getattr(part.maps, name) for part in parts]) for name in ("mean", "std"))
         errors = {k: self._neighbour_errors(train, parts, k) for k in NEIGHBOUR_COUNTS if k < len(rssi) / 2}
         k = min(errors, key=lambda k: float(errors[k].norm(dim=1).median()))
-        edge = float(self.cells.edge.norm(dim=1).max()) if len(self.cells.edge) else 1.0
-        scale = (errors[k].abs().quantile(0.6, dim=0).square() + edge**2).sqrt()
+        scale = (errors[k].abs().quantile(0.6, dim=0).square() + max(self.cells.edge_m, MIN_SCALE_M) ** 2).sqrt()
         values = ValueLikelihood.fit((rssi.float() - mean) / std)
         return values, DetectionLikelihood.fit(mean, ~rssi.isnan()), k, scale
 
@@ -143,7 +144,7 @@ class RssiLocator(Saved):
 
         The distributions of each fold are fitted to the other folds.
         """
-        truth, values = [], []
+        truth, values, positions = [], [], []
         share = min(1.0, self.config.n_calibration / len(train))
         for number, part in enumerate(parts):
             value, detection, k, scale = self._likelihoods(train, parts[:number] + parts[number + 1 :])
@@ -169,10 +170,18 @@ class RssiLocator(Saved):
 
             values.append(all_of(maps, self.cells.position, rssi))
             own = RssiMaps(part.maps.mean[some], part.maps.std[some])
+            positions.append(at)
             truth.append(all_of(own, at, rssi).diagonal(dim1=1, dim2=2))
-        candidates = torch.cat(values, dim=1)
+        candidates, position = torch.cat(values, dim=1), torch.cat(positions)
         volume = self.cells.log_volume.expand(candidates.shape[1], -1)
-        self.weight = pooled_weights(torch.cat(truth, dim=1), candidates, volume)
+        weight = pooled_weights(torch.cat(truth, dim=1), candidates, volume)
+        rows = torch.randperm(len(position), generator=torch.Generator().manual_seed(self.config.seed))[:MAX_TEMPERING]
+
+        def posterior(weight: Tensor) -> Posterior:
+            log_mass = torch.einsum("k,knm->nm", weight, candidates[:, rows]) + self.cells.log_volume
+            return Posterior(self.cells.position[None], normalised(log_mass), self.cells.edge_m)
+
+        self.weight = tempered(weight, posterior, position[rows])
 
     @torch.no_grad()
     def locate(self, rssi: Tensor) -> Posterior:
@@ -199,8 +208,7 @@ class RssiLocator(Saved):
             self.fingerprints.log_likelihood(at, rssi),
         )
         log_mass = sum(weight * part.double() for weight, part in zip(self.weight.tolist(), parts, strict=True))
-        edge = float(self.cells.edge.norm(dim=1).max()) if len(self.cells.edge) else 0.0
-        return Posterior(at[None], normalised(log_mass + self.cells.log_volume), edge)
+        return Posterior(at[None], normalised(log_mass + self.cells.log_volume), self.cells.edge_m)
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """Return the fitted tensors by name, and plain values."""

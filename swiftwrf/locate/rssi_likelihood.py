@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
@@ -113,8 +114,8 @@ def _correlation(residual: Tensor, shrinkage: float) -> Tensor:
     own = (product / scale / scale[:, None]).clamp(-0.99, 0.99)
     shape = (1 - shrinkage) * own
     value, vector = torch.linalg.eigh(shape - torch.diag(shape.diagonal()) + torch.eye(len(own), dtype=own.dtype))
-    positive = (vector * value.clamp_min(0.05)) @ vector.T
-    return positive * scale * scale[:, None]
+    positive: Tensor = (vector * value.clamp_min(0.05)) @ vector.T * scale * scale[:, None]
+    return positive
 
 
 @dataclass(frozen=True)
@@ -138,14 +139,14 @@ class DetectionLikelihood:
         """Fit to predicted RSSI (n, R) [dBm] and detections, bool (n, R), of held-out rows."""
         m, d = mean.double().flatten(), detected.flatten()
 
-        def loss(raw: np.ndarray) -> float:  # type: ignore[type-arg]
+        def loss(raw: NDArray[np.float64]) -> float:
             return -float(cls._of(raw)._log_probability(m, d).mean())
 
         start = np.array([float(m.quantile(0.1)), 1.5, -2.0])
         return cls._of(minimize(loss, start, method="Nelder-Mead", options={"maxiter": 300}).x)
 
     @classmethod
-    def _of(cls, raw: np.ndarray) -> DetectionLikelihood:  # type: ignore[type-arg]
+    def _of(cls, raw: NDArray[np.float64]) -> DetectionLikelihood:
         return cls(float(raw[0]), float(np.exp(np.clip(raw[1], -1, 4))), float(0.9 / (1 + np.exp(-raw[2]))))
 
     def _log_probability(self, mean: Tensor, detected: Tensor) -> Tensor:

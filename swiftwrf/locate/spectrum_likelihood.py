@@ -218,7 +218,8 @@ class PhaseLikelihood(Likelihood):
         match = 2 * (m.conj() * x).sum(dim=1).abs()
         misfit = x.abs().square().sum(dim=1) + m.abs().square().sum(dim=1)
         density = match + torch.special.i0e(match).log() - misfit
-        return density.logsumexp(dim=1) - 2 * root.diagonal(dim1=1, dim2=2).real.log().sum(dim=1)
+        total_density: Tensor = density.logsumexp(dim=1) - 2 * root.diagonal(dim1=1, dim2=2).real.log().sum(dim=1)
+        return total_density
 
 
 def _isotropic(room: GeometryModel) -> Tensor:

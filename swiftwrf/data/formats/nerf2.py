@@ -22,7 +22,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, ArrayPose
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
-from swiftwrf.data.archives import BROKEN, array_header, array_names, read_arrays, read_rows
+from swiftwrf.data.archives import array_header, array_names, read_arrays, read_rows, refusing_broken
 from swiftwrf.data.files import (
     MAX_COORDINATE_M,
     check_carrier,
@@ -202,7 +202,7 @@ def _read_images(folder: Path, n: int) -> tuple[Store, str]:
     return stored((n, *shape), torch.uint8, lambda: digest, batches), digest
 
 
-def _opened(file: Path, content: bytes) -> Image.Image:
+def _opened(content: bytes) -> Image.Image:
     """Open a PNG image without decoding it. Other formats are excluded, because Pillow starts programs for some."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is checked below
@@ -211,11 +211,8 @@ def _opened(file: Path, content: bytes) -> Image.Image:
 
 def _check_size(file: Path, content: bytes, n: int, shape: tuple[int, int] | None) -> tuple[int, int]:
     """Return rows and columns, checked before anything is decoded: a few kilobytes may claim gigabytes."""
-    try:
-        with _opened(file, content) as image:
-            rows, columns, mode = image.height, image.width, image.mode
-    except (*BROKEN, Image.DecompressionBombError) as error:
-        raise InputError(f"{file} is not a complete PNG image ({error})") from None
+    with refusing_broken(file, "a complete PNG image"), _opened(content) as image:
+        rows, columns, mode = image.height, image.width, image.mode
     if mode != "L":
         raise InputError(f"{file} has mode {mode}; a spectrum is an 8-bit grey image")
     if not (rows >= 2 and columns == 4 * rows):
@@ -236,10 +233,8 @@ def _check_size(file: Path, content: bytes, n: int, shape: tuple[int, int] | Non
 
 
 def _decode(file: Path, content: bytes) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
-    try:
-        with _opened(file, content) as image:
+    with refusing_broken(file, "a complete PNG image"):
+        with _opened(content) as image:
             image.verify()  # the checksums; loading alone forgives a missing end
-        with _opened(file, content) as image:
+        with _opened(content) as image:
             return np.asarray(image)
-    except (*BROKEN, Image.DecompressionBombError) as error:
-        raise InputError(f"{file} is not a complete PNG image ({error})") from None
