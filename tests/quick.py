@@ -11,10 +11,11 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from unittest import mock
 
-from small import glances, small_published, small_swiftwrf, with_defaults
+from small import glances, small_published, small_swiftwrf
 
 from swiftwrf import AngularGrid, RssiConfig, RssiModel, rssi_room, simulated_room
 from swiftwrf.errors import LONGEST
+from swiftwrf.runtime.validation import configuration
 from tasks.aoa import experiment as aoa
 from tasks.aoa.condition import NETWORK
 from tasks.aoa.estimators import ESTIMATORS
@@ -50,6 +51,14 @@ FOR_LIFE = ExitStack()
 PREDICTORS_KEPT = ("swiftwrf", "mean", "mri_pooled", "mri_receiver")
 
 
+@configuration
+class QuickRssiConfig(RssiConfig):
+    """A fit without primitives, in a class that workers of a cluster find by its name."""
+
+    n_primitives: int = 0
+    steps: int = 2
+
+
 class QuickNetwork(Constant):
     """Stand-in for the network that leaves a history."""
 
@@ -72,7 +81,7 @@ def quick() -> Iterator[None]:
         glances(),
         mock.patch.object(aoa, "simulated_room", return_value=spectra),
         mock.patch.object(rssi, "rssi_room", return_value=floor),
-        mock.patch.object(RssiModel, "config_type", with_defaults(RssiConfig(steps=2, n_primitives=0))),
+        mock.patch.object(RssiModel, "config_type", QuickRssiConfig),
         mock.patch("tasks.rssi.experiment.MAP_CELLS", 8),
         mock.patch.dict(ESTIMATORS._registered, {NETWORK: QuickNetwork}),
         mock.patch.object(PREDICTORS, "_registered", {name: PREDICTORS[name] for name in PREDICTORS_KEPT}),

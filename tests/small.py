@@ -47,7 +47,13 @@ def with_defaults(config: Any) -> type[Any]:
     parent = type(config)
     values = {field.name: getattr(config, field.name) for field in fields(config)}
     annotations = get_type_hints(parent, include_extras=True)
-    return configuration(type(parent.__name__, (parent,), values | {"__annotations__": annotations}))
+    # any configuration of the parent's class counts as one of this class, e.g. that of a study sent to a worker
+    kind = type("SameInstances", (type(parent),), {"__instancecheck__": lambda _, given: isinstance(given, parent)})
+    made = configuration(kind(parent.__name__, (parent,), values | {"__annotations__": annotations}))
+    # found by its name, as the worker of a cluster has such a class, too
+    made.__module__, made.__qualname__ = __name__, f"Small{parent.__name__}"
+    globals()[made.__qualname__] = made
+    return made
 
 
 @contextmanager

@@ -34,7 +34,7 @@ HERE = Path(__file__).parent
 CPU = torch.device("cpu")
 ENDS = ("client", "scheduler", "worker")
 AOA = ("aoa", "--mix", 0.5, "--synthesizer", "swiftwrf", "idw", "--extra", 20)
-RSSI = ("rssi", "--rx", 1, 2, 3, 4, 5)  # two groups
+RSSI = ("rssi", "--rx", 1, 2, 3, 4, 5)
 
 
 @pytest.fixture(autouse=True)

@@ -434,6 +434,8 @@ def test_refuses():
         fit_rssi(data, pool=path_loss_only(seed=1))
     with pytest.raises(InputError, match="is not fitted"):
         RssiModel().predict(data.transmitter_position)
+    with pytest.raises(InputError, match="is not fitted"):
+        RssiModel().state()
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,10 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-from quick import PREDICTORS_KEPT, TASKS, QuickNetwork
-from small import glances, with_defaults
+from quick import PREDICTORS_KEPT, TASKS, QuickNetwork, QuickRssiConfig
+from small import glances
 
-from swiftwrf import RssiConfig, RssiModel
+from swiftwrf import RssiModel
 from tasks.aoa.condition import NETWORK
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.rssi.predictors import PREDICTORS
@@ -38,7 +38,7 @@ def test_every_block_runs(part, tmp_path, monkeypatch):
         with (
             glances(),
             mock.patch.dict(ESTIMATORS._registered, {NETWORK: QuickNetwork}),
-            mock.patch.object(RssiModel, "config_type", with_defaults(RssiConfig(steps=2, n_primitives=0))),
+            mock.patch.object(RssiModel, "config_type", QuickRssiConfig),
             mock.patch.object(PREDICTORS, "_registered", {name: PREDICTORS[name] for name in PREDICTORS_KEPT}),
         ):
             assert command_line(module, config, function, arguments) == 0, block

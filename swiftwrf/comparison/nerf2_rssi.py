@@ -145,6 +145,7 @@ class NeRF2Rssi(RssiPredictor, Saved):
         return check_finite(100 * (torch.cat([empty, *parts]).double() - 1)), None
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
+        self.check_fitted()
         return self.network.state_dict(), {"options": asdict(self.config), "receiver_names": self.receiver_names}
 
     @classmethod

@@ -141,13 +141,17 @@ class RssiPredictor(Configured, ABC):
         Raises:
             InputError: Positions of another shape or not finite, or a predictor that is not fitted.
         """
-        if not hasattr(self, "receiver_names"):
-            raise InputError(f"this {type(self).__name__} is not fitted; call fit first")
+        self.check_fitted()
         position = check_positions(position)
         with torch.set_grad_enabled(torch.is_grad_enabled() and position.requires_grad):
             parts = [self._predict(some) for some in position.split(self.batch_size)]
         stds = [std for _, std in parts if std is not None]
         return Prediction(torch.cat([mean for mean, _ in parts]), torch.cat(stds) if stds else None)
+
+    def check_fitted(self) -> None:
+        """Raise InputError if the predictor is not fitted."""
+        if not hasattr(self, "receiver_names"):
+            raise InputError(f"this {type(self).__name__} is not fitted; call fit first")
 
     def __repr__(self) -> str:
         fitted = f"fitted, {len(self.receiver_names)} receivers" if hasattr(self, "receiver_names") else "not fitted"

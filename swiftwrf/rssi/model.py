@@ -181,6 +181,7 @@ class RssiModel(RssiPredictor, Saved):
         return mean, (self.noise_db.square() + self.field_db.square() * variance[:, None]).sqrt()
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
+        self.check_fitted()
         tensors = {name: getattr(self, name) for name in _shapes(0, 0)}
         header = {
             "options": asdict(self.config),
@@ -193,11 +194,8 @@ class RssiModel(RssiPredictor, Saved):
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         model = cls(from_plain(RssiConfig, header["options"]))
-        model.receiver_names, model.n_primitives = (
-            tuple(map(str, header["receiver_names"])),
-            int(header["n_primitives"]),
-        )
-        model.kernel = Kernel(**header["kernel"])
+        model.receiver_names = tuple(map(str, header["receiver_names"]))
+        model.n_primitives, model.kernel = int(header["n_primitives"]), Kernel(**header["kernel"])
         shapes = _shapes(len(model.receiver_names), len(tensors["anchor"]))
         files.expect(tensors, shapes)
         for name in shapes:

@@ -9,7 +9,9 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
+import sys
 from collections.abc import Callable, Iterator, Mapping
+from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
@@ -63,7 +65,7 @@ class Registry(Mapping[str, type[Made]]):
         return (inspect.getdoc(self[name]) or "").partition("\n")[0].removesuffix(".")
 
     def _external(self) -> dict[str, EntryPoint]:
-        found = entry_points(group=self.group) if self.group else ()
+        found = _entry_points(self.group, tuple(sys.path)) if self.group else ()
         return {point.name: point for point in found if point.name not in self._registered}
 
     def __getitem__(self, name: str) -> Any:
@@ -91,3 +93,9 @@ class Registry(Mapping[str, type[Made]]):
 
     def __len__(self) -> int:
         return len(tuple(iter(self)))
+
+
+@lru_cache(maxsize=32)
+def _entry_points(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    """Return the entry points of a group. A search reads the metadata of every installed package, so its result is kept."""
+    return tuple(entry_points(group=group))

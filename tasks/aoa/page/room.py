@@ -37,13 +37,14 @@ def advice_sentences(fraction: FractionRecords) -> list[str]:
     for name, advice in advice_of(fraction).items():
         gains = [gain for gain in advice["gains"] if gain["sampled"] == advice["sampled"]]
         best = min(gains, key=lambda gain: gain["median_deg"])
-        rule = advice.get("rule") or best
+        rule = advice.get("rule") or best  # older runs have the best number alone
+        how = "chosen on other held-out spectra" if advice.get("rule") else "chosen on the same spectra"
         found = (
             f"Cross-validation inside the measured fraction ({advice['n_held_out']} spectra held out, {advice['stand_in']} "
             f"as stand-in for the network): spectra {'sampled' if advice['sampled'] else 'predicted'} by {name} at further "
             f"positions change the median error by {rule['change']:+.0%} [{rule['low']:+.0%}, {rule['high']:+.0%}], from "
-            f"{advice['measured_only_deg']:.2f} to {rule['median_deg']:.2f} degrees, if their number is chosen on other "
-            f"held-out spectra. The best number is {best['extra']}."
+            f"{advice['measured_only_deg']:.2f} to {rule['median_deg']:.2f} degrees, with their number {how}. "
+            f"The best number is {best['extra']}."
         )
         if advice["helps"]:
             verdict = f"Turbo learning helps here: use --extra {advice['recommended_extra']} with this fraction."
