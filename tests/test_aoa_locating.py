@@ -31,7 +31,7 @@ from tasks.estimate import run as estimate
 from tasks.run import command_line
 
 PLANES = {(0.0, 0.0, -1.0): 0.0, (1.0, 0.0, 0.0): 5.0, (0.0, 1.0, 0.0): 4.0}  # outward normal to offset [m]
-FEW_CELLS = MatchedFieldConfig(max_cells=3000, n_best=60, n_background=20, n_rounds=2, n_calibration=12)
+FEW_CELLS = MatchedFieldConfig(max_cells=3000, n_best=60, n_background=20, n_rounds=2, n_calibration=40)
 LEFT_OUT = {LOCATOR, f"{LOCATOR}_measured_all"}
 
 
