@@ -12,7 +12,7 @@ import pkgutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from typing import Any, TypeVar
 
 from swiftwrf.errors import InputError
@@ -64,7 +64,7 @@ class Registry(Mapping[str, type[Made]]):
         """Return the first line of an implementation's docstring, without its full stop."""
         return (inspect.getdoc(self[name]) or "").partition("\n")[0].removesuffix(".")
 
-    def _external(self) -> dict[str, EntryPoint]:
+    def _external(self) -> dict[str, Any]:
         found = _entry_points(self.group, tuple(sys.path)) if self.group else ()
         return {point.name: point for point in found if point.name not in self._registered}
 
@@ -96,6 +96,7 @@ class Registry(Mapping[str, type[Made]]):
 
 
 @lru_cache(maxsize=32)
-def _entry_points(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+def _entry_points(group: str, path: tuple[str, ...]) -> tuple[Any, ...]:
     """Return the entry points of a group. A search reads the metadata of every installed package, so its result is kept."""
+    # a backport of importlib.metadata, if another package has loaded it, returns its own class
     return tuple(entry_points(group=group))
