@@ -98,16 +98,40 @@ class AdviceMetrics(TypedDict):
     helps: bool
 
 
+class EstimatorChoiceMetrics(TypedDict):
+    """Method with the smallest median angular error on held-out measured spectra; that error of each candidate."""
+
+    name: str
+    held_out_deg: dict[str, float]
+    n_held_out: int
+
+
+class LocatingMetrics(TypedDict):
+    """Located test positions: position error [m], fraction of the test positions inside their 80 % credible region, fraction
+    of ambiguous spectra, weights of the likelihoods (first repeat), and seconds (means of the repeats) to find the `room`,
+    to `fit` the locator and to `locate` all test spectra."""
+
+    position_error_m: ErrorSummary
+    coverage_80: float
+    ambiguous: float
+    weights: list[float]
+    seconds: dict[str, float]
+
+
 class MixMetrics(TypedDict):
-    """One measured fraction; `choice` and `advice` (by field model) of the first repeat, `counts` of spectra by origin in
-    each training set, seconds to `fit` and `synthesize` of the trained field models and to `train` all networks."""
+    """One measured fraction; `choice`, `advice` (by field model) and `estimator_choice` of the first repeat, `counts` of
+    spectra by origin in each training set, seconds to `fit` and `synthesize` of the trained field models and to `train` all
+    networks. `locating` by method, `left_out` says why a method is not there."""
 
     n_measured: int
     counts: dict[str, dict[str, int]]
     choice: ChoiceMetrics | None
     advice: dict[str, AdviceMetrics] | None
+    estimator_choice: EstimatorChoiceMetrics | None
     synthesis: dict[str, SynthesisMetrics]
     methods: dict[str, MethodMetrics]
+    locating: dict[str, LocatingMetrics]
+    left_out: dict[str, str]
     seconds: dict[str, float]
 
 

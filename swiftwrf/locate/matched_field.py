@@ -35,6 +35,7 @@ from swiftwrf.runtime.checkpoint import Header, Saved, expect
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
 FOLDS = 5
+MIN_SPECTRA = 15
 OBSERVATIONS = 64  # searched at a time
 FIRST_WEIGHTS = (0.05, 0.05, 0.3)  # of the likelihoods, before calibration
 
@@ -97,7 +98,7 @@ class MatchedField(Saved):
         """Fit the likelihoods to measured spectra and return the locator.
 
         Args:
-            train: Measured spectra, at least 10, with array, rotation and fixed end.
+            train: Measured spectra, at least 15, with array, rotation and fixed end.
             room: Fitted model of the scene with a room. Defaults to a search for the room.
             progress: Show a progress bar on a terminal.
 
@@ -105,6 +106,10 @@ class MatchedField(Saved):
             InputError: Too few spectra, or a property of the data that is missing.
         """
         check_training(train)
+        if len(train) < MIN_SPECTRA:
+            raise InputError(
+                f"matched-field processing needs {MIN_SPECTRA} spectra to hold a fifth of them out, got {len(train)}"
+            )
         if room is not None and room.room is None:
             raise InputError(f"a {room.kind} has no room to locate by; fit geometry or hybrid")
         own = GeometryModel(seed=self.config.seed).fit(train, like=room, progress=progress)
@@ -164,9 +169,9 @@ class MatchedField(Saved):
     def _calibrated(self, position: Tensor, features: SpectrumFeatures, fold: Tensor, parts: list[_Fit]) -> Tensor:
         """Return the weights of the likelihoods that calibrate the posterior of held-out positions."""
         (some,) = thinned(torch.arange(len(position)), rows=self.config.n_calibration)
-        rows_of = [some[fold[some] == number] for number in range(FOLDS)]
+        rows_of = {number: some[fold[some] == number] for number in fold[some].unique().tolist()}
         at_truth, values, volumes, candidates = [], [], [], []
-        for number, rows in enumerate(rows_of):
+        for number, rows in rows_of.items():
             likelihoods, observed = self._likelihoods(parts[number], fold != number), features.subset(rows)
             truth = position[rows][:, None]
             at_truth.append(torch.stack([one.log_likelihood(truth, observed)[:, 0] for one in likelihoods]))
@@ -180,7 +185,7 @@ class MatchedField(Saved):
         def posterior(weight: Tensor) -> Posterior:
             return Posterior(at, normalised(torch.einsum("k,knm->nm", weight, value) + volume), self._resolution_m)
 
-        return tempered(weight, posterior, position[torch.cat(rows_of)])
+        return tempered(weight, posterior, position[torch.cat(list(rows_of.values()))])
 
     def _searched(self, observed: SpectrumFeatures, likelihoods: Any) -> Iterator[tuple[Cells, Tensor]]:
         """Yield cells (b, m) and log-likelihoods (k, b, m) of some observations at a time."""

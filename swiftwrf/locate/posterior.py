@@ -11,6 +11,7 @@ from swiftwrf.errors import InputError
 
 WEISZFELD_STEPS = 30
 MODE_MASS = 0.1  # mass of a second mode from which on a posterior is ambiguous
+MODE_LEVEL, MODE_WIDTH = 0.3, 5.0  # of the first mode, see `Posterior.ambiguous`
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +79,7 @@ class Posterior:
         if not 0 < level < 1:
             raise InputError(f"level must be between 0 and 1, got {level}")
         away = (self.position - self.median[:, None]).norm(dim=2)
-        order = away.argsort(dim=1)
-        mass = self.weight.gather(1, order).cumsum(dim=1)
-        first = (mass < level).sum(dim=1).clamp(max=away.shape[1] - 1)
-        radius: Tensor = away.gather(1, order).gather(1, first[:, None])[:, 0]
-        return radius + self.resolution_m / 4
+        return self._radius(away, level) + self.resolution_m / 4
 
     def direction(self, vectors: Tensor) -> Tensor:
         """Return the unit vector of the smallest expected angular error, (n, 3).
@@ -98,14 +95,22 @@ class Posterior:
 
     @property
     def ambiguous(self) -> Tensor:
-        """True where a second mode, three standard deviations of the first one away, holds a tenth of the mass, (n,)."""
-        at = self.position.expand(len(self), -1, -1)
-        away = (at - self.most_likely[:, None]).norm(dim=2)
-        scale = self.credible_radius(0.5)
-        inner = (self.weight * (away <= scale[:, None])).sum(dim=1)
-        second = (self.weight * (away > 3 * torch.minimum(scale, away.amax(dim=1) / 4)[:, None])).sum(dim=1)
-        found: Tensor = (second > MODE_MASS) & (inner > MODE_MASS)
-        return found
+        """True where a tenth of the mass lies away from the most likely candidate, beyond the width of its mode, (n,).
+
+        The width is five times the radius that contains 30 % of the mass: four to six standard deviations of a single mode.
+        """
+        away = (self.position - self.most_likely[:, None]).norm(dim=2)
+        width = MODE_WIDTH * self._radius(away, MODE_LEVEL) + self.resolution_m
+        second: Tensor = (self.weight * (away > width[:, None])).sum(dim=1) > MODE_MASS
+        return second
+
+    def _radius(self, away: Tensor, level: float) -> Tensor:
+        """Return the radius that contains a fraction of the mass, (n,), given the distances (n, m) of the candidates."""
+        order = away.argsort(dim=1)
+        mass = self.weight.gather(1, order).cumsum(dim=1)
+        first = (mass < level).sum(dim=1).clamp(max=away.shape[1] - 1)
+        radius: Tensor = away.gather(1, order).gather(1, first[:, None])[:, 0]
+        return radius
 
 
 def _geometric_median(point: Tensor, weight: Tensor, start: Tensor, smallest: float) -> Tensor:

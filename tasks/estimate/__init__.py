@@ -10,6 +10,7 @@ import torch
 import tyro
 
 from swiftwrf import InputError, load
+from swiftwrf.locate import MatchedField
 from swiftwrf.metrics import angle_errors
 from tasks.aoa.estimators import SavedEstimator
 from tasks.directory import check_new_table
@@ -22,7 +23,7 @@ class EstimateConfig(SpectraSource):
     """Directions from spectra, by an estimator that `python -m tasks.aoa` trained and left in its run's directory."""
 
     estimator: Annotated[str, tyro.conf.Positional]
-    """file of the estimator, e.g. runs/aoa/first/aann-mix0.3.safetensors"""
+    """file of the estimator, e.g. runs/aoa/first/aann-mix0.3.safetensors or matched_field-mix0.3.safetensors"""
     source: Annotated[str, tyro.conf.Positional]
     """measurements of any format that tasks.aoa takes, or spectra of unknown positions: a .npy file (n, elevations,
     azimuths) of magnitudes in [0, 1]"""
@@ -39,7 +40,7 @@ def run(config: EstimateConfig) -> None:
     out = Path(config.out)
     check_new_table(out)
     estimator = load(config.estimator)
-    if not isinstance(estimator, SavedEstimator):
+    if not isinstance(estimator, SavedEstimator | MatchedField):
         raise InputError(f"{config.estimator} holds a {estimator.kind}; give an estimator that tasks.aoa trained")
     store, known = observed_spectra(config.source, reading(config), estimator.grid, "estimator")
     estimate = torch.cat([estimator.predict(part) for part in store.batches()])

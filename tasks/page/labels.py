@@ -43,6 +43,10 @@ FIELD_MODELS = {
 ESTIMATORS = {
     "aann": Label("the angular neural network (ResNet-50), its head replaced by kernel regression"),
     "kernel_ridge": Label("kernel regression from the spectrum to the direction", "#44aa99"),
+    "matched_field": Label(
+        "the position whose spectrum, predicted by the room, matches, and its direction (matched-field processing)",
+        "#ddaa33",
+    ),
     "nearest_spectrum": Label("the label of the most similar training spectrum", "#666666"),
     "constant": Label("the mean direction of the training labels", "#999999"),
     "peak": Label("the strongest direction", "#bbbbbb"),
