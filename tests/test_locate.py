@@ -62,7 +62,9 @@ def test_the_mass_of_a_one_dimensional_posterior_is_right():
 
 def test_two_modes_are_ambiguous():
     one, two = gaussian_on_a_line(-3, 0.2), gaussian_on_a_line(3, 0.2)
-    both = Posterior(one.position, torch.logaddexp(one.log_weight + math.log(0.6), two.log_weight + math.log(0.4)), 0.025)
+    both = Posterior(
+        one.position, torch.logaddexp(one.log_weight + math.log(0.6), two.log_weight + math.log(0.4)), 0.025
+    )
     assert both.ambiguous[0]
     assert both.most_likely[0, 0] == pytest.approx(-3, abs=0.05)
 
@@ -191,7 +193,9 @@ def test_missing_values_count_as_missing():
     likelihood = ValueLikelihood(torch.eye(3, dtype=torch.float64), math.inf)
     both = likelihood.log_likelihood(maps, torch.tensor([[-61.0, math.nan, -80.0]]))
     alone = RssiMaps(maps.mean[:, [0, 2]], maps.std[:, [0, 2]])
-    less = ValueLikelihood(torch.eye(2, dtype=torch.float64), math.inf).log_likelihood(alone, torch.tensor([[-61.0, -80.0]]))
+    less = ValueLikelihood(torch.eye(2, dtype=torch.float64), math.inf).log_likelihood(
+        alone, torch.tensor([[-61.0, -80.0]])
+    )
     assert torch.allclose(both, less)
 
 
