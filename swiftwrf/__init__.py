@@ -15,6 +15,7 @@ from swiftwrf.data import Rssi, Snapshots, Spectra, load_rssi, load_snapshots, l
 from swiftwrf.data.simulated import rssi_room, simulated_room
 from swiftwrf.diagnostics.calibration import Calibration, calibrate
 from swiftwrf.errors import FitError, InputError
+from swiftwrf.locate import MatchedField, Posterior, RssiLocator
 from swiftwrf.models.base import FIELD_MODELS, FieldModel, Prediction, make_model
 from swiftwrf.models.coarray import CoarrayModel, fit_coarray, project
 from swiftwrf.models.geometry import GeometryModel, HybridModel, fit_geometry, fit_hybrid
@@ -35,10 +36,13 @@ __all__ = [
     "GeometryModel",
     "HybridModel",
     "InputError",
+    "MatchedField",
     "ModelConfig",
+    "Posterior",
     "Prediction",
     "Rssi",
     "RssiConfig",
+    "RssiLocator",
     "RssiModel",
     "Snapshots",
     "Spectra",

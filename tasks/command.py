@@ -33,6 +33,7 @@ COMMANDS = {
         "estimate angles of arrival with few measured spectra, and report the errors", "tasks.aoa.experiment"
     ),
     "rssi": Command("predict RSSI maps of receivers, and report the errors", "tasks.rssi.experiment"),
+    "locate": Command("locate transmitters from RSSI or spectra, and report the errors", "tasks.locate.experiment"),
     "report": Command("merge finished runs of one task into one report", "tasks.report"),
     "inspect": Command("check measurements before a run: counts, frames, calibration", "tasks.inspect"),
     "convert": Command("write measurements of any known format in the toolkit's layout", "tasks.convert"),

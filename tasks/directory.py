@@ -97,6 +97,18 @@ def new_directory(out: Path, what: str) -> Iterator[Path]:
             shutil.rmtree(unfinished)
 
 
+def check_new_table(out: Path) -> None:
+    """Refuse the place of a table that a command is to write.
+
+    Raises:
+        InputError: `out` exists already, or its folder does not exist.
+    """
+    if out.exists():
+        raise InputError(f"--out {out} exists already and is never overwritten; choose another")
+    if not out.parent.is_dir():
+        raise InputError(f"--out {out} lies in {out.parent}, which is no directory")
+
+
 class Run:
     """The directory of a run while it is being filled.
 

@@ -30,7 +30,6 @@ class RunMetrics(TypedDict):
     task: str
     data: str
     split: str
-    preset: str
     seed: int
     n_train: int
     n_test: int
@@ -99,22 +98,47 @@ class AdviceMetrics(TypedDict):
     helps: bool
 
 
+class EstimatorChoiceMetrics(TypedDict):
+    """Method with the smallest median angular error on held-out measured spectra; that error of each candidate."""
+
+    name: str
+    held_out_deg: dict[str, float]
+    n_held_out: int
+
+
+class LocatingMetrics(TypedDict):
+    """Located test positions: position error [m], fraction of the test positions inside their 80 % credible region, fraction
+    of ambiguous spectra, weights of the likelihoods (first repeat), and seconds (means of the repeats) to find the `room`,
+    to `fit` the locator and to `locate` all test spectra."""
+
+    position_error_m: ErrorSummary
+    coverage_80: float
+    ambiguous: float
+    weights: list[float]
+    seconds: dict[str, float]
+
+
 class MixMetrics(TypedDict):
-    """One measured fraction; `choice` and `advice` (by field model) of the first repeat, `counts` of spectra by origin in
-    each training set, seconds to `fit` and `synthesize` of the trained field models and to `train` all networks."""
+    """One measured fraction; `choice`, `advice` (by field model) and `estimator_choice` of the first repeat, `counts` of
+    spectra by origin in each training set, seconds to `fit` and `synthesize` of the trained field models and to `train` all
+    networks. `locating` by method, `left_out` says why a method is not there."""
 
     n_measured: int
     counts: dict[str, dict[str, int]]
     choice: ChoiceMetrics | None
     advice: dict[str, AdviceMetrics] | None
+    estimator_choice: EstimatorChoiceMetrics | None
     synthesis: dict[str, SynthesisMetrics]
     methods: dict[str, MethodMetrics]
+    locating: dict[str, LocatingMetrics]
+    left_out: dict[str, str]
     seconds: dict[str, float]
 
 
 class AoaMetrics(RunMetrics):
     """Metrics of a run of tasks.aoa; `mixes` by measured fraction."""
 
+    preset: str
     repeats: int
     moving: str
     extra: int
@@ -158,9 +182,43 @@ class ChosenMetrics(TypedDict):
 class RssiMetrics(RunMetrics):
     """Of a run of tasks.rssi; `receivers` by receiver and method; `left_out` says why a method is not there."""
 
+    preset: str
     overall: dict[str, PredictorMetrics]
     left_out: dict[str, str]
     receivers: dict[str, dict[str, ReceiverMetrics]]
     seconds: PredictorSeconds
     interval: IntervalMetrics
     chosen: ChosenMetrics
+
+
+class LocalizerMetrics(TypedDict):
+    """Position errors of one localizer, in space and in plan, and its seconds."""
+
+    position_error_m: ErrorSummary
+    horizontal_error_m: ErrorSummary
+    seconds: PredictorSeconds
+
+
+class StudyMetrics(TypedDict):
+    """Position errors of one localizer fitted to a part of the training rows or of the receivers."""
+
+    localizer: str
+    n_train: int
+    n_receivers: int
+    position_error_m: ErrorSummary
+
+
+class LocateMetrics(RunMetrics):
+    """Metrics of a run of tasks.locate.
+
+    `n_undetected` test rows are left out, because no receiver detected them. `calibration` is the fraction of the test
+    positions in the posterior's credible regions by their probability. `weights` are those of its likelihoods.
+    """
+
+    n_receivers: int
+    n_undetected: int
+    overall: dict[str, LocalizerMetrics]
+    calibration: dict[str, float]
+    weights: dict[str, float]
+    by_rows: list[StudyMetrics]
+    by_receivers: list[StudyMetrics]

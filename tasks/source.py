@@ -1,14 +1,20 @@
-"""Options of all commands that state how files are read, where the files leave it open."""
+"""Options of all commands that state how files are read, where the files leave it open, and reading by them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
-from swiftwrf import AngularGrid, InputError
+import numpy as np
+import torch
+from torch import Tensor
+
+from swiftwrf import AngularGrid, InputError, Spectra
 from swiftwrf.array.beamforming import BEAMFORMERS
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data import ReadOptions
+from swiftwrf.data import ReadOptions, read_spectra
+from swiftwrf.data.store import Store
 from tasks.run import choice
 
 MAX_SIDE = 32  # elements: spectra of 32 x 32 elements have 7,938 independent numbers
@@ -90,3 +96,47 @@ def _columns(columns: tuple[str, ...]) -> dict[str, str] | None:
     if len(roles) < len(pairs):
         raise InputError(f"--columns names something twice: {' '.join(columns)}")
     return roles or None
+
+
+def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model: str) -> tuple[Store, Spectra | None]:
+    """Read the spectra that a fitted model is applied to.
+
+    Args:
+        source: Measurements of any format, or a .npy file of spectra of unknown positions.
+        options: Options of reading.
+        grid: Directions of the spectra that the model was fitted to.
+        model: What the model is, for messages.
+
+    Returns:
+        Spectra, and the measurements that they belong to if positions are known.
+
+    Raises:
+        InputError: Spectra that cannot be read, or on another grid.
+    """
+    known = None
+    if not source.endswith(".npy"):
+        known = read_spectra(source, options)
+    elif options.given:
+        raise InputError(f"{source} holds spectra as they are; --{options.given[0]} does not apply")
+    store = Store(_read_array(Path(source))) if known is None else known.store
+    if store.shape[1:] != grid.shape or (known is not None and known.grid != grid):
+        shape, its = (" x ".join(map(str, s)) for s in (store.shape[1:], grid.shape))
+        raise InputError(
+            f"{source} has spectra of {shape} directions, the {model} was trained on others ({its}); where spectra are "
+            f"computed, --grid {' '.join(map(str, grid.shape))} makes them alike"
+        )
+    return store, known
+
+
+def _read_array(file: Path) -> Tensor:
+    """Return the spectra of unknown positions in a .npy file."""
+    try:
+        array = np.load(file, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"{file} is not a readable .npy file ({error})") from None
+    if not isinstance(array, np.ndarray) or array.ndim != 3 or array.dtype.kind != "f" or not len(array):
+        raise InputError(f"{file} must hold floating-point spectra (n, elevations, azimuths)")
+    spectrum = torch.from_numpy(np.array(array, dtype=np.float32))
+    if not bool(((spectrum >= 0) & (spectrum <= 1)).all()):
+        raise InputError(f"{file} must hold magnitudes in [0, 1]")
+    return spectrum

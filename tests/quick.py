@@ -27,6 +27,8 @@ from tasks.estimate import EstimateConfig
 from tasks.estimate import run as estimate
 from tasks.inspect import InspectConfig
 from tasks.inspect import run as inspect
+from tasks.locate import experiment as locate
+from tasks.locate.options import LocateConfig
 from tasks.report import ReportConfig
 from tasks.report import run as report
 from tasks.rssi import experiment as rssi
@@ -40,6 +42,7 @@ from tasks.view import run as view
 TASKS = {
     "aoa": (AoaConfig, aoa.run),
     "rssi": (rssi.RssiTaskConfig, rssi.run),
+    "locate": (LocateConfig, locate.run),
     "report": (ReportConfig, report),
     "convert": (ConvertConfig, convert),
     "estimate": (EstimateConfig, estimate),
@@ -81,6 +84,7 @@ def quick() -> Iterator[None]:
         glances(),
         mock.patch.object(aoa, "simulated_room", return_value=spectra),
         mock.patch.object(rssi, "rssi_room", return_value=floor),
+        mock.patch.object(locate, "rssi_room", return_value=rssi_room(n=80)),
         mock.patch.object(RssiModel, "config_type", QuickRssiConfig),
         mock.patch("tasks.rssi.experiment.MAP_CELLS", 8),
         mock.patch.dict(ESTIMATORS._registered, {NETWORK: QuickNetwork}),

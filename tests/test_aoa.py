@@ -24,7 +24,7 @@ from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models import FIELD_MODELS, FieldModel
 from swiftwrf.models.geometry import model as geometry
-from tasks.aoa import cross_validation, experiment, steps
+from tasks.aoa import context, cross_validation, experiment, steps
 from tasks.aoa.condition import Condition, MeasuredSubset, conditions_of, fraction_key, headline
 from tasks.aoa.estimators import ESTIMATORS, aann, radial
 from tasks.aoa.estimators.aann import AANN, AANNConfig
@@ -338,7 +338,7 @@ def test_samples_train_only_if_they_are_significantly_better_than_means(room, ri
     for number in range(2):
         train, test = (room.subset(rows.nonzero()[:, 0]) for rows in (part != number, part == number))
         folds.append(Fold(Informed().fit(train), train, test))
-    given = cross_validation.advise(folds, n_synthetic=100, seed=0)
+    given = cross_validation.advise(folds, n_synthetic=100, seed=0).metrics
     assert given["sampled"] is sampled
     assert [gain["sampled"] for gain in given["gains"]] == [False, True]
 
@@ -348,7 +348,7 @@ def pretended(monkeypatch, room, errors):
     monkeypatch.setattr(cross_validation, "_errors", lambda fold, number, *_: errors(fold.test, number))
     model = make_model("idw").fit(room)
     folds = [SimpleNamespace(model=model, test=fold) for fold in range(4)]
-    return cross_validation.advise(folds, n_synthetic=3000, seed=0)
+    return cross_validation.advise(folds, n_synthetic=3000, seed=0).metrics
 
 
 @pytest.mark.parametrize(
@@ -590,7 +590,9 @@ def test_models_for_comparison_are_always_quick(small, monkeypatch):
     train, test = small.split("random", 0)
     data = steps.Experiment(given, train, test, 0, torch.device("cpu"))
     made = []
-    monkeypatch.setattr(steps, "make_model", lambda name, preset, **options: made.append((name, preset)) or mock.Mock())
+    monkeypatch.setattr(
+        context, "make_model", lambda name, preset, **options: made.append((name, preset)) or mock.Mock()
+    )
     for synthesis in steps._syntheses(data, MeasuredSubset(0.5), ["idw"], {}):
         synthesis._fitted(data, train, steps._FitHistory(), Path())
     assert made == [("idw", "paper"), ("gp", "quick"), ("coarray", "quick")]

@@ -24,7 +24,8 @@ def test_tables_come_from_the_results(name):
 
 
 @pytest.mark.parametrize(
-    "name", [*FILES, "docs/architecture.md", "docs/conventions.md", "docs/formats.md", "docs/view.md"]
+    "name",
+    [*FILES, "docs/architecture.md", "docs/conventions.md", "docs/formats.md", "docs/locating.md", "docs/view.md"],
 )
 def test_every_file_that_a_page_names_is_there(name):
     for target in re.findall(r"\]\(([^)#:]+)\)", (ROOT / name).read_text()):

@@ -11,7 +11,7 @@ import pytest
 from quick import PREDICTORS_KEPT, TASKS, QuickNetwork, QuickRssiConfig
 from small import glances
 
-from swiftwrf import RssiModel
+from swiftwrf import RssiConfig, RssiModel
 from tasks.aoa.condition import NETWORK
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.rssi.predictors import PREDICTORS
@@ -35,10 +35,13 @@ def test_every_block_runs(part, tmp_path, monkeypatch):
         config, function = TASKS[name]
         if name == "aoa":
             arguments += ["--extra", "20"]
+        rssi_config = (
+            RssiConfig if ".safetensors" in block else QuickRssiConfig
+        )  # files open with the class of their kind
         with (
             glances(),
             mock.patch.dict(ESTIMATORS._registered, {NETWORK: QuickNetwork}),
-            mock.patch.object(RssiModel, "config_type", QuickRssiConfig),
+            mock.patch.object(RssiModel, "config_type", rssi_config),
             mock.patch.object(PREDICTORS, "_registered", {name: PREDICTORS[name] for name in PREDICTORS_KEPT}),
         ):
             assert command_line(module, config, function, arguments) == 0, block

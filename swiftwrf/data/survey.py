@@ -74,6 +74,12 @@ def read_frame(file: Path) -> pd.DataFrame:
         return content.read().to_pandas()
 
 
+def has_positions(table: pd.DataFrame, columns: Mapping[str, str]) -> bool:
+    """Return True if a column of a table holds positions, by its name or by the names of columns given by role."""
+    named = any(ROLES[role].fullmatch(_plain(str(name))) for role in ("x", "y") for name in table.columns)
+    return named or bool({"x", "y"} & set(columns))
+
+
 def read_survey(label: object, table: pd.DataFrame, columns: Mapping[str, str]) -> Survey:
     """Return receivers, RSSI and positions of a survey table.
 

@@ -14,6 +14,7 @@ from tasks.run import Row
 
 Training = Literal["measured", "turbo", "turbo_extra", "all"]
 NETWORK = "aann"  # estimator of the paper; names of its conditions omit it
+LOCATOR = "matched_field"  # estimator that locates the moving end by the room; it needs positions, array and fixed end
 AUTO = "auto"  # --synthesizer: the field model that cross-validation chooses
 Value = TypeVar("Value")
 
@@ -53,6 +54,9 @@ class MeasuredSubset:
     def columns(self) -> Row:
         """Columns of the result tables."""
         return {"measured_fraction": self.measured_fraction, "repeat": self.repeat}
+
+
+EVERYTHING = MeasuredSubset(1.0)  # all training spectra
 
 
 @dataclass(frozen=True)
@@ -99,6 +103,16 @@ class Condition:
         if self.estimator == NETWORK:
             return self.training_set
         return self.estimator if self.training == "measured" else f"{self.estimator}_{self.training_set}"
+
+    @property
+    def subset(self) -> MeasuredSubset:
+        """Measured spectra of the condition."""
+        return MeasuredSubset(self.measured_fraction, self.repeat)
+
+    @property
+    def result_name(self) -> str:
+        """Name of the kept result. Measured fractions share the result of a condition that is trained on all spectra."""
+        return f"{self.method}-{f'r{self.repeat}' if self.training == 'all' else self.subset}"
 
     @property
     def is_turbo(self) -> bool:
@@ -204,5 +218,6 @@ def terms() -> dict[str, str]:
         "turbo_NAME_extra": "turbo_NAME with synthetic spectra at further positions, their number by --extra",
         "turbo_auto": "the choice of each repeat by cross-validation, where repeats chose differently",
         **{name: label.meaning for name, label in labels.labels(ESTIMATORS, labels.ESTIMATORS).items()},
+        LOCATOR: labels.ESTIMATORS[LOCATOR].meaning,
         "no estimator's name": f"the network ({NETWORK}); the name of another estimator alone: trained on measured spectra",
     }

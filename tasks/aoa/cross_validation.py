@@ -1,4 +1,4 @@
-"""Cross-validation of turbo learning on the measured spectra: do synthetic spectra reduce the error, and how many?
+"""Cross-validation on the measured spectra: do synthetic spectra reduce the error, how many, and which estimator is best?
 
 Kernel ridge regression stands in for the network, because it trains in a second. Withheld spectra and test spectra take no
 part. The number of synthetic positions is chosen by the errors, so the error at the chosen number is too optimistic. The
@@ -7,28 +7,53 @@ interval is therefore that of the rule: for each fold, the number is chosen on t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from augment import Fold, Mixed, synthetic_positions
+from augment.choose import BLIND_FOLDS
+from swiftwrf import FitError, InputError
+from swiftwrf.gp import thinned
+from swiftwrf.locate import MatchedField, MatchedFieldConfig
 from swiftwrf.metrics import angle_errors
 from swiftwrf.runtime.threads import single_thread
+from tasks.aoa.condition import LOCATOR
 from tasks.aoa.estimators import make_estimator
-from tasks.metrics import AdviceMetrics, ChangeMetrics
+from tasks.metrics import AdviceMetrics, ChangeMetrics, EstimatorChoiceMetrics
 
 STAND_IN = "kernel_ridge"
 N_SYNTHETIC_CANDIDATES = (300, 1000, 3000)
 N_SYNTHETIC_COMPARED = 1000  # number of positions at which predicted means and samples are compared
 N_BOOTSTRAP = 2000
+MAX_LOCATED = 60  # held-out spectra of a fold that are located
+FOLD_LOCATOR = MatchedFieldConfig(n_calibration=40, max_cells=100_000)  # half the time of the defaults
+Errors = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Advice:
+    """Result of `advise`.
+
+    Args:
+        metrics: Values for metrics.json.
+        measured_only: Angular errors [deg] on the held-out spectra of each fold, trained on measured spectra alone.
+        turbo: The same with synthetic spectra, their number chosen on the other folds. Empty without further positions.
+    """
+
+    metrics: AdviceMetrics
+    measured_only: list[Errors]
+    turbo: list[Errors]
 
 
 @single_thread()
-def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> AdviceMetrics:
+def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> Advice:
     """Return the change of the error on held-out measured spectra by synthetic spectra of one field model.
 
     Args:
@@ -41,10 +66,10 @@ def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> AdviceMetrics:
     every = range(len(folds))
 
     @cache
-    def fold_errors(fold: int, number: int, sampled: bool) -> NDArray[np.float64]:
+    def fold_errors(fold: int, number: int, sampled: bool) -> Errors:
         return _errors(folds[fold], number, sampled, seed)
 
-    def errors(some: Iterable[int], number: int, sampled: bool = False) -> NDArray[np.float64]:
+    def errors(some: Iterable[int], number: int, sampled: bool = False) -> Errors:
         return np.concatenate([fold_errors(fold, number, sampled) for fold in some])
 
     def chosen(some: Sequence[int]) -> tuple[int, bool]:
@@ -54,7 +79,8 @@ def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> AdviceMetrics:
         sampled = folds[0].model.samples and _change(means, errors(some, compared, True))["high"] < 0
         return min(numbers, key=lambda number: float(np.median(errors(some, number, sampled)))), sampled
 
-    measured_only = errors(every, 0)
+    alone = [fold_errors(fold, 0, False) for fold in every]
+    measured_only = np.concatenate(alone)
     advice: AdviceMetrics = {
         "stand_in": STAND_IN,
         "n_held_out": len(measured_only),
@@ -66,7 +92,7 @@ def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> AdviceMetrics:
         "helps": False,
     }
     if not numbers:
-        return advice
+        return Advice(advice, alone, [])
     best, sampled = chosen(every)
     for with_samples in (False, True) if folds[0].model.samples else (False,):
         for number in numbers if with_samples == sampled else [compared]:
@@ -79,10 +105,52 @@ def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> AdviceMetrics:
     if all(gain["change"] < 0 for gain in advice["gains"] if gain["sampled"] == sampled):
         advice["recommended_extra"] = best
         advice["helps"] = rule["high"] < 0
-    return advice
+    return Advice(advice, alone, by_rule)
 
 
-def _errors(fold: Fold, n_synthetic: int, sampled: bool, seed: int) -> NDArray[np.float64]:
+def choose_estimator(
+    errors: Mapping[str, Sequence[Errors]], folds: Sequence[Fold], seed: int
+) -> EstimatorChoiceMetrics:
+    """Return the estimator with the smallest median error on held-out measured spectra.
+
+    Matched-field processing is compared on one fold of each structure search, because its fits take seconds. It is a
+    candidate only if planes were found without the spectra of each of these folds. All estimators are then compared on the
+    spectra that it located.
+
+    Args:
+        errors: Angular errors [deg] on the held-out spectra of each fold, by name of the method.
+        folds: The same folds with a field model that has a room. Empty without such a model.
+        seed: Seed of the locators.
+    """
+    compared = {name: np.concatenate(parts) for name, parts in errors.items()}
+    scored = range(0, len(folds), len(BLIND_FOLDS[0]))[: len(BLIND_FOLDS)]
+    rows = [thinned(torch.arange(len(folds[fold].test)), rows=MAX_LOCATED)[0] for fold in scored]
+    located = [_located_errors(folds[fold], some, seed) for fold, some in zip(scored, rows, strict=True)]
+    if located and all(found is not None for found in located):
+        compared = {
+            name: np.concatenate([parts[fold][some.numpy()] for fold, some in zip(scored, rows, strict=True)])
+            for name, parts in errors.items()
+        }
+        compared[LOCATOR] = np.concatenate([found for found in located if found is not None])
+    held_out = {name: float(np.median(values)) for name, values in compared.items()}
+    best = min(held_out, key=lambda name: held_out[name])
+    return {"name": best, "held_out_deg": held_out, "n_held_out": len(compared[best])}
+
+
+def _located_errors(fold: Fold, rows: Tensor, seed: int) -> Errors | None:
+    """Return the angular errors [deg] of matched-field processing on held-out spectra; None without a room."""
+    room = fold.model.room
+    if room is None or not room.planes:
+        return None
+    test = fold.test.subset(rows)
+    try:
+        locator = MatchedField(FOLD_LOCATOR, seed=seed).fit(fold.train, room=room)
+    except (InputError, FitError):
+        return None
+    return _degrees(locator.predict(test.spectrum), test.label)
+
+
+def _errors(fold: Fold, n_synthetic: int, sampled: bool, seed: int) -> Errors:
     """Return the angular errors [deg] of the stand-in on held-out spectra, trained with synthetic spectra."""
     train = Mixed.measured(fold.train)
     if n_synthetic:
@@ -93,11 +161,15 @@ def _errors(fold: Fold, n_synthetic: int, sampled: bool, seed: int) -> NDArray[n
             spectra = fold.model.synthesize(positions.position)
         train = train.add(positions, spectra.cpu())
     stand_in = make_estimator(STAND_IN, seed=seed).fit(train)
-    errors = angle_errors(stand_in.predict(fold.test.spectrum), fold.test.label)["great_circle"].rad2deg()
-    return cast(NDArray[np.float64], errors.double().numpy())
+    return _degrees(stand_in.predict(fold.test.spectrum), fold.test.label)
 
 
-def _change(before: NDArray[np.float64], after: NDArray[np.float64]) -> ChangeMetrics:
+def _degrees(estimate: Tensor, label: Tensor) -> Errors:
+    """Return the angular errors [deg] of directions (n, 2) [rad]."""
+    return cast(Errors, angle_errors(estimate, label)["great_circle"].rad2deg().double().numpy())
+
+
+def _change(before: Errors, after: Errors) -> ChangeMetrics:
     """Return the median of `after`, its relative change against that of `before`, and the change's 95 % bootstrap interval
     over held-out spectra."""
     rows = np.random.default_rng(0).integers(len(before), size=(N_BOOTSTRAP, len(before)))

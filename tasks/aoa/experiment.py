@@ -9,10 +9,11 @@ from swiftwrf import InputError, Spectra, simulated_room
 from swiftwrf.data import read_spectra
 from swiftwrf.data.files import sha256
 from tasks.aoa.condition import MeasuredSubset, fraction_key
+from tasks.aoa.context import Experiment
 from tasks.aoa.options import AoaConfig, check, check_data, n_synthetic
 from tasks.aoa.page import page
 from tasks.aoa.results import Results
-from tasks.aoa.steps import Experiment, Suggestion, first_steps
+from tasks.aoa.steps import Suggestion, first_steps
 from tasks.cluster import connected
 from tasks.metrics import AoaMetrics
 from tasks.page.page import reporting

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import torch
 from pandas import DataFrame
@@ -10,9 +10,12 @@ from torch import Tensor
 
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import angle_errors, covered, l1, psnr, ssim
-from tasks.aoa.condition import AUTO, Condition, MeasuredSubset, fraction_key, pooled
-from tasks.aoa.steps import CrossValidation, Evaluation, Experiment, Suggestion, Synthesis, as_bytes
-from tasks.metrics import ANGLES, SCORES, MethodMetrics, MixMetrics, SynthesisMetrics
+from swiftwrf.models import FIELD_MODELS
+from tasks.aoa.condition import AUTO, EVERYTHING, LOCATOR, Condition, MeasuredSubset, fraction_key, pooled
+from tasks.aoa.context import ROOM_MODEL, Experiment
+from tasks.aoa.locating import LEVEL, NO_PLANE, Locating
+from tasks.aoa.steps import CrossValidation, Evaluation, RoomSearch, Suggestion, Synthesis, as_bytes
+from tasks.metrics import ANGLES, SCORES, LocatingMetrics, MethodMetrics, MixMetrics, SynthesisMetrics
 from tasks.run import Row, Run, console
 from tasks.steps import Step
 from tasks.summarise import averaged, repeats_averaged
@@ -43,7 +46,14 @@ class Results:
         self.synthesis_seconds: list[Row] = []
         self.history: list[Row] = []
         self.chosen: dict[str, Row] = {}  # by measured fraction, of the first repeat
+        self.left_out: dict[Condition, str] = {}  # conditions of matched-field processing, and why
         self._examples: set[str] = set()
+        self._sentences: set[str] = set()
+        if missing := FIELD_MODELS[ROOM_MODEL].lacking(self.test):
+            reason = f"it needs the {missing[0]}, which {self.test.name} does not describe"
+            console.print(f"{LOCATOR} is left out: {reason}")
+            subsets = (*map(MeasuredSubset, experiment.config.mix), EVERYTHING)
+            self.left_out = dict.fromkeys((c for subset in subsets for c in experiment.located_by(subset)), reason)
 
     def add(self, step: Step[Experiment], value: Row) -> None:
         """Add the result of one step."""
@@ -54,7 +64,11 @@ class Results:
                 console.print(f"{step.synthesizer} is left out of the comparison: {value['refused']}")
             case Synthesis():
                 self._add_synthesis(step, value)
-            case Evaluation():
+            case RoomSearch() if not value.get("planes"):
+                self._leave_out(step.located, value.get("refused", NO_PLANE))
+            case Locating() if "refused" in value:
+                self._leave_out((step.condition,), value["refused"])
+            case Evaluation() | Locating():
                 self.evaluated.append((step.condition, value))
                 self.history += [step.condition.columns | row for row in value["history"]]
             case Suggestion():
@@ -68,6 +82,8 @@ class Results:
     def write(self) -> None:
         """Write the tables of the run."""
         self.run.write_csv("errors.csv", self.errors())
+        if positions := self.positions():
+            self.run.write_csv("positions.csv", positions)
         self.run.write_csv("synthesis.csv", self.synthesis)
         self.run.write_csv("history.csv", self.history)
 
@@ -88,6 +104,38 @@ class Results:
             columns |= {f"{angle}_deg": error.rad2deg() for angle, error in errors.items()}
             rows += _rows(condition.columns, columns)
         return rows
+
+    def positions(self) -> list[Row]:
+        """Return one row for each condition that locates and each test spectrum: truth, estimate, error and radius."""
+        rows: list[Row] = []
+        for condition, value in self.evaluated:
+            if "located" not in value:
+                continue
+            found = {name: torch.tensor(value["located"][name]) for name in ("radius", "level", "ambiguous")}
+            estimate = torch.tensor(value["located"]["position"], dtype=torch.float64)
+            error = (estimate - self.test.position).norm(dim=1)
+            columns = {"index": self.test.index}
+            for name, at in (("truth", self.test.position), ("estimate", estimate)):
+                columns |= {f"{name}_{axis}_m": at[:, number] for number, axis in enumerate("xyz")}
+            columns |= {
+                "error_m": error,
+                "credible_radius_80_m": found["radius"],
+                "covered": found["level"] < LEVEL,
+                "containing_level": found["level"],
+                "ambiguous": found["ambiguous"],
+            }
+            rows += _rows(condition.columns, columns)
+        return rows
+
+    def _leave_out(self, conditions: Iterable[Condition], reason: str) -> None:
+        """Record and print why conditions are not in the results, each sentence once."""
+        for condition in conditions:
+            share = "everything" if condition.training == "all" else f"{condition.measured_fraction:.0%}"
+            sentence = f"{condition.method} is left out with {share} measured: {reason}"
+            if sentence not in self._sentences:
+                console.print(sentence)
+            self._sentences.add(sentence)
+            self.left_out[condition] = reason
 
     def _add_synthesis(self, step: Synthesis, value: Row) -> None:
         spectra = step.test_spectra(self.run.folder)
@@ -150,8 +198,11 @@ class Results:
             "counts": {condition.training_set: value["counts"] for condition, value in evaluated},
             "choice": chosen.get("choice"),
             "advice": chosen.get("advice"),
+            "estimator_choice": chosen.get("estimator_choice"),
             "synthesis": _synthesis_metrics(synthesis, fits),
             "methods": self._method_metrics(fraction),
+            "locating": self._locating_metrics(fraction),
+            "left_out": {c.method: reason for c, reason in self.left_out.items() if c.measured_fraction == fraction},
             "seconds": {
                 "fit": float(trained["fit"].sum()),
                 "synthesize": float(trained["draw"].sum()),
@@ -169,6 +220,28 @@ class Results:
         return {
             method: {**conditions[method].description, **summaries, "seconds": seconds[method]}  # type: ignore[typeddict-item]
             for method, summaries in repeats_averaged(errors, "method", ANGLES).items()
+        }
+
+    def _locating_metrics(self, fraction: float) -> dict[str, LocatingMetrics]:
+        rows = DataFrame([row for row in self.positions() if row["measured_fraction"] == fraction])
+        if not len(rows):
+            return {}
+        located = [(c, value["located"]) for c, value in self.evaluated if "located" in value]
+        own = [(c, found) for c, found in located if c.measured_fraction == fraction]
+        weights = {c.method: found["weights"] for c, found in reversed(own)}  # of the first repeat
+        seconds = averaged(
+            DataFrame([c.columns | found["seconds"] for c, found in own]), "method", ("room", "fit", "locate")
+        )
+        shares = averaged(rows, "method", ("covered", "ambiguous"))
+        return {
+            method: {
+                "position_error_m": summaries["error_m"],
+                "coverage_80": shares[method]["covered"],
+                "ambiguous": shares[method]["ambiguous"],
+                "weights": weights[method],
+                "seconds": seconds[method],
+            }
+            for method, summaries in repeats_averaged(rows, "method", ("error_m",)).items()
         }
 
 

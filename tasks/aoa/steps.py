@@ -11,62 +11,25 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from augment import Mixed, SyntheticPositions, choose_model, mix, suggest, synthetic_positions, withhold
+from augment import Mixed, SyntheticPositions, choose_model, mix, suggest, synthetic_positions
 from augment.choose import candidates
 from swiftwrf import FitError, InputError, Spectra, load
 from swiftwrf.data.store import Store
-from swiftwrf.models import FIELD_MODELS, FieldModel, make_model
+from swiftwrf.models import FIELD_MODELS, FieldModel
 from swiftwrf.runtime.checkpoint import read, write
 from tasks.aoa.artifacts import save_artifacts
-from tasks.aoa.condition import AUTO, Condition, MeasuredSubset, Training, trainable
-from tasks.aoa.cross_validation import advise
+from tasks.aoa.condition import AUTO, EVERYTHING, Condition, MeasuredSubset, Training, trainable
+from tasks.aoa.context import ROOM_MODEL, Experiment
+from tasks.aoa.cross_validation import STAND_IN, advise, choose_estimator
 from tasks.aoa.estimators import ESTIMATORS, SavedEstimator, make_estimator
-from tasks.aoa.options import RAYTRACE, AoaConfig
+from tasks.aoa.locating import Locating
 from tasks.claim import STEPS
 from tasks.metrics import AdviceMetrics
-from tasks.run import Preset, Row
+from tasks.run import Row
 from tasks.steps import Step
 
 KIND = "synthetic spectra"
-ROOM_MODEL = "geometry"  # field model that finds the room for all models with one
 BATCH_POSITIONS = 4096  # spectra predicted before they are rounded: half a gigabyte of 90 x 360 pixels
-
-
-@dataclass(frozen=True, eq=False)
-class Experiment:
-    """Data and options that all steps of a run share.
-
-    Args:
-        config: Options of the run.
-        train: Training spectra of the split.
-        test: Test spectra of the split.
-        n_synthetic: Largest number of further synthetic positions.
-        device: Device to compute on.
-    """
-
-    config: AoaConfig
-    train: Spectra
-    test: Spectra
-    n_synthetic: int
-    device: torch.device
-
-    def seed(self, subset: MeasuredSubset) -> int:
-        """Return the seed of a repeat."""
-        return self.config.seed + subset.repeat
-
-    def withhold(self, subset: MeasuredSubset) -> tuple[Spectra, SyntheticPositions]:
-        """Return the measured spectra, and the positions of the others."""
-        return withhold(self.train, subset.measured_fraction, self.seed(subset))
-
-    def make_model(self, name: str, subset: MeasuredSubset, preset: Preset = "quick") -> FieldModel:
-        """Return a field model that is not fitted."""
-        # validation at random: withheld positions lie among the measured ones, whatever the split of the test
-        return make_model(name, preset, seed=self.seed(subset), validation="random", scene=self.config.scene)
-
-    def finds_room(self, name: str) -> bool:
-        """Return True if a field model is built on the room that the spectra show."""
-        has_room = FIELD_MODELS[name].room is not FieldModel.room
-        return has_room and not (name == RAYTRACE and self.config.scene is not None)
 
 
 def first_steps(experiment: Experiment, subset: MeasuredSubset) -> list[Step[Experiment]]:
@@ -78,12 +41,16 @@ def first_steps(experiment: Experiment, subset: MeasuredSubset) -> list[Step[Exp
     def reference(estimator: str, training: Training) -> Evaluation:
         return Evaluation(Condition(estimator, training, measured_fraction=fraction, repeat=repeat))
 
-    return [
+    steps: list[Step[Experiment]] = [
         *(reference(estimator, "measured") for estimator in ESTIMATORS),
         *(_syntheses(experiment, subset, named, {}) if named and not compared else [CrossValidation(subset, compared)]),
         # independent of the measured fraction, so all fractions share these steps
         *(reference(estimator, "all") for estimator in trainable()),
     ]
+    config = experiment.config
+    if subset == MeasuredSubset(config.mix[0]) and 1.0 not in config.mix and ROOM_MODEL in candidates(experiment.train):
+        steps.append(RoomSearch(EVERYTHING, (), experiment.located_by(EVERYTHING)))
+    return steps
 
 
 def _syntheses(
@@ -94,12 +61,12 @@ def _syntheses(
     with_room: list[Synthesis] = []
     for name in dict.fromkeys((*names, *candidates(experiment.train))):
         trains, own = name in names, advice.get(name)
-        # by default only where held-out measured spectra gain from further positions
-        wanted = experiment.config.extra is not None or bool(own and own["recommended_extra"])
-        n_synthetic = experiment.n_synthetic if trains and wanted else 0
+        n_synthetic = experiment.n_extra(own) if trains else 0
         synthesis = Synthesis(subset, name, trains, n_synthetic, bool(own and own["sampled"]))
         (with_room if experiment.finds_room(name) else direct).append(synthesis)
-    search: list[Step[Experiment]] = [RoomSearch(subset, tuple(with_room))] if with_room else []
+    search: list[Step[Experiment]] = []
+    if with_room:
+        search.append(RoomSearch(subset, tuple(with_room), experiment.located_by(subset)))
     return search + direct if with_room and with_room[0].trains else direct + search
 
 
@@ -127,12 +94,25 @@ class CrossValidation(Step[Experiment]):
         except InputError:
             if not self.compared:
                 raise
-            return {"choice": None, "advice": {}}  # field models asked for by name need no comparison
+            # field models asked for by name need no comparison
+            return {"choice": None, "advice": {}, "estimator_choice": None}
         trained = [name for name in self.compared if name in choice.folds] or [choice.name]
+        advice = {name: advise(choice.folds[name], experiment.n_synthetic, seed) for name in trained}
+        first = advice[trained[0]]
+        turbo = self._turbo(experiment, trained[0], first.metrics)
+        errors = {Condition(STAND_IN, "measured").method: first.measured_only}
+        errors |= {turbo.method: first.turbo} if first.turbo else {}
+        with_room = next((found for found in choice.folds.values() if found[0].model.room is not None), [])
         return {
             "choice": {"name": choice.name, "psnr_db": choice.psnr_db, "seconds": choice.seconds},
-            "advice": {name: advise(choice.folds[name], experiment.n_synthetic, seed) for name in trained},
+            "advice": {name: entry.metrics for name, entry in advice.items()},
+            "estimator_choice": choose_estimator(errors, with_room, seed),
         }
+
+    def _turbo(self, experiment: Experiment, synthesizer: str, advice: AdviceMetrics) -> Condition:
+        """Return the condition of the stand-in with all spectra of a field model."""
+        number = experiment.n_extra(advice)
+        return Condition(STAND_IN, "turbo_extra" if number else "turbo", synthesizer, number)
 
     def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
         named = [name for name in experiment.config.synthesizer if name != AUTO]
@@ -141,15 +121,17 @@ class CrossValidation(Step[Experiment]):
 
 @dataclass(frozen=True)
 class RoomSearch(Step[Experiment]):
-    """Find the room in the measured spectra, once for all field models that are built on it.
+    """Find the room in the measured spectra, once for all field models that are built on it and for the locator.
 
     Args:
         subset: Measured spectra.
         syntheses: Steps of these models.
+        located: Conditions of matched-field processing.
     """
 
     subset: MeasuredSubset
     syntheses: tuple[Synthesis, ...]
+    located: tuple[Condition, ...] = ()
 
     @property
     def name(self) -> str:
@@ -170,11 +152,13 @@ class RoomSearch(Step[Experiment]):
         except (InputError, FitError) as error:
             return {"refused": str(error)}
         model.save(folder / self.file)
-        return {"seconds": time.perf_counter() - began}
+        return {"seconds": time.perf_counter() - began, "planes": len(model.room.planes) if model.room else 0}
 
     def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
         found = None if "refused" in value else self  # without a room the models refuse the spectra themselves
-        return [replace(synthesis, room=found, room_seconds=value.get("seconds", 0.0)) for synthesis in self.syntheses]
+        seconds = value.get("seconds", 0.0)
+        steps: list[Step[Experiment]] = [replace(one, room=found, room_seconds=seconds) for one in self.syntheses]
+        return steps + [Locating(condition, self.file, seconds) for condition in self.located if value.get("planes")]
 
 
 @dataclass(frozen=True)
@@ -310,12 +294,11 @@ class Evaluation(Step[Experiment]):
     @property
     def subset(self) -> MeasuredSubset:
         """Measured spectra of the condition."""
-        return MeasuredSubset(self.condition.measured_fraction, self.condition.repeat)
+        return self.condition.subset
 
     @property
     def name(self) -> str:
-        of_all = self.condition.training == "all"
-        return f"{self.condition.method}-{f'r{self.condition.repeat}' if of_all else self.subset}"
+        return self.condition.result_name
 
     @property
     def reads(self) -> tuple[str, ...]:

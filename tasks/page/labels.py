@@ -43,6 +43,10 @@ FIELD_MODELS = {
 ESTIMATORS = {
     "aann": Label("the angular neural network (ResNet-50), its head replaced by kernel regression"),
     "kernel_ridge": Label("kernel regression from the spectrum to the direction", "#44aa99"),
+    "matched_field": Label(
+        "the position whose spectrum, predicted by the room, matches, and its direction (matched-field processing)",
+        "#ddaa33",
+    ),
     "nearest_spectrum": Label("the label of the most similar training spectrum", "#666666"),
     "constant": Label("the mean direction of the training labels", "#999999"),
     "peak": Label("the strongest direction", "#bbbbbb"),
@@ -65,6 +69,17 @@ PREDICTORS = {
     "mean": Label("the mean of the receiver's training values", "#bbbbbb"),
     "nerf2": Label("a neural field for all receivers, its rays averaged (NeRF2)", "#44aa99"),
     "blend": Label("a weighted mean of other predictors, weights by cross-validation", "#aa3377"),
+}
+
+LOCALIZERS = {
+    "posterior": Label(
+        "the median of the posterior over positions: radio maps with their uncertainty, detections, similar training rows",
+        "#4477aa",
+    ),
+    "knn": Label("the inverse-distance mean position of the k training rows with the most similar RSSI", "#66ccee"),
+    "knn_difference": Label("knn on differences to the row's strongest value, without the device's offset", "#ee8866"),
+    "gp": Label("Gaussian-process regression from RSSI to coordinates", "#228833"),
+    "mean": Label("the mean training position", "#bbbbbb"),
 }
 
 

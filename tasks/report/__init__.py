@@ -13,11 +13,12 @@ import tyro
 from swiftwrf import InputError
 from tasks.aoa import page as aoa
 from tasks.directory import new_directory
+from tasks.locate import page as locate
 from tasks.page.page import Page, write_page
 from tasks.page.records import Records
 from tasks.rssi import page as rssi
 
-PAGES: dict[str, Callable[[list[Records[Any]]], Page]] = {"aoa": aoa.page, "rssi": rssi.page}
+PAGES: dict[str, Callable[[list[Records[Any]]], Page]] = {"aoa": aoa.page, "rssi": rssi.page, "locate": locate.page}
 
 
 @dataclass(frozen=True)

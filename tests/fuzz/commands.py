@@ -31,6 +31,7 @@ NEEDED = {
     "view": ["data"],
     "scenes": ["--room", "office", "--moving", "receiver", "--positions", "5"],
     "estimate": ["data", "data"],
+    "locate": ["--cells", "100"],
 }
 RIGHT = {
     "aoa": {
@@ -46,6 +47,12 @@ RIGHT = {
     "rssi": {
         "--rx": ("1", "receiver06 2", "all"),
         "--split": ("random", "block"),
+        "--seed": ("0", "4294967295"),
+    },
+    "locate": {
+        "--rx": ("1", "receiver06 2", "all"),
+        "--split": ("random", "block"),
+        "--cells": ("10", "100"),
         "--seed": ("0", "4294967295"),
     },
 }

@@ -9,10 +9,12 @@ remains unknown. A rotation of the array by half a turn with all phases reversed
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
 
+from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray, basis, pairs
 from swiftwrf.data.spectra import Spectra
 
@@ -29,14 +31,24 @@ def autocorrelation(channel: Tensor, array: PlanarArray) -> Tensor:
 
 
 def correlations(spectra: Spectra) -> Tensor:
-    """Return r(l) of each spectrum by least squares on the squares of at most 6000 pixels, complex128 (n, P)."""
+    """Return the co-array numbers of spectra with a known array, complex128 (n, P)."""
     assert spectra.array is not None
-    functions = basis(spectra.array, spectra.grid)
+    return coarray_numbers(spectra.store.batches(), spectra.array, spectra.grid)
+
+
+def coarray_numbers(spectra: Iterable[Tensor], array: PlanarArray, grid: AngularGrid) -> Tensor:
+    """Return r(l) of each spectrum by least squares on its square, complex128 (n, P).
+
+    Args:
+        spectra: Batches (b, H, W) of magnitudes, of which at most 6000 evenly chosen pixels are used.
+        array: Array of the spectra.
+        grid: Directions of the pixels.
+    """
+    functions = basis(array, grid)
     stride = max(1, functions.shape[1] // MAX_PIXELS)
-    stride += 1 - stride % 2  # odd, because an even one would take every other column only
+    stride += 1 - stride % 2  # odd: an even one would keep to every other column
     inverse = torch.linalg.pinv(functions[:, ::stride])
-    some = (part.flatten(1)[:, ::stride] for part in spectra.store.batches())
-    coefficient = torch.cat([part.double().square() @ inverse for part in some])
+    coefficient = torch.cat([part.flatten(1)[:, ::stride].double().square() @ inverse for part in spectra])
     half = (coefficient.shape[1] - 1) // 2
     return torch.complex(coefficient[:, 1 : 1 + half], coefficient[:, 1 + half :]) / 2
 

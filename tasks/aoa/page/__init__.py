@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from tasks.aoa.page.cost import sizes, speed_section, time_section, trainings
 from tasks.aoa.page.field import field_section
+from tasks.aoa.page.locating import locating_section
 from tasks.aoa.page.records import AoaRecords, FractionRecords
-from tasks.aoa.page.results import over_estimators, over_fractions, results_section
+from tasks.aoa.page.results import estimator_section, over_estimators, over_fractions, results_section
 from tasks.aoa.page.room import choice_section, room_section
 from tasks.aoa.page.suggest import suggestion_section
 from tasks.aoa.page.summary import summary
@@ -22,8 +23,8 @@ def page(runs: list[AoaRecords]) -> Page:
     if len(fractions) > 1:
         sections.insert(0, Section("Error against the measured fraction", plots=[over_fractions(fractions, "shares")]))
     for fraction in fractions:
-        found = choice_section(fraction), room_section(fraction), suggestion_section(fraction)
-        sections += [section for section in found if section]
+        makers = (locating_section, estimator_section, choice_section, room_section, suggestion_section)
+        sections += [section for make in makers if (section := make(fraction))]
     sections += [synthesis_section(fractions, several), *(examples_section(fraction) for fraction in fractions)]
     sections += [section for fraction in fractions if (section := field_section(fraction))]
     sections += [

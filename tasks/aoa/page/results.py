@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tasks.aoa.condition import NETWORK, terms, trainable
+from tasks.aoa.condition import LOCATOR, NETWORK, terms, trainable
 from tasks.aoa.page.records import FractionRecords, palette
 from tasks.metrics import Angle, ErrorSummary
 from tasks.page import figures
@@ -47,6 +47,37 @@ def results_section(fraction: FractionRecords, several: bool) -> Section:
     return Section(title, paragraphs, [table, origin], [_cdf(fraction), *_turbo_cdf(fraction)], terms())
 
 
+def estimator_section(fraction: FractionRecords) -> Section | None:
+    """Return the comparison of the estimators on held-out measured spectra; None if the run has none."""
+    choice = fraction.mix.get("estimator_choice")
+    if choice is None:
+        return None
+    held_out = sorted(choice["held_out_deg"].items(), key=lambda item: item[1])
+    tested = {name: method["great_circle_deg"]["median"] for name, method in fraction.mix["methods"].items()}
+    rows = [[name, number(error), number(tested.get(name))] for name, error in held_out]
+    caption = (
+        f"Median angular error over {choice['n_held_out']} held-out measured spectra, and over the test spectra, which "
+        "take no part in the choice."
+    )
+    table = Table(["method", "held out [deg]", "test [deg]"], rows, caption, frozenset({choice["name"]}))
+    return Section(f"Which estimator? ({fraction.percent} measured)", [choice_sentence(fraction)], [table])
+
+
+def choice_sentence(fraction: FractionRecords) -> str:
+    """Return which estimator cross-validation chose, and by which errors; empty if the run has no choice."""
+    choice = fraction.mix.get("estimator_choice")
+    if choice is None:
+        return ""
+    errors = ", ".join(f"{name} {error:.2f}" for name, error in choice["held_out_deg"].items())
+    text = (
+        f"Cross-validation inside the measured fraction chooses {choice['name']} (median error in degrees on "
+        f"{choice['n_held_out']} held-out spectra: {errors})."
+    )
+    if LOCATOR not in choice["held_out_deg"]:
+        text += f" {LOCATOR} is not a candidate: no compared field model found planes without the held-out spectra."
+    return text
+
+
 def _with_interval(summary: ErrorSummary) -> str:
     return f"{number(summary['median'])} [{number(summary['low'])}, {number(summary['high'])}]"
 
@@ -62,7 +93,9 @@ def _cdf(fraction: FractionRecords) -> Plot:
     axes[1].set_ylabel("")
     axes[2].set_ylabel("")
     figures.legend_below(figure, axes[0])
-    caption = "Distribution of the errors; full lines are networks, dashed ones baselines, which may leave the axes."
+    caption = (
+        "Distribution of the errors; full lines are networks, dashed ones other estimators, which may leave the axes."
+    )
     return Plot(f"cdf-{fraction.file_name}", figure, caption, own[["repeat", "index", "method", *ERRORS]])
 
 
@@ -107,6 +140,8 @@ def over_fractions(fractions: list[FractionRecords], name: str) -> Plot:
 def over_estimators(fraction: FractionRecords) -> Plot:
     """Return the errors of each trainable estimator on the measured spectra, with synthetic ones, and on all spectra."""
     estimators, heights = trainable(), {}
+    if any(condition.estimator == LOCATOR for condition in fraction.conditions.values()):
+        estimators.append(LOCATOR)
     trainings = {condition.training_set: condition for condition in fraction.conditions.values()}
     for name, condition in trainings.items():
         methods = [replace(condition, estimator=estimator).method for estimator in estimators]

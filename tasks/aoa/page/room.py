@@ -167,7 +167,7 @@ def _room_figure(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) 
     low, high = extent(planes, np.concatenate([points["measured"], points["fixed"][None]]))
     plan = axes[0]
     for plane in planes:
-        _draw_in_plan(plan, plane, low, high)
+        draw_in_plan(plan, plane, low, high)
     first = points["order"] == 1
     plan.plot(*points["measured"][:, :2].T, "o", color=MEASURED, markersize=2, label="measured positions")
     plan.plot(*points["fixed"][:2], "*", color=FIXED, markersize=11, label="fixed end")
@@ -211,7 +211,8 @@ def in_plan(plane: dict[str, Any], low: NDArray[Any], high: NDArray[Any]) -> NDA
     return np.stack([x, (plane["offset_m"] - nx * x - nz * height) / ny], axis=1)
 
 
-def _draw_in_plan(ax: Axes, plane: dict[str, Any], low: NDArray[Any], high: NDArray[Any]) -> None:
+def draw_in_plan(ax: Axes, plane: dict[str, Any], low: NDArray[Any], high: NDArray[Any]) -> None:
+    """Draw a plane's line through the box from `low` to `high` (3,) [m], dashed if it is uncertain."""
     ends = in_plan(plane, low - MARGIN, high + MARGIN)
     if ends is not None:
         ax.plot(*ends.T, "-" if plane["certain"] else "--", color="black", linewidth=1.3)

@@ -1,0 +1,133 @@
+"""Directions and positions by matched-field processing on few measured spectra, optionally beside kernel regression.
+
+python benchmarks/locating_aoa.py --data /data/newrf-bedroom /data/newrf-office --fractions 0.1 0.3 --draws 3 --kernel
+
+The split is the random one of seed 0. Draws differ in the spectra that count as measured. Test spectra take no part in any
+fit.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import tyro
+from record import RESULTS, write_result
+
+from augment import Mixed, withhold
+from swiftwrf import FitError, InputError, MatchedField, Spectra, load_spectra, make_model, simulated_room
+from swiftwrf.metrics import angle_errors, summary
+from tasks.aoa.condition import fraction_key
+from tasks.aoa.context import ROOM_MODEL
+from tasks.aoa.estimators import make_estimator
+from tasks.aoa.locating import LEVEL, NO_PLANE, located
+
+N_LOCATED = 200  # spectra whose time is measured
+KERNEL = "kernel_ridge"
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Config:
+    scenes: tuple[Literal["room", "room-receiver"], ...] = ("room", "room-receiver")
+    """built-in rooms, the transmitter or the receiver moves"""
+    data: tuple[Path, ...] = ()
+    """folders of spectra"""
+    fractions: tuple[float, ...] = (0.3,)
+    """measured fractions of the training spectra"""
+    draws: int = 3
+    """draws of the measured spectra"""
+    kernel: bool = False
+    """measure kernel regression on the same spectra, too"""
+    out: Path = RESULTS
+    """folder of the result"""
+
+
+def main(config: Config) -> None:
+    """Measure every scene, measured fraction and draw, and write `locating_spectra.json`."""
+    torch.set_num_threads(1)
+    found: dict[str, Any] = {}
+    for name, data in scenes(config):
+        train, test = data.split("random")
+        found[name] = {}
+        for fraction in config.fractions:
+            rows = []
+            for draw in range(config.draws):
+                rows.append(measure(withhold(train, fraction, draw)[0], test, draw, config.kernel))
+                print(name, fraction, rows[-1], flush=True)
+            found[name][fraction_key(fraction)] = {"median": median_of(rows), "draws": rows}
+            write_result("locating_spectra", {"n_located": N_LOCATED, "scenes": found}, folder=config.out)
+
+
+def scenes(config: Config) -> Iterator[tuple[str, Spectra]]:
+    """Yield name and spectra of each scene."""
+    for name in config.scenes:
+        yield name, simulated_room(moving="transmitter" if name == "room" else "receiver")
+    for folder in config.data:
+        yield folder.name, load_spectra(folder)
+
+
+def measure(measured: Spectra, test: Spectra, draw: int, kernel: bool) -> Row:
+    """Return errors, coverage and seconds of one draw, or the reason why the spectra cannot be located."""
+    row: Row = {"draw": draw, "n_measured": len(measured), "n_test": len(test)}
+    if kernel:
+        estimate = make_estimator(KERNEL, seed=draw).fit(Mixed.measured(measured)).predict(test.spectrum)
+        row[f"{KERNEL}_angle_deg"] = angle_summary(estimate, test)
+    began = time.perf_counter()
+    try:
+        room = make_model(ROOM_MODEL, seed=draw).fit(measured)
+        searched = time.perf_counter()
+        if room.room is None or not room.room.planes:
+            return row | {"left_out": NO_PLANE}
+        locator = MatchedField(seed=draw).fit(measured, room=room)
+    except (InputError, FitError) as error:
+        return row | {"left_out": str(error)}
+    fitted = time.perf_counter()
+    timed = test.subset(torch.arange(N_LOCATED) % len(test)).spectrum
+    ready = time.perf_counter()
+    locator.predict(timed)
+    seconds = {"room": searched - began, "fit": fitted - searched, "locate": time.perf_counter() - ready}
+    result = located(locator, test)
+    return row | {
+        "planes": len(locator.room.planes),
+        "weights": locator.weight.tolist(),
+        "angle_deg": angle_summary(result["estimate"], test),
+        "position_m": quantiles((result["position"] - test.position).norm(dim=1)),
+        f"coverage_{100 * LEVEL:.0f}": float((result["level"] < LEVEL).double().mean()),
+        "ambiguous": float(result["ambiguous"].double().mean()),
+        "seconds": seconds,
+    }
+
+
+def angle_summary(estimate: torch.Tensor, test: Spectra) -> dict[str, float]:
+    """Return median and 90th percentile of the angular errors [deg]."""
+    return quantiles(angle_errors(estimate, test.label)["great_circle"].rad2deg())
+
+
+def quantiles(values: torch.Tensor) -> dict[str, float]:
+    """Return median and 90th percentile."""
+    found = summary(values)
+    return {"median": found["median"], "p90": found["p90"]}
+
+
+def median_of(rows: list[Row]) -> Row:
+    """Return the median over the draws of every number that all draws have."""
+    found: Row = {}
+    for name, value in rows[0].items():
+        values = [row.get(name) for row in rows]
+        if any(other is None for other in values) or name == "draw":
+            continue
+        if isinstance(value, dict):
+            found[name] = median_of(values)  # type: ignore[arg-type]
+        elif isinstance(value, int | float):
+            found[name] = float(np.median(np.array(values, dtype=float)))
+    return found
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

@@ -1,0 +1,8 @@
+"""Where was it? Posterior over the position of the moving end, from a fitted field and an observation."""
+
+from swiftwrf.locate.matched_field import MatchedField, MatchedFieldConfig
+from swiftwrf.locate.posterior import Posterior
+from swiftwrf.locate.region import Region
+from swiftwrf.locate.rssi import RssiLocator, RssiLocatorConfig
+
+__all__ = ["MatchedField", "MatchedFieldConfig", "Posterior", "Region", "RssiLocator", "RssiLocatorConfig"]

@@ -1,0 +1,282 @@
+"""Matched-field processing: the position of the moving end from one spectrum, by the room that was found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from swiftwrf.array.angles import to_angles, to_direction
+from swiftwrf.array.planar import differences
+from swiftwrf.data.spectra import Spectra, check_training, direction_of_link
+from swiftwrf.errors import InputError
+from swiftwrf.gp import GaussianProcess, thinned
+from swiftwrf.locate.pool import pooled_weights, tempered
+from swiftwrf.locate.posterior import Posterior, normalised
+from swiftwrf.locate.region import Cells, Region, outside_mass
+from swiftwrf.locate.search import best_cells, refined
+from swiftwrf.locate.spectrum_likelihood import (
+    CoarrayLikelihood,
+    PathStatistics,
+    PhaseLikelihood,
+    SpectrumFeatures,
+    gain_features,
+    room_features,
+)
+from swiftwrf.models.base import FieldModel
+from swiftwrf.models.geometry import GeometryModel
+from swiftwrf.models.geometry.fit import GeometryConfig, observe
+from swiftwrf.models.geometry.path_gains import PathGains, fit_path_gains, prior
+from swiftwrf.runtime.checkpoint import Header, Saved, expect
+from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, configuration
+
+FOLDS = 5
+MIN_SPECTRA = 15
+OBSERVATIONS = 64  # searched at a time
+FIRST_WEIGHTS = (0.05, 0.05, 0.3)  # of the likelihoods, before calibration
+
+
+@configuration
+class MatchedFieldConfig:
+    """Options of matched-field processing."""
+
+    spacing: PositiveFloat = 0.2
+    """spacing of the first cells, in wavelengths"""
+    max_cells: PositiveInt = 400_000
+    """number of first cells at most"""
+    n_best: PositiveInt = 500
+    """cells of largest mass that are kept for each spectrum"""
+    n_background: NonNegativeInt = 200
+    """cells that represent all others"""
+    n_split: PositiveInt = 16
+    """cells that are split in each round"""
+    n_rounds: NonNegativeInt = 3
+    """rounds of splitting"""
+    n_calibration: PositiveInt = 200
+    """held-out spectra that determine the weights of the likelihoods, at most"""
+    seed: NonNegativeInt = 0
+    """seed of everything random"""
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A room and path gains, fitted to some of the spectra."""
+
+    room: GeometryModel
+    gains: PathGains
+    statistics: PathStatistics
+
+
+class MatchedField(Saved):
+    """Posterior over the position of the moving end, given a spectrum.
+
+    Three likelihoods are pooled: co-array numbers predicted by constant path gains, by position-dependent path gains, and
+    element phases under uncertain path gains. Their covariances come from held-out spectra, and their weights maximise the
+    posterior density at held-out positions, which also calibrates the posterior.
+
+    Args:
+        config: Options as one object. Defaults to `MatchedFieldConfig()`.
+        options: Single options, which replace those of `config`.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.simulated_room(n=60).split()
+        >>> posterior = MatchedField().fit(train).locate(test.spectrum)  # doctest: +SKIP
+        >>> posterior.median  # (n, 3) [m]  # doctest: +SKIP
+    """
+
+    kind: ClassVar[str] = "matched-field locator"
+
+    def __init__(self, config: MatchedFieldConfig | None = None, **options: Any) -> None:
+        self.config = replace(config or MatchedFieldConfig(), **options)
+
+    def fit(self, train: Spectra, *, room: FieldModel | None = None, progress: bool = False) -> Self:
+        """Fit the likelihoods to measured spectra and return the locator.
+
+        Args:
+            train: Measured spectra, at least 15, with array, rotation and fixed end.
+            room: Fitted model of the scene with a room. Defaults to a search for the room.
+            progress: Show a progress bar on a terminal.
+
+        Raises:
+            InputError: Too few spectra, or a property of the data that is missing.
+        """
+        check_training(train)
+        if len(train) < MIN_SPECTRA:
+            raise InputError(
+                f"matched-field processing needs {MIN_SPECTRA} spectra to hold a fifth of them out, got {len(train)}"
+            )
+        if room is not None and room.room is None:
+            raise InputError(f"a {room.kind} has no room to locate by; fit geometry or hybrid")
+        own = GeometryModel(seed=self.config.seed).fit(train, like=room, progress=progress)
+        self.grid, self.room = train.grid, own
+        assert train.array is not None
+        features = SpectrumFeatures.of(train.store.batches(), train.array, train.grid, self.config.seed)
+        scene, rows = observe(train, GeometryConfig(seed=self.config.seed))
+        kernel = prior(scene.moving)
+
+        def fitted(kept: Tensor) -> _Fit:
+            some = train.subset(kept.nonzero()[:, 0])
+            part = GeometryModel(seed=self.config.seed).fit(some, like=own)
+            gains = fit_path_gains(part, scene.subset(kept[rows].nonzero()[:, 0]), kernel)
+            return _Fit(part, gains, PathStatistics.fit(part, some.position, features.phases[kept]))
+
+        fold = torch.arange(len(train)) % FOLDS
+        parts = [fitted(fold != number) for number in range(FOLDS)]
+        self._set_residuals(train.position, features, fold, parts)
+        self._fit = fitted(torch.ones_like(fold, dtype=torch.bool))
+        self.known = train.position
+        others = [Region(train.position[fold != number]) for number in range(FOLDS)]
+        self.outside = outside_mass(others, [train.position[fold == number] for number in range(FOLDS)])
+        self._prepare()
+        self.weight = torch.tensor(FIRST_WEIGHTS, dtype=torch.float64)
+        self.weight = self._calibrated(train.position, features, fold, parts)
+        return self
+
+    def _set_residuals(self, position: Tensor, features: SpectrumFeatures, fold: Tensor, parts: list[_Fit]) -> None:
+        """Predict the co-array numbers of every spectrum by the fit without its fold."""
+        self.residual = torch.empty(2, *features.coarray.shape)
+        for number, part in enumerate(parts):
+            out = fold == number
+            for kind, predict in enumerate((room_features(part.room), gain_features(part.room, part.gains))):
+                self.residual[kind, out] = predict(position[out]) - features.coarray[out]
+        self.observed_power = float(features.coarray.square().mean())
+
+    def _prepare(self) -> None:
+        """Compute what all spectra share: cells of the region and their predicted co-array numbers."""
+        self.region = Region(self.known, outside=self.outside)
+        extent = self.region.extent
+        spacing = self.config.spacing * self.room.array.wavelength
+        count = math.prod((extent / spacing).clamp_min(1).tolist())
+        self.cells = self.region.cells(int(min(max(count, 1), self.config.max_cells)))
+        self.likelihoods = self._likelihoods(self._fit)
+        self._whitened = self.likelihoods[0].whitened(self.cells.position)
+
+    def _likelihoods(
+        self, fit: _Fit, kept: Tensor | None = None
+    ) -> tuple[CoarrayLikelihood, CoarrayLikelihood, PhaseLikelihood]:
+        residual = self.residual if kept is None else self.residual[:, kept]
+        return (
+            CoarrayLikelihood(room_features(fit.room), residual[0], self.observed_power),
+            CoarrayLikelihood(gain_features(fit.room, fit.gains), residual[1], self.observed_power),
+            PhaseLikelihood(fit.room, fit.statistics),
+        )
+
+    def _calibrated(self, position: Tensor, features: SpectrumFeatures, fold: Tensor, parts: list[_Fit]) -> Tensor:
+        """Return the weights of the likelihoods that calibrate the posterior of held-out positions."""
+        (some,) = thinned(torch.arange(len(position)), rows=self.config.n_calibration)
+        rows_of = {number: some[fold[some] == number] for number in fold[some].unique().tolist()}
+        at_truth, values, volumes, candidates = [], [], [], []
+        for number, rows in rows_of.items():
+            likelihoods, observed = self._likelihoods(parts[number], fold != number), features.subset(rows)
+            truth = position[rows][:, None]
+            at_truth.append(torch.stack([one.log_likelihood(truth, observed)[:, 0] for one in likelihoods]))
+            for cells, value in self._searched(observed, likelihoods):
+                values.append(value)
+                volumes.append(cells.log_volume)
+                candidates.append(cells.position)
+        value, volume, at = torch.cat(values, dim=1).double(), torch.cat(volumes), torch.cat(candidates)
+        weight = pooled_weights(torch.cat(at_truth, dim=1), value, volume)
+
+        def posterior(weight: Tensor) -> Posterior:
+            return Posterior(at, normalised(torch.einsum("k,knm->nm", weight, value) + volume), self._resolution_m)
+
+        return tempered(weight, posterior, position[torch.cat(list(rows_of.values()))])
+
+    def _searched(self, observed: SpectrumFeatures, likelihoods: Any) -> Iterator[tuple[Cells, Tensor]]:
+        """Yield cells (b, m) and log-likelihoods (k, b, m) of some observations at a time."""
+        generator = torch.Generator().manual_seed(self.config.seed)
+        config = self.config
+        for rows in torch.arange(len(observed)).split(OBSERVATIONS):
+            part = observed.subset(rows)
+
+            def evaluate(position: Tensor, part: SpectrumFeatures = part) -> Tensor:
+                return torch.stack([one.log_likelihood(position, part) for one in likelihoods])
+
+            screened = self.likelihoods[0].from_whitened(self._whitened, part)
+            cells = best_cells(self.cells, screened, config.n_best, config.n_background, generator)
+            values = evaluate(cells.position)
+            for _ in range(config.n_rounds):
+                cells, values = refined(cells, self._log_mass(cells, values), values, evaluate, config.n_split)
+            yield cells, values
+
+    def _log_mass(self, cells: Cells, values: Tensor) -> Tensor:
+        return normalised(torch.einsum("k,knm->nm", self.weight, values.double()) + cells.log_volume)
+
+    @torch.no_grad()
+    def locate(self, spectrum: Tensor) -> Posterior:
+        """Return the posterior over the position of the moving end for each spectrum.
+
+        Args:
+            spectrum: Magnitudes in [0, 1], (n, n_elevation, n_azimuth) on the grid of the training spectra.
+
+        Raises:
+            InputError: Spectra on another grid, or not finite.
+        """
+        if spectrum.dim() != 3 or tuple(spectrum.shape[1:]) != self.grid.shape:
+            raise InputError(
+                f"expected spectra of shape (n, {self.grid.shape[0]}, {self.grid.shape[1]}), got {tuple(spectrum.shape)}"
+            )
+        if not bool(spectrum.isfinite().all()):
+            raise InputError("spectra must be finite magnitudes in [0, 1]")
+        observed = SpectrumFeatures.of([spectrum], self.room.array, self.grid, self.config.seed)
+        parts = list(self._searched(observed, self.likelihoods))
+        position = torch.cat([cells.position for cells, _ in parts])
+        log_weight = torch.cat([self._log_mass(cells, values) for cells, values in parts])
+        return Posterior(position, log_weight, self._resolution_m)
+
+    @property
+    def _resolution_m(self) -> float:
+        """Edge of the smallest cells [m]."""
+        return float(self.cells.edge_m / 2**self.config.n_rounds)
+
+    def predict(self, spectrum: Tensor) -> Tensor:
+        """Return azimuth and elevation (n, 2) [rad] of the transmitter that minimise the expected angular error."""
+        return self.direction(self.locate(spectrum))
+
+    def direction(self, posterior: Posterior) -> Tensor:
+        """Return azimuth and elevation (n, 2) [rad] of the smallest expected angular error under a posterior."""
+        room, at = self.room, posterior.position
+        label = direction_of_link(at.reshape(-1, 3), room.fixed_position, room.rotation, room.moving)
+        vectors = to_direction(*label.unbind(-1)).reshape(at.shape)
+        return torch.stack(to_angles(posterior.direction(vectors)), dim=-1)
+
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        """Return the fitted tensors by name, and plain values."""
+        tensors, header = self.room.state()
+        gains, values = self._fit.gains.process.state("path_gains.")
+        own = {
+            "statistics": self._fit.statistics.raw,
+            "residual": self.residual,
+            "known": self.known,
+            "weight": self.weight,
+        }
+        plain = {"locator": asdict(self.config), "outside": self.outside, "observed_power": self.observed_power}
+        return tensors | gains | own, header | values | plain
+
+    @classmethod
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
+        """Return the locator that `state` describes."""
+        locator = cls(MatchedFieldConfig(**header["locator"]))
+        room = GeometryModel.from_state(tensors, header)
+        features = 2 * len(differences(room.array))
+        n, known = tensors["residual"].shape[1], len(tensors["known"])
+        shapes = {
+            "statistics": (4 + len(room.planes),),
+            "residual": (2, n, features),
+            "known": (known, 3),
+            "weight": (3,),
+        }
+        expect(tensors, shapes)
+        process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True, prefix="path_gains.")
+        gains = PathGains(process, len(room.image_sources()[0]))
+        locator.grid, locator.room = room.grid, room
+        locator._fit = _Fit(room, gains, PathStatistics.of(tensors["statistics"]))
+        locator.residual, locator.known, locator.weight = (tensors[name] for name in ("residual", "known", "weight"))
+        locator.outside, locator.observed_power = float(header["outside"]), float(header["observed_power"])
+        locator._prepare()
+        return locator

@@ -1,0 +1,128 @@
+"""A posterior over positions on weighted candidates, and what follows from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from swiftwrf.errors import InputError
+
+WEISZFELD_STEPS = 30
+MODE_MASS = 0.1  # mass of a second mode from which on a posterior is ambiguous
+MODE_LEVEL, MODE_WIDTH = 0.3, 5.0  # of the first mode, see `Posterior.ambiguous`
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Posterior over the position of the moving end for each of n observations.
+
+    Args:
+        position: Candidate positions, float64 (n, m, 3) [m], or (1, m, 3) if all observations share them.
+        log_weight: Logarithms of their posterior masses, which sum to 1, float64 (n, m).
+        resolution_m: Edge of the largest cell around a candidate [m].
+
+    Example:
+        >>> at = torch.tensor([[[0.0, 0, 0], [1.0, 0, 0]]], dtype=torch.float64)
+        >>> posterior = Posterior(at, torch.tensor([[0.25, 0.75]], dtype=torch.float64).log(), 0.1)
+        >>> posterior.mean.tolist()
+        [[0.75, 0.0, 0.0]]
+    """
+
+    position: Tensor
+    log_weight: Tensor
+    resolution_m: float = 0.0
+
+    def __len__(self) -> int:
+        return len(self.log_weight)
+
+    @property
+    def weight(self) -> Tensor:
+        """Posterior masses (n, m), which sum to 1."""
+        return self.log_weight.exp()
+
+    @property
+    def mean(self) -> Tensor:
+        """Posterior mean, which minimises the expected squared error, (n, 3) [m]."""
+        return torch.einsum("nm,nmk->nk", self.weight, self.position.expand(len(self), -1, -1))
+
+    @property
+    def most_likely(self) -> Tensor:
+        """Candidate of the largest mass, (n, 3) [m]."""
+        at = self.position.expand(len(self), -1, -1)
+        return at[torch.arange(len(self)), self.log_weight.argmax(dim=1)]
+
+    @property
+    def median(self) -> Tensor:
+        """Geometric median, which minimises the expected distance, (n, 3) [m] (E. Weiszfeld, Tohoku Math. J. 43, 1937)."""
+        return _geometric_median(self.position.expand(len(self), -1, -1), self.weight, self.mean, self.resolution_m)
+
+    @property
+    def covariance(self) -> Tensor:
+        """Posterior covariance (n, 3, 3) [m^2], the resolution of the candidates included."""
+        away = self.position - self.mean[:, None]
+        spread = torch.einsum("nm,nmi,nmj->nij", self.weight, away, away)
+        return spread + self.resolution_m**2 / 12 * torch.eye(3, dtype=spread.dtype)
+
+    @property
+    def std(self) -> Tensor:
+        """Posterior standard deviation along each axis, (n, 3) [m]."""
+        return self.covariance.diagonal(dim1=1, dim2=2).sqrt()
+
+    def credible_radius(self, level: float = 0.8) -> Tensor:
+        """Return the radius [m] around the median within which the position lies with probability `level`, (n,).
+
+        Raises:
+            InputError: A level outside (0, 1).
+        """
+        if not 0 < level < 1:
+            raise InputError(f"level must be between 0 and 1, got {level}")
+        away = (self.position - self.median[:, None]).norm(dim=2)
+        return self._radius(away, level) + self.resolution_m / 4
+
+    def direction(self, vectors: Tensor) -> Tensor:
+        """Return the unit vector of the smallest expected angular error, (n, 3).
+
+        Args:
+            vectors: Unit vector towards each candidate, as `position`: (n, m, 3) or (1, m, 3).
+        """
+        vectors = vectors.expand(len(self), -1, -1)
+        start = torch.einsum("nm,nmk->nk", self.weight, vectors)
+        found = _geometric_median(vectors, self.weight, start, 1e-4)
+        unit: Tensor = found / found.norm(dim=1, keepdim=True).clamp_min(1e-12)
+        return unit
+
+    @property
+    def ambiguous(self) -> Tensor:
+        """True where a tenth of the mass lies away from the most likely candidate, beyond the width of its mode, (n,).
+
+        The width is five times the radius that contains 30 % of the mass: four to six standard deviations of a single mode.
+        """
+        away = (self.position - self.most_likely[:, None]).norm(dim=2)
+        width = MODE_WIDTH * self._radius(away, MODE_LEVEL) + self.resolution_m
+        second: Tensor = (self.weight * (away > width[:, None])).sum(dim=1) > MODE_MASS
+        return second
+
+    def _radius(self, away: Tensor, level: float) -> Tensor:
+        """Return the radius that contains a fraction of the mass, (n,), given the distances (n, m) of the candidates."""
+        order = away.argsort(dim=1)
+        mass = self.weight.gather(1, order).cumsum(dim=1)
+        first = (mass < level).sum(dim=1).clamp(max=away.shape[1] - 1)
+        radius: Tensor = away.gather(1, order).gather(1, first[:, None])[:, 0]
+        return radius
+
+
+def _geometric_median(point: Tensor, weight: Tensor, start: Tensor, smallest: float) -> Tensor:
+    """Return the weighted geometric median (n, k) of points (n, m, k), from a start (n, k)."""
+    found = start
+    for _ in range(WEISZFELD_STEPS):
+        away = (point - found[:, None]).norm(dim=2).clamp_min(max(smallest / 4, 1e-9))
+        pull = weight / away
+        found = torch.einsum("nm,nmk->nk", pull, point) / pull.sum(dim=1, keepdim=True)
+    return found
+
+
+def normalised(log_mass: Tensor) -> Tensor:
+    """Return logarithms of masses (n, m) shifted so that each row sums to mass 1."""
+    return log_mass - log_mass.logsumexp(dim=1, keepdim=True)

@@ -1,0 +1,139 @@
+"""Candidate positions: the region where the moving end can be, cut into cells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from swiftwrf.errors import InputError
+from swiftwrf.positions import nearest
+
+FLAT = 1e-3  # extent below which a dimension of the region counts as none, as a fraction of the largest extent
+NEIGHBOURS = 8  # the distance to this neighbour gives the scale on which positions fill a region
+QUANTILE = 0.95  # of these distances
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Cells of candidate positions: boxes of equal shape, in as many dimensions as the region has.
+
+    Args:
+        position: Centres, float64 (..., 3) [m].
+        log_volume: Logarithm of each cell's prior mass, (...).
+        edge: Edge vectors of a cell of level 0, float64 (d, 3) [m], d = 0 to 3.
+        level: How often a cell's edges are halved, (...).
+    """
+
+    position: Tensor
+    log_volume: Tensor
+    edge: Tensor
+    level: Tensor
+
+    @property
+    def edge_m(self) -> float:
+        """Length of the longest edge of a cell of level 0 [m]."""
+        return float(self.edge.norm(dim=1).max()) if len(self.edge) else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """Where the moving end can be: a box around known positions, most of its prior mass in their neighbourhood.
+
+    The neighbourhood reaches as far from the known positions as these lie from each other. So it follows a measured path and
+    fills a measured room.
+
+    Args:
+        known: Known positions, float64 (n, 3) [m].
+        margin: Fraction of the extent by which the box exceeds the known positions on each side.
+        outside: Prior mass spread over the whole box.
+
+    Raises:
+        InputError: Fewer than 2 known positions, a negative margin, or a mass outside (0, 1].
+
+    Example:
+        >>> region = Region(torch.rand(50, 3, dtype=torch.float64))
+        >>> cells = region.cells(1000)
+        >>> round(float(cells.log_volume.exp().sum()), 6)
+        1.0
+    """
+
+    known: Tensor
+    margin: float = 0.03
+    outside: float = 0.05
+
+    def __post_init__(self) -> None:
+        if self.known.dim() != 2 or self.known.shape[1] != 3 or len(self.known) < 2:
+            raise InputError(f"a region needs at least 2 known positions (n, 3), got shape {tuple(self.known.shape)}")
+        if not self.margin >= 0 or not 0 < self.outside <= 1:
+            raise InputError(f"a margin is at least 0 and a mass above 0, got {self.margin} and {self.outside}")
+
+    @cached_property
+    def scale_m(self) -> float:
+        """Distance [m] from the known positions that their neighbourhood covers."""
+        spots = self.known.unique(dim=0)
+        apart, _ = nearest(spots, spots, min(NEIGHBOURS + 1, len(spots)))
+        return float(apart[:, -1].quantile(QUANTILE))
+
+    @cached_property
+    def _box(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Centre (3,), axes (d, 3) along which the positions extend, and half the extent along each (d,) [m]."""
+        middle = self.known.mean(dim=0)
+        _, size, axes = torch.linalg.svd(self.known - middle, full_matrices=False)
+        extended = size > FLAT * size[0].clamp_min(1e-12)
+        # a region in all three dimensions is a box along the coordinates, as rooms are
+        axes = torch.eye(3, dtype=torch.float64) if bool(extended.sum() == 3) else axes[extended]
+        along = (self.known - middle) @ axes.T
+        low, high = along.amin(dim=0), along.amax(dim=0)
+        return middle + (low + high) / 2 @ axes, axes, (high - low) * (0.5 + self.margin)
+
+    @property
+    def extent(self) -> Tensor:
+        """Lengths of the box, (d,) [m]."""
+        return 2 * self._box[2]
+
+    def contains(self, position: Tensor) -> Tensor:
+        """Return True for each position (n, 3) [m] inside the box, (n,)."""
+        centre, axes, half = self._box
+        away = position - centre
+        flat = (away - away @ axes.T @ axes).norm(dim=1)
+        inside: Tensor = ((away @ axes.T).abs() <= half).all(dim=1) & (flat <= self.scale_m)
+        return inside
+
+    def is_near(self, position: Tensor) -> Tensor:
+        """Return True for each position (n, 3) [m] in the neighbourhood of the known positions, (n,)."""
+        return nearest(position, self.known, 1)[0][:, 0] <= self.scale_m
+
+    def cells(self, count: int) -> Cells:
+        """Return about `count` cells of equal size that cover the box; `log_volume` is their prior mass."""
+        centre, axes, half = self._box
+        if not len(half):
+            step, offset = torch.empty(0, dtype=torch.float64), torch.zeros(1, 0, dtype=torch.float64)
+        else:
+            spacing = float((2 * half).prod() / count) ** (1 / len(half))
+            numbers = (2 * half / spacing).round().clamp_min(1)
+            step = 2 * half / numbers
+            lines = [
+                -h + s * (torch.arange(int(n), dtype=torch.float64) + 0.5)
+                for h, s, n in zip(half, step, numbers, strict=True)
+            ]
+            offset = torch.cartesian_prod(*lines).reshape(-1, len(half))
+        position = centre + offset @ axes
+        near = self.is_near(position)
+        mass = torch.full((len(position),), self.outside / len(position), dtype=torch.float64)
+        mass[near] += (1 - self.outside) / max(int(near.sum()), 1)
+        return Cells(position, (mass / mass.sum()).log(), step[:, None] * axes, torch.zeros_like(mass))
+
+
+def outside_mass(regions: list[Region], positions: list[Tensor]) -> float:
+    """Return the prior mass outside the neighbourhood of known positions, from held-out positions of each fold.
+
+    Args:
+        regions: Region of the other folds' positions, one a fold.
+        positions: Held-out positions (n, 3) [m], one tensor a fold.
+    """
+    outside = sum(int((~region.is_near(at)).sum()) for region, at in zip(regions, positions, strict=True))
+    total = sum(len(at) for at in positions)
+    return (outside + 1) / (total + 2)

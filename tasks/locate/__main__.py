@@ -1,0 +1,8 @@
+"""python -m tasks.locate --rx all, or python -m tasks.locate MODEL SOURCE"""
+
+import sys
+
+from tasks.command import run_command
+
+if __name__ == "__main__":
+    sys.exit(run_command("locate", sys.argv[1:]))

@@ -1,0 +1,159 @@
+"""Localization measured: the posterior over positions against the baselines, on the same split of measured RSSI."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from swiftwrf import InputError, Rssi, load_rssi, rssi_room
+from tasks.cluster import connected
+from tasks.locate.localizers import LEVELS
+from tasks.locate.observations import write_positions
+from tasks.locate.options import LocateConfig, check
+from tasks.locate.page import page
+from tasks.locate.steps import MIN_ROWS, Experiment, Localization
+from tasks.metrics import LocateMetrics, StudyMetrics
+from tasks.page.page import reporting
+from tasks.run import Row, Run, choose_device, console
+from tasks.source import reading
+from tasks.steps import computed
+from tasks.summarise import error_summary
+
+
+def run(config: LocateConfig, resume: Path | None = None) -> None:
+    """Run the experiment and write its directory, or write the positions of new observations.
+
+    Raises:
+        InputError: Data or options that do not exist or do not fit together.
+    """
+    check(config)
+    if config.model is not None:
+        write_positions(config)
+        return
+    device = choose_device("cpu")
+    data = measurements(config)
+    for note in data.notes:
+        console.print(f"{data.name}: {note}")
+    experiment, n_undetected = prepared(data, config.split, config.cells, config.seed)
+    if n_undetected:
+        console.print(f"{data.name}: test rows that no receiver detected are left out: {n_undetected}")
+    label = f"rx{'_'.join(config.rx)}-s{config.seed}"
+    with (
+        connected(config.scheduler, device) as cluster,
+        Run("locate", config.out, label, config, device, data.source, resume) as directory,
+    ):
+        results = Results(experiment)
+        for step, value in computed(directory, experiment.steps(), experiment, cluster):
+            assert isinstance(step, Localization)
+            results.add(step, value)
+        directory.write_csv("errors.csv", results.errors)
+        final = directory.finish(results.metrics(data.name, n_undetected), reporting(page))
+    console.print(f"report: [bold]{final / 'report.html'}[/]")
+
+
+def measurements(config: LocateConfig) -> Rssi:
+    """Return the RSSI of a run at the receivers that are asked for.
+
+    Raises:
+        InputError: The data cannot be read, or have no such receiver.
+    """
+    if config.data is not None:
+        return load_rssi(config.data, columns=reading(config).columns).receivers(config.rx)
+    if config.columns:
+        raise InputError("--columns is for a survey table; give it with --data, or with MODEL and SOURCE")
+    return rssi_room(seed=config.seed).receivers(config.rx)
+
+
+def prepared(data: Rssi, split: str, cells: int, seed: int) -> tuple[Experiment, int]:
+    """Return the experiment on a split, and the number of its test rows that no receiver detected, which it omits.
+
+    Raises:
+        InputError: No such split, or too few rows in which a receiver detected the transmitter.
+    """
+    train, test = data.split(split, seed)
+    detected = int(train.detected.any(dim=1).sum())
+    if detected < MIN_ROWS:
+        raise InputError(
+            f"split {split!r} of {data.name} has {detected} training rows that a receiver detected; at least {MIN_ROWS} are "
+            "needed to locate by"
+        )
+    kept = test.detected.any(dim=1)
+    if not bool(kept.any()):
+        raise InputError(f"split {split!r} of {data.name} has no test rows that a receiver detected")
+    return Experiment(train, test.subset(kept), split, cells, seed), int((~kept).sum())
+
+
+class Results:
+    """Tables and metrics of a run, collected step by step.
+
+    Args:
+        experiment: Data and options of the run.
+    """
+
+    def __init__(self, experiment: Experiment) -> None:
+        self.experiment = experiment
+        self.errors: list[Row] = []
+        self._overall: Row = {}
+        self._studies: list[tuple[Localization, StudyMetrics]] = []
+        self._coverage: dict[str, float] = {}
+        self._weights: dict[str, float] = {}
+
+    def add(self, step: Localization, value: Row) -> None:
+        """Add the result of a step."""
+        truth, estimate = (torch.tensor(value[name], dtype=torch.float64) for name in ("truth", "estimate"))
+        away = estimate - truth
+        error, horizontal = away.norm(dim=1), away[:, :2].norm(dim=1)
+        study: StudyMetrics = {
+            "localizer": step.localizer,
+            "n_train": value["n_train"],
+            "n_receivers": value["n_receivers"],
+            "position_error_m": error_summary(error),
+        }
+        self._studies.append((step, study))
+        if not step.is_whole:
+            return
+        columns: Row = {"position_error_m": error, "horizontal_error_m": horizontal}
+        columns |= dict(zip(("x_m", "y_m", "z_m"), estimate.T, strict=True))
+        columns |= dict(zip(("truth_x_m", "truth_y_m", "truth_z_m"), truth.T, strict=True))
+        if "radius" in value:
+            radius = torch.tensor(value["radius"], dtype=torch.float64)
+            columns |= {f"credible_radius_{100 * p:.0f}_m": r for p, r in zip(LEVELS, radius.T, strict=True)}
+            columns["ambiguous"] = torch.tensor(value["ambiguous"])
+        if step.localizer == "posterior":
+            inside = (error[:, None] <= radius).double().mean(dim=0)
+            self._coverage = {str(level): float(c) for level, c in zip(LEVELS, inside, strict=True)}
+            self._weights = value["weights"]
+        cells = zip(value["index"], *(column.tolist() for column in columns.values()), strict=True)
+        self.errors += [{"method": step.localizer} | dict(zip(("index", *columns), row, strict=True)) for row in cells]
+        self._overall[step.localizer] = {
+            "position_error_m": error_summary(error),
+            "horizontal_error_m": error_summary(horizontal),
+            "seconds": value["seconds"],
+        }
+
+    def metrics(self, data: str, n_undetected: int) -> LocateMetrics:
+        """Return the content of metrics.json."""
+        train, test = self.experiment.train, self.experiment.test
+        return {
+            "task": "locate",
+            "data": data,
+            "split": self.experiment.split,
+            "seed": self.experiment.seed,
+            "n_train": len(train),
+            "n_test": len(test),
+            "n_receivers": len(train.receiver_names),
+            "n_undetected": n_undetected,
+            "overall": self._overall,
+            "calibration": self._coverage,
+            "weights": self._weights,
+            "by_rows": self._studied(lambda step: step.receivers == 1),
+            "by_receivers": self._studied(lambda step: step.rows == 1),
+        }
+
+    def _studied(self, belongs: Callable[[Localization], bool]) -> list[StudyMetrics]:
+        """Return the study of localizers that some of these steps fit to parts of the data."""
+        studies = [(step, study) for step, study in self._studies if belongs(step)]
+        names = {step.localizer for step, _ in studies if not step.is_whole}
+        return [study for step, study in studies if step.localizer in names]

@@ -1,0 +1,70 @@
+"""Options of both uses of the command: the experiment, and the positions of new observations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Annotated
+
+import tyro
+
+from swiftwrf import InputError
+from tasks.source import SpectraSource, TableSource
+
+TABLE = "positions.csv"
+
+
+@dataclass(frozen=True)
+class LocateConfig(SpectraSource, TableSource):
+    """Positions of a transmitter from RSSI or spectra.
+
+    Without MODEL and SOURCE: compare localizers on a split of measured RSSI, by default of the built-in simulated floor, and
+    report their errors. Continue an interrupted run with --resume DIR.partial.
+
+    With MODEL and SOURCE: write the positions of new observations to a table.
+    """
+
+    model: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[MODEL]")] = None
+    """file of a locator of RSSI or spectra, e.g. runs/locate/first/locator.safetensors"""
+    source: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[SOURCE]")] = None
+    """RSSI of any format that tasks.rssi takes, a table without positions included; or spectra of any format that tasks.aoa
+    takes, or a .npy file (n, elevations, azimuths) of magnitudes in [0, 1]"""
+    data: str | None = None
+    """survey table (CSV or Parquet), or folder in NeRF2 layout, of the experiment"""
+    rx: tuple[str, ...] = ("all",)
+    """receivers: names, numbers counted from 1, or all"""
+    split: str = "random"
+    """a split that comes with the data, or a seeded one: random or block"""
+    cells: int = 4000
+    """number of candidate positions of the posterior"""
+    scheduler: str | None = None
+    """address of a Dask scheduler whose workers compute the steps (extra: cluster)"""
+    seed: int = 0
+    """seed of everything random"""
+    out: str | None = None
+    """directory of the run (default: a new one under runs/locate), or table (default: positions.csv); must not exist"""
+
+
+EXPERIMENT = ("data", "rx", "split", "cells", "scheduler", "seed")
+OBSERVATIONS = ("array", "beamformer", "grid", "every", "station")
+
+
+def check(config: LocateConfig) -> None:
+    """Refuse options of the use that is not asked for.
+
+    Raises:
+        InputError: MODEL without SOURCE, an option that does not apply, or fewer than 10 cells.
+    """
+    if config.model is not None and config.source is None:
+        raise InputError(
+            f"{config.model} needs observations: python -m tasks.locate MODEL SOURCE; the experiment takes options only, "
+            "e.g. --data"
+        )
+    default = {field.name: field.default for field in fields(config)}
+    reason = "spectra; give it with MODEL and SOURCE"
+    if config.model is not None:
+        reason = "the experiment; leave it out with MODEL and SOURCE"
+    for name in OBSERVATIONS if config.model is None else EXPERIMENT:
+        if getattr(config, name) != default[name]:
+            raise InputError(f"--{name} is for {reason}")
+    if not 10 <= config.cells <= 1_000_000:
+        raise InputError(f"--cells takes 10 to 1,000,000, got {config.cells}")

@@ -1,0 +1,123 @@
+"""The report of one localization run or several."""
+
+from __future__ import annotations
+
+import math
+
+from pandas import concat
+
+from tasks.locate.localizers import LOCALIZERS
+from tasks.locate.page import drawing
+from tasks.locate.page.summary import OWN, LocateRecords, by_method, summary
+from tasks.page.labels import LOCALIZERS as LABELS
+from tasks.page.labels import labels
+from tasks.page.page import Page, Plot, Section, Table
+from tasks.page.provenance import number, provenance
+from tasks.summarise import paired_difference
+
+
+def page(runs: list[LocateRecords]) -> Page:
+    """Return the page of these runs."""
+    sections = [section for n, run in enumerate(runs) for section in _run(run, several=len(runs) > 1, first=n == 0)]
+    names = ", ".join(dict.fromkeys(run.place for run in runs))
+    first = summary(runs[0], _overview(runs[0], "summary"))
+    return Page(f"Localization: {names}", first, [*sections, _limits(runs[0]), provenance(runs)])
+
+
+def _run(run: LocateRecords, several: bool, first: bool) -> list[Section]:
+    suffix = f" - {run.scene}" if several else ""
+    n_undetected = run.metrics["n_undetected"]
+    notes = [f"Test rows that no receiver detected are left out: {n_undetected}."] if n_undetected else []
+    terms = {name: label.meaning for name, label in labels(LOCALIZERS, LABELS).items()}
+    overview = [] if first else [_overview(run, f"overview-{run.file_name}")]
+    sections = [
+        Section(f"Position errors{suffix}", notes, [_table(run), _paired(run)], overview, terms),
+        Section(f"Calibration{suffix}", _weights(run), plots=[_calibration(run)]),
+        Section(f"Posterior maps{suffix}", plots=[_posteriors(run)]),
+    ]
+    if run.metrics["by_rows"] or run.metrics["by_receivers"]:
+        sections.insert(2, Section(f"Errors against training rows and receivers{suffix}", plots=[_studies(run)]))
+    return sections
+
+
+def _overview(run: LocateRecords, name: str) -> Plot:
+    caption = (
+        "Left: position errors of the posterior in plan, a line from each true position (dot) to its estimate, coloured by "
+        "the error. Right: distribution of the position errors of all localizers."
+    )
+    columns = ["method", "index", "position_error_m", "truth_x_m", "truth_y_m", "x_m", "y_m"]
+    return Plot(name, drawing.overview(run.table("errors")), caption, run.table("errors")[columns])
+
+
+def _table(run: LocateRecords) -> Table:
+    rows = []
+    for name, entry in run.metrics["overall"].items():
+        error, horizontal = entry["position_error_m"], entry["horizontal_error_m"]
+        median = f"{number(error['median'])} [{number(error['low'])}, {number(error['high'])}]"
+        seconds = f"{number(entry['seconds']['fit'])} + {number(entry['seconds']['predict'])}"
+        rows.append([name, median, number(error["p90"]), number(error["mean"]), number(horizontal["median"]), seconds])
+    columns = ["localizer", "median [m]", "90 % [m]", "mean [m]", "median in plan [m]", "fit + locate [s]"]
+    return Table(columns, rows, "Position error of the test rows; median with its 95 % interval.", frozenset([OWN]))
+
+
+def _paired(run: LocateRecords) -> Table:
+    errors, rows = by_method(run), []
+    for name in run.metrics["overall"]:
+        if name != OWN:
+            mean, low, high = paired_difference(errors, OWN, name)
+            interval = "" if math.isnan(low) else f" [{low:+.2f}, {high:+.2f}]"
+            rows.append([name, f"{mean:+.2f}{interval}"])
+    caption = "Mean of the posterior's position error minus that of the localizer on the same rows; 95 % bootstrap."
+    return Table(["against", "difference [m]"], rows, caption)
+
+
+def _weights(run: LocateRecords) -> list[str]:
+    weights = ", ".join(f"{name} {weight:.2f}" for name, weight in run.metrics["weights"].items())
+    return [
+        f"Weights of the posterior's likelihoods, which maximise the density at held-out training positions: {weights}. A "
+        "weight below 1 widens the posterior."
+    ]
+
+
+def _calibration(run: LocateRecords) -> Plot:
+    caption = (
+        "Fraction of the true positions inside the posterior's credible regions (dots; bars: 95 % interval) against their "
+        "probability. On the line the posterior is calibrated, below it the regions are too small."
+    )
+    data = drawing.coverage(run.metrics["calibration"], run.metrics["n_test"])
+    return Plot(f"calibration-{run.file_name}", drawing.calibration(data), caption, data)
+
+
+def _studies(run: LocateRecords) -> Plot:
+    caption = (
+        "Median position error (bars: 95 % interval) of localizers fitted to a random part of the training rows, and with a "
+        "random part of the receivers."
+    )
+    rows, receivers = drawing.study_table(run.metrics["by_rows"]), drawing.study_table(run.metrics["by_receivers"])
+    data = concat([rows, receivers]).drop_duplicates()
+    return Plot(f"studies-{run.file_name}", drawing.studies(rows, receivers), caption, data)
+
+
+def _posteriors(run: LocateRecords) -> Plot:
+    caption = (
+        "Posteriors of six test rows in plan, from the smallest error to the largest, each relative to its largest mass. "
+        "Cross: true position; dot: estimate; circle: 80 % credible region; small dots: training positions."
+    )
+    maps = run.arrays("maps")
+    return Plot(f"posteriors-{run.file_name}", drawing.posteriors(maps), caption, drawing.posterior_cells(maps))
+
+
+def _limits(run: LocateRecords) -> Section:
+    texts = [
+        "Rows that no receiver detected have no position. They are left out of the errors.",
+        "Candidate positions lie in and around the training positions. A transmitter elsewhere is located at their edge.",
+        "Intervals of medians treat test rows as independent. Along a walked path they are not, and the intervals are too "
+        "narrow.",
+        "Training and test rows are of one device and one time, unless the split separates these. Another device has "
+        "another offset.",
+    ]
+    if run.metrics["data"] == "simulated-floor":
+        texts.append(
+            "This floor is simulated. It shows that the software works, and not how accurate it is on measurements."
+        )
+    return Section("What this does not show", texts)

@@ -1,0 +1,83 @@
+"""The summary of a report: three numbers, a picture, their meaning and the next steps."""
+
+from __future__ import annotations
+
+import math
+
+from pandas import DataFrame
+
+from tasks.locate.steps import MODEL
+from tasks.metrics import LocateMetrics
+from tasks.page.page import Number, Plot, Summary
+from tasks.page.records import Records
+from tasks.summarise import paired_difference
+
+LocateRecords = Records[LocateMetrics]
+OWN = "posterior"  # the localizer that all others are compared with
+NEIGHBOURS = ("knn", "knn_difference")
+LEVEL = 0.8  # probability of the credible regions in the summary
+MAX_COVERAGE_ERROR = 0.05  # difference from the nominal coverage above which the report warns
+
+
+def summary(run: LocateRecords, picture: Plot) -> Summary:
+    """Return the summary of one run."""
+    error = {name: entry["position_error_m"] for name, entry in run.metrics["overall"].items()}
+    own, nearest = error[OWN], min(NEIGHBOURS, key=lambda name: error[name]["median"])
+    best = error[nearest]
+    numbers = [
+        Number(
+            f"{own['median']:.2f} m",
+            f"the posterior's median position error, 95 % interval [{own['low']:.2f}, {own['high']:.2f}]; 90 % of the "
+            f"errors are below {own['p90']:.1f} m",
+        ),
+        Number(
+            f"{best['median']:.2f} m",
+            f"the best nearest-neighbour fingerprinting, {nearest}, 95 % interval [{best['low']:.2f}, {best['high']:.2f}]; "
+            f"90 % are below {best['p90']:.1f} m",
+        ),
+        Number(
+            f"{run.metrics['calibration'][str(LEVEL)]:.0%}",
+            f"of the true positions lie in the {LEVEL:.0%} credible region that comes with each estimate",
+        ),
+    ]
+    rest = min((name for name in error if name != OWN), key=lambda name: error[name]["median"])
+    receivers = run.metrics["n_receivers"]
+    meaning = [
+        f"On {run.scene}: {run.metrics['n_train']} training rows and {run.metrics['n_test']} test rows at {receivers} "
+        f"{'receiver' if receivers == 1 else 'receivers'}.",
+        _against(run, rest),
+    ]
+    return Summary(numbers, picture, meaning, _next_steps(run))
+
+
+def _against(run: LocateRecords, best: str) -> str:
+    """Return a sentence that compares the posterior with the best other localizer."""
+    mean, low, high = paired_difference(by_method(run), OWN, best)
+    if math.isnan(low):
+        return f"{run.metrics['n_test']} test rows are too few to compare the posterior with {best}."
+    interval = f"{mean:+.2f} m [{low:+.2f}, {high:+.2f}]"
+    if high < 0:
+        return f"On the same rows the posterior's mean error is lower than that of {best}: {interval}."
+    if low > 0:
+        return f"On the same rows {best} has the lower mean error: the posterior's differs by {interval}. Take {best} here."
+    return f"On the same rows the errors of the posterior and {best} do not differ significantly: {interval}."
+
+
+def _next_steps(run: LocateRecords) -> list[str]:
+    steps = [
+        f"Locate new observations: python -m tasks.locate {run.folder.name.removesuffix('.partial')}/{MODEL} SOURCE."
+    ]
+    coverage = run.metrics["calibration"][str(LEVEL)]
+    if abs(coverage - LEVEL) > MAX_COVERAGE_ERROR:
+        steps.append(
+            "The credible regions are not calibrated on these rows; take their radii as a ranking, not as a promise."
+        )
+    if run.metrics["split"] == "random":
+        steps.append("Run --split block: it shows the error in a region where nothing was measured.")
+    return steps
+
+
+def by_method(run: LocateRecords) -> DataFrame:
+    """Return the position errors, one row for each test row and one column for each localizer."""
+    errors: DataFrame = run.table("errors").pivot_table(index=["index"], columns="method", values="position_error_m")
+    return errors

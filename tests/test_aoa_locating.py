@@ -1,0 +1,254 @@
+"""Matched-field processing in the angle-of-arrival task: positions, keys, resumption, and the choice of the estimator."""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from unittest import mock
+
+import locating_aoa
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from quick import QuickNetwork
+from small import with_defaults
+
+from augment import Fold
+from swiftwrf import FIELD_MODELS, MatchedField, load, make_model
+from swiftwrf.locate import MatchedFieldConfig, Posterior, matched_field
+from swiftwrf.models.geometry import model as geometry
+from swiftwrf.models.geometry.planes import Plane
+from swiftwrf.testing.rooms import mirror_room
+from tasks.aoa import cross_validation, experiment
+from tasks.aoa.condition import LOCATOR, NETWORK
+from tasks.aoa.estimators import ESTIMATORS
+from tasks.aoa.locating import Locating, containing_level
+from tasks.aoa.options import AoaConfig
+from tasks.estimate import EstimateConfig
+from tasks.estimate import run as estimate
+from tasks.run import command_line
+
+PLANES = {(0.0, 0.0, -1.0): 0.0, (1.0, 0.0, 0.0): 5.0, (0.0, 1.0, 0.0): 4.0}  # outward normal to offset [m]
+FEW_CELLS = MatchedFieldConfig(max_cells=3000, n_best=60, n_background=20, n_rounds=2, n_calibration=40)
+LEFT_OUT = {LOCATOR, f"{LOCATOR}_measured_all"}
+
+
+@pytest.fixture(scope="module")
+def closed_form():
+    """Spectra of three planes in closed form, without noise."""
+    data = mirror_room(PLANES, moving="transmitter", n=50)
+    return replace(data, label=data.direction_at(data.position))
+
+
+@contextmanager
+def quickly(data, planes=PLANES):
+    """Shorten what has its own tests: the search for the room, which gives these planes, the network, and the locator."""
+
+    def known(train, config, progress=False):
+        found = [Plane(normal, offset, -0.6) for normal, offset in planes.items()]
+        return geometry.GeometryModel.of_planes(train, found).estimate
+
+    with ExitStack() as patches:
+        for patch in (
+            mock.patch.object(geometry, "search_room", known),
+            mock.patch.object(matched_field, "MatchedFieldConfig", with_defaults(FEW_CELLS)),
+            mock.patch.object(cross_validation, "FOLD_LOCATOR", FEW_CELLS),
+            mock.patch.object(experiment, "simulated_room", return_value=data),
+            mock.patch.dict(ESTIMATORS._registered, {NETWORK: QuickNetwork}),
+            *(
+                mock.patch(f"{place}.candidates", lambda data: [n for n in ("idw", "geometry") if not lacking(n, data)])
+                for place in ("tasks.aoa.steps", "augment.choose")
+            ),
+        ):
+            patches.enter_context(patch)
+        yield
+
+
+def lacking(name, data):
+    return FIELD_MODELS[name].lacking(data)
+
+
+def run(*arguments):
+    return command_line("tasks.aoa", AoaConfig, experiment.run, [str(a) for a in arguments])
+
+
+def mix_of(folder):
+    (found,) = json.loads((folder / "metrics.json").read_text())["mixes"].values()
+    return found
+
+
+@pytest.fixture(scope="module")
+def finished(closed_form, tmp_path_factory):
+    """The directory of a run that locates."""
+    folder = tmp_path_factory.mktemp("located") / "run"
+    with quickly(closed_form):
+        assert run("--mix", 0.6, "--extra", 0, "--out", folder) == 0
+    return folder
+
+
+def test_methods_and_positions_have_their_keys(closed_form, finished):
+    mix = mix_of(finished)
+    assert set(mix["methods"]) >= LEFT_OUT
+    assert mix["left_out"] == {}
+    errors = pd.read_csv(finished / "errors.csv")
+    positions = pd.read_csv(finished / "positions.csv")
+    test = closed_form.split()[1]
+    for name in LEFT_OUT:
+        own, at = errors[errors.method == name], positions[positions.method == name]
+        assert own["index"].tolist() == at["index"].tolist() == test.index.tolist()
+        truth, found = (at[[f"{what}_{axis}_m" for axis in "xyz"]].to_numpy() for what in ("truth", "estimate"))
+        np.testing.assert_allclose(truth, test.position, rtol=1e-9)
+        np.testing.assert_allclose(at["error_m"], np.linalg.norm(found - truth, axis=1), rtol=1e-9)
+        assert (at["covered"] == (at["containing_level"] < 0.8)).all()
+        located = mix["locating"][name]
+        assert located["position_error_m"]["median"] == pytest.approx(at["error_m"].median())
+        assert located["coverage_80"] == pytest.approx(at["covered"].mean())
+        assert len(located["weights"]) >= 1
+        assert set(located["seconds"]) == {"room", "fit", "locate"}
+        assert mix["methods"][name]["great_circle_deg"]["median"] == pytest.approx(own["great_circle_deg"].median())
+
+
+def test_a_known_room_without_noise_is_located(finished):
+    """Far below the error of every estimator that does not use the room."""
+    mix = mix_of(finished)
+    error = {name: method["great_circle_deg"]["median"] for name, method in mix["methods"].items()}
+    assert error[LOCATOR] < 0.3 * error["kernel_ridge"]
+    assert mix["locating"][LOCATOR]["position_error_m"]["median"] < 0.1
+    assert mix["estimator_choice"]["name"] == LOCATOR
+    assert set(mix["estimator_choice"]["held_out_deg"]) == {"kernel_ridge", LOCATOR}
+
+
+def test_the_report_shows_where_it_was(finished):
+    html = (finished / "report.html").read_text()
+    assert "Where was it? (60% measured)" in html
+    assert f"Take {LOCATOR} on this data" in html
+    assert f"python -m tasks.estimate {LOCATOR}-mix0.6.safetensors SOURCE" in html
+    for kind in ("located", "posteriors"):
+        assert list((finished / "figures").glob(f"{kind}-mix0.6-*.csv"))
+
+
+def test_the_trained_locator_is_kept_and_estimates_directions(closed_form, finished, tmp_path, capsys):
+    file = finished / f"{LOCATOR}-mix0.6.safetensors"
+    locator = load(file)
+    assert isinstance(locator, MatchedField)
+    test = closed_form.split()[1]
+    np.save(tmp_path / "new.npy", test.spectrum.numpy())
+    out = tmp_path / "directions.csv"
+    arguments = [str(file), str(tmp_path / "new.npy"), "--out", str(out)]
+    assert command_line("tasks.estimate", EstimateConfig, estimate, arguments) == 0
+    errors = pd.read_csv(finished / "errors.csv")
+    own = errors[errors.method == LOCATOR]
+    found = pd.read_csv(out)
+    np.testing.assert_allclose(found["elevation_deg"], own["estimate_elevation_deg"], atol=1e-3)
+    np.save(tmp_path / "other.npy", np.zeros((1, 5, 5), dtype=np.float32))
+    assert command_line("tasks.estimate", EstimateConfig, estimate, [str(file), str(tmp_path / "other.npy")]) == 2
+    assert "trained on others" in capsys.readouterr().err
+
+
+def test_a_resumed_run_has_equal_numbers(closed_form, finished, tmp_path, monkeypatch):
+    with quickly(closed_form):
+        honest = Locating.compute
+
+        def interrupt(self, *given):
+            if self.condition.training == "all":
+                raise KeyboardInterrupt
+            return honest(self, *given)
+
+        monkeypatch.setattr(Locating, "compute", interrupt)
+        assert run("--mix", 0.6, "--extra", 0, "--out", tmp_path / "cut") == 130
+        monkeypatch.setattr(Locating, "compute", honest)
+        assert run("--resume", tmp_path / "cut.partial") == 0
+    whole, cut = mix_of(finished), mix_of(tmp_path / "cut")
+    for mix in (whole, cut):
+        for entry in (*mix["methods"].values(), *mix["locating"].values()):
+            del entry["seconds"]
+    assert whole["methods"] == cut["methods"]
+    assert whole["locating"] == cut["locating"]
+    assert whole["estimator_choice"] == cut["estimator_choice"]
+
+
+@pytest.mark.parametrize("missing", ["array", "planes"])
+def test_without_array_or_planes_it_is_left_out_with_one_sentence(closed_form, tmp_path, capsys, missing):
+    data, planes = (replace(closed_form, array=None), PLANES) if missing == "array" else (closed_form, {})
+    with quickly(data, planes):
+        assert run("--mix", 0.6, "--extra", 0, "--out", tmp_path / "run") == 0
+    console = " ".join(capsys.readouterr().err.split())
+    mix = mix_of(tmp_path / "run")
+    assert not LEFT_OUT & set(mix["methods"])
+    assert mix["locating"] == {}
+    assert set(mix["left_out"]) == LEFT_OUT
+    (reason,) = set(mix["left_out"].values())
+    if missing == "array":
+        assert console.count("left out") == 1
+        assert f"{LOCATOR} is left out: {reason}" in console
+        assert reason.startswith("it needs the array")
+    else:
+        assert f"{LOCATOR} is left out with 60% measured: {reason}" in console
+        assert reason == "no plane explains the spectra"
+    assert set(mix["estimator_choice"]["held_out_deg"]) == {"kernel_ridge"}
+    assert not (tmp_path / "run" / "positions.csv").exists()
+    assert "Where was it?" in (tmp_path / "run" / "report.html").read_text()
+
+
+def test_fractions_and_repeats_share_the_search_in_all_spectra(closed_form, tmp_path):
+    with quickly(closed_form):
+        config = AoaConfig((0.5, 1.0), extra=0, repeats=2)
+        train, test = closed_form.split()
+        data = experiment.Experiment(config, train, test, 0, torch.device("cpu"))
+        subsets = [experiment.MeasuredSubset(fraction, repeat) for repeat in range(2) for fraction in config.mix]
+        own = {subset: [condition.result_name for condition in data.located_by(subset)] for subset in subsets}
+    everything = [f"{LOCATOR}_measured_all-r{repeat}" for repeat in (0, 0, 1, 1)]
+    assert own[subsets[0]] == [f"{LOCATOR}-mix0.5-r0"]
+    assert own[subsets[1]] == [f"{LOCATOR}-mix1-r0", *everything]
+    assert own[subsets[3]] == [f"{LOCATOR}-mix1-r1"]
+
+
+def test_the_estimator_is_chosen_by_held_out_errors_alone(monkeypatch, closed_form):
+    """Without a model that has a room, or with planes in one of two searches, it is not matched-field processing."""
+    model = make_model("idw").fit(closed_form)
+    folds = [Fold(model, closed_form, closed_form.subset(torch.arange(4))) for _ in range(4)]
+    errors = {"kernel_ridge": [np.full(4, 2.0)] * 4, "kernel_ridge_turbo_idw": [np.full(4, 1.0)] * 4}
+    for given in ([], folds):
+        choice = cross_validation.choose_estimator(errors, given, seed=0)
+        assert choice["name"] == "kernel_ridge_turbo_idw"
+        assert choice["held_out_deg"] == {"kernel_ridge": 2.0, "kernel_ridge_turbo_idw": 1.0}
+        assert choice["n_held_out"] == 16
+    located = iter([np.full(4, 0.1), None])
+    monkeypatch.setattr(cross_validation, "_located_errors", lambda *_: next(located))
+    assert LOCATOR not in cross_validation.choose_estimator(errors, folds, seed=0)["held_out_deg"]
+    for error, chosen in ((0.1, LOCATOR), (1.5, "kernel_ridge_turbo_idw")):
+        monkeypatch.setattr(cross_validation, "_located_errors", lambda *_, error=error: np.full(4, error))
+        choice = cross_validation.choose_estimator(errors, folds, seed=0)
+        assert (choice["name"], choice["n_held_out"]) == (chosen, 8)
+
+
+def test_the_benchmark_writes_every_draw_and_their_medians(closed_form, tmp_path, monkeypatch):
+    monkeypatch.setattr(locating_aoa, "scenes", lambda config: [("closed form", closed_form)])
+    monkeypatch.setattr(locating_aoa, "N_LOCATED", 12)
+    with quickly(closed_form):
+        locating_aoa.main(locating_aoa.Config(fractions=(0.5,), draws=2, kernel=True, out=tmp_path))
+    written = json.loads((tmp_path / "locating_spectra.json").read_text())
+    assert {"command", "environment"} <= set(written)
+    found = written["scenes"]["closed form"]["0.5"]
+    assert [row["draw"] for row in found["draws"]] == [0, 1]
+    for name in ("angle_deg", "position_m", "kernel_ridge_angle_deg"):
+        assert found["median"][name]["p90"] == pytest.approx(np.mean([row[name]["p90"] for row in found["draws"]]))
+        assert found["median"][name]["median"] > 0
+    assert 0 <= found["median"]["coverage_80"] <= 1
+    assert set(found["median"]["seconds"]) == {"room", "fit", "locate"}
+    with quickly(closed_form, {}):
+        row = locating_aoa.measure(closed_form, closed_form, draw=0, kernel=False)
+    assert row["left_out"] == "no plane explains the spectra"
+
+
+def test_the_containing_level_is_that_of_the_credible_radius():
+    generator = torch.Generator().manual_seed(0)
+    at = torch.randn(6, 40, 3, generator=generator, dtype=torch.float64)
+    log_weight = torch.randn(6, 40, generator=generator, dtype=torch.float64).log_softmax(dim=1)
+    posterior, truth = Posterior(at, log_weight, 0.1), torch.randn(6, 3, generator=generator, dtype=torch.float64)
+    error = (truth - posterior.median).norm(dim=1)
+    for level in (0.2, 0.5, 0.8):
+        inside = error <= posterior.credible_radius(level)
+        assert torch.equal(containing_level(posterior, truth) < level, inside)

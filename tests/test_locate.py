@@ -1,0 +1,233 @@
+"""Locating: posteriors with known answers, rooms in closed form, invariances, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from swiftwrf import AngularGrid, InputError, load, rssi_room, simulated_room
+from swiftwrf.array.angles import angular_distance, to_direction
+from swiftwrf.locate import MatchedField, Posterior, Region, RssiLocator
+from swiftwrf.locate.likelihood import ResidualDistribution
+from swiftwrf.locate.pool import pooled_weights
+from swiftwrf.locate.posterior import normalised
+from swiftwrf.locate.region import Cells
+from swiftwrf.locate.rssi_likelihood import DetectionLikelihood, RssiMaps, ValueLikelihood
+from swiftwrf.locate.search import best_cells, refined
+from swiftwrf.models.geometry import GeometryModel, Plane
+
+SMALL = {"n_best": 60, "n_background": 40, "n_split": 8, "spacing": 0.4, "n_calibration": 40}
+ROOM = [
+    Plane((-1.0, 0.0, 0.0), 0.0, -0.6, 0.1, True),
+    Plane((0.0, 1.0, 0.0), 5.0, -0.6, 0.1, True),
+    Plane((0.0, 0.0, -1.0), 0.0, -0.6, 0.1, True),
+]
+
+
+@pytest.fixture(scope="module")
+def floor():
+    """RSSI of a small floor, and its locator."""
+    train, test = rssi_room(n=150, seed=1).split()
+    return train, test, RssiLocator(n_cells=600).fit(train)
+
+
+@pytest.fixture(scope="module")
+def closed_form():
+    """Spectra without noise that follow exactly from three known planes, and the locator of that room."""
+    spectra = simulated_room(n=50, seed=3, grid=AngularGrid.hemisphere(15, 60))
+    room = GeometryModel.of_planes(spectra, ROOM)
+    exact = replace(spectra, store=type(spectra.store)(room.synthesize(spectra.position)))
+    train, test = exact.split()
+    return train, test, MatchedField(**SMALL, n_rounds=9).fit(train, room=GeometryModel.of_planes(train, ROOM))
+
+
+def gaussian_on_a_line(centre, std, n=400):
+    """A posterior on a line of cells whose mass is that of a normal distribution."""
+    x = torch.linspace(-5, 5, n, dtype=torch.float64)
+    at = torch.stack([x, torch.zeros(n), torch.zeros(n)], dim=1)[None]
+    return Posterior(at, normalised(-((x - centre) ** 2)[None] / (2 * std**2)), 10 / n)
+
+
+def test_the_mass_of_a_one_dimensional_posterior_is_right():
+    posterior = gaussian_on_a_line(0.7, 0.5)
+    assert posterior.mean[0, 0] == pytest.approx(0.7, abs=1e-3)
+    assert posterior.median[0, 0] == pytest.approx(0.7, abs=1e-2)
+    assert posterior.std[0, 0] == pytest.approx(0.5, abs=1e-3)
+    assert posterior.credible_radius(0.8)[0] == pytest.approx(1.2816 * 0.5, abs=0.03)
+    assert not posterior.ambiguous[0]
+
+
+def test_two_modes_are_ambiguous():
+    one, two = gaussian_on_a_line(-3, 0.2), gaussian_on_a_line(3, 0.2)
+    both = Posterior(
+        one.position, torch.logaddexp(one.log_weight + math.log(0.6), two.log_weight + math.log(0.4)), 0.025
+    )
+    assert both.ambiguous[0]
+    assert both.most_likely[0, 0] == pytest.approx(-3, abs=0.05)
+
+
+def test_the_direction_has_the_smallest_expected_angular_error():
+    generator = torch.Generator().manual_seed(0)
+    vectors = torch.nn.functional.normalize(torch.rand(1, 40, 3, generator=generator, dtype=torch.float64), dim=2)
+    posterior = Posterior(vectors, normalised(torch.randn(1, 40, generator=generator, dtype=torch.float64)))
+
+    def expected(direction):
+        return float((posterior.weight[0] * angular_distance(vectors[0], direction.expand(40, -1))).sum())
+
+    best = posterior.direction(vectors)[0]
+    for step in 0.03 * torch.randn(50, 3, generator=generator, dtype=torch.float64):
+        assert expected(best) <= expected(torch.nn.functional.normalize(best + step, dim=0)) + 1e-4
+
+
+def test_splitting_cells_keeps_their_mass_and_finds_a_narrow_peak():
+    peak = torch.tensor([0.3137, -0.271, 0.05], dtype=torch.float64)
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
+    cells = Region(corners).cells(1000)
+
+    def evaluate(position):
+        return -((position - peak).square().sum(dim=2) / (2 * 0.002**2))[None]
+
+    found = best_cells(cells, evaluate(cells.position[None])[0], 40, 0, torch.Generator().manual_seed(0))
+    volume, values = found.log_volume.exp().sum(), evaluate(found.position)
+    for _ in range(10):
+        found, values = refined(found, normalised(values[0].double() + found.log_volume), values, evaluate, 8)
+    posterior = Posterior(found.position, normalised(values[0].double() + found.log_volume))
+    assert (posterior.mean - peak).norm() < 1e-3
+    assert found.log_volume.exp().sum() <= volume + 1e-12
+
+
+def test_background_cells_stand_for_all_others():
+    position = torch.arange(100, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0, 0])
+    volume = torch.full((100,), -math.log(100), dtype=torch.float64)
+    cells = Cells(position, volume, torch.eye(3, dtype=torch.float64)[:1], torch.zeros(100, dtype=torch.float64))
+    kept = best_cells(cells, torch.zeros(7, 100), 10, 20, torch.Generator().manual_seed(0))
+    assert torch.allclose(kept.log_volume.exp().sum(dim=1), torch.ones(7, dtype=torch.float64))
+
+
+def test_pooling_tempers_what_is_too_certain_and_drops_what_is_noise():
+    generator = torch.Generator().manual_seed(0)
+    x = torch.linspace(-4, 4, 200, dtype=torch.float64)
+    truth = 0.5 * torch.randn(400, 1, generator=generator, dtype=torch.float64)
+    seen = truth + torch.randn(truth.shape, generator=generator, dtype=torch.float64)  # standard deviation 1 ...
+    claimed = 0.5  # ... of which the likelihood claims a half
+
+    def models(at, noise):
+        return torch.stack([-((at - seen) ** 2) / (2 * claimed**2), noise])
+
+    at_candidates = models(x.expand(400, -1), torch.randn(400, 200, generator=generator, dtype=torch.float64))
+    at_truth = models(truth, torch.randn(400, 1, generator=generator, dtype=torch.float64))[..., 0]
+    prior = (-(x**2) / (2 * 0.5**2)).expand(400, -1)
+    weight = pooled_weights(at_truth, at_candidates, prior)
+    assert weight[0] == pytest.approx(claimed**2, rel=0.25)
+    assert weight[1] < 0.1
+
+
+def test_residuals_with_outliers_have_heavy_tails():
+    generator = torch.Generator().manual_seed(0)
+    clean = torch.randn(400, 6, generator=generator)
+    heavy = clean / (torch.rand(400, 1, generator=generator) + 0.05)
+    assert ResidualDistribution.fit(heavy, 1.0).degrees < ResidualDistribution.fit(clean, 1.0).degrees
+
+
+def test_a_region_follows_a_path_and_fills_a_room():
+    turn = torch.linspace(0, 2 * math.pi, 200, dtype=torch.float64)
+    path = torch.stack([4 * turn.cos(), 4 * turn.sin(), torch.zeros_like(turn)], dim=1)
+    cells = Region(path).cells(4000)
+    inside = cells.log_volume.exp()[cells.position.norm(dim=1) < 2].sum()
+    assert inside < 0.05
+    assert (cells.position[:, 2].abs() < 1e-9).all()
+    room = torch.rand(300, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    assert Region(room).is_near(Region(room).cells(500).position).double().mean() > 0.9
+
+
+def test_a_room_in_closed_form_is_located_to_a_millimetre(closed_form):
+    _, test, locator = closed_form
+    posterior = locator.locate(test.spectrum)
+    assert (posterior.median - test.position).norm(dim=1).median() < 1e-3
+    angles = locator.direction(posterior)
+    error = angular_distance(to_direction(*angles.unbind(-1)), to_direction(*test.label.unbind(-1)))
+    assert error.rad2deg().median() < 0.05
+
+
+def test_saved_locators_locate_alike(closed_form, floor, tmp_path):
+    for data, locator in ((closed_form[1].spectrum, closed_form[2]), (floor[1].rssi_dbm, floor[2])):
+        locator.save(tmp_path / "locator.safetensors")
+        again = load(tmp_path / "locator.safetensors")
+        assert torch.equal(again.locate(data).log_weight, locator.locate(data).log_weight)
+
+
+def test_coordinates_from_another_origin_change_nothing(floor):
+    train, test, locator = floor
+    shift = torch.tensor([512.0, -256.0, 0.0], dtype=torch.float64)
+
+    def moved(data):
+        return replace(
+            data,
+            transmitter_position=data.transmitter_position + shift,
+            receiver_position=data.receiver_position + shift,
+        )
+
+    again = RssiLocator(n_cells=600).fit(moved(train)).locate(test.rssi_dbm)
+    assert torch.allclose(again.median - shift, locator.locate(test.rssi_dbm).median, atol=0.05)
+
+
+def test_the_order_of_receivers_changes_nothing(floor):
+    train, test, locator = floor
+    order = list(reversed(range(len(train.receiver_names))))
+    again = RssiLocator(n_cells=600).fit(train.columns(order)).locate(test.columns(order).rssi_dbm)
+    assert (again.median - locator.locate(test.rssi_dbm).median).norm(dim=1).max() < 0.05
+
+
+def test_rssi_is_located_better_than_by_fingerprints(floor):
+    _, test, locator = floor
+    found = (locator.locate(test.rssi_dbm).median - test.transmitter_position).norm(dim=1)
+    nearest = (locator.fingerprints.estimate(test.rssi_dbm) - test.transmitter_position).norm(dim=1)
+    assert found.median() < nearest.median()
+
+
+def test_missing_values_count_as_missing():
+    maps = RssiMaps(torch.tensor([[-60.0, -70.0, -80.0]]), torch.full((1, 3), 2.0))
+    likelihood = ValueLikelihood(torch.eye(3, dtype=torch.float64), math.inf)
+    both = likelihood.log_likelihood(maps, torch.tensor([[-61.0, math.nan, -80.0]]))
+    alone = RssiMaps(maps.mean[:, [0, 2]], maps.std[:, [0, 2]])
+    less = ValueLikelihood(torch.eye(2, dtype=torch.float64), math.inf).log_likelihood(
+        alone, torch.tensor([[-61.0, -80.0]])
+    )
+    assert torch.allclose(both, less)
+
+
+def test_detections_are_learnt():
+    generator = torch.Generator().manual_seed(0)
+    mean = -100 + 60 * torch.rand(500, 4, generator=generator)
+    detected = torch.rand(500, 4, generator=generator) < 0.9 * torch.sigmoid((mean + 85) / 3)
+    found = DetectionLikelihood.fit(mean, detected)
+    assert found.threshold == pytest.approx(-85, abs=2)
+    assert found.loss == pytest.approx(0.1, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("rssi", "message"),
+    [
+        (torch.full((2, 12), math.nan), "no receiver detected the transmitter in row 0"),
+        (torch.zeros(2, 5), r"expected RSSI of shape \(n, 12\), got \(2, 5\)"),
+        (torch.full((1, 12), math.inf), "finite"),
+    ],
+)
+def test_observations_that_make_no_sense_are_refused(floor, rssi, message):
+    with pytest.raises(InputError, match=message):
+        floor[2].locate(rssi)
+
+
+def test_spectra_on_another_grid_are_refused(closed_form):
+    with pytest.raises(InputError, match="expected spectra of shape"):
+        closed_form[2].locate(torch.zeros(1, 30, 120))
+    with pytest.raises(InputError, match="finite"):
+        closed_form[2].locate(torch.full((1, 15, 60), math.nan))
+
+
+def test_data_without_an_array_have_no_matched_field(room):
+    with pytest.raises(InputError, match="array"):
+        MatchedField().fit(replace(room, array=None))

@@ -1,0 +1,309 @@
+"""The localizers, their experiment, and positions of new observations."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from unittest import mock
+
+import locating
+import numpy as np
+import pandas as pd
+import pytest
+import quick
+import torch
+from quick import said
+from small import glances
+
+from swiftwrf import AngularGrid, InputError, RssiModel, load, make_model, rssi_room, simulated_room
+from swiftwrf.data.writing import write_spectra
+from swiftwrf.locate import MatchedField
+from swiftwrf.runtime.registry import Registry
+from tasks.locate import experiment
+from tasks.locate.experiment import prepared
+from tasks.locate.localizers import LEVELS, LOCALIZERS, RegressedCoordinates
+from tasks.locate.observations import aligned, read_rssi
+from tasks.locate.options import LocateConfig
+from tasks.locate.steps import MODEL, Localization, in_plan
+from tasks.page.labels import LOCALIZERS as LABELS
+from tasks.run import command_line
+
+GRID = AngularGrid.hemisphere(8, 32)
+
+
+def run(*arguments):
+    """The experiment with cheap radio maps; its exit code."""
+    return quick.run("locate", *arguments)
+
+
+def locate(*arguments):
+    """The positions of new observations; the exit code."""
+    return command_line("tasks.locate", LocateConfig, experiment.run, [str(a) for a in arguments])
+
+
+def strict_json(file):
+    return json.loads(file.read_text(), parse_constant=lambda name: pytest.fail(name))
+
+
+def write_rssi(file, data, located=True):
+    table = pd.DataFrame(data.rssi_dbm.numpy(), columns=list(data.receiver_names))
+    if located:
+        table[["x", "y", "z"]] = data.transmitter_position.numpy()
+    table.to_csv(file, index=False)
+    return file
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The directory of a run on the built-in floor."""
+    folder = tmp_path_factory.mktemp("locate") / "run"
+    assert run("--cells", 300, "--out", folder) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def matched(tmp_path_factory):
+    """Spectra of the built-in room, and the file of a coarse locator that was fitted to them."""
+    data = simulated_room(n=40, grid=GRID)
+    file = tmp_path_factory.mktemp("matched") / "matched.safetensors"
+    with glances():
+        MatchedField(max_cells=200, n_best=20, n_background=10, n_rounds=1).fit(data).save(file)
+    return data, file
+
+
+def test_localizers_describe_themselves():
+    assert list(LOCALIZERS) == ["posterior", "knn", "knn_difference", "gp", "mean"]
+    for name, localizer in LOCALIZERS.items():
+        assert localizer.name == name
+        assert LOCALIZERS.summary(name)
+        assert LABELS[name].colour
+
+
+@pytest.mark.parametrize("name", [name for name in LOCALIZERS if name != "posterior"])
+@pytest.mark.parametrize("validation", ["random", "block"])
+def test_baselines_locate_better_than_the_mean_position(name, validation):
+    train, test = rssi_room(n=150).split()
+    located = LOCALIZERS[name](validation=validation).fit(train).locate(test.rssi_dbm)
+    error = (located.position - test.transmitter_position).norm(dim=1)
+    spread = (train.transmitter_position.mean(dim=0) - test.transmitter_position).norm(dim=1)
+    assert float(error.mean()) <= (1 if name == "mean" else 0.85) * float(spread.mean()) + 1e-9
+    assert located.radius is None
+
+
+def test_a_known_fingerprint_is_located_where_it_was_measured():
+    train = rssi_room(n=60)
+    with mock.patch("tasks.locate.localizers.NEIGHBOUR_COUNTS", (1,)):
+        located = LOCALIZERS["knn"]().fit(train).locate(train.rssi_dbm)
+    torch.testing.assert_close(located.position, train.transmitter_position)
+
+
+def test_differences_are_robust_to_the_offset_of_a_device():
+    train, test = rssi_room(n=100).split()
+    for name, is_robust in (("knn_difference", True), ("knn", False)):
+        localizer = LOCALIZERS[name]().fit(train)
+        one, other = (localizer.locate(test.rssi_dbm + offset).position for offset in (0.0, 8.0))
+        assert torch.allclose(one, other) == is_robust
+
+
+def test_test_rows_reach_no_fit():
+    given, _ = prepared(rssi_room(n=60), "random", 50, 0)
+    moved = replace(given, test=replace(given.test, transmitter_position=given.test.transmitter_position + 5))
+    for name in ("knn", "knn_difference", "gp"):
+        values = [Localization(name).compute(one, None) for one in (given, moved)]
+        torch.testing.assert_close(values[0]["estimate"], values[1]["estimate"])
+
+
+def test_whole_run(finished):
+    metrics = strict_json(finished / "metrics.json")
+    assert (metrics["task"], metrics["data"], metrics["split"], metrics["seed"]) == (
+        "locate",
+        "simulated-floor",
+        "random",
+        0,
+    )
+    assert (metrics["n_train"], metrics["n_test"], metrics["n_receivers"], metrics["n_undetected"]) == (64, 16, 12, 0)
+    assert list(metrics["overall"]) == list(LOCALIZERS)
+    assert set(metrics["weights"]) == {"values", "detections", "fingerprints"}
+    errors = pd.read_csv(finished / "errors.csv")
+    for name, entry in metrics["overall"].items():
+        own = errors[errors.method == name]
+        assert entry["position_error_m"]["median"] == pytest.approx(own.position_error_m.median())
+        assert entry["horizontal_error_m"]["n"] == len(own) == 16
+        assert set(entry["seconds"]) == {"fit", "predict"}
+    own = errors[errors.method == "posterior"]
+    away = own[["x_m", "y_m", "z_m"]].to_numpy() - own[["truth_x_m", "truth_y_m", "truth_z_m"]].to_numpy()
+    np.testing.assert_allclose(np.linalg.norm(away, axis=1), own.position_error_m)
+    inside = {str(p): float((own.position_error_m <= own[f"credible_radius_{100 * p:.0f}_m"]).mean()) for p in LEVELS}
+    assert metrics["calibration"] == pytest.approx(inside)
+    assert own.credible_radius_50_m.lt(own.credible_radius_95_m).all()
+    assert metrics["by_rows"] == []  # a tenth of 64 rows is too few
+    sizes = [(study["localizer"], study["n_receivers"]) for study in metrics["by_receivers"]]
+    assert sizes == [("posterior", 12), ("knn", 12), ("posterior", 3), ("knn", 3), ("posterior", 6), ("knn", 6)]
+
+
+def test_the_report_shows_errors_calibration_and_posteriors(finished):
+    page = (finished / "report.html").read_text()
+    assert "the best nearest-neighbour fingerprinting" in page
+    assert "What this does not show" in page
+    assert f"tasks.locate run/{MODEL} SOURCE" in page
+    drawn = {file.stem.partition("-")[0] for file in (finished / "figures").glob("*.svg")}
+    assert drawn == {"summary", "calibration", "studies", "posteriors"}
+    with np.load(finished / "maps.npz") as maps:
+        assert maps["density"].shape == (6, len(maps["y"]), len(maps["x"]))
+        assert np.nanmax(maps["density"], axis=(1, 2)) == pytest.approx(1)
+
+
+def test_runs_are_merged(finished, tmp_path):
+    assert quick.run("report", finished, finished, "--out", tmp_path / "merged") == 0
+    assert "run 2" in (tmp_path / "merged" / "report.html").read_text()
+
+
+def test_a_part_of_the_training_rows():
+    given, _ = prepared(rssi_room(n=100), "block", 100, 3)
+    train, test = given.part(0.3, 1)
+    assert (len(train), len(test)) == (24, 20)
+    assert set(train.index.tolist()) < set(given.train.index.tolist())
+    assert [step.name for step in given.steps()][5:] == [
+        f"{name}-{part}" for part in ("rows0.3", "receivers0.25", "receivers0.5") for name in ("posterior", "knn")
+    ]
+
+
+def test_rows_that_no_receiver_detected_are_left_out(tmp_path, capsys):
+    data = rssi_room(n=80)
+    data.rssi_dbm[::4] = torch.nan
+    write_rssi(tmp_path / "walk.csv", data)
+    out = tmp_path / "run"
+    assert run("--data", tmp_path / "walk.csv", "--rx", "1", "2", "3", "--cells", 100, "--out", out) == 0
+    metrics = strict_json(out / "metrics.json")
+    assert metrics["n_undetected"] > 0
+    assert metrics["n_test"] + metrics["n_undetected"] == 16
+    assert f"test rows that no receiver detected are left out: {metrics['n_undetected']}" in capsys.readouterr().err
+    data.rssi_dbm[:70] = torch.nan
+    with pytest.raises(InputError, match="at least 20 are needed"):
+        prepared(data, "random", 100, 0)
+
+
+def test_an_interrupted_run_goes_on_to_the_same_numbers(finished, tmp_path):
+    out = tmp_path / "run"
+    with mock.patch.object(RegressedCoordinates, "_regress", side_effect=KeyboardInterrupt):
+        assert run("--cells", 300, "--out", out) == 130
+    partial = tmp_path / "run.partial"
+    kept = {file.stem for file in (partial / "steps").iterdir()}
+    assert {"posterior", "knn", "knn_difference"} <= kept
+    assert run("--resume", partial) == 0
+    same, other = (pd.read_csv(folder / "errors.csv") for folder in (finished, out))
+    pd.testing.assert_frame_equal(same, other)
+    assert strict_json(out / "metrics.json")["calibration"] == strict_json(finished / "metrics.json")["calibration"]
+
+
+def test_positions_of_new_rows(finished, tmp_path, capsys):
+    test = rssi_room(n=80).subset(torch.tensor(pd.read_csv(finished / "errors.csv")["index"].unique()))
+    known = write_rssi(tmp_path / "known.csv", test)
+    unknown = write_rssi(tmp_path / "unknown.csv", test.columns([3, 0, 1, 2, *range(4, 12)]), located=False)
+    assert locate(finished / MODEL, known, "--out", tmp_path / "positions.csv") == 0
+    assert "16 positions, median error" in capsys.readouterr().out
+    assert locate(finished / MODEL, unknown, "--out", tmp_path / "unknown_positions.csv") == 0
+    assert "16 positions: " in capsys.readouterr().out
+    found, other = pd.read_csv(tmp_path / "positions.csv"), pd.read_csv(tmp_path / "unknown_positions.csv")
+    columns = ["index", "x_m", "y_m", "z_m", "std_x_m", "std_y_m", "std_z_m", "credible_radius_80_m", "ambiguous"]
+    assert list(other) == columns
+    assert list(found) == [*columns, "truth_x_m", "truth_y_m", "truth_z_m", "position_error_m"]
+    pd.testing.assert_frame_equal(found[columns], other)
+    errors = pd.read_csv(finished / "errors.csv").query("method == 'posterior'")
+    np.testing.assert_allclose(found.position_error_m, errors.position_error_m, atol=1e-4)
+
+
+def test_receivers_of_the_model_are_found_by_name(finished, tmp_path, capsys):
+    data = rssi_room(n=80)
+    some = replace(data.columns([1, 0]), receiver_names=("receiver02", "kitchen"))
+    locator = load(finished / MODEL)
+    placed = aligned(some, locator.receiver_names)
+    assert placed.receiver_names == locator.receiver_names
+    torch.testing.assert_close(placed.rssi_dbm[:, 1], data.rssi_dbm[:, 1], equal_nan=True)
+    assert placed.detected[:, 2:].sum() == 0
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "count as not detecting: receiver01" in printed
+    assert "are not used: kitchen" in printed
+
+
+def test_a_table_without_positions(tmp_path):
+    data, is_known = read_rssi(str(write_rssi(tmp_path / "a.csv", rssi_room(n=20), located=False)), {})
+    assert (len(data), len(data.receiver_names), is_known) == (20, 12, False)
+    long = pd.DataFrame({"receiver": ["a", "b", "a"], "time": [1, 1, 2], "rssi": [-50, -60, -55]})
+    long.to_csv(tmp_path / "b.csv", index=False)
+    data, is_known = read_rssi(str(tmp_path / "b.csv"), {})
+    assert (len(data), is_known) == (2, False)
+    assert read_rssi(str(write_rssi(tmp_path / "c.csv", rssi_room(n=20))), {})[1]
+
+
+def test_other_rows_are_refused(finished, matched, tmp_path, capsys):
+    data, out = rssi_room(n=20), tmp_path / "out.csv"
+    others = write_rssi(tmp_path / "a.csv", replace(data, receiver_names=tuple("abcdefghijkl")))
+    assert locate(finished / MODEL, others, "--out", out) == 2
+    assert "has other receivers (a, b" in said(capsys)
+    assert locate(finished / MODEL, others, "--every", 2, "--out", out) == 2
+    assert "--every is for spectra" in said(capsys)
+    make_model("nearest").fit(simulated_room(n=20, grid=GRID)).save(tmp_path / "nearest")
+    assert locate(tmp_path / "nearest", others, "--out", out) == 2
+    assert "locates nothing" in said(capsys)
+    assert not out.exists()
+
+
+def test_no_receiver_detected(finished, tmp_path, capsys):
+    data = rssi_room(n=20)
+    data.rssi_dbm[:] = torch.nan
+    with mock.patch("tasks.locate.observations.read_rssi", return_value=(data, True)):
+        assert locate(finished / MODEL, "walk", "--out", tmp_path / "out.csv") == 2
+    assert "no receiver of" in said(capsys)
+    data.rssi_dbm[3] = -70.0
+    with mock.patch("tasks.locate.observations.read_rssi", return_value=(data, True)):
+        assert locate(finished / MODEL, "walk", "--out", tmp_path / "out.csv") == 0
+    assert "left out: 19" in capsys.readouterr().err
+    assert pd.read_csv(tmp_path / "out.csv")["index"].tolist() == [3]
+
+
+def test_positions_and_directions_of_spectra(matched, tmp_path, capsys):
+    data, file = matched
+    (tmp_path / "data").mkdir()
+    write_spectra(data, tmp_path / "data")
+    assert locate(file, tmp_path / "data", "--out", tmp_path / "known.csv") == 0
+    assert "40 positions, median error" in capsys.readouterr().out
+    known = pd.read_csv(tmp_path / "known.csv")
+    assert known.great_circle_deg.between(0, 180).all()
+    assert known.position_error_m.median() < 2
+    np.save(tmp_path / "unknown.npy", data.spectrum.numpy()[:5])
+    assert locate(file, tmp_path / "unknown.npy", "--out", tmp_path / "unknown.csv") == 0
+    unknown = pd.read_csv(tmp_path / "unknown.csv")
+    assert list(unknown)[-2:] == ["azimuth_deg", "elevation_deg"]
+    assert len(unknown) == 5
+    np.save(tmp_path / "other.npy", np.zeros((3, 8, 16), np.float32))
+    assert locate(file, tmp_path / "other.npy", "--out", tmp_path / "out.csv") == 2
+    assert "--grid 8 32" in said(capsys)
+    assert locate(file, tmp_path / "unknown.npy", "--every", 2, "--out", tmp_path / "out.csv") == 2
+    assert "--every does not apply" in said(capsys)
+
+
+def test_a_posterior_is_summed_over_height():
+    at = torch.tensor([[[0.0, 0, 0], [0, 0, 1], [1, 0, 0], [1, 2, 0]]], dtype=torch.float64)
+    posterior = mock.Mock(position=at, weight=torch.tensor([[0.2, 0.2, 0.4, 0.2]]).double(), resolution_m=0.3)
+    posterior.__len__ = lambda self: 1
+    xs, ys, density = in_plan(posterior)
+    assert density.shape == (1, len(ys), len(xs))
+    assert density[0, 0, 0] == pytest.approx(1)
+    assert density[0, -1, -1] == pytest.approx(0.5)
+    assert density[0, len(ys) // 2].isnan().all()
+
+
+def test_the_benchmark_measures_every_localizer(monkeypatch):
+    written = {}
+    monkeypatch.setattr(locating, "read", lambda source: rssi_room(n=60))
+    monkeypatch.setattr(locating, "write_result", lambda name, content: written.update({name: content}))
+    monkeypatch.setattr(locating, "earlier", dict)
+    cheap = Registry("localizer")
+    cheap._registered = {name: LOCALIZERS[name] for name in ("posterior", "knn")}
+    monkeypatch.setattr(locating, "LOCALIZERS", cheap)
+    with mock.patch.object(RssiModel, "config_type", quick.QuickRssiConfig):
+        locating.main(locating.Config(("floor:block",), cells=60))
+    (result,) = written["locating_rssi"]["sets"].values()
+    assert set(result["localizers"]) == {"posterior", "knn"}
+    assert set(result["coverage"]) == {"0.5", "0.8", "0.95"}
