@@ -108,6 +108,7 @@ def test_kernel_ridge_reads_only_the_spectra_that_it_keeps(room, monkeypatch):
     assert sum(read) == 12
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("circular", [False, True])
 def test_aann_learns_a_toy(circular):
     """Four directions, four patterns: a network that cannot tell them apart stays at the constant's error."""
@@ -274,6 +275,7 @@ def test_batches_are_at_most_half_of_what_trains(room, monkeypatch, spectra, bat
     assert not torch.equal(found[0], found[1])
 
 
+@pytest.mark.long
 def test_regression_takes_the_place_of_the_head_that_a_short_training_leaves():
     """On spectra that neither has seen."""
     room = simulated_room(n=300, grid=AngularGrid.hemisphere(10, 40))
@@ -510,6 +512,7 @@ def test_a_name_without_colour_has_one_that_depends_on_the_name_alone():
     assert Palette().colour("unknown") == Palette({"other": "#000000"}).colour("unknown")
 
 
+@pytest.mark.long
 def test_interrupted_run_goes_on_to_the_same_numbers(small, tmp_path, monkeypatch):
     arguments = ("--mix", 0.5, "--extra", 20, "--out")
     assert run(*arguments, tmp_path / "whole") == 0
@@ -537,6 +540,7 @@ def test_interrupted_run_goes_on_to_the_same_numbers(small, tmp_path, monkeypatc
     assert whole["synthesis"] == cut["synthesis"]
 
 
+@pytest.mark.long
 def test_fractions_of_many_digits_have_results_of_their_own(small, tmp_path, monkeypatch):
     """Through to the report, also of a resumed run, for fractions that are equal to six digits, too."""
     fractions = (0.6666667, 0.66666671, 0.3333333)

@@ -106,6 +106,7 @@ def test_workers_keep_the_memory_that_a_training_frees(cluster):
     assert max(cluster.map(faults, range(2))) < 20_000  # 200,000 as Dask sets it
 
 
+@pytest.mark.long
 def test_aoa_has_the_same_numbers_when_a_worker_dies(local, whole, tmp_path, monkeypatch):
     during(monkeypatch, (Run, "keep", 4), lambda: kill_a_worker(local))
     assert run(*AOA, "--scheduler", local.scheduler_address, "--out", tmp_path / "run") == 0

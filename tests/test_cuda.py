@@ -343,6 +343,7 @@ def check_full_graph(device, backend):
         torch.testing.assert_close(a, b)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(bool(SANITIZERS), reason="is running under them")
 @pytest.mark.usefixtures("shim")
 def test_sanitizers_find_nothing():

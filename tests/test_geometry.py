@@ -157,6 +157,7 @@ def test_a_plane_among_the_positions_has_no_turns():
     assert phase_alternatives(scene, PlaneSet(normal, offset, torch.tensor([[-0.6]]), 1)) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("away", [(8, 8, 6, 6, 0, 2), (3, 3, 4, 4, 0, 3)], ids=["whole turns", "half turns"])
 def test_planes_that_are_turns_away_together_return(away):
     """Images of images hold planes at wrong places together, from where no one to three of them find back."""
@@ -198,6 +199,7 @@ def test_scores_of_combinations_are_those_of_their_rooms():
         torch.testing.assert_close(score[choice], scene.score(room.field(scene)), atol=1e-5, rtol=0)
 
 
+@pytest.mark.long
 def test_a_tilted_plane_is_found_to_a_millimetre():
     model = fit(mirror_room({(0.8, 0.5, 0.1): 5.0}, -0.7, n=60), width=1)
     assert len(model.planes) == 1
@@ -364,6 +366,7 @@ def test_path_gains_follow_a_shadow():
     assert [plane.normal for plane in like.room.planes] == [plane.normal for plane in room.planes]
 
 
+@pytest.mark.long
 def test_path_gains_are_held_out_from_spectra_without_observed_phases_too():
     """What stands for predictions of one fold follows from the observed spectra of the other folds."""
     data, fold = mirror_room(SIX, n=80), torch.arange(80) % 3

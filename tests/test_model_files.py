@@ -178,6 +178,7 @@ print(type(swiftwrf.load(sys.argv[1])).__name__)
 """
 
 
+@pytest.mark.long
 def test_models_of_every_kind_are_opened_with_swiftwrf_alone(room, tmp_path, small_published):
     for name in ("gp", "hybrid", "vae"):
         make_model(name).fit(room).save(tmp_path / name)

@@ -97,12 +97,14 @@ def main(folder: Path) -> None:
     (folder / f"code{os.environ['RANK']}").write_text(str(code))
 
 
+@pytest.mark.long
 def test_the_network_of_two_processes_is_that_of_one(ended):
     alone, shared = learnt(), torch.load(ended[0] / "learnt.pt")
     assert (shared["estimate"] - alone["estimate"]).abs().max() < 1e-4
     torch.testing.assert_close(shared["losses"], alone["losses"], rtol=1e-4, atol=0)
 
 
+@pytest.mark.long
 def test_a_run_of_two_processes_is_that_of_one(ended):
     folder, said = ended
     set_threads(1)

@@ -21,6 +21,7 @@ TEXT = (Path(__file__).parent.parent / "docs" / "tutorial.md").read_text()
 PARTS = re.split(r"^## ", TEXT, flags=re.MULTILINE)[1:]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("part", PARTS, ids=[part.splitlines()[0] for part in PARTS])
 def test_every_block_runs(part, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
