@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import torch
+from annotated_types import Ge, Le
 from torch import Tensor
 
 from swiftwrf.array.angles import to_angles, to_direction
@@ -32,10 +33,11 @@ from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.path_gains import PathGains, fit_path_gains, prior
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
-from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, configuration
+from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 
 FOLDS = 5
 MIN_SPECTRA = 15
+MAX_LOG_VARIANCE = 30.0  # of path gains in a file
 OBSERVATIONS = 64  # searched at a time
 FIRST_WEIGHTS = (0.05, 0.05, 0.3)  # of the likelihoods, before calibration
 
@@ -44,17 +46,17 @@ FIRST_WEIGHTS = (0.05, 0.05, 0.3)  # of the likelihoods, before calibration
 class MatchedFieldConfig:
     """Options of matched-field processing."""
 
-    spacing: PositiveFloat = 0.2
+    spacing: Annotated[float, Ge(0.02)] = 0.2
     """spacing of the first cells, in wavelengths"""
-    max_cells: PositiveInt = 400_000
+    max_cells: Annotated[int, Ge(1), Le(4_000_000)] = 400_000
     """number of first cells at most"""
-    n_best: PositiveInt = 500
+    n_best: Annotated[int, Ge(1), Le(100_000)] = 500
     """cells of largest mass that are kept for each spectrum"""
-    n_background: NonNegativeInt = 200
+    n_background: Annotated[int, Ge(0), Le(100_000)] = 200
     """cells that represent all others"""
-    n_split: PositiveInt = 16
+    n_split: Annotated[int, Ge(1), Le(10_000)] = 16
     """cells that are split in each round"""
-    n_rounds: NonNegativeInt = 3
+    n_rounds: Annotated[int, Ge(0), Le(20)] = 3
     """rounds of splitting"""
     n_calibration: PositiveInt = 200
     """held-out spectra that determine the weights of the likelihoods, at most"""
@@ -272,6 +274,8 @@ class MatchedField(Saved):
             "weight": (3,),
         }
         expect(tensors, shapes)
+        if n < MIN_SPECTRA or known < MIN_SPECTRA or bool((tensors["statistics"].abs() > MAX_LOG_VARIANCE).any()):
+            raise InputError("residuals, positions or variances are not those of a fitted locator")
         process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True, prefix="path_gains.")
         gains = PathGains(process, len(room.image_sources()[0]))
         locator.grid, locator.room = room.grid, room

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import torch
+from annotated_types import Ge, Le
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
@@ -34,7 +35,7 @@ class RssiLocatorConfig:
 
     validation: Validation = "random"
     """training rows held out to calibrate: single ones at random, or one region at a time"""
-    n_cells: PositiveInt = 4000
+    n_cells: Annotated[int, Ge(1), Le(1_000_000)] = 4000
     """candidate positions"""
     n_calibration: PositiveInt = 600
     """held-out rows that determine the weights of the likelihoods, at most"""
@@ -245,6 +246,10 @@ class RssiLocator(Saved):
         degrees, k = header["degrees"], int(header["k"])
         if not 1 <= k <= n:
             raise InputError(f"k must be between 1 and the number of rows, got {k}")
+        correlation, scale = tensors["correlation"], tensors["scale_m"]
+        definite = not bool(torch.linalg.cholesky_ex(correlation).info)
+        if not (definite and bool((scale > 0).all()) and (degrees is None or float(degrees) > 0)):
+            raise InputError("correlation, scale or degrees of freedom are those of no distribution")
         locator.values = ValueLikelihood(tensors["correlation"], math.inf if degrees is None else float(degrees))
         locator.detections = DetectionLikelihood(**header["detections"])
         locator.floor_dbm = float(header["floor_dbm"])

@@ -33,8 +33,10 @@ from swiftwrf import (
     FIELD_MODELS,
     AngularGrid,
     FitConfig,
+    MatchedField,
     ModelConfig,
     Rssi,
+    RssiLocator,
     Spectra,
     fit,
     fit_coarray,
@@ -198,6 +200,28 @@ def go_on(folder: Path) -> SwiftWRF:
         return fit(_few(), TINY, progress=False, checkpoint=folder / "state")
 
 
+def model_rssi_locator(folder: Path) -> None:
+    train = rssi_room(n=40)
+    RssiLocator(n_cells=200).fit(train).save(folder / "model")
+
+
+def model_matched_field(folder: Path) -> None:
+    room = simulated_room(n=20, grid=GRID)
+    locator = MatchedField(spacing=0.5, n_best=20, n_background=10, n_split=4)
+    locator.fit(room, room=fit_geometry(room, GLANCE, progress=False)).save(folder / "model")
+
+
+def read_locator(folder: Path) -> torch.Tensor:
+    locator = load(folder / "model")
+    if isinstance(locator, RssiLocator):
+        posterior = locator.locate(torch.full((1, len(locator.receiver_names)), -70.0))
+    else:
+        assert isinstance(locator, MatchedField)
+        posterior = locator.locate(torch.rand(1, *locator.grid.shape))
+    assert posterior.median.isfinite().all()
+    return posterior.median
+
+
 @functools.cache
 def _few() -> Spectra:
     return _room()
@@ -229,5 +253,7 @@ KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "vae model": (functools.partial(model_published, "vae"), read_model),
     "dcgan model": (functools.partial(model_published, "dcgan"), read_model),
     "kernel ridge regression": (model_kernel_ridge, read_estimator),
+    "RSSI locator": (model_rssi_locator, read_locator),
+    "matched-field locator": (model_matched_field, read_locator),
     "fit state": (state_of_a_fit, go_on),
 }
