@@ -44,12 +44,14 @@ class Config:
     """draws of the measured spectra"""
     kernel: bool = False
     """measure kernel regression on the same spectra, too"""
+    name: str = "locating_spectra"
+    """name of the result"""
     out: Path = RESULTS
     """folder of the result"""
 
 
 def main(config: Config) -> None:
-    """Measure every scene, measured fraction and draw, and write `locating_spectra.json`."""
+    """Measure every scene, measured fraction and draw, and write the result."""
     torch.set_num_threads(1)
     found: dict[str, Any] = {}
     for name, data in scenes(config):
@@ -61,7 +63,7 @@ def main(config: Config) -> None:
                 rows.append(measure(withhold(train, fraction, draw)[0], test, draw, config.kernel))
                 print(name, fraction, rows[-1], flush=True)
             found[name][fraction_key(fraction)] = {"median": median_of(rows), "draws": rows}
-            write_result("locating_spectra", {"n_located": N_LOCATED, "scenes": found}, folder=config.out)
+            write_result(config.name, {"n_located": N_LOCATED, "scenes": found}, folder=config.out)
 
 
 def scenes(config: Config) -> Iterator[tuple[str, Spectra]]:

@@ -26,10 +26,11 @@ from swiftwrf.comparison.base import Config, Count, Training, descend
 from swiftwrf.comparison.nerf2 import MAX_SAMPLES_AT_ONCE, Field, NeRF2Size, received
 from swiftwrf.comparison.network import chunks, draw_parameters, restored
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.models.base import check_finite, from_plain
+from swiftwrf.models.base import check_finite
 from swiftwrf.positions import frame, normalise
 from swiftwrf.rssi.base import RssiFitContext, RssiPredictor, fingerprint
 from swiftwrf.runtime.checkpoint import Header, Saved
+from swiftwrf.runtime.options import from_plain
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
 

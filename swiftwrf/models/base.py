@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_type_hints
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -18,6 +18,7 @@ from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions
 from swiftwrf.runtime.checkpoint import Header, Saved
+from swiftwrf.runtime.options import Configured, Preset, from_plain
 from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.validation import NonNegativeInt, checked, configuration
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
 ARRAY, FIXED_END = "array", "fixed end"  # requirements that a model can declare
 CPU = torch.device("cpu")
-Preset = Literal["quick", "paper"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,41 +88,6 @@ class FitContext:
     progress: bool = False
 
 
-class Configured:
-    """Base class of models whose options are keyword arguments of the constructor; `config_type` declares their ranges.
-
-    Args:
-        config: Options as one object. Defaults to those of the preset.
-        preset: "quick" for the defaults, sized for a desktop; "paper" for the settings of the model's publication.
-        options: Single options, which replace those of `config`.
-
-    Raises:
-        InputError: An unknown option, or a value outside its range.
-    """
-
-    config_type: ClassVar[type[Any]] = FieldConfig
-    """dataclass of the options"""
-
-    @checked
-    def __init__(self, config: Any = None, *, preset: Preset = "quick", **options: Any) -> None:
-        known = [field.name for field in fields(self.config_type)]
-        unknown = [name for name in options if name not in known]
-        if unknown:
-            raise InputError(f"{type(self).__name__} has no option {unknown[0]!r}; it has {', '.join(known)}")
-        if config is None:
-            self.config = (self.config_type.paper if preset == "paper" else self.config_type)(**options)
-        elif isinstance(config, self.config_type):
-            self.config = replace(config, **options)
-        else:
-            raise InputError(f"{type(self).__name__} takes a {self.config_type.__name__}, got {type(config).__name__}")
-
-    @classmethod
-    def with_known(cls, preset: Preset, options: Mapping[str, Any]) -> Self:
-        """Return a model with those of the options that it has."""
-        known = {field.name for field in fields(cls.config_type)}
-        return cls(preset=preset, **{option: value for option, value in options.items() if option in known})
-
-
 class FieldModel(Configured, Saved):
     """Base class of all field models.
 
@@ -138,6 +103,8 @@ class FieldModel(Configured, Saved):
         InputError: An unknown option, or a value outside its range.
     """
 
+    config_type: ClassVar[type[Any]] = FieldConfig
+    """dataclass of the options"""
     name: ClassVar[str]
     """name in the registry, on the command line and in reports"""
     requires: ClassVar[tuple[str, ...]] = ()
@@ -378,18 +345,6 @@ def bounding_box(position: Tensor) -> Tensor:
     return torch.stack([position.amin(dim=0), position.amax(dim=0)])
 
 
-def from_plain(config_type: type[Any], options: Mapping[str, Any]) -> Any:
-    """Return a configuration from values that JSON has stored: nested configurations as objects, tuples as lists."""
-    hints = get_type_hints(config_type)
-
-    def restored(name: str, value: Any) -> Any:
-        if is_dataclass(hints.get(name)):
-            return from_plain(hints[name], value)
-        return tuple(value) if isinstance(value, list) else value
-
-    return config_type(**{name: restored(name, value) for name, value in options.items()})
-
-
 def check_finite(spectrum: Tensor) -> Tensor:
     """Return the spectra unchanged if they are finite.
 
@@ -431,17 +386,3 @@ def model_types(names: Iterable[str] | None = None) -> dict[str, type[FieldModel
         InputError: An unknown name.
     """
     return {name: FIELD_MODELS[name] for name in (FIELD_MODELS if names is None else names)}
-
-
-__all__ = [
-    "ARRAY",
-    "FIELD_MODELS",
-    "FIXED_END",
-    "FieldConfig",
-    "FieldModel",
-    "FitContext",
-    "Prediction",
-    "Preset",
-    "Record",
-]
-__all__ += ["check_finite", "from_plain", "make_model", "model_types"]

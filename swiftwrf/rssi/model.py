@@ -23,7 +23,7 @@ from torch import Tensor
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, thinned
-from swiftwrf.models.base import Record, from_plain
+from swiftwrf.models.base import Record
 from swiftwrf.rssi.base import Map, RssiFitContext, RssiPredictor, fingerprint, map_threads
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
@@ -34,6 +34,7 @@ from swiftwrf.rssi.stacking import MIN_STACKING_ROWS, comparable, receiver_weigh
 from swiftwrf.rssi.training import RssiTraining, prepare
 from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header, Saved
+from swiftwrf.runtime.options import from_plain
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.session import Session
 from swiftwrf.runtime.threads import single_thread

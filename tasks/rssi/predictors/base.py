@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from swiftwrf.models.base import Preset
 from swiftwrf.rssi import RssiPredictor
+from swiftwrf.runtime.options import Preset
 from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.validation import checked
 

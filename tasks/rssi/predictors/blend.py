@@ -10,9 +10,10 @@ from torch import Tensor
 
 from swiftwrf import Rssi
 from swiftwrf.data.splits import folds
-from swiftwrf.models.base import FieldConfig, Preset
+from swiftwrf.models.base import FieldConfig
 from swiftwrf.rssi import RssiFitContext, RssiPredictor
 from swiftwrf.rssi.stacking import mixing_weights
+from swiftwrf.runtime.options import Preset
 from swiftwrf.runtime.validation import configuration
 from tasks.rssi.predictors.base import PREDICTORS, make_predictor
 

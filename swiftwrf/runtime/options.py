@@ -1,0 +1,59 @@
+"""Models with declared options: one constructor for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, ClassVar, Literal, Self, get_type_hints
+
+from swiftwrf.errors import InputError
+from swiftwrf.runtime.validation import checked
+
+Preset = Literal["quick", "paper"]
+
+
+class Configured:
+    """Base class of models whose options are keyword arguments of the constructor; `config_type` declares their ranges.
+
+    Args:
+        config: Options as one object. Defaults to those of the preset.
+        preset: "quick" for the defaults, sized for a desktop; "paper" for the settings of the model's publication.
+        options: Single options, which replace those of `config`.
+
+    Raises:
+        InputError: An unknown option, or a value outside its range.
+    """
+
+    config_type: ClassVar[type[Any]]
+    """dataclass of the options"""
+
+    @checked
+    def __init__(self, config: Any = None, *, preset: Preset = "quick", **options: Any) -> None:
+        known = [field.name for field in fields(self.config_type)]
+        unknown = [name for name in options if name not in known]
+        if unknown:
+            raise InputError(f"{type(self).__name__} has no option {unknown[0]!r}; it has {', '.join(known)}")
+        if config is None:
+            self.config = (self.config_type.paper if preset == "paper" else self.config_type)(**options)
+        elif isinstance(config, self.config_type):
+            self.config = replace(config, **options)
+        else:
+            raise InputError(f"{type(self).__name__} takes a {self.config_type.__name__}, got {type(config).__name__}")
+
+    @classmethod
+    def with_known(cls, preset: Preset, options: Mapping[str, Any]) -> Self:
+        """Return a model with those of the options that it has."""
+        known = {field.name for field in fields(cls.config_type)}
+        return cls(preset=preset, **{option: value for option, value in options.items() if option in known})
+
+
+def from_plain(config_type: type[Any], options: Mapping[str, Any]) -> Any:
+    """Return a configuration from values that JSON has stored: nested configurations as objects, tuples as lists."""
+    hints = get_type_hints(config_type)
+
+    def restored(name: str, value: Any) -> Any:
+        if is_dataclass(hints.get(name)):
+            return from_plain(hints[name], value)
+        return tuple(value) if isinstance(value, list) else value
+
+    return config_type(**{name: restored(name, value) for name, value in options.items()})
