@@ -16,12 +16,12 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.comparison.network import LinkNetwork, Network, restored
 from swiftwrf.data.spectra import Moving, Spectra, fingerprint
-from swiftwrf.models.base import FieldModel, FitContext, Record
+from swiftwrf.models.base import FieldModel, FitContext
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.descent import Descent, Model, Schedule, warm_cosine
 from swiftwrf.runtime.options import from_plain
 from swiftwrf.runtime.progress import progress_bar
-from swiftwrf.runtime.session import Session
+from swiftwrf.runtime.session import Record, Session
 from swiftwrf.runtime.validation import Fraction, NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
 # sizes of networks, limited because a damaged file may claim any

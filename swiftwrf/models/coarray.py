@@ -22,9 +22,10 @@ from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, choose_kernel, principal_components
-from swiftwrf.models.base import ARRAY, FIELD_MODELS, FieldModel, FitContext, Record
+from swiftwrf.models.base import ARRAY, FIELD_MODELS, FieldModel, FitContext
 from swiftwrf.runtime.checkpoint import Header, expect, refusing, restore
 from swiftwrf.runtime.progress import progress_bar
+from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.threads import single_thread
 
 MAX_COMPONENTS = 64  # principal components of the training magnitudes

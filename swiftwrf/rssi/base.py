@@ -16,9 +16,10 @@ from torch import Tensor
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError
-from swiftwrf.models.base import FitContext, Prediction, Record
+from swiftwrf.models.base import FitContext, Prediction
 from swiftwrf.positions import check_positions
 from swiftwrf.runtime.options import Configured
+from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.threads import side_by_side
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]

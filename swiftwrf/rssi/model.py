@@ -23,7 +23,6 @@ from torch import Tensor
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, thinned
-from swiftwrf.models.base import Record
 from swiftwrf.rssi.base import Map, RssiFitContext, RssiPredictor, fingerprint, map_threads
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
@@ -36,7 +35,7 @@ from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.options import from_plain
 from swiftwrf.runtime.progress import progress_bar
-from swiftwrf.runtime.session import Session
+from swiftwrf.runtime.session import Record, Session
 from swiftwrf.runtime.threads import single_thread
 
 LEVEL = 0.8  # nominal coverage of the interval that the standard deviation is calibrated for

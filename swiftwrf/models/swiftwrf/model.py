@@ -12,12 +12,13 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.models.base import FIELD_MODELS, FieldModel, FitContext, Record
+from swiftwrf.models.base import FIELD_MODELS, FieldModel, FitContext
 from swiftwrf.models.swiftwrf.config import FitConfig, ModelConfig
 from swiftwrf.models.swiftwrf.field import DeformableGaussians
 from swiftwrf.models.swiftwrf.fit import MAX_PRIMITIVES, fit_field
 from swiftwrf.rasterize.magnitude import magnitude
 from swiftwrf.runtime.checkpoint import Header
+from swiftwrf.runtime.session import Record
 
 MAX_CACHED_VALUES = 2**26  # float32 values that one model caches: 256 MiB
 

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.gp import Kernel, thinned
-from swiftwrf.models.base import Record
 from swiftwrf.models.swiftwrf.config import FitConfig
 from swiftwrf.models.swiftwrf.field import DeformableGaussians
 from swiftwrf.models.swiftwrf.loss import spectrum_loss
 from swiftwrf.runtime.descent import Descent, Schedule, warm_cosine
+from swiftwrf.runtime.session import Record
 
 MAX_ANCHORS = 1000  # anchors of the deformation; the time of a step grows with their square
 
