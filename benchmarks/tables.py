@@ -10,6 +10,7 @@ from typing import Any
 from committed import RESULTS, ROOT, aoa_shares, interval, load, markdown, rssi_runs, turbo_condition
 from comparison_tables import comparison, comparison_counts, comparison_turbo
 from geometry import SIDES, WALLS, nearest
+from locating_tables import locating_rssi, locating_spectra
 from speed_tables import busy, drawing, scaling, scaling_quality, scaling_rssi, size, speed
 from targets import aoa_targets, rssi_targets, synthesis_targets
 
@@ -259,6 +260,8 @@ TABLES = {
     "scaling_rssi": scaling_rssi,
     "busy": busy,
     "headline": headline,
+    "locating_spectra": locating_spectra,
+    "locating_rssi": locating_rssi,
     "reliability": reliability,
     "synthesis": synthesis,
     "aoa": aoa,
