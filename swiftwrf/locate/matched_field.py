@@ -86,9 +86,12 @@ class MatchedField(Saved):
 
     Example:
         >>> import swiftwrf
-        >>> train, test = swiftwrf.simulated_room(n=60).split()
-        >>> posterior = MatchedField().fit(train).locate(test.spectrum)  # doctest: +SKIP
-        >>> posterior.median  # (n, 3) [m]  # doctest: +SKIP
+        >>> from swiftwrf.models.geometry import Plane
+        >>> spectra = swiftwrf.simulated_room(n=30, grid=swiftwrf.AngularGrid.hemisphere(8, 32))
+        >>> train, test = spectra.split()
+        >>> room = swiftwrf.GeometryModel.of_planes(train, [Plane((0.0, 0.0, -1.0), offset_m=0.0, gain=-0.6)])
+        >>> MatchedField(spacing=0.5).fit(train, room=room).locate(test.spectrum).median.shape
+        torch.Size([6, 3])
     """
 
     kind: ClassVar[str] = "matched-field locator"
