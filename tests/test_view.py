@@ -23,7 +23,7 @@ from fuzz import kinds
 from PIL import Image
 
 from swiftwrf import AngularGrid, GeometryModel, InputError, load, load_rssi, rssi_room
-from swiftwrf.locate import RssiLocator
+from swiftwrf.locate import MatchedField, RssiLocator
 from swiftwrf.models.geometry import Plane, fit_hybrid
 from tasks.locate.options import LocateConfig
 from tasks.run import command_line
@@ -287,7 +287,7 @@ def test_posterior_of_a_row_is_that_of_the_locator(locating, located_floor):
     assert found.error_m == pytest.approx(float((posterior.median[0] - data.transmitter_position[7]).norm()))
     assert np.nanmax(found.density.values) == 1
     assert found.density.at(*posterior.most_likely[0, :2].tolist()) == pytest.approx(1)
-    assert f"row 7: median at {found.median[0]:.1f}" in locating.describe(row)
+    assert f"row 7: median at {found.median[0]:.2f}" in locating.describe(row)
 
 
 def test_rows_are_simulated_from_the_distributions_of_the_locator(located_floor, generator):
@@ -364,6 +364,27 @@ def test_view_of_a_run_of_locate(located_floor, tmp_path):
     (folder / "locator.safetensors").unlink()
     with pytest.raises(InputError, match="holds no model"):
         open_source(folder)
+
+
+def test_posterior_of_a_spectrum_is_that_of_the_locator(aoa_run, room, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(aoa_run, folder)
+    with small.glances():
+        locator = MatchedField(max_cells=200, n_best=20, n_background=10, n_rounds=1).fit(room)
+    locator.save(folder / "matched_field-mix1.safetensors")
+    view = open_source(folder)
+    assert view.models[0].locating is None
+    found, posterior = view.located(view.models[1], 3), locator.locate(view.data.store[3:4])
+    np.testing.assert_allclose(found.median, posterior.median[0], atol=1e-3)
+    np.testing.assert_allclose(found.truth, room.position[3], atol=1e-6)
+    x0, x1, y0, y1 = found.density.corners
+    low, high = locator.cells.position.amin(dim=0), locator.cells.position.amax(dim=0)
+    assert x0 <= low[0] <= high[0] <= x1
+    assert y0 <= low[1] <= high[1] <= y1
+    assert np.nanmax(found.density.values) == 1
+    shutil.copy(folder / "model-mix1.safetensors", folder / "matched_field-mix1.safetensors")
+    with pytest.raises(InputError, match="expected a matched-field locator"):
+        open_source(folder).models[1].locating.locator  # noqa: B018
 
 
 def said(capsys, *arguments) -> str:

@@ -1,10 +1,11 @@
-"""Posterior over the position of a row of RSSI, and the expected position error over the floor, for the page."""
+"""Posterior over the position of an observation, and the expected position error over the floor, for the page."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,18 +13,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf import Rssi
-from swiftwrf.locate import RssiLocator
+from swiftwrf import InputError, Rssi, load
+from swiftwrf.locate import MatchedField, Posterior, RssiLocator
 from swiftwrf.locate.rssi import UNDETECTED_BELOW_DB
 from swiftwrf.locate.rssi_likelihood import RssiMaps
 from swiftwrf.positions import nearest
 from tasks.locate.localizers import BATCH_ROWS
-from tasks.locate.steps import in_plan
+from tasks.locate.steps import MAP_PIXELS, in_plan
 from tasks.records import as_table
 
 LEVELS = (0.5, 0.8)  # probabilities of the credible regions that are shown
 N_POSITIONS = 300  # of the map of expected errors
-N_DRAWS = 8  # simulated rows at each of them
+MIN_MASS = 1e-3  # of a pixel, relative to the largest; less is transparent
+N_DRAWS = 16  # simulated rows at each of them
 Corners = tuple[float, float, float, float]  # x0, x1, y0, y1 [m]
 
 
@@ -64,8 +66,8 @@ class PlanMap:
 
 
 @dataclass(frozen=True, eq=False)
-class LocatedRow:
-    """Posterior over the position of one row of RSSI.
+class Located:
+    """Posterior over the position of one observation.
 
     Args:
         density: Posterior mass in plan, relative to the largest.
@@ -80,6 +82,21 @@ class LocatedRow:
     radius: tuple[float, ...]
     truth: NDArray[np.floating]
     ambiguous: bool
+
+    @classmethod
+    def of(cls, posterior: Posterior, density: PlanMap, truth: Tensor) -> Located:
+        """Return what the page shows of the posterior of one observation, measured at `truth` (3,) [m]."""
+        radius = tuple(float(posterior.credible_radius(level)) for level in LEVELS)
+        return cls(density, posterior.median[0].numpy(), radius, truth.numpy(), bool(posterior.ambiguous))
+
+    def describe(self) -> str:
+        """Describe the posterior in a few sentences."""
+        x, y, z = self.median.tolist()
+        regions = ", ".join(f"{level:.0%} within {r:.2f} m" for level, r in zip(LEVELS, self.radius, strict=True))
+        return (
+            f"median at {x:.2f}, {y:.2f}, {z:.2f} m, {regions}. The measured position is {self.error_m:.2f} m away from the "
+            f"median.{' A second position is likely.' if self.ambiguous else ''}"
+        )
 
     @property
     def error_m(self) -> float:
@@ -138,28 +155,16 @@ class RssiLocating:
         """Return the row that was measured nearest to a position in plan [m]."""
         return int((self.rows.transmitter_position[:, :2] - torch.tensor([x, y])).norm(dim=1).argmin())
 
-    def _located(self, row: int) -> LocatedRow:
+    def _located(self, row: int) -> Located:
         posterior = self.locator.locate(self.rows.rssi_dbm[row : row + 1])
         x, y, density = in_plan(posterior)
-        return LocatedRow(
-            PlanMap(x.numpy(), y.numpy(), density[0].numpy()),
-            posterior.median[0].numpy(),
-            tuple(float(posterior.credible_radius(level)) for level in LEVELS),
-            self.rows.transmitter_position[row].numpy(),
-            bool(posterior.ambiguous),
-        )
+        in_plan_of_row = PlanMap(x.numpy(), y.numpy(), density[0].numpy())
+        return Located.of(posterior, in_plan_of_row, self.rows.transmitter_position[row])
 
     def describe(self, row: int) -> str:
         """Describe the posterior of a row in a few sentences."""
-        found = self.located(row)
-        x, y, z = found.median.tolist()
-        regions = ", ".join(f"{level:.0%} within {r:.1f} m" for level, r in zip(LEVELS, found.radius, strict=True))
         part = "training" if self.in_training[row] else "test"
-        return (
-            f"Posterior of {part} row {int(self.rows.index[row])}: median at {x:.1f}, {y:.1f}, {z:.1f} m, {regions}. "
-            f"The measured position is {found.error_m:.1f} m away from the median."
-            + (" A second position is likely." if found.ambiguous else "")
-        )
+        return f"Posterior of {part} row {int(self.rows.index[row])}: {self.located(row).describe()}"
 
     def map(self, row: int | None) -> PlanMap:
         """Return the posterior of a row in plan, or the expected error for None."""
@@ -189,6 +194,46 @@ class RssiLocating:
         values = torch.full((len(position),), torch.nan, dtype=torch.float64)
         values[inside] = error.mean(dim=0)
         return PlanMap(x.numpy(), y.numpy(), values.reshape(len(y), len(x)).numpy())
+
+
+class SpectrumLocating:
+    """The locator that a run of tasks.aoa keeps; it is opened when it is first used.
+
+    Args:
+        file: File of the locator.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+
+    @cached_property
+    def locator(self) -> MatchedField:
+        """The locator.
+
+        Raises:
+            InputError: The file contains none.
+        """
+        locator = load(self._file)
+        if not isinstance(locator, MatchedField):
+            raise InputError(f"{self._file} holds a {locator.kind}, expected a {MatchedField.kind}")
+        return locator
+
+    def located(self, spectrum: Tensor, truth: Tensor) -> Located:
+        """Return the posterior of a spectrum (n_elevation, n_azimuth) that was measured at `truth`, (3,) [m].
+
+        Its masses are summed over square pixels of the locator's region.
+        """
+        posterior = self.locator.locate(spectrum[None])
+        cells = self.locator.cells.position[:, :2]
+        low, extent = cells.amin(dim=0), cells.amax(dim=0) - cells.amin(dim=0)
+        pixel_m = float(extent.max()) / MAP_PIXELS or 1.0
+        width, height = (int(number) + 1 for number in (extent / pixel_m).ceil())
+        column, row = ((posterior.position[0, :, :2] - low) / pixel_m).round().long().unbind(-1)
+        mass = torch.zeros(height * width, dtype=torch.float64)
+        mass.index_add_(0, row.clamp(0, height - 1) * width + column.clamp(0, width - 1), posterior.weight[0])
+        density = (mass / mass.max()).masked_fill(mass < MIN_MASS * mass.max(), torch.nan).reshape(height, width)
+        x, y = (float(start) + pixel_m * np.arange(number) for start, number in zip(low, (width, height), strict=True))
+        return Located.of(posterior, PlanMap(x, y, density.numpy()), truth)
 
 
 def simulated_rows(locator: RssiLocator, position: Tensor, n: int, generator: torch.Generator) -> Tensor:

@@ -8,8 +8,8 @@ from matplotlib.colors import to_hex
 from nicegui import events, run, ui
 from PIL import Image
 
-from tasks.view.drawing import colour_image, ring, text
-from tasks.view.page import NewestOnly, colour_bar, header, plan_picture, slider
+from tasks.view.drawing import colour_image, text
+from tasks.view.page import NewestOnly, colour_bar, header, located_marks, plan_picture, slider
 from tasks.view.rssi import (
     LOCATING,
     N_RECEIVER_COLOURS,
@@ -24,7 +24,7 @@ N_DOT_COLOURS = 33
 MAX_MAP_PX = (880, 700)
 KIND_LABELS = {"interval": "uncertainty"}  # of the kinds that the page calls by another word
 HINT = "Hover over the map."
-TRUTH, MEDIAN, ROW = "#66ccee", "#ffffff", "#999999"
+ROW = "#999999"  # of the measured rows under a posterior
 
 
 class RssiPage:
@@ -129,13 +129,9 @@ class RssiPage:
 
     def _located_svg(self, row: int) -> str:
         """Return the measured rows, and the median, credible regions and measured position of one of them."""
-        plan, locating = self._plan, self._view.locating
-        assert locating is not None
-        found = locating.located(row)
-        x, y = plan.pixel(found.median)
-        rings = [ring(x, y, radius * plan.scale, MEDIAN, 6) for radius in found.radius]
-        dots = plan.dots(self._view.floor.position, ROW, 1.5)
-        return "".join([dots, *rings, plan.cross(found.median, MEDIAN), plan.cross(found.truth, TRUTH)])
+        assert self._view.locating is not None
+        dots = self._plan.dots(self._view.floor.position, ROW, 1.5)
+        return dots + located_marks(self._plan, self._view.locating.located(row))
 
     def _on_pointer(self, event: events.MouseEventArguments) -> None:
         if event.type == "pointerdown" and self._view.locating is not None and self._kind.value == "posterior":

@@ -13,6 +13,7 @@ from swiftwrf import FIELD_MODELS, FieldModel, InputError, RssiModel, Spectra, l
 from swiftwrf.locate import RssiLocator
 from swiftwrf.runtime.checkpoint import Saved, refusing
 from tasks.aoa.artifacts import model_file
+from tasks.aoa.condition import LOCATOR as MATCHED_FIELD
 from tasks.aoa.condition import fraction_key
 from tasks.aoa.experiment import measurements as spectra_of
 from tasks.aoa.options import AoaConfig
@@ -23,7 +24,7 @@ from tasks.locate.steps import MODEL as LOCATOR
 from tasks.records import Row, read_json
 from tasks.rssi.experiment import MODEL
 from tasks.run import configured
-from tasks.view.locating import RssiLocating
+from tasks.view.locating import RssiLocating, SpectrumLocating
 from tasks.view.rssi import MeasuredFloor, RssiView
 from tasks.view.spectra import LoadedModel, SpectraView
 
@@ -89,11 +90,15 @@ def _aoa_run(folder: Path, content: Row) -> SpectraView:
             if data is not None and train is not None:
                 measured, _ = withhold(train, fraction, config.seed)
                 in_training = np.isin(data.index.numpy(), measured.index.numpy())
+            located_by = model_file(folder, MATCHED_FIELD, fraction_key(fraction))
+            locating = SpectrumLocating(located_by) if located_by.is_file() else None
             files = {name: model_file(folder, name, fraction_key(fraction)) for name in FIELD_MODELS}
             for name in (name for name, file in files.items() if file.is_file()):
                 model = _field_model(load(files[name]))
                 planes = _planes(model) or _planes_of_run(folder, fraction)
-                models.append(LoadedModel(f"{name}, {100 * fraction:g}% measured", model, planes, in_training))
+                models.append(
+                    LoadedModel(f"{name}, {100 * fraction:g}% measured", model, planes, in_training, locating)
+                )
     if not models:
         raise InputError(f"{folder} holds no model; run tasks.aoa with a --synthesizer that can be saved")
     return SpectraView(folder.name, models, data, notes)
