@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import base64
+import copy
 import io
 import json
 import shutil
 import socket
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -21,11 +22,14 @@ import torch
 from fuzz import kinds
 from PIL import Image
 
-from swiftwrf import AngularGrid, GeometryModel, InputError, load
+from swiftwrf import AngularGrid, GeometryModel, InputError, load, load_rssi, rssi_room
+from swiftwrf.locate import MatchedField, RssiLocator
 from swiftwrf.models.geometry import Plane, fit_hybrid
+from tasks.locate.options import LocateConfig
 from tasks.run import command_line
 from tasks.view import ViewConfig, run, spectra
 from tasks.view.drawing import HemisphereProjection, PlanProjection, colour_image, data_url, text
+from tasks.view.locating import N_POSITIONS, RssiLocating, simulated_rows
 from tasks.view.rssi import MapSelection, probability_above
 from tasks.view.sources import open_source
 from tasks.view.spectra import angle_between
@@ -257,6 +261,130 @@ def test_an_rssi_model_by_itself(rssi_run):
     view = open_source(rssi_run / "model.safetensors")
     assert np.isfinite(view.coloured(MapSelection("RSSI", 0, view.heights[1])).values).all()
     assert np.isnan(view.floor.rssi_dbm).all()
+
+
+@pytest.fixture(scope="module")
+def located_floor():
+    """A locator on the built-in floor, its data, and which rows it was fitted to."""
+    data = rssi_room(n=120)
+    train, _ = data.split()
+    return RssiLocator(n_cells=400).fit(train), data, torch.isin(data.index, train.index)
+
+
+@pytest.fixture
+def locating(located_floor):
+    return RssiLocating(*located_floor)
+
+
+def test_posterior_of_a_row_is_that_of_the_locator(locating, located_floor):
+    locator, data, in_training = located_floor
+    assert not in_training[locating.first]
+    row = locating.nearest(*data.transmitter_position[7, :2].tolist())
+    assert row == 7 == locating.numbered(7.2)
+    found, posterior = locating.located(row), locator.locate(data.rssi_dbm[7:8])
+    np.testing.assert_allclose(found.median, posterior.median[0])
+    assert found.radius == (float(posterior.credible_radius(0.5)), float(posterior.credible_radius(0.8)))
+    assert found.error_m == pytest.approx(float((posterior.median[0] - data.transmitter_position[7]).norm()))
+    assert np.nanmax(found.density.values) == 1
+    assert found.density.at(*posterior.most_likely[0, :2].tolist()) == pytest.approx(1)
+    assert f"row 7: median at {found.median[0]:.2f}" in locating.describe(row)
+
+
+def test_rows_are_simulated_from_the_distributions_of_the_locator(located_floor, generator):
+    locator, data, _ = located_floor
+    at = data.transmitter_position[:3]
+    rssi = simulated_rows(locator, at, 4000, generator)
+    assert not rssi.isnan().all(dim=2).any()
+    predicted = locator.model.predict(at)
+    median = rssi.nanmedian(dim=0).values
+    often = rssi.isnan().double().mean(dim=0) < 0.5
+    # losses do not depend on the noise, so that they leave the median alone
+    assert float(((median - predicted.mean) / predicted.std)[often].abs().max()) < 0.1
+
+
+def test_expected_error_is_that_of_the_test_rows(locating, located_floor):
+    locator, data, in_training = located_floor
+    test = data.subset(~in_training)
+    error = (locator.locate(test.rssi_dbm).median - test.transmitter_position).norm(dim=1).mean()
+    expected = locating.expected_error
+    inside = np.isfinite(expected.values)
+    assert 0.5 * N_POSITIONS <= inside.sum() <= 2 * N_POSITIONS
+    assert expected.values[inside].mean() == pytest.approx(float(error), rel=0.5)
+    assert np.isnan(expected.at(1e3, 0))
+    again = RssiLocating(*located_floor).expected_error
+    np.testing.assert_array_equal(expected.values, again.values)
+
+
+def test_larger_errors_of_rssi_make_the_expected_error_larger(located_floor):
+    """Here RSSI deviates three times as far from the maps."""
+    locator, data, in_training = located_floor
+    noisy = copy.copy(locator)
+    noisy.values = replace(locator.values, correlation=9 * locator.values.correlation)
+    expected = [np.nanmean(RssiLocating(one, data, in_training).expected_error.values) for one in (locator, noisy)]
+    assert expected[1] > 1.3 * expected[0]
+
+
+def test_view_of_a_locator_by_itself(located_floor, tmp_path):
+    locator, data, in_training = located_floor
+    locator.save(tmp_path / "locator.safetensors")
+    view = open_source(tmp_path / "locator.safetensors")
+    assert view.kinds[-2:] == ("posterior", "expected error")
+    train = data.subset(in_training)
+    np.testing.assert_allclose(view.floor.rssi_dbm, train.rssi_dbm, atol=1e-4)
+    assert view.locating.in_training.all()
+    selection = MapSelection("posterior", 0, 1.2, row=3)
+    coloured = view.coloured(selection)
+    assert coloured.values.shape == view.locating.located(3).density.values.shape
+    assert coloured.corners == view.locating.located(3).density.corners
+    assert Image.open(io.BytesIO(view.picture(selection))).format == "PNG"
+    assert list(pd.read_csv(io.StringIO(view.table(selection)))) == ["x_m", "y_m", "posterior_of_row_3"]
+    assert "of its maximum" in view.describe(selection, *train.transmitter_position[3, :2].tolist())
+    assert "outside the region" in view.describe(selection, 1e3, 1e3)
+
+
+def test_view_of_a_run_of_locate(located_floor, tmp_path):
+    locator, data, in_training = located_floor
+    table = data.to_frame()
+    table.to_csv(tmp_path / "survey.csv", index=False)
+    folder = tmp_path / "run"
+    folder.mkdir()
+    locator.save(folder / "locator.safetensors")
+    read = load_rssi(tmp_path / "survey.csv")
+    config = {"task": "locate", "config": asdict(LocateConfig(data=str(tmp_path / "survey.csv")))}
+    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "environment.json").write_text(json.dumps({"input_sha256": dict(read.source)}))
+    view = open_source(folder)
+    assert not view.notes
+    np.testing.assert_array_equal(view.locating.in_training, in_training)
+    np.testing.assert_allclose(view.floor.position, data.transmitter_position)
+    (tmp_path / "survey.csv").write_text("changed")
+    view = open_source(folder)
+    assert len(view.notes) == 1
+    assert view.locating.in_training.all()
+    (folder / "locator.safetensors").unlink()
+    with pytest.raises(InputError, match="holds no model"):
+        open_source(folder)
+
+
+def test_posterior_of_a_spectrum_is_that_of_the_locator(aoa_run, room, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(aoa_run, folder)
+    with small.glances():
+        locator = MatchedField(max_cells=200, n_best=20, n_background=10, n_rounds=1).fit(room)
+    locator.save(folder / "matched_field-mix1.safetensors")
+    view = open_source(folder)
+    assert view.models[0].locating is None
+    found, posterior = view.located(view.models[1], 3), locator.locate(view.data.store[3:4])
+    np.testing.assert_allclose(found.median, posterior.median[0], atol=1e-3)
+    np.testing.assert_allclose(found.truth, room.position[3], atol=1e-6)
+    x0, x1, y0, y1 = found.density.corners
+    low, high = locator.cells.position.amin(dim=0), locator.cells.position.amax(dim=0)
+    assert x0 <= low[0] <= high[0] <= x1
+    assert y0 <= low[1] <= high[1] <= y1
+    assert np.nanmax(found.density.values) == 1
+    shutil.copy(folder / "model-mix1.safetensors", folder / "matched_field-mix1.safetensors")
+    with pytest.raises(InputError, match="expected a matched-field locator"):
+        open_source(folder).models[1].locating.locator  # noqa: B018
 
 
 def said(capsys, *arguments) -> str:

@@ -20,6 +20,9 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from swiftwrf import rssi_room
+from swiftwrf.locate import RssiLocator
+
 LIBRARIES = ("nicegui", "selenium")
 PROGRAMS = ("chromium", "chromedriver")
 missing = [name for name in LIBRARIES if find_spec(name) is None] + [
@@ -182,3 +185,17 @@ def test_page_of_rssi(browser, serve, rssi_run, tmp_path):
     file = until(lambda: next(tmp_path.glob("*.csv"), None))
     until(lambda: next(tmp_path.glob("*.png"), None))
     assert set(pd.read_csv(file)["receiver"]) == {"receiver01"}
+
+
+def test_page_of_a_locator(browser, serve, tmp_path):
+    train, _ = rssi_room(n=100).split()
+    RssiLocator(n_cells=300).fit(train).save(tmp_path / "locator.safetensors")
+    plan = opened(browser, serve(tmp_path / "locator.safetensors"), "map", "sentence")
+    press(browser, "posterior")
+    shown = until(lambda: "median at" in said(browser, "sentence") and said(browser, "sentence"))
+    pointer(browser).move_to_element_with_offset(plan, 150, 60).click().perform()
+    until(lambda: "median at" in said(browser, "sentence") and said(browser, "sentence") != shown)
+    press(browser, "expected error")
+    until(lambda: "simulated rows" in said(browser, "sentence"))
+    pointer(browser).move_to_element_with_offset(plan, 0, 0).perform()
+    until(lambda: "expected position error" in said(browser, "here"))

@@ -23,7 +23,7 @@ class ViewConfig:
     """
 
     source: Annotated[str, tyro.conf.Positional]
-    """directory of a run of tasks.aoa or tasks.rssi, or a saved model"""
+    """directory of a run of tasks.aoa, tasks.rssi or tasks.locate, or a saved model"""
     port: int = 8080
     """port of the page; 0 takes any free port"""
     host: str = "127.0.0.1"

@@ -204,9 +204,9 @@ def text(x: float, y: float, content: str, anchor: str = "start", size: float = 
     return f"<text {place} {look}>{escape(content)}</text>"
 
 
-def ring(x: float, y: float, radius: float, colour: str) -> str:
-    """Return a ring with a dark rim, visible on any colour."""
-    return _rimmed(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.2f}" fill="none"', radius, colour)
+def ring(x: float, y: float, radius: float, colour: str, width: float | None = None) -> str:
+    """Return a ring with a dark rim, visible on any colour; the line's width follows the radius by default."""
+    return _rimmed(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.2f}" fill="none"', width or radius, colour)
 
 
 def cross(x: float, y: float, radius: float, colour: str) -> str:

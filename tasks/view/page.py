@@ -15,9 +15,11 @@ from nicegui import app, background_tasks, ui
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from swiftwrf import InputError
-from tasks.view.drawing import PlanProjection, text
+from tasks.view.drawing import PlanProjection, ring, text
+from tasks.view.locating import Located
 
 LOCAL_HOSTS = ["127.0.0.1", "localhost"]
+MEDIAN, TRUTH = "#ffffff", "#66ccee"
 STYLE = """
 .nicegui-content { padding: 12px 20px; }
 .outside svg { overflow: visible; }
@@ -76,6 +78,13 @@ def plan_picture(plan: PlanProjection, name: str) -> ui.interactive_image:
     picture = ui.interactive_image(size=plan.size, events=events, sanitize=False)
     picture.style(f"width: {plan.size[0]}px; margin: 24px 10px 34px 48px")
     return picture.classes("outside drag").props(f'id="{name}"')
+
+
+def located_marks(plan: PlanProjection, found: Located) -> str:
+    """Return median, credible radii and measured position of a located observation."""
+    x, y = plan.pixel(found.median)
+    rings = [ring(x, y, radius * plan.scale, MEDIAN, 6) for radius in found.radius]
+    return "".join([*rings, plan.cross(found.median, MEDIAN), plan.cross(found.truth, TRUTH)])
 
 
 def slider(

@@ -15,18 +15,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf import Prediction, RssiModel
+from swiftwrf import Prediction, Rssi, RssiModel
 from swiftwrf.rssi import LEVEL
 from tasks.page import figures
 from tasks.records import as_table
 from tasks.view.drawing import PlanProjection
+from tasks.view.locating import Corners, RssiLocating
 
 CELLS = 120  # of a map, along its longer side
 RECEIVER_COLOURS, N_RECEIVER_COLOURS = "tab20", 20
 RECEIVER_MARK = "#ee6677"
 MIN_STD_DB = 1e-6
-MapKind = Literal["RSSI", "interval", "coverage", "best receiver"]
-Corners = tuple[float, float, float, float]  # x0, x1, y0, y1 [m]
+MapKind = Literal["RSSI", "interval", "coverage", "best receiver", "posterior", "expected error"]
+LOCATING: tuple[MapKind, ...] = ("posterior", "expected error")
 Values = NDArray[np.floating]
 
 
@@ -61,17 +62,24 @@ class MeasuredFloor:
         position = (model.anchor + model.centre).numpy()
         return cls(position, np.full((len(position), len(model.receiver_names)), np.nan), model.receiver.numpy())
 
+    @classmethod
+    def from_rows(cls, rows: Rssi) -> MeasuredFloor:
+        """Return measured rows."""
+        return cls(rows.transmitter_position.numpy(), rows.rssi_dbm.numpy(), rows.receiver_position.numpy())
+
 
 @dataclass(frozen=True)
 class MapSelection:
     """The map that a visitor has selected.
 
     Args:
-        kind: Predicted RSSI, width of its interval, cells above the threshold, or receiver with the highest prediction.
-        receiver: Number of the receiver, counted from 0. A map of the best receiver ignores it.
+        kind: Predicted RSSI, width of its interval, cells above the threshold, receiver with the highest prediction,
+            posterior over the position of a measured row, or expected position error.
+        receiver: Number of the receiver, counted from 0. Maps of all receivers ignore it.
         height: Height of the transmitter [m].
         threshold: Threshold of the coverage [dBm].
         certainty: Required probability that a measurement exceeds the threshold, in (0, 1).
+        row: Row whose posterior is shown, counted from 0.
     """
 
     kind: MapKind
@@ -79,6 +87,7 @@ class MapSelection:
     height: float
     threshold: float = -75.0
     certainty: float = 0.9
+    row: int = 0
 
 
 @dataclass(frozen=True)
@@ -91,6 +100,7 @@ class ColouredMap:
         low: Value of its first colour.
         high: Value of its last colour.
         label: Quantity with its unit. Empty if the colours stand for names.
+        corners: Corners of the picture. Defaults to those of the view.
     """
 
     values: Values
@@ -98,6 +108,7 @@ class ColouredMap:
     low: float
     high: float
     label: str
+    corners: Corners | None = None
 
 
 @dataclass(eq=False)
@@ -108,11 +119,15 @@ class RssiView:
         title: Title of the page.
         model: Fitted model.
         floor: Measurements on the floor.
+        locating: Locator and the rows that it locates. None if there is no locator.
+        notes: Remarks on the data, a sentence each.
     """
 
     title: str
     model: RssiModel
     floor: MeasuredFloor
+    locating: RssiLocating | None = None
+    notes: list[str] = field(default_factory=list)
     _last: tuple[float, Prediction] | None = field(default=None, init=False, repr=False)
 
     @property
@@ -122,9 +137,10 @@ class RssiView:
 
     @property
     def kinds(self) -> tuple[MapKind, ...]:
-        """Available maps. The best receiver needs several receivers."""
-        kinds: tuple[MapKind, ...] = get_args(MapKind)
-        return kinds if len(self.receivers) > 1 else kinds[:-1]
+        """Available maps. The best receiver needs several receivers, the position a locator."""
+        missing: tuple[MapKind, ...] = () if len(self.receivers) > 1 else ("best receiver",)
+        missing += () if self.locating else LOCATING
+        return tuple(kind for kind in get_args(MapKind) if kind not in missing)
 
     @property
     def heights(self) -> tuple[float, float, float]:
@@ -175,6 +191,8 @@ class RssiView:
 
     def coloured(self, selection: MapSelection) -> ColouredMap:
         """Return values and colours of the selected map."""
+        if selection.kind in LOCATING:
+            return self._located(selection)
         mean, receiver = self.map(selection.height).mean.numpy(), selection.receiver
         match selection.kind:
             case "RSSI":
@@ -190,13 +208,24 @@ class RssiView:
             case "best receiver":
                 values = mean.argmax(axis=0) % N_RECEIVER_COLOURS + 0.5
                 return ColouredMap(values, RECEIVER_COLOURS, 0, N_RECEIVER_COLOURS, "")
+        raise AssertionError(selection.kind)
+
+    def _located(self, selection: MapSelection) -> ColouredMap:
+        assert self.locating is not None
+        found = self.locating.map(None if selection.kind == "expected error" else selection.row)
+        if selection.kind == "posterior":
+            return ColouredMap(found.values, "magma", 0.0, 1.0, "posterior relative to its maximum", found.corners)
+        high = float(np.nanpercentile(found.values, 98))
+        return ColouredMap(found.values, "viridis", 0.0, high, "expected position error [m]", found.corners)
 
     def _covered(self, selection: MapSelection) -> NDArray[np.bool_]:
         rssi = self.map(selection.height)
         return (probability_above(rssi, selection)[selection.receiver] >= selection.certainty).numpy()
 
     def sentence(self, selection: MapSelection) -> str:
-        """Describe the selected map in a sentence."""
+        """Describe the selected map in a few sentences."""
+        if self.locating is not None and selection.kind in LOCATING:
+            return self.locating.describe(selection.row) if selection.kind == "posterior" else self.locating.summary
         name = self.receivers[selection.receiver]
         match selection.kind:
             case "RSSI":
@@ -215,6 +244,7 @@ class RssiView:
                 first = int(counts.argmax())
                 fraction = counts[first] / best.numel()
                 return f"Receiver with the highest prediction: {self.receivers[first]} on {fraction:.0%} of the map."
+        raise AssertionError(selection.kind)
 
     def at(self, selection: MapSelection, x: float, y: float) -> Prediction:
         """Return the predictions of all receivers (R,) at a position [m], at the height of the selected map."""
@@ -223,6 +253,8 @@ class RssiView:
 
     def describe(self, selection: MapSelection, x: float, y: float) -> str:
         """Describe the predictions at a position [m] in lines of text."""
+        if self.locating is not None and selection.kind in LOCATING:
+            return f"at {x:.2f}, {y:.2f} m\n{self._located_at(selection, x, y)}"
         rssi, r = self.at(selection, x, y), selection.receiver
         mean, (low, high) = rssi.mean, rssi.interval(LEVEL)
         lines = [
@@ -235,8 +267,20 @@ class RssiView:
             lines.append(f"best receiver: {self.receivers[int(mean.argmax())]}, {mean.max():.1f} dBm")
         return "\n".join(lines)
 
+    def _located_at(self, selection: MapSelection, x: float, y: float) -> str:
+        assert self.locating is not None
+        is_error = selection.kind == "expected error"
+        value = self.locating.map(None if is_error else selection.row).at(x, y)
+        if np.isnan(value):
+            return "outside the region of the measured positions"
+        return f"expected position error {value:.2f} m" if is_error else f"posterior {value:.1%} of its maximum"
+
     def table(self, selection: MapSelection) -> str:
         """Return the selected map as comma-separated values, a row a cell."""
+        if self.locating is not None and selection.kind in LOCATING:
+            is_error = selection.kind == "expected error"
+            name = "expected_error_m" if is_error else f"posterior_of_row_{self.locating.rows.index[selection.row]}"
+            return self.locating.map(None if is_error else selection.row).table(name)
         rssi, r = self.map(selection.height), selection.receiver
         low, high = rssi.interval(LEVEL)
         x, y = np.meshgrid(*(centres.round(4) for centres in self.cells))
@@ -266,7 +310,7 @@ class RssiView:
         drawn = ax.imshow(
             coloured.values,
             origin="lower",
-            extent=corners,
+            extent=coloured.corners or corners,
             cmap=coloured.colours,
             vmin=coloured.low,
             vmax=coloured.high,
@@ -279,7 +323,8 @@ class RssiView:
                 ax.annotate(figures.short(self.receivers[number]), (x, y), (6, 6), textcoords="offset points")
         ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", xlim=corners[:2], ylim=corners[2:])
         ax.grid(visible=False)
-        title = textwrap.fill(f"{self.sentence(selection)} Height {selection.height:.2f} m.", figures.LONGEST)
+        height_m = "" if selection.kind in LOCATING else f" Height {selection.height:.2f} m."
+        title = textwrap.fill(f"{self.sentence(selection)}{height_m}", figures.LONGEST)
         ax.set_title(figures.plain(title), fontsize=8)
         if coloured.label:
             figure.colorbar(drawn, ax=ax, label=coloured.label, fraction=0.04, pad=0.02)

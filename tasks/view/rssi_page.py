@@ -9,8 +9,9 @@ from nicegui import events, run, ui
 from PIL import Image
 
 from tasks.view.drawing import colour_image, text
-from tasks.view.page import NewestOnly, colour_bar, header, plan_picture, slider
+from tasks.view.page import NewestOnly, colour_bar, header, located_marks, plan_picture, slider
 from tasks.view.rssi import (
+    LOCATING,
     N_RECEIVER_COLOURS,
     RECEIVER_COLOURS,
     RECEIVER_MARK,
@@ -21,8 +22,9 @@ from tasks.view.rssi import (
 
 N_DOT_COLOURS = 33
 MAX_MAP_PX = (880, 700)
-KIND_LABELS = {"RSSI": "RSSI", "interval": "uncertainty", "coverage": "coverage", "best receiver": "best receiver"}
+KIND_LABELS = {"interval": "uncertainty"}  # of the kinds that the page calls by another word
 HINT = "Hover over the map."
+ROW = "#999999"  # of the measured rows under a posterior
 
 
 class RssiPage:
@@ -31,8 +33,8 @@ class RssiPage:
     def __init__(self, view: RssiView) -> None:
         self._view, self._plan = view, view.plan(MAX_MAP_PX)
         self._maps, self._points = NewestOnly(self._show_map), NewestOnly(self._show_point)
-        with header(view.title, []):
-            kinds = {kind: KIND_LABELS[kind] for kind in view.kinds}
+        with header(view.title, view.notes):
+            kinds = {kind: KIND_LABELS.get(kind, kind) for kind in view.kinds}
             self._kind = ui.toggle(kinds, value="RSSI", on_change=self._update).props("no-caps padding='2px 12px'")
         with ui.row().classes("w-full no-wrap items-start gap-8"):
             with ui.column().classes("gap-1").style("flex: none"):
@@ -54,6 +56,11 @@ class RssiPage:
         with ui.column().classes("w-full gap-0") as self._limits:
             self._threshold = slider("above", -110, -30, -75, "dBm", self._update)
             self._certainty = slider("certainty", 50, 99, 90, "%", self._update)
+        with ui.column().classes("w-full gap-0") as self._choice:
+            self._row = ui.number("row", format="%d", on_change=self._update).props("outlined dense")
+            ui.label("Click the map: the measured row nearest to it.").classes("quiet")
+        if (locating := self._view.locating) is not None:
+            self._row.value = int(locating.rows.index[locating.first])
         self._sentence = ui.label().props('id="sentence"')
         ui.separator()
         self._point = ui.label(HINT).classes("numbers").props('id="here"').style("white-space: pre-line")
@@ -65,9 +72,13 @@ class RssiPage:
     @property
     def _selection(self) -> MapSelection:
         height, certainty = round(self._height.value, 3), self._certainty.value / 100
-        return MapSelection(self._kind.value, self._receiver.value, height, self._threshold.value, certainty)
+        locating, number = self._view.locating, self._row.value
+        row = 0 if locating is None or number is None else locating.numbered(number)
+        return MapSelection(self._kind.value, self._receiver.value, height, self._threshold.value, certainty, row)
 
     def _update(self) -> None:
+        if self._kind.value == "expected error":
+            self._sentence.set_text("The expected error is being computed, once.")
         self._maps.submit(self._selection)
 
     async def _show_map(self, selection: MapSelection) -> None:
@@ -75,7 +86,9 @@ class RssiPage:
         if coloured is None:  # the server is being ended
             return
         self._limits.set_visibility(selection.kind == "coverage")
-        self._receiver.set_enabled(selection.kind != "best receiver")
+        self._receiver.set_enabled(selection.kind not in ("best receiver", *LOCATING))
+        self._height.set_enabled(selection.kind not in LOCATING)
+        self._choice.set_visibility(selection.kind == "posterior")
         self._sentence.set_text(self._view.sentence(selection))
         bar = colour_bar(coloured.colours, coloured.low, coloured.high, coloured.label) if coloured.label else ""
         self._bar.set_content(bar)
@@ -85,14 +98,16 @@ class RssiPage:
         plan, floor = self._plan, self._view.floor
         parts = [plan.picture(Image.fromarray(floor.plan[0]), floor.plan[1])] if floor.plan else []
         image = colour_image(coloured.values[::-1], coloured.colours, coloured.low, coloured.high)
-        parts.append(plan.picture(image, self._view.corners, 0.7 if floor.plan else 1.0))
+        parts.append(plan.picture(image, coloured.corners or self._view.corners, 0.7 if floor.plan else 1.0))
         if selection.kind == "RSSI":
             parts.append(self._measured_svg(selection.receiver, coloured))
-        every = selection.kind == "best receiver"
+        if selection.kind == "posterior":
+            parts.append(self._located_svg(selection.row))
+        every = selection.kind in ("best receiver", *LOCATING)
         for number, position in enumerate(floor.receiver):
             if np.isfinite(position).all() and (every or number == selection.receiver):
                 x, y = plan.pixel(position)
-                if every:
+                if selection.kind == "best receiver":
                     colour = to_hex(colormaps[RECEIVER_COLOURS](number % N_RECEIVER_COLOURS))
                     parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="7" fill="{colour}" stroke="black"/>')
                 else:
@@ -112,7 +127,16 @@ class RssiPage:
         dots = [self._plan.dots(position[step == number], to_hex(colour(int(number))), 4) for number in np.unique(step)]
         return "".join([self._plan.dots(position, "white", 4.7), *dots])
 
+    def _located_svg(self, row: int) -> str:
+        """Return the measured rows, and the median, credible regions and measured position of one of them."""
+        assert self._view.locating is not None
+        dots = self._plan.dots(self._view.floor.position, ROW, 1.5)
+        return dots + located_marks(self._plan, self._view.locating.located(row))
+
     def _on_pointer(self, event: events.MouseEventArguments) -> None:
+        if event.type == "pointerdown" and self._view.locating is not None and self._kind.value == "posterior":
+            row = self._view.locating.nearest(*self._plan.position(event.image_x, event.image_y))
+            self._row.value = int(self._view.locating.rows.index[row])
         if event.type == "pointerleave":
             self._point.set_text(HINT)
         else:

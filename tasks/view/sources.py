@@ -6,22 +6,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from augment import withhold
 from swiftwrf import FIELD_MODELS, FieldModel, InputError, RssiModel, Spectra, load
+from swiftwrf.locate import RssiLocator
 from swiftwrf.runtime.checkpoint import Saved, refusing
 from tasks.aoa.artifacts import model_file
+from tasks.aoa.condition import LOCATOR as MATCHED_FIELD
 from tasks.aoa.condition import fraction_key
-from tasks.aoa.experiment import measurements
+from tasks.aoa.experiment import measurements as spectra_of
 from tasks.aoa.options import AoaConfig
 from tasks.claim import CONFIG, ENVIRONMENT
+from tasks.locate.experiment import measurements as rssi_of
+from tasks.locate.options import LocateConfig
+from tasks.locate.steps import MODEL as LOCATOR
 from tasks.records import Row, read_json
 from tasks.rssi.experiment import MODEL
 from tasks.run import configured
+from tasks.view.locating import RssiLocating, SpectrumLocating
 from tasks.view.rssi import MeasuredFloor, RssiView
 from tasks.view.spectra import LoadedModel, SpectraView
 
-EXPECTED = "give the directory of a run of tasks.aoa or tasks.rssi, or a saved field model or RSSI model"
+EXPECTED = "give the directory of a run of tasks.aoa, tasks.rssi or tasks.locate, or a saved model of spectra or RSSI"
 
 
 def open_source(source: Path) -> SpectraView | RssiView:
@@ -46,6 +53,8 @@ def open_source(source: Path) -> SpectraView | RssiView:
             return _aoa_run(source, content)
         case "rssi":
             return _rssi_run(source)
+        case "locate":
+            return _locate_run(source, content)
         case other:
             raise InputError(f"{source} is a run of tasks.{other}; {EXPECTED}")
 
@@ -54,6 +63,8 @@ def _saved_model(file: Path) -> SpectraView | RssiView:
     model = load(file)
     if isinstance(model, RssiModel):
         return RssiView(file.name, model, MeasuredFloor.from_model(model))
+    if isinstance(model, RssiLocator):
+        return _located(file.name, RssiLocating.of_training(model))
     field_model = _field_model(model)
     return SpectraView(file.name, [LoadedModel(model.kind, field_model, _planes(field_model))])
 
@@ -79,11 +90,15 @@ def _aoa_run(folder: Path, content: Row) -> SpectraView:
             if data is not None and train is not None:
                 measured, _ = withhold(train, fraction, config.seed)
                 in_training = np.isin(data.index.numpy(), measured.index.numpy())
+            located_by = model_file(folder, MATCHED_FIELD, fraction_key(fraction))
+            locating = SpectrumLocating(located_by) if located_by.is_file() else None
             files = {name: model_file(folder, name, fraction_key(fraction)) for name in FIELD_MODELS}
             for name in (name for name, file in files.items() if file.is_file()):
                 model = _field_model(load(files[name]))
                 planes = _planes(model) or _planes_of_run(folder, fraction)
-                models.append(LoadedModel(f"{name}, {100 * fraction:g}% measured", model, planes, in_training))
+                models.append(
+                    LoadedModel(f"{name}, {100 * fraction:g}% measured", model, planes, in_training, locating)
+                )
     if not models:
         raise InputError(f"{folder} holds no model; run tasks.aoa with a --synthesizer that can be saved")
     return SpectraView(folder.name, models, data, notes)
@@ -99,13 +114,42 @@ def _planes_of_run(folder: Path, fraction: float) -> list[dict[str, Any]]:
 def _measured(folder: Path, config: AoaConfig) -> tuple[Spectra | None, Spectra | None, list[str]]:
     """Read the spectra of a run again: return all spectra, the training part, and remarks on them."""
     try:
-        data = measurements(config)
-        recorded = read_json(folder / ENVIRONMENT).get("input_sha256", {})  # may contain more: a scene to trace in
-        if {name: recorded.get(name) for name in data.source} != data.source:
-            raise InputError("they have changed since the run")
+        data = spectra_of(config)
+        _expect_unchanged(data.source, folder)
         return data, data.split(config.split, config.seed)[0], list(data.notes)
     except InputError as error:
         return None, None, [f"The measured spectra are not shown: {error}."]
+
+
+def _expect_unchanged(source: dict[str, str], folder: Path) -> None:
+    """Refuse data whose checksums differ from those in the records of a run."""
+    recorded = read_json(folder / ENVIRONMENT).get("input_sha256", {})  # may contain more: a scene to trace in
+    if {name: recorded.get(name) for name in source} != source:
+        raise InputError("they have changed since the run")
+
+
+def _locate_run(folder: Path, content: Row) -> RssiView:
+    file = folder / LOCATOR
+    if not file.is_file():
+        raise InputError(f"{folder} holds no model: it has no {LOCATOR}; the run did not end")
+    locator = load(file)
+    if not isinstance(locator, RssiLocator):
+        raise InputError(f"{file} holds a {locator.kind}, expected a {RssiLocator.kind}")
+    with refusing(f"the records in {folder} are not those of a run"):
+        config = configured(LocateConfig, content["config"], folder)
+        try:
+            data = rssi_of(config)
+            _expect_unchanged(data.source, folder)
+            train, _ = data.split(config.split, config.seed)
+            locating = RssiLocating(locator, data, torch.isin(data.index, train.index))
+        except InputError as error:
+            note = f"The measured rows are not shown, but the training rows in the locator: {error}."
+            return _located(folder.name, RssiLocating.of_training(locator), [note])
+    return _located(folder.name, locating)
+
+
+def _located(title: str, locating: RssiLocating, notes: list[str] | None = None) -> RssiView:
+    return RssiView(title, locating.locator.model, MeasuredFloor.from_rows(locating.rows), locating, notes or [])
 
 
 def _rssi_run(folder: Path) -> RssiView:

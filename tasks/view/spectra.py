@@ -17,6 +17,7 @@ from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.data.spectra import Moving, direction_of_link
 from swiftwrf.positions import distance
 from tasks.aoa.page.room import MARGIN, extent
+from tasks.view.locating import Located, SpectrumLocating
 
 MAX_DRAG_SECONDS = 0.02  # of one prediction while the moving end is dragged
 MAX_BEYOND_DATA = 1.5  # margin of the page around the measured positions, in units of their extent
@@ -32,12 +33,14 @@ class LoadedModel:
         model: Field model.
         planes: Planes of the room as in `geometry-mix*.json`. Defaults to those of the model.
         in_training: Whether each measured spectrum trained the model, (n,). None if that is unknown.
+        locating: Locator that was fitted to the same spectra. None if there is none.
     """
 
     title: str
     model: FieldModel
     planes: list[dict[str, Any]]
     in_training: NDArray[np.bool_] | None = None
+    locating: SpectrumLocating | None = None
 
     @cached_property
     def drag_grid(self) -> AngularGrid:
@@ -164,6 +167,12 @@ class SpectraView:
         assert self.data is not None
         away = distance(torch.as_tensor(position, dtype=torch.float64).reshape(1, 3), self.data.position)[0]
         return int(away.argmin()), float(away.min())
+
+    def located(self, loaded: LoadedModel, index: int) -> Located:
+        """Return the posterior over the position of a measured spectrum."""
+        assert self.data is not None
+        assert loaded.locating is not None
+        return loaded.locating.located(self.data.store[index : index + 1][0], self.data.position[index].double())
 
 
 def peak(spectrum: Tensor, grid: AngularGrid) -> Direction:

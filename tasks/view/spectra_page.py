@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from swiftwrf import AngularGrid, Spectra
 from tasks.aoa.page.room import FIXED, MEASURED, in_plan
 from tasks.view.drawing import HemisphereProjection, PlanProjection, colour_image, cross, data_url, ring, text
-from tasks.view.page import NewestOnly, colour_bar, header, plan_picture, slider
-from tasks.view.spectra import Direction, PredictedSpectrum, SpectraView, angle_between, peak
+from tasks.view.page import NewestOnly, colour_bar, header, located_marks, plan_picture, slider
+from tasks.view.spectra import Direction, LoadedModel, PredictedSpectrum, SpectraView, angle_between, peak
 
 UNSEEN, MOVING, PEAK, SIGHT = "#bb8833", "#ee6677", "#ffffff", "#ee6677"
 KEY_STEP = 0.01  # of the plan; ten times as far with Shift
@@ -128,6 +128,7 @@ class SpectraPage:
             choice.props("dense options-dense outlined").style("min-width: 240px")
         else:
             ui.label(titles[0]).classes("quiet")
+        self._locate = ui.switch("posterior", on_change=lambda: self._request(dragging=False)).props("id=locate")
         self._polar = ui.toggle({False: "rectangular", True: "polar"}, value=False, on_change=self._lay_out)
         self._polar.props("no-caps padding='2px 12px'")
 
@@ -136,11 +137,12 @@ class SpectraPage:
             self._picture = plan_picture(self._plan, "plan")
             self._picture.on_mouse(self._on_pointer)
             self._picture.props("tabindex=0").on("keydown", self._on_key, js_handler=KEYS)
-            self._overlay = self._picture.add_layer()
+            self._overlay, self._posterior = self._picture.add_layer(), self._picture.add_layer()
             low, middle, high = self._low[2].item(), self._position[2].item(), self._high[2].item()
             self._height = slider("height", low, high, middle, "m", self._on_height, step=0.01)
             self._where = ui.label().classes("numbers").props('id="where"')
             self._angles = ui.label().classes("numbers")
+            self._located = ui.label().classes("numbers").props('id="located"')
             self._frame = ui.label().classes("quiet numbers").props('id="frame"')
             ui.html(self._legend(), sanitize=False).classes("quiet")
             ui.label(HELP).classes("quiet")
@@ -167,6 +169,7 @@ class SpectraPage:
             picture.lay_out(projection)
         self._shown_measurement = -1
         self._measured.column.set_visibility(self._view.data is not None)
+        self._locate.set_visibility(self._view.data is not None and self._model.locating is not None)
         self._picture.set_content(self._background())
         self._request(dragging=False)
 
@@ -229,8 +232,24 @@ class SpectraPage:
         if predicted is not None and loaded is self._model:  # None while the server is being ended
             self._show(predicted)
             self._describe(predicted, time.perf_counter() - began)
+        await self._show_located(loaded, position, dragging)
         if not dragging:
             await run.io_bound(lambda: loaded.drag_grid)  # found before the pointer begins to drag
+
+    async def _show_located(self, loaded: LoadedModel, position: NDArray[np.floating], dragging: bool) -> None:
+        """Show the posterior of the nearest measured spectrum; while dragging, only its removal."""
+        marks = described = ""
+        if not dragging and self._locate.value and self._view.data is not None and loaded.locating is not None:
+            index, _ = self._view.nearest(position)
+            self._located.set_text("The nearest measured spectrum is being located.")
+            found = await run.io_bound(self._view.located, loaded, index)
+            if found is None or loaded is not self._model:
+                return
+            image = colour_image(found.density.values[::-1], "magma")
+            marks = self._plan.picture(image, found.density.corners, 0.8) + located_marks(self._plan, found)
+            described = f"Posterior of spectrum {int(self._view.data.index[index])}: {found.describe()}"
+        self._posterior.set_content(marks)
+        self._located.set_text(described)
 
     def _show(self, predicted: PredictedSpectrum) -> None:
         grid = predicted.grid

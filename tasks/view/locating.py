@@ -1,0 +1,286 @@
+"""Posterior over the position of an observation, and the expected position error over the floor, for the page."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from swiftwrf import InputError, Rssi, load
+from swiftwrf.locate import MatchedField, Posterior, RssiLocator
+from swiftwrf.locate.rssi import UNDETECTED_BELOW_DB
+from swiftwrf.locate.rssi_likelihood import RssiMaps
+from swiftwrf.positions import nearest
+from tasks.locate.localizers import BATCH_ROWS
+from tasks.locate.steps import MAP_PIXELS, in_plan
+from tasks.records import as_table
+
+LEVELS = (0.5, 0.8)  # probabilities of the credible regions that are shown
+N_POSITIONS = 300  # of the map of expected errors
+MIN_MASS = 1e-3  # of a pixel, relative to the largest; less is transparent
+N_DRAWS = 16  # simulated rows at each of them
+Corners = tuple[float, float, float, float]  # x0, x1, y0, y1 [m]
+
+
+@dataclass(frozen=True, eq=False)
+class PlanMap:
+    """Values on a grid in plan.
+
+    Args:
+        x: Centres of the columns [m], (W,).
+        y: Centres of the rows [m], (H,).
+        values: Values (H, W), nan away from the known positions.
+    """
+
+    x: NDArray[np.floating]
+    y: NDArray[np.floating]
+    values: NDArray[np.floating]
+
+    @property
+    def corners(self) -> Corners:
+        """Corners of the picture of all cells. A single row is as high as a column is wide."""
+        steps = [float(line[1] - line[0]) for line in (self.x, self.y) if len(line) > 1] or [1.0]
+        dx, dy = steps[0], steps[-1]
+        x0, x1, y0, y1 = self.x[0] - dx / 2, self.x[-1] + dx / 2, self.y[0] - dy / 2, self.y[-1] + dy / 2
+        return float(x0), float(x1), float(y0), float(y1)
+
+    def at(self, x: float, y: float) -> float:
+        """Return the value of the cell at a position [m], nan outside of the grid."""
+        x0, x1, y0, y1 = self.corners
+        if not (x0 <= x <= x1 and y0 <= y <= y1):
+            return math.nan
+        return float(self.values[np.abs(self.y - y).argmin(), np.abs(self.x - x).argmin()])
+
+    def table(self, name: str) -> str:
+        """Return the cells with values as comma-separated values, under this name."""
+        x, y = np.meshgrid(self.x.round(4), self.y.round(4))
+        table = pd.DataFrame({"x_m": x.ravel(), "y_m": y.ravel(), name: self.values.ravel().round(4)})
+        return as_table(table.dropna().to_dict("records"))
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """Posterior over the position of one observation.
+
+    Args:
+        density: Posterior mass in plan, relative to the largest.
+        median: Geometric median [m], (3,).
+        radius: Radii [m] of the credible regions of `LEVELS` around the median.
+        truth: Measured position [m], (3,).
+        ambiguous: True where a second position is likely.
+    """
+
+    density: PlanMap
+    median: NDArray[np.floating]
+    radius: tuple[float, ...]
+    truth: NDArray[np.floating]
+    ambiguous: bool
+
+    @classmethod
+    def of(cls, posterior: Posterior, density: PlanMap, truth: Tensor) -> Located:
+        """Return what the page shows of the posterior of one observation, measured at `truth` (3,) [m]."""
+        radius = tuple(float(posterior.credible_radius(level)) for level in LEVELS)
+        return cls(density, posterior.median[0].numpy(), radius, truth.numpy(), bool(posterior.ambiguous))
+
+    def describe(self) -> str:
+        """Describe the posterior in a few sentences."""
+        x, y, z = self.median.tolist()
+        regions = ", ".join(f"{level:.0%} within {r:.2f} m" for level, r in zip(LEVELS, self.radius, strict=True))
+        return (
+            f"median at {x:.2f}, {y:.2f}, {z:.2f} m, {regions}. The measured position is {self.error_m:.2f} m away from the "
+            f"median.{' A second position is likely.' if self.ambiguous else ''}"
+        )
+
+    @property
+    def error_m(self) -> float:
+        """Distance between median and measured position [m]."""
+        return float(np.linalg.norm(self.median - self.truth))
+
+
+class RssiLocating:
+    """A locator, the rows to choose from, and the expected error over the floor.
+
+    Args:
+        locator: Fitted locator.
+        rows: Measured rows at the receivers of the locator. Rows that no receiver detected are left out.
+        in_training: Whether the locator was fitted to each row, bool (n,).
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.rssi_room(n=60).split()
+        >>> locator = RssiLocator(n_cells=200).fit(train)
+        >>> locating = RssiLocating(locator, test, torch.zeros(len(test), dtype=torch.bool))
+        >>> locating.located(0).median.shape
+        (3,)
+    """
+
+    def __init__(self, locator: RssiLocator, rows: Rssi, in_training: Tensor) -> None:
+        detected = rows.detected.any(dim=1)
+        self.locator, self.rows = locator, rows.subset(detected)
+        self.in_training: NDArray[np.bool_] = in_training[detected].numpy()
+        self.located = lru_cache(maxsize=1)(self._located)
+        """Return the posterior of a row, counted from 0 in `rows`. The last one is cached."""
+
+    @classmethod
+    def of_training(cls, locator: RssiLocator) -> RssiLocating:
+        """Return a locator with its training rows, if the measurements are not known."""
+        known = locator.fingerprints
+        rssi = known.rssi.double()
+        rssi[known.rssi < known.floor + UNDETECTED_BELOW_DB / 2] = torch.nan
+        rows = Rssi(
+            rssi,
+            known.position,
+            receiver_position=locator.model.receiver,
+            receiver_names=locator.receiver_names,
+        )
+        return cls(locator, rows, torch.ones(len(rows), dtype=torch.bool))
+
+    @property
+    def first(self) -> int:
+        """First row that is not in the training set, or 0."""
+        return int(self.in_training.argmin())
+
+    def numbered(self, number: float) -> int:
+        """Return the row whose number in the data is nearest."""
+        return int((self.rows.index - number).abs().argmin())
+
+    def nearest(self, x: float, y: float) -> int:
+        """Return the row that was measured nearest to a position in plan [m]."""
+        return int((self.rows.transmitter_position[:, :2] - torch.tensor([x, y])).norm(dim=1).argmin())
+
+    def _located(self, row: int) -> Located:
+        posterior = self.locator.locate(self.rows.rssi_dbm[row : row + 1])
+        x, y, density = in_plan(posterior)
+        in_plan_of_row = PlanMap(x.numpy(), y.numpy(), density[0].numpy())
+        return Located.of(posterior, in_plan_of_row, self.rows.transmitter_position[row])
+
+    def describe(self, row: int) -> str:
+        """Describe the posterior of a row in a few sentences."""
+        part = "training" if self.in_training[row] else "test"
+        return f"Posterior of {part} row {int(self.rows.index[row])}: {self.located(row).describe()}"
+
+    def map(self, row: int | None) -> PlanMap:
+        """Return the posterior of a row in plan, or the expected error for None."""
+        return self.expected_error if row is None else self.located(row).density
+
+    @property
+    def summary(self) -> str:
+        """Describe the expected error in a few sentences."""
+        values = self.expected_error.values
+        inside = values[np.isfinite(values)]
+        return (
+            f"Expected error of the posterior median: {inside.mean():.1f} m on average, 90 % below "
+            f"{np.quantile(inside, 0.9):.1f} m, from {N_DRAWS} simulated rows at each of {len(inside)} positions."
+        )
+
+    @cached_property
+    def expected_error(self) -> PlanMap:
+        """Expected distance [m] between the posterior median and the true position, where rows were measured.
+
+        Rows are simulated at each position of a coarse grid, at the height of the nearest known position, and located.
+        """
+        x, y, position, inside = _coarse_grid(self.locator)
+        generator = torch.Generator().manual_seed(self.locator.config.seed)
+        rssi = simulated_rows(self.locator, position[inside], N_DRAWS, generator)
+        median = torch.cat([self.locator.locate(some).median for some in rssi.flatten(0, 1).split(BATCH_ROWS)])
+        error = (median.reshape(*rssi.shape[:2], 3) - position[inside]).norm(dim=2)
+        values = torch.full((len(position),), torch.nan, dtype=torch.float64)
+        values[inside] = error.mean(dim=0)
+        return PlanMap(x.numpy(), y.numpy(), values.reshape(len(y), len(x)).numpy())
+
+
+class SpectrumLocating:
+    """The locator that a run of tasks.aoa keeps; it is opened when it is first used.
+
+    Args:
+        file: File of the locator.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+
+    @cached_property
+    def locator(self) -> MatchedField:
+        """The locator.
+
+        Raises:
+            InputError: The file contains none.
+        """
+        locator = load(self._file)
+        if not isinstance(locator, MatchedField):
+            raise InputError(f"{self._file} holds a {locator.kind}, expected a {MatchedField.kind}")
+        return locator
+
+    def located(self, spectrum: Tensor, truth: Tensor) -> Located:
+        """Return the posterior of a spectrum (n_elevation, n_azimuth) that was measured at `truth`, (3,) [m].
+
+        Its masses are summed over square pixels of the locator's region.
+        """
+        posterior = self.locator.locate(spectrum[None])
+        cells = self.locator.cells.position[:, :2]
+        low, extent = cells.amin(dim=0), cells.amax(dim=0) - cells.amin(dim=0)
+        pixel_m = float(extent.max()) / MAP_PIXELS or 1.0
+        width, height = (int(number) + 1 for number in (extent / pixel_m).ceil())
+        column, row = ((posterior.position[0, :, :2] - low) / pixel_m).round().long().unbind(-1)
+        mass = torch.zeros(height * width, dtype=torch.float64)
+        mass.index_add_(0, row.clamp(0, height - 1) * width + column.clamp(0, width - 1), posterior.weight[0])
+        density = (mass / mass.max()).masked_fill(mass < MIN_MASS * mass.max(), torch.nan).reshape(height, width)
+        x, y = (float(start) + pixel_m * np.arange(number) for start, number in zip(low, (width, height), strict=True))
+        return Located.of(posterior, PlanMap(x, y, density.numpy()), truth)
+
+
+def simulated_rows(locator: RssiLocator, position: Tensor, n: int, generator: torch.Generator) -> Tensor:
+    """Draw rows of RSSI from the distributions of a locator: values with correlated errors, and lost packets.
+
+    Args:
+        locator: Fitted locator.
+        position: Positions of the transmitter [m], float64 (m, 3).
+        n: Number of rows at each position.
+        generator: Source of randomness.
+
+    Returns:
+        RSSI (n, m, R) [dBm], NaN if not detected. A row whose packets are all lost keeps its strongest value.
+    """
+    maps = RssiMaps.of(locator.model.predict(position))
+    mean, std = maps.mean.double(), maps.std.double()
+    shape = (n, *mean.shape)
+    values, detections = locator.values, locator.detections
+    noise = torch.randn(shape, generator=generator, dtype=torch.float64) @ torch.linalg.cholesky(values.correlation).T
+    if math.isfinite(values.degrees):  # a Student variable is a Gaussian one over the root of a scaled chi-squared one
+        rng = np.random.default_rng(int(torch.randint(2**31, (), generator=generator)))
+        chi_squared = torch.from_numpy(rng.chisquare(values.degrees, shape[:2]))
+        noise = noise / (chi_squared / values.degrees).sqrt()[..., None]
+    rssi = mean + std * noise
+    chance = (1 - detections.loss) * torch.sigmoid((mean - detections.threshold) / detections.width)
+    lost = torch.rand(shape, generator=generator, dtype=torch.float64) >= chance
+    strongest = torch.nn.functional.one_hot(rssi.argmax(dim=2), shape[2]).bool()
+    lost &= ~(strongest & lost.all(dim=2, keepdim=True))
+    rows: Tensor = rssi.masked_fill(lost, torch.nan)
+    return rows
+
+
+def _coarse_grid(locator: RssiLocator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return x (W,), y (H,), positions (H W, 3) [m], and which of them, about `N_POSITIONS`, lie near known ones."""
+    region, cells = locator.region, locator.cells.position
+    low, high = cells[:, :2].amin(dim=0), cells[:, :2].amax(dim=0)
+    extent = high - low
+    near = float(region.is_near(cells).double().mean())
+    spacing = max(float((extent.prod() * near / N_POSITIONS).sqrt()), float(extent.max()) / N_POSITIONS) or 1.0
+    x, y = (
+        torch.linspace(float(a), float(b), max(1, round(float(b - a) / spacing)) + 1, dtype=torch.float64)
+        if b - a > spacing / 2
+        else (a + b)[None] / 2
+        for a, b in zip(low, high, strict=True)
+    )
+    plan = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
+    flat = region.known * torch.tensor([1.0, 1.0, 0.0])
+    _, row = nearest(torch.nn.functional.pad(plan, (0, 1)), flat, 1)
+    position = torch.cat([plan, region.known[row[:, 0], 2:]], dim=1)
+    return x, y, position, region.is_near(position)
