@@ -32,6 +32,8 @@ class LocateConfig(SpectraSource, TableSource):
     """survey table (CSV or Parquet), or folder in NeRF2 layout, of the experiment"""
     rx: tuple[str, ...] = ("all",)
     """receivers: names, numbers counted from 1, or all"""
+    track: float | None = None
+    """rows of SOURCE are a walk: smooths its positions by this typical speed [m/s], or [m] a row without a column of time"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
     cells: int = 4000
@@ -45,7 +47,7 @@ class LocateConfig(SpectraSource, TableSource):
 
 
 EXPERIMENT = ("data", "rx", "split", "cells", "scheduler", "seed")
-OBSERVATIONS = ("array", "beamformer", "grid", "every", "station")
+SPECTRA = ("array", "beamformer", "grid", "every", "station")
 
 
 def check(config: LocateConfig) -> None:
@@ -63,7 +65,9 @@ def check(config: LocateConfig) -> None:
     reason = "spectra; give it with MODEL and SOURCE"
     if config.model is not None:
         reason = "the experiment; leave it out with MODEL and SOURCE"
-    for name in OBSERVATIONS if config.model is None else EXPERIMENT:
+    if config.model is None and config.track is not None:
+        raise InputError("--track is for observations; give it with MODEL and SOURCE")
+    for name in SPECTRA if config.model is None else EXPERIMENT:
         if getattr(config, name) != default[name]:
             raise InputError(f"--{name} is for {reason}")
     if not 10 <= config.cells <= 1_000_000:
