@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from augment.suggest import MAX_SUGGESTIONS
 from swiftwrf import InputError
 from tasks.source import SpectraSource, TableSource
 
@@ -38,6 +39,8 @@ class LocateConfig(SpectraSource, TableSource):
     """a split that comes with the data, or a seeded one: random or block"""
     cells: int = 4000
     """number of candidate positions of the posterior"""
+    suggest: int = 0
+    """number of positions to suggest for the next measurements, those that reduce the expected position error most"""
     scheduler: str | None = None
     """address of a Dask scheduler whose workers compute the steps (extra: cluster)"""
     seed: int = 0
@@ -46,7 +49,7 @@ class LocateConfig(SpectraSource, TableSource):
     """directory of the run (default: a new one under runs/locate), or table (default: positions.csv); must not exist"""
 
 
-EXPERIMENT = ("data", "rx", "split", "cells", "scheduler", "seed")
+EXPERIMENT = ("data", "rx", "split", "cells", "suggest", "scheduler", "seed")
 SPECTRA = ("array", "beamformer", "grid", "every", "station")
 
 
@@ -72,3 +75,5 @@ def check(config: LocateConfig) -> None:
             raise InputError(f"--{name} is for {reason}")
     if not 10 <= config.cells <= 1_000_000:
         raise InputError(f"--cells takes 10 to 1,000,000, got {config.cells}")
+    if not 0 <= config.suggest <= MAX_SUGGESTIONS:
+        raise InputError(f"--suggest takes 0 to {MAX_SUGGESTIONS} positions, got {config.suggest}")
