@@ -65,7 +65,7 @@ def suggest(measured: Spectra, count: int, seed: int = 0) -> Suggestion:
 
 
 def suggest_positions(locator: RssiLocator, train: Rssi, count: int, seed: int = 0) -> Suggestion:
-    """Return positions where a measurement is expected to reduce the error of localization most.
+    """Return positions to measure next, where position errors are large and the radio maps are uncertain.
 
     The positions are chosen among the locator's cells near the measured positions, one after the other. Each one lowers the
     sum over the cells of the expected squared position error times the posterior variance of the radio maps most. Rows of
