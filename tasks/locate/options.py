@@ -40,7 +40,7 @@ class LocateConfig(SpectraSource, TableSource):
     cells: int = 4000
     """number of candidate positions of the posterior"""
     suggest: int = 0
-    """number of positions to suggest for the next measurements, where position errors are large and the radio maps uncertain"""
+    """number of positions to measure next that are suggested: where position errors are large and radio maps uncertain"""
     scheduler: str | None = None
     """address of a Dask scheduler whose workers compute the steps (extra: cluster)"""
     seed: int = 0
