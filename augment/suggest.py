@@ -1,20 +1,26 @@
-"""Where to measure next: the positions that reduce the predictive variance over the region most."""
+"""Where to measure next: the positions that reduce the predictive variance or the position error most."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from augment.positions import sample_positions
-from swiftwrf import InputError, Spectra
+from swiftwrf import InputError, Rssi, Spectra
 from swiftwrf.data.spectra import check_training
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import choose_kernel, most_informative, thinned
+from swiftwrf.locate import RssiLocator
+from swiftwrf.positions import nearest
 
 N_CANDIDATE_POSITIONS = 1500  # positions that are compared
 MAX_SUGGESTIONS = 500
 MAX_MEASURED_POSITIONS = 2000  # measured positions that the variance is conditioned on
+N_SIMULATED_ROWS = 400  # rows of RSSI whose expected position errors are computed
+N_AVERAGED_ROWS = 8  # rows nearest to a candidate, whose mean error is the candidate's
+BATCH_ROWS = 128  # rows whose posteriors are in memory together
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,8 +29,8 @@ class Suggestion:
 
     Args:
         position: Positions (n, 3) [m].
-        variance: Mean predictive variance of a spectrum over the region, as a fraction of the spectra's variance, before
-            and after measuring at the first 1, 2, ..., n positions, (1 + n,).
+        variance: Mean predictive variance over the region, as a fraction of the variance of the field, before and after
+            measuring at the first 1, 2, ..., n positions, (1 + n,).
     """
 
     position: Tensor
@@ -50,10 +56,77 @@ def suggest(measured: Spectra, count: int, seed: int = 0) -> Suggestion:
         torch.Size([3, 3])
     """
     check_training(measured)
-    if not 1 <= count <= MAX_SUGGESTIONS:
-        raise InputError(f"between 1 and {MAX_SUGGESTIONS} positions can be suggested, not {count}")
+    _check_count(count)
     kernel = choose_kernel(measured.position, measured.store, folds(measured.position, "random", seed))
     candidate = sample_positions(measured.position, N_CANDIDATE_POSITIONS, seed)
     (known,) = thinned(measured.position, rows=MAX_MEASURED_POSITIONS)
     chosen, variance = most_informative(kernel, known, candidate, count)
     return Suggestion(candidate[chosen], variance)
+
+
+def suggest_positions(locator: RssiLocator, train: Rssi, count: int, seed: int = 0) -> Suggestion:
+    """Return positions to measure next, where position errors are large and the radio maps are uncertain.
+
+    The positions are chosen among the locator's cells near the measured positions, one after the other. Each one lowers the
+    sum over the cells of the expected squared position error times the posterior variance of the radio maps most. Rows of
+    RSSI simulated with the locator's maps determine the error. The variance is that of the maps' Gaussian process, relative
+    to its prior. The variance of the result is weighted in the same way.
+
+    Args:
+        locator: Locator fitted to the measured rows.
+        train: Measured rows.
+        count: Number of positions, 1 to 500 and at most the number of these cells.
+        seed: Seed of the candidate cells and of the simulated rows.
+
+    Raises:
+        InputError: A number that is not as above, or other receivers than the locator's.
+
+    Example:
+        >>> import swiftwrf
+        >>> train = swiftwrf.rssi_room(n=60)
+        >>> suggest_positions(RssiLocator(n_cells=200).fit(train), train, 3).position.shape
+        torch.Size([3, 3])
+    """
+    _check_count(count)
+    if train.receiver_names != locator.receiver_names:
+        raise InputError(f"{train.name} has other receivers than the locator")
+    generator = torch.Generator().manual_seed(seed)
+    cells = locator.cells.position
+    cells = cells[locator.region.is_near(cells)]
+    candidate = cells[torch.randperm(len(cells), generator=generator)[:N_CANDIDATE_POSITIONS]]
+    if count > len(candidate):
+        raise InputError(
+            f"{count} positions cannot be chosen among {len(candidate)} cells; fit the locator with more cells"
+        )
+    at = candidate[torch.arange(min(N_SIMULATED_ROWS, len(candidate)))]
+    error = _expected_errors(locator, at, generator)
+    _, number = nearest(candidate, at, min(N_AVERAGED_ROWS, len(at)))
+    weight = error[number].square().mean(dim=1).clamp_min(1e-12)
+    (known,) = thinned(train.transmitter_position, rows=MAX_MEASURED_POSITIONS)
+    chosen, variance = most_informative(locator.model.kernel, known, candidate, count, weight)
+    return Suggestion(candidate[chosen], variance)
+
+
+def _check_count(count: int) -> None:
+    if not 1 <= count <= MAX_SUGGESTIONS:
+        raise InputError(f"between 1 and {MAX_SUGGESTIONS} positions can be suggested, not {count}")
+
+
+def _expected_errors(locator: RssiLocator, position: Tensor, generator: torch.Generator) -> Tensor:
+    """Return the root-mean-square position error (n,) [m] under the posterior of one simulated row a position (n, 3)."""
+    prediction = locator.model.predict(position)
+    assert prediction.std is not None
+    mean, std = prediction.mean.double(), prediction.std.double()
+    root = torch.linalg.cholesky(locator.values.correlation.double())
+    rssi = mean + std * (torch.randn(mean.shape, generator=generator, dtype=torch.float64) @ root.T)
+    detection = locator.detections
+    chance = (1 - detection.loss) * torch.sigmoid((mean - detection.threshold) / detection.width)
+    detected = torch.rand(mean.shape, generator=generator, dtype=torch.float64) < chance
+    detected[torch.arange(len(mean)), chance.argmax(dim=1)] = True  # a row that no receiver detects is not located
+    rssi = rssi.where(detected, torch.nan)
+    errors = []
+    for at, rows in zip(position.split(BATCH_ROWS), rssi.split(BATCH_ROWS), strict=True):
+        posterior = locator.locate(rows)
+        square = torch.cdist(at, posterior.position[0], compute_mode="donot_use_mm_for_euclid_dist").square()
+        errors.append((posterior.weight * square).sum(dim=1).sqrt())
+    return torch.cat(errors)

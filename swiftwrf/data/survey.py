@@ -76,8 +76,14 @@ def read_frame(file: Path) -> pd.DataFrame:
 
 def has_positions(table: pd.DataFrame, columns: Mapping[str, str]) -> bool:
     """Return True if a column of a table holds positions, by its name or by the names of columns given by role."""
-    named = any(ROLES[role].fullmatch(_plain(str(name))) for role in ("x", "y") for name in table.columns)
-    return named or bool({"x", "y"} & set(columns))
+    return any(column_of(table, role, columns) is not None for role in ("x", "y"))
+
+
+def column_of(table: pd.DataFrame, role: str, columns: Mapping[str, str]) -> str | None:
+    """Return the first column of a role, by the names of columns given by role or by its own name. None without one."""
+    if role in columns:
+        return columns[role]
+    return next((name for name in map(str, table.columns) if ROLES[role].fullmatch(_plain(name))), None)
 
 
 def read_survey(label: object, table: pd.DataFrame, columns: Mapping[str, str]) -> Survey:

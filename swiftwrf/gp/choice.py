@@ -64,7 +64,9 @@ def choose_rank(position: Tensor, spectrum: Tensor | Store, fold: Tensor, kernel
 
 
 @single_thread()
-def most_informative(kernel: Kernel, known: Tensor, candidate: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def most_informative(
+    kernel: Kernel, known: Tensor, candidate: Tensor, count: int, weight: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Choose positions whose measurement lowers the mean posterior variance most, one after the other.
 
     Greedy variance reduction is nearly optimal (Krause, Singh and Guestrin 2008).
@@ -74,24 +76,27 @@ def most_informative(kernel: Kernel, known: Tensor, candidate: Tensor, count: in
         known: Measured positions (n, 3).
         candidate: Positions (m, 3) to choose from, evenly over the region.
         count: Number of positions to choose, at most m.
+        weight: Weights of the candidates' variances in the mean, (m,). Defaults to equal ones.
 
     Returns:
         Numbers of the chosen candidates in order, (count,), and the mean variance before the first and after each of them,
         relative to k(0) = 1, float64 (1 + count,).
     """
     candidate = candidate.double()
+    weight = torch.ones(len(candidate)) if weight is None else weight
+    weight = weight.double() / weight.double().mean()
     cross = kernel(candidate, known.double())
     covariance = kernel(candidate, candidate) - cross @ torch.linalg.solve(kernel.covariance(known), cross.T)
     chosen: list[int] = []
-    left = [covariance.diagonal().mean()]
+    left = [(weight * covariance.diagonal()).mean()]
     for _ in range(count):
         noisy = covariance.diagonal().clamp_min(0) + kernel.noise + JITTER
-        lowered = covariance.square().sum(dim=0) / noisy
+        lowered = (weight @ covariance.square()) / noisy
         lowered[chosen] = -1
         best = int(lowered.argmax())
         covariance -= covariance[:, best, None] * covariance[best] / noisy[best]
         chosen.append(best)
-        left.append(covariance.diagonal().mean())
+        left.append((weight * covariance.diagonal()).mean())
     return torch.tensor(chosen, dtype=torch.int64), torch.stack(left).clamp_min(0)
 
 

@@ -36,7 +36,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     data = measurements(config)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
-    experiment, n_undetected = prepared(data, config.split, config.cells, config.seed)
+    experiment, n_undetected = prepared(data, config.split, config.cells, config.seed, config.suggest)
     if n_undetected:
         console.print(f"{data.name}: test rows that no receiver detected are left out: {n_undetected}")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
@@ -66,7 +66,7 @@ def measurements(config: LocateConfig) -> Rssi:
     return rssi_room(seed=config.seed).receivers(config.rx)
 
 
-def prepared(data: Rssi, split: str, cells: int, seed: int) -> tuple[Experiment, int]:
+def prepared(data: Rssi, split: str, cells: int, seed: int, suggest: int = 0) -> tuple[Experiment, int]:
     """Return the experiment on a split, and the number of its test rows that no receiver detected, which it omits.
 
     Raises:
@@ -82,7 +82,7 @@ def prepared(data: Rssi, split: str, cells: int, seed: int) -> tuple[Experiment,
     kept = test.detected.any(dim=1)
     if not bool(kept.any()):
         raise InputError(f"split {split!r} of {data.name} has no test rows that a receiver detected")
-    return Experiment(train, test.subset(kept), split, cells, seed), int((~kept).sum())
+    return Experiment(train, test.subset(kept), split, cells, seed, suggest), int((~kept).sum())
 
 
 class Results:

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import torch
 from torch import Tensor
 
 from swiftwrf import InputError, Rssi, Spectra, load, load_rssi
 from swiftwrf.data.store import Store
-from swiftwrf.data.survey import SUFFIXES, has_positions, read_frame
+from swiftwrf.data.survey import SUFFIXES, column_of, has_positions, read_frame
 from swiftwrf.errors import listed
-from swiftwrf.locate import MatchedField, Posterior, RssiLocator
+from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
+from swiftwrf.locate.track import joined
 from swiftwrf.metrics import angle_errors
 from tasks.directory import check_new_table, console
 from tasks.locate.localizers import BATCH_ROWS
-from tasks.locate.options import OBSERVATIONS, TABLE, LocateConfig
+from tasks.locate.options import SPECTRA, TABLE, LocateConfig
 from tasks.records import write_table
 from tasks.source import observed_spectra, reading
 
 Columns = dict[str, Tensor]
+MAX_TRACKED = 20_000_000  # candidate positions of a walk that are in memory together
 
 
 def write_positions(config: LocateConfig) -> None:
@@ -50,7 +53,7 @@ def write_positions(config: LocateConfig) -> None:
 
 
 def _of_rssi(locator: RssiLocator, config: LocateConfig, source: str) -> Columns:
-    unused = [name for name in OBSERVATIONS if getattr(config, name) is not None]
+    unused = [name for name in SPECTRA if getattr(config, name) is not None]
     if unused:
         raise InputError(f"--{unused[0]} is for spectra, and {config.model} locates by RSSI")
     data, is_known = read_rssi(source, reading(config).columns or {})
@@ -60,10 +63,12 @@ def _of_rssi(locator: RssiLocator, config: LocateConfig, source: str) -> Columns
         raise InputError(f"no receiver of {config.model} detected the transmitter in any row of {source}")
     if not bool(kept.all()):
         console.print(f"{data.name}: rows that no receiver detected are left out: {int((~kept).sum())}")
+    posteriors: Iterable[Posterior] = map(locator.locate, data.rssi_dbm[kept].split(BATCH_ROWS))
+    if config.track is not None:
+        time = _times(source, reading(config).columns or {}, len(data))
+        posteriors = _tracked(posteriors, time[kept], config.track)
     data = data.subset(kept)
-    return _located(
-        locator.locate, data.rssi_dbm.split(BATCH_ROWS), data.index, data.transmitter_position if is_known else None
-    )
+    return _located(posteriors, data.index, data.transmitter_position if is_known else None)
 
 
 def read_rssi(source: str, columns: Mapping[str, str]) -> tuple[Rssi, bool]:
@@ -111,14 +116,16 @@ def _of_spectra(locator: MatchedField, config: LocateConfig, source: str) -> Col
     if known is not None and known.array is not None and known.array != locator.room.array:
         raise InputError(f"{source} has spectra of another array than those that {config.model} was fitted to")
     directions: list[Tensor] = []
+    index = torch.arange(len(store)) if known is None else known.index
+    posteriors: Iterable[Posterior] = map(locator.locate, _batches(store))
+    if config.track is not None:
+        posteriors = _tracked(posteriors, index.double(), config.track)
 
-    def locate(spectrum: Tensor) -> Posterior:
-        posterior = locator.locate(spectrum)
+    def with_direction(posterior: Posterior) -> Posterior:
         directions.append(locator.direction(posterior))
         return posterior
 
-    index = torch.arange(len(store)) if known is None else known.index
-    columns = _located(locate, _batches(store), index, None if known is None else known.position)
+    columns = _located(map(with_direction, posteriors), index, None if known is None else known.position)
     direction = torch.cat(directions)
     columns |= {"azimuth_deg": direction[:, 0].rad2deg(), "elevation_deg": direction[:, 1].rad2deg()}
     return columns | _direction_errors(direction, known)
@@ -136,14 +143,74 @@ def _direction_errors(direction: Tensor, known: Spectra | None) -> Columns:
     return {"truth_azimuth_deg": truth[:, 0], "truth_elevation_deg": truth[:, 1], "great_circle_deg": error}
 
 
-def _located(
-    locate: Callable[[Tensor], Posterior], batches: Iterable[Tensor], index: Tensor, truth: Tensor | None
-) -> Columns:
+def _times(source: str, columns: Mapping[str, str], n: int) -> Tensor:
+    """Return the times of the n rows of RSSI in a file (n,) [s]: one second a row if it has no column of time."""
+    file = Path(source)
+    if file.is_file() and file.suffix.lower() in SUFFIXES:
+        time = row_times(source, read_frame(file), columns)
+        if time is not None:
+            if len(time) != n:
+                raise InputError(f"{source} has {n} positions at {len(time)} times; a walk has one position at a time")
+            return time
+    return torch.arange(n, dtype=torch.float64)
+
+
+def row_times(label: str, frame: pd.DataFrame, columns: Mapping[str, str]) -> Tensor | None:
+    """Return the time since the first row [s] for each row of the RSSI in a survey table. None without a column of time.
+
+    Args:
+        label: Name of the table, for messages.
+        frame: Survey table, wide or long. Times are numbers [s] or dates.
+        columns: Names of columns that are not recognised, by role.
+
+    Raises:
+        InputError: A cell that is no time.
+    """
+    frame = frame.set_axis([str(name).strip() for name in frame.columns], axis=1)
+    name = column_of(frame, "time", columns)
+    if name is None:
+        return None
+    cells = frame[name]
+    numbers = pd.to_numeric(cells, errors="coerce") if cells.dtype.kind != "M" else pd.Series(float("nan"), cells.index)
+    if numbers.isna().all():
+        dates = pd.to_datetime(cells, errors="coerce", utc=True, format="mixed")
+        numbers = (dates - dates.iloc[0]).dt.total_seconds()
+    if numbers.isna().any():
+        row = int(numbers.isna().to_numpy().argmax())
+        raise InputError(f"{label} row {row + 1}, column {name}: {cells.iloc[row]!r} is no time [s] or date")
+    time = numbers - numbers.iloc[0]
+    if column_of(frame, "receiver", columns) is None:
+        return torch.from_numpy(time.to_numpy(dtype="float64", copy=True))
+    # packets of a long table form rows by time, position and repetition: with the time as x, the rows' positions are times
+    marked = frame.assign(**{"time as x": time})
+    roles = {**columns, "x": "time as x"}
+    if column_of(frame, "y", columns) is None:
+        marked, roles["y"] = marked.assign(**{"no y": 0.0}), "no y"
+    return Rssi.from_frame(marked, columns=roles).transmitter_position[:, 0]
+
+
+def _tracked(posteriors: Iterable[Posterior], time: Tensor, speed_m_s: float) -> Iterator[Posterior]:
+    """Yield the posteriors of a walk in groups, smoothed along it.
+
+    Raises:
+        InputError: A walk that is too long, or times or a speed that are none.
+    """
+    parts: list[Posterior] = []
+    for part in posteriors:
+        parts.append(part)
+        if sum(some.log_weight.numel() for some in parts) > MAX_TRACKED:
+            most = MAX_TRACKED // part.log_weight.shape[1]
+            raise InputError(f"--track takes {most} rows with this locator; split SOURCE, or fit it with fewer --cells")
+    whole = smoothed(joined(parts), time, speed_m_s)
+    for start in range(0, len(whole), BATCH_ROWS):
+        rows = slice(start, start + BATCH_ROWS)
+        position = whole.position if len(whole.position) == 1 else whole.position[rows]
+        yield Posterior(position, whole.log_weight[rows], whole.resolution_m)
+
+
+def _located(posteriors: Iterable[Posterior], index: Tensor, truth: Tensor | None) -> Columns:
     """Return the columns of a table with the positions of observations, batch by batch."""
-    parts = []
-    for batch in batches:
-        posterior = locate(batch)
-        parts.append((posterior.median, posterior.std, posterior.credible_radius(0.8), posterior.ambiguous))
+    parts = ((each.median, each.std, each.credible_radius(0.8), each.ambiguous) for each in posteriors)
     position, std, radius, ambiguous = (torch.cat(values) for values in zip(*parts, strict=True))
     columns: Columns = {"index": index}
     columns |= dict(zip(("x_m", "y_m", "z_m"), position.T, strict=True))

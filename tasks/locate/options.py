@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from augment.suggest import MAX_SUGGESTIONS
 from swiftwrf import InputError
 from tasks.source import SpectraSource, TableSource
 
@@ -32,10 +33,14 @@ class LocateConfig(SpectraSource, TableSource):
     """survey table (CSV or Parquet), or folder in NeRF2 layout, of the experiment"""
     rx: tuple[str, ...] = ("all",)
     """receivers: names, numbers counted from 1, or all"""
+    track: float | None = None
+    """rows of SOURCE are a walk: smooths its positions by this typical speed [m/s], or [m] a row without a column of time"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
     cells: int = 4000
     """number of candidate positions of the posterior"""
+    suggest: int = 0
+    """number of positions to measure next that are suggested: where position errors are large and radio maps uncertain"""
     scheduler: str | None = None
     """address of a Dask scheduler whose workers compute the steps (extra: cluster)"""
     seed: int = 0
@@ -44,8 +49,8 @@ class LocateConfig(SpectraSource, TableSource):
     """directory of the run (default: a new one under runs/locate), or table (default: positions.csv); must not exist"""
 
 
-EXPERIMENT = ("data", "rx", "split", "cells", "scheduler", "seed")
-OBSERVATIONS = ("array", "beamformer", "grid", "every", "station")
+EXPERIMENT = ("data", "rx", "split", "cells", "suggest", "scheduler", "seed")
+SPECTRA = ("array", "beamformer", "grid", "every", "station")
 
 
 def check(config: LocateConfig) -> None:
@@ -63,8 +68,12 @@ def check(config: LocateConfig) -> None:
     reason = "spectra; give it with MODEL and SOURCE"
     if config.model is not None:
         reason = "the experiment; leave it out with MODEL and SOURCE"
-    for name in OBSERVATIONS if config.model is None else EXPERIMENT:
+    if config.model is None and config.track is not None:
+        raise InputError("--track is for observations; give it with MODEL and SOURCE")
+    for name in SPECTRA if config.model is None else EXPERIMENT:
         if getattr(config, name) != default[name]:
             raise InputError(f"--{name} is for {reason}")
     if not 10 <= config.cells <= 1_000_000:
         raise InputError(f"--cells takes 10 to 1,000,000, got {config.cells}")
+    if not 0 <= config.suggest <= MAX_SUGGESTIONS:
+        raise InputError(f"--suggest takes 0 to {MAX_SUGGESTIONS} positions, got {config.suggest}")

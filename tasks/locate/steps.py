@@ -11,16 +11,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from augment.suggest import suggest_positions
 from swiftwrf import Rssi
 from swiftwrf.data.splits import validation_for
 from swiftwrf.locate import Posterior, RssiLocator
 from swiftwrf.positions import nearest
 from tasks.locate.localizers import LOCALIZERS, PosteriorLocalizer
-from tasks.records import Row, write_npz
+from tasks.records import Row, write_npz, write_table
 from tasks.steps import Step
 
 MODEL = "locator.safetensors"
 MAPS = "maps.npz"
+SUGGESTED = "suggested"
 MIN_ROWS = 20  # training rows that a receiver detected: five folds, of which four hold at least 10 rows
 ROW_FRACTIONS, RECEIVER_FRACTIONS = (0.1, 0.3), (0.25, 0.5)  # that are compared with everything
 STUDIED = ("posterior", "knn")
@@ -38,6 +40,7 @@ class Experiment:
         split: Name of the split, which determines how training rows are held out.
         cells: Number of candidate positions of the posterior.
         seed: Seed of everything random.
+        suggest: Number of positions to suggest for the next measurements.
     """
 
     train: Rssi
@@ -45,6 +48,7 @@ class Experiment:
     split: str
     cells: int
     seed: int
+    suggest: int = 0
 
     def part(self, rows: float, receivers: float) -> tuple[Rssi, Rssi]:
         """Return fractions of the training rows and of the receivers, and the test rows that these receivers detected."""
@@ -122,7 +126,22 @@ class Localization(Step[Experiment]):
             locator.save(folder / MODEL)
             error = (located.position - test.transmitter_position).norm(dim=1)
             write_npz(folder / MAPS, posterior_maps(locator, train, test, error))
+            if context.suggest:
+                write_suggestion(folder, locator, train, context)
         return value
+
+
+def write_suggestion(folder: Path, locator: RssiLocator, train: Rssi, context: Experiment) -> None:
+    """Write the positions where a measurement reduces the position error most, as a table and for the report."""
+    found = suggest_positions(locator, train, context.suggest, context.seed)
+    columns = dict(zip(("x_m", "y_m", "z_m"), found.position.T.tolist(), strict=True))
+    columns["variance_left"] = found.variance[1:].tolist()
+    write_table(
+        folder / f"{SUGGESTED}.csv",
+        [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)],
+    )
+    arrays = {"measured": train.transmitter_position, "suggested": found.position, "left": found.variance}
+    write_npz(folder / f"{SUGGESTED}.npz", {name: value.numpy() for name, value in arrays.items()})
 
 
 def posterior_maps(locator: RssiLocator, train: Rssi, test: Rssi, error: Tensor) -> dict[str, Any]:

@@ -9,10 +9,12 @@ from pandas import concat
 from tasks.locate.localizers import LOCALIZERS
 from tasks.locate.page import drawing
 from tasks.locate.page.summary import OWN, LocateRecords, by_method, summary
+from tasks.locate.steps import SUGGESTED
 from tasks.page.labels import LOCALIZERS as LABELS
 from tasks.page.labels import labels
 from tasks.page.page import Page, Plot, Section, Table
 from tasks.page.provenance import number, provenance
+from tasks.page.suggestion import suggestion_plot
 from tasks.summarise import paired_difference
 
 
@@ -37,7 +39,21 @@ def _run(run: LocateRecords, several: bool, first: bool) -> list[Section]:
     ]
     if run.metrics["by_rows"] or run.metrics["by_receivers"]:
         sections.insert(2, Section(f"Errors against training rows and receivers{suffix}", plots=[_studies(run)]))
+    if run.holds(SUGGESTED):
+        sections.append(_suggestion(run, suffix))
     return sections
+
+
+def _suggestion(run: LocateRecords, suffix: str) -> Section:
+    arrays = run.arrays(SUGGESTED)
+    left = arrays["left"]
+    text = (
+        f"Measuring at {len(arrays['suggested'])} more positions ({SUGGESTED}.csv, the most useful first) would reduce the "
+        f"variance of the radio maps from {left[0]:.0%} to {left[-1]:.0%} of the field's variance. The mean over the region "
+        "is weighted by the expected squared position error. Errors are those of simulated rows under the fitted maps."
+    )
+    plot = suggestion_plot(f"suggested-{run.file_name}", arrays, "weighted variance left [%]")
+    return Section(f"Where to measure next{suffix}", [text], plots=[plot])
 
 
 def _overview(run: LocateRecords, name: str) -> Plot:

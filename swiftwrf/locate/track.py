@@ -1,0 +1,138 @@
+"""Posteriors over the positions along a walk: each observation's posterior, smoothed by those before and after it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from swiftwrf.errors import InputError
+from swiftwrf.locate.posterior import Posterior, normalised
+
+JUMP = 1e-3  # prior probability of a displacement that does not depend on the distance, for each step
+CHUNK = 2**22  # pairs of candidates whose distances are computed together
+MAX_KERNEL = 4096**2  # pairs of candidates whose transition densities are kept from step to step
+MAX_PAIRS = 20_000**2  # pairs of candidates of two consecutive observations
+
+
+def smoothed(posterior: Posterior, time: Tensor | None, speed_m_s: float) -> Posterior:
+    """Return the posterior of each observation given all observations of a walk.
+
+    The motion prior is a random walk: the displacement between consecutive observations is Gaussian along each axis, with
+    standard deviation `speed_m_s` times the time between them, and uniform with a probability of 0.001. The candidates'
+    resolution adds to the variance. The forward-backward recursion is exact on the candidates (L. Rabiner, Proc. IEEE 77,
+    1989). A single observation keeps its posterior.
+
+    Args:
+        posterior: Posteriors of n independent observations in the order of the walk, on m candidates each.
+        time: Time of each observation, which does not decrease, (n,) [s]. None stands for one observation a second.
+        speed_m_s: Typical speed, above 0 [m/s].
+
+    Raises:
+        InputError: A speed or times that are not as above, or more than 20,000 candidates.
+
+    Example:
+        >>> at = torch.tensor([[[0.0, 0, 0], [1.0, 0, 0], [9.0, 0, 0]]], dtype=torch.float64)
+        >>> weight = torch.tensor([[0.98, 0.01, 0.01], [0.01, 0.49, 0.5]], dtype=torch.float64)
+        >>> smoothed(Posterior(at, weight.log()), None, 1.0).most_likely[:, 0].tolist()
+        [0.0, 1.0]
+    """
+    if not (math.isfinite(speed_m_s) and speed_m_s > 0):
+        raise InputError(f"a speed is a number above 0 [m/s], got {speed_m_s}")
+    n, m = posterior.log_weight.shape
+    if m * m > MAX_PAIRS:
+        raise InputError(f"a walk is smoothed on at most {math.isqrt(MAX_PAIRS)} candidate positions, got {m}")
+    std = (speed_m_s * _intervals(time, n)).square().add(posterior.resolution_m**2 / 6).sqrt().clamp_min(1e-6).tolist()
+    # the error of the distances is that of float32 relative to the region, not to the origin of the coordinates
+    position = (posterior.position - posterior.position.reshape(-1, 3).mean(dim=0)).float().expand(n, -1, -1)
+    own = posterior.log_weight
+    step = _Transition(shared=len(posterior.position) == 1)
+    before, after = torch.zeros_like(own), torch.zeros_like(own)
+    for i in range(1, n):
+        before[i] = step(position[i], position[i - 1], std[i - 1], own[i - 1] + before[i - 1])
+    for i in range(n - 2, -1, -1):
+        after[i] = step(position[i], position[i + 1], std[i], own[i + 1] + after[i + 1])
+    return Posterior(posterior.position, normalised(own + before + after), posterior.resolution_m)
+
+
+def joined(posteriors: Sequence[Posterior]) -> Posterior:
+    """Return the posteriors of several groups of observations as one.
+
+    Raises:
+        InputError: Groups with different numbers of candidates.
+    """
+    first = posteriors[0]
+    if len({part.log_weight.shape[1] for part in posteriors}) > 1:
+        raise InputError("posteriors on different numbers of candidates cannot be joined")
+    is_shared = all(len(part.position) == 1 and part.position.equal(first.position) for part in posteriors)
+    expanded = (part.position.expand(len(part), -1, -1) for part in posteriors)
+    return Posterior(
+        first.position if is_shared else torch.cat(list(expanded)),
+        torch.cat([part.log_weight for part in posteriors]),
+        max(part.resolution_m for part in posteriors),
+    )
+
+
+def _intervals(time: Tensor | None, n: int) -> Tensor:
+    """Return the times between consecutive observations (n - 1,) [s]."""
+    if time is None:
+        return torch.ones(max(n - 1, 0), dtype=torch.float64)
+    time = torch.as_tensor(time, dtype=torch.float64)
+    if time.shape != (n,) or not bool(time.isfinite().all()):
+        raise InputError(f"expected {n} finite times [s], one for each observation, got shape {tuple(time.shape)}")
+    interval = time.diff()
+    back = (interval < 0).nonzero()[:, 0]
+    if len(back):
+        raise InputError(f"observations of a walk must be in the order of time; number {int(back[0]) + 2} is earlier")
+    return interval
+
+
+class _Transition:
+    """Products with the transition densities between two sets of candidates.
+
+    Args:
+        shared: True if all observations have the same candidates. Their distances are computed once, and the densities are
+            kept until the interval changes.
+    """
+
+    def __init__(self, *, shared: bool) -> None:
+        self._shared = shared
+        self._square: Tensor | None = None
+        self._kept: tuple[float, Tensor, float] | None = None
+
+    def __call__(self, to: Tensor, start: Tensor, std: float, log_mass: Tensor) -> Tensor:
+        """Return the logarithm of the density at candidates `to` (k, 3) after a step from masses (m,) at `start` (m, 3)."""
+        mass = (log_mass - log_mass.max()).exp()
+        if self._shared and len(to) * len(start) <= MAX_KERNEL:
+            kernel, mean = self._of_shared(to, std)
+            moved = kernel @ mass.float()
+        else:
+            parts, total = [], 0.0
+            for some in to.split(max(1, CHUNK // len(start))):
+                kernel = _kernel(_square(some, start), std)
+                parts.append(kernel @ mass.float())
+                total += float(kernel.sum(dtype=torch.float64))
+            moved, mean = torch.cat(parts), total / (len(to) * len(start))
+        floor = JUMP * max(mean, 1e-30) * mass.sum()
+        return ((1 - JUMP) * moved.double() + floor).log()
+
+    def _of_shared(self, position: Tensor, std: float) -> tuple[Tensor, float]:
+        """Return the densities between all candidates and their mean."""
+        if self._square is None:
+            self._square = _square(position, position)
+        if self._kept is None or self._kept[0] != std:
+            kernel = _kernel(self._square, std)
+            self._kept = std, kernel, float(kernel.mean())
+        return self._kept[1:]
+
+
+def _square(to: Tensor, start: Tensor) -> Tensor:
+    """Return the squared distances between candidates (k, 3) and (m, 3), float32 (k, m) [m^2]."""
+    return torch.cdist(to, start, compute_mode="donot_use_mm_for_euclid_dist").square_()
+
+
+def _kernel(square: Tensor, std: float) -> Tensor:
+    """Return exp(-d^2 / 2 std^2) for squared distances d^2 [m^2]."""
+    return (square * (-0.5 / std**2)).exp_()
