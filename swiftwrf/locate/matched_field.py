@@ -16,7 +16,7 @@ from swiftwrf.array.planar import differences
 from swiftwrf.data.spectra import Spectra, check_training, direction_of_link
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, thinned
-from swiftwrf.locate.pool import pooled_weights, tempered
+from swiftwrf.locate.pool import inflation, pooled_weights
 from swiftwrf.locate.posterior import Posterior, normalised
 from swiftwrf.locate.region import Cells, Region, outside_mass
 from swiftwrf.locate.search import best_cells, refined
@@ -138,8 +138,8 @@ class MatchedField(Saved):
         others = [Region(train.position[fold != number]) for number in range(FOLDS)]
         self.outside = outside_mass(others, [train.position[fold == number] for number in range(FOLDS)])
         self._prepare()
-        self.weight = torch.tensor(FIRST_WEIGHTS, dtype=torch.float64)
-        self.weight = self._calibrated(train.position, features, fold, parts)
+        self.weight, self.inflation = torch.tensor(FIRST_WEIGHTS, dtype=torch.float64), 1.0
+        self._calibrate(train.position, features, fold, parts)
         return self
 
     def _set_residuals(self, position: Tensor, features: SpectrumFeatures, fold: Tensor, parts: list[_Fit]) -> None:
@@ -171,8 +171,8 @@ class MatchedField(Saved):
             PhaseLikelihood(fit.room, fit.statistics),
         )
 
-    def _calibrated(self, position: Tensor, features: SpectrumFeatures, fold: Tensor, parts: list[_Fit]) -> Tensor:
-        """Return the weights of the likelihoods that calibrate the posterior of held-out positions."""
+    def _calibrate(self, position: Tensor, features: SpectrumFeatures, fold: Tensor, parts: list[_Fit]) -> None:
+        """Choose the weights of the likelihoods and the inflation of credible radii by held-out positions."""
         (some,) = thinned(torch.arange(len(position)), rows=self.config.n_calibration)
         rows_of = {number: some[fold[some] == number] for number in fold[some].unique().tolist()}
         at_truth, values, volumes, candidates = [], [], [], []
@@ -185,12 +185,10 @@ class MatchedField(Saved):
                 volumes.append(cells.log_volume)
                 candidates.append(cells.position)
         value, volume, at = torch.cat(values, dim=1).double(), torch.cat(volumes), torch.cat(candidates)
-        weight = pooled_weights(torch.cat(at_truth, dim=1), value, volume)
-
-        def posterior(weight: Tensor) -> Posterior:
-            return Posterior(at, normalised(torch.einsum("k,knm->nm", weight, value) + volume), self._resolution_m)
-
-        return tempered(weight, posterior, position[torch.cat(list(rows_of.values()))])
+        self.weight = pooled_weights(torch.cat(at_truth, dim=1), value, volume)
+        log_mass = torch.einsum("k,knm->nm", self.weight, value) + volume
+        held_out = Posterior(at, normalised(log_mass), self._resolution_m)
+        self.inflation = inflation(held_out, position[torch.cat(list(rows_of.values()))])
 
     def _searched(self, observed: SpectrumFeatures, likelihoods: Any) -> Iterator[tuple[Cells, Tensor]]:
         """Yield cells (b, m) and log-likelihoods (k, b, m) of some observations at a time."""
@@ -232,7 +230,7 @@ class MatchedField(Saved):
         parts = list(self._searched(observed, self.likelihoods))
         position = torch.cat([cells.position for cells, _ in parts])
         log_weight = torch.cat([self._log_mass(cells, values) for cells, values in parts])
-        return Posterior(position, log_weight, self._resolution_m)
+        return Posterior(position, log_weight, self._resolution_m, self.inflation)
 
     @property
     def _resolution_m(self) -> float:
@@ -260,7 +258,12 @@ class MatchedField(Saved):
             "known": self.known,
             "weight": self.weight,
         }
-        plain = {"locator": asdict(self.config), "outside": self.outside, "observed_power": self.observed_power}
+        plain = {
+            "locator": asdict(self.config),
+            "outside": self.outside,
+            "observed_power": self.observed_power,
+            "inflation": self.inflation,
+        }
         return tensors | gains | own, header | values | plain
 
     @classmethod
@@ -285,5 +288,13 @@ class MatchedField(Saved):
         locator._fit = _Fit(room, gains, PathStatistics.of(tensors["statistics"]))
         locator.residual, locator.known, locator.weight = (tensors[name] for name in ("residual", "known", "weight"))
         locator.outside, locator.observed_power = float(header["outside"]), float(header["observed_power"])
+        locator.inflation = _positive(header["inflation"])
         locator._prepare()
         return locator
+
+
+def _positive(value: Any) -> float:
+    """Return a factor of a file."""
+    if not (isinstance(value, int | float) and 0 < value < math.inf):
+        raise InputError(f"inflation must be a number above 0, got {value!r}")
+    return float(value)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -12,8 +10,6 @@ from torch import Tensor
 
 from swiftwrf.locate.posterior import Posterior
 
-BISECTIONS = 6  # of the tempering factor
-MIN_LOG2_FACTOR, MAX_LOG2_FACTOR = -2.0, 1.0
 RIDGE = 1e-3  # of the weights: keeps those that the data do not determine near their start
 START = 0.3  # sum of the weights
 
@@ -53,21 +49,16 @@ def pooled_weights(at_truth: Tensor, at_candidates: Tensor, log_volume: Tensor) 
     return torch.from_numpy(found.x)
 
 
-def tempered(weight: Tensor, posterior: Callable[[Tensor], Posterior], truth: Tensor, level: float = 0.8) -> Tensor:
-    """Return the weights scaled so that credible regions of `level` contain that fraction of held-out positions.
+def inflation(posterior: Posterior, truth: Tensor, level: float = 0.8) -> float:
+    """Return the factor of credible radii for which regions of `level` contain that fraction of held-out positions.
 
-    Maximum likelihood alone leaves regions too small if the likelihoods are wrong in ways that weights cannot mend.
+    The weights of largest posterior density leave regions too small if the likelihoods are wrong in ways that no weight
+    corrects (split conformal calibration: V. Vovk, A. Gammerman and G. Shafer, "Algorithmic Learning in a Random World", 2005).
 
     Args:
-        weight: Weights of the pool, (k,).
-        posterior: Returns the posterior of the held-out observations for weights (k,).
-        truth: Held-out true positions, (n, 3) [m].
+        posterior: Posterior of held-out observations.
+        truth: Their true positions, (n, 3) [m].
         level: Nominal coverage.
     """
-    low, high = MIN_LOG2_FACTOR, MAX_LOG2_FACTOR
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        found = posterior(weight * 2**middle)
-        inside = (found.median - truth).norm(dim=1) <= found.credible_radius(level)
-        low, high = (middle, high) if float(inside.double().mean()) > level else (low, middle)
-    return weight * 2 ** ((low + high) / 2)
+    ratio = (posterior.median - truth).norm(dim=1) / posterior.credible_radius(level).clamp_min(1e-9)
+    return float(ratio.quantile(level))

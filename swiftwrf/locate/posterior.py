@@ -22,6 +22,7 @@ class Posterior:
         position: Candidate positions, float64 (n, m, 3) [m], or (1, m, 3) if all observations share them.
         log_weight: Logarithms of their posterior masses, which sum to 1, float64 (n, m).
         resolution_m: Edge of the largest cell around a candidate [m].
+        inflation: Factor of credible radii that held-out positions call for.
 
     Example:
         >>> at = torch.tensor([[[0.0, 0, 0], [1.0, 0, 0]]], dtype=torch.float64)
@@ -33,6 +34,7 @@ class Posterior:
     position: Tensor
     log_weight: Tensor
     resolution_m: float = 0.0
+    inflation: float = 1.0
 
     def __len__(self) -> int:
         return len(self.log_weight)
@@ -79,7 +81,7 @@ class Posterior:
         if not 0 < level < 1:
             raise InputError(f"level must be between 0 and 1, got {level}")
         away = (self.position - self.median[:, None]).norm(dim=2)
-        return self._radius(away, level) + self.resolution_m / 4
+        return self.inflation * (self._radius(away, level) + self.resolution_m / 4)
 
     def direction(self, vectors: Tensor) -> Tensor:
         """Return the unit vector of the smallest expected angular error, (n, 3).

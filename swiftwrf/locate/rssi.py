@@ -13,7 +13,7 @@ from torch import Tensor
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
-from swiftwrf.locate.pool import pooled_weights, tempered
+from swiftwrf.locate.pool import inflation, pooled_weights
 from swiftwrf.locate.posterior import Posterior, normalised
 from swiftwrf.locate.region import Region, outside_mass
 from swiftwrf.locate.rssi_likelihood import DetectionLikelihood, FingerprintLikelihood, RssiMaps, ValueLikelihood
@@ -22,7 +22,7 @@ from swiftwrf.runtime.checkpoint import Header, Saved, expect
 from swiftwrf.runtime.progress import progress as tracked
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 
-MAX_TEMPERING = 200  # held-out rows that determine the coverage of credible regions
+MAX_INFLATION_ROWS = 300  # held-out rows that determine the coverage of credible regions
 NEIGHBOUR_COUNTS = (1, 2, 3, 5, 8, 13, 20)
 BLOCK_MARGIN = 0.25  # of the region: a block of a fifth may lie beyond the known positions
 MIN_SCALE_M = 0.05  # of the error of nearest neighbours
@@ -175,14 +175,12 @@ class RssiLocator(Saved):
             truth.append(all_of(own, at, rssi).diagonal(dim1=1, dim2=2))
         candidates, position = torch.cat(values, dim=1), torch.cat(positions)
         volume = self.cells.log_volume.expand(candidates.shape[1], -1)
-        weight = pooled_weights(torch.cat(truth, dim=1), candidates, volume)
-        rows = torch.randperm(len(position), generator=torch.Generator().manual_seed(self.config.seed))[:MAX_TEMPERING]
-
-        def posterior(weight: Tensor) -> Posterior:
-            log_mass = torch.einsum("k,knm->nm", weight, candidates[:, rows]) + self.cells.log_volume
-            return Posterior(self.cells.position[None], normalised(log_mass), self.cells.edge_m)
-
-        self.weight = tempered(weight, posterior, position[rows])
+        self.weight = pooled_weights(torch.cat(truth, dim=1), candidates, volume)
+        generator = torch.Generator().manual_seed(self.config.seed)
+        rows = torch.randperm(len(position), generator=generator)[:MAX_INFLATION_ROWS]
+        log_mass = torch.einsum("k,knm->nm", self.weight, candidates[:, rows]) + self.cells.log_volume
+        held_out = Posterior(self.cells.position[None], normalised(log_mass), self.cells.edge_m)
+        self.inflation = inflation(held_out, position[rows])
 
     @torch.no_grad()
     def locate(self, rssi: Tensor) -> Posterior:
@@ -209,7 +207,7 @@ class RssiLocator(Saved):
             self.fingerprints.log_likelihood(at, rssi),
         )
         log_mass = sum(weight * part.double() for weight, part in zip(self.weight.tolist(), parts, strict=True))
-        return Posterior(at[None], normalised(log_mass + self.cells.log_volume), self.cells.edge_m)
+        return Posterior(at[None], normalised(log_mass + self.cells.log_volume), self.cells.edge_m, self.inflation)
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """Return the fitted tensors by name, and plain values."""
@@ -229,6 +227,7 @@ class RssiLocator(Saved):
             "detections": asdict(self.detections),
             "margin": self.region.margin,
             "outside": self.region.outside,
+            "inflation": self.inflation,
         }
         return tensors | own, header | plain
 
@@ -258,6 +257,8 @@ class RssiLocator(Saved):
         )
         locator.region = Region(tensors["known"], float(header["margin"]), float(header["outside"]))
         locator.cells = locator.region.cells(locator.config.n_cells)
-        locator.weight = tensors["weight"]
+        locator.weight, locator.inflation = tensors["weight"], float(header["inflation"])
+        if not 0 < locator.inflation < math.inf:
+            raise InputError(f"inflation must be a number above 0, got {locator.inflation}")
         locator._maps = RssiMaps.of(locator.model.predict(locator.cells.position))
         return locator

@@ -16,7 +16,7 @@ from torch import Tensor
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError
-from swiftwrf.models.base import FitContext, Prediction
+from swiftwrf.models.base import FieldConfig, FitContext, Prediction
 from swiftwrf.positions import check_positions
 from swiftwrf.runtime.options import Configured
 from swiftwrf.runtime.session import Record
@@ -63,6 +63,8 @@ class RssiPredictor(Configured, ABC):
         torch.Size([12, 12])
     """
 
+    config_type: ClassVar[type[Any]] = FieldConfig
+    """dataclass of the options"""
     name: ClassVar[str]
     """name on the command line and in reports"""
     requires_receiver_position: ClassVar[bool] = False
