@@ -53,7 +53,8 @@ def inflation(posterior: Posterior, truth: Tensor, level: float = 0.8) -> float:
     """Return the factor of credible radii for which regions of `level` contain that fraction of held-out positions.
 
     The weights of largest posterior density leave regions too small if the likelihoods are wrong in ways that no weight
-    corrects (split conformal calibration: V. Vovk, A. Gammerman and G. Shafer, "Algorithmic Learning in a Random World", 2005).
+    corrects (split conformal calibration: V. Vovk, A. Gammerman and G. Shafer, "Algorithmic Learning in a Random World",
+    2005).
 
     Args:
         posterior: Posterior of held-out observations.
