@@ -113,7 +113,8 @@ def containing_level(posterior: Posterior, truth: Tensor) -> Tensor:
         tensor([0.7500], dtype=torch.float64)
     """
     median = posterior.median
-    error = (truth - median).norm(dim=1) - posterior.resolution_m / 4  # as the credible radius
+    # the inverse of the credible radius
+    error = (truth - median).norm(dim=1) / posterior.inflation - posterior.resolution_m / 4
     inside = (posterior.position - median[:, None]).norm(dim=2) < error[:, None]
     level: Tensor = (posterior.weight * inside).sum(dim=1)
     return level
