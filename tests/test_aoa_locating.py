@@ -247,7 +247,7 @@ def test_the_containing_level_is_that_of_the_credible_radius():
     generator = torch.Generator().manual_seed(0)
     at = torch.randn(6, 40, 3, generator=generator, dtype=torch.float64)
     log_weight = torch.randn(6, 40, generator=generator, dtype=torch.float64).log_softmax(dim=1)
-    posterior, truth = Posterior(at, log_weight, 0.1), torch.randn(6, 3, generator=generator, dtype=torch.float64)
+    posterior, truth = Posterior(at, log_weight, 0.1, 1.3), torch.randn(6, 3, generator=generator, dtype=torch.float64)
     error = (truth - posterior.median).norm(dim=1)
     for level in (0.2, 0.5, 0.8):
         inside = error <= posterior.credible_radius(level)
