@@ -119,8 +119,7 @@ def _expected_errors(locator: RssiLocator, position: Tensor, generator: torch.Ge
     mean, std = prediction.mean.double(), prediction.std.double()
     root = torch.linalg.cholesky(locator.values.correlation.double())
     rssi = mean + std * (torch.randn(mean.shape, generator=generator, dtype=torch.float64) @ root.T)
-    detection = locator.detections
-    chance = (1 - detection.loss) * torch.sigmoid((mean - detection.threshold) / detection.width)
+    chance = locator.detections.probability(mean)
     detected = torch.rand(mean.shape, generator=generator, dtype=torch.float64) < chance
     detected[torch.arange(len(mean)), chance.argmax(dim=1)] = True  # a row that no receiver detects is not located
     rssi = rssi.where(detected, torch.nan)

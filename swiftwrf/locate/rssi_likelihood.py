@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
-from swiftwrf.locate.likelihood import DEGREES, Likelihood
+from swiftwrf.locate.likelihood import DEGREES
 from swiftwrf.models.base import Prediction
 
 MIN_STD_DB = 0.5
@@ -149,14 +149,17 @@ class DetectionLikelihood:
     def _of(cls, raw: NDArray[np.float64]) -> DetectionLikelihood:
         return cls(float(raw[0]), float(np.exp(np.clip(raw[1], -1, 4))), float(0.9 / (1 + np.exp(-raw[2]))))
 
+    def probability(self, mean: Tensor) -> Tensor:
+        """Return the probability of a detection for each predicted RSSI [dBm], of the same shape."""
+        return (1 - self.loss) * torch.sigmoid((mean - self.threshold) / self.width)
+
     def _log_probability(self, mean: Tensor, detected: Tensor) -> Tensor:
-        chance = (1 - self.loss) * torch.sigmoid((mean - self.threshold) / self.width)
-        chance = chance.clamp(1e-4, 1 - 1e-4)
+        chance = self.probability(mean).clamp(1e-4, 1 - 1e-4)
         return torch.where(detected, chance.log(), (-chance).log1p())
 
     def log_likelihood(self, maps: RssiMaps, rssi: Tensor) -> Tensor:
         """Return log-likelihoods (n, m) of the detections in RSSI (n, R) at candidates with maps (m, R)."""
-        chance = ((1 - self.loss) * torch.sigmoid((maps.mean - self.threshold) / self.width)).clamp(1e-4, 1 - 1e-4)
+        chance = self.probability(maps.mean).clamp(1e-4, 1 - 1e-4)
         detected = (~rssi.isnan()).float()
         return detected @ chance.log().T + (1 - detected) @ (-chance).log1p().T
 
@@ -193,6 +196,3 @@ class FingerprintLikelihood:
         """Return log-likelihoods (n, m) of candidate positions (m, 3) [m]."""
         away = (position - self.estimate(rssi)[:, None]) / self.scale_m
         return -(self.degrees + 3) / 2 * torch.log1p(away.square().sum(dim=2) / self.degrees)
-
-
-__all__ = ["DetectionLikelihood", "FingerprintLikelihood", "Likelihood", "RssiMaps", "ValueLikelihood"]

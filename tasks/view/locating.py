@@ -258,7 +258,7 @@ def simulated_rows(locator: RssiLocator, position: Tensor, n: int, generator: to
         chi_squared = torch.from_numpy(rng.chisquare(values.degrees, shape[:2]))
         noise = noise / (chi_squared / values.degrees).sqrt()[..., None]
     rssi = mean + std * noise
-    chance = (1 - detections.loss) * torch.sigmoid((mean - detections.threshold) / detections.width)
+    chance = detections.probability(mean)
     lost = torch.rand(shape, generator=generator, dtype=torch.float64) >= chance
     strongest = torch.nn.functional.one_hot(rssi.argmax(dim=2), shape[2]).bool()
     lost &= ~(strongest & lost.all(dim=2, keepdim=True))
