@@ -160,8 +160,8 @@ def test_rooms_are_refined_together_as_one_by_one():
 
 
 def test_mirroring_twice_returns():
-    point = torch.randn(4, 3, dtype=torch.float64)
-    normal = torch.nn.functional.normalize(torch.randn(4, 3, dtype=torch.float64), dim=1)
+    point = torch.randn(3, 4, dtype=torch.float64)
+    normal = torch.nn.functional.normalize(torch.randn(3, 4, dtype=torch.float64), dim=0)
     offset = torch.randn(4, dtype=torch.float64)
     torch.testing.assert_close(mirror(mirror(point, normal, offset), normal, offset), point)
 
@@ -266,11 +266,11 @@ def test_images_are_mirrored_in_one_plane_after_another():
     chain = [(1, 0, 2), (2,), (0, 1)]
     found, strength = images(scene, normal, offset, chain), image_gain(gain, chain)
     for row, sequence in enumerate(chain):
-        point, product = position, torch.ones(2)
+        point, product = position.T[:, None], torch.ones(2)
         for plane in sequence:
-            point = mirror(point, normal[:, plane, None], offset[:, plane, None])
+            point = mirror(point, normal[:, plane].T[..., None], offset[:, plane, None])
             product = product * gain[:, plane]
-        torch.testing.assert_close(found[:, row], point)
+        torch.testing.assert_close(found[:, row], point.movedim(0, -1))
         torch.testing.assert_close(strength[:, row], product)
 
 

@@ -24,7 +24,7 @@ MAX_MOVING = 6  # planes, one for each side of a room
 MAX_PERIODS = 4  # to either side
 N_POSITIONS = 18  # that the best combinations are scored at
 N_FIRST_POSITIONS = 6  # that all combinations are scored at
-MAX_SCORED = 512  # combinations that are scored at more positions than the first ones
+N_RESCORED = 8  # times as many combinations as are wanted are scored at more than the first positions
 OFFSET_STEP_WAVELENGTHS = 0.125  # of the grid from which aliases are interpolated
 N_WHOLE = 32  # combinations of whole periods around which half periods are tried
 N_COARSE, N_FINE = 24, 8  # rooms that are refined with some positions, and with all
@@ -107,7 +107,7 @@ class _AlternativeTable:
         ]
         (first, scene), (direct, base), (few, waves) = self.scenes, self.direct, self.waves
         score = few.at(rows).scores(first, direct)
-        best = score.flatten().argsort()[:MAX_SCORED].numpy()
+        best = score.flatten().argsort()[: N_RESCORED * most].numpy()
         number = [torch.from_numpy(n) for n in np.unravel_index(best, score.shape)]  # torch's own loads its compiler
         score = batched_score(scene, base + waves.of_choices([r[n] for r, n in zip(rows, number, strict=True)]))
         kept = score.argsort()[:most]

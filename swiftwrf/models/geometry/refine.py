@@ -25,9 +25,9 @@ def phase_jacobian(
 ) -> tuple[Tensor, Tensor]:
     """Return the field h with the direct wave, complex64 (K, B, n), and the derivatives of its phase, (K, B, Q P, n).
 
-    The Q parameters of each plane are offset [m], gain and, if planes tilt, two rotation angles of the normal [rad]. A change
-    dh of the field changes its phase by Im(dh / h). With the position x of an image, its distance d and direction u, its wave
-    w changes by
+    The Q parameters of each plane are offset [m], gain and, if planes tilt, two rotation angles of the normal [rad]. A
+    change dh of the field changes its phase by Im(dh / h). The wave w of an image at position x, distance d and direction u
+    changes by
 
         dw_k / w_k = j e_k . du - j k dd - dd / d,    dd = u . dx,    du = (dx - u dd) / d,
 
@@ -78,26 +78,22 @@ def image_jacobian(normal: Tensor, offset: Tensor, transmitter: Tensor, sequence
     Returns:
         Derivatives, float32 (3, B, P or 3 P, S, n or 1).
     """
-    b, p = offset.shape
-    across = torch.linalg.svd(normal[:, :, None]).Vh[:, :, 1:]
-    turns = 2 if tilt else 0
-    point = transmitter.expand(b, 1, -1, -1)
-    last, found = point.new_zeros(b, 1, p, 1 + turns, len(transmitter) if tilt else 1, 3), []
+    (rooms, planes), turns = offset.shape, 2 if tilt else 0
+    across = torch.linalg.svd(normal[:, :, None]).Vh[:, :, 1:].permute(3, 2, 0, 1)  # (3, 2, B, P)
+    point = transmitter.T[:, None, None].expand(-1, rooms, 1, -1)
+    last, found = point.new_zeros(3, rooms, 1, planes, 1 + turns, len(transmitter) if tilt else 1), []
     tree = tree_of(tuple(sequence))
     for parent, plane in tree.levels:
-        n, point = normal[:, plane, None], point[:, parent]
-        distance = (point * n).sum(-1, keepdim=True) - offset[:, plane, None, None]
-        last = mirror(
-            last[:, parent], n[:, :, None, None], offset.new_zeros(())
-        )  # as points in planes through the origin
+        n, o, point = normal[:, plane].movedim(-1, 0)[..., None], offset[:, plane, None], point[:, :, parent]
+        last = mirror(last[:, :, parent], n[..., None, None], o.new_zeros(()))  # as points in planes through the origin
         rows = torch.arange(len(plane))
-        last[:, rows, plane, 0] += 2 * n
+        last[:, :, rows, plane, 0] += 2 * n
         for q in range(turns):
-            turn = across[:, plane, q, None]
-            last[:, rows, plane, 1 + q] -= 2 * ((point * turn).sum(-1, keepdim=True) * n + distance * turn)
-        point = point - 2 * distance * n
+            turn = across[:, q, :, plane, None]
+            last[:, :, rows, plane, 1 + q] -= 2 * ((point * turn).sum(0) * n + ((point * n).sum(0) - o) * turn)
+        point = mirror(point, n, o)
         found.append(last)
-    return torch.cat(found, dim=1)[:, tree.rows].permute(5, 0, 3, 2, 1, 4).flatten(2, 3).float()
+    return torch.cat(found, dim=2)[:, :, tree.rows].permute(0, 1, 4, 3, 2, 5).flatten(2, 3).float()
 
 
 def normal_equations(

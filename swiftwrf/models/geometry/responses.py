@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 from swiftwrf.models.geometry.batched import batched_field, batched_score
 from swiftwrf.models.geometry.images import PhaseObservations, sequences
 
-N_INNER = 3  # planes whose combinations are scored at a time
+MAX_INNER = 1000  # combinations that are scored at a time
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,10 @@ class SteeringResponses:
 
     def of_choices(self, rows: list[Tensor]) -> Tensor:
         """Return the fields (n, 2 K, C) of C combinations with these offset numbers (C,) of each plane."""
-        total = sum(waves[..., r] for waves, r in zip(self.single, rows, strict=True))
-        return sum((waves[..., rows[i], rows[j]] for (i, j), waves in self.double.items()), start=total)
+        total = sum(waves.index_select(-1, r) for waves, r in zip(self.single, rows, strict=True))
+        for (i, j), waves in self.double.items():
+            total += waves.flatten(2).index_select(-1, rows[i] * waves.shape[-1] + rows[j])
+        return total
 
     def moved(self, direct: Tensor, moving: tuple[int, ...]) -> tuple[Tensor, SteeringResponses]:
         """Return the field (n, 2 K, 1) of the planes that stay at their first offsets, with the direct wave.
@@ -74,20 +77,21 @@ class SteeringResponses:
 
     def scores(self, scene: PhaseObservations, base: Tensor) -> Tensor:
         """Return the scores (A, B, ...) of all combinations of the planes' offsets, added to a field (n, 2 K, 1)."""
-        planes = len(self.single)
-        outer, inner = range(max(planes - N_INNER, 0)), range(max(planes - N_INNER, 0), planes)
+        size = [waves.shape[-1] for waves in self.single]
+        begin = next(i for i in range(len(size)) if math.prod(size[i:]) <= MAX_INNER or i == len(size) - 1)
+        outer, inner = range(begin), range(begin, len(size))
         among = base[(..., *[None] * (len(inner) - 1))]
         for i, j in itertools.combinations(inner, 2):
             if (i, j) in self.double:
                 among = among + _spread(self.double[i, j], [i - inner.start, j - inner.start], len(inner))
         found = []
-        for choice in itertools.product(*[range(self.single[i].shape[-1]) for i in outer]):
+        for choice in itertools.product(*map(range, size[:begin])):
             total = _spread(self._fixed(choice), [0], len(inner)) if outer else 0
             for axis, j in enumerate(inner):  # small sums first
                 beside = [self.double[i, j][..., choice[i], :] for i in outer if (i, j) in self.double]
                 total = total + _spread(sum(beside, start=self.single[j]), [axis], len(inner))
             found.append(batched_score(scene, (total + among).flatten(2)))
-        return torch.cat(found).reshape([waves.shape[-1] for waves in self.single])
+        return torch.cat(found).reshape(size)
 
     def _fixed(self, choice: tuple[int, ...]) -> Tensor:
         """Return the field (n, 2 K, 1) of the first planes at these offset numbers, without images in other planes."""
