@@ -27,8 +27,9 @@ def batched_field(
     strength = image_gain(gain, sequence)[..., None] * visibility(scene, normal, offset, sequence)
     strength = strength.permute(1, 2, 0)
     size = max(1, BATCH_WAVES // ray[0, 0].numel())
-    parts = zip(ray.split(size, dim=1), strength.split(size), strict=True)
-    total = sum(torch.view_as_real(scene.waves(*part)).sum(1) for part in parts)
+    total = torch.zeros(())
+    for some, part in zip(ray.split(size, dim=1), strength.split(size), strict=True):
+        total = total + torch.view_as_real(scene.waves(some, part)).sum(1)
     return total.permute(1, 3, 0, 2).flatten(1, 2)
 
 
@@ -41,4 +42,5 @@ def batched_score(scene: PhaseObservations, field: Tensor) -> Tensor:
     match = torch.cat([observed.real, -observed.imag], dim=1) @ (real * inverse)
     match += torch.cat([observed.imag, observed.real], dim=1) @ (imaginary * inverse)
     power = match.square_().unflatten(1, (2, -1)).sum(1)
-    return 1 - power.amax(1).mean(0) / size**2
+    score: Tensor = 1 - power.amax(1).mean(0) / size**2
+    return score

@@ -17,6 +17,7 @@ from swiftwrf.models.geometry.sample import Residual
 from swiftwrf.models.geometry.search import SIDES, CandidateRoom
 from swiftwrf.runtime.validation import NonNegativeFloat, configuration
 
+PLANE_TENSORS = ("normal", "offset", "gain")  # of a `PlaneSet`
 MIN_MISSING = 1e-5  # missing coherence by rounding of spectra and phases
 
 
@@ -119,10 +120,10 @@ def refined(rooms: list[PlaneSet], scene: PhaseObservations, steps: int = 10, ti
         if room.sequence:
             groups.setdefault(tuple(room.sequence), []).append(number)
     for sequence, numbers in groups.items():
-        planes = [torch.cat([getattr(rooms[i], name) for i in numbers]) for name in ("normal", "offset", "gain")]
-        _, *planes = refine(scene, *planes, list(sequence), steps=steps, tilt=tilt)
+        normal, offset, gain = (torch.cat([getattr(rooms[i], name) for i in numbers]) for name in PLANE_TENSORS)
+        _, *planes = refine(scene, normal, offset, gain, list(sequence), steps=steps, tilt=tilt)
         for number, *one in zip(numbers, *(t.split(1) for t in planes), strict=True):
-            found[number] = replace(rooms[number], normal=one[0], offset=one[1], gain=one[2])
+            found[number] = replace(rooms[number], **dict(zip(PLANE_TENSORS, one, strict=True)))
     return found
 
 

@@ -47,10 +47,9 @@ def phase_jacobian(
     real, imaginary = ratio.real / length, ratio.imag.contiguous()
     along = (scene.element @ unit.flatten(1)).view_as(real) + scene.wavenumber * length
     along = along.mul_(real).addcdiv_(imaginary, length)
-    moved = sum(
-        _over_images((real * e[:, None, None, None]).addcmul_(along, u, value=-1), dx)
-        for e, u, dx in zip(scene.element.T, unit, movement, strict=True)
-    )
+    moved = torch.zeros(())
+    for e, u, dx in zip(scene.element.T, unit, movement, strict=True):
+        moved = moved + _over_images((real * e[:, None, None, None]).addcmul_(along, u, value=-1), dx)
     planes = gain.shape[1]
     safe_gain = torch.where(gain.abs() < MIN_GAIN, torch.full_like(gain, MIN_GAIN), gain)
     scaled = (_reflections(tuple(sequence), planes) / safe_gain[..., None]) @ imaginary

@@ -53,7 +53,9 @@ class SteeringResponses:
 
     def of_choices(self, rows: list[Tensor]) -> Tensor:
         """Return the fields (n, 2 K, C) of C combinations with these offset numbers (C,) of each plane."""
-        total = sum(waves.index_select(-1, r) for waves, r in zip(self.single, rows, strict=True))
+        total = torch.zeros(())
+        for waves, r in zip(self.single, rows, strict=True):
+            total = total + waves.index_select(-1, r)
         for (i, j), waves in self.double.items():
             total += waves.flatten(2).index_select(-1, rows[i] * waves.shape[-1] + rows[j])
         return total
@@ -80,27 +82,21 @@ class SteeringResponses:
         size = [waves.shape[-1] for waves in self.single]
         begin = next(i for i in range(len(size)) if math.prod(size[i:]) <= MAX_INNER or i == len(size) - 1)
         outer, inner = range(begin), range(begin, len(size))
-        among = base[(..., *[None] * (len(inner) - 1))]
+        choices = list(itertools.product(*map(range, size[:begin])))
+        first = SteeringResponses(self.single[:begin], {p: w for p, w in self.double.items() if p[1] < begin})
+        fixed = base + first.of_choices(list(torch.tensor(choices, dtype=torch.int64).reshape(len(choices), begin).T))
+        among = torch.zeros(())
         for i, j in itertools.combinations(inner, 2):
             if (i, j) in self.double:
-                among = among + _spread(self.double[i, j], [i - inner.start, j - inner.start], len(inner))
+                among = among + _spread(self.double[i, j], [i - begin, j - begin], len(inner))
         found = []
-        for choice in itertools.product(*map(range, size[:begin])):
-            total = _spread(self._fixed(choice), [0], len(inner)) if outer else 0
+        for choice, stay in zip(choices, fixed.split(1, dim=-1), strict=True):
+            total = _spread(stay, [0], len(inner))
             for axis, j in enumerate(inner):  # small sums first
                 beside = [self.double[i, j][..., choice[i], :] for i in outer if (i, j) in self.double]
                 total = total + _spread(sum(beside, start=self.single[j]), [axis], len(inner))
             found.append(batched_score(scene, (total + among).flatten(2)))
         return torch.cat(found).reshape(size)
-
-    def _fixed(self, choice: tuple[int, ...]) -> Tensor:
-        """Return the field (n, 2 K, 1) of the first planes at these offset numbers, without images in other planes."""
-        single = (self.single[i][..., c : c + 1] for i, c in enumerate(choice))
-        pairs = itertools.combinations(enumerate(choice), 2)
-        waves: Tensor = sum(
-            [*single, *(self.double[i, j][..., a, b : b + 1] for (i, a), (j, b) in pairs if (i, j) in self.double)]
-        )  # type: ignore[assignment]
-        return waves
 
 
 def _spread(waves: Tensor, axes: list[int], k: int) -> Tensor:
