@@ -48,8 +48,8 @@ class SteeringResponses:
 
     def at(self, rows: list[Tensor]) -> SteeringResponses:
         """Return the waves at the given offset numbers (A,) of each plane."""
-        double = {(i, j): waves[:, :, rows[i]][..., rows[j]] for (i, j), waves in self.double.items()}
-        return SteeringResponses([waves[..., r] for waves, r in zip(self.single, rows, strict=True)], double)
+        double = {(i, j): w.index_select(2, rows[i]).index_select(3, rows[j]) for (i, j), w in self.double.items()}
+        return SteeringResponses([w.index_select(2, r) for w, r in zip(self.single, rows, strict=True)], double)
 
     def of_choices(self, rows: list[Tensor]) -> Tensor:
         """Return the fields (n, 2 K, C) of C combinations with these offset numbers (C,) of each plane."""
