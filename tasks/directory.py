@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 import secrets
 import shutil
@@ -24,55 +22,16 @@ from swiftwrf.runtime.threads import set_threads
 from tasks.claim import CONFIG, ENVIRONMENT, LOCK, STEPS, Claim
 from tasks.environment import environment, invocation, now
 from tasks.records import Row, read_json, strict, write_json, write_npz, write_table
+from tasks.resume import PARTIAL, digest
 
-PARTIAL = ".partial"  # suffix of a run that is not finished
 MAX_LABEL = 60  # characters of the label in the name of a directory under runs/
 console = Console(stderr=True, highlight=False)
-
-
-def interrupted(folder: Path) -> Row:
-    """Return the content of an interrupted run's configuration file: task, command and config.
-
-    Raises:
-        InputError: There is no interrupted run, or it stopped before it wrote its configuration.
-    """
-    if not folder.name.endswith(PARTIAL) or not folder.is_dir():
-        raise InputError(f"{folder} is no interrupted run; expected a directory *{PARTIAL} with a {CONFIG}")
-    if not (folder / CONFIG).exists():
-        raise InputError(
-            f"{folder} was stopped before its {CONFIG} was written, so it holds nothing to go on with; start the run again"
-        )
-    return read_json(folder / CONFIG)
-
-
-def saved_config(folder: Path, task: str) -> Row:
-    """Return the configuration of an interrupted run.
-
-    Raises:
-        InputError: There is no such run, it is of another task, or its configuration has changed since it began.
-    """
-    content = interrupted(folder)
-    if content.get("task") != task:
-        raise InputError(
-            f"{folder} is a run of tasks.{content.get('task')}; resume it with that task, not tasks.{task}"
-        )
-    if _digest(content.get("config")) != read_json(folder / ENVIRONMENT).get("config_sha256"):
-        raise InputError(
-            f"{folder / CONFIG} is not what the run began with, and its steps would mix two configurations; restore it or "
-            "start a new run"
-        )
-    config: Row = content["config"]
-    return config
 
 
 def _versions(environment: Row) -> dict[str, str]:
     """Return the versions on which the results of a run depend: of the packages, and the commit of this project."""
     packages = environment.get("packages")
     return (packages if isinstance(packages, dict) else {}) | {"commit": environment.get("commit") or "unknown"}
-
-
-def _digest(config: Any) -> str:
-    return hashlib.sha256(json.dumps(strict(config), sort_keys=True).encode()).hexdigest()
 
 
 @contextmanager
@@ -166,7 +125,7 @@ class Run:
     def _begin(self, task: str, config: Any, device: torch.device, source: dict[str, str]) -> None:
         set_threads(torch.get_num_threads())  # the same call as in a resumed run
         values = asdict(config)
-        self._environment = environment(device, source) | {"config_sha256": _digest(values)}
+        self._environment = environment(device, source) | {"config_sha256": digest(values)}
         self.write_json(ENVIRONMENT, self._environment)
         self.write_json(CONFIG, {"task": task, "command": invocation(task), "config": values})
 

@@ -8,9 +8,10 @@ from augment import withhold
 from swiftwrf import InputError, Spectra, simulated_room
 from swiftwrf.data import read_spectra
 from swiftwrf.data.files import sha256
-from tasks.aoa.condition import MeasuredSubset, fraction_key
+from swiftwrf.data.raytraced import sionna
+from tasks.aoa.condition import MeasuredSubset
 from tasks.aoa.context import Experiment
-from tasks.aoa.options import AoaConfig, check, check_data, n_synthetic
+from tasks.aoa.options import RAYTRACE, AoaConfig, check_data, fraction_key, n_synthetic
 from tasks.aoa.page import page
 from tasks.aoa.results import Results
 from tasks.aoa.steps import Suggestion, first_steps
@@ -30,7 +31,8 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         FitError: A fit diverged, or the connection to the cluster was lost.
     """
     device = choose_device(config.device)
-    check(config)
+    if RAYTRACE in config.synthesizer:
+        sionna()  # refuses before anything is computed
     data = measurements(config)
     for note in data.notes:
         console.print(f"{data.name}: {note}")

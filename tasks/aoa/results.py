@@ -11,9 +11,10 @@ from torch import Tensor
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import angle_errors, covered, l1, psnr, ssim
 from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.condition import AUTO, EVERYTHING, LOCATOR, Condition, MeasuredSubset, fraction_key, pooled
+from tasks.aoa.condition import EVERYTHING, LOCATOR, Condition, MeasuredSubset, pooled
 from tasks.aoa.context import ROOM_MODEL, Experiment
 from tasks.aoa.locating import LEVEL, NO_PLANE, Locating
+from tasks.aoa.options import AUTO, fraction_key
 from tasks.aoa.steps import CrossValidation, Evaluation, RoomSearch, Suggestion, Synthesis, as_bytes
 from tasks.metrics import ANGLES, SCORES, LocatingMetrics, MethodMetrics, MixMetrics, SynthesisMetrics
 from tasks.run import Row, Run, console

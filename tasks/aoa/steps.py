@@ -18,11 +18,12 @@ from swiftwrf.data.store import Store
 from swiftwrf.models import FIELD_MODELS, FieldModel
 from swiftwrf.runtime.checkpoint import read, write
 from tasks.aoa.artifacts import save_artifacts
-from tasks.aoa.condition import AUTO, EVERYTHING, Condition, MeasuredSubset, Training, trainable
+from tasks.aoa.condition import EVERYTHING, Condition, MeasuredSubset, Training, trainable
 from tasks.aoa.context import ROOM_MODEL, Experiment
 from tasks.aoa.cross_validation import STAND_IN, advise, choose_estimator
 from tasks.aoa.estimators import ESTIMATORS, SavedEstimator, make_estimator
 from tasks.aoa.locating import Locating
+from tasks.aoa.options import AUTO
 from tasks.claim import STEPS
 from tasks.metrics import AdviceMetrics
 from tasks.run import Row

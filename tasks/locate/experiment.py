@@ -11,7 +11,7 @@ from swiftwrf import InputError, Rssi, load_rssi, rssi_room
 from tasks.cluster import connected
 from tasks.locate.localizers import LEVELS
 from tasks.locate.observations import write_positions
-from tasks.locate.options import LocateConfig, check
+from tasks.locate.options import LocateConfig
 from tasks.locate.page import page
 from tasks.locate.steps import MIN_ROWS, Experiment, Localization
 from tasks.metrics import LocateMetrics, StudyMetrics
@@ -28,7 +28,6 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     Raises:
         InputError: Data or options that do not exist or do not fit together.
     """
-    check(config)
     if config.model is not None:
         write_positions(config)
         return

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,47 +21,16 @@ from swiftwrf.rssi import LEVEL, RssiModel
 from tasks.cluster import connected
 from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
 from tasks.page.page import reporting
+from tasks.rssi.options import RssiTaskConfig
 from tasks.rssi.page import page
 from tasks.rssi.predictors import PREDICTORS, make_predictor
-from tasks.run import Preset, Row, Run, choose_device, console
-from tasks.source import TableSource, reading
+from tasks.run import Row, Run, choose_device, console
+from tasks.source import reading
 from tasks.summarise import error_summary, grouped
 
 MODEL = "model.safetensors"
 MAP_CELLS = 80  # along the longer side of the floor
 MAX_PLAN_PIXELS = 2**24
-
-
-@dataclass(frozen=True)
-class RssiTaskConfig(TableSource):
-    """RSSI of a moving transmitter at fixed receivers, against baselines.
-
-    Without --data the built-in simulated floor is used. Continue an interrupted run with --resume DIR.partial, and with
-    --scheduler ADDRESS to continue on a cluster.
-    """
-
-    rx: tuple[str, ...]
-    """receivers: names, numbers counted from 1, or all"""
-    data: str | None = None
-    """survey table (CSV or Parquet), or folder with tx_pos.csv, gateway_rssi.csv and gateway_position.yml (NeRF2 layout)"""
-    split: str = "random"
-    """a split that comes with the data, or a seeded one: random or block"""
-    also: tuple[str, ...] = ()
-    """predictors that take minutes and are compared only when named: nerf2, blend"""
-    preset: Preset = "quick"
-    """of SwiftWRF and NeRF2: quick, or paper for the published head and field"""
-    floor_plan: str | None = None
-    """an image to draw behind the maps, PNG or JPEG"""
-    floor_extent: tuple[float, float, float, float] | None = None
-    """x0 x1 y0 y1 of that image [m]"""
-    scheduler: str | None = None
-    """address of a Dask scheduler whose workers fit groups of receivers (extra: cluster)"""
-    seed: int = 0
-    """seed of everything random"""
-    out: str | None = None
-    """directory of the run; must not exist (default: a new one under runs/rssi)"""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """where to compute; RSSI models are small, so auto is the CPU"""
 
 
 def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
@@ -72,8 +40,6 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         InputError: A configuration that the data cannot meet or that contradicts itself.
     """
     device = choose_device("cpu" if config.device == "auto" else config.device)
-    for name in config.also:
-        PREDICTORS[name]  # refuses an unknown one
     plan = _read_floor_plan(config)
     whole = _load(config)
     data, (pool, _) = whole.receivers(config.rx), whole.split(config.split, config.seed)
@@ -122,21 +88,14 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
 
 def _load(config: RssiTaskConfig) -> Rssi:
     if config.data is None:
-        if config.columns:
-            raise InputError("--columns is for a survey table; give it with --data")
         return rssi_room(seed=config.seed)
     return load_rssi(config.data, columns=reading(config).columns)
 
 
 def _read_floor_plan(config: RssiTaskConfig) -> dict[str, Any]:
     """Return the floor plan and its corners as maps.npz stores them, or nothing if there is no plan."""
-    if (config.floor_plan is None) != (config.floor_extent is None):
-        raise InputError("--floor-plan needs --floor-extent x0 x1 y0 y1 [m], and the other way round")
     if config.floor_plan is None or config.floor_extent is None:
         return {}
-    x0, x1, y0, y1 = config.floor_extent
-    if not (x0 < x1 and y0 < y1):
-        raise InputError(f"--floor-extent must be x0 x1 y0 y1 with x0 < x1 and y0 < y1, got {config.floor_extent}")
     try:
         # two formats only: Pillow starts other programs for some; the pixels are read here, since the file may be truncated
         with Image.open(config.floor_plan, formats=("PNG", "JPEG")) as image:

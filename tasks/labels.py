@@ -40,6 +40,12 @@ FIELD_MODELS = {
     "dcgan": Label("a convolutional generator trained against a discriminator (DCGAN)", "#661100"),
 }
 
+BEAMFORMERS = {
+    "phase": Label("from the phases alone, the paper's spectrum of one snapshot"),
+    "bartlett": Label("the fraction of the power that a beam collects"),
+    "capon": Label("minimum variance; needs as many snapshots as elements"),
+}
+
 ESTIMATORS = {
     "aann": Label("the angular neural network (ResNet-50), its head replaced by kernel regression"),
     "kernel_ridge": Label("kernel regression from the spectrum to the direction", "#44aa99"),
