@@ -14,9 +14,10 @@ from typing import TypeVar
 import tyro
 
 from swiftwrf.errors import FitError, InputError, one_line
-from tasks.options import Options
+from tasks.options import OUTPUT, Options
 from tasks.records import Row
 from tasks.resume import saved_config
+from tasks.terminal import terminal
 
 Config = TypeVar("Config", bound=Options)
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -85,7 +86,7 @@ def execute(
     """Parse a command line and run the task.
 
     A resumable task takes a second argument, the directory to resume or None. For such a task `--resume DIR` takes the
-    configuration of an interrupted run, and `--scheduler ADDRESS` after it continues the run on a cluster.
+    configuration of an interrupted run. `--scheduler ADDRESS` continues it on a cluster, and options of `Output` may follow.
 
     Args:
         name: Module of the task, e.g. tasks.aoa.
@@ -101,22 +102,34 @@ def execute(
     match arguments:
         case ["--resume", *_] if not config_type.resumable:
             raise InputError(f"a run of {name} cannot be resumed; start it again")
-        case ["--resume", resumed, *place] if not place or (place[0] == "--scheduler" and len(place) == 2):
-            folder = Path(resumed)
-            values = saved_config(folder, name.removeprefix("tasks.")) | {"scheduler": place[1] if place else None}
-            config = configured(config_type, values, folder)
-        case ["--resume", *_]:
-            raise InputError(
-                "--resume takes one directory, and --scheduler to use a cluster; no other option can change"
-            )
+        case ["--resume", *options]:
+            folder, changed = _resumed(options)
+            config = configured(config_type, saved_config(folder, name.removeprefix("tasks.")) | changed, folder)
         case _:
             description = inspect.cleandoc(config_type.__doc__ or "")
-            config = tyro.cli(config_type, prog=program or f"python -m {name}", description=description, args=arguments)
+            config = tyro.cli(
+                config_type,
+                prog=program or f"python -m {name}",
+                description=description,
+                args=arguments,
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
     config.check()
-    if config_type.resumable:
-        task(config, folder)
-    else:
-        task(config)
+    with terminal.of(config):
+        task(*((config, folder) if config_type.resumable else (config,)))
+
+
+def _resumed(options: Sequence[str]) -> tuple[Path, Row]:
+    """Return the directory after `--resume`, and the options that may change."""
+    shown = {name: True for name in OUTPUT if f"--{name}" in options}
+    match [option for option in options if option.removeprefix("--") not in shown]:
+        case [folder]:
+            return Path(folder), {"scheduler": None, **shown}
+        case [folder, "--scheduler", address]:
+            return Path(folder), {"scheduler": address, **shown}
+    raise InputError(
+        "--resume takes one directory, --scheduler to use a cluster, and --open, --quiet, --json; no other option can change"
+    )
 
 
 def configured(config_type: type[Config], values: Row, folder: Path) -> Config:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 import secrets
+import shlex
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -14,18 +16,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.console import Console
 
 from swiftwrf import InputError
 from swiftwrf.runtime.durable import rename
 from swiftwrf.runtime.threads import set_threads
 from tasks.claim import CONFIG, ENVIRONMENT, LOCK, STEPS, Claim
 from tasks.environment import environment, invocation, now
+from tasks.options import OUTPUT
 from tasks.records import Row, read_json, strict, write_json, write_npz, write_table
 from tasks.resume import PARTIAL, digest
+from tasks.terminal import terminal
 
 MAX_LABEL = 60  # characters of the label in the name of a directory under runs/
-console = Console(stderr=True, highlight=False)
 
 
 def _versions(environment: Row) -> dict[str, str]:
@@ -124,7 +126,7 @@ class Run:
 
     def _begin(self, task: str, config: Any, device: torch.device, source: dict[str, str]) -> None:
         set_threads(torch.get_num_threads())  # the same call as in a resumed run
-        values = asdict(config)
+        values = {name: value for name, value in asdict(config).items() if name not in OUTPUT}
         self._environment = environment(device, source) | {"config_sha256": digest(values)}
         self.write_json(ENVIRONMENT, self._environment)
         self.write_json(CONFIG, {"task": task, "command": invocation(task), "config": values})
@@ -164,19 +166,28 @@ class Run:
         """Write arrays by name."""
         write_npz(self.path(name), arrays)
 
-    def step(self, name: str, compute: Callable[[], Row]) -> Row:
+    def step(self, name: str, title: str, compute: Callable[[], Row]) -> Row:
         """Return the plain values of `compute`, which is called once, also over a resumed run.
+
+        Args:
+            name: Key of the kept result.
+            title: What is computed, for the terminal.
+            compute: Computes the values.
 
         Raises:
             InputError: The kept result is damaged.
         """
         value = self.kept(name)
         if value is None:
-            console.print(f"[bold]{name}[/] ...", end=" " if not console.is_terminal else "\n")
+            terminal.begin(title)
             began = time.perf_counter()
             value = self.keep(name, compute(), time.perf_counter() - began)
-            console.print(f"{time.perf_counter() - began:.1f} s")
+            terminal.end()
         return value
+
+    def holds(self, name: str) -> bool:
+        """Return True if the result of a step is kept."""
+        return self.path(f"{STEPS}/{name}.json").exists()
 
     def kept(self, name: str) -> Row | None:
         """Return the kept result of a step, or None.
@@ -184,9 +195,9 @@ class Run:
         Raises:
             InputError: The kept result is damaged.
         """
-        file = self.path(f"{STEPS}/{name}.json")
-        if not file.exists():
+        if not self.holds(name):
             return None
+        file = self.path(f"{STEPS}/{name}.json")
         value = read_json(file).get("value")
         if not isinstance(value, dict):
             raise InputError(f"{file} does not hold what the step computed; remove it and resume again")
@@ -235,4 +246,4 @@ class Run:
             pass
         else:
             self._claim.release()
-            console.print(f"stopped; go on with [bold]--resume {self.folder}[/]")
+            print(f"stopped; continue with: swiftwrf resume {shlex.quote(str(self.folder))}", file=sys.stderr)

@@ -65,6 +65,21 @@ class Options:
                 raise InputError(f"--seed must be from 0 to {SEEDS - 1}, got {given}")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Output(Options):
+    """Options of what a command shows. They are no part of a run's configuration."""
+
+    open: bool = False
+    """open the report in the browser at the end"""
+    quiet: bool = False
+    """print the answer only, no progress and no notes"""
+    json: bool = False
+    """print the answer as one JSON object, and nothing else"""
+
+
+OUTPUT = tuple(option.name for option in fields(Output))
+
+
 def choice(meaning: str, registry: Registry[Any], known: Mapping[str, labels.Label]) -> Any:
     """Return the annotation of an option that takes names of a registry. Its help lists the names.
 

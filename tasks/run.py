@@ -6,8 +6,9 @@ import torch
 
 from swiftwrf import InputError
 from swiftwrf.runtime.options import Preset
-from tasks.directory import Run, console
+from tasks.directory import Run
 from tasks.records import Row
+from tasks.terminal import console
 from tasks.torchrun import check_gpus
 
 

@@ -94,6 +94,19 @@ class Condition:
         return self.estimator if self.training == "measured" else f"{self.estimator}_{self.training_set}"
 
     @property
+    def meaning(self) -> str:
+        """Training set in words."""
+        match self.training:
+            case "measured":
+                return "measured alone"
+            case "all":
+                return "everything measured"
+            case "turbo":
+                return f"with synthetic spectra ({self.synthesizer})"
+            case "turbo_extra":
+                return f"with {self.n_synthetic:,} further synthetic spectra ({self.synthesizer})"
+
+    @property
     def subset(self) -> MeasuredSubset:
         """Measured spectra of the condition."""
         return MeasuredSubset(self.measured_fraction, self.repeat)

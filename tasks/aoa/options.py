@@ -9,7 +9,7 @@ from swiftwrf.choices import FIELD_MODELS, Moving, check_scene
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.options import Preset
 from tasks import labels
-from tasks.options import SEEDS, SpectraSource, choice, command_options, given
+from tasks.options import SEEDS, Output, SpectraSource, choice, command_options, given
 
 if TYPE_CHECKING:
     from swiftwrf import Spectra
@@ -20,11 +20,13 @@ DEFAULT_EXTRA = 3000  # further synthetic positions where cross-validation recom
 
 
 @command_options
-class AoaConfig(SpectraSource):
+class AoaConfig(SpectraSource, Output):
     """Angle of arrival with few measured spectra: turbo learning against its references and baselines.
 
     Without --data the built-in simulated room is used. --resume DIR.partial continues an interrupted run, on a cluster with
     --scheduler.
+
+    Example: python -m tasks.aoa --mix 0.3 --data DIR --split block
     """
 
     resumable: ClassVar[bool] = True

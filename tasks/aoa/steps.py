@@ -87,6 +87,10 @@ class CrossValidation(Step[Experiment]):
     def name(self) -> str:
         return f"choice-{self.subset}"
 
+    @property
+    def title(self) -> str:
+        return "comparing field models"
+
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.subset)
         seed = experiment.seed(self.subset)
@@ -139,6 +143,10 @@ class RoomSearch(Step[Experiment]):
         return f"room-{self.subset}"
 
     @property
+    def title(self) -> str:
+        return "finding the room"
+
+    @property
     def file(self) -> str:
         """File of the fitted model in the run's directory."""
         return f"{STEPS}/{self.name}.safetensors"
@@ -187,6 +195,10 @@ class Synthesis(Step[Experiment]):
     @property
     def name(self) -> str:
         return f"synthesis_{self.synthesizer}-{self.subset}"
+
+    @property
+    def title(self) -> str:
+        return f"synthesizing spectra by {self.synthesizer}"
 
     @property
     def file(self) -> str:
@@ -302,6 +314,10 @@ class Evaluation(Step[Experiment]):
         return self.condition.result_name
 
     @property
+    def title(self) -> str:
+        return f"training {self.condition.estimator}, {self.condition.meaning}"
+
+    @property
     def reads(self) -> tuple[str, ...]:
         return (self.synthesis.file,) if self.synthesis else ()
 
@@ -350,6 +366,10 @@ class Suggestion(Step[Experiment]):
     @property
     def name(self) -> str:
         return f"suggestion-mix{self.subset.key}"
+
+    @property
+    def title(self) -> str:
+        return "choosing positions to measure next"
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.subset)

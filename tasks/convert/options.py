@@ -12,7 +12,10 @@ from tasks.options import SpectraSource, TableSource, command_options
 
 @command_options
 class ConvertConfig(SpectraSource, TableSource):
-    """Convert measurements of any known format to the toolkit's own layout (see docs/formats.md)."""
+    """Convert measurements of any known format to the toolkit's own layout (see docs/formats.md).
+
+    Example: python -m tasks.convert DIR converted --calibrate
+    """
 
     source: Annotated[str, tyro.conf.Positional]
     """folder or file of measurements"""

@@ -14,10 +14,11 @@ from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMAT
 from swiftwrf.data.writing import write_rssi, write_spectra
 from swiftwrf.diagnostics.calibration import Calibration, calibrate
 from tasks.convert.options import ConvertConfig
-from tasks.directory import console, new_directory
+from tasks.directory import new_directory
 from tasks.environment import invocation
 from tasks.records import write_json
 from tasks.source import reading
+from tasks.terminal import console
 
 
 def run(config: ConvertConfig) -> None:

@@ -11,7 +11,10 @@ from tasks.options import SpectraSource, command_options
 
 @command_options
 class EstimateConfig(SpectraSource):
-    """Directions from spectra, by an estimator that `python -m tasks.aoa` trained and left in its run's directory."""
+    """Directions from spectra, by an estimator that `python -m tasks.aoa` trained and left in its run's directory.
+
+    Example: python -m tasks.estimate runs/aoa/first/aann-mix0.3.safetensors DIR
+    """
 
     estimator: Annotated[str, tyro.conf.Positional]
     """file of the estimator, e.g. runs/aoa/first/aann-mix0.3.safetensors or matched_field-mix0.3.safetensors"""

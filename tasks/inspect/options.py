@@ -6,12 +6,15 @@ from typing import Annotated
 
 import tyro
 
-from tasks.options import SpectraSource, TableSource, command_options
+from tasks.options import Output, SpectraSource, TableSource, command_options
 
 
 @command_options
-class InspectConfig(SpectraSource, TableSource):
-    """What measurements of any known format hold: counts, extents, neighbours, frames, calibration, suspicious columns."""
+class InspectConfig(SpectraSource, TableSource, Output):
+    """What measurements of any known format hold: counts, extents, neighbours, frames, calibration, suspicious columns.
+
+    Example: python -m tasks.inspect DIR
+    """
 
     source: Annotated[str, tyro.conf.Positional]
     """folder or file of measurements"""

@@ -14,6 +14,7 @@ from tasks.inspect.page import page
 from tasks.page.page import write_page
 from tasks.records import write_json
 from tasks.source import reading
+from tasks.terminal import terminal
 
 
 def run(config: InspectConfig) -> None:
@@ -36,7 +37,5 @@ def run(config: InspectConfig) -> None:
         }
         write_json(folder / "inspect.json", content)
         write_page(folder, page(shown, kind, findings))
-    print(f"{config.source}: {kind}")
-    for finding in findings.sentences:
-        print(f"{'! ' if finding.level == 'warning' else '  '}{finding.text}")
-    print(f"page: {out / 'report.html'}")
+    marked = (f"{'! ' if finding.level == 'warning' else '  '}{finding.text}" for finding in findings.sentences)
+    terminal.page(content, "\n".join([f"{config.source}: {kind}", *marked]), out / "report.html")

@@ -17,11 +17,12 @@ from swiftwrf.errors import listed
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
 from swiftwrf.locate.track import joined
 from swiftwrf.metrics import angle_errors
-from tasks.directory import check_new_table, console
+from tasks.directory import check_new_table
 from tasks.locate.localizers import BATCH_ROWS
 from tasks.locate.options import SPECTRA, TABLE, LocateConfig
 from tasks.records import write_table
 from tasks.source import observed_spectra, reading
+from tasks.terminal import console
 
 Columns = dict[str, Tensor]
 MAX_TRACKED = 20_000_000  # candidate positions of a walk that are in memory together

@@ -9,7 +9,7 @@ import tyro
 
 from augment.limits import MAX_SUGGESTIONS
 from swiftwrf.errors import InputError
-from tasks.options import SpectraSource, TableSource, command_options
+from tasks.options import Output, SpectraSource, TableSource, command_options
 
 TABLE = "positions.csv"
 
@@ -19,13 +19,15 @@ SPECTRA = ("array", "beamformer", "grid", "every", "station")
 
 
 @command_options
-class LocateConfig(SpectraSource, TableSource):
+class LocateConfig(SpectraSource, TableSource, Output):
     """Positions of a transmitter from RSSI or spectra.
 
     Without MODEL and SOURCE: compare localizers on a split of measured RSSI, by default of the built-in simulated floor, and
     report their errors. Continue an interrupted run with --resume DIR.partial.
 
     With MODEL and SOURCE: write the positions of new observations to a table.
+
+    Example: python -m tasks.locate --rx all --data DIR
     """
 
     resumable: ClassVar[bool] = True

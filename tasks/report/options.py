@@ -11,7 +11,10 @@ from tasks.options import Options, command_options
 
 @command_options
 class ReportConfig(Options):
-    """One report over several finished runs of one task."""
+    """One report over several finished runs of one task.
+
+    Example: python -m tasks.report runs/rssi/first runs/rssi/second --out runs/report
+    """
 
     runs: Annotated[tuple[str, ...], tyro.conf.Positional]
     """directories of the runs"""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +22,15 @@ from swiftwrf.rssi import LEVEL, RssiModel
 from tasks.cluster import connected
 from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
 from tasks.page.page import reporting
+from tasks.page.records import Records
 from tasks.rssi.options import RssiTaskConfig
 from tasks.rssi.page import page
+from tasks.rssi.page.summary import answer
 from tasks.rssi.predictors import PREDICTORS, make_predictor
-from tasks.run import Row, Run, choose_device, console
+from tasks.run import Row, Run, choose_device
 from tasks.source import reading
 from tasks.summarise import error_summary, grouped
+from tasks.terminal import console, terminal
 
 MODEL = "model.safetensors"
 MAP_CELLS = 80  # along the longer side of the floor
@@ -59,11 +63,10 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         tables = _Tables(config, train, test, plan, directory, options)
         compared = [name for name in PREDICTORS if not PREDICTORS[name].slow or name in config.also]
         left_out = {name: reason for name in compared if (reason := PREDICTORS[name].lacking(data))}
-        for name in compared:
-            if name in left_out:
-                console.print(f"left out: {left_out[name]}")
-            else:
-                tables.add(name)
+        for reason in left_out.values():
+            console.print(f"left out: {reason}")
+        with terminal.progress():
+            tables.add([name for name in compared if name not in left_out])
         directory.computed_on(cluster.machines if cluster else ())
         directory.write_csv("errors.csv", tables.errors)
         directory.write_csv("predictions.csv", tables.predictions)
@@ -83,7 +86,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             "chosen": {"n_primitives": tables.n_primitives},
         }
         final = directory.finish(metrics, reporting(page))
-    console.print(f"report: [bold]{final / 'report.html'}[/]")
+    terminal.answer(answer(Records(final)), final / "report.html")
 
 
 def _load(config: RssiTaskConfig) -> Rssi:
@@ -142,8 +145,15 @@ class _Tables:
         self.from_receiver = distance(test.transmitter_position, test.receiver_position)
         self.from_training = distance(test.transmitter_position, train.transmitter_position).min(dim=1).values
 
-    def add(self, name: str) -> None:
-        """Fit and test one predictor."""
+    def add(self, names: Sequence[str]) -> None:
+        """Fit and test predictors."""
+        terminal.expect(sum(not self.directory.holds(name) for name in names))
+        for name in names:
+            self._add(name)
+            errors = DataFrame(self.errors[-len(self.row) :])["abs_error_db"]
+            terminal.result(name, f"{errors.median():.2f} dB")
+
+    def _add(self, name: str) -> None:
 
         def compute() -> Row:
             config = self.config
@@ -160,7 +170,7 @@ class _Tables:
                 self._write_maps(predictor)
             return result | {"predicted": prediction.mean, "std": prediction.std}
 
-        value = self.directory.step(name, compute)
+        value = self.directory.step(name, f"fitting {name}", compute)
         self.seconds[name] = {"fit": value["fit"], "predict": value["predict"]}
         predicted, measured = torch.tensor(value["predicted"], dtype=torch.float64), self.test.rssi_dbm
         self.errors += _rows(

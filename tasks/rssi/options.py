@@ -6,16 +6,18 @@ from typing import ClassVar, Literal
 
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.options import Preset
-from tasks.options import TableSource, command_options
+from tasks.options import Output, TableSource, command_options
 from tasks.rssi.predictors import PREDICTORS
 
 
 @command_options
-class RssiTaskConfig(TableSource):
+class RssiTaskConfig(TableSource, Output):
     """RSSI of a moving transmitter at fixed receivers, against baselines.
 
     Without --data the built-in simulated floor is used. Continue an interrupted run with --resume DIR.partial, and with
     --scheduler ADDRESS to continue on a cluster.
+
+    Example: python -m tasks.rssi --rx 6 --data DIR
     """
 
     resumable: ClassVar[bool] = True

@@ -8,7 +8,7 @@ import tyro
 
 from swiftwrf.choices import CARRIERS_HZ, ROOMS, SCENE_FILE, Moving, check_scene
 from swiftwrf.errors import InputError
-from tasks.options import Options, command_options
+from tasks.options import Output, command_options
 
 RANGES = {"positions": (2, 100_000), "frequency": CARRIERS_HZ, "order": (0, 8), "scattering": (0, 1)}
 ROOM_HELP = "a Mitsuba scene with radio materials (FILE.xml), or a built-in room: " + "; ".join(
@@ -17,11 +17,13 @@ ROOM_HELP = "a Mitsuba scene with radio materials (FILE.xml), or a built-in room
 
 
 @command_options
-class ScenesConfig(Options):
+class ScenesConfig(Output):
     """Ray paths in a room with furniture or in a scene file of Mitsuba, traced by Sionna RT (extra: raytrace).
 
     The directory holds paths.npz, which --data of the tasks reads, and a page with the room in plan, in space, and with the
     paths of one position.
+
+    Example: python -m tasks.scenes --room office --moving receiver --positions 1000 --out office
     """
 
     room: Annotated[str, tyro.conf.arg(help=ROOM_HELP)]

@@ -14,12 +14,13 @@ from swiftwrf import InputError
 from swiftwrf.data.files import sha256
 from swiftwrf.data.raytraced import ROOMS, FurnishedRoom, Scene, Tracing, trace
 from swiftwrf.data.writing import write_paths
-from tasks.directory import console, new_directory
+from tasks.directory import new_directory
 from tasks.environment import invocation
 from tasks.page.page import write_page
 from tasks.records import write_json
 from tasks.scenes.options import ScenesConfig
 from tasks.scenes.page import page
+from tasks.terminal import console, terminal
 
 MAX_ATTEMPTS = 100  # draws of all positions before the region counts as full
 
@@ -67,7 +68,8 @@ def run(config: ScenesConfig) -> None:
         }
         write_json(folder / "scene.json", record)
         write_page(folder, page(Path(config.room).stem, scene.surfaces, config.moving, paths))
-    print(f"{len(paths.count)} positions with {each:.0f} paths each, traced in {seconds:.0f} s: {config.out}")
+    text = f"{len(paths.count)} positions with {each:.0f} paths each, traced in {seconds:.0f} s: {config.out}"
+    terminal.page(record, text, Path(config.out) / "report.html")
 
 
 def where(config: ScenesConfig) -> tuple[FurnishedRoom | None, Tensor, Tensor]:

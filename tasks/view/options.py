@@ -17,6 +17,8 @@ class ViewConfig(Options):
     """A page to explore a fitted model: drag the moving end and see its spectrum, or hover over a map of RSSI.
 
     Needs the optional extra: pip install 'swiftwrf-tasks[view]'. Ctrl-C ends it.
+
+    Example: python -m tasks.view runs/aoa/first
     """
 
     source: Annotated[str, tyro.conf.Positional]

@@ -14,7 +14,7 @@ from pandas import DataFrame, concat
 from swiftwrf.models import FIELD_MODELS
 from tasks import labels
 from tasks.aoa.page.records import FractionRecords
-from tasks.metrics import AdviceMetrics, GainMetrics
+from tasks.metrics import AdviceMetrics, ChangeMetrics, GainMetrics
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
 from tasks.page.provenance import number
@@ -36,9 +36,7 @@ def advice_sentences(fraction: FractionRecords) -> list[str]:
     """Return a text for each field model that was compared: does turbo learning help?"""
     texts = []
     for name, advice in advice_of(fraction).items():
-        gains = [gain for gain in advice["gains"] if gain["sampled"] == advice["sampled"]]
-        best = min(gains, key=lambda gain: gain["median_deg"])
-        rule = advice.get("rule") or best  # older runs have the best number alone
+        best, rule = _best_and_rule(advice)
         how = "chosen on other held-out spectra" if advice.get("rule") else "chosen on the same spectra"
         found = (
             f"Cross-validation inside the measured fraction ({advice['n_held_out']} spectra held out, {advice['stand_in']} "
@@ -47,14 +45,24 @@ def advice_sentences(fraction: FractionRecords) -> list[str]:
             f"{advice['measured_only_deg']:.2f} to {rule['median_deg']:.2f} degrees, with their number {how}. "
             f"The best number is {best['extra']}."
         )
-        if advice["helps"]:
-            verdict = f"Turbo learning helps here: use --extra {advice['recommended_extra']} with this fraction."
-        elif rule["low"] > 0:
-            verdict = "Turbo learning harms here: measure more instead, or use another synthesizer."
-        else:
-            verdict = "The change is not significant: more measured positions are the safer way."
-        texts.append(f"{found} {verdict}")
+        texts.append(f"{found} {advice_verdict(advice)}")
     return texts
+
+
+def advice_verdict(advice: AdviceMetrics) -> str:
+    """Return in one sentence whether turbo learning helps by a field model."""
+    if advice["helps"]:
+        return f"Turbo learning helps here: use --extra {advice['recommended_extra']} with this fraction."
+    if _best_and_rule(advice)[1]["low"] > 0:
+        return "Turbo learning harms here: measure more instead, or use another synthesizer."
+    return "The change is not significant: more measured positions are the safer way."
+
+
+def _best_and_rule(advice: AdviceMetrics) -> tuple[GainMetrics, ChangeMetrics]:
+    """Return the number with the lowest error, and the number chosen on other folds."""
+    gains = [gain for gain in advice["gains"] if gain["sampled"] == advice["sampled"]]
+    best = min(gains, key=lambda gain: gain["median_deg"])
+    return best, advice.get("rule") or best  # older runs have the best number alone
 
 
 def choice_section(fraction: FractionRecords) -> Section | None:

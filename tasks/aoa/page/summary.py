@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from tasks.aoa.condition import LOCATOR, headline
 from tasks.aoa.estimators import ESTIMATORS
-from tasks.aoa.page.records import FractionRecords
+from tasks.aoa.page.records import AoaRecords, FractionRecords
 from tasks.aoa.page.results import choice_sentence
-from tasks.aoa.page.room import advice_sentences
+from tasks.aoa.page.room import advice_of, advice_sentences, advice_verdict
 from tasks.page.page import Number, Plot, Summary
+from tasks.terminal import Answer
 
 
 def summary(fraction: FractionRecords, picture: Plot) -> Summary:
@@ -42,7 +43,29 @@ def summary(fraction: FractionRecords, picture: Plot) -> Summary:
         *([text] if (text := choice_sentence(fraction)) else []),
         *advice_sentences(fraction),
     ]
-    return Summary(numbers, picture, meaning, _next_steps(fraction))
+    return Summary(numbers, picture, meaning, _next_steps(fraction), verdict(fraction))
+
+
+def answer(run: AoaRecords) -> Answer:
+    """Return what the terminal shows of a run."""
+    fractions = FractionRecords.of(run)
+    rows = []
+    for fraction in fractions:
+        share = {"measured": fraction.percent} if len(fractions) > 1 else {}
+        for method, condition in fraction.conditions.items():
+            names = {"condition": condition.meaning, "estimator": condition.estimator}
+            rows.append((share | names, fraction.mix["methods"][method]["great_circle_deg"]))
+    return Answer("deg", rows, verdict(fractions[0]), _next_steps(fractions[0]))
+
+
+def verdict(fraction: FractionRecords) -> str:
+    """Return whether turbo learning helps with the measured fraction, in one sentence."""
+    advice = next(iter(advice_of(fraction).values()), None)
+    if advice is not None:
+        return advice_verdict(advice)
+    turbo = headline(fraction.conditions.values()).method
+    before, after = (fraction.mix["methods"][name]["great_circle_deg"]["median"] for name in ("measured_only", turbo))
+    return f"Synthetic spectra change the median error of the network from {before:.2f} to {after:.2f} degrees."
 
 
 def _located(fraction: FractionRecords) -> list[Number]:
