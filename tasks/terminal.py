@@ -22,6 +22,7 @@ from tasks.records import strict
 if TYPE_CHECKING:
     from tasks.metrics import ErrorSummary
 
+PLAIN_WIDTH = 140  # characters of a table that is not shown on a terminal
 SPEED_PERIOD_S = 120  # over which the speed is averaged for the time left
 
 
@@ -147,7 +148,8 @@ class Terminal:
         if self._output.json:
             print(json.dumps(strict({**values, "report": str(page)}), allow_nan=False, ensure_ascii=False))
         else:
-            out = Console(file=sys.stdout, highlight=False, soft_wrap=True)
+            width = None if sys.stdout.isatty() else PLAIN_WIDTH
+            out = Console(file=sys.stdout, highlight=False, soft_wrap=True, width=width)
             for part in parts:
                 out.print(part, markup=False)
             out.print(f"report: {page}", markup=False)

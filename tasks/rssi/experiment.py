@@ -17,7 +17,6 @@ from swiftwrf.data.files import sha256
 from swiftwrf.data.splits import validation_for
 from swiftwrf.models.base import Prediction
 from swiftwrf.positions import distance
-from swiftwrf.rasterize import prepare
 from swiftwrf.rssi import LEVEL, RssiModel
 from tasks.cluster import connected
 from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
@@ -54,7 +53,6 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         raise InputError(f"split {config.split!r} of {data.name} has no test rows that detect these receivers")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
-    prepare(device)  # compiles, which no predictor's time should contain
     with (
         connected(config.scheduler, device) as cluster,
         Run("rssi", config.out, label, config, device, source, resume) as directory,
