@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from swiftwrf.runtime.durable import rename
 from swiftwrf.runtime.threads import set_threads
 from tasks.claim import CONFIG, ENVIRONMENT, LOCK, STEPS, Claim
 from tasks.environment import environment, invocation, now
-from tasks.options import OUTPUT
+from tasks.options import plain
 from tasks.records import Row, read_json, strict, write_json, write_npz, write_table
 from tasks.resume import PARTIAL, digest
 from tasks.terminal import terminal
@@ -126,7 +125,7 @@ class Run:
 
     def _begin(self, task: str, config: Any, device: torch.device, source: dict[str, str]) -> None:
         set_threads(torch.get_num_threads())  # the same call as in a resumed run
-        values = {name: value for name, value in asdict(config).items() if name not in OUTPUT}
+        values = plain(config)
         self._environment = environment(device, source) | {"config_sha256": digest(values)}
         self.write_json(ENVIRONMENT, self._environment)
         self.write_json(CONFIG, {"task": task, "command": invocation(task), "config": values})

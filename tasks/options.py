@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, Field, dataclass, fields
+from dataclasses import MISSING, Field, asdict, dataclass, fields
 from typing import Annotated, Any, ClassVar, TypeVar, dataclass_transform
 from unicodedata import category
 
@@ -78,6 +78,11 @@ class Output(Options):
 
 
 OUTPUT = tuple(option.name for option in fields(Output))
+
+
+def plain(config: Any) -> dict[str, Any]:
+    """Return the options of a command as plain values, without those of what it shows."""
+    return {name: value for name, value in asdict(config).items() if name not in OUTPUT}
 
 
 def choice(meaning: str, registry: Registry[Any], known: Mapping[str, labels.Label]) -> Any:

@@ -140,20 +140,22 @@ class Terminal:
         """Print the answer of a run and the place of its report."""
         self._print(found.values(), page, found.table(), "", found.verdict, *(f"- {text}" for text in found.next_steps))
 
-    def page(self, values: Mapping[str, Any], text: str, page: Path) -> None:
-        """Print the text of a command, or its values with `--json`, and the place of its page."""
+    def page(self, values: Mapping[str, Any], text: str, page: Path | None = None) -> None:
+        """Print the text of a command, or its values with `--json`, and the place of its page if it has one."""
         self._print(values, page, text)
 
-    def _print(self, values: Mapping[str, Any], page: Path, *parts: str | Table) -> None:
+    def _print(self, values: Mapping[str, Any], page: Path | None, *parts: str | Table) -> None:
         if self._output.json:
-            print(json.dumps(strict({**values, "report": str(page)}), allow_nan=False, ensure_ascii=False))
+            report = {"report": str(page)} if page else {}
+            print(json.dumps(strict({**values, **report}), allow_nan=False, ensure_ascii=False))
         else:
             width = None if sys.stdout.isatty() else PLAIN_WIDTH
             out = Console(file=sys.stdout, highlight=False, soft_wrap=True, width=width)
             for part in parts:
                 out.print(part, markup=False)
-            out.print(f"report: {page}", markup=False)
-        if self._output.open:
+            if page is not None:
+                out.print(f"report: {page}", markup=False)
+        if self._output.open and page is not None:
             webbrowser.open(page.resolve().as_uri())
 
 

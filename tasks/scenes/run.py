@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from swiftwrf.data.raytraced import ROOMS, FurnishedRoom, Scene, Tracing, trace
 from swiftwrf.data.writing import write_paths
 from tasks.directory import new_directory
 from tasks.environment import invocation
+from tasks.options import plain
 from tasks.page.page import write_page
 from tasks.records import write_json
 from tasks.scenes.options import ScenesConfig
@@ -55,7 +55,7 @@ def run(config: ScenesConfig) -> None:
         each = float(paths.count.double().mean())
         record = {
             "command": invocation("scenes"),
-            "options": asdict(config),
+            "options": plain(config),
             "source_sha256": {Path(config.room).name: sha256(Path(config.room))} if room is None else {},
             "fixed": fixed.tolist(),
             "region": region.tolist(),
