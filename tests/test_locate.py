@@ -11,7 +11,7 @@ import torch
 from swiftwrf import AngularGrid, InputError, load, rssi_room, simulated_room
 from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.locate import MatchedField, Posterior, Region, RssiLocator
-from swiftwrf.locate.likelihood import ResidualDistribution
+from swiftwrf.locate.residuals import ResidualDistribution
 from swiftwrf.locate.pool import pooled_weights
 from swiftwrf.locate.posterior import normalised
 from swiftwrf.locate.region import Cells
@@ -90,7 +90,7 @@ def test_splitting_cells_keeps_their_mass_and_finds_a_narrow_peak():
     def evaluate(position):
         return -((position - peak).square().sum(dim=2) / (2 * 0.002**2))[None]
 
-    found = best_cells(cells, evaluate(cells.position[None])[0], 40, 0, torch.Generator().manual_seed(0))
+    found = best_cells(cells, -evaluate(cells.position[None])[0], 40, 0, torch.Generator().manual_seed(0))
     volume, values = found.log_volume.exp().sum(), evaluate(found.position)
     for _ in range(10):
         found, values = refined(found, normalised(values[0].double() + found.log_volume), values, evaluate, 8)

@@ -22,7 +22,9 @@ from swiftwrf.locate.region import Cells, Region, outside_mass
 from swiftwrf.locate.search import best_cells, refined
 from swiftwrf.locate.spectrum_likelihood import (
     CoarrayLikelihood,
+    Features,
     PathStatistics,
+    PathWaves,
     PhaseLikelihood,
     SpectrumFeatures,
     gain_features,
@@ -38,7 +40,8 @@ from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configurati
 FOLDS = 5
 MIN_SPECTRA = 15
 MAX_LOG_VARIANCE = 30.0  # of path gains in a file
-OBSERVATIONS = 64  # searched at a time
+BATCH_OBSERVATIONS = 32  # searched at a time
+BATCH_CANDIDATES = 2048  # whose waves are computed together: as many as a processor's cache holds
 FIRST_WEIGHTS = (0.05, 0.05, 0.3)  # of the likelihoods, before calibration
 
 
@@ -50,9 +53,9 @@ class MatchedFieldConfig:
     """spacing of the first cells, in wavelengths"""
     max_cells: Annotated[int, Ge(1), Le(4_000_000)] = 400_000
     """number of first cells at most"""
-    n_best: Annotated[int, Ge(1), Le(100_000)] = 500
+    n_best: Annotated[int, Ge(1), Le(100_000)] = 300
     """cells of largest mass that are kept for each spectrum"""
-    n_background: Annotated[int, Ge(0), Le(100_000)] = 200
+    n_background: Annotated[int, Ge(0), Le(100_000)] = 100
     """cells that represent all others"""
     n_split: Annotated[int, Ge(1), Le(10_000)] = 16
     """cells that are split in each round"""
@@ -71,6 +74,31 @@ class _Fit:
     room: GeometryModel
     gains: PathGains
     statistics: PathStatistics
+
+    @property
+    def features(self) -> tuple[Features, Features]:
+        """Co-array numbers by constant and by position-dependent path gains."""
+        return room_features(self.room.array), gain_features(self.room.array, self.gains)
+
+
+@dataclass(frozen=True, eq=False)
+class _Likelihoods:
+    """Likelihoods that share a room."""
+
+    room: GeometryModel
+    parts: tuple[CoarrayLikelihood, CoarrayLikelihood, PhaseLikelihood]
+
+    def __call__(self, position: Tensor, observed: SpectrumFeatures) -> Tensor:
+        """Return log-likelihoods (k, n, m) of n observations at candidates (n, m, 3) [m]."""
+        n, m, _ = position.shape
+        owner = torch.arange(n).repeat_interleave(m)
+        found = []
+        for some, rows in zip(
+            position.reshape(-1, 3).split(BATCH_CANDIDATES), owner.split(BATCH_CANDIDATES), strict=True
+        ):
+            waves, target = PathWaves.at(self.room, some), observed.subset(rows)
+            found.append(torch.stack([part.log_likelihood(waves, target) for part in self.parts]))
+        return torch.cat(found, dim=1).reshape(len(self.parts), n, m)
 
 
 class MatchedField(Saved):
@@ -128,7 +156,7 @@ class MatchedField(Saved):
             some = train.subset(kept.nonzero()[:, 0])
             part = GeometryModel(seed=self.config.seed).fit(some, like=own)
             gains = fit_path_gains(part, scene.subset(kept[rows].nonzero()[:, 0]), kernel)
-            return _Fit(part, gains, PathStatistics.fit(part, some.position, features.phases[kept]))
+            return _Fit(part, gains, PathStatistics.fit(part, some.position, features.subset(kept)))
 
         fold = torch.arange(len(train)) % FOLDS
         parts = [fitted(fold != number) for number in range(FOLDS)]
@@ -147,8 +175,9 @@ class MatchedField(Saved):
         self.residual = torch.empty(2, *features.coarray.shape)
         for number, part in enumerate(parts):
             out = fold == number
-            for kind, predict in enumerate((room_features(part.room), gain_features(part.room, part.gains))):
-                self.residual[kind, out] = predict(position[out]) - features.coarray[out]
+            waves = PathWaves.at(part.room, position[out])
+            for kind, predict in enumerate(part.features):
+                self.residual[kind, out] = predict(waves) - features.coarray[out]
         self.observed_power = float(features.coarray.square().mean())
 
     def _prepare(self) -> None:
@@ -159,17 +188,17 @@ class MatchedField(Saved):
         count = math.prod((extent / spacing).clamp_min(1).tolist())
         self.cells = self.region.cells(int(min(max(count, 1), self.config.max_cells)))
         self.likelihoods = self._likelihoods(self._fit)
-        self._whitened = self.likelihoods[0].whitened(self.cells.position)
+        screen = self.likelihoods.parts[0]
+        batches = self.cells.position.split(BATCH_CANDIDATES)
+        self._whitened = torch.cat([screen.whitened(PathWaves.at(self.room, some)) for some in batches])
 
-    def _likelihoods(
-        self, fit: _Fit, kept: Tensor | None = None
-    ) -> tuple[CoarrayLikelihood, CoarrayLikelihood, PhaseLikelihood]:
+    def _likelihoods(self, fit: _Fit, kept: Tensor | None = None) -> _Likelihoods:
         residual = self.residual if kept is None else self.residual[:, kept]
-        return (
-            CoarrayLikelihood(room_features(fit.room), residual[0], self.observed_power),
-            CoarrayLikelihood(gain_features(fit.room, fit.gains), residual[1], self.observed_power),
-            PhaseLikelihood(fit.room, fit.statistics),
+        constant, varying = (
+            CoarrayLikelihood(predict, part, self.observed_power)
+            for predict, part in zip(fit.features, residual, strict=True)
         )
+        return _Likelihoods(fit.room, (constant, varying, PhaseLikelihood(fit.room, fit.statistics)))
 
     def _calibrate(self, position: Tensor, features: SpectrumFeatures, fold: Tensor, parts: list[_Fit]) -> None:
         """Choose the weights of the likelihoods and the inflation of credible radii by held-out positions."""
@@ -178,8 +207,7 @@ class MatchedField(Saved):
         at_truth, values, volumes, candidates = [], [], [], []
         for number, rows in rows_of.items():
             likelihoods, observed = self._likelihoods(parts[number], fold != number), features.subset(rows)
-            truth = position[rows][:, None]
-            at_truth.append(torch.stack([one.log_likelihood(truth, observed)[:, 0] for one in likelihoods]))
+            at_truth.append(likelihoods(position[rows][:, None], observed)[..., 0])
             for cells, value in self._searched(observed, likelihoods):
                 values.append(value)
                 volumes.append(cells.log_volume)
@@ -190,18 +218,21 @@ class MatchedField(Saved):
         held_out = Posterior(at, normalised(log_mass), self._resolution_m)
         self.inflation = inflation(held_out, position[torch.cat(list(rows_of.values()))])
 
-    def _searched(self, observed: SpectrumFeatures, likelihoods: Any) -> Iterator[tuple[Cells, Tensor]]:
+    def _searched(self, observed: SpectrumFeatures, likelihoods: _Likelihoods) -> Iterator[tuple[Cells, Tensor]]:
         """Yield cells (b, m) and log-likelihoods (k, b, m) of some observations at a time."""
         generator = torch.Generator().manual_seed(self.config.seed)
-        config = self.config
-        for rows in torch.arange(len(observed)).split(OBSERVATIONS):
+        config, screen = self.config, self.likelihoods.parts[0]
+        size = self._whitened.square().sum(dim=1)
+        for rows in torch.arange(len(observed)).split(BATCH_OBSERVATIONS):
             part = observed.subset(rows)
 
             def evaluate(position: Tensor, part: SpectrumFeatures = part) -> Tensor:
-                return torch.stack([one.log_likelihood(position, part) for one in likelihoods])
+                return likelihoods(position, part)
 
-            screened = self.likelihoods[0].from_whitened(self._whitened, part)
-            cells = best_cells(self.cells, screened, config.n_best, config.n_background, generator)
+            target = part.coarray @ screen.distribution.whitening
+            # squared distances up to a constant of each observation
+            away = torch.addmm(size, target, self._whitened.T, alpha=-2)
+            cells = best_cells(self.cells, away, config.n_best, config.n_background, generator)
             values = evaluate(cells.position)
             for _ in range(config.n_rounds):
                 cells, values = refined(cells, self._log_mass(cells, values), values, evaluate, config.n_split)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
-from swiftwrf.locate.likelihood import DEGREES
+from swiftwrf.locate.residuals import DEGREES
 from swiftwrf.models.base import Prediction
 
 MIN_STD_DB = 0.5
