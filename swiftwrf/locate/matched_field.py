@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Annotated, Any, ClassVar, Self
 
 import torch
@@ -35,6 +35,7 @@ from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.path_gains import PathGains, fit_path_gains, prior
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
+from swiftwrf.runtime.options import Configured
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 
 FOLDS = 5
@@ -101,7 +102,7 @@ class _Likelihoods:
         return torch.cat(found, dim=1).reshape(len(self.parts), n, m)
 
 
-class MatchedField(Saved):
+class MatchedField(Configured, Saved):
     """Posterior over the position of the moving end, given a spectrum.
 
     Three likelihoods are pooled: co-array numbers predicted by constant path gains, by position-dependent path gains, and
@@ -111,6 +112,9 @@ class MatchedField(Saved):
     Args:
         config: Options as one object. Defaults to `MatchedFieldConfig()`.
         options: Single options, which replace those of `config`.
+
+    Raises:
+        InputError: An unknown option, or a value outside its range.
 
     Example:
         >>> import swiftwrf
@@ -123,9 +127,8 @@ class MatchedField(Saved):
     """
 
     kind: ClassVar[str] = "matched-field locator"
-
-    def __init__(self, config: MatchedFieldConfig | None = None, **options: Any) -> None:
-        self.config = replace(config or MatchedFieldConfig(), **options)
+    config_type: ClassVar[type[MatchedFieldConfig]] = MatchedFieldConfig
+    config: MatchedFieldConfig
 
     def fit(self, train: Spectra, *, room: FieldModel | None = None, progress: bool = False) -> Self:
         """Fit the likelihoods to measured spectra and return the locator.
@@ -261,7 +264,9 @@ class MatchedField(Saved):
         parts = list(self._searched(observed, self.likelihoods))
         position = torch.cat([cells.position for cells, _ in parts])
         log_weight = torch.cat([self._log_mass(cells, values) for cells, values in parts])
-        return Posterior(position, log_weight, self._resolution_m, self.inflation)
+        # within half a wavelength the field changes too little for a second mode
+        width = self.room.array.wavelength / 2
+        return Posterior(position, log_weight, self._resolution_m, self.inflation, width)
 
     @property
     def _resolution_m(self) -> float:

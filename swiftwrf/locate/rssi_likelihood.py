@@ -91,6 +91,18 @@ class ValueLikelihood:
                 distance[some] = (error @ whitening).square().sum(dim=2)
         return distance, determinant, detected.sum(dim=1, keepdim=True).float()
 
+    def sample(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+        """Sample standardised errors, float64 (*shape, R)."""
+        white = torch.randn(*shape, len(self.correlation), generator=generator, dtype=torch.float64)
+        noise: Tensor = white @ torch.linalg.cholesky(self.correlation).T
+        if math.isinf(self.degrees):
+            return noise
+        # a Student variable is a Gaussian one over the root of a scaled chi-squared one
+        rng = np.random.default_rng(int(torch.randint(2**31, (), generator=generator)))
+        chi_squared = torch.from_numpy(rng.chisquare(self.degrees, shape))
+        scale: Tensor = (chi_squared / self.degrees).sqrt()
+        return noise / scale[..., None]
+
     def log_likelihood(self, maps: RssiMaps, rssi: Tensor) -> Tensor:
         """Return log-likelihoods (n, m) of RSSI (n, R) [dBm] at candidates with maps (m, R)."""
         return _density(*self._parts(maps, rssi.float()), self.degrees)
