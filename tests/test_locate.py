@@ -189,6 +189,15 @@ def test_rssi_is_located_better_than_by_fingerprints(floor):
     assert found.median() < nearest.median()
 
 
+def test_the_prior_region_can_be_given(floor, tmp_path):
+    train, test, _ = floor
+    corner = Region(train.transmitter_position[train.transmitter_position[:, 0] < 5], margin=0.0, outside=0.01)
+    locator = RssiLocator(n_cells=600).fit(train, region=corner)
+    assert locator.locate(test.rssi_dbm).median[:, 0].max() < 5.5
+    locator.save(tmp_path / "locator.safetensors")
+    assert torch.equal(load(tmp_path / "locator.safetensors").cells.position, locator.cells.position)
+
+
 @pytest.mark.parametrize("locator", [MatchedField, RssiLocator])
 def test_unknown_options_are_refused(locator):
     with pytest.raises(InputError, match="has no option 'cells'"):

@@ -130,12 +130,21 @@ class MatchedField(Configured, Saved):
     config_type: ClassVar[type[MatchedFieldConfig]] = MatchedFieldConfig
     config: MatchedFieldConfig
 
-    def fit(self, train: Spectra, *, room: FieldModel | None = None, progress: bool = False) -> Self:
+    def fit(
+        self,
+        train: Spectra,
+        *,
+        room: FieldModel | None = None,
+        region: Region | None = None,
+        progress: bool = False,
+    ) -> Self:
         """Fit the likelihoods to measured spectra and return the locator.
 
         Args:
             train: Measured spectra, at least 15, with array, rotation and fixed end.
             room: Fitted model of the scene with a room. Defaults to a search for the room.
+            region: Prior over positions. Defaults to the neighbourhood of the training positions, with the mass outside from
+                held-out ones.
             progress: Show a progress bar on a terminal.
 
         Raises:
@@ -165,9 +174,9 @@ class MatchedField(Configured, Saved):
         parts = [fitted(fold != number) for number in range(FOLDS)]
         self._set_residuals(train.position, features, fold, parts)
         self._fit = fitted(torch.ones_like(fold, dtype=torch.bool))
-        self.known = train.position
+        held_out = [train.position[fold == number] for number in range(FOLDS)]
         others = [Region(train.position[fold != number]) for number in range(FOLDS)]
-        self.outside = outside_mass(others, [train.position[fold == number] for number in range(FOLDS)])
+        self.region = region or Region(train.position, outside=outside_mass(others, held_out))
         self._prepare()
         self.weight, self.inflation = torch.tensor(FIRST_WEIGHTS, dtype=torch.float64), 1.0
         self._calibrate(train.position, features, fold, parts)
@@ -185,7 +194,6 @@ class MatchedField(Configured, Saved):
 
     def _prepare(self) -> None:
         """Compute what all spectra share: cells of the region and their predicted co-array numbers."""
-        self.region = Region(self.known, outside=self.outside)
         extent = self.region.extent
         spacing = self.config.spacing * self.room.array.wavelength
         count = math.prod((extent / spacing).clamp_min(1).tolist())
@@ -291,16 +299,15 @@ class MatchedField(Configured, Saved):
         own = {
             "statistics": self._fit.statistics.raw,
             "residual": self.residual,
-            "known": self.known,
             "weight": self.weight,
         }
+        at, prior_values = self.region.state()
         plain = {
             "locator": asdict(self.config),
-            "outside": self.outside,
             "observed_power": self.observed_power,
             "inflation": self.inflation,
         }
-        return tensors | gains | own, header | values | plain
+        return tensors | gains | own | at, header | values | plain | prior_values
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
@@ -308,22 +315,22 @@ class MatchedField(Configured, Saved):
         locator = cls(MatchedFieldConfig(**header["locator"]))
         room = GeometryModel.from_state(tensors, header)
         features = 2 * len(differences(room.array))
-        n, known = tensors["residual"].shape[1], len(tensors["known"])
+        n, known = tensors["residual"].shape[1], len(tensors["region"])
         shapes = {
             "statistics": (4 + len(room.planes),),
             "residual": (2, n, features),
-            "known": (known, 3),
+            "region": (known, 3),
             "weight": (3,),
         }
         expect(tensors, shapes)
-        if n < MIN_SPECTRA or known < MIN_SPECTRA or bool((tensors["statistics"].abs() > MAX_LOG_VARIANCE).any()):
+        if n < MIN_SPECTRA or bool((tensors["statistics"].abs() > MAX_LOG_VARIANCE).any()):
             raise InputError("residuals, positions or variances are not those of a fitted locator")
         process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True, prefix="path_gains.")
         gains = PathGains(process, len(room.image_sources()[0]))
         locator.grid, locator.room = room.grid, room
         locator._fit = _Fit(room, gains, PathStatistics.of(tensors["statistics"]))
-        locator.residual, locator.known, locator.weight = (tensors[name] for name in ("residual", "known", "weight"))
-        locator.outside, locator.observed_power = float(header["outside"]), float(header["observed_power"])
+        locator.residual, locator.weight = tensors["residual"], tensors["weight"]
+        locator.region, locator.observed_power = Region.from_state(tensors, header), float(header["observed_power"])
         locator.inflation = _positive(header["inflation"])
         locator._prepare()
         return locator

@@ -80,12 +80,21 @@ class RssiLocator(Configured, Saved):
     config_type: ClassVar[type[RssiLocatorConfig]] = RssiLocatorConfig
     config: RssiLocatorConfig
 
-    def fit(self, train: Rssi, *, model: RssiModel | None = None, progress: bool = False) -> Self:
+    def fit(
+        self,
+        train: Rssi,
+        *,
+        model: RssiModel | None = None,
+        region: Region | None = None,
+        progress: bool = False,
+    ) -> Self:
         """Fit the likelihoods to measured rows and return the locator.
 
         Args:
             train: Measured rows, at least 10.
             model: Radio maps fitted to the same rows. Fitted by default.
+            region: Prior over positions. Defaults to the neighbourhood of the training positions, with the mass outside from
+                held-out ones.
             progress: Show a progress bar on a terminal.
 
         Raises:
@@ -99,7 +108,7 @@ class RssiLocator(Configured, Saved):
         fold = folds(known, config.validation, config.seed)
         numbers = tracked(fold.unique().tolist(), "held-out folds", progress)
         parts = [self._part(train, fold, number) for number in numbers]
-        self.region = Region(
+        self.region = region or Region(
             known,
             BLOCK_MARGIN if config.validation == "block" else 0.03,
             outside_mass([Region(known[part.kept]) for part in parts], [known[part.out] for part in parts]),
@@ -249,11 +258,10 @@ class RssiLocator(Configured, Saved):
             "k": self.fingerprints.k,
             "degrees": None if math.isinf(self.values.degrees) else self.values.degrees,
             "detections": asdict(self.detections),
-            "margin": self.region.margin,
-            "outside": self.region.outside,
             "inflation": self.inflation,
         }
-        return tensors | own, header | plain
+        at, prior = self.region.state()
+        return tensors | own | at, header | plain | prior
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
@@ -279,7 +287,7 @@ class RssiLocator(Configured, Saved):
         locator.fingerprints = FingerprintLikelihood(
             tensors["known"], tensors["fingerprint"], locator.floor_dbm, k, tensors["scale_m"]
         )
-        locator.region = Region(tensors["known"], float(header["margin"]), float(header["outside"]))
+        locator.region = Region.from_state(tensors, header)
         locator.cells = locator.region.cells(locator.config.n_cells)
         locator.weight, locator.inflation = tensors["weight"], float(header["inflation"])
         if not 0 < locator.inflation < math.inf:
