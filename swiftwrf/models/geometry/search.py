@@ -80,12 +80,6 @@ class Search:
         self.offsets = [n + torch.arange(self.step, reach, self.step, dtype=torch.float64) for n in near]
         self.direct = batched(scene.wave(scene.transmitter))
 
-    def few(self) -> Search:
-        """Return the search at few of the positions."""
-        few = Search(self.scene.few(), self.reach, self.signs)
-        few.offsets = self.offsets
-        return few
-
     @cached_property
     def single(self) -> list[Tensor]:
         """Waves of a plane on each side at all its offsets."""
@@ -242,7 +236,7 @@ class Search:
         responses = self.responses(alternatives)
         for k in MAX_ALTERNATIVES:
             yield self.refined(self.moves(alternatives, responses, k, N_REFINED), SEARCH_ORDER)[0]
-        few, aliases = self.few(), self.aliases(room)
+        few, aliases = Search(self.scene.few(), self.reach, self.signs), self.aliases(room)
         yield self.refined(few.moves(aliases, few.responses(aliases), 6, N_REFINED), SEARCH_ORDER)[0]
 
 
@@ -263,8 +257,7 @@ def find_room(
         return SIGNS[0], nothing
     for signs in SIGNS:
         search = Search(scene, reach, signs)
-        found = [search.few().beam(width, order)[0] for order in (SEARCH_ORDER, 1)]
-        starts += [(start, search) for start in search.refined(found, SEARCH_ORDER)]
+        starts += [(search.beam(width, order)[0], search) for order in (SEARCH_ORDER, 1)]
     best: tuple[Tensor, CandidateRoom] | None = None
     for start, search in sorted(starts, key=lambda s: s[0].score):
         if best is None or PERFECT_SCORE < start.score < MAX_START_RATIO * best[1].score:
