@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tasks.aoa.condition import Condition, conditions_of, headline
+from tasks.aoa.former import with_present_names
 from tasks.metrics import AoaMetrics, ErrorSummary, MixMetrics, RssiMetrics
 
 ROOT = Path(__file__).parent.parent
@@ -15,7 +16,7 @@ RESULTS = ROOT / "benchmarks" / "results"
 
 def load(name: str) -> dict[str, Any]:
     """Return one result."""
-    content: dict[str, Any] = json.loads((RESULTS / f"{name}.json").read_text())
+    content: dict[str, Any] = with_present_names(json.loads((RESULTS / f"{name}.json").read_text()))
     return content
 
 

@@ -28,7 +28,7 @@ from tasks.aoa.estimators import make_estimator
 from tasks.aoa.locating import LEVEL, NO_PLANE, located
 
 N_LOCATED = 200  # spectra whose time is measured
-KERNEL = "kernel_ridge"
+KERNEL = "kernel_regression"
 Row = dict[str, Any]
 
 

@@ -30,13 +30,13 @@ def synthesis() -> str:
 
 def aoa() -> str:
     """Return median angular errors of the conditions of each run."""
-    fixed = ("nearest_spectrum", "kernel_ridge", "measured_only")
+    fixed = ("nearest_spectrum", "kernel_regression", "measured_only")
     columns = [
         "scene, split, moving end",
         "measured",
         *fixed,
         "turbo",
-        "turbo, kernel_ridge",
+        "turbo, kernel_regression",
         "measured_all",
         "synthesizer",
     ]
@@ -45,7 +45,7 @@ def aoa() -> str:
         metrics = result["metrics"]
         scene = f"{metrics['data']}, {metrics['split']}, {metrics['moving']}"
         methods, turbo = mix["methods"], turbo_condition(mix)
-        names = (*fixed, turbo.method, replace(turbo, estimator="kernel_ridge").method, "measured_all")
+        names = (*fixed, turbo.method, replace(turbo, estimator="kernel_regression").method, "measured_all")
         cells = [interval(methods[name]["great_circle_deg"]) if name in methods else "" for name in names]
         rows.append([scene, f"{float(share):.0%}", *cells, _synthesizer(turbo)])
     return markdown(columns, rows)

@@ -1,6 +1,6 @@
 """Cross-validation on the measured spectra: do synthetic spectra reduce the error, how many, and which estimator is best?
 
-Kernel ridge regression stands in for the network, because it trains in a second. Withheld spectra and test spectra take no
+Kernel regression stands in for the network, because it trains in a second. Withheld spectra and test spectra take no
 part. The number of synthetic positions is chosen by the errors, so the error at the chosen number is too optimistic. The
 interval is therefore that of the rule: for each fold, the number is chosen on the other folds.
 """
@@ -26,12 +26,12 @@ from swiftwrf.metrics import angle_errors
 from swiftwrf.runtime.threads import single_thread
 from tasks.aoa.condition import LOCATOR
 from tasks.aoa.estimators import make_estimator
-from tasks.metrics import AdviceMetrics, ChangeMetrics, EstimatorChoiceMetrics
+from tasks.metrics import AdviceMetrics, EstimatorChoiceMetrics
+from tasks.summarise import paired_change
 
-STAND_IN = "kernel_ridge"
+STAND_IN = "kernel_regression"
 N_SYNTHETIC_CANDIDATES = (300, 1000, 3000)
 N_SYNTHETIC_COMPARED = 1000  # number of positions at which predicted means and samples are compared
-N_BOOTSTRAP = 2000
 MAX_LOCATED = 60  # held-out spectra of a fold that are located
 FOLD_LOCATOR = MatchedFieldConfig(n_calibration=40, max_cells=100_000)  # half the time of the defaults
 Errors = NDArray[np.float64]
@@ -76,7 +76,7 @@ def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> Advice:
         """Choose the number of positions, and whether to sample, by the errors of some folds."""
         means = errors(some, compared)
         # samples must be significantly better than means
-        sampled = folds[0].model.samples and _change(means, errors(some, compared, True))["high"] < 0
+        sampled = folds[0].model.samples and paired_change(means, errors(some, compared, True))["high"] < 0
         return min(numbers, key=lambda number: float(np.median(errors(some, number, sampled)))), sampled
 
     alone = [fold_errors(fold, 0, False) for fold in every]
@@ -96,10 +96,10 @@ def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> Advice:
     best, sampled = chosen(every)
     for with_samples in (False, True) if folds[0].model.samples else (False,):
         for number in numbers if with_samples == sampled else [compared]:
-            change = _change(measured_only, errors(every, number, with_samples))
+            change = paired_change(measured_only, errors(every, number, with_samples))
             advice["gains"].append({"extra": number, "sampled": with_samples, **change})
     by_rule = [fold_errors(fold, *chosen([other for other in every if other != fold])) for fold in every]
-    rule = advice["rule"] = _change(measured_only, np.concatenate(by_rule))
+    rule = advice["rule"] = paired_change(measured_only, np.concatenate(by_rule))
     advice["sampled"] = sampled
     # a gain at one number of positions alone is likely chance, because few spectra are held out
     if all(gain["change"] < 0 for gain in advice["gains"] if gain["sampled"] == sampled):
@@ -167,13 +167,3 @@ def _errors(fold: Fold, n_synthetic: int, sampled: bool, seed: int) -> Errors:
 def _degrees(estimate: Tensor, label: Tensor) -> Errors:
     """Return the angular errors [deg] of directions (n, 2) [rad]."""
     return cast(Errors, angle_errors(estimate, label)["great_circle"].rad2deg().double().numpy())
-
-
-def _change(before: Errors, after: Errors) -> ChangeMetrics:
-    """Return the median of `after`, its relative change against that of `before`, and the change's 95 % bootstrap interval
-    over held-out spectra."""
-    rows = np.random.default_rng(0).integers(len(before), size=(N_BOOTSTRAP, len(before)))
-    medians = np.median(after[rows], axis=1), np.median(before[rows], axis=1)
-    low, high = np.percentile(medians[0] / np.maximum(medians[1], 1e-9) - 1, (2.5, 97.5))
-    change = float(np.median(after) / max(float(np.median(before)), 1e-9) - 1)
-    return {"median_deg": float(np.median(after)), "change": change, "low": float(low), "high": float(high)}

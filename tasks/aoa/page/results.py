@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tasks.aoa.condition import LOCATOR, NETWORK, terms, trainable
+from tasks.aoa.condition import LOCATOR, terms
 from tasks.aoa.page.records import FractionRecords, palette
 from tasks.metrics import Angle, ErrorSummary
 from tasks.page import figures
@@ -101,10 +101,9 @@ def _cdf(fraction: FractionRecords) -> Plot:
 
 def _turbo_cdf(fraction: FractionRecords) -> list[Plot]:
     """Return the paper's figure if there are several field models: the network between its references, one curve a model."""
-    networks = {name: condition for name, condition in fraction.conditions.items() if condition.is_network}
-    if sum(condition.training == "turbo" for condition in networks.values()) < 2:
+    shown = [name for name, condition in fraction.conditions.items() if condition.is_network]
+    if sum(fraction.conditions[name].is_turbo for name in shown) < 2:
         return []
-    shown = [name for name, condition in networks.items() if condition.training != "turbo_extra"]
     own = fraction.table("errors")
     own = own[own["method"].isin(shown)]
     figure, axes = figures.new_figure(1, 2, 12, 3.8)
@@ -114,7 +113,7 @@ def _turbo_cdf(fraction: FractionRecords) -> list[Plot]:
         figures.cdf(ax, fraction.palette, groups, f"{name} error [deg]", limit=limit)
     axes[1].set_ylabel("")
     figures.legend_below(figure, axes[0])
-    caption = "The network with spectra of each synthesizer at the withheld positions, between its references."
+    caption = "The network with spectra of each synthesizer, between its references."
     return [Plot(f"turbo-{fraction.file_name}", figure, caption, own[["repeat", "index", "method", *ERRORS]])]
 
 
@@ -139,16 +138,18 @@ def over_fractions(fractions: list[FractionRecords], name: str) -> Plot:
 
 def over_estimators(fraction: FractionRecords) -> Plot:
     """Return the errors of each trainable estimator on the measured spectra, with synthetic ones, and on all spectra."""
-    estimators, heights = trainable(), {}
-    if any(condition.estimator == LOCATOR for condition in fraction.conditions.values()):
-        estimators.append(LOCATOR)
+    networks = [condition.estimator for condition in fraction.conditions.values() if condition.is_network]
+    trained = {c.estimator for c in fraction.conditions.values() if c.training == "all"} - {LOCATOR}
+    located = any(condition.estimator == LOCATOR for condition in fraction.conditions.values())
+    estimators, heights = sorted(trained, key=lambda name: (name not in networks, name)), {}
+    estimators += [LOCATOR] if located else []
     trainings = {condition.training_set: condition for condition in fraction.conditions.values()}
     for name, condition in trainings.items():
         methods = [replace(condition, estimator=estimator).method for estimator in estimators]
         heights[name] = [_median_and_interval(fraction, method) for method in methods]
-    colours = palette(replace(condition, estimator=NETWORK) for condition in trainings.values())
+    colours = palette(replace(condition, estimator=networks[0]) for condition in trainings.values())
     figure, axes = figures.new_figure(1, 1, 7.2, 4)
-    labels = [f"network ({name})" if name == NETWORK else name.replace("_", " ") for name in estimators]
+    labels = [f"network ({name})" if name in networks else name.replace("_", " ") for name in estimators]
     figures.bars(axes[0], colours, labels, heights, "median great-circle error [deg]")
     figures.legend_below(figure, axes[0])
     caption = f"Median error of each estimator on each training set, {fraction.title}; whiskers: 95 % intervals."

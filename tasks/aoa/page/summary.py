@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from tasks.aoa.condition import LOCATOR, headline
 from tasks.aoa.estimators import ESTIMATORS
+from tasks.aoa.former import FORMER_NAMES
 from tasks.aoa.page.records import FractionRecords
 from tasks.aoa.page.results import choice_sentence
 from tasks.aoa.page.room import advice_sentences
@@ -76,7 +77,7 @@ def _next_steps(fraction: FractionRecords) -> list[str]:
     files = {
         file.name.removesuffix(f"-mix{key}.safetensors") for file in fraction.run.folder.glob(f"*-mix{key}.safetensors")
     }
-    estimators = sorted(files & {*ESTIMATORS, LOCATOR})
+    estimators = sorted(files & {*ESTIMATORS, *FORMER_NAMES, LOCATOR})
     steps += [
         f"Estimate directions: python -m tasks.estimate {name}-mix{key}.safetensors SOURCE." for name in estimators
     ]
