@@ -116,6 +116,11 @@ class Condition:
         return f"{self.method}-{f'r{self.repeat}' if self.training == 'all' else self.subset}"
 
     @property
+    def measured_only(self) -> Condition:
+        """The same estimator on the measured spectra alone."""
+        return replace(self, training="measured", synthesizer="", n_synthetic=0)
+
+    @property
     def is_turbo(self) -> bool:
         """Whether synthetic spectra are part of the training set."""
         return bool(self.synthesizer)
@@ -180,6 +185,25 @@ def headline(conditions: Iterable[Condition]) -> Condition:
         ValueError: No network was trained with synthetic spectra.
     """
     return max((c for c in conditions if c.is_turbo and c.is_network), key=lambda c: c.training == "turbo_extra")
+
+
+def reference_of(conditions: Mapping[str, Condition], error: Mapping[str, float]) -> str:
+    """Return the method with the smallest error among the estimators that are trained on measured spectra alone.
+
+    A gain by synthetic spectra is relative to it. It is chosen by its error on test spectra, which favours it: the gain is
+    not overestimated. Matched-field processing is left out, because it is no regression from spectra to directions.
+
+    Args:
+        conditions: Condition of each method.
+        error: Error of each method.
+
+    Example:
+        >>> conditions = {name: Condition(name, "measured") for name in ("peak", "kernel_regression")}
+        >>> reference_of(conditions, {"peak": 9.0, "kernel_regression": 2.0})
+        'kernel_regression'
+    """
+    alone = [name for name, c in conditions.items() if c.training == "measured" and c.estimator != LOCATOR]
+    return min(alone, key=lambda name: error[name])
 
 
 def pooled(results: list[tuple[Condition, Value]], auto: bool) -> list[tuple[Condition, Value]]:

@@ -10,7 +10,7 @@ from swiftwrf.data import read_spectra
 from swiftwrf.data.files import sha256
 from tasks.aoa.condition import MeasuredSubset, fraction_key
 from tasks.aoa.context import Experiment
-from tasks.aoa.options import AoaConfig, check, check_data, n_synthetic
+from tasks.aoa.options import AoaConfig, check, check_data, n_synthetic, with_preset
 from tasks.aoa.page import page
 from tasks.aoa.results import Results
 from tasks.aoa.steps import Suggestion, first_steps
@@ -30,6 +30,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         FitError: A fit diverged, or the connection to the cluster was lost.
     """
     device = choose_device(config.device)
+    config = with_preset(config)
     check(config)
     data = measurements(config)
     for note in data.notes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 from augment.suggest import MAX_SUGGESTIONS
@@ -17,6 +17,7 @@ from tasks.run import SEEDS, Preset, choice
 from tasks.source import SpectraSource, reading
 
 RAYTRACE = "raytrace"  # the field model that takes --scene
+PAPER_FRACTIONS = (0.1, 0.3, 0.5, 0.7)
 DEFAULT_EXTRA = 3000  # further synthetic positions where cross-validation recommends some
 
 
@@ -28,8 +29,9 @@ class AoaConfig(SpectraSource):
     --scheduler.
     """
 
-    mix: tuple[float, ...]
-    """measured fractions, each in (0, 1]: 0.3 keeps 30 % of the training spectra and synthesizes the others"""
+    mix: tuple[float, ...] = ()
+    """measured fractions, each in (0, 1]: 0.3 keeps 30 % of the training spectra and synthesizes the others (default with
+    --preset paper: 0.1 0.3 0.5 0.7)"""
     data: str | None = None
     """folder or file of spectra, ray paths or array snapshots, see docs/formats.md"""
     split: str = "random"
@@ -47,13 +49,13 @@ class AoaConfig(SpectraSource):
     the room that it estimates from the spectra)"""
     extra: int | None = None
     """number of further synthetic positions in the region of the measured ones (default: 3000 if cross-validation on the
-    measured spectra shows a gain, else none)"""
+    measured spectra shows a gain, else none; none with --preset paper)"""
     suggest: int = 0
     """number of positions to suggest for the next measurements, those that reduce the uncertainty over the region most"""
     moving: Moving | None = None
     """which end moves in the built-in room (default: transmitter)"""
     preset: Preset = "quick"
-    """quick: sized for a CPU; paper: the paper's model and a long training, for a GPU"""
+    """quick: sized for a CPU; paper: the paper's model, network and measured fractions, and a long training, for a GPU"""
     repeats: int = 1
     """runs with different measured spectra and networks, pooled"""
     scheduler: str | None = None
@@ -64,6 +66,19 @@ class AoaConfig(SpectraSource):
     """directory of the run; must not exist (default: a new one under runs/aoa)"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """device to compute on"""
+
+
+def with_preset(config: AoaConfig) -> AoaConfig:
+    """Return the options with those of the paper where --preset paper leaves them open.
+
+    Example:
+        >>> with_preset(AoaConfig(preset="paper")).mix
+        (0.1, 0.3, 0.5, 0.7)
+    """
+    if config.preset != "paper":
+        return config
+    # the paper's training sets contain synthetic spectra at the withheld positions alone
+    return replace(config, mix=config.mix or PAPER_FRACTIONS, extra=config.extra or 0)
 
 
 def check(config: AoaConfig) -> None:

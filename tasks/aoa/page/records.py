@@ -53,6 +53,11 @@ class FractionRecords:
         return conditions_of(self.mix["methods"])
 
     @property
+    def medians(self) -> dict[str, float]:
+        """Median angular error [deg] of each method."""
+        return {name: method["great_circle_deg"]["median"] for name, method in self.mix["methods"].items()}
+
+    @property
     def in_overviews(self) -> list[str]:
         """Methods of overviews: networks, and other estimators on the measured spectra. More would hide each other."""
         return [name for name, c in self.conditions.items() if c.is_network or c.training == "measured"]
