@@ -23,7 +23,7 @@ from committed import (
 from comparison_tables import comparison, comparison_counts, comparison_turbo
 from geometry import SIDES, WALLS, nearest
 from locating_tables import locating_rssi, locating_spectra
-from speed_tables import busy, drawing, scaling, scaling_quality, scaling_rssi, size, speed
+from speed_tables import busy, drawing, networks, scaling, scaling_quality, scaling_rssi, size, speed
 from targets import aoa_targets, rssi_targets, synthesis_targets
 
 from tasks.aoa.condition import Condition
@@ -298,6 +298,7 @@ TABLES = {
     "hard_fits": hard_fits,
     "speed": speed,
     "drawing": drawing,
+    "networks": networks,
     "ablation": ablation,
     "comparison": comparison,
     "raytracing": raytracing,
