@@ -7,6 +7,7 @@ interval is therefore that of the rule: for each fold, the number is chosen on t
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -23,7 +24,7 @@ from swiftwrf import FitError, InputError
 from swiftwrf.gp import thinned
 from swiftwrf.locate import MatchedField, MatchedFieldConfig
 from swiftwrf.metrics import angle_errors
-from swiftwrf.runtime.threads import single_thread
+from swiftwrf.runtime.threads import side_by_side
 from tasks.aoa.condition import LOCATOR
 from tasks.aoa.estimators import make_estimator
 from tasks.metrics import AdviceMetrics, EstimatorChoiceMetrics
@@ -35,6 +36,7 @@ N_SYNTHETIC_COMPARED = 1000  # number of positions at which predicted means and 
 MAX_LOCATED = 60  # held-out spectra of a fold that are located
 FOLD_LOCATOR = MatchedFieldConfig(n_calibration=40, max_cells=100_000)  # half the time of the defaults
 Errors = NDArray[np.float64]
+_PREDICTING = threading.Lock()  # folds are computed side by side, but parallel loops of numba take one caller at a time
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,6 @@ class Advice:
     turbo: list[Errors]
 
 
-@single_thread()
 def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> Advice:
     """Return the change of the error on held-out measured spectra by synthetic spectra of one field model.
 
@@ -66,11 +67,11 @@ def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> Advice:
     every = range(len(folds))
 
     @cache
-    def fold_errors(fold: int, number: int, sampled: bool) -> Errors:
-        return _errors(folds[fold], number, sampled, seed)
+    def fold_errors(number: int, sampled: bool) -> list[Errors]:
+        return side_by_side(lambda fold: _errors(fold, number, sampled, seed), folds)
 
     def errors(some: Iterable[int], number: int, sampled: bool = False) -> Errors:
-        return np.concatenate([fold_errors(fold, number, sampled) for fold in some])
+        return np.concatenate([fold_errors(number, sampled)[fold] for fold in some])
 
     def chosen(some: Sequence[int]) -> tuple[int, bool]:
         """Choose the number of positions, and whether to sample, by the errors of some folds."""
@@ -79,7 +80,7 @@ def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> Advice:
         sampled = folds[0].model.samples and paired_change(means, errors(some, compared, True))["high"] < 0
         return min(numbers, key=lambda number: float(np.median(errors(some, number, sampled)))), sampled
 
-    alone = [fold_errors(fold, 0, False) for fold in every]
+    alone = fold_errors(0, False)
     measured_only = np.concatenate(alone)
     advice: AdviceMetrics = {
         "stand_in": STAND_IN,
@@ -98,7 +99,7 @@ def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> Advice:
         for number in numbers if with_samples == sampled else [compared]:
             change = paired_change(measured_only, errors(every, number, with_samples))
             advice["gains"].append({"extra": number, "sampled": with_samples, **change})
-    by_rule = [fold_errors(fold, *chosen([other for other in every if other != fold])) for fold in every]
+    by_rule = [fold_errors(*chosen([other for other in every if other != fold]))[fold] for fold in every]
     rule = advice["rule"] = paired_change(measured_only, np.concatenate(by_rule))
     advice["sampled"] = sampled
     # a gain at one number of positions alone is likely chance, because few spectra are held out
@@ -125,7 +126,8 @@ def choose_estimator(
     compared = {name: np.concatenate(parts) for name, parts in errors.items()}
     scored = range(0, len(folds), len(BLIND_FOLDS[0]))[: len(BLIND_FOLDS)]
     rows = [thinned(torch.arange(len(folds[fold].test)), rows=MAX_LOCATED)[0] for fold in scored]
-    located = [_located_errors(folds[fold], some, seed) for fold, some in zip(scored, rows, strict=True)]
+    compared_folds = [(folds[fold], some) for fold, some in zip(scored, rows, strict=True)]
+    located = side_by_side(lambda item: _located_errors(*item, seed), compared_folds)
     if located and all(found is not None for found in located):
         compared = {
             name: np.concatenate([parts[fold][some.numpy()] for fold, some in zip(scored, rows, strict=True)])
@@ -155,10 +157,11 @@ def _errors(fold: Fold, n_synthetic: int, sampled: bool, seed: int) -> Errors:
     train = Mixed.measured(fold.train)
     if n_synthetic:
         positions = synthetic_positions(fold.train, n_synthetic, seed)
-        if sampled:
-            spectra = fold.model.sample(positions.position, generator=torch.Generator().manual_seed(seed))
-        else:
-            spectra = fold.model.synthesize(positions.position)
+        with _PREDICTING:
+            if sampled:
+                spectra = fold.model.sample(positions.position, generator=torch.Generator().manual_seed(seed))
+            else:
+                spectra = fold.model.synthesize(positions.position)
         train = train.add(positions, spectra.cpu())
     stand_in = make_estimator(STAND_IN, seed=seed).fit(train)
     return _degrees(stand_in.predict(fold.test.spectrum), fold.test.label)
