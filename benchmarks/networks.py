@@ -29,8 +29,8 @@ from swiftwrf.models import FIELD_MODELS
 from tasks.aoa.condition import LOCATOR
 from tasks.aoa.context import ROOM_MODEL
 from tasks.aoa.estimators import make_estimator
-from tasks.aoa.estimators.aann import AANN, AANNConfig
-from tasks.aoa.estimators.aann_kernel import AANNKernel
+from tasks.aoa.estimators.aann import AANN
+from tasks.aoa.estimators.aann_kernel import AANNKernel, AANNKernelConfig
 from tasks.run import Preset
 from tasks.summarise import error_summary, paired_change
 
@@ -136,7 +136,7 @@ def estimates(mixed: Mixed, measured: Spectra, training: Training, held_out: Spe
             locator = MatchedField(seed=config.seed).fit(measured, room=room)
             yield LOCATOR, *finished(began, locator.predict, estimator=LOCATOR)
     for preset, steps in product(config.presets, config.steps):
-        options = AANNConfig.paper() if preset == "paper" else AANNConfig(batch=config.batch)
+        options = AANNKernelConfig.paper() if preset == "paper" else AANNKernelConfig(batch=config.batch)
         began = time.process_time()
         network = TimedNetwork(replace(options, steps=steps, seed=config.seed)).fit(mixed)
         more = {"preset": preset, "steps": steps, "batch": options.batch}

@@ -25,9 +25,9 @@ from swiftwrf.models import FIELD_MODELS, FieldModel
 from swiftwrf.models.geometry import model as geometry
 from tasks.aoa import context, cross_validation, experiment, steps
 from tasks.aoa.condition import Condition, MeasuredSubset, conditions_of, fraction_key, headline
-from tasks.aoa.estimators import ESTIMATORS, aann, nadaraya_watson
+from tasks.aoa.estimators import ESTIMATORS, aann, make_estimator, nadaraya_watson
 from tasks.aoa.estimators.aann import AANN, AANNConfig
-from tasks.aoa.estimators.aann_kernel import AANNKernel
+from tasks.aoa.estimators.aann_kernel import AANNKernel, AANNKernelConfig
 from tasks.aoa.estimators.baselines import Constant, NearestSpectrum, Peak
 from tasks.aoa.estimators.kernel_regression import KernelRegression
 from tasks.aoa.options import AoaConfig
@@ -397,6 +397,9 @@ def test_a_training_is_as_long_as_the_scene_needs():
         (715, 64),
         (1000, 64),
     ]
+    assert [AANNKernelConfig.quick(n).steps for n in (0, 240, 780, 1525, 100_000)] == [30, 30, 98, 191, 1000]
+    assert make_estimator("aann_kernel", 780).config.steps == 98
+    assert make_estimator("aann", 780, "paper").config.steps == AANNConfig.paper().steps
 
 
 def test_whole_run(small, tmp_path):

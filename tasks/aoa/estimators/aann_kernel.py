@@ -8,7 +8,7 @@ training spectra.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from numpy.typing import NDArray
@@ -18,13 +18,23 @@ from augment import Mixed
 from swiftwrf import InputError
 from swiftwrf.array.angles import to_angles
 from swiftwrf.runtime.checkpoint import Header
-from tasks.aoa.estimators.aann import AANN, halved
+from swiftwrf.runtime.validation import PositiveInt, configuration
+from tasks.aoa.estimators.aann import AANN, AANNConfig, halved
 from tasks.aoa.estimators.base import ESTIMATORS
 from tasks.aoa.estimators.nadaraya_watson import NadarayaWatson, coarse_pixels, kept_rows
 from tasks.aoa.estimators.resnet import FEATURES
 
 MAX_FEATURE = 1e4  # larger features are clipped; typical ones are a thousandth of that
 HALF_TRUST_SPECTRA = 1000  # training spectra after which squared distances of features count half
+
+
+@configuration
+class AANNKernelConfig(AANNConfig):
+    """Options of the network and its short training: more steps do not improve the regression on held-out spectra."""
+
+    evaluations: ClassVar[int] = 8
+    steps: PositiveInt = 30
+    """optimisation steps, the same for every training set"""
 
 
 @ESTIMATORS.register("aann_kernel")
@@ -40,6 +50,7 @@ class AANNKernel(AANN):
 
     kind = "kernel regression on the features of an angular neural network"
     former_kinds = ("angle-of-arrival network",)
+    config_type = AANNKernelConfig
 
     def _fit(self, train: Mixed, device: torch.device) -> None:
         prepared, direction = self._fit_network(train, device)
