@@ -648,6 +648,7 @@ def test_advice_is_that_of_each_field_model(small):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
+        (("--seed", 1), "got none"),
         (("--mix", 0), "in (0, 1]"),
         (("--mix", 1.5), "in (0, 1]"),
         (("--mix", 0.3, 0.3), "twice"),
