@@ -28,7 +28,7 @@ from tasks.aoa.locating import LEVEL, NO_PLANE, located
 from tasks.aoa.options import fraction_key
 
 N_LOCATED = 200  # spectra whose time is measured
-KERNEL = "kernel_ridge"
+KERNEL = "kernel_regression"
 Row = dict[str, Any]
 
 

@@ -17,7 +17,7 @@ from swiftwrf import AngularGrid, RssiConfig, RssiModel, rssi_room, simulated_ro
 from swiftwrf.errors import LONGEST
 from swiftwrf.runtime.validation import configuration
 from tasks.aoa import experiment as aoa
-from tasks.aoa.condition import NETWORK
+from tasks.aoa.condition import NETWORKS
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.estimators.baselines import Constant
 from tasks.aoa.options import AoaConfig
@@ -88,7 +88,7 @@ def quick() -> Iterator[None]:
         mock.patch.object(locate, "rssi_room", return_value=rssi_room(n=80)),
         mock.patch.object(RssiModel, "config_type", QuickRssiConfig),
         mock.patch("tasks.rssi.experiment.MAP_CELLS", 8),
-        mock.patch.dict(ESTIMATORS._registered, {NETWORK: QuickNetwork}),
+        mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
         mock.patch.object(PREDICTORS, "_registered", {name: PREDICTORS[name] for name in PREDICTORS_KEPT}),
     ):
         yield

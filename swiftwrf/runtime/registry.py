@@ -42,6 +42,7 @@ class Registry(Mapping[str, type[Made]]):
     def __init__(self, kind: str, group: str | None = None, declared: Mapping[str, str] = MappingProxyType({})) -> None:
         self.kind, self.group = kind, group
         self._registered: dict[str, Any] = dict(declared)  # implementations, and references before their first use
+        self._package: str | None = None  # whose modules register themselves
 
     def register(self, name: str) -> Callable[[Registered], Registered]:
         """Return a decorator that registers a class or function under a name.
@@ -59,6 +60,7 @@ class Registry(Mapping[str, type[Made]]):
 
     def discover(self, package: str, path: list[str], first: tuple[str, ...] = ()) -> None:
         """Import every module of a package, the modules named `first` before the others, so that each registers itself."""
+        self._package = package
         for module in (*first, *sorted(module.name for module in pkgutil.iter_modules(path))):
             importlib.import_module(f"{package}.{module}")
 
@@ -77,7 +79,9 @@ class Registry(Mapping[str, type[Made]]):
 
     def _external(self) -> dict[str, Any]:
         found = _entry_points(self.group, tuple(sys.path)) if self.group else ()
-        return {point.name: point for point in found if point.name not in self._registered}
+        # the installed metadata may be older than the package and name modules that it no longer has
+        others = (point for point in found if not point.module.startswith(f"{self._package}."))
+        return {point.name: point for point in others if point.name not in self._registered}
 
     def __getitem__(self, name: str) -> Any:
         """Return the implementation of that name.

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 AUTO = "auto"  # --synthesizer: the field model that cross-validation chooses
 RAYTRACE = "raytrace"  # the field model that takes --scene
+PAPER_FRACTIONS = (0.1, 0.3, 0.5, 0.7)
 DEFAULT_EXTRA = 3000  # further synthetic positions where cross-validation recommends some
 
 
@@ -31,8 +32,9 @@ class AoaConfig(SpectraSource, Output):
 
     resumable: ClassVar[bool] = True
 
-    mix: tuple[float, ...]
-    """measured fractions, each in (0, 1]: 0.3 keeps 30 % of the training spectra and synthesizes the others"""
+    mix: tuple[float, ...] = ()
+    """measured fractions in (0, 1], required without --preset paper: 0.3 keeps 30 % of the training spectra and synthesizes the
+    others"""
     data: str | None = None
     """folder or file of spectra, ray paths or array snapshots, see docs/formats.md"""
     split: str = "random"
@@ -50,13 +52,13 @@ class AoaConfig(SpectraSource, Output):
     the room that it estimates from the spectra)"""
     extra: int | None = None
     """number of further synthetic positions in the region of the measured ones (default: 3000 if cross-validation on the
-    measured spectra shows a gain, else none)"""
+    measured spectra shows a gain, else none; none with --preset paper)"""
     suggest: int = 0
     """number of positions to suggest for the next measurements, those that reduce the uncertainty over the region most"""
     moving: Moving | None = None
     """which end moves in the built-in room (default: transmitter)"""
     preset: Preset = "quick"
-    """quick: sized for a CPU; paper: the paper's model and a long training, for a GPU"""
+    """quick: sized for a CPU; paper: the paper's model, network and measured fractions, and a long training, for a GPU"""
     repeats: int = 1
     """runs with different measured spectra and networks, pooled"""
     scheduler: str | None = None
@@ -67,6 +69,12 @@ class AoaConfig(SpectraSource, Output):
     """directory of the run; must not exist (default: a new one under runs/aoa)"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """device to compute on"""
+
+    def __post_init__(self) -> None:
+        if self.preset == "paper":
+            # the paper's training sets contain synthetic spectra at the withheld positions alone
+            object.__setattr__(self, "mix", self.mix or PAPER_FRACTIONS)
+            object.__setattr__(self, "extra", self.extra or 0)
 
     def check(self) -> None:
         super().check()

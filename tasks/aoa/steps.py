@@ -18,10 +18,10 @@ from swiftwrf.data.store import Store
 from swiftwrf.models import FIELD_MODELS, FieldModel
 from swiftwrf.runtime.checkpoint import read, write
 from tasks.aoa.artifacts import save_artifacts
-from tasks.aoa.condition import EVERYTHING, Condition, MeasuredSubset, Training, trainable
+from tasks.aoa.condition import EVERYTHING, NETWORKS, Condition, MeasuredSubset, Training, estimators, trainable
 from tasks.aoa.context import ROOM_MODEL, Experiment
 from tasks.aoa.cross_validation import STAND_IN, advise, choose_estimator
-from tasks.aoa.estimators import ESTIMATORS, SavedEstimator, make_estimator
+from tasks.aoa.estimators import SavedEstimator, make_estimator
 from tasks.aoa.locating import Locating
 from tasks.aoa.options import AUTO
 from tasks.claim import STEPS
@@ -43,10 +43,10 @@ def first_steps(experiment: Experiment, subset: MeasuredSubset) -> list[Step[Exp
         return Evaluation(Condition(estimator, training, measured_fraction=fraction, repeat=repeat))
 
     steps: list[Step[Experiment]] = [
-        *(reference(estimator, "measured") for estimator in ESTIMATORS),
+        *(reference(estimator, "measured") for estimator in estimators(experiment.config.preset)),
         *(_syntheses(experiment, subset, named, {}) if named and not compared else [CrossValidation(subset, compared)]),
         # independent of the measured fraction, so all fractions share these steps
-        *(reference(estimator, "all") for estimator in trainable()),
+        *(reference(estimator, "all") for estimator in trainable(experiment.config.preset)),
     ]
     config = experiment.config
     if subset == MeasuredSubset(config.mix[0]) and 1.0 not in config.mix and ROOM_MODEL in candidates(experiment.train):
@@ -288,7 +288,9 @@ class Synthesis(Step[Experiment]):
         return [
             Evaluation(Condition(estimator, training, self.synthesizer, number, fraction, repeat), self)
             for training, number in trainings
-            for estimator in trainable()
+            for estimator in trainable(experiment.config.preset)
+            # a training of the network takes most of the time
+            if training == trainings[-1][0] or estimator not in NETWORKS.values()
         ]
 
 

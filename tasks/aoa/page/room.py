@@ -23,7 +23,7 @@ MARGIN = 0.5  # [m] around the room in a plan
 FIXED, MEASURED, IMAGE = "#cc3311", "#4477aa", "#ee8866"
 
 
-def advice_of(fraction: FractionRecords) -> dict[str, AdviceMetrics]:
+def _advice_of(fraction: FractionRecords) -> dict[str, AdviceMetrics]:
     """Return the cross-validation of each field model, if it has further positions. Older runs have the chosen one alone."""
     advice: dict[str, Any] = dict(fraction.mix["advice"] or {})
     choice = fraction.mix["choice"]
@@ -35,7 +35,7 @@ def advice_of(fraction: FractionRecords) -> dict[str, AdviceMetrics]:
 def advice_sentences(fraction: FractionRecords) -> list[str]:
     """Return a text for each field model that was compared: does turbo learning help?"""
     texts = []
-    for name, advice in advice_of(fraction).items():
+    for name, advice in _advice_of(fraction).items():
         best, rule = _best_and_rule(advice)
         how = "chosen on other held-out spectra" if advice.get("rule") else "chosen on the same spectra"
         found = (
@@ -45,11 +45,11 @@ def advice_sentences(fraction: FractionRecords) -> list[str]:
             f"{advice['measured_only_deg']:.2f} to {rule['median_deg']:.2f} degrees, with their number {how}. "
             f"The best number is {best['extra']}."
         )
-        texts.append(f"{found} {advice_verdict(advice)}")
+        texts.append(f"{found} {_verdict(advice)}")
     return texts
 
 
-def advice_verdict(advice: AdviceMetrics) -> str:
+def _verdict(advice: AdviceMetrics) -> str:
     """Return in one sentence whether turbo learning helps by a field model."""
     if advice["helps"]:
         return f"Turbo learning helps here: use --extra {advice['recommended_extra']} with this fraction."
@@ -84,7 +84,7 @@ def choice_section(fraction: FractionRecords) -> Section | None:
     name = choice["name"]
     meaning = labels.labels(FIELD_MODELS, labels.FIELD_MODELS, [name])
     text = f"{name} predicts held-out measured spectra best" + (f": {meaning[name].meaning}." if meaning else ".")
-    plots = [_gain(fraction, *item) for item in advice_of(fraction).items()]
+    plots = [_gain(fraction, *item) for item in _advice_of(fraction).items()]
     title = f"Which synthesizer, and does it help? ({fraction.percent} measured)"
     return Section(title, [text, *advice_sentences(fraction)], [table], plots)
 
