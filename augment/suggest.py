@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from augment.limits import MAX_SUGGESTIONS
 from augment.positions import sample_positions
 from swiftwrf import InputError, Rssi, Spectra
 from swiftwrf.data.spectra import check_training
@@ -16,7 +17,6 @@ from swiftwrf.locate import RssiLocator
 from swiftwrf.positions import nearest
 
 N_CANDIDATE_POSITIONS = 1500  # positions that are compared
-MAX_SUGGESTIONS = 500
 MAX_MEASURED_POSITIONS = 2000  # measured positions that the variance is conditioned on
 N_SIMULATED_ROWS = 400  # rows of RSSI whose expected position errors are computed
 N_AVERAGED_ROWS = 8  # rows nearest to a candidate, whose mean error is the candidate's
@@ -114,15 +114,7 @@ def _check_count(count: int) -> None:
 
 def _expected_errors(locator: RssiLocator, position: Tensor, generator: torch.Generator) -> Tensor:
     """Return the root-mean-square position error (n,) [m] under the posterior of one simulated row a position (n, 3)."""
-    prediction = locator.model.predict(position)
-    assert prediction.std is not None
-    mean, std = prediction.mean.double(), prediction.std.double()
-    root = torch.linalg.cholesky(locator.values.correlation.double())
-    rssi = mean + std * (torch.randn(mean.shape, generator=generator, dtype=torch.float64) @ root.T)
-    chance = locator.detections.probability(mean)
-    detected = torch.rand(mean.shape, generator=generator, dtype=torch.float64) < chance
-    detected[torch.arange(len(mean)), chance.argmax(dim=1)] = True  # a row that no receiver detects is not located
-    rssi = rssi.where(detected, torch.nan)
+    rssi = locator.sample(position, 1, generator)[0]
     errors = []
     for at, rows in zip(position.split(BATCH_ROWS), rssi.split(BATCH_ROWS), strict=True):
         posterior = locator.locate(rows)

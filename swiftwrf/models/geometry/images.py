@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.spectra import Moving
+from swiftwrf.choices import Moving
 from swiftwrf.models.geometry.chain import ElementChain
 
 MAX_COSINE = 0.02  # of two planes that count as perpendicular; above 1 - MAX_COSINE**2 they count as parallel
