@@ -24,17 +24,17 @@ from swiftwrf.metrics import angle_errors
 from swiftwrf.models import FIELD_MODELS, FieldModel
 from swiftwrf.models.geometry import model as geometry
 from tasks.aoa import context, cross_validation, experiment, steps
-from tasks.aoa.condition import Condition, MeasuredSubset, conditions_of, fraction_key, headline
+from tasks.aoa.condition import Condition, MeasuredSubset, conditions_of, headline
 from tasks.aoa.estimators import ESTIMATORS, aann, make_estimator, nadaraya_watson
 from tasks.aoa.estimators.aann import AANN, AANNConfig
 from tasks.aoa.estimators.aann_kernel import AANNKernel, AANNKernelConfig
 from tasks.aoa.estimators.baselines import Constant, NearestSpectrum, Peak
 from tasks.aoa.estimators.kernel_regression import KernelRegression
-from tasks.aoa.options import AoaConfig
+from tasks.aoa.options import AoaConfig, fraction_key
 from tasks.aoa.page.records import palette
+from tasks.command_line import command_line
 from tasks.page.palette import Palette
-from tasks.report import merge
-from tasks.run import command_line
+from tasks.report.run import merge
 
 TINY_FIT = FitConfig(model=ModelConfig(n_primitives=8), steps=20, check_every=10)
 

@@ -26,9 +26,9 @@ from tasks.aoa.condition import LOCATOR, NETWORKS
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.locating import Locating, containing_level
 from tasks.aoa.options import AoaConfig
-from tasks.estimate import EstimateConfig
-from tasks.estimate import run as estimate
-from tasks.run import command_line
+from tasks.command_line import command_line
+from tasks.estimate.options import EstimateConfig
+from tasks.estimate.run import run as estimate
 
 PLANES = {(0.0, 0.0, -1.0): 0.0, (1.0, 0.0, 0.0): 5.0, (0.0, 1.0, 0.0): 4.0}  # outward normal to offset [m]
 FEW_CELLS = MatchedFieldConfig(max_cells=3000, n_best=60, n_background=20, n_rounds=2, n_calibration=40)

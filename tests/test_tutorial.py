@@ -14,8 +14,8 @@ from small import glances
 from swiftwrf import RssiConfig, RssiModel
 from tasks.aoa.condition import NETWORKS
 from tasks.aoa.estimators import ESTIMATORS
+from tasks.command_line import command_line
 from tasks.rssi.predictors import PREDICTORS
-from tasks.run import command_line
 
 TEXT = (Path(__file__).parent.parent / "docs" / "tutorial.md").read_text()
 PARTS = re.split(r"^## ", TEXT, flags=re.MULTILINE)[1:]

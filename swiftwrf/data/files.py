@@ -17,11 +17,11 @@ import torch
 import yaml
 from torch import Tensor
 
+from swiftwrf.choices import CARRIERS_HZ
 from swiftwrf.errors import InputError
 
 MAX_TEXT_BYTES = 2**28  # a million rows of positions take a tenth of it
 MAX_COORDINATE_M = 1e9  # beyond, float64 does not resolve a wavelength
-CARRIERS_HZ = (1e6, 1e13)
 DECIMAL_COMMA = re.compile(r"^(\s*[+-]?\d+),(\d+\s*)$")
 PLAIN_TAGS = {
     f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "timestamp", "seq", "map")

@@ -9,6 +9,7 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, ClassVar
@@ -22,6 +23,7 @@ from swiftwrf.errors import InputError
 from swiftwrf.runtime.durable import write_bytes
 
 FORMAT = 1
+DEFINING_PACKAGES = ("swiftwrf.models", "swiftwrf.comparison", "swiftwrf.rssi", "swiftwrf.locate")  # of saved kinds
 EXTENSION_GROUPS = ("swiftwrf.models", "swiftwrf.estimators")  # entry points of packages that define saved kinds
 Header = dict[str, Any]  # values that JSON can store
 
@@ -139,12 +141,14 @@ def load(path: str | Path) -> Saved:
     """
     with suppress(OSError, SafetensorError), safe_open(path, framework="pt") as file:
         if (file.metadata() or {}).get("kind") not in Saved.kinds:
-            _import_extensions()
+            _import_kinds()
     return restore(path, *Saved.kinds)[0]
 
 
-def _import_extensions() -> None:
-    """Import all packages that define saved kinds; those that cannot be imported define none."""
+def _import_kinds() -> None:
+    """Import all packages that define saved kinds; those of others that cannot be imported define none."""
+    for package in DEFINING_PACKAGES:
+        import_module(package)
     for point in (point for group in EXTENSION_GROUPS for point in entry_points(group=group)):
         with suppress(Exception):  # code of another package may raise anything
             point.load()

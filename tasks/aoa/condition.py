@@ -8,27 +8,16 @@ from itertools import product
 from typing import Any, Literal, TypeVar, get_args
 
 from swiftwrf.models import FIELD_MODELS
+from tasks import labels
 from tasks.aoa.estimators import ESTIMATORS
-from tasks.page import labels
+from tasks.aoa.options import AUTO, fraction_key
 from tasks.run import Preset, Row
 
 Training = Literal["measured", "turbo", "turbo_extra", "all"]
 NETWORKS: dict[Preset, str] = {"quick": "aann_kernel", "paper": "aann"}
 """network that a run of each preset trains; names of its conditions omit it"""
 LOCATOR = "matched_field"  # estimator that locates the moving end by the room; it needs positions, array and fixed end
-AUTO = "auto"  # --synthesizer: the field model that cross-validation chooses
 Value = TypeVar("Value")
-
-
-def fraction_key(fraction: float) -> str:
-    """Return the shortest text that reads back as the same number, for keys and file names.
-
-    Example:
-        >>> fraction_key(0.3), fraction_key(1.0), fraction_key(0.6666667)
-        ('0.3', '1', '0.6666667')
-    """
-    short = f"{fraction:g}"
-    return short if float(short) == fraction else repr(fraction)
 
 
 @dataclass(frozen=True)
@@ -104,6 +93,19 @@ class Condition:
         if self.is_network:
             return self.training_set
         return self.estimator if self.training == "measured" else f"{self.estimator}_{self.training_set}"
+
+    @property
+    def meaning(self) -> str:
+        """Training set in words."""
+        match self.training:
+            case "measured":
+                return "measured alone"
+            case "all":
+                return "everything measured"
+            case "turbo":
+                return f"with synthetic spectra ({self.synthesizer})"
+            case "turbo_extra":
+                return f"with {self.n_synthetic:,} further synthetic spectra ({self.synthesizer})"
 
     @property
     def subset(self) -> MeasuredSubset:

@@ -11,23 +11,16 @@ from torch import Tensor
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import angle_errors, covered, l1, psnr, ssim
 from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.condition import (
-    AUTO,
-    EVERYTHING,
-    LOCATOR,
-    Condition,
-    MeasuredSubset,
-    fraction_key,
-    pooled,
-    reference_of,
-)
+from tasks.aoa.condition import EVERYTHING, LOCATOR, Condition, MeasuredSubset, pooled, reference_of
 from tasks.aoa.context import ROOM_MODEL, Experiment
 from tasks.aoa.locating import LEVEL, NO_PLANE, Locating
+from tasks.aoa.options import AUTO, fraction_key
 from tasks.aoa.steps import CrossValidation, Evaluation, RoomSearch, Suggestion, Synthesis, as_bytes
 from tasks.metrics import ANGLES, SCORES, ChangeMetrics, LocatingMetrics, MethodMetrics, MixMetrics, SynthesisMetrics
-from tasks.run import Row, Run, console
+from tasks.run import Row, Run
 from tasks.steps import Step
 from tasks.summarise import averaged, paired_change, repeats_averaged
+from tasks.terminal import console, terminal
 
 SCORE = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
 EXAMPLE_QUANTILES = (
@@ -79,6 +72,7 @@ class Results:
                 self._leave_out((step.condition,), value["refused"])
             case Evaluation() | Locating():
                 self.evaluated.append((step.condition, value))
+                self._show(step.condition, value)
                 self.history += [step.condition.columns | row for row in value["history"]]
             case Suggestion():
                 self._add_suggestion(step, value)
@@ -135,6 +129,14 @@ class Results:
             }
             rows += _rows(condition.columns, columns)
         return rows
+
+    def _show(self, condition: Condition, value: Row) -> None:
+        """Show the median angular error of a condition."""
+        error = angle_errors(torch.tensor(value["estimate"], dtype=torch.float64), self.test.label)["great_circle"]
+        name = f"{condition.estimator}, {condition.meaning}"
+        if condition.training != "all" and len(self.experiment.config.mix) > 1:
+            name = f"{condition.measured_fraction:.0%}: {name}"
+        terminal.result(name, f"{float(error.nanmedian().rad2deg()):.2f} deg")
 
     def _leave_out(self, conditions: Iterable[Condition], reason: str) -> None:
         """Record and print why conditions are not in the results, each sentence once."""

@@ -18,11 +18,12 @@ from swiftwrf.data.store import Store
 from swiftwrf.models import FIELD_MODELS, FieldModel
 from swiftwrf.runtime.checkpoint import read, write
 from tasks.aoa.artifacts import save_artifacts
-from tasks.aoa.condition import AUTO, EVERYTHING, NETWORKS, Condition, MeasuredSubset, Training, estimators, trainable
+from tasks.aoa.condition import EVERYTHING, NETWORKS, Condition, MeasuredSubset, Training, estimators, trainable
 from tasks.aoa.context import ROOM_MODEL, Experiment
 from tasks.aoa.cross_validation import STAND_IN, advise, choose_estimator
 from tasks.aoa.estimators import SavedEstimator, make_estimator
 from tasks.aoa.locating import Locating
+from tasks.aoa.options import AUTO
 from tasks.claim import STEPS
 from tasks.metrics import AdviceMetrics
 from tasks.run import Row
@@ -86,6 +87,10 @@ class CrossValidation(Step[Experiment]):
     def name(self) -> str:
         return f"choice-{self.subset}"
 
+    @property
+    def title(self) -> str:
+        return "comparing field models"
+
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.subset)
         seed = experiment.seed(self.subset)
@@ -138,6 +143,10 @@ class RoomSearch(Step[Experiment]):
         return f"room-{self.subset}"
 
     @property
+    def title(self) -> str:
+        return "finding the room"
+
+    @property
     def file(self) -> str:
         """File of the fitted model in the run's directory."""
         return f"{STEPS}/{self.name}.safetensors"
@@ -186,6 +195,10 @@ class Synthesis(Step[Experiment]):
     @property
     def name(self) -> str:
         return f"synthesis_{self.synthesizer}-{self.subset}"
+
+    @property
+    def title(self) -> str:
+        return f"synthesizing spectra by {self.synthesizer}"
 
     @property
     def file(self) -> str:
@@ -303,6 +316,10 @@ class Evaluation(Step[Experiment]):
         return self.condition.result_name
 
     @property
+    def title(self) -> str:
+        return f"training {self.condition.estimator}, {self.condition.meaning}"
+
+    @property
     def reads(self) -> tuple[str, ...]:
         return (self.synthesis.file,) if self.synthesis else ()
 
@@ -351,6 +368,10 @@ class Suggestion(Step[Experiment]):
     @property
     def name(self) -> str:
         return f"suggestion-mix{self.subset.key}"
+
+    @property
+    def title(self) -> str:
+        return "choosing positions to measure next"
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.subset)

@@ -9,10 +9,11 @@ from functools import cached_property
 from pandas import DataFrame
 
 from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.condition import AUTO, Condition, conditions_of, fraction_key
+from tasks import labels
+from tasks.aoa.condition import Condition, conditions_of
 from tasks.aoa.former import table_with_present_names, with_present_names
+from tasks.aoa.options import AUTO, fraction_key
 from tasks.metrics import AoaMetrics, MixMetrics
-from tasks.page import labels
 from tasks.page.palette import Palette
 from tasks.page.records import Records
 

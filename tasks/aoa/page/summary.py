@@ -5,11 +5,12 @@ from __future__ import annotations
 from tasks.aoa.condition import LOCATOR
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.former import FORMER_NAMES
-from tasks.aoa.page.gains import changes_of, gain_sentence, judgement, reference, turbo_method
-from tasks.aoa.page.records import FractionRecords
+from tasks.aoa.page.gains import change_text, changes_of, gain_sentence, judgement, reference, turbo_method
+from tasks.aoa.page.records import AoaRecords, FractionRecords
 from tasks.aoa.page.results import choice_sentence
 from tasks.aoa.page.room import advice_sentences
 from tasks.page.page import Number, Plot, Summary
+from tasks.terminal import Answer
 
 
 def summary(fraction: FractionRecords, picture: Plot) -> Summary:
@@ -22,7 +23,7 @@ def summary(fraction: FractionRecords, picture: Plot) -> Summary:
         *(text for text in (choice_sentence(fraction), gain_sentence(fraction)) if text),
         *advice_sentences(fraction),
     ]
-    return Summary(_numbers(fraction), picture, meaning, _next_steps(fraction))
+    return Summary(_numbers(fraction), picture, meaning, _next_steps(fraction), verdict(fraction))
 
 
 def _numbers(fraction: FractionRecords) -> list[Number]:
@@ -40,6 +41,37 @@ def _numbers(fraction: FractionRecords) -> list[Number]:
             f"median PSNR of the spectra that {synthesizer} predicts at positions without a measurement",
         ),
     ]
+
+
+def answer(run: AoaRecords) -> Answer:
+    """Return what the terminal shows of a run."""
+    fractions = FractionRecords.of(run)
+    rows = []
+    for fraction in fractions:
+        share = {"measured": fraction.percent} if len(fractions) > 1 else {}
+        for method, condition in fraction.conditions.items():
+            names = {"condition": condition.meaning, "estimator": condition.estimator}
+            rows.append((share | names, fraction.mix["methods"][method]["great_circle_deg"]))
+    return Answer("deg", rows, verdict(fractions[0]), _next_steps(fractions[0]))
+
+
+def verdict(fraction: FractionRecords) -> str:
+    """Return which estimator to take and what synthetic spectra change, in one or two short sentences."""
+    sentences = []
+    if choice := fraction.mix.get("estimator_choice"):
+        sentences.append(f"Take {choice['name']}: median error {fraction.medians[choice['name']]:.2f} degrees.")
+    turbo = turbo_method(fraction)
+    own = "measured_only"
+    if change := changes_of(fraction, turbo).get(own):
+        sentences.append(
+            f"Synthetic spectra change the network's median error by {change_text(change)}: {judgement(change)}."
+        )
+    else:
+        before, after = fraction.medians[own], fraction.medians[turbo]
+        sentences.append(
+            f"Synthetic spectra change the network's median error from {before:.2f} to {after:.2f} degrees."
+        )
+    return " ".join(sentences)
 
 
 def _error(fraction: FractionRecords, method: str) -> Number:

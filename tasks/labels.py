@@ -40,6 +40,12 @@ FIELD_MODELS = {
     "dcgan": Label("a convolutional generator trained against a discriminator (DCGAN)", "#661100"),
 }
 
+BEAMFORMERS = {
+    "phase": Label("from the phases alone, the paper's spectrum of one snapshot"),
+    "bartlett": Label("the fraction of the power that a beam collects"),
+    "capon": Label("minimum variance; needs as many snapshots as elements"),
+}
+
 ESTIMATORS = {
     "aann": Label("the paper's angular neural network: ResNet-50 and a multilayer perceptron"),
     "aann_kernel": Label("kernel regression on the features of a briefly trained ResNet-50 and on coarse pixels"),
