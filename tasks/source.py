@@ -10,13 +10,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from swiftwrf import AngularGrid, InputError, Spectra
+from swiftwrf import AngularGrid, InputError, Rssi, Spectra
 from swiftwrf.array.beamforming import BEAMFORMERS
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data import ReadOptions, read_spectra
+from swiftwrf.data import ReadOptions, read_rssi, read_spectra
+from swiftwrf.data.coordinates import Coordinates
 from swiftwrf.data.store import Store
 from tasks.run import choice
 
+TABLE_OPTIONS = ("columns", "filler", "coordinates")
 MAX_SIDE = 32  # elements: spectra of 32 x 32 elements have 7,938 independent numbers
 
 
@@ -38,11 +40,17 @@ class SpectraSource:
 
 @dataclass(frozen=True, kw_only=True)
 class TableSource:
-    """Options of reading survey tables."""
+    """Options of reading RSSI."""
 
     columns: tuple[str, ...] = ()
     """names of columns of a survey table that are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME ... (several with
     rssi='WAP*')"""
+    filler: tuple[float, ...] = ()
+    """values of RSSI that stand for not detected (default: those that are recognised)"""
+    keep_filler: bool = False
+    """whether all values of RSSI count as measured"""
+    coordinates: Coordinates | None = None
+    """unit of the positions in a survey table (default: the one that is recognised)"""
 
 
 def reading(config: SpectraSource | TableSource) -> ReadOptions:
@@ -51,7 +59,7 @@ def reading(config: SpectraSource | TableSource) -> ReadOptions:
     Raises:
         InputError: An option that makes no sense whatever the data.
     """
-    array = beamformer = grid = every = station = columns = None
+    array = beamformer = grid = every = station = columns = filler = coordinates = None
     if isinstance(config, SpectraSource):
         array, beamformer, grid = _array(config), config.beamformer, _grid(config)
         every, station = config.every, config.station
@@ -61,8 +69,8 @@ def reading(config: SpectraSource | TableSource) -> ReadOptions:
             if value is not None and value < 1:
                 raise InputError(f"--{name} must be at least 1, got {value}")
     if isinstance(config, TableSource):
-        columns = _columns(config.columns)
-    return ReadOptions(array, beamformer, grid, every, station, columns)
+        columns, filler, coordinates = _columns(config.columns), _filler(config), config.coordinates
+    return ReadOptions(array, beamformer, grid, every, station, columns, filler, coordinates)
 
 
 def _array(config: SpectraSource) -> PlanarArray | None:
@@ -96,6 +104,26 @@ def _columns(columns: tuple[str, ...]) -> dict[str, str] | None:
     if len(roles) < len(pairs):
         raise InputError(f"--columns names something twice: {' '.join(columns)}")
     return roles or None
+
+
+def _filler(config: TableSource) -> tuple[float, ...] | None:
+    if config.keep_filler and config.filler:
+        raise InputError("--filler and --keep-filler exclude each other")
+    return config.filler if config.filler or config.keep_filler else None
+
+
+def measured_rssi(data: str | None, config: TableSource) -> Rssi | None:
+    """Return the RSSI of an experiment in a folder or file, None without one.
+
+    Raises:
+        InputError: RSSI that cannot be read, or options of reading without a source.
+    """
+    options = reading(config)
+    if data is not None:
+        return read_rssi(data, options)
+    if given := [name for name in options.given if name in TABLE_OPTIONS]:
+        raise InputError(f"--{given[0]} is for measured RSSI; give it with --data")
+    return None
 
 
 def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model: str) -> tuple[Store, Spectra | None]:

@@ -148,9 +148,11 @@ REFUSED = {
     "quaternion in degrees": (_snapshots(array_orientation=np.array([0.0, 90.0, 25.0, 1.0])), "unit quaternion"),
     "subcarriers and elements swapped": (_snapshots(csi=DATA.channel.numpy().transpose(0, 2, 1)), "transpose"),
     "missing columns": (_survey(["a", "y", "z", *survey_rows()[0][3:]]), "no column for x"),
-    "degrees of longitude": (
-        lambda folder: load_rssi(write_survey(folder, header=["lon", "lat", "a"], rows=[[11.5, 48.1, -50]] * 12)),
-        "hold degrees",
+    "metres called longitude": (
+        lambda folder: load_rssi(
+            write_survey(folder, header=["lon", "lat", "a"], rows=[[11.5 + i, 48.1, -50] for i in range(12)])
+        ),
+        "may be degrees or metres",
     ),
 }
 

@@ -11,11 +11,14 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin
 from swiftwrf.data.dataset import Numbers, PositionedData, to_positions
 from swiftwrf.data.splits import MIN_TRAINING
-from swiftwrf.data.survey import read_survey
+from swiftwrf.data.survey import SurveyOptions, read_survey
 from swiftwrf.errors import InputError, listed
 from swiftwrf.runtime.validation import checked
+
+UNKNOWN = (float("nan"),) * 3  # position of a receiver
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -25,13 +28,14 @@ class Rssi(PositionedData):
     Args:
         rssi_dbm: RSSI, (n, R) [dBm], nan where a receiver did not detect the transmitter.
         transmitter_position: Positions of the transmitter, (n, 3) [m].
-        receiver_position: Positions of the receivers, (R, 3) [m]. Defaults to nan for all, which stands for unknown.
+        receiver_position: Positions of the receivers, (R, 3) [m], nan where unknown. Defaults to nan for all.
         receiver_names: Names of the receivers. Defaults to receiver1, receiver2, ...
+        origin: Latitude and longitude of x = y = 0, if the positions were projected from degrees.
         name: Name of the data set.
         details: index, named_splits, source and notes of `PositionedData`.
 
     Raises:
-        InputError: A length that does not match, an infinite number, or positions of some receivers only.
+        InputError: A length that does not match, or an infinite number.
 
     Example:
         >>> data = Rssi([[-60.0, float("nan")]] * 20, torch.rand(20, 3), receiver_names=["hall", "office"])
@@ -43,6 +47,7 @@ class Rssi(PositionedData):
     transmitter_position: Tensor
     receiver_position: Tensor
     receiver_names: tuple[str, ...]
+    origin: GeodeticOrigin | None
 
     row_fields: ClassVar[tuple[str, ...]] = ("transmitter_position", "rssi_dbm", "index")
 
@@ -54,6 +59,7 @@ class Rssi(PositionedData):
         *,
         receiver_position: Numbers | None = None,
         receiver_names: Sequence[str] | None = None,
+        origin: GeodeticOrigin | None = None,
         name: str = "rssi",
         **details: Any,
     ) -> None:
@@ -72,9 +78,9 @@ class Rssi(PositionedData):
         places = torch.full((count, 3), torch.nan, dtype=torch.float64)
         if receiver_position is not None:
             places = torch.as_tensor(receiver_position, dtype=torch.float64)
-        if places.shape != (count, 3) or not (bool(places.isfinite().all()) or bool(places.isnan().all())):
+        if places.shape != (count, 3) or not bool((places.isfinite().all(dim=1) | places.isnan().all(dim=1)).all()):
             raise InputError(
-                f"receiver_position must hold ({count}, 3) finite numbers [m], or nan for all receivers, got shape "
+                f"receiver_position must hold ({count}, 3) numbers [m], for each receiver finite ones or nan, got shape "
                 f"{tuple(places.shape)}"
             )
         super().__init__(
@@ -84,6 +90,7 @@ class Rssi(PositionedData):
             transmitter_position=position,
             receiver_position=places,
             receiver_names=names,
+            origin=origin,
         )
 
     @classmethod
@@ -92,6 +99,8 @@ class Rssi(PositionedData):
         frame: pd.DataFrame,
         *,
         columns: Mapping[str, str] | None = None,
+        filler: Sequence[float] | None = None,
+        coordinates: Coordinates | None = None,
         receiver_position: Mapping[str, Sequence[float]] | None = None,
         name: str = "rssi",
     ) -> Rssi:
@@ -99,28 +108,42 @@ class Rssi(PositionedData):
 
         Args:
             frame: Columns of positions [m] and RSSI [dBm], recognised by their names as in docs/formats.md.
-            columns: Names of columns that are not recognised, by role: x, y, z, time, receiver, rssi.
-            receiver_position: Positions [m] by name of the receiver.
+            columns: Names of columns that are not recognised, by role: x, y, z, longitude, latitude, time, receiver, rssi.
+            filler: Values that stand for not detected, [] for none. Defaults to those that are recognised.
+            coordinates: "degrees" or "metres". Defaults to the unit that is recognised.
+            receiver_position: Positions [m] by name of the receiver; those of others are unknown.
             name: Name of the data set.
 
         Raises:
-            InputError: A column that is missing or ambiguous, a value that is no position or received power, or a receiver
-                without a position.
+            InputError: A column that is missing or ambiguous, or a value that is no position or received power.
 
         Example:
             >>> Rssi.from_frame(pd.DataFrame({"x": [0, 1], "y": [0, 1], "z": [1, 1], "hall": [-50, -60]})).receiver_names
             ('hall',)
         """
-        names, rssi, position, notes = read_survey("the table", frame, columns or {})
-        if receiver_position is not None and (missing := [r for r in names if r not in receiver_position]):
-            raise InputError(f"receiver_position lacks {listed(missing)}")
-        places = None if receiver_position is None else [list(receiver_position[receiver]) for receiver in names]
-        return cls(rssi, position, receiver_position=places, receiver_names=names, name=name, notes=notes)
+        options = SurveyOptions(columns, None if filler is None else tuple(filler), coordinates)
+        survey = read_survey("the table", frame, options)
+        known = receiver_position or {}
+        return cls(
+            survey.rssi_dbm,
+            survey.position,
+            receiver_position=[list(known.get(receiver, UNKNOWN)) for receiver in survey.receiver_names],
+            receiver_names=survey.receiver_names,
+            origin=survey.origin,
+            name=name,
+            index=survey.row,
+            notes=survey.notes,
+        )
 
     @property
     def located(self) -> bool:
-        """True if the positions of the receivers are known."""
-        return bool(self.receiver_position.isfinite().all())
+        """True if the position of a receiver is known."""
+        return bool(self.receiver_located.any())
+
+    @property
+    def receiver_located(self) -> Tensor:
+        """Whether the position of each receiver is known, bool (R,)."""
+        return self.receiver_position.isfinite().all(dim=1)
 
     @property
     def detected(self) -> Tensor:

@@ -74,6 +74,19 @@ def _read_indices(file: Path, n: int, first: int) -> list[int]:
     return list(rows)
 
 
+def kept_splits(splits: dict[str, tuple[Tensor, Tensor]], kept: Tensor, n: int) -> dict[str, tuple[Tensor, Tensor]]:
+    """Return splits of n rows as splits of those that are kept, given by their numbers.
+
+    Example:
+        >>> kept_splits({"days": (torch.tensor([0, 1]), torch.tensor([2]))}, torch.tensor([1, 2]), 3)
+        {'days': (tensor([0]), tensor([1]))}
+    """
+    number = torch.full((n,), -1).scatter(0, kept, torch.arange(len(kept)))
+    return {
+        name: (a[a >= 0], b[b >= 0]) for name, (a, b) in ((k, (number[x], number[y])) for k, (x, y) in splits.items())
+    }
+
+
 def random_split(n: int, seed: int) -> tuple[Tensor, Tensor]:
     """Return training rows and a random fifth as test rows, both ascending. Suits positions drawn independently."""
     order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))

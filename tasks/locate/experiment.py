@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 
-from swiftwrf import InputError, Rssi, load_rssi, rssi_room
+from swiftwrf import InputError, Rssi, rssi_room
 from tasks.cluster import connected
 from tasks.locate.localizers import LEVELS
 from tasks.locate.observations import write_positions
@@ -17,7 +17,7 @@ from tasks.locate.steps import MIN_ROWS, Experiment, Localization
 from tasks.metrics import LocateMetrics, StudyMetrics
 from tasks.page.page import reporting
 from tasks.run import Row, Run, choose_device, console
-from tasks.source import reading
+from tasks.source import measured_rssi
 from tasks.steps import computed
 from tasks.summarise import error_summary
 
@@ -49,7 +49,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
             assert isinstance(step, Localization)
             results.add(step, value)
         directory.write_csv("errors.csv", results.errors)
-        final = directory.finish(results.metrics(data.name, n_undetected), reporting(page))
+        final = directory.finish(results.metrics(data.name, data.notes, n_undetected), reporting(page))
     console.print(f"report: [bold]{final / 'report.html'}[/]")
 
 
@@ -59,11 +59,8 @@ def measurements(config: LocateConfig) -> Rssi:
     Raises:
         InputError: The data cannot be read, or have no such receiver.
     """
-    if config.data is not None:
-        return load_rssi(config.data, columns=reading(config).columns).receivers(config.rx)
-    if config.columns:
-        raise InputError("--columns is for a survey table; give it with --data, or with MODEL and SOURCE")
-    return rssi_room(seed=config.seed).receivers(config.rx)
+    measured = measured_rssi(config.data, config)
+    return (rssi_room(seed=config.seed) if measured is None else measured).receivers(config.rx)
 
 
 def prepared(data: Rssi, split: str, cells: int, seed: int, suggest: int = 0) -> tuple[Experiment, int]:
@@ -133,12 +130,13 @@ class Results:
             "seconds": value["seconds"],
         }
 
-    def metrics(self, data: str, n_undetected: int) -> LocateMetrics:
+    def metrics(self, data: str, notes: Sequence[str], n_undetected: int) -> LocateMetrics:
         """Return the content of metrics.json."""
         train, test = self.experiment.train, self.experiment.test
         return {
             "task": "locate",
             "data": data,
+            "notes": list(notes),
             "split": self.experiment.split,
             "seed": self.experiment.seed,
             "n_train": len(train),

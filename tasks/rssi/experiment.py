@@ -12,7 +12,7 @@ import torch
 from pandas import DataFrame
 from PIL import Image, UnidentifiedImageError
 
-from swiftwrf import InputError, Rssi, load_rssi, rssi_room
+from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.data.files import sha256
 from swiftwrf.data.splits import validation_for
 from swiftwrf.models.base import Prediction
@@ -25,7 +25,7 @@ from tasks.page.page import reporting
 from tasks.rssi.page import page
 from tasks.rssi.predictors import PREDICTORS, make_predictor
 from tasks.run import Preset, Row, Run, choose_device, console
-from tasks.source import TableSource, reading
+from tasks.source import TableSource, measured_rssi
 from tasks.summarise import error_summary, grouped
 
 MODEL = "model.safetensors"
@@ -104,6 +104,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         metrics: RssiMetrics = {
             "task": "rssi",
             "data": data.name,
+            "notes": list(data.notes),
             "split": config.split,
             "preset": config.preset,
             "seed": config.seed,
@@ -121,11 +122,8 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
 
 
 def _load(config: RssiTaskConfig) -> Rssi:
-    if config.data is None:
-        if config.columns:
-            raise InputError("--columns is for a survey table; give it with --data")
-        return rssi_room(seed=config.seed)
-    return load_rssi(config.data, columns=reading(config).columns)
+    measured = measured_rssi(config.data, config)
+    return rssi_room(seed=config.seed) if measured is None else measured
 
 
 def _read_floor_plan(config: RssiTaskConfig) -> dict[str, Any]:
@@ -231,8 +229,7 @@ class _Tables:
         """Write the prediction and the width of its interval over the floor, at the median height of the measurements."""
         position = self.train.transmitter_position
         shown = torch.cat([position, self.test.transmitter_position])
-        if self.train.located:
-            shown = torch.cat([shown, self.train.receiver_position])
+        shown = torch.cat([shown, self.train.receiver_position[self.train.receiver_located]])
         low, high = shown.min(dim=0).values, shown.max(dim=0).values
         cell = float((high - low)[:2].max()) / MAP_CELLS or 1.0
         xs, ys = (

@@ -75,7 +75,7 @@ def _columns(data: Rssi, detected: Tensor, findings: Findings) -> None:
 
 
 def _path_loss(data: Rssi, findings: Findings) -> None:
-    report = check_path_loss(data)
+    report = check_path_loss(data.columns(data.receiver_located.nonzero()[:, 0].tolist()))
     if report is None:
         findings.say("The receivers' positions are unknown, so there is no path-loss model; other predictors work.")
         return
