@@ -15,6 +15,7 @@ from swiftwrf.array.beamforming import BEAMFORMERS
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import ReadOptions, read_rssi, read_spectra
 from swiftwrf.data.coordinates import Coordinates
+from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
 from tasks.run import choice
 
@@ -124,6 +125,13 @@ def measured_rssi(data: str | None, config: TableSource) -> Rssi | None:
     if given := [name for name in options.given if name in TABLE_OPTIONS]:
         raise InputError(f"--{given[0]} is for measured RSSI; give it with --data")
     return None
+
+
+def split_notes(train: Rssi, test: Rssi) -> list[str]:
+    """Return a note on a split whose test rows are at training positions, or none."""
+    repeated = repeated_fraction(train.transmitter_position, test.transmitter_position)
+    note = f"this split tests look-up: {repeated:.0%} of the test rows are at positions of training rows"
+    return [note] if repeated > MAX_REPEATED else []
 
 
 def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model: str) -> tuple[Store, Spectra | None]:

@@ -5,17 +5,21 @@ Each is made from a floor with random positions, so that the expected measuremen
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 import pytest
+import quick
 import torch
 from numpy.typing import NDArray
 
-from swiftwrf import InputError, load_rssi
+from swiftwrf import InputError, Rssi, load_rssi
 from swiftwrf.data.coordinates import GeodeticOrigin
+from swiftwrf.data.splits import folds, random_split, repeated_fraction
 from swiftwrf.data.writing import write_rssi
+from tasks.rssi.predictors import PREDICTORS
 
 NAMES = ["ap-a", "ap-b", "ap-c", "ap-d"]
 
@@ -270,3 +274,59 @@ def test_sod_indoor_loc(tmp_path, floor):
     assert data.receiver_names == ("MAC1", "MAC2", "MAC3", "MAC4")
     np.testing.assert_array_equal(data.rssi_dbm.isnan(), filled)
     assert data.transmitter_position[0].tolist() == [*floor.position[0, :2], 12.0]
+
+
+def test_a_place_measured_again_is_in_one_part_of_every_random_split(floor):
+    place = torch.from_numpy(floor.position[:40])
+    position = place.repeat_interleave(torch.arange(40) % 5 + 1, dim=0)
+    position = position[torch.from_numpy(floor.random.permutation(len(position)))]
+    data = Rssi(torch.full((len(position), 1), -60.0), position)
+    train, test = data.split("random")
+    assert repeated_fraction(train.transmitter_position, test.transmitter_position) == 0
+    assert abs(len(test) / len(data) - 0.2) < 0.05
+    fold = folds(position, "random", seed=1)
+    assert fold.unique().tolist() == [0, 1, 2, 3, 4]
+    for spot in place:
+        assert len(fold[(position == spot).all(dim=1)].unique()) == 1
+    frequent = torch.cat([position, place[:1].expand(3 * len(position), 3)])
+    train, test = random_split(frequent, seed=0)
+    assert len(test) >= 0.1 * len(position)
+    assert len(train) + len(test) == len(frequent)
+
+
+def test_a_split_that_tests_look_up_is_named_first(tmp_path, floor, capsys):
+    table = pd.concat([floor.table()] * 2, ignore_index=True)
+    (tmp_path / "walk").mkdir()
+    table.to_csv(tmp_path / "walk" / "walk.csv", index=False)
+    order = floor.random.permutation(240)
+    (tmp_path / "walk" / "train_index.txt").write_text("\n".join(map(str, order[:190])))
+    (tmp_path / "walk" / "test_index.txt").write_text("\n".join(map(str, order[190:])))
+    for task in ("rssi", "locate"):
+        assert quick.run(task, "--rx", "all", "--data", tmp_path / "walk", "--out", tmp_path / task) == 0
+        page = (tmp_path / task / "report.html").read_text()
+        assert re.search(r"This split tests look-up: [6-9]\d% of the test rows", page[: page.index("What to do next")])
+    assert quick.run("inspect", tmp_path / "walk", "--out", tmp_path / "inspect") == 0
+    assert "Split random tests look-up" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("task", ["rssi", "locate"])
+def test_notes_are_in_every_report(tmp_path, floor, task):
+    filled = floor.some(0.4)
+    floor.table(np.where(filled, -107, floor.rssi)).to_csv(tmp_path / "walk.csv", index=False)
+    source = ("--rx", "all", "--data", tmp_path / "walk.csv")
+    assert quick.run(task, *source, "--out", tmp_path / "run") == 0
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert f"-107 counts as not detected: {filled.sum()} of 480 cells" in page[: page.index("What to do next")]
+    assert quick.run(task, *source, "--keep-filler", "--out", tmp_path / "kept") == 0
+    assert "counts as not detected" not in (tmp_path / "kept" / "report.html").read_text()
+
+
+@pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
+def test_the_lengths_of_a_gaussian_process_follow_the_extent(floor, scale):
+    data = Rssi(floor.rssi, scale * floor.position, receiver_position=scale * floor.receiver, receiver_names=NAMES)
+    train, test = data.split("random")
+    errors = [
+        float((PREDICTORS[name]().fit(train).predict(test.transmitter_position).mean - test.rssi_dbm).abs().mean())
+        for name in ("gp", "mean")
+    ]
+    assert errors[0] < 0.6 * errors[1]

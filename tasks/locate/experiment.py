@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -17,7 +17,7 @@ from tasks.locate.steps import MIN_ROWS, Experiment, Localization
 from tasks.metrics import LocateMetrics, StudyMetrics
 from tasks.page.page import reporting
 from tasks.run import Row, Run, choose_device, console
-from tasks.source import measured_rssi
+from tasks.source import measured_rssi, split_notes
 from tasks.steps import computed
 from tasks.summarise import error_summary
 
@@ -49,7 +49,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
             assert isinstance(step, Localization)
             results.add(step, value)
         directory.write_csv("errors.csv", results.errors)
-        final = directory.finish(results.metrics(data.name, data.notes, n_undetected), reporting(page))
+        final = directory.finish(results.metrics(data, n_undetected), reporting(page))
     console.print(f"report: [bold]{final / 'report.html'}[/]")
 
 
@@ -130,13 +130,13 @@ class Results:
             "seconds": value["seconds"],
         }
 
-    def metrics(self, data: str, notes: Sequence[str], n_undetected: int) -> LocateMetrics:
-        """Return the content of metrics.json."""
+    def metrics(self, data: Rssi, n_undetected: int) -> LocateMetrics:
+        """Return the content of metrics.json of a run on these data."""
         train, test = self.experiment.train, self.experiment.test
         return {
             "task": "locate",
-            "data": data,
-            "notes": list(notes),
+            "data": data.name,
+            "notes": [*split_notes(train, test), *data.notes],
             "split": self.experiment.split,
             "seed": self.experiment.seed,
             "n_train": len(train),

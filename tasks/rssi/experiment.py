@@ -25,7 +25,7 @@ from tasks.page.page import reporting
 from tasks.rssi.page import page
 from tasks.rssi.predictors import PREDICTORS, make_predictor
 from tasks.run import Preset, Row, Run, choose_device, console
-from tasks.source import TableSource, measured_rssi
+from tasks.source import TableSource, measured_rssi, split_notes
 from tasks.summarise import error_summary, grouped
 
 MODEL = "model.safetensors"
@@ -104,7 +104,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         metrics: RssiMetrics = {
             "task": "rssi",
             "data": data.name,
-            "notes": list(data.notes),
+            "notes": [*split_notes(train, test), *data.notes],
             "split": config.split,
             "preset": config.preset,
             "seed": config.seed,
