@@ -15,11 +15,13 @@ from swiftwrf.array.beamforming import BEAMFORMERS
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import ReadOptions, read_rssi, read_spectra
 from swiftwrf.data.coordinates import Coordinates
+from swiftwrf.data.rssi import Offsets
 from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
+from swiftwrf.rssi import estimate_offsets
 from tasks.run import choice
 
-TABLE_OPTIONS = ("columns", "filler", "coordinates")
+TABLE_OPTIONS = ("columns", "filler", "coordinates", "offset_by")
 MAX_SIDE = 32  # elements: spectra of 32 x 32 elements have 7,938 independent numbers
 
 
@@ -54,6 +56,15 @@ class TableSource:
     """unit of the positions in a survey table (default: the one that is recognised)"""
 
 
+@dataclass(frozen=True, kw_only=True)
+class OffsetSource(TableSource):
+    """Options of reading RSSI of several devices or channels."""
+
+    offset_by: str | None = None
+    """column of a survey table with groups of rows, e.g. devices, whose constant offsets are estimated; COLUMN=VALUE makes
+    that group the reference of maps (default: the most frequent one)"""
+
+
 def reading(config: SpectraSource | TableSource) -> ReadOptions:
     """Return the options of a command line for reading.
 
@@ -71,7 +82,8 @@ def reading(config: SpectraSource | TableSource) -> ReadOptions:
                 raise InputError(f"--{name} must be at least 1, got {value}")
     if isinstance(config, TableSource):
         columns, filler, coordinates = _columns(config.columns), _filler(config), config.coordinates
-    return ReadOptions(array, beamformer, grid, every, station, columns, filler, coordinates)
+    offset_by = config.offset_by.partition("=")[0] if isinstance(config, OffsetSource) and config.offset_by else None
+    return ReadOptions(array, beamformer, grid, every, station, columns, filler, coordinates, offset_by)
 
 
 def _array(config: SpectraSource) -> PlanarArray | None:
@@ -123,15 +135,30 @@ def measured_rssi(data: str | None, config: TableSource) -> Rssi | None:
     if data is not None:
         return read_rssi(data, options)
     if given := [name for name in options.given if name in TABLE_OPTIONS]:
-        raise InputError(f"--{given[0]} is for measured RSSI; give it with --data")
+        raise InputError(f"--{given[0].replace('_', '-')} is for measured RSSI; give it with --data")
     return None
 
 
+def asked_offsets(train: Rssi, config: OffsetSource) -> Offsets | None:
+    """Return the offsets of the groups that a user asks for, estimated from training rows.
+
+    Raises:
+        InputError: One group only, or an unknown reference.
+    """
+    if config.offset_by is None:
+        return None
+    return estimate_offsets(train, config.offset_by.partition("=")[2] or None)
+
+
 def split_notes(train: Rssi, test: Rssi) -> list[str]:
-    """Return a note on a split whose test rows are at training positions, or none."""
+    """Return a note on rows that share positions, or none."""
     repeated = repeated_fraction(train.transmitter_position, test.transmitter_position)
-    note = f"this split tests look-up: {repeated:.0%} of the test rows are at positions of training rows"
-    return [note] if repeated > MAX_REPEATED else []
+    if repeated > MAX_REPEATED:
+        return [f"this split tests look-up: {repeated:.0%} of the test rows are at positions of training rows"]
+    position = torch.cat([train.transmitter_position, test.transmitter_position])
+    n_places = len(position.unique(dim=0))
+    shared = f"{len(position)} rows are at {n_places} positions, each of which is in one part of the split"
+    return [shared] if n_places < len(position) and not repeated else []
 
 
 def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model: str) -> tuple[Store, Spectra | None]:

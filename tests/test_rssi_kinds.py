@@ -15,12 +15,16 @@ import quick
 import torch
 from numpy.typing import NDArray
 
-from swiftwrf import InputError, Rssi, load_rssi
+from swiftwrf import InputError, Rssi, load, load_rssi
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.splits import folds, random_split, repeated_fraction
 from swiftwrf.data.writing import write_rssi
+from swiftwrf.locate import RssiLocator
+from tasks.locate.experiment import run as locate
+from tasks.locate.options import LocateConfig
 from tasks.rssi.predictors import PREDICTORS
 
+FEW_CELLS = ("--cells", "200")
 NAMES = ["ap-a", "ap-b", "ap-c", "ap-d"]
 
 
@@ -294,29 +298,31 @@ def test_a_place_measured_again_is_in_one_part_of_every_random_split(floor):
     assert len(train) + len(test) == len(frequent)
 
 
-def test_a_split_that_tests_look_up_is_named_first(tmp_path, floor, capsys):
+def test_a_split_that_tests_look_up_is_named_first(tmp_path, capsys):
+    floor = Floor.made(5, n=30)
     table = pd.concat([floor.table()] * 2, ignore_index=True)
     (tmp_path / "walk").mkdir()
     table.to_csv(tmp_path / "walk" / "walk.csv", index=False)
-    order = floor.random.permutation(240)
-    (tmp_path / "walk" / "train_index.txt").write_text("\n".join(map(str, order[:190])))
-    (tmp_path / "walk" / "test_index.txt").write_text("\n".join(map(str, order[190:])))
-    for task in ("rssi", "locate"):
-        assert quick.run(task, "--rx", "all", "--data", tmp_path / "walk", "--out", tmp_path / task) == 0
+    order = floor.random.permutation(60)
+    (tmp_path / "walk" / "train_index.txt").write_text("\n".join(map(str, order[:48])))
+    (tmp_path / "walk" / "test_index.txt").write_text("\n".join(map(str, order[48:])))
+    for task, options in (("rssi", ()), ("locate", FEW_CELLS)):
+        assert quick.run(task, "--rx", "all", "--data", tmp_path / "walk", *options, "--out", tmp_path / task) == 0
         page = (tmp_path / task / "report.html").read_text()
-        assert re.search(r"This split tests look-up: [6-9]\d% of the test rows", page[: page.index("What to do next")])
+        assert re.search(r"This split tests look-up: [5-9]\d% of the test rows", page[: page.index("What to do next")])
     assert quick.run("inspect", tmp_path / "walk", "--out", tmp_path / "inspect") == 0
     assert "Split random tests look-up" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("task", ["rssi", "locate"])
-def test_notes_are_in_every_report(tmp_path, floor, task):
+@pytest.mark.parametrize(("task", "options"), [("rssi", ()), ("locate", FEW_CELLS)])
+def test_notes_are_in_every_report(tmp_path, task, options):
+    floor = Floor.made(5, n=40)
     filled = floor.some(0.4)
     floor.table(np.where(filled, -107, floor.rssi)).to_csv(tmp_path / "walk.csv", index=False)
-    source = ("--rx", "all", "--data", tmp_path / "walk.csv")
+    source = ("--rx", "all", "--data", tmp_path / "walk.csv", *options)
     assert quick.run(task, *source, "--out", tmp_path / "run") == 0
     page = (tmp_path / "run" / "report.html").read_text()
-    assert f"-107 counts as not detected: {filled.sum()} of 480 cells" in page[: page.index("What to do next")]
+    assert f"-107 counts as not detected: {filled.sum()} of 160 cells" in page[: page.index("What to do next")]
     assert quick.run(task, *source, "--keep-filler", "--out", tmp_path / "kept") == 0
     assert "counts as not detected" not in (tmp_path / "kept" / "report.html").read_text()
 
@@ -330,3 +336,32 @@ def test_the_lengths_of_a_gaussian_process_follow_the_extent(floor, scale):
         for name in ("gp", "mean")
     ]
     assert errors[0] < 0.6 * errors[1]
+
+
+def test_outputs_of_a_table_in_degrees(tmp_path):
+    """Positions come back in degrees, also those of a later log with another median."""
+    floor = Floor.made(5, n=60)
+    degrees = floor.degrees(59.33, 18.07)
+    table = floor.table().assign(x=degrees[:, 1], y=degrees[:, 0]).rename(columns={"x": "lon", "y": "lat"})
+    table[:40].to_csv(tmp_path / "walk.csv", index=False)
+    table[40:].to_csv(tmp_path / "later.csv", index=False)
+    run = tmp_path / "rssi"
+    assert quick.run("rssi", "--rx", "all", "--data", tmp_path / "walk.csv", "--out", run) == 0
+    predicted = pd.read_csv(run / "predictions.csv")
+    near = np.abs(predicted[["latitude_deg", "longitude_deg"]].to_numpy()[:, None] - degrees).max(axis=2).min(axis=1)
+    assert near.max() < 1e-8
+    cells = pd.read_csv(run / "figures" / "summary.csv")
+    assert cells["latitude_deg"].between(*(degrees[:, 0].min() - 1e-4, degrees[:, 0].max() + 1e-4)).all()
+    data = load_rssi(tmp_path / "walk.csv")
+    locator = RssiLocator(n_cells=300).fit(data)
+    locator.save(tmp_path / "locator.safetensors")
+    assert load(tmp_path / "locator.safetensors").model.origin == data.origin
+    found = tmp_path / "positions.csv"
+    locate(
+        LocateConfig(model=str(tmp_path / "locator.safetensors"), source=str(tmp_path / "later.csv"), out=str(found))
+    )
+    positions = pd.read_csv(found)
+    truth = data.origin.to_metres(degrees[40:])
+    np.testing.assert_allclose(positions[["truth_x_m", "truth_y_m"]], truth, atol=1e-3)
+    estimate = data.origin.to_metres(positions[["latitude_deg", "longitude_deg"]].to_numpy())
+    np.testing.assert_allclose(estimate, positions[["x_m", "y_m"]], atol=1e-3)

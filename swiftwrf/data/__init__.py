@@ -79,6 +79,7 @@ def load_rssi(
     columns: Mapping[str, str] | None = None,
     filler: Sequence[float] | None = None,
     coordinates: Coordinates | None = None,
+    offset_by: str | None = None,
 ) -> Rssi:
     """Read RSSI in any format of docs/formats.md: the NeRF2 layout, or a survey table (CSV, Parquet).
 
@@ -88,12 +89,14 @@ def load_rssi(
             rssi.
         filler: Values that stand for not detected, [] for none. Defaults to those that are recognised.
         coordinates: "degrees" or "metres", of the positions in a table. Defaults to the unit that is recognised.
+        offset_by: Column of a table with groups of rows, e.g. devices, between which RSSI has constant offsets.
 
     Raises:
         InputError: A part that is missing or invalid, parts that do not match, or an argument that does not apply.
     """
     values = None if filler is None else tuple(map(float, filler))
-    return read_rssi(path, ReadOptions(columns=columns, filler=values, coordinates=coordinates))
+    options = ReadOptions(columns=columns, filler=values, coordinates=coordinates, offset_by=offset_by)
+    return read_rssi(path, options)
 
 
 def read_rssi(path: str | Path, options: ReadOptions) -> Rssi:

@@ -61,6 +61,18 @@ class GeodeticOrigin(NamedTuple):
         return f"latitude {self.latitude:.7g}, longitude {self.longitude:.7g}"
 
 
+def degree_columns(origin: GeodeticOrigin | None, xy: Floats) -> dict[str, Floats]:
+    """Return columns with latitude and longitude [deg] of positions (n, 2 or more) [m]; none without an origin.
+
+    Example:
+        >>> degree_columns(GeodeticOrigin(48.0, 11.0), np.zeros((1, 2)))
+        {'latitude_deg': array([48.]), 'longitude_deg': array([11.])}
+    """
+    if origin is None:
+        return {}
+    return dict(zip(("latitude_deg", "longitude_deg"), origin.to_degrees(xy).T, strict=True))
+
+
 def without_fix(position: Floats) -> tuple[NDArray[np.bool_], list[str]]:
     """Return which positions are no fix, and notes on them.
 

@@ -21,6 +21,69 @@ from swiftwrf.runtime.validation import checked
 UNKNOWN = (float("nan"),) * 3  # position of a receiver
 
 
+@dataclass(frozen=True, eq=False)
+class Groups:
+    """Groups of rows between which RSSI has constant offsets, e.g. devices or channels.
+
+    Args:
+        column: Name of the column with the groups' names.
+        names: Names of the groups.
+        code: Group of each row, int64 (n,).
+    """
+
+    column: str
+    names: tuple[str, ...]
+    code: Tensor
+
+    @classmethod
+    def of(cls, column: str, values: Sequence[str]) -> Groups:
+        """Return the groups of n rows by their values in a column."""
+        code, names = pd.factorize(np.asarray(values, dtype=object), sort=True)
+        return cls(column, tuple(map(str, names)), torch.from_numpy(code.astype(np.int64)))
+
+    def __len__(self) -> int:
+        return len(self.code)
+
+    def subset(self, rows: Tensor) -> Groups:
+        """Return the groups of the given rows."""
+        return replace(self, code=self.code[rows])
+
+    def labels(self) -> list[str]:
+        """Return the name of each row's group."""
+        return [self.names[code] for code in self.code.tolist()]
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """Offsets of RSSI between groups of rows.
+
+    Args:
+        column: Name of the column with the groups' names.
+        reference: Group whose offset is 0.
+        offset_db: Offset of each group [dB].
+        explained: Fraction of the variance about the field that the offsets explain.
+    """
+
+    column: str
+    reference: str
+    offset_db: Mapping[str, float]
+    explained: float
+
+    def of(self, data: Rssi) -> Tensor:
+        """Return the offset of each row, float64 (n,) [dB]; 0 for a group without an estimate, or without groups."""
+        labels = data.groups.labels() if data.groups else [self.reference] * len(data)
+        return torch.tensor([self.offset_db.get(label, 0.0) for label in labels], dtype=torch.float64)
+
+    def removed(self, data: Rssi) -> Rssi:
+        """Return the data as the reference group would have measured them."""
+        return replace(data, rssi_dbm=data.rssi_dbm - self.of(data)[:, None], offsets=self)
+
+    def note(self) -> str:
+        """Return a sentence with all offsets."""
+        each = listed(f"{name} {db:+.1f} dB" for name, db in self.offset_db.items() if name != self.reference)
+        return f"offsets of {self.column} relative to {self.reference}, which maps are of: {each}"
+
+
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class Rssi(PositionedData):
     """RSSI of a moving transmitter at R fixed receivers.
@@ -31,6 +94,9 @@ class Rssi(PositionedData):
         receiver_position: Positions of the receivers, (R, 3) [m], nan where unknown. Defaults to nan for all.
         receiver_names: Names of the receivers. Defaults to receiver1, receiver2, ...
         origin: Latitude and longitude of x = y = 0, if the positions were projected from degrees.
+        groups: Groups of rows between which RSSI has constant offsets.
+        offsets: Offsets that were removed from the RSSI.
+        labels: Names of columns of the table that distinguish groups of rows.
         name: Name of the data set.
         details: index, named_splits, source and notes of `PositionedData`.
 
@@ -48,8 +114,11 @@ class Rssi(PositionedData):
     receiver_position: Tensor
     receiver_names: tuple[str, ...]
     origin: GeodeticOrigin | None
+    groups: Groups | None
+    offsets: Offsets | None
+    labels: tuple[str, ...]
 
-    row_fields: ClassVar[tuple[str, ...]] = ("transmitter_position", "rssi_dbm", "index")
+    row_fields: ClassVar[tuple[str, ...]] = ("transmitter_position", "rssi_dbm", "index", "groups")
 
     @checked
     def __init__(
@@ -60,6 +129,9 @@ class Rssi(PositionedData):
         receiver_position: Numbers | None = None,
         receiver_names: Sequence[str] | None = None,
         origin: GeodeticOrigin | None = None,
+        groups: Groups | None = None,
+        offsets: Offsets | None = None,
+        labels: tuple[str, ...] = (),
         name: str = "rssi",
         **details: Any,
     ) -> None:
@@ -91,6 +163,9 @@ class Rssi(PositionedData):
             receiver_position=places,
             receiver_names=names,
             origin=origin,
+            groups=groups,
+            offsets=offsets,
+            labels=labels,
         )
 
     @classmethod
@@ -101,6 +176,7 @@ class Rssi(PositionedData):
         columns: Mapping[str, str] | None = None,
         filler: Sequence[float] | None = None,
         coordinates: Coordinates | None = None,
+        offset_by: str | None = None,
         receiver_position: Mapping[str, Sequence[float]] | None = None,
         name: str = "rssi",
     ) -> Rssi:
@@ -111,6 +187,7 @@ class Rssi(PositionedData):
             columns: Names of columns that are not recognised, by role: x, y, z, longitude, latitude, time, receiver, rssi.
             filler: Values that stand for not detected, [] for none. Defaults to those that are recognised.
             coordinates: "degrees" or "metres". Defaults to the unit that is recognised.
+            offset_by: Column with the groups of rows between which RSSI has constant offsets.
             receiver_position: Positions [m] by name of the receiver; those of others are unknown.
             name: Name of the data set.
 
@@ -121,7 +198,7 @@ class Rssi(PositionedData):
             >>> Rssi.from_frame(pd.DataFrame({"x": [0, 1], "y": [0, 1], "z": [1, 1], "hall": [-50, -60]})).receiver_names
             ('hall',)
         """
-        options = SurveyOptions(columns, None if filler is None else tuple(filler), coordinates)
+        options = SurveyOptions(columns, None if filler is None else tuple(filler), coordinates, offset_by)
         survey = read_survey("the table", frame, options)
         known = receiver_position or {}
         return cls(
@@ -130,6 +207,8 @@ class Rssi(PositionedData):
             receiver_position=[list(known.get(receiver, UNKNOWN)) for receiver in survey.receiver_names],
             receiver_names=survey.receiver_names,
             origin=survey.origin,
+            groups=Groups.of(offset_by, survey.group) if offset_by else None,
+            labels=survey.labels,
             name=name,
             index=survey.row,
             notes=survey.notes,
@@ -149,6 +228,25 @@ class Rssi(PositionedData):
     def detected(self) -> Tensor:
         """Whether a receiver detected the transmitter, bool (n, R)."""
         return ~self.rssi_dbm.isnan()
+
+    def about(self, origin: GeodeticOrigin | None) -> Rssi:
+        """Return the data in local metres about another origin.
+
+        Args:
+            origin: Origin of the metres. With None, or if the data have none, nothing changes.
+        """
+        if origin is None or self.origin is None or origin == self.origin:
+            return self
+        own = self.origin
+
+        def moved(position: Tensor) -> Tensor:
+            xy = origin.to_metres(own.to_degrees(position[:, :2].numpy()))
+            return torch.cat([torch.from_numpy(xy), position[:, 2:]], dim=1)
+
+        places = self.receiver_position.clone()
+        places[self.receiver_located] = moved(places[self.receiver_located])
+        position = moved(self.transmitter_position)
+        return replace(self, transmitter_position=position, receiver_position=places, origin=origin)
 
     def receivers(self, asked: Sequence[str]) -> Rssi:
         """Return the data of some receivers.

@@ -27,6 +27,7 @@ SEPARATORS = ",;\t"
 EMPTY_CELLS = {"", "nan", "na", "n/a", "null", "none", "-"}
 STOREY_M = 4.0  # height of a floor, in a table with numbers of floors and no heights
 MAX_VALUES = 2**27  # rows x receivers
+MAX_GROUPS, MIN_GROUP_ROWS = 30, 10  # of a column that may distinguish devices or channels
 AXIS = "(?:(?:pos|position|coord|tx|rx)_)?{0}(?:_(?:pos|position|coord))?(?:_m)?"
 ROLES = {  # names of columns, in lower case with underscores
     "x": re.compile(AXIS.format("x") + "|east(?:ing)?|e_?coord"),
@@ -50,11 +51,13 @@ class SurveyOptions(NamedTuple):
         columns: Names of columns that are not recognised, by role.
         filler: Values that stand for not detected. Defaults to those that are recognised; none if it is empty.
         coordinates: Unit of the positions. Defaults to the one that is recognised.
+        offset_by: Column with the group of each row. Packets of a row of RSSI are of one group.
     """
 
     columns: Mapping[str, str] | None = None
     filler: tuple[float, ...] | None = None
     coordinates: Coordinates | None = None
+    offset_by: str | None = None
 
 
 class Survey(NamedTuple):
@@ -66,6 +69,8 @@ class Survey(NamedTuple):
     row: NDArray[np.int64]  # number of each row in the table, before those without a position are left out
     n_rows: int  # of the table
     origin: GeodeticOrigin | None  # of positions in degrees
+    group: list[str]  # of each row; empty if it was not asked for
+    labels: tuple[str, ...]  # columns that distinguish groups of rows
     notes: tuple[str, ...]
 
 
@@ -108,12 +113,13 @@ def _candidates(table: pd.DataFrame, role: str) -> list[str]:
     return [name for name in found if role != "receiver" or not _is_rssi(table[name])]
 
 
-def first_rows(table: pd.DataFrame, columns: Mapping[str, str]) -> NDArray[np.int64]:
+def first_rows(table: pd.DataFrame, columns: Mapping[str, str], offset_by: str | None = None) -> NDArray[np.int64]:
     """Return the first row in the table of each row of RSSI: packets of a long table share rows of RSSI.
 
     Args:
         table: Survey table, with or without positions.
         columns: Names of columns that are not recognised, by role.
+        offset_by: Column with the group of each row.
     """
     receiver, time = (column_of(table, role, columns) for role in ("receiver", "time"))
     if receiver is None:
@@ -121,6 +127,8 @@ def first_rows(table: pd.DataFrame, columns: Mapping[str, str]) -> NDArray[np.in
     roles = ("x", "y", "z", "longitude", "latitude", "floor")
     keys = {role: name for role in roles if (name := column_of(table, role, columns)) is not None}
     coordinate = pd.DataFrame({role: column_of_numbers("the table", table, name) for role, name in keys.items()})
+    if offset_by is not None:
+        coordinate["group"] = _text(table[offset_by])
     row = _row_of_packet(coordinate, _text(table[receiver]), None if time is None else _text(table[time]))
     return np.unique(row, return_index=True)[1]
 
@@ -142,13 +150,17 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
     asked = options.columns or {}
     roles = _roles(label, table, asked)
     coordinate, notes = _coordinates(label, table, roles)
+    if options.offset_by is not None and options.offset_by not in table.columns:
+        raise InputError(f"{label} has no column {options.offset_by!r} for offsets; there are {listed(table.columns)}")
+    group = _text(table[options.offset_by]) if options.offset_by else pd.Series([""] * len(table))
     if "receiver" in roles:
-        names, rssi, source, coordinate = _long(label, table, roles, coordinate)
+        names, rssi, source, coordinate = _long(label, table, roles, coordinate, group)
         unused = [name for name in table.columns if name not in roles.values()]
     else:
         names, rssi = _wide(label, table, roles, asked)
         source = np.arange(len(table))[:, None]
         unused = [name for name in table.columns if name not in roles.values() and name not in names]
+    unused = [name for name in unused if name != options.offset_by]
     if unused:
         notes.append(f"columns that are not used: {listed(unused)}")
     fillers = find_fillers(rssi) if options.filler is None else list(options.filler)
@@ -169,7 +181,9 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
     if not kept.all():
         notes.append(f"receivers that never detected the transmitter are left out: {int((~kept).sum())}")
     names = [names[i] for i in np.flatnonzero(kept)]
-    return Survey(names, rssi[row][:, kept], position, row, len(rssi), origin, tuple(notes))
+    groups = group.to_numpy()[source.max(axis=1)[row]].tolist() if options.offset_by else []
+    labels = tuple(name for name in unused if _distinguishes(table[name]))
+    return Survey(names, rssi[row][:, kept], position, row, len(rssi), origin, groups, labels, tuple(notes))
 
 
 def column_of_numbers(label: object, table: pd.DataFrame, name: str) -> Floats:
@@ -260,7 +274,7 @@ def _in_metres(
 
 
 def _long(
-    label: object, table: pd.DataFrame, roles: dict[str, str], coordinate: Floats
+    label: object, table: pd.DataFrame, roles: dict[str, str], coordinate: Floats, group: pd.Series
 ) -> tuple[list[str], Floats, NDArray[np.int64], Floats]:
     """Return receivers, RSSI (n, R), its row in the table (n, R), and coordinates, with one row for each time and place.
 
@@ -272,7 +286,7 @@ def _long(
         raise InputError(f"{label} row {nameless[0] + 1} has no receiver in column {roles['receiver']}")
     power = column_of_numbers(label, table, roles["rssi"])
     time = _text(table[roles["time"]]) if "time" in roles else None
-    row = _row_of_packet(pd.DataFrame(coordinate), receiver, time)
+    row = _row_of_packet(pd.DataFrame(coordinate).assign(group=group.to_numpy()), receiver, time)
     column, names = pd.factorize(receiver)
     _, first = np.unique(row, return_index=True)
     _check_size(label, len(first), len(names))
@@ -336,6 +350,12 @@ def _is_rssi(column: pd.Series) -> bool:
     below = power[power < 0]
     mostly_below = len(power) - len(below) <= 1 or np.median(power) < 0
     return bool(mostly_below and len(below) and np.median(below) >= MIN_RSSI_DBM)
+
+
+def _distinguishes(column: pd.Series) -> bool:
+    """Return True if a column has few different values, each of them in several rows."""
+    times = _text(column).value_counts()
+    return 2 <= len(times) <= MAX_GROUPS and int(times.min()) >= MIN_GROUP_ROWS
 
 
 def _is_coordinate(name: str) -> bool:

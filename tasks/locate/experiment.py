@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from swiftwrf import InputError, Rssi, rssi_room
+from swiftwrf.data.coordinates import degree_columns
 from tasks.cluster import connected
 from tasks.locate.localizers import LEVELS
 from tasks.locate.observations import write_positions
@@ -17,7 +19,7 @@ from tasks.locate.steps import MIN_ROWS, Experiment, Localization
 from tasks.metrics import LocateMetrics, StudyMetrics
 from tasks.page.page import reporting
 from tasks.run import Row, Run, choose_device, console
-from tasks.source import measured_rssi, split_notes
+from tasks.source import asked_offsets, measured_rssi, split_notes
 from tasks.steps import computed
 from tasks.summarise import error_summary
 
@@ -39,6 +41,10 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     experiment, n_undetected = prepared(data, config.split, config.cells, config.seed, config.suggest)
     if n_undetected:
         console.print(f"{data.name}: test rows that no receiver detected are left out: {n_undetected}")
+    if (offsets := asked_offsets(experiment.train, config)) is not None:
+        train, test = offsets.removed(experiment.train), offsets.removed(experiment.test)
+        experiment = replace(experiment, train=train, test=test)
+        console.print(f"{data.name}: {offsets.note()}")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     with (
         connected(config.scheduler, device) as cluster,
@@ -114,6 +120,8 @@ class Results:
         columns: Row = {"position_error_m": error, "horizontal_error_m": horizontal}
         columns |= dict(zip(("x_m", "y_m", "z_m"), estimate.T, strict=True))
         columns |= dict(zip(("truth_x_m", "truth_y_m", "truth_z_m"), truth.T, strict=True))
+        degrees = degree_columns(self.experiment.train.origin, estimate.numpy())
+        columns |= {name: torch.from_numpy(values.copy()) for name, values in degrees.items()}
         if "radius" in value:
             radius = torch.tensor(value["radius"], dtype=torch.float64)
             columns |= {f"credible_radius_{100 * p:.0f}_m": r for p, r in zip(LEVELS, radius.T, strict=True)}
@@ -136,7 +144,7 @@ class Results:
         return {
             "task": "locate",
             "data": data.name,
-            "notes": [*split_notes(train, test), *data.notes],
+            "notes": [*split_notes(train, test), *data.notes, *([train.offsets.note()] if train.offsets else [])],
             "split": self.experiment.split,
             "seed": self.experiment.seed,
             "n_train": len(train),

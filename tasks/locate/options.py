@@ -9,13 +9,13 @@ import tyro
 
 from augment.suggest import MAX_SUGGESTIONS
 from swiftwrf import InputError
-from tasks.source import SpectraSource, TableSource
+from tasks.source import OffsetSource, SpectraSource
 
 TABLE = "positions.csv"
 
 
 @dataclass(frozen=True)
-class LocateConfig(SpectraSource, TableSource):
+class LocateConfig(SpectraSource, OffsetSource):
     """Positions of a transmitter from RSSI or spectra.
 
     Without MODEL and SOURCE: compare localizers on a split of measured RSSI, by default of the built-in simulated floor, and
@@ -49,7 +49,7 @@ class LocateConfig(SpectraSource, TableSource):
     """directory of the run (default: a new one under runs/locate), or table (default: positions.csv); must not exist"""
 
 
-EXPERIMENT = ("data", "rx", "split", "cells", "suggest", "scheduler", "seed")
+EXPERIMENT = ("data", "offset_by", "rx", "split", "cells", "suggest", "scheduler", "seed")
 SPECTRA = ("array", "beamformer", "grid", "every", "station")
 
 
@@ -72,7 +72,7 @@ def check(config: LocateConfig) -> None:
         raise InputError("--track is for observations; give it with MODEL and SOURCE")
     for name in SPECTRA if config.model is None else EXPERIMENT:
         if getattr(config, name) != default[name]:
-            raise InputError(f"--{name} is for {reason}")
+            raise InputError(f"--{name.replace('_', '-')} is for {reason}")
     if not 10 <= config.cells <= 1_000_000:
         raise InputError(f"--cells takes 10 to 1,000,000, got {config.cells}")
     if not 0 <= config.suggest <= MAX_SUGGESTIONS:

@@ -13,6 +13,7 @@ from pandas import DataFrame
 from PIL import Image, UnidentifiedImageError
 
 from swiftwrf import InputError, Rssi, rssi_room
+from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.files import sha256
 from swiftwrf.data.splits import validation_for
 from swiftwrf.models.base import Prediction
@@ -25,7 +26,7 @@ from tasks.page.page import reporting
 from tasks.rssi.page import page
 from tasks.rssi.predictors import PREDICTORS, make_predictor
 from tasks.run import Preset, Row, Run, choose_device, console
-from tasks.source import TableSource, measured_rssi, split_notes
+from tasks.source import OffsetSource, asked_offsets, measured_rssi, split_notes
 from tasks.summarise import error_summary, grouped
 
 MODEL = "model.safetensors"
@@ -34,7 +35,7 @@ MAX_PLAN_PIXELS = 2**24
 
 
 @dataclass(frozen=True)
-class RssiTaskConfig(TableSource):
+class RssiTaskConfig(OffsetSource):
     """RSSI of a moving transmitter at fixed receivers, against baselines.
 
     Without --data the built-in simulated floor is used. Continue an interrupted run with --resume DIR.partial, and with
@@ -82,6 +83,11 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     train, test = data.split(config.split, config.seed)
     if not bool((~test.rssi_dbm.isnan()).any()):
         raise InputError(f"split {config.split!r} of {data.name} has no test rows that detect these receivers")
+    notes = [*split_notes(train, test), *data.notes]
+    if (offsets := asked_offsets(pool, config)) is not None:
+        train, pool = offsets.removed(train), offsets.removed(pool)
+        notes.append(offsets.note())
+        console.print(f"{data.name}: {notes[-1]}")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
     prepare(device)  # compiles, which no predictor's time should contain
@@ -104,7 +110,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         metrics: RssiMetrics = {
             "task": "rssi",
             "data": data.name,
-            "notes": [*split_notes(train, test), *data.notes],
+            "notes": notes,
             "split": config.split,
             "preset": config.preset,
             "seed": config.seed,
@@ -179,6 +185,7 @@ class _Tables:
         self.row, column = self.detected.nonzero(as_tuple=True)
         self.receiver = [test.receiver_names[number] for number in column.tolist()]
         self.from_receiver = distance(test.transmitter_position, test.receiver_position)
+        self.offset = train.offsets.of(test)[:, None] if train.offsets else torch.zeros(1, 1, dtype=torch.float64)
         self.from_training = distance(test.transmitter_position, train.transmitter_position).min(dim=1).values
 
     def add(self, name: str) -> None:
@@ -201,7 +208,7 @@ class _Tables:
 
         value = self.directory.step(name, compute)
         self.seconds[name] = {"fit": value["fit"], "predict": value["predict"]}
-        predicted, measured = torch.tensor(value["predicted"], dtype=torch.float64), self.test.rssi_dbm
+        predicted, measured = torch.tensor(value["predicted"], dtype=torch.float64) + self.offset, self.test.rssi_dbm
         self.errors += _rows(
             method=[name] * len(self.row),
             receiver=self.receiver,
@@ -223,7 +230,10 @@ class _Tables:
         x, y, z = self.test.transmitter_position[self.row].unbind(dim=1)
         values = {"measured": measured, "predicted": prediction.mean, "low": low, "high": high}
         columns = {name: value[detected] for name, value in values.items()}
-        self.predictions += _rows(x=x, y=y, z=z, receiver=self.receiver, **columns)
+        degrees = degree_columns(self.test.origin, self.test.transmitter_position[self.row].numpy())
+        columns |= {name: torch.from_numpy(value) for name, value in degrees.items()}
+        group = {"group": self.test.groups.subset(self.row).labels()} if self.test.groups else {}
+        self.predictions += _rows(x=x, y=y, z=z, receiver=self.receiver, **group, **columns)
 
     def _write_maps(self, model: RssiModel) -> None:
         """Write the prediction and the width of its interval over the floor, at the median height of the measurements."""
@@ -250,6 +260,8 @@ class _Tables:
             "receiver": self.train.receiver_position.numpy(),
             "receiver_names": np.array(self.train.receiver_names),
         }
+        if self.train.origin is not None:
+            maps["origin"] = np.array(self.train.origin)
         self.directory.write_npz("maps.npz", maps | self.plan)
 
     def overall(self) -> dict[str, PredictorMetrics]:

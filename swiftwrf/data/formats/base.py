@@ -47,6 +47,8 @@ class ReadOptions:
     """values of RSSI that stand for not detected, () for none (default: those that are recognised)"""
     coordinates: Coordinates | None = None
     """unit of the positions in a table (default: the one that is recognised)"""
+    offset_by: str | None = None
+    """column of a table with groups of rows, e.g. devices, between which RSSI has constant offsets"""
 
     @property
     def given(self) -> list[str]:

@@ -10,7 +10,7 @@ from swiftwrf.data.files import digests, lines_before_header
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.nerf2_rssi import FILES as NERF2_FILES
 from swiftwrf.data.receivers import read_receivers
-from swiftwrf.data.rssi import Rssi
+from swiftwrf.data.rssi import Groups, Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
 from swiftwrf.data.survey import SEPARATORS, SUFFIXES, SurveyOptions, read_frame, read_survey
 from swiftwrf.errors import InputError
@@ -22,7 +22,7 @@ RECEIVERS = "receivers.csv"  # beside the table: receiver,x,y,z
 class SurveyTable(Format[Rssi]):
     """Table of a walk test; positions of receivers are unknown unless receivers.csv beside it contains them."""
 
-    takes = frozenset({"columns", "filler", "coordinates"})
+    takes = frozenset({"columns", "filler", "coordinates", "offset_by"})
 
     def recognises(self, path: Path) -> bool:
         return bool(_tables(path))
@@ -35,7 +35,9 @@ class SurveyTable(Format[Rssi]):
             )
         file, receivers = tables[0], tables[0].with_name(RECEIVERS)
         survey = read_survey(
-            file, read_frame(file), SurveyOptions(options.columns, options.filler, options.coordinates)
+            file,
+            read_frame(file),
+            SurveyOptions(options.columns, options.filler, options.coordinates, options.offset_by),
         )
         known, unknown = (
             read_receivers(receivers, survey.receiver_names, survey.origin) if receivers.is_file() else (None, [])
@@ -50,6 +52,8 @@ class SurveyTable(Format[Rssi]):
             receiver_names=survey.receiver_names,
             receiver_position=known,
             origin=survey.origin,
+            groups=Groups.of(options.offset_by, survey.group) if options.offset_by else None,
+            labels=survey.labels,
             index=survey.row,
             named_splits=kept_splits(splits, torch.from_numpy(survey.row), survey.n_rows),
             source=digests([file, *([receivers] if receivers.is_file() else [])], file.parent),
