@@ -5,8 +5,11 @@ Each is made from a floor with random positions, so that the expected measuremen
 
 from __future__ import annotations
 
+import json
+import os
 import re
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -15,11 +18,13 @@ import quick
 import torch
 from numpy.typing import NDArray
 
-from swiftwrf import InputError, Rssi, load, load_rssi
+from swiftwrf import InputError, Rssi, RssiModel, load, load_rssi
 from swiftwrf.data.coordinates import GeodeticOrigin
+from swiftwrf.data.rssi import Offsets
 from swiftwrf.data.splits import folds, random_split, repeated_fraction
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.locate import RssiLocator
+from swiftwrf.rssi import estimate_offsets
 from tasks.locate.experiment import run as locate
 from tasks.locate.options import LocateConfig
 from tasks.rssi.predictors import PREDICTORS
@@ -365,3 +370,118 @@ def test_outputs_of_a_table_in_degrees(tmp_path):
     np.testing.assert_allclose(positions[["truth_x_m", "truth_y_m"]], truth, atol=1e-3)
     estimate = data.origin.to_metres(positions[["latitude_deg", "longitude_deg"]].to_numpy())
     np.testing.assert_allclose(estimate, positions[["x_m", "y_m"]], atol=1e-3)
+
+
+def grouped_tables(floor, kind, tmp_path):
+    """Write a table of two devices (wide) or three channels (long); return it, the column and the offsets [dB]."""
+    receiver = pd.DataFrame(floor.receiver, columns=["x", "y", "z"])
+    receiver.insert(0, "receiver", NAMES)
+    receiver.to_csv(tmp_path / "receivers.csv", index=False)
+    if kind == "devices":
+        offset = {"pixel": 0.0, "galaxy": -11.0}
+        device = floor.random.choice(list(offset), len(floor.rssi), p=[0.6, 0.4])
+        table = floor.table(floor.rssi + np.array([offset[name] for name in device])[:, None]).assign(Device=device)
+    else:
+        offset = {"37": 0.0, "38": 6.0, "39": -5.0}
+        frame = floor.table().melt(["x", "y", "z"], var_name="gateway", value_name="rssi")
+        frame = frame.loc[frame.index.repeat(3)].reset_index(drop=True)
+        frame["ch"] = list(offset) * (len(frame) // 3)
+        frame["rssi"] += frame["ch"].map(offset) + floor.random.normal(0, 1, len(frame))
+        table = frame[floor.random.random(len(frame)) < 0.8]  # packets are lost
+    table.to_csv(tmp_path / "walk.csv", index=False)
+    return "Device" if kind == "devices" else "ch", offset
+
+
+@pytest.mark.parametrize("kind", ["devices", "channels"])
+def test_offsets_between_groups_of_rows(tmp_path, floor, kind, capsys):
+    column, truth = grouped_tables(floor, kind, tmp_path)
+    data = load_rssi(tmp_path / "walk.csv", offset_by=column)
+    train, test = data.split("random")
+    reference = next(iter(truth))
+    offsets = estimate_offsets(train, reference)
+    assert offsets.offset_db == pytest.approx(truth, abs=0.8)
+    errors = []
+    for known in (Offsets(column, reference, {}, 0.0), offsets):
+        predicted = RssiModel().fit(known.removed(train)).predict(test.transmitter_position).mean
+        errors.append(float((predicted + known.of(test)[:, None] - test.rssi_dbm).abs().nanmedian()))
+    assert errors[1] < 0.65 * errors[0]
+    assert quick.run("inspect", tmp_path / "walk.csv", "--out", tmp_path / "inspect") == 0
+    assert f"--offset-by {column}" in capsys.readouterr().out
+
+
+def test_columns_without_offsets_are_not_proposed(tmp_path, floor, capsys):
+    zone = np.where(floor.position[:, 0] < 15, "west", "east")
+    table = floor.table().assign(zone=zone, day=floor.random.choice(["monday", "friday"], len(zone)))
+    table.to_csv(tmp_path / "walk.csv", index=False)
+    assert quick.run("inspect", tmp_path / "walk.csv", "--out", tmp_path / "inspect") == 0
+    assert "--offset-by" not in capsys.readouterr().out
+
+
+def test_a_run_with_offsets(tmp_path, capsys):
+    """Measured values stay those of the table, predictions are of each row's group, and the locator knows the offsets."""
+    floor = Floor.made(7, n=60)
+    column, truth = grouped_tables(floor, "devices", tmp_path)
+    source = ("--rx", "all", "--data", tmp_path / "walk.csv", "--offset-by", f"{column}=galaxy")
+    assert quick.run("rssi", *source, "--out", tmp_path / "rssi") == 0
+    notes = json.loads((tmp_path / "rssi" / "metrics.json").read_text())["notes"]
+    assert any(f"offsets of {column} relative to galaxy" in note for note in notes)
+    predicted = pd.read_csv(tmp_path / "rssi" / "predictions.csv")
+    assert set(predicted["group"]) == set(truth)
+    table = pd.read_csv(tmp_path / "walk.csv")
+    assert predicted["measured"].isin(table[NAMES].to_numpy().ravel()).all()
+    assert load(tmp_path / "rssi" / "model.safetensors").offsets.reference == "galaxy"
+    assert quick.run("rssi", *source[:-1], "nowhere", "--out", tmp_path / "other") == 2
+    assert "no column 'nowhere' for offsets" in capsys.readouterr().err
+    data = load_rssi(tmp_path / "walk.csv", offset_by=column)
+    known = estimate_offsets(data, "pixel")
+    RssiLocator(n_cells=200).fit(known.removed(data)).save(tmp_path / "locator.safetensors")
+    found = []
+    for other in ("galaxy", "pixel"):  # the same transmitters, each measured by another device
+        rssi = floor.rssi + truth[other]
+        floor.table(rssi).drop(columns=["x", "y", "z"]).assign(Device=other).to_csv(
+            tmp_path / f"{other}.csv", index=False
+        )
+        out = tmp_path / f"{other}-positions.csv"
+        locate(
+            LocateConfig(
+                model=str(tmp_path / "locator.safetensors"), source=str(tmp_path / f"{other}.csv"), out=str(out)
+            )
+        )
+        found.append(pd.read_csv(out)[["x_m", "y_m"]].to_numpy())
+    assert np.median(np.linalg.norm(found[0] - found[1], axis=1)) < 1.0
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["kolak", "lora-campus", "tetam-tracks", "tetam-fingerprints", "dcm-rssi"])
+def test_measured_tables_are_read_without_options(measured_data, name):
+    data = load_rssi(measured_data / name)
+    fillers = [note for note in data.notes if "not detected" in note]
+    assert all(note.startswith("-100 ") for note in fillers)
+    assert data.located
+
+
+CASES = os.environ.get("SWIFTWRF_CASES")
+
+
+@pytest.mark.skipif(CASES is None, reason="set SWIFTWRF_CASES to the folder of inputs that went wrong")
+@pytest.mark.parametrize(
+    ("case", "rows", "n_detected", "note"),
+    [
+        ("01-rssi-127/input", 240, 1151, "127 counts as not detected: 49 "),
+        ("02-rssi-0-unknown/input", 240, 1057, "0 counts as not detected"),
+        ("03-filler-below-minus-100/input", 240, 532, "-105 counts as not detected"),
+        ("04-wigle-log/input", 240, 1200, "lines before the header"),
+        ("05-degrees-called-x-y/input", 240, 1200, "projected to local metres"),
+        ("06-rows-without-fix/input/empty", 228, 1140, "without a position"),
+        ("06-rows-without-fix/input/zero", 228, 1140, "at 0, 0"),
+        ("08-minus-inf/input", 240, 1125, "-inf counts as not detected"),
+        ("11-some-receivers-known/input", 240, 1200, "ap-south, ap-hall, ap-west"),
+        ("12-raw-nerf2-ble-layout/input", 240, 1200, ""),
+        ("13-receiver-moves-layout/input", 240, 1200, "the receiver moves"),
+        ("14-receiver-called-gateway/input", 240, 480, ""),
+    ],
+)
+def test_inputs_that_went_wrong(case, rows, n_detected, note):
+    data = load_rssi(Path(CASES) / case)
+    assert (len(data), int(data.detected.sum())) == (rows, n_detected)
+    assert not note or noted(data, note)
