@@ -114,15 +114,7 @@ def _check_count(count: int) -> None:
 
 def _expected_errors(locator: RssiLocator, position: Tensor, generator: torch.Generator) -> Tensor:
     """Return the root-mean-square position error (n,) [m] under the posterior of one simulated row a position (n, 3)."""
-    prediction = locator.model.predict(position)
-    assert prediction.std is not None
-    mean, std = prediction.mean.double(), prediction.std.double()
-    root = torch.linalg.cholesky(locator.values.correlation.double())
-    rssi = mean + std * (torch.randn(mean.shape, generator=generator, dtype=torch.float64) @ root.T)
-    chance = locator.detections.probability(mean)
-    detected = torch.rand(mean.shape, generator=generator, dtype=torch.float64) < chance
-    detected[torch.arange(len(mean)), chance.argmax(dim=1)] = True  # a row that no receiver detects is not located
-    rssi = rssi.where(detected, torch.nan)
+    rssi = locator.sample(position, 1, generator)[0]
     errors = []
     for at, rows in zip(position.split(BATCH_ROWS), rssi.split(BATCH_ROWS), strict=True):
         posterior = locator.locate(rows)

@@ -11,10 +11,10 @@ import torch
 from swiftwrf import AngularGrid, InputError, load, rssi_room, simulated_room
 from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.locate import MatchedField, Posterior, Region, RssiLocator
-from swiftwrf.locate.likelihood import ResidualDistribution
 from swiftwrf.locate.pool import pooled_weights
 from swiftwrf.locate.posterior import normalised
 from swiftwrf.locate.region import Cells
+from swiftwrf.locate.residuals import ResidualDistribution
 from swiftwrf.locate.rssi_likelihood import DetectionLikelihood, RssiMaps, ValueLikelihood
 from swiftwrf.locate.search import best_cells, refined
 from swiftwrf.models.geometry import GeometryModel, Plane
@@ -66,6 +66,7 @@ def test_two_modes_are_ambiguous():
         one.position, torch.logaddexp(one.log_weight + math.log(0.6), two.log_weight + math.log(0.4)), 0.025
     )
     assert both.ambiguous[0]
+    assert not replace(both, mode_width_m=6.5).ambiguous[0]
     assert both.most_likely[0, 0] == pytest.approx(-3, abs=0.05)
 
 
@@ -90,7 +91,7 @@ def test_splitting_cells_keeps_their_mass_and_finds_a_narrow_peak():
     def evaluate(position):
         return -((position - peak).square().sum(dim=2) / (2 * 0.002**2))[None]
 
-    found = best_cells(cells, evaluate(cells.position[None])[0], 40, 0, torch.Generator().manual_seed(0))
+    found = best_cells(cells, -evaluate(cells.position[None])[0], 40, 0, torch.Generator().manual_seed(0))
     volume, values = found.log_volume.exp().sum(), evaluate(found.position)
     for _ in range(10):
         found, values = refined(found, normalised(values[0].double() + found.log_volume), values, evaluate, 8)
@@ -186,6 +187,21 @@ def test_rssi_is_located_better_than_by_fingerprints(floor):
     found = (locator.locate(test.rssi_dbm).median - test.transmitter_position).norm(dim=1)
     nearest = (locator.fingerprints.estimate(test.rssi_dbm) - test.transmitter_position).norm(dim=1)
     assert found.median() < nearest.median()
+
+
+def test_the_prior_region_can_be_given(floor, tmp_path):
+    train, test, _ = floor
+    corner = Region(train.transmitter_position[train.transmitter_position[:, 0] < 5], margin=0.0, outside=0.01)
+    locator = RssiLocator(n_cells=600).fit(train, region=corner)
+    assert locator.locate(test.rssi_dbm).median[:, 0].max() < 5.5
+    locator.save(tmp_path / "locator.safetensors")
+    assert torch.equal(load(tmp_path / "locator.safetensors").cells.position, locator.cells.position)
+
+
+@pytest.mark.parametrize("locator", [MatchedField, RssiLocator])
+def test_unknown_options_are_refused(locator):
+    with pytest.raises(InputError, match="has no option 'cells'"):
+        locator(cells=4)
 
 
 def test_missing_values_count_as_missing():

@@ -29,7 +29,7 @@ from tasks.locate.options import LocateConfig
 from tasks.run import command_line
 from tasks.view import ViewConfig, run, spectra
 from tasks.view.drawing import HemisphereProjection, PlanProjection, colour_image, data_url, text
-from tasks.view.locating import N_POSITIONS, RssiLocating, simulated_rows
+from tasks.view.locating import N_POSITIONS, RssiLocating
 from tasks.view.rssi import MapSelection, probability_above
 from tasks.view.sources import open_source
 from tasks.view.spectra import angle_between
@@ -293,7 +293,7 @@ def test_posterior_of_a_row_is_that_of_the_locator(locating, located_floor):
 def test_rows_are_simulated_from_the_distributions_of_the_locator(located_floor, generator):
     locator, data, _ = located_floor
     at = data.transmitter_position[:3]
-    rssi = simulated_rows(locator, at, 4000, generator)
+    rssi = locator.sample(at, 4000, generator)
     assert not rssi.isnan().all(dim=2).any()
     predicted = locator.model.predict(at)
     median = rssi.nanmedian(dim=0).values

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Annotated, Any, ClassVar, Self
 
 import torch
@@ -22,7 +22,9 @@ from swiftwrf.locate.region import Cells, Region, outside_mass
 from swiftwrf.locate.search import best_cells, refined
 from swiftwrf.locate.spectrum_likelihood import (
     CoarrayLikelihood,
+    Features,
     PathStatistics,
+    PathWaves,
     PhaseLikelihood,
     SpectrumFeatures,
     gain_features,
@@ -33,12 +35,14 @@ from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.path_gains import PathGains, fit_path_gains, prior
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
+from swiftwrf.runtime.options import Configured
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 
 FOLDS = 5
 MIN_SPECTRA = 15
 MAX_LOG_VARIANCE = 30.0  # of path gains in a file
-OBSERVATIONS = 64  # searched at a time
+BATCH_OBSERVATIONS = 32  # searched at a time
+BATCH_CANDIDATES = 2048  # whose waves are computed together: as many as a processor's cache holds
 FIRST_WEIGHTS = (0.05, 0.05, 0.3)  # of the likelihoods, before calibration
 
 
@@ -50,9 +54,9 @@ class MatchedFieldConfig:
     """spacing of the first cells, in wavelengths"""
     max_cells: Annotated[int, Ge(1), Le(4_000_000)] = 400_000
     """number of first cells at most"""
-    n_best: Annotated[int, Ge(1), Le(100_000)] = 500
+    n_best: Annotated[int, Ge(1), Le(100_000)] = 300
     """cells of largest mass that are kept for each spectrum"""
-    n_background: Annotated[int, Ge(0), Le(100_000)] = 200
+    n_background: Annotated[int, Ge(0), Le(100_000)] = 100
     """cells that represent all others"""
     n_split: Annotated[int, Ge(1), Le(10_000)] = 16
     """cells that are split in each round"""
@@ -72,8 +76,33 @@ class _Fit:
     gains: PathGains
     statistics: PathStatistics
 
+    @property
+    def features(self) -> tuple[Features, Features]:
+        """Co-array numbers by constant and by position-dependent path gains."""
+        return room_features(self.room.array), gain_features(self.room.array, self.gains)
 
-class MatchedField(Saved):
+
+@dataclass(frozen=True, eq=False)
+class _Likelihoods:
+    """Likelihoods that share a room."""
+
+    room: GeometryModel
+    parts: tuple[CoarrayLikelihood, CoarrayLikelihood, PhaseLikelihood]
+
+    def __call__(self, position: Tensor, observed: SpectrumFeatures) -> Tensor:
+        """Return log-likelihoods (k, n, m) of n observations at candidates (n, m, 3) [m]."""
+        n, m, _ = position.shape
+        owner = torch.arange(n).repeat_interleave(m)
+        found = []
+        for some, rows in zip(
+            position.reshape(-1, 3).split(BATCH_CANDIDATES), owner.split(BATCH_CANDIDATES), strict=True
+        ):
+            waves, target = PathWaves.at(self.room, some), observed.subset(rows)
+            found.append(torch.stack([part.log_likelihood(waves, target) for part in self.parts]))
+        return torch.cat(found, dim=1).reshape(len(self.parts), n, m)
+
+
+class MatchedField(Configured, Saved):
     """Posterior over the position of the moving end, given a spectrum.
 
     Three likelihoods are pooled: co-array numbers predicted by constant path gains, by position-dependent path gains, and
@@ -83,6 +112,9 @@ class MatchedField(Saved):
     Args:
         config: Options as one object. Defaults to `MatchedFieldConfig()`.
         options: Single options, which replace those of `config`.
+
+    Raises:
+        InputError: An unknown option, or a value outside its range.
 
     Example:
         >>> import swiftwrf
@@ -95,16 +127,24 @@ class MatchedField(Saved):
     """
 
     kind: ClassVar[str] = "matched-field locator"
+    config_type: ClassVar[type[MatchedFieldConfig]] = MatchedFieldConfig
+    config: MatchedFieldConfig
 
-    def __init__(self, config: MatchedFieldConfig | None = None, **options: Any) -> None:
-        self.config = replace(config or MatchedFieldConfig(), **options)
-
-    def fit(self, train: Spectra, *, room: FieldModel | None = None, progress: bool = False) -> Self:
+    def fit(
+        self,
+        train: Spectra,
+        *,
+        room: FieldModel | None = None,
+        region: Region | None = None,
+        progress: bool = False,
+    ) -> Self:
         """Fit the likelihoods to measured spectra and return the locator.
 
         Args:
             train: Measured spectra, at least 15, with array, rotation and fixed end.
             room: Fitted model of the scene with a room. Defaults to a search for the room.
+            region: Prior over positions. Defaults to the neighbourhood of the training positions, with the mass outside from
+                held-out ones.
             progress: Show a progress bar on a terminal.
 
         Raises:
@@ -128,15 +168,15 @@ class MatchedField(Saved):
             some = train.subset(kept.nonzero()[:, 0])
             part = GeometryModel(seed=self.config.seed).fit(some, like=own)
             gains = fit_path_gains(part, scene.subset(kept[rows].nonzero()[:, 0]), kernel)
-            return _Fit(part, gains, PathStatistics.fit(part, some.position, features.phases[kept]))
+            return _Fit(part, gains, PathStatistics.fit(part, some.position, features.subset(kept)))
 
         fold = torch.arange(len(train)) % FOLDS
         parts = [fitted(fold != number) for number in range(FOLDS)]
         self._set_residuals(train.position, features, fold, parts)
         self._fit = fitted(torch.ones_like(fold, dtype=torch.bool))
-        self.known = train.position
+        held_out = [train.position[fold == number] for number in range(FOLDS)]
         others = [Region(train.position[fold != number]) for number in range(FOLDS)]
-        self.outside = outside_mass(others, [train.position[fold == number] for number in range(FOLDS)])
+        self.region = region or Region(train.position, outside=outside_mass(others, held_out))
         self._prepare()
         self.weight, self.inflation = torch.tensor(FIRST_WEIGHTS, dtype=torch.float64), 1.0
         self._calibrate(train.position, features, fold, parts)
@@ -147,29 +187,29 @@ class MatchedField(Saved):
         self.residual = torch.empty(2, *features.coarray.shape)
         for number, part in enumerate(parts):
             out = fold == number
-            for kind, predict in enumerate((room_features(part.room), gain_features(part.room, part.gains))):
-                self.residual[kind, out] = predict(position[out]) - features.coarray[out]
+            waves = PathWaves.at(part.room, position[out])
+            for kind, predict in enumerate(part.features):
+                self.residual[kind, out] = predict(waves) - features.coarray[out]
         self.observed_power = float(features.coarray.square().mean())
 
     def _prepare(self) -> None:
         """Compute what all spectra share: cells of the region and their predicted co-array numbers."""
-        self.region = Region(self.known, outside=self.outside)
         extent = self.region.extent
         spacing = self.config.spacing * self.room.array.wavelength
         count = math.prod((extent / spacing).clamp_min(1).tolist())
         self.cells = self.region.cells(int(min(max(count, 1), self.config.max_cells)))
         self.likelihoods = self._likelihoods(self._fit)
-        self._whitened = self.likelihoods[0].whitened(self.cells.position)
+        screen = self.likelihoods.parts[0]
+        batches = self.cells.position.split(BATCH_CANDIDATES)
+        self._whitened = torch.cat([screen.whitened(PathWaves.at(self.room, some)) for some in batches])
 
-    def _likelihoods(
-        self, fit: _Fit, kept: Tensor | None = None
-    ) -> tuple[CoarrayLikelihood, CoarrayLikelihood, PhaseLikelihood]:
+    def _likelihoods(self, fit: _Fit, kept: Tensor | None = None) -> _Likelihoods:
         residual = self.residual if kept is None else self.residual[:, kept]
-        return (
-            CoarrayLikelihood(room_features(fit.room), residual[0], self.observed_power),
-            CoarrayLikelihood(gain_features(fit.room, fit.gains), residual[1], self.observed_power),
-            PhaseLikelihood(fit.room, fit.statistics),
+        constant, varying = (
+            CoarrayLikelihood(predict, part, self.observed_power)
+            for predict, part in zip(fit.features, residual, strict=True)
         )
+        return _Likelihoods(fit.room, (constant, varying, PhaseLikelihood(fit.room, fit.statistics)))
 
     def _calibrate(self, position: Tensor, features: SpectrumFeatures, fold: Tensor, parts: list[_Fit]) -> None:
         """Choose the weights of the likelihoods and the inflation of credible radii by held-out positions."""
@@ -178,8 +218,7 @@ class MatchedField(Saved):
         at_truth, values, volumes, candidates = [], [], [], []
         for number, rows in rows_of.items():
             likelihoods, observed = self._likelihoods(parts[number], fold != number), features.subset(rows)
-            truth = position[rows][:, None]
-            at_truth.append(torch.stack([one.log_likelihood(truth, observed)[:, 0] for one in likelihoods]))
+            at_truth.append(likelihoods(position[rows][:, None], observed)[..., 0])
             for cells, value in self._searched(observed, likelihoods):
                 values.append(value)
                 volumes.append(cells.log_volume)
@@ -190,18 +229,21 @@ class MatchedField(Saved):
         held_out = Posterior(at, normalised(log_mass), self._resolution_m)
         self.inflation = inflation(held_out, position[torch.cat(list(rows_of.values()))])
 
-    def _searched(self, observed: SpectrumFeatures, likelihoods: Any) -> Iterator[tuple[Cells, Tensor]]:
+    def _searched(self, observed: SpectrumFeatures, likelihoods: _Likelihoods) -> Iterator[tuple[Cells, Tensor]]:
         """Yield cells (b, m) and log-likelihoods (k, b, m) of some observations at a time."""
         generator = torch.Generator().manual_seed(self.config.seed)
-        config = self.config
-        for rows in torch.arange(len(observed)).split(OBSERVATIONS):
+        config, screen = self.config, self.likelihoods.parts[0]
+        size = self._whitened.square().sum(dim=1)
+        for rows in torch.arange(len(observed)).split(BATCH_OBSERVATIONS):
             part = observed.subset(rows)
 
             def evaluate(position: Tensor, part: SpectrumFeatures = part) -> Tensor:
-                return torch.stack([one.log_likelihood(position, part) for one in likelihoods])
+                return likelihoods(position, part)
 
-            screened = self.likelihoods[0].from_whitened(self._whitened, part)
-            cells = best_cells(self.cells, screened, config.n_best, config.n_background, generator)
+            target = part.coarray @ screen.distribution.whitening
+            # squared distances up to a constant of each observation
+            away = torch.addmm(size, target, self._whitened.T, alpha=-2)
+            cells = best_cells(self.cells, away, config.n_best, config.n_background, generator)
             values = evaluate(cells.position)
             for _ in range(config.n_rounds):
                 cells, values = refined(cells, self._log_mass(cells, values), values, evaluate, config.n_split)
@@ -230,7 +272,9 @@ class MatchedField(Saved):
         parts = list(self._searched(observed, self.likelihoods))
         position = torch.cat([cells.position for cells, _ in parts])
         log_weight = torch.cat([self._log_mass(cells, values) for cells, values in parts])
-        return Posterior(position, log_weight, self._resolution_m, self.inflation)
+        # within half a wavelength the field changes too little for a second mode
+        width = self.room.array.wavelength / 2
+        return Posterior(position, log_weight, self._resolution_m, self.inflation, width)
 
     @property
     def _resolution_m(self) -> float:
@@ -255,16 +299,15 @@ class MatchedField(Saved):
         own = {
             "statistics": self._fit.statistics.raw,
             "residual": self.residual,
-            "known": self.known,
             "weight": self.weight,
         }
+        at, prior_values = self.region.state()
         plain = {
             "locator": asdict(self.config),
-            "outside": self.outside,
             "observed_power": self.observed_power,
             "inflation": self.inflation,
         }
-        return tensors | gains | own, header | values | plain
+        return tensors | gains | own | at, header | values | plain | prior_values
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
@@ -272,22 +315,22 @@ class MatchedField(Saved):
         locator = cls(MatchedFieldConfig(**header["locator"]))
         room = GeometryModel.from_state(tensors, header)
         features = 2 * len(differences(room.array))
-        n, known = tensors["residual"].shape[1], len(tensors["known"])
+        n, known = tensors["residual"].shape[1], len(tensors["region"])
         shapes = {
             "statistics": (4 + len(room.planes),),
             "residual": (2, n, features),
-            "known": (known, 3),
+            "region": (known, 3),
             "weight": (3,),
         }
         expect(tensors, shapes)
-        if n < MIN_SPECTRA or known < MIN_SPECTRA or bool((tensors["statistics"].abs() > MAX_LOG_VARIANCE).any()):
+        if n < MIN_SPECTRA or bool((tensors["statistics"].abs() > MAX_LOG_VARIANCE).any()):
             raise InputError("residuals, positions or variances are not those of a fitted locator")
         process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True, prefix="path_gains.")
         gains = PathGains(process, len(room.image_sources()[0]))
         locator.grid, locator.room = room.grid, room
         locator._fit = _Fit(room, gains, PathStatistics.of(tensors["statistics"]))
-        locator.residual, locator.known, locator.weight = (tensors[name] for name in ("residual", "known", "weight"))
-        locator.outside, locator.observed_power = float(header["outside"]), float(header["observed_power"])
+        locator.residual, locator.weight = tensors["residual"], tensors["weight"]
+        locator.region, locator.observed_power = Region.from_state(tensors, header), float(header["observed_power"])
         locator.inflation = _positive(header["inflation"])
         locator._prepare()
         return locator

@@ -23,6 +23,7 @@ class Posterior:
         log_weight: Logarithms of their posterior masses, which sum to 1, float64 (n, m).
         resolution_m: Edge of the largest cell around a candidate [m].
         inflation: Factor of credible radii that held-out positions call for.
+        mode_width_m: Least distance of two modes [m].
 
     Example:
         >>> at = torch.tensor([[[0.0, 0, 0], [1.0, 0, 0]]], dtype=torch.float64)
@@ -35,6 +36,7 @@ class Posterior:
     log_weight: Tensor
     resolution_m: float = 0.0
     inflation: float = 1.0
+    mode_width_m: float = 0.0
 
     def __len__(self) -> int:
         return len(self.log_weight)
@@ -99,10 +101,11 @@ class Posterior:
     def ambiguous(self) -> Tensor:
         """True where a tenth of the mass lies away from the most likely candidate, beyond the width of its mode, (n,).
 
-        The width is five times the radius that contains 30 % of the mass: four to six standard deviations of a single mode.
+        The width is five times the radius that contains 30 % of the mass, four to six standard deviations of a single mode,
+        and at least `mode_width_m`.
         """
         away = (self.position - self.most_likely[:, None]).norm(dim=2)
-        width = MODE_WIDTH * self._radius(away, MODE_LEVEL) + self.resolution_m
+        width = (MODE_WIDTH * self._radius(away, MODE_LEVEL) + self.resolution_m).clamp_min(self.mode_width_m)
         second: Tensor = (self.weight * (away > width[:, None])).sum(dim=1) > MODE_MASS
         return second
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -69,6 +71,15 @@ class Region:
             raise InputError(f"a region needs at least 2 known positions (n, 3), got shape {tuple(self.known.shape)}")
         if not self.margin >= 0 or not 0 < self.outside <= 1:
             raise InputError(f"a margin is at least 0 and a mass above 0, got {self.margin} and {self.outside}")
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+        """Return the known positions by name, and the plain values."""
+        return {"region": self.known}, {"margin": self.margin, "outside": self.outside}
+
+    @classmethod
+    def from_state(cls, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> Region:
+        """Return the region that `state` describes."""
+        return cls(tensors["region"], float(header["margin"]), float(header["outside"]))
 
     @cached_property
     def scale_m(self) -> float:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
-from typing import Annotated, Any, ClassVar, Self
+from dataclasses import asdict, dataclass
+from typing import Annotated, ClassVar, Self
 
 import torch
 from annotated_types import Ge, Le
@@ -19,6 +19,7 @@ from swiftwrf.locate.region import Region, outside_mass
 from swiftwrf.locate.rssi_likelihood import DetectionLikelihood, FingerprintLikelihood, RssiMaps, ValueLikelihood
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
+from swiftwrf.runtime.options import Configured
 from swiftwrf.runtime.progress import progress as tracked
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 
@@ -53,7 +54,7 @@ class _Part:
     maps: RssiMaps
 
 
-class RssiLocator(Saved):
+class RssiLocator(Configured, Saved):
     """Posterior over the position of the transmitter, given its RSSI at the receivers.
 
     Three likelihoods are pooled: the values under the radio maps with their uncertainty and correlated errors, which
@@ -64,6 +65,9 @@ class RssiLocator(Saved):
         config: Options as one object. Defaults to `RssiLocatorConfig()`.
         options: Single options, which replace those of `config`.
 
+    Raises:
+        InputError: An unknown option, or a value outside its range.
+
     Example:
         >>> import swiftwrf
         >>> train, test = swiftwrf.rssi_room(n=100).split()
@@ -73,16 +77,24 @@ class RssiLocator(Saved):
     """
 
     kind: ClassVar[str] = "RSSI locator"
+    config_type: ClassVar[type[RssiLocatorConfig]] = RssiLocatorConfig
+    config: RssiLocatorConfig
 
-    def __init__(self, config: RssiLocatorConfig | None = None, **options: Any) -> None:
-        self.config = replace(config or RssiLocatorConfig(), **options)
-
-    def fit(self, train: Rssi, *, model: RssiModel | None = None, progress: bool = False) -> Self:
+    def fit(
+        self,
+        train: Rssi,
+        *,
+        model: RssiModel | None = None,
+        region: Region | None = None,
+        progress: bool = False,
+    ) -> Self:
         """Fit the likelihoods to measured rows and return the locator.
 
         Args:
             train: Measured rows, at least 10.
             model: Radio maps fitted to the same rows. Fitted by default.
+            region: Prior over positions. Defaults to the neighbourhood of the training positions, with the mass outside from
+                held-out ones.
             progress: Show a progress bar on a terminal.
 
         Raises:
@@ -96,7 +108,7 @@ class RssiLocator(Saved):
         fold = folds(known, config.validation, config.seed)
         numbers = tracked(fold.unique().tolist(), "held-out folds", progress)
         parts = [self._part(train, fold, number) for number in numbers]
-        self.region = Region(
+        self.region = region or Region(
             known,
             BLOCK_MARGIN if config.validation == "block" else 0.03,
             outside_mass([Region(known[part.kept]) for part in parts], [known[part.out] for part in parts]),
@@ -209,6 +221,27 @@ class RssiLocator(Saved):
         log_mass = sum(weight * part.double() for weight, part in zip(self.weight.tolist(), parts, strict=True))
         return Posterior(at[None], normalised(log_mass + self.cells.log_volume), self.cells.edge_m, self.inflation)
 
+    @torch.no_grad()
+    def sample(self, position: Tensor, n: int, generator: torch.Generator) -> Tensor:
+        """Sample rows of RSSI from the fitted distributions: values with correlated errors, and lost packets.
+
+        Args:
+            position: Positions of the transmitter, float64 (m, 3) [m].
+            n: Number of rows at each position.
+            generator: Source of randomness.
+
+        Returns:
+            RSSI (n, m, R) [dBm], NaN if not detected. A row whose packets are all lost keeps its strongest value.
+        """
+        maps = RssiMaps.of(self.model.predict(position))
+        mean, std = maps.mean.double(), maps.std.double()
+        rssi = mean + std * self.values.sample((n, len(mean)), generator)
+        chance = self.detections.probability(mean)
+        lost = torch.rand(rssi.shape, generator=generator, dtype=torch.float64) >= chance
+        strongest = torch.nn.functional.one_hot(rssi.argmax(dim=2), rssi.shape[2]).bool()
+        lost &= ~(strongest & lost.all(dim=2, keepdim=True))
+        return rssi.masked_fill(lost, torch.nan)
+
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """Return the fitted tensors by name, and plain values."""
         tensors, header = self.model.state()
@@ -225,11 +258,10 @@ class RssiLocator(Saved):
             "k": self.fingerprints.k,
             "degrees": None if math.isinf(self.values.degrees) else self.values.degrees,
             "detections": asdict(self.detections),
-            "margin": self.region.margin,
-            "outside": self.region.outside,
             "inflation": self.inflation,
         }
-        return tensors | own, header | plain
+        at, prior = self.region.state()
+        return tensors | own | at, header | plain | prior
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
@@ -255,7 +287,7 @@ class RssiLocator(Saved):
         locator.fingerprints = FingerprintLikelihood(
             tensors["known"], tensors["fingerprint"], locator.floor_dbm, k, tensors["scale_m"]
         )
-        locator.region = Region(tensors["known"], float(header["margin"]), float(header["outside"]))
+        locator.region = Region.from_state(tensors, header)
         locator.cells = locator.region.cells(locator.config.n_cells)
         locator.weight, locator.inflation = tensors["weight"], float(header["inflation"])
         if not 0 < locator.inflation < math.inf:

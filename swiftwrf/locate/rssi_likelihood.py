@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
-from swiftwrf.locate.likelihood import DEGREES
+from swiftwrf.locate.residuals import DEGREES
 from swiftwrf.models.base import Prediction
 
 MIN_STD_DB = 0.5
@@ -90,6 +90,18 @@ class ValueLikelihood:
                 error = rssi[some][:, columns][:, None] / maps.std[:, columns] - scaled
                 distance[some] = (error @ whitening).square().sum(dim=2)
         return distance, determinant, detected.sum(dim=1, keepdim=True).float()
+
+    def sample(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+        """Sample standardised errors, float64 (*shape, R)."""
+        white = torch.randn(*shape, len(self.correlation), generator=generator, dtype=torch.float64)
+        noise: Tensor = white @ torch.linalg.cholesky(self.correlation).T
+        if math.isinf(self.degrees):
+            return noise
+        # a Student variable is a Gaussian one over the root of a scaled chi-squared one
+        rng = np.random.default_rng(int(torch.randint(2**31, (), generator=generator)))
+        chi_squared = torch.from_numpy(rng.chisquare(self.degrees, shape))
+        scale: Tensor = (chi_squared / self.degrees).sqrt()
+        return noise / scale[..., None]
 
     def log_likelihood(self, maps: RssiMaps, rssi: Tensor) -> Tensor:
         """Return log-likelihoods (n, m) of RSSI (n, R) [dBm] at candidates with maps (m, R)."""

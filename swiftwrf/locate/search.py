@@ -14,19 +14,19 @@ from swiftwrf.locate.region import Cells
 Evaluate = Callable[[Tensor], Tensor]  # candidates (n, m, 3) to log-likelihoods (n, m)
 
 
-def best_cells(cells: Cells, log_likelihood: Tensor, most: int, others: int, generator: torch.Generator) -> Cells:
-    """Return, for each observation, the cells of largest mass and a sample that stands for all others.
+def best_cells(cells: Cells, misfit: Tensor, most: int, others: int, generator: torch.Generator) -> Cells:
+    """Return, for each observation, the cells of smallest misfit and a sample that represents all others.
 
     Args:
         cells: Cells (m,) of the region.
-        log_likelihood: Log-likelihoods (n, m).
-        most: Number of cells of largest mass.
+        misfit: Misfit (n, m), any decreasing function of the likelihood.
+        most: Number of cells of smallest misfit.
         others: Number of cells drawn among the others, whose volume they share.
         generator: Source of randomness.
     """
-    n, m = log_likelihood.shape
+    n, m = misfit.shape
     most = min(most, m)
-    best = log_likelihood.topk(most, dim=1).indices
+    best = misfit.topk(most, dim=1, largest=False).indices
     position, volume, level = cells.position[best], cells.log_volume[best], cells.level[best]
     left = m - most
     if left <= 0 or others <= 0:

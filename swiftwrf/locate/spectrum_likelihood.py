@@ -9,21 +9,26 @@ J. Acoust. Soc. Am. 89, 1991).
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import ClassVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.optimize import minimize
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.locate.likelihood import Likelihood, ResidualDistribution
+from swiftwrf.locate.residuals import ResidualDistribution
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.path_gains import PathGains, paths
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation, coarray_numbers, retrieve_phases
 
-CHUNK = 50_000  # candidates whose channels are computed together
-PHASE_CHUNK = 4_000  # candidates whose covariances are factorised together
+MAX_STEPS = 20  # of L-BFGS
+PENALTY = 0.01  # of the squared logarithms of the variances: keeps those that the data do not determine near 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,59 +65,81 @@ def real_parts(numbers: Tensor) -> Tensor:
     return torch.view_as_real(numbers).flatten(-2).float()
 
 
-def room_features(room: GeometryModel) -> Callable[[Tensor], Tensor]:
-    """Return a function from positions (m, 3) to co-array numbers by constant path gains, float32 (m, F)."""
-    return lambda position: _chunked(
-        lambda some: real_parts(autocorrelation(room.channel(some).sgn(), room.array)), position, CHUNK
-    )
+@dataclass(frozen=True, eq=False)
+class PathWaves:
+    """Waves of the paths of a room at candidate positions, which all likelihoods share.
+
+    Args:
+        position: Candidate positions, float64 (m, 3) [m].
+        wave: Wave of the direct path and of each image at the elements, complex64 (m, 1 + S, K).
+        gain: Gains of the paths, (1 + S,).
+    """
+
+    position: Tensor
+    wave: Tensor
+    gain: Tensor
+
+    @classmethod
+    def at(cls, room: GeometryModel, position: Tensor) -> PathWaves:
+        """Compute the waves at positions (m, 3) [m]."""
+        return cls(position, *paths(room, room.scene(position)))
+
+    @property
+    def channel(self) -> Tensor:
+        """Channel of each element by constant path gains, complex64 (m, K)."""
+        return self.gain.to(self.wave.dtype) @ self.wave
 
 
-def gain_features(room: GeometryModel, gains: PathGains) -> Callable[[Tensor], Tensor]:
-    """Return a function from positions (m, 3) to co-array numbers by position-dependent path gains, float32 (m, F)."""
-
-    def features(some: Tensor) -> Tensor:
-        channel = gains.channel(room, some).sgn()
-        return real_parts(autocorrelation(channel, room.array).mean(dim=1))
-
-    return lambda position: _chunked(features, position, CHUNK // 8)
+Features = Callable[[PathWaves], Tensor]
 
 
-def _chunked(function: Callable[[Tensor], Tensor], position: Tensor, size: int) -> Tensor:
-    return torch.cat([function(some) for some in position.split(size)])
+def room_features(array: PlanarArray) -> Features:
+    """Return a function from waves of m positions to co-array numbers by constant path gains, float32 (m, F)."""
+    return lambda waves: real_parts(autocorrelation(waves.channel.sgn(), array))
 
 
-class CoarrayLikelihood(Likelihood):
+def gain_features(array: PlanarArray, gains: PathGains) -> Features:
+    """Return a function from waves of m positions to co-array numbers by position-dependent path gains, float32 (m, F)."""
+
+    def features(waves: PathWaves) -> Tensor:
+        channel = (waves.gain + gains.change(waves.position)) @ waves.wave
+        return real_parts(autocorrelation(channel.sgn(), array).mean(dim=1))
+
+    return features
+
+
+class SpectrumLikelihood(ABC):
+    """Log-likelihood of a spectrum at a candidate position."""
+
+    name: ClassVar[str]
+
+    @abstractmethod
+    def log_likelihood(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
+        """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""
+
+
+class CoarrayLikelihood(SpectrumLikelihood):
     """Student likelihood of the co-array numbers, with the covariance of held-out residuals.
 
     Args:
-        features: Function from positions (m, 3) [m] to predicted co-array numbers (m, F).
+        features: Function from waves of m positions to predicted co-array numbers (m, F).
         residual: Held-out residuals (n, F), predicted minus observed.
         power: Mean square of the observed numbers.
     """
 
     name = "coarray"
 
-    def __init__(self, features: Callable[[Tensor], Tensor], residual: Tensor, power: float) -> None:
+    def __init__(self, features: Features, residual: Tensor, power: float) -> None:
         self.features = features
         self.distribution = ResidualDistribution.fit(residual, power)
 
-    def whitened(self, position: Tensor) -> Tensor:
-        """Return whitened predictions (m, F) at positions (m, 3)."""
-        return self.features(position) @ self.distribution.whitening
+    def whitened(self, waves: PathWaves) -> Tensor:
+        """Return whitened predictions (m, F)."""
+        return self.features(waves) @ self.distribution.whitening
 
-    def from_whitened(self, predicted: Tensor, observed: SpectrumFeatures) -> Tensor:
-        """Return log-likelihoods (n, m) of whitened predictions (m, F) that all observations share."""
-        target = observed.coarray @ self.distribution.whitening
-        distance = target.square().sum(1)[:, None] + predicted.square().sum(1) - 2 * target @ predicted.T
-        return self.distribution.log_density(distance.clamp_min(0))
-
-    def log_likelihood(self, position: Tensor, observed: SpectrumFeatures) -> Tensor:
-        predicted = self.whitened(position.reshape(-1, 3))
-        if len(position) == 1:
-            return self.from_whitened(predicted, observed)
-        target = observed.coarray @ self.distribution.whitening
-        away = predicted.reshape(*position.shape[:2], -1) - target[:, None]
-        return self.distribution.log_density(away.square().sum(dim=2))
+    def log_likelihood(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
+        away = self.whitened(waves) - observed.coarray @ self.distribution.whitening
+        return self.distribution.log_density(away.square().sum(dim=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,21 +161,23 @@ class PathStatistics:
     floor: Tensor
 
     @classmethod
-    def fit(cls, room: GeometryModel, position: Tensor, phases: Tensor) -> PathStatistics:
-        """Fit the variances by the marginal likelihood of phasors (n, T, K) at known positions (n, 3)."""
-        planes = len(room.planes)
-        raw = torch.cat([torch.tensor([-3.0]), torch.full((planes,), -2.0), torch.tensor([0.0, -2.0, -2.0])])
-        raw.requires_grad_()
-        optimiser = torch.optim.Adam([raw], lr=0.15)
-        wave = paths(room, room.scene(position))
-        with torch.enable_grad():
-            for _ in range(STATISTICS_STEPS):
-                model = PhaseLikelihood(room, cls.of(raw))
-                loss = -model.paired_from(*wave, phases).mean() + 0.01 * raw.square().mean()
-                optimiser.zero_grad()
-                loss.backward()
-                optimiser.step()
-        return cls.of(raw.detach())
+    def fit(cls, room: GeometryModel, position: Tensor, observed: SpectrumFeatures) -> PathStatistics:
+        """Fit the variances by the marginal likelihood of n observations at known positions (n, 3)."""
+        start = torch.cat(
+            [torch.tensor([-3.0]), torch.full((len(room.planes),), -2.0), torch.tensor([0.0, -2.0, -2.0])]
+        )
+        waves = PathWaves.at(room, position)
+
+        @torch.enable_grad()
+        def loss(values: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+            raw = torch.from_numpy(values).float().requires_grad_()
+            density = PhaseLikelihood(room, cls.of(raw)).log_likelihood(waves, observed).mean()
+            total = PENALTY * raw.square().mean() - density
+            (gradient,) = torch.autograd.grad(total, raw)
+            return float(total.detach()), gradient.double().numpy()
+
+        found = minimize(loss, start.double().numpy(), jac=True, method="L-BFGS-B", options={"maxiter": MAX_STEPS})
+        return cls.of(torch.from_numpy(found.x).float())
 
     @property
     def raw(self) -> Tensor:
@@ -175,7 +204,7 @@ class PathStatistics:
         return torch.stack(variance)
 
 
-class PhaseLikelihood(Likelihood):
+class PhaseLikelihood(SpectrumLikelihood):
     """Marginal likelihood of the element phases if path gains vary about their mean by a complex normal distribution.
 
     The phase of the whole channel is unknown and integrated over.
@@ -192,19 +221,8 @@ class PhaseLikelihood(Likelihood):
         self._variance = statistics.of_paths(room)
         self._diffuse = _isotropic(room)
 
-    def log_likelihood(self, position: Tensor, observed: SpectrumFeatures) -> Tensor:
-        n, m = len(observed), position.shape[1]
-        flat = position.expand(n, -1, -1).reshape(-1, 3)
-        owner = torch.arange(n).repeat_interleave(m)
-        parts = [
-            self.paired_from(*paths(self.room, self.room.scene(some)), observed.phases[rows])
-            for some, rows in zip(flat.split(PHASE_CHUNK), owner.split(PHASE_CHUNK), strict=True)
-        ]
-        return torch.cat(parts).reshape(n, m)
-
-    def paired_from(self, wave: Tensor, gain: Tensor, phases: Tensor) -> Tensor:
-        """Return log-likelihoods (m,) of phasors (m, T, K) with paths (m, 1 + S, K) of mean gains (1 + S,)."""
-        mean = torch.einsum("s,msk->mk", gain.to(wave.dtype), wave)
+    def log_likelihood(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
+        mean, wave, phases = waves.channel, waves.wave, observed.phases
         power = (self._variance[:, None] * wave.abs().square()).sum(dim=1).mean(dim=1) + mean.abs().square().mean(dim=1)
         total = power * (1 + self.statistics.diffuse + self.statistics.floor)
         weighted = wave * self._variance.sqrt()[:, None]
@@ -227,14 +245,3 @@ def _isotropic(room: GeometryModel) -> Tensor:
     element = room.array.element.double()
     apart = 2 * torch.cdist(element, element) / room.array.wavelength
     return torch.sinc(apart).to(torch.complex64)
-
-
-STATISTICS_STEPS = 60
-__all__ = [
-    "CoarrayLikelihood",
-    "PathStatistics",
-    "PhaseLikelihood",
-    "SpectrumFeatures",
-    "gain_features",
-    "room_features",
-]

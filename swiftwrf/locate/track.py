@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -54,7 +55,8 @@ def smoothed(posterior: Posterior, time: Tensor | None, speed_m_s: float) -> Pos
         before[i] = step(position[i], position[i - 1], std[i - 1], own[i - 1] + before[i - 1])
     for i in range(n - 2, -1, -1):
         after[i] = step(position[i], position[i + 1], std[i], own[i + 1] + after[i + 1])
-    return Posterior(posterior.position, normalised(own + before + after), posterior.resolution_m)
+    # the inflation belongs to posteriors of single observations
+    return replace(posterior, log_weight=normalised(own + before + after), inflation=1.0)
 
 
 def joined(posteriors: Sequence[Posterior]) -> Posterior:
@@ -72,6 +74,7 @@ def joined(posteriors: Sequence[Posterior]) -> Posterior:
         first.position if is_shared else torch.cat(list(expanded)),
         torch.cat([part.log_weight for part in posteriors]),
         max(part.resolution_m for part in posteriors),
+        mode_width_m=first.mode_width_m,
     )
 
 

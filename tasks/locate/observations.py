@@ -224,7 +224,7 @@ def _tracked(posteriors: Iterable[Posterior], time: Tensor, speed_m_s: float) ->
     for start in range(0, len(whole), BATCH_ROWS):
         rows = slice(start, start + BATCH_ROWS)
         position = whole.position if len(whole.position) == 1 else whole.position[rows]
-        yield Posterior(position, whole.log_weight[rows], whole.resolution_m)
+        yield replace(whole, position=position, log_weight=whole.log_weight[rows])
 
 
 def _located(posteriors: Iterable[Posterior], index: Tensor, truth: Tensor | None) -> Columns:

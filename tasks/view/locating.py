@@ -16,7 +16,6 @@ from torch import Tensor
 from swiftwrf import InputError, Rssi, load
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator
 from swiftwrf.locate.rssi import UNDETECTED_BELOW_DB
-from swiftwrf.locate.rssi_likelihood import RssiMaps
 from swiftwrf.positions import nearest
 from tasks.locate.localizers import BATCH_ROWS
 from tasks.locate.steps import MAP_PIXELS, in_plan
@@ -188,7 +187,7 @@ class RssiLocating:
         """
         x, y, position, inside = _coarse_grid(self.locator)
         generator = torch.Generator().manual_seed(self.locator.config.seed)
-        rssi = simulated_rows(self.locator, position[inside], N_DRAWS, generator)
+        rssi = self.locator.sample(position[inside], N_DRAWS, generator)
         median = torch.cat([self.locator.locate(some).median for some in rssi.flatten(0, 1).split(BATCH_ROWS)])
         error = (median.reshape(*rssi.shape[:2], 3) - position[inside]).norm(dim=2)
         values = torch.full((len(position),), torch.nan, dtype=torch.float64)
@@ -234,36 +233,6 @@ class SpectrumLocating:
         density = (mass / mass.max()).masked_fill(mass < MIN_MASS * mass.max(), torch.nan).reshape(height, width)
         x, y = (float(start) + pixel_m * np.arange(number) for start, number in zip(low, (width, height), strict=True))
         return Located.of(posterior, PlanMap(x, y, density.numpy()), truth)
-
-
-def simulated_rows(locator: RssiLocator, position: Tensor, n: int, generator: torch.Generator) -> Tensor:
-    """Draw rows of RSSI from the distributions of a locator: values with correlated errors, and lost packets.
-
-    Args:
-        locator: Fitted locator.
-        position: Positions of the transmitter [m], float64 (m, 3).
-        n: Number of rows at each position.
-        generator: Source of randomness.
-
-    Returns:
-        RSSI (n, m, R) [dBm], NaN if not detected. A row whose packets are all lost keeps its strongest value.
-    """
-    maps = RssiMaps.of(locator.model.predict(position))
-    mean, std = maps.mean.double(), maps.std.double()
-    shape = (n, *mean.shape)
-    values, detections = locator.values, locator.detections
-    noise = torch.randn(shape, generator=generator, dtype=torch.float64) @ torch.linalg.cholesky(values.correlation).T
-    if math.isfinite(values.degrees):  # a Student variable is a Gaussian one over the root of a scaled chi-squared one
-        rng = np.random.default_rng(int(torch.randint(2**31, (), generator=generator)))
-        chi_squared = torch.from_numpy(rng.chisquare(values.degrees, shape[:2]))
-        noise = noise / (chi_squared / values.degrees).sqrt()[..., None]
-    rssi = mean + std * noise
-    chance = detections.probability(mean)
-    lost = torch.rand(shape, generator=generator, dtype=torch.float64) >= chance
-    strongest = torch.nn.functional.one_hot(rssi.argmax(dim=2), shape[2]).bool()
-    lost &= ~(strongest & lost.all(dim=2, keepdim=True))
-    rows: Tensor = rssi.masked_fill(lost, torch.nan)
-    return rows
 
 
 def _coarse_grid(locator: RssiLocator) -> tuple[Tensor, Tensor, Tensor, Tensor]:

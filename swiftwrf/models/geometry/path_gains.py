@@ -52,14 +52,20 @@ class PathGains:
 
         With a generator, return one field at random, complex64 (n, 1, K), with gains sampled from the posterior.
         """
-        change = self.process.mean(position).reshape(len(position), -1, self.n_paths, 2)
+        change = self.change(position)
         if generator is not None:
             field = torch.randint(change.shape[1], (len(change),), generator=generator)
             change = change[torch.arange(len(change)), field, None]
             spread = self.process.variance(position).sqrt().float()[:, None, None, None] * GAIN_STD
-            change = change + spread * torch.randn(change.shape, generator=generator)
+            noise = spread * torch.randn(*change.shape, 2, generator=generator)
+            change = change + torch.view_as_complex(noise)
         wave, gain = paths(geometry, geometry.scene(position))
-        return (gain + torch.view_as_complex(change)) @ wave
+        return (gain + change) @ wave
+
+    def change(self, position: Tensor) -> Tensor:
+        """Return the differences of the gains from those of the planes in each field, complex64 (n, F, S)."""
+        change = self.process.mean(position).reshape(len(position), -1, self.n_paths, 2)
+        return torch.view_as_complex(change)
 
 
 def paths(geometry: GeometryModel, scene: PhaseObservations) -> tuple[Tensor, Tensor]:

@@ -1,12 +1,10 @@
-"""Likelihoods of observations given a position: the interface, and distributions that held-out residuals determine."""
+"""Distribution of residuals, fitted to held-out ones."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -15,21 +13,6 @@ SHRINKAGES = (0.05, 0.1, 0.2, 0.4, 0.7)  # of a covariance towards a multiple of
 FOLDS, EM_STEPS = 5, 8
 DEGREES = (3.0, 5.0, 10.0, 30.0, math.inf)  # degrees of freedom that are compared
 FLOOR = 1e-6  # of a residual's variance, relative to the features' own
-
-
-class Likelihood(ABC):
-    """Log-likelihood of each of n observations at candidate positions."""
-
-    name: ClassVar[str]
-
-    @abstractmethod
-    def log_likelihood(self, position: Tensor, observed: Any) -> Tensor:
-        """Return log-likelihoods (n, m) up to a constant of each observation.
-
-        Args:
-            position: Candidates (n, m, 3) [m], or (1, m, 3) if all observations share them.
-            observed: Observations, as the implementation has them.
-        """
 
 
 @dataclass(frozen=True, eq=False)
