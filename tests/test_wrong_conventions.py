@@ -62,7 +62,6 @@ def shrunk(p):
 
 
 ALL_SHRUNK = replace(DATA, position=shrunk(DATA.position), fixed_position=shrunk(DATA.fixed_position))
-REPEATED = moved(lambda p: p.roll(1, 0).where(torch.arange(150)[:, None] == 3, p))
 FLIP_Y = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
 TURNED = oriented(FACING_X * Rotation.from_euler("x", 20, degrees=True))
 
@@ -80,7 +79,6 @@ NAMED = {
     "zenith for elevation": (drawn(lambda s: s.flip(1)), "run from the zenith down"),
     "phases reversed": (replace(DATA, channel=DATA.channel.conj()), "phases have the wrong sign"),
     "phases uncalibrated": (offsets(), "The array is not calibrated"),
-    "a place twice": (REPEATED, "occur more than once"),
     "RSSI, x and y swapped": (placed(lambda p: p[:, [1, 0, 2]]), "x and y of the positions are swapped"),
     "RSSI, positions in millimetres": (placed(shrunk), "the positions are in millimetres"),
     "RSSI, everything in millimetres": (placed(shrunk, receivers=True), "are positions in millimetres"),
