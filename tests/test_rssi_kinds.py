@@ -159,6 +159,7 @@ DEGREES = {
     "the other way round": (["Lat", "Lng"], (-33.85, 151.2)),
     "of a phone": (["GPS Longitude", "GPS Latitude"], (40.7, -74.0)),
     "called x and y": (["X", "Y"], (35.68, 139.7)),
+    "called x and y, swapped": (["x", "y"], (-33.4, -100.6)),
     "called pos_x and pos_y": (["pos_x", "pos_y"], (-1.29, 36.8)),
     "across the antimeridian": (["lon", "lat"], (-17.7, 180.0)),
 }
@@ -169,7 +170,7 @@ def test_degrees_become_local_metres(tmp_path, floor, kind):
     header, at = DEGREES[kind]
     degrees = floor.degrees(*at)
     degrees[:, 1] = (degrees[:, 1] + 180) % 360 - 180
-    columns = degrees if header[0] == "Lat" else degrees[:, ::-1]
+    columns = degrees if header[0] == "Lat" or "swapped" in kind else degrees[:, ::-1]
     table = pd.concat([pd.DataFrame(columns, columns=header), floor.table().drop(columns=["x", "y"])], axis=1)
     table.to_csv(tmp_path / "walk.csv", index=False)
     data = load_rssi(tmp_path / "walk.csv")
@@ -239,10 +240,17 @@ def test_positions_of_some_receivers(tmp_path, floor):
     floor.table().to_csv(tmp_path / "walk.csv", index=False)
     floor.write_receivers(tmp_path, NAMES[:3])
     data = load_rssi(tmp_path / "walk.csv")
+    with (tmp_path / "receivers.csv").open("a") as stream:
+        stream.write("ap-d,,,\n")
+    assert torch.equal(load_rssi(tmp_path / "walk.csv").receiver_located, data.receiver_located)
     assert data.receiver_located.tolist() == [True, True, True, False]
     assert noted(data, "ap-d", "no path-loss model")
     write_rssi(data, tmp_path)
-    assert load_rssi(tmp_path).receiver_located.tolist() == [True, True, True, False]
+    for line in ("", "ap-d: null\n", "ap-d:\n"):
+        with (tmp_path / "gateway_position.yml").open("a") as stream:
+            stream.write(line)
+        assert load_rssi(tmp_path).receiver_located.tolist() == [True, True, True, False]
+        write_rssi(data, tmp_path)
 
 
 @pytest.mark.parametrize("layout", ["raw", "receiver moves"])

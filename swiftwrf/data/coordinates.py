@@ -83,7 +83,7 @@ def without_fix(position: Floats) -> tuple[NDArray[np.bool_], list[str]]:
         position: Coordinates (n, 3) in any unit, nan where they are empty.
 
     Example:
-        >>> without_fix(np.array([[5.0, 5.0, 1.0], [5.0, 6.0, 1.0], [np.nan, 5.0, 1.0], [0.0, 0.0, 0.0]]))[0]
+        >>> without_fix(np.array([[50.0, 5.0, 1.0], [50.0, 6.0, 1.0], [np.nan, 5.0, 1.0], [0.0, 0.0, 0.0]]))[0]
         array([False, False,  True,  True])
     """
     empty = np.isnan(position).any(axis=1)
@@ -106,33 +106,45 @@ def _is_apart(places: Floats, most: int, at_origin: int) -> bool:
     return distance > FAR_RATIO * spacing or (at_origin > most and distance > spacing)
 
 
-def are_degrees(label: object, names: tuple[str, str], xy: Floats, named: bool, asked: Coordinates | None) -> bool:
-    """Return True if coordinates are longitude and latitude in degrees.
+def degrees_in(
+    label: object, names: tuple[str, str], xy: Floats, named: bool, asked: Coordinates | None
+) -> Floats | None:
+    """Return latitudes and longitudes (n, 2) [deg], None if the coordinates are metres.
 
     Args:
         label: Name of the table, for messages.
         names: Names of both columns.
-        xy: Longitude or x, and latitude or y, (n, 2).
+        xy: Longitude or x, and latitude or y, (n, 2). Without names, x is the latitude if y exceeds 90.
         named: Whether the columns are named after longitude and latitude.
         asked: What the user states.
 
     Raises:
         InputError: Values that are no degrees though the user states it, or that may be either.
+
+    Example:
+        >>> degrees_in("walk.csv", ("x", "y"), np.array([[11.0, 48.0], [11.0, 48.001]]), False, None)
+        array([[48.   , 11.   ],
+               [48.001, 11.   ]])
     """
     columns = f"{label}: columns {names[0]} and {names[1]}"
-    is_degrees = bool((np.abs(xy) <= (180, 90)).all())
-    if asked is not None:
-        if asked == "degrees" and not is_degrees:
-            raise InputError(f"{columns} exceed 180 and 90, so they are not longitude and latitude in degrees")
-        return asked == "degrees"
+    if asked == "metres":
+        return None
+    swapped = not named and bool((np.abs(xy[:, 1]) > 90).any())
+    degrees = xy if swapped else xy[:, ::-1]
+    if not (np.abs(degrees) <= (90, 180)).all():
+        if asked == "degrees" or (named and (np.abs(degrees) <= 180).all()):
+            raise InputError(
+                f"{columns} hold latitudes beyond 90 degrees; are they swapped? say which: columns latitude=NAME "
+                "longitude=NAME"
+            )
+        return None
     extent, distance = float(np.ptp(xy, axis=0).max()), float(np.abs(xy).max())
-    if named and np.abs(xy).max() <= 180 and not is_degrees:
-        raise InputError(f"{columns} hold latitudes beyond 90; are they swapped? say which: columns latitude=NAME")
-    far = distance > FAR_RATIO * extent
-    if not is_degrees or (not named and (not far or extent == 0 or extent > MAX_EXTENT_DEG)):
-        return False
-    if extent <= (MAX_EXTENT_DEG if named else MAX_FINE_EXTENT):
-        return True
+    if asked == "degrees" or (named and extent <= MAX_EXTENT_DEG):
+        return degrees
+    if not named and (distance <= FAR_RATIO * extent or extent == 0 or extent > MAX_EXTENT_DEG):
+        return None
+    if not named and extent <= MAX_FINE_EXTENT:
+        return degrees
     raise InputError(
         f"{columns} extend over {extent:.3g} and may be degrees or metres; say which: --coordinates degrees or "
         "--coordinates metres"

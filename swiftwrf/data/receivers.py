@@ -41,6 +41,8 @@ def read_receivers(file: Path, names: list[str], origin: GeodeticOrigin | None =
     height = column_of(table, "z", {})
     values = [column_of_numbers(file, table, str(name)) for name in columns]
     position = np.column_stack([*values, column_of_numbers(file, table, height) if height else np.zeros(len(table))])
+    given = np.flatnonzero(~(np.isnan(values[0]) & np.isnan(values[1])))
+    position, listed_names = position[given], [listed_names[row] for row in given]
     if not (np.abs(position) <= MAX_COORDINATE_M).all():
         raise InputError(f"{file} needs 3 finite numbers [m], at most {MAX_COORDINATE_M:g}, for each receiver")
     position[:, :2] = _in_metres(file, position[:, :2], column_of(table, "longitude", {}) in columns, origin)

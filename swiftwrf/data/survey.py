@@ -16,7 +16,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES, refusing_broken
-from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin, are_degrees, without_fix
+from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin, degrees_in, without_fix
 from swiftwrf.data.files import MAX_COORDINATE_M, lines_before_header, read_cells
 from swiftwrf.data.fillers import KNOWN_FILLERS, MIN_RSSI_DBM, check_powers, find_fillers, without_fillers
 from swiftwrf.errors import InputError, listed
@@ -174,6 +174,8 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
     position, origin = _in_metres(label, roles, coordinate[row], options.coordinates)
     if origin is not None:
         x, y = (roles.get(role) or roles[GEODETIC[role]] for role in "xy")
+        if np.abs(coordinate[row, 1]).max() > 90:  # only a longitude does
+            x, y = y, x
         notes.append(f"longitude {x} and latitude {y} are projected to local metres about {origin}")
     kept = (~np.isnan(rssi[row])).any(axis=0)
     if not kept.any():
@@ -265,10 +267,9 @@ def _in_metres(
 ) -> tuple[Floats, GeodeticOrigin | None]:
     """Return positions (n, 3) [m], and their origin if they were in degrees."""
     names = roles.get("x") or roles["longitude"], roles.get("y") or roles["latitude"]
-    named = "longitude" in roles and "latitude" in roles
-    if not are_degrees(label, names, coordinate[:, :2], named, asked):
+    degrees = degrees_in(label, names, coordinate[:, :2], "longitude" in roles and "latitude" in roles, asked)
+    if degrees is None:
         return coordinate, None
-    degrees = coordinate[:, 1::-1]
     origin = GeodeticOrigin.amid(degrees)
     return np.column_stack([origin.to_metres(degrees), coordinate[:, 2]]), origin
 

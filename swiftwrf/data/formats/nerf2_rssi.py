@@ -27,6 +27,7 @@ POSITIONS = ("tx_pos.csv", "rx_pos.csv", "beacon_pos.csv")
 RECEIVERS = ("gateway_position.yml", "gateway_pos.csv")
 FILES = ("gateway_rssi.csv", *POSITIONS, *RECEIVERS)  # any of which marks the layout
 AXES = ["x", "y", "z"]
+EMPTY_VALUES = ("", "~", "null", "none")  # of a receiver whose position is unknown
 
 
 @RSSI_FORMATS.register("nerf2")
@@ -100,7 +101,7 @@ def _receiver_positions(file: Path | None, names: list[str]) -> tuple[Tensor | N
         return None, []
     if file.suffix == ".csv":
         return read_receivers(file, names)
-    content = read_yaml(file)
+    content = {name: value for name, value in read_yaml(file).items() if value not in EMPTY_VALUES}
     unknown = [name for name in names if name not in content]
     if len(unknown) == len(names):
         raise InputError(f"{file} has no position of the receivers that the table names: {listed(names)}")
