@@ -1,88 +1,33 @@
-"""Options of all commands that state how files are read, where the files leave it open, and reading by them."""
+"""Reading of measurements as the options of a command line state it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from swiftwrf import AngularGrid, InputError, Rssi, Spectra
-from swiftwrf.array.beamforming import BEAMFORMERS
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import ReadOptions, read_rssi, read_spectra
-from swiftwrf.data.coordinates import Coordinates
 from swiftwrf.data.rssi import Offsets
 from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
 from swiftwrf.rssi import estimate_offsets
-from tasks.run import choice
-
-TABLE_OPTIONS = ("columns", "filler", "coordinates", "offset_by")
-MAX_SIDE = 32  # elements: spectra of 32 x 32 elements have 7,938 independent numbers
-
-
-@dataclass(frozen=True, kw_only=True)
-class SpectraSource:
-    """Options of reading spectra."""
-
-    array: tuple[int, float, float] | tuple[int, int, float, float] | None = None
-    """array of the spectra if the data do not describe it, or for which spectra of ray paths are computed: elements a side,
-    spacing [m], carrier [Hz] of a square array, or rows, columns, spacing [m], carrier [Hz]"""
-    beamformer: Annotated[str | None, choice("beamformer for array snapshots (default: phase)", BEAMFORMERS)] = None
-    grid: tuple[int, int] | None = None
-    """elevations and azimuths of computed spectra (default: 90 360)"""
-    every: int | None = None
-    """reads one measurement of that many"""
-    station: int | None = None
-    """number of the array in a file with several, counted from 1"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TableSource:
-    """Options of reading RSSI."""
-
-    columns: tuple[str, ...] = ()
-    """names of columns of a survey table that are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME ... (several with
-    rssi='WAP*')"""
-    filler: tuple[float, ...] = ()
-    """values of RSSI that stand for not detected (default: those that are recognised)"""
-    keep_filler: bool = False
-    """whether all values of RSSI count as measured"""
-    coordinates: Coordinates | None = None
-    """unit of the positions in a survey table (default: the one that is recognised)"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class OffsetSource(TableSource):
-    """Options of reading RSSI of several devices or channels."""
-
-    offset_by: str | None = None
-    """column of a survey table with groups of rows, e.g. devices, whose constant offsets are estimated; COLUMN=VALUE makes
-    that group the reference of maps (default: the most frequent one)"""
+from tasks.options import OffsetSource, SpectraSource, TableSource
 
 
 def reading(config: SpectraSource | TableSource) -> ReadOptions:
-    """Return the options of a command line for reading.
-
-    Raises:
-        InputError: An option that makes no sense whatever the data.
-    """
-    array = beamformer = grid = every = station = columns = filler = coordinates = None
+    """Return the options of a command line for reading."""
+    array = beamformer = grid = every = station = columns = filler = coordinates = offset_by = None
     if isinstance(config, SpectraSource):
-        array, beamformer, grid = _array(config), config.beamformer, _grid(config)
-        every, station = config.every, config.station
-        if beamformer is not None:
-            BEAMFORMERS[beamformer]  # refuses an unknown one
-        for name, value in (("every", every), ("station", station)):
-            if value is not None and value < 1:
-                raise InputError(f"--{name} must be at least 1, got {value}")
+        array, beamformer, every, station = _array(config), config.beamformer, config.every, config.station
+        grid = AngularGrid.hemisphere(*config.grid) if config.grid else None
     if isinstance(config, TableSource):
-        columns, filler, coordinates = _columns(config.columns), _filler(config), config.coordinates
-    offset_by = config.offset_by.partition("=")[0] if isinstance(config, OffsetSource) and config.offset_by else None
+        columns, filler, coordinates = config.column_names, config.fillers, config.coordinates
+    if isinstance(config, OffsetSource) and config.offset_by is not None:
+        offset_by = config.offset_by.partition("=")[0]
     return ReadOptions(array, beamformer, grid, every, station, columns, filler, coordinates, offset_by)
 
 
@@ -91,52 +36,18 @@ def _array(config: SpectraSource) -> PlanarArray | None:
         return None
     *sides, spacing, frequency = config.array
     rows, columns = (int(side) for side in (sides[0], sides[-1]))
-    if not (1 <= min(rows, columns) <= max(rows, columns) <= MAX_SIDE and max(rows, columns) >= 2):
-        raise InputError(f"--array takes 2 to {MAX_SIDE} elements a side, got {rows} x {columns}")
-    if min(spacing, frequency) <= 0:
-        raise InputError(f"--array takes a spacing [m] and a carrier [Hz] above 0, got {spacing:g} and {frequency:g}")
     if rows == columns:
         return PlanarArray.square(rows, frequency, spacing)
     return PlanarArray.grid(rows, columns, spacing, frequency)
-
-
-def _grid(config: SpectraSource) -> AngularGrid | None:
-    if config.grid is None:
-        return None
-    if min(config.grid) < 2:
-        raise InputError(f"--grid takes numbers of elevations and azimuths, each at least 2, got {config.grid}")
-    return AngularGrid.hemisphere(*config.grid)
-
-
-def _columns(columns: tuple[str, ...]) -> dict[str, str] | None:
-    pairs = [text.partition("=") for text in columns]
-    for text, (role, _, name) in zip(columns, pairs, strict=True):
-        if not role or not name:
-            raise InputError(f"--columns takes what a column holds and its name, e.g. x=NAME, got {text!r}")
-    roles = {role: name for role, _, name in pairs}
-    if len(roles) < len(pairs):
-        raise InputError(f"--columns names something twice: {' '.join(columns)}")
-    return roles or None
-
-
-def _filler(config: TableSource) -> tuple[float, ...] | None:
-    if config.keep_filler and config.filler:
-        raise InputError("--filler and --keep-filler exclude each other")
-    return config.filler if config.filler or config.keep_filler else None
 
 
 def measured_rssi(data: str | None, config: TableSource) -> Rssi | None:
     """Return the RSSI of an experiment in a folder or file, None without one.
 
     Raises:
-        InputError: RSSI that cannot be read, or options of reading without a source.
+        InputError: RSSI that cannot be read.
     """
-    options = reading(config)
-    if data is not None:
-        return read_rssi(data, options)
-    if given := [name for name in options.given if name in TABLE_OPTIONS]:
-        raise InputError(f"--{given[0].replace('_', '-')} is for measured RSSI; give it with --data")
-    return None
+    return None if data is None else read_rssi(data, reading(config))
 
 
 def asked_offsets(train: Rssi, config: OffsetSource) -> Offsets | None:
@@ -145,9 +56,7 @@ def asked_offsets(train: Rssi, config: OffsetSource) -> Offsets | None:
     Raises:
         InputError: One group only, or an unknown reference.
     """
-    if config.offset_by is None:
-        return None
-    return estimate_offsets(train, config.offset_by.partition("=")[2] or None)
+    return None if config.offset_by is None else estimate_offsets(train, config.offset_by.partition("=")[2] or None)
 
 
 def split_notes(train: Rssi, test: Rssi) -> list[str]:

@@ -18,11 +18,11 @@ import torch
 import yaml
 from torch import Tensor
 
+from swiftwrf.choices import CARRIERS_HZ
 from swiftwrf.errors import InputError
 
 MAX_TEXT_BYTES = 2**28  # a million rows of positions take a tenth of it
 MAX_COORDINATE_M = 1e9  # beyond, float64 does not resolve a wavelength
-CARRIERS_HZ = (1e6, 1e13)
 MAX_PREAMBLE_LINES = 20  # before the header of a table
 DECIMAL_COMMA = re.compile(r"^(\s*[+-]?\d+),(\d+\s*)$")
 PLAIN_TAGS = {

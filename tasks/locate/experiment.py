@@ -13,15 +13,18 @@ from swiftwrf.data.coordinates import degree_columns
 from tasks.cluster import connected
 from tasks.locate.localizers import LEVELS
 from tasks.locate.observations import write_positions
-from tasks.locate.options import LocateConfig, check
+from tasks.locate.options import LocateConfig
 from tasks.locate.page import page
+from tasks.locate.page.summary import answer
 from tasks.locate.steps import MIN_ROWS, Experiment, Localization
 from tasks.metrics import LocateMetrics, StudyMetrics
 from tasks.page.page import reporting
-from tasks.run import Row, Run, choose_device, console
+from tasks.page.records import Records
+from tasks.run import Row, Run, choose_device
 from tasks.source import asked_offsets, measured_rssi, split_notes
 from tasks.steps import computed
 from tasks.summarise import error_summary
+from tasks.terminal import console, terminal
 
 
 def run(config: LocateConfig, resume: Path | None = None) -> None:
@@ -30,7 +33,6 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     Raises:
         InputError: Data or options that do not exist or do not fit together.
     """
-    check(config)
     if config.model is not None:
         write_positions(config)
         return
@@ -51,12 +53,14 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
         Run("locate", config.out, label, config, device, data.source, resume) as directory,
     ):
         results = Results(experiment)
-        for step, value in computed(directory, experiment.steps(), experiment, cluster):
-            assert isinstance(step, Localization)
-            results.add(step, value)
+        with terminal.progress():
+            for step, value in computed(directory, experiment.steps(), experiment, cluster):
+                assert isinstance(step, Localization)
+                results.add(step, value)
+                terminal.result(step.title, f"{results.median_m(step):.2f} m")
         directory.write_csv("errors.csv", results.errors)
         final = directory.finish(results.metrics(data, n_undetected), reporting(page))
-    console.print(f"report: [bold]{final / 'report.html'}[/]")
+    terminal.answer(answer(Records(final)), final / "report.html")
 
 
 def measurements(config: LocateConfig) -> Rssi:
@@ -137,6 +141,10 @@ class Results:
             "horizontal_error_m": error_summary(horizontal),
             "seconds": value["seconds"],
         }
+
+    def median_m(self, step: Localization) -> float:
+        """Return the median position error of a step [m]."""
+        return next(study["position_error_m"]["median"] for known, study in self._studies if known == step)
 
     def metrics(self, data: Rssi, n_undetected: int) -> LocateMetrics:
         """Return the content of metrics.json of a run on these data."""

@@ -20,11 +20,12 @@ from swiftwrf.errors import listed
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
 from swiftwrf.locate.track import joined
 from swiftwrf.metrics import angle_errors
-from tasks.directory import check_new_table, console
+from tasks.directory import check_new_table
 from tasks.locate.localizers import BATCH_ROWS
 from tasks.locate.options import SPECTRA, TABLE, LocateConfig
-from tasks.records import write_table
+from tasks.records import Row, write_table
 from tasks.source import observed_spectra, reading
+from tasks.terminal import console, terminal
 
 Columns = dict[str, Tensor]
 MAX_TRACKED = 20_000_000  # candidate positions of a walk that are in memory together
@@ -51,8 +52,12 @@ def write_positions(config: LocateConfig) -> None:
         )
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     write_table(out, [dict(zip(columns, row, strict=True)) for row in rows])
-    error = f", median error {columns['position_error_m'].median():.2f} m" if "position_error_m" in columns else ""
-    print(f"{len(columns['index'])} positions{error}: {out}")
+    values: Row = {"n_positions": len(columns["index"]), "table": str(out)}
+    error = ""
+    if "position_error_m" in columns:
+        values["median_error_m"] = float(columns["position_error_m"].median())
+        error = f", median error {values['median_error_m']:.2f} m"
+    terminal.page(values, f"{values['n_positions']} positions{error}: {out}")
 
 
 def _of_rssi(locator: RssiLocator, config: LocateConfig, source: str) -> Columns:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from pandas import DataFrame
 
 from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
+from tasks.labels import PREDICTORS as LABELS
+from tasks.labels import labels
 from tasks.page import figures
-from tasks.page.labels import PREDICTORS as LABELS
-from tasks.page.labels import labels
 from tasks.page.page import Page, Plot, Section, Table
 from tasks.page.palette import Palette
 from tasks.page.provenance import number, provenance

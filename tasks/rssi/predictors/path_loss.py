@@ -6,10 +6,8 @@ from torch import Tensor
 
 from swiftwrf import Rssi
 from swiftwrf.rssi import PathLoss, RssiFitContext, RssiPredictor, fit_path_loss, fit_shared_path_loss, log_distance
-from tasks.rssi.predictors.base import PREDICTORS
 
 
-@PREDICTORS.register("mean")
 class Mean(RssiPredictor):
     """The mean of the receiver's training values, at every position.
 
@@ -25,7 +23,6 @@ class Mean(RssiPredictor):
         return self._mean.expand(len(position), -1), None
 
 
-@PREDICTORS.register("mri_pooled")
 class SharedPathLoss(RssiPredictor):
     """One log-distance path-loss model for all receivers of the pool, by least squares.
 
@@ -45,7 +42,6 @@ class SharedPathLoss(RssiPredictor):
         return self._path_loss(log_distance(position, self._receiver)), None
 
 
-@PREDICTORS.register("mri_receiver")
 class ReceiverPathLoss(SharedPathLoss):
     """A log-distance path-loss model for each receiver; a receiver never detected has the model of all receivers."""
 

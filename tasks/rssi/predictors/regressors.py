@@ -20,7 +20,6 @@ from swiftwrf import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.rssi import RssiFitContext, RssiPredictor
 from swiftwrf.runtime.threads import side_by_side
-from tasks.rssi.predictors.base import PREDICTORS
 from tasks.rssi.predictors.path_loss import Mean, ReceiverPathLoss
 
 # scikit-learn's own choice for many neighbours computes distances from squares and a product, which cancel map coordinates
@@ -76,7 +75,6 @@ class ReceiverRegressors(RssiPredictor):
         return predicted if self._simpler is None else predicted + self._simpler.predict(position.detach()).mean, None
 
 
-@PREDICTORS.register("knn")
 class KNNPredictor(ReceiverRegressors):
     """Inverse-distance mean of the k nearest measurements of RSSI; k by cross-validation in the training rows."""
 
@@ -102,7 +100,6 @@ class KNNPredictor(ReceiverRegressors):
         return KNeighborsRegressor(k, weights=weights, algorithm=NEIGHBOUR_SEARCH).fit(x, y)
 
 
-@PREDICTORS.register("mri_residual")
 class ResidualKNNPredictor(KNNPredictor):
     """The receiver's path-loss model, and the mean of its nearest residuals.
 
@@ -116,7 +113,6 @@ class ResidualKNNPredictor(KNNPredictor):
         return ReceiverPathLoss()
 
 
-@PREDICTORS.register("gp")
 class GPPredictor(ReceiverRegressors):
     """A Gaussian process on the residual of the receiver's path-loss model.
 
