@@ -161,6 +161,11 @@ def to_angles(direction: Tensor) -> tuple[Tensor, Tensor]:
     return azimuth, torch.atan2(z.abs(), torch.hypot(x, y))
 
 
+def folded_to_front(direction: Tensor) -> Tensor:
+    """Return vectors (..., 3) with z made positive: a planar array does not distinguish +z from -z."""
+    return torch.cat([direction[..., :2], direction[..., 2:].abs()], dim=-1)
+
+
 def wrap(angle: Tensor) -> Tensor:
     """Return the angle [rad] in [-pi, pi] that differs by a multiple of 2 pi."""
     return angle - math.tau * torch.round(angle / math.tau)

@@ -137,10 +137,9 @@ def check_spacing(file: Path, array: PlanarArray) -> None:
     """
     if len(array.element) < 2:
         raise InputError(f"{file} describes an array of one element, which sees no directions; at least 2 are needed")
-    apart = torch.cdist(array.element, array.element).fill_diagonal_(torch.inf).amin(dim=1).median() / array.wavelength
-    low, high = SPACING_WAVELENGTHS
-    if not low <= float(apart) <= high:
+    apart, (low, high) = array.spacing_wavelengths, SPACING_WAVELENGTHS
+    if not low <= apart <= high:
         raise InputError(
-            f"{file}: neighbouring elements are {float(apart) * array.wavelength:.4g} m, {float(apart):.3g} wavelengths "
+            f"{file}: neighbouring elements are {apart * array.wavelength:.4g} m, {apart:.3g} wavelengths "
             f"apart; expected {low:g} to {high:g} wavelengths, so is the spacing in metres and the carrier in Hz?"
         )

@@ -30,6 +30,7 @@ from swiftwrf.array.beamforming import covariance
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.splits import FOLDS, MIN_TRAINING, slabs
+from swiftwrf.diagnostics.elements import phases_are_constant
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.threads import single_thread
 
@@ -93,8 +94,8 @@ def calibrate(train: Snapshots) -> Calibration:
         train: Snapshots of training positions. Those without line of sight are omitted.
 
     Raises:
-        InputError: Fewer than 20 positions with line of sight, fewer than 10 where the direct path dominates, or a rotation
-            that is not identifiable.
+        InputError: Fewer than 20 positions with line of sight, fewer than 10 where the direct path dominates, a linear array,
+            phases that do not depend on the position, a rotation beyond 45 degrees or one that is not identifiable.
     """
     seen = train.subset(train.line_of_sight.nonzero()[:, 0])
     if len(seen) < 2 * MIN_TRAINING:
@@ -102,8 +103,23 @@ def calibrate(train: Snapshots) -> Calibration:
             f"{train.name} has {len(seen)} training positions with line of sight; a calibration needs at least "
             f"{2 * MIN_TRAINING}"
         )
+    if train.array.axis is not None:
+        raise InputError(
+            f"the elements of {train.name} lie on a line, which receives the angle to its axis only, so the array's "
+            "orientation cannot be estimated"
+        )
+    if phases_are_constant(seen):
+        raise InputError(
+            f"the phases between the elements of {train.name} hardly depend on the position, so they do not contain the "
+            "direction of the line of sight"
+        )
     problem = _Problem.of(seen)
     found = problem.descend(problem.scan())
+    if (turn := float(found.turn.norm())) > MAX_TURN:
+        raise InputError(
+            f"the phases of {train.name} fit best with the array turned by {math.degrees(turn):.0f} degrees; beyond "
+            f"{math.degrees(MAX_TURN):.0f} degrees that is an error of frames, not of mounting, so nothing is calibrated"
+        )
     clear = int((problem.shares(found) >= CLEAR_SHARE).sum())
     if clear < MIN_TRAINING:
         raise InputError(

@@ -34,7 +34,7 @@ def results_section(fraction: FractionRecords, several: bool) -> Section:
     ]
     columns = ["method", *(f"{name} [deg]" for name in ERRORS.values()), "great circle, 90 %"]
     strong = frozenset(name for name, condition in fraction.conditions.items() if condition.is_turbo)
-    paragraphs = []
+    paragraphs = [f"{note}." for note in fraction.run.metrics.get("notes", ())]
     if fraction.key in PAPER:
         elevation, azimuth = PAPER[fraction.key]
         paragraphs.append(
