@@ -25,7 +25,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from swiftwrf.array.angles import wrap
+from swiftwrf.array.angles import angular_distance, wrap
 from swiftwrf.array.beamforming import covariance
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.snapshots import Snapshots
@@ -42,6 +42,7 @@ SINGULAR = 1e-9  # relative eigenvalue below which a matrix is singular
 CLEAR_SHARE = 0.5  # of the received power, along a clear line of sight
 NEIGHBOURHOODS = 20
 MAX_LOSS = 0.02  # of that share at held-out positions
+MIN_CONE = math.radians(20)  # angle between the lines of sight and their mean (median), below which they are too narrow
 MAX_TURN_STD, MAX_PHASE_STD = math.radians(3), math.radians(30)  # beyond, the rotation is not identifiable
 
 
@@ -128,10 +129,13 @@ def calibrate(train: Snapshots) -> Calibration:
         )
     phase_std, turn_std = problem.standard_errors(found)
     if float(turn_std.max()) > MAX_TURN_STD or float(phase_std.max()) > MAX_PHASE_STD:
+        narrow = problem.cone() < MIN_CONE
+        reason = "measure positions in more directions from the array" if narrow else (
+            "phases change from position to position as no direct path explains"
+        )  # fmt: skip
         raise InputError(
-            f"the positions of {train.name} cannot tell the array's orientation from its elements' phases (standard errors "
-            f"{math.degrees(float(turn_std.max())):.1f} and {math.degrees(float(phase_std.max())):.0f} degrees); measure "
-            "positions in more directions from the array"
+            f"{train.name} does not determine the array's orientation and its elements' phases (standard errors "
+            f"{math.degrees(float(turn_std.max())):.1f} and {math.degrees(float(phase_std.max())):.0f} degrees); {reason}"
         )
     before, after = problem.held_out(found, slabs(seen.position, FOLDS))
     if after < before - MAX_LOSS:
@@ -172,6 +176,11 @@ class _Problem:
         return cls(
             data.array, data.position, data.direction, received, torch.linalg.eigh(received).eigenvectors[..., -1]
         )
+
+    def cone(self) -> float:
+        """Return the median angle [rad] between the lines of sight and their mean direction."""
+        mean = self.direction.mean(dim=0).expand_as(self.direction)
+        return float(angular_distance(self.direction, mean).median())
 
     def subset(self, rows: Tensor) -> _Problem:
         return _Problem(

@@ -18,6 +18,7 @@ from swiftwrf.data.snapshots import Snapshots
 LATTICE_TOLERANCE_WAVELENGTHS = 1e-3  # between coordinates of elements in one row or column
 MIN_FLIP_GAIN = 0.15  # in the fraction of the power along the line of sight, above no flips and above chance
 MIN_FLIP_SHARE = 0.75  # of the power along the line of sight, once flips are taken back
+MIN_DOUBLED_SHARE = 0.5  # of the power of the squared channel along the line of sight, which flips do not change
 MIN_CORRELATION = 0.8  # between the signs of elements that flip together
 MIN_COMMON_SHARE = 0.8  # of the power in one direction, to call phases constant
 MAX_GEOMETRIC_SHARE = 0.65  # the same by the lines of sight: beyond, they are too close to each other
@@ -80,12 +81,12 @@ def flipping_elements(data: Snapshots) -> list[int]:
     """
     channel, steering = _unit_channel(data), _steering(data)
     residual = channel * steering[:, None].conj()
-    plain = residual.mean(dim=-1).abs().square()
+    plain, doubled = (residual.pow(power).mean(dim=-1).abs().square() for power in (1, 2))
     sign, mended = _without_flips(residual)
     rolled = (steering.roll(shift, 0) for shift in _shifts(len(data)))
     chance = torch.stack([_without_flips(channel * other[:, None].conj())[1].mean() for other in rolled]).mean()
     gain = min(mended.mean() - plain.mean(), mended.mean() - chance)
-    if gain < MIN_FLIP_GAIN or mended.median() < MIN_FLIP_SHARE:
+    if gain < MIN_FLIP_GAIN or mended.median() < MIN_FLIP_SHARE or doubled.median() < MIN_DOUBLED_SHARE:
         return []
     signs = sign.flatten(0, 1)
     together = (signs.T @ signs / len(signs)).abs() > MIN_CORRELATION

@@ -34,8 +34,9 @@ def check_peaks(
             f"{MIN_CLEAR_POSITIONS} positions with line of sight."
         )
         return "unknown"
-    _say_behind(data, report, findings)
     frame, text = _error(data, report, snapshots) or _without_error(report)
+    if frame != "explained":
+        _say_behind(data, report, findings)
     linear = data.array is not None and data.array.axis is not None
     by = ", by the angle to the array's axis" if linear else ""
     say = findings.say if frame in ("fits", "in part") else findings.warn
@@ -56,11 +57,11 @@ def _error(data: Spectra, report: FrameReport, snapshots: Snapshots | None) -> t
     """Return the error that explains the peaks, in words, or None."""
     if not report.fits and (filled := normalised(data.position)):
         return "explained", f". All coordinates fill {filled} exactly, so positions look normalised; give metres"
+    if report.explanations:
+        return "explained", f". That would fit if {'; or if '.join(report.explanations)}"
     if snapshots is not None and (flipping := flipping_elements(snapshots)):
         elements = f"{'element' if len(flipping) == 1 else 'elements'} {ranges(flipping)}"
         return "explained", f". The phase of {elements} jumps by half a turn from measurement to measurement"
-    if report.explanations:
-        return "explained", f". That would fit if {'; or if '.join(report.explanations)}"
     if snapshots is not None and phases_are_constant(snapshots):
         return "explained", (
             ". Phases between elements hardly depend on the position: the delay to each element may be missing in them, or "
