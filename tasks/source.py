@@ -34,6 +34,10 @@ class SpectraSource:
     """reads one measurement of that many"""
     station: int | None = None
     """number of the array in a file with several, counted from 1"""
+    drop_null: bool = False
+    """whether to leave out null subcarriers of array snapshots, which are the same at every position and element"""
+    round_trip: bool = False
+    """whether phases of array snapshots are those of the way there and back, as of RFID and backscatter"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,10 +55,11 @@ def reading(config: SpectraSource | TableSource) -> ReadOptions:
     Raises:
         InputError: An option that makes no sense whatever the data.
     """
-    array = beamformer = grid = every = station = columns = None
+    array = beamformer = grid = every = station = columns = drop_null = round_trip = None
     if isinstance(config, SpectraSource):
         array, beamformer, grid = _array(config), config.beamformer, _grid(config)
         every, station = config.every, config.station
+        drop_null, round_trip = config.drop_null or None, config.round_trip or None
         if beamformer is not None:
             BEAMFORMERS[beamformer]  # refuses an unknown one
         for name, value in (("every", every), ("station", station)):
@@ -62,7 +67,7 @@ def reading(config: SpectraSource | TableSource) -> ReadOptions:
                 raise InputError(f"--{name} must be at least 1, got {value}")
     if isinstance(config, TableSource):
         columns = _columns(config.columns)
-    return ReadOptions(array, beamformer, grid, every, station, columns)
+    return ReadOptions(array, beamformer, grid, every, station, columns, drop_null, round_trip)
 
 
 def _array(config: SpectraSource) -> PlanarArray | None:

@@ -84,6 +84,11 @@ class AngularGrid:
             azimuth=[360 / n_azimuth * column for column in range(n_azimuth)],
         )
 
+    @classmethod
+    def of(cls, grid: AngularGrid | tuple[int, int]) -> AngularGrid:
+        """Return a grid as it is, or `hemisphere` of a pair of rows and columns."""
+        return grid if isinstance(grid, AngularGrid) else cls.hemisphere(*grid)
+
     def coarsen(self, factor: int) -> AngularGrid:
         """Return the grid of the centres of factor x factor pixels. Both sizes must be multiples of the factor."""
         middle = (factor - 1) / 2

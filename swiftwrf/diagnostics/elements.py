@@ -74,12 +74,18 @@ def _ranks(values: Tensor, tolerance: float) -> Tensor:
     return rank
 
 
+def power_share(data: Snapshots, direction: Tensor) -> float:
+    """Return the mean fraction of the power that arrives along directions (n, 3) in array coordinates."""
+    residual = _unit_channel(data) * _steering(data.array, direction)[:, None].conj()
+    return float(residual.mean(dim=-1).abs().square().mean())
+
+
 def flipping_elements(data: Snapshots) -> list[int]:
     """Return the elements whose phase changes by half a turn from measurement to measurement, counted from 1.
 
     Of two groups that flip against each other, the larger one counts as steady.
     """
-    channel, steering = _unit_channel(data), _steering(data)
+    channel, steering = _unit_channel(data), _steering(data.array, data.direction)
     residual = channel * steering[:, None].conj()
     plain, doubled = (residual.pow(power).mean(dim=-1).abs().square() for power in (1, 2))
     sign, mended = _without_flips(residual)
@@ -108,7 +114,7 @@ def _shifts(n: int) -> list[int]:
 
 def phases_are_constant(data: Snapshots) -> bool:
     """Return True if the phases between elements hardly depend on the position, although the lines of sight differ."""
-    channel, steering = _unit_channel(data), _steering(data)
+    channel, steering = _unit_channel(data), _steering(data.array, data.direction)
     each = channel.mT @ channel.conj() / channel.shape[1]
     of_one_position = torch.linalg.eigvalsh(each)[:, -1].mean()
     common = torch.linalg.eigvalsh(each.mean(dim=0))[-1] / of_one_position
@@ -123,6 +129,6 @@ def _unit_channel(data: Snapshots) -> Tensor:
     return torch.polar(torch.ones_like(phase), phase)
 
 
-def _steering(data: Snapshots) -> Tensor:
-    phase = data.array.phase(data.direction)
+def _steering(array: PlanarArray, direction: Tensor) -> Tensor:
+    phase = array.phase(direction)
     return torch.polar(torch.ones_like(phase), phase)

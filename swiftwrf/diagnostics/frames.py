@@ -32,7 +32,7 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import slabs
-from swiftwrf.diagnostics.elements import other_readings
+from swiftwrf.diagnostics.elements import other_readings, power_share
 
 SIGMA = math.radians(10)
 MAX_ANGLE_DEG = 10.0  # median angle between peak and line of sight in a frame that fits
@@ -44,6 +44,7 @@ EQUAL_PEAKS = 0.97  # of the largest magnitude: peaks above it are alternatives
 MAX_PEAKS = 8
 SCANNED_ROTATIONS = 4000
 MIN_TURN = math.radians(5)  # of a constant rotation that is reported, and the most that two halves of the positions differ
+MIN_TURN_EXPLAINED = 0.8  # agreement with a constant rotation that is reported: with three angles, much is explained
 MIN_TURN_GAIN = 0.03  # in agreement, of such a rotation
 NARROW_DEG = 10.0  # angle between lines of sight (median of pairs), below which no frame can be checked
 MAX_STEADY = 0.25  # angle between peaks relative to that between lines of sight, below which spectra hardly differ
@@ -205,9 +206,12 @@ def check_frames(
     turn, turned, turned_by_chance = _constant_turn(frame, peak)
     clear = named - max(by_chance, agreement) >= MIN_EVIDENCE
     error = clear and named >= max(MIN_EXPLAINED, turned - MIN_TURN_GAIN)
-    angle = float(np.linalg.norm(turn))
-    rotates = not error and angle >= MIN_TURN and turned >= MIN_EXPLAINED and turned - agreement >= MIN_TURN_GAIN
-    rotates = rotates and turned - turned_by_chance >= MIN_EVIDENCE and _constant(turn, frame, peak)
+    rotates = not error and turned >= MIN_TURN_EXPLAINED and turned - turned_by_chance >= MIN_EVIDENCE
+    rotates = rotates and float(np.linalg.norm(turn)) >= MIN_TURN and turned - agreement >= MIN_TURN_GAIN
+    if rotates and snapshots is not None:
+        seen = snapshots.subset(rows)
+        rotates = power_share(seen, seen.direction @ _matrix(turn)) >= MIN_EXPLAINED
+    rotates = rotates and _constant(turn, frame, peak)
     return FrameReport(
         agreement=agreement,
         chance=chance,

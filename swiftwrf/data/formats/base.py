@@ -46,6 +46,10 @@ class ReadOptions:
     """number of the array in a file with several, counted from 1"""
     columns: Mapping[str, str] | None = None
     """names of the columns of a table, by what they hold"""
+    drop_null: bool | None = None
+    """leaves out null subcarriers, which are the same at every position and element"""
+    round_trip: bool | None = None
+    """phases are those of the way there and back"""
 
     @property
     def given(self) -> list[str]:

@@ -14,7 +14,7 @@ from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import ARCHIVES, Arrays, array_names, read_arrays
 from swiftwrf.data.files import MAX_COORDINATE_M, check_carrier, digests
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
-from swiftwrf.data.snapshots import Snapshots, check_spacing
+from swiftwrf.data.snapshots import Snapshots, check_spacing, round_trip_array, without_null
 from swiftwrf.data.splits import read_splits
 from swiftwrf.errors import InputError
 
@@ -27,7 +27,7 @@ MAX_HEIGHT_WAVELENGTHS = 1e-3  # of elements over their plane
 class SnapshotArrays(Format[Snapshots]):
     """Arrays by name, one row a position of the transmitter."""
 
-    takes = frozenset({"beamformer", "grid", "every"})
+    takes = frozenset({"beamformer", "grid", "every", "drop_null", "round_trip"})
 
     def recognises(self, path: Path) -> bool:
         return _file(path) is not None
@@ -43,7 +43,10 @@ class SnapshotArrays(Format[Snapshots]):
                 raise InputError(f"{file}: {name} holds a value that is not finite; leave that row out")
         position, array = _points(file, arrays, "position", 3), _array(file, arrays)
         n, folder, pose = len(position), file.parent, _pose(file, arrays)
-        channel = _channel(file, arrays["csi"], n, len(array.element))
+        raw = _channel(file, arrays["csi"], n, len(array.element))
+        raw, null = without_null(raw, options.drop_null)
+        channel = _scaled(file, raw)
+        array, turned = round_trip_array(array) if options.round_trip else (array, ())
         if bool((position == torch.tensor(pose.position, dtype=torch.float64)).all(dim=1).any()):
             raise InputError(f"{file} has a position equal to array_position, from which there is no direction")
         data = Snapshots(
@@ -56,6 +59,7 @@ class SnapshotArrays(Format[Snapshots]):
             source=digests([file], folder),
             line_of_sight=_one_each(file, arrays, "line_of_sight", n),
             time=_one_each(file, arrays, "time", n),
+            notes=(*null, *turned),
         )
         return data if options.every in (None, 1) else data.subset(torch.arange(0, n, options.every))
 
@@ -92,7 +96,7 @@ def _one_each(file: Path, arrays: Arrays, name: str, n: int) -> Tensor | None:
 
 
 def _channel(file: Path, csi: NDArray[np.generic], n: int, elements: int) -> Tensor:
-    """Return channels, complex64 (n, S, K), each row scaled to unit mean power, because their unit is arbitrary."""
+    """Return channels, complex128 (n, S, K)."""
     if csi.dtype.kind != "c":
         hint = "; join real and imaginary parts as csi[..., 0] + 1j * csi[..., 1]" if csi.shape[-1:] == (2,) else ""
         raise InputError(f"{file}: csi must hold complex numbers, got {csi.dtype}{hint}")
@@ -106,7 +110,11 @@ def _channel(file: Path, csi: NDArray[np.generic], n: int, elements: int) -> Ten
             f"{file}: csi must have shape ({n}, [subcarriers or packets,] {elements}) for {n} positions and {elements} "
             f"elements, got {csi.shape}"
         )
-    channel = torch.from_numpy(csi.reshape(n, -1, elements).astype(np.complex128))
+    return torch.from_numpy(csi.reshape(n, -1, elements).astype(np.complex128))
+
+
+def _scaled(file: Path, channel: Tensor) -> Tensor:
+    """Return channels, complex64 (n, S, K), each row scaled to unit mean power, because their unit is arbitrary."""
     power = torch.view_as_real(channel).square().sum(-1).mean(dim=(1, 2), keepdim=True)
     silent = (~((power > 0) & power.isfinite())).flatten().nonzero()
     if len(silent):
