@@ -1,9 +1,12 @@
 """Turbo learning: measured spectra, and synthetic spectra at positions without a measurement, in one training set."""
 
-from augment.choose import Fold, ModelChoice, choose_model
-from augment.mix import Mixed, mix, withhold
-from augment.positions import SyntheticPositions, sample_positions, synthetic_positions
-from augment.suggest import Suggestion, suggest
+from swiftwrf.runtime.lazy import lazy_imports
+
+with lazy_imports(globals()):
+    from augment.choose import Fold, ModelChoice, choose_model
+    from augment.mix import Mixed, mix, withhold
+    from augment.positions import SyntheticPositions, sample_positions, synthetic_positions
+    from augment.suggest import Suggestion, suggest
 
 __all__ = [
     "Fold",

@@ -11,7 +11,7 @@ from torch import Tensor
 from augment.positions import NO_INDEX, SyntheticPositions
 from swiftwrf import AngularGrid, InputError, Spectra
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.splits import MIN_TRAINING
+from swiftwrf.data.splits import MIN_TRAINING, random_rows
 from swiftwrf.data.store import Store
 
 
@@ -100,6 +100,8 @@ class Mixed:
 def withhold(train: Spectra, measured_fraction: float, seed: int) -> tuple[Spectra, SyntheticPositions]:
     """Return a random fraction of the training spectra as measured, and the positions of the others.
 
+    Spectra at one position are in one part.
+
     Args:
         train: Training spectra.
         measured_fraction: Fraction of the training spectra that counts as measured, in (0, 1].
@@ -122,9 +124,9 @@ def withhold(train: Spectra, measured_fraction: float, seed: int) -> tuple[Spect
             f"a measured fraction of {measured_fraction:g} leaves {n} of {len(train)} training spectra; "
             f"at least {MIN_TRAINING} are needed, a fraction of {MIN_TRAINING / len(train):.2g}"
         )
-    order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
-    measured, others = train.subset(order[:n].sort().values), train.subset(order[n:].sort().values)
-    return measured, SyntheticPositions(others.position, others.label, others.index)
+    rows = random_rows(train.position, n, seed)
+    others = train.subset(torch.ones(len(train), dtype=torch.bool).index_fill(0, rows, value=False))
+    return train.subset(rows), SyntheticPositions(others.position, others.label, others.index)
 
 
 def mix(measured: Spectra, withheld: SyntheticPositions, synthetic: Tensor) -> Mixed:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from augment.limits import MAX_SUGGESTIONS
 from augment.positions import sample_positions
 from swiftwrf import InputError, Rssi, Spectra
 from swiftwrf.data.spectra import check_training
@@ -16,7 +17,6 @@ from swiftwrf.locate import RssiLocator
 from swiftwrf.positions import nearest
 
 N_CANDIDATE_POSITIONS = 1500  # positions that are compared
-MAX_SUGGESTIONS = 500
 MAX_MEASURED_POSITIONS = 2000  # measured positions that the variance is conditioned on
 N_SIMULATED_ROWS = 400  # rows of RSSI whose expected position errors are computed
 N_AVERAGED_ROWS = 8  # rows nearest to a candidate, whose mean error is the candidate's

@@ -31,12 +31,13 @@ from swiftwrf.gp import thinned
 from swiftwrf.metrics import l1, psnr, ssim, summary
 from swiftwrf.models.nearest import MemoryModel
 from swiftwrf.runtime.durable import write_text
+from tasks import labels
 from tasks.aoa.condition import conditions_of
 from tasks.aoa.experiment import run
 from tasks.aoa.options import AoaConfig
 from tasks.cluster import Cluster, connected
 from tasks.environment import machine
-from tasks.page import figures, labels
+from tasks.page import figures
 from tasks.page.palette import Palette
 
 MEASURED = (("s23-200", "random"), ("s23-200", "block"), ("newrf-bedroom", "random"), ("newrf-office", "random"))

@@ -14,7 +14,7 @@ import torch
 from record import write_result
 
 from swiftwrf import Spectra, load_spectra, simulated_room
-from swiftwrf.data.spectra import Moving
+from swiftwrf.choices import Moving
 from swiftwrf.metrics import psnr, summary
 from swiftwrf.models.geometry import fit_geometry, fit_hybrid
 

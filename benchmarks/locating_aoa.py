@@ -22,13 +22,13 @@ from record import RESULTS, write_result
 from augment import Mixed, withhold
 from swiftwrf import FitError, InputError, MatchedField, Spectra, load_spectra, make_model, simulated_room
 from swiftwrf.metrics import angle_errors, summary
-from tasks.aoa.condition import fraction_key
 from tasks.aoa.context import ROOM_MODEL
 from tasks.aoa.estimators import make_estimator
 from tasks.aoa.locating import LEVEL, NO_PLANE, located
+from tasks.aoa.options import fraction_key
 
 N_LOCATED = 200  # spectra whose time is measured
-KERNEL = "kernel_ridge"
+KERNEL = "kernel_regression"
 Row = dict[str, Any]
 
 

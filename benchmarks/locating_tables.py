@@ -39,7 +39,7 @@ def _cells(median: dict[str, Any]) -> list[str]:
 
     seconds = median.get("seconds")
     return [
-        both("kernel_ridge_angle_deg", 2),
+        both("kernel_regression_angle_deg", 2),
         both("angle_deg", 2),
         both("position_m", 3),
         f"{median['coverage_80']:.0%}" if "coverage_80" in median else "",

@@ -12,7 +12,7 @@ from typing import Any, get_args
 import torch
 from record import write_result
 
-from swiftwrf.data.spectra import Moving
+from swiftwrf.choices import Moving
 from swiftwrf.models.geometry import fit_geometry
 from swiftwrf.models.geometry.search import SIDES
 from swiftwrf.testing.rooms import mirror_room

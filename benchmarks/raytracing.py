@@ -16,11 +16,12 @@ import tyro
 from record import write_result
 
 from swiftwrf import AngularGrid, Spectra, load_spectra, make_model
+from swiftwrf.choices import Moving
 from swiftwrf.data.raytraced import ROOMS
-from swiftwrf.data.spectra import Moving
 from swiftwrf.metrics import psnr, ssim, summary
 from swiftwrf.runtime.durable import write_text
-from tasks.scenes import ScenesConfig, run
+from tasks.scenes.options import ScenesConfig
+from tasks.scenes.run import run
 
 GRID = AngularGrid.hemisphere(30, 120)
 METHODS = ("nearest", "gp", "coarray", "swiftwrf", "geometry", "hybrid", "raytrace")

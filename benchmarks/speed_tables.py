@@ -60,6 +60,34 @@ def speed() -> str:
     return markdown(["scene, split", "setting", "ms a spectrum", "held-out PSNR [dB]", "fit [s]", "parameters"], rows)
 
 
+def networks() -> str:
+    """Return error and seconds of every estimator on every training set, those on the Pareto front in bold."""
+    rows = []
+    for scene, trainings in load("networks")["scenes"].items():
+        for training, entry in trainings.items():
+            what = training.partition(",")[0]
+            methods = entry["methods"]
+            points = {
+                name: (method["seconds"]["train"], method["great_circle_deg"]["median"])
+                for name, method in methods.items()
+            }
+            front = pareto(points)
+            for name, method in methods.items():
+                error, change, seconds = method["great_circle_deg"], method["change"], method["seconds"]
+                rows.append(
+                    [
+                        f"{scene}, {what}, {entry['n_train']} spectra",
+                        f"**{name}**" if name in front else name,
+                        f"{error['median']:.2f} [{error['low']:.2f}, {error['high']:.2f}]",
+                        f"{change['change']:+.0%} [{change['low']:+.0%}, {change['high']:+.0%}]",
+                        f"{seconds['train']:.1f}",
+                        f"{seconds['estimate'] * 1e3:.1f}",
+                    ]
+                )
+    columns = ["scene, training set", "estimator", "held-out error [deg]", "against kernel_regression", "train [s]"]
+    return markdown([*columns, "ms a spectrum"], rows)
+
+
 def drawing() -> str:
     """Return every rendering of the default model of each scene, those on the Pareto front in bold."""
     rows = []

@@ -35,7 +35,8 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import psnr
 from swiftwrf.rasterize import Backend, prepare, rasterize_magnitude
-from tasks.page import figures, labels
+from tasks import labels
+from tasks.page import figures
 from tasks.page.palette import Palette
 
 CUTOFFS = (None, 1e-5, 1e-4, 1e-3, 1e-2)

@@ -7,11 +7,23 @@ import statistics
 from dataclasses import replace
 from typing import Any
 
-from committed import RESULTS, ROOT, aoa_shares, interval, load, markdown, rssi_runs, turbo_condition
+from committed import (
+    RESULTS,
+    ROOT,
+    aoa_shares,
+    change,
+    change_text,
+    interval,
+    load,
+    markdown,
+    reference,
+    rssi_runs,
+    turbo_condition,
+)
 from comparison_tables import comparison, comparison_counts, comparison_turbo
 from geometry import SIDES, WALLS, nearest
 from locating_tables import locating_rssi, locating_spectra
-from speed_tables import busy, drawing, scaling, scaling_quality, scaling_rssi, size, speed
+from speed_tables import busy, drawing, networks, scaling, scaling_quality, scaling_rssi, size, speed
 from targets import aoa_targets, rssi_targets, synthesis_targets
 
 from tasks.aoa.condition import Condition
@@ -30,13 +42,13 @@ def synthesis() -> str:
 
 def aoa() -> str:
     """Return median angular errors of the conditions of each run."""
-    fixed = ("nearest_spectrum", "kernel_ridge", "measured_only")
+    fixed = ("peak", "constant", "nearest_spectrum", "kernel_regression", "measured_only")
     columns = [
         "scene, split, moving end",
         "measured",
         *fixed,
         "turbo",
-        "turbo, kernel_ridge",
+        "turbo, kernel_regression",
         "measured_all",
         "synthesizer",
     ]
@@ -45,7 +57,7 @@ def aoa() -> str:
         metrics = result["metrics"]
         scene = f"{metrics['data']}, {metrics['split']}, {metrics['moving']}"
         methods, turbo = mix["methods"], turbo_condition(mix)
-        names = (*fixed, turbo.method, replace(turbo, estimator="kernel_ridge").method, "measured_all")
+        names = (*fixed, turbo.method, replace(turbo, estimator="kernel_regression").method, "measured_all")
         cells = [interval(methods[name]["great_circle_deg"]) if name in methods else "" for name in names]
         rows.append([scene, f"{float(share):.0%}", *cells, _synthesizer(turbo)])
     return markdown(columns, rows)
@@ -85,12 +97,22 @@ def headline() -> str:
             continue
         metrics, methods = result["metrics"], mix["methods"]
         turbo = turbo_condition(mix)
-        error = {name: methods[name]["great_circle_deg"] for name in ("measured_only", turbo.method, "measured_all")}
-        lower, own, _ = error.values()
-        gain = f"{own['median'] / lower['median'] - 1:+.0%}"
+        best = reference(mix)
+        shown = ("peak", "constant", best, turbo.method, "measured_all")
+        cells = [interval(methods[name]["great_circle_deg"]) for name in shown]
+        cells[2] = f"{cells[2]} ({'network' if best == 'measured_only' else best})"
         scene = f"{metrics['data']}, {metrics['split']} split, {metrics['moving']} moves"
-        rows.append([scene, *map(interval, error.values()), gain, _synthesizer(turbo)])
-    columns = ["scene", "measured share alone", "with synthetic spectra", "everything measured", "gain", "synthesizer"]
+        rows.append([scene, *cells, change_text(change(mix, turbo.method, best)), _synthesizer(turbo)])
+    columns = [
+        "scene",
+        "peak",
+        "constant",
+        "best on measured spectra",
+        "with synthetic spectra",
+        "everything measured",
+        "gain",
+        "synthesizer",
+    ]
     return markdown(columns, rows)
 
 
@@ -276,6 +298,7 @@ TABLES = {
     "hard_fits": hard_fits,
     "speed": speed,
     "drawing": drawing,
+    "networks": networks,
     "ablation": ablation,
     "comparison": comparison,
     "raytracing": raytracing,

@@ -9,20 +9,24 @@ spectrum = model.predict(test.position).mean
 Gaussian Splatting for Efficient Wireless Radiance Field Rendering", 2025.
 """
 
-from swiftwrf import comparison
-from swiftwrf.array.angles import AngularGrid, ArrayPose
-from swiftwrf.data import Rssi, Snapshots, Spectra, load_rssi, load_snapshots, load_spectra
-from swiftwrf.data.simulated import rssi_room, simulated_room
-from swiftwrf.diagnostics.calibration import Calibration, calibrate
-from swiftwrf.errors import FitError, InputError
-from swiftwrf.locate import MatchedField, Posterior, RssiLocator
-from swiftwrf.models.base import FIELD_MODELS, FieldModel, Prediction, make_model
-from swiftwrf.models.coarray import CoarrayModel, fit_coarray, project
-from swiftwrf.models.geometry import GeometryModel, HybridModel, fit_geometry, fit_hybrid
-from swiftwrf.models.swiftwrf import FitConfig, ModelConfig, SwiftWRF, fit
-from swiftwrf.rasterize import rasterize, rasterize_magnitude
-from swiftwrf.rssi import RssiConfig, RssiModel, fit_rssi
-from swiftwrf.runtime.checkpoint import load
+from swiftwrf.runtime.lazy import lazy_imports
+
+with lazy_imports(globals()):
+    from swiftwrf import comparison
+    from swiftwrf.array.angles import AngularGrid, ArrayPose
+    from swiftwrf.choices import FIELD_MODELS
+    from swiftwrf.data import Rssi, Snapshots, Spectra, load_rssi, load_snapshots, load_spectra
+    from swiftwrf.data.simulated import rssi_room, simulated_room
+    from swiftwrf.diagnostics.calibration import Calibration, calibrate
+    from swiftwrf.errors import FitError, InputError
+    from swiftwrf.locate import MatchedField, Posterior, RssiLocator
+    from swiftwrf.models.base import FieldModel, Prediction, make_model
+    from swiftwrf.models.coarray import CoarrayModel, fit_coarray, project
+    from swiftwrf.models.geometry import GeometryModel, HybridModel, fit_geometry, fit_hybrid
+    from swiftwrf.models.swiftwrf import FitConfig, ModelConfig, SwiftWRF, fit
+    from swiftwrf.rasterize import rasterize, rasterize_magnitude
+    from swiftwrf.rssi import RssiConfig, RssiModel, fit_rssi
+    from swiftwrf.runtime.checkpoint import load
 
 __all__ = [
     "FIELD_MODELS",

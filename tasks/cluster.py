@@ -24,9 +24,9 @@ import torch
 
 from swiftwrf import FitError, InputError
 from swiftwrf.runtime.threads import set_threads
-from tasks.directory import console
 from tasks.environment import machine, packages
 from tasks.run import choose_device
+from tasks.terminal import console
 from tasks.torchrun import process_count
 
 if TYPE_CHECKING:

@@ -1,7 +1,7 @@
 """Commands: `swiftwrf aoa --mix 0.3`, or `python -m tasks.aoa --mix 0.3`.
 
 The console script also works in a directory with a `tasks.py`, which `python -m tasks.aoa` would import in place of this
-package. Only the module of the requested command is imported, so `swiftwrf --help` takes no time.
+package. Options are parsed and checked before the modules that compute are imported, so help and refusals take no time.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple, get_type_hints
+from typing import Any, NamedTuple
 
 
 class Command(NamedTuple):
@@ -20,26 +20,38 @@ class Command(NamedTuple):
 
     Args:
         summary: One line for the help.
-        module: Module with `run(config)`, or `run(config, resume)` if its runs can be resumed. The annotation of `config`
-            is the dataclass of the options.
+        options: Dataclass of the options, in the module `options` of the command's package, which imports no torch.
+        module: Module of that package with `run(config)`, or `run(config, resume)` if its runs can be resumed.
     """
 
     summary: str
-    module: str
+    options: str
+    module: str = "run"
 
 
 COMMANDS = {
     "aoa": Command(
-        "estimate angles of arrival with few measured spectra, and report the errors", "tasks.aoa.experiment"
+        "estimate angles of arrival with few measured spectra, and report the errors",
+        "AoaConfig",
+        "experiment",
     ),
-    "rssi": Command("predict RSSI maps of receivers, and report the errors", "tasks.rssi.experiment"),
-    "locate": Command("locate transmitters from RSSI or spectra, and report the errors", "tasks.locate.experiment"),
-    "report": Command("merge finished runs of one task into one report", "tasks.report"),
-    "inspect": Command("check measurements before a run: counts, frames, calibration", "tasks.inspect"),
-    "convert": Command("write measurements of any known format in the toolkit's layout", "tasks.convert"),
-    "estimate": Command("estimate directions of new spectra with a trained estimator", "tasks.estimate"),
-    "scenes": Command("trace ray paths in a room (extra: raytrace)", "tasks.scenes"),
-    "view": Command("show a fitted field in the browser (extra: view)", "tasks.view"),
+    "rssi": Command("predict RSSI maps of receivers, and report the errors", "RssiTaskConfig", "experiment"),
+    "locate": Command("locate transmitters from RSSI or spectra, and report the errors", "LocateConfig", "experiment"),
+    "report": Command("merge finished runs of one task into one report", "ReportConfig"),
+    "inspect": Command(
+        "check measurements before a run: counts, frames, calibration",
+        "InspectConfig",
+    ),
+    "convert": Command(
+        "write measurements of any known format in the toolkit's layout",
+        "ConvertConfig",
+    ),
+    "estimate": Command(
+        "estimate directions of new spectra with a trained estimator",
+        "EstimateConfig",
+    ),
+    "scenes": Command("trace ray paths in a room (extra: raytrace)", "ScenesConfig"),
+    "view": Command("show a fitted field in the browser (extra: view)", "ViewConfig"),
 }
 RESUME = "continue an interrupted run: swiftwrf resume DIR.partial [--scheduler ADDRESS]"
 
@@ -51,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Command and its options. Defaults to those of the process.
 
     Returns:
-        Exit code; see `tasks.run.exit_code`.
+        Exit code; see `tasks.command_line.exit_code`.
 
     Example:
         >>> main(["--help"])  # doctest: +ELLIPSIS
@@ -80,7 +92,7 @@ def run_command(name: str, options: Sequence[str], program: str | None = None) -
         program: Name of the program in the help. Defaults to `python -m tasks.NAME`.
     """
     _shorten_waits()
-    from tasks.run import exit_code
+    from tasks.command_line import exit_code
 
     return exit_code(partial(_execute, name, options, program))
 
@@ -90,9 +102,9 @@ def _resume(options: Sequence[str]) -> int:
         print(f"usage: swiftwrf resume DIR.partial [--scheduler ADDRESS]\n\n{RESUME}")
         return 0 if options[:1] in (["-h"], ["--help"]) else 2
     _shorten_waits()
-    from swiftwrf import InputError
-    from tasks.directory import interrupted
-    from tasks.run import exit_code
+    from swiftwrf.errors import InputError
+    from tasks.command_line import exit_code
+    from tasks.resume import interrupted
 
     def action() -> None:
         task = interrupted(Path(options[0])).get("task")
@@ -104,10 +116,14 @@ def _resume(options: Sequence[str]) -> int:
 
 
 def _execute(name: str, options: Sequence[str], program: str | None) -> None:
-    from tasks.run import execute
+    from tasks.command_line import execute
 
-    task: Any = import_module(COMMANDS[name].module).run
-    execute(f"tasks.{name}", get_type_hints(task)["config"], task, options, program)
+    command = COMMANDS[name]
+
+    def task(*arguments: Any) -> None:
+        import_module(f"tasks.{name}.{command.module}").run(*arguments)
+
+    execute(f"tasks.{name}", getattr(import_module(f"tasks.{name}.options"), command.options), task, options, program)
 
 
 def _help() -> str:

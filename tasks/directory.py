@@ -2,77 +2,37 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 import secrets
+import shlex
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import torch
-from rich.console import Console
 
 from swiftwrf import InputError
 from swiftwrf.runtime.durable import rename
 from swiftwrf.runtime.threads import set_threads
 from tasks.claim import CONFIG, ENVIRONMENT, LOCK, STEPS, Claim
 from tasks.environment import environment, invocation, now
+from tasks.options import plain
 from tasks.records import Row, read_json, strict, write_json, write_npz, write_table
+from tasks.resume import PARTIAL, digest
+from tasks.terminal import terminal
 
-PARTIAL = ".partial"  # suffix of a run that is not finished
 MAX_LABEL = 60  # characters of the label in the name of a directory under runs/
-console = Console(stderr=True, highlight=False)
-
-
-def interrupted(folder: Path) -> Row:
-    """Return the content of an interrupted run's configuration file: task, command and config.
-
-    Raises:
-        InputError: There is no interrupted run, or it stopped before it wrote its configuration.
-    """
-    if not folder.name.endswith(PARTIAL) or not folder.is_dir():
-        raise InputError(f"{folder} is no interrupted run; expected a directory *{PARTIAL} with a {CONFIG}")
-    if not (folder / CONFIG).exists():
-        raise InputError(
-            f"{folder} was stopped before its {CONFIG} was written, so it holds nothing to go on with; start the run again"
-        )
-    return read_json(folder / CONFIG)
-
-
-def saved_config(folder: Path, task: str) -> Row:
-    """Return the configuration of an interrupted run.
-
-    Raises:
-        InputError: There is no such run, it is of another task, or its configuration has changed since it began.
-    """
-    content = interrupted(folder)
-    if content.get("task") != task:
-        raise InputError(
-            f"{folder} is a run of tasks.{content.get('task')}; resume it with that task, not tasks.{task}"
-        )
-    if _digest(content.get("config")) != read_json(folder / ENVIRONMENT).get("config_sha256"):
-        raise InputError(
-            f"{folder / CONFIG} is not what the run began with, and its steps would mix two configurations; restore it or "
-            "start a new run"
-        )
-    config: Row = content["config"]
-    return config
 
 
 def _versions(environment: Row) -> dict[str, str]:
     """Return the versions on which the results of a run depend: of the packages, and the commit of this project."""
     packages = environment.get("packages")
     return (packages if isinstance(packages, dict) else {}) | {"commit": environment.get("commit") or "unknown"}
-
-
-def _digest(config: Any) -> str:
-    return hashlib.sha256(json.dumps(strict(config), sort_keys=True).encode()).hexdigest()
 
 
 @contextmanager
@@ -165,8 +125,8 @@ class Run:
 
     def _begin(self, task: str, config: Any, device: torch.device, source: dict[str, str]) -> None:
         set_threads(torch.get_num_threads())  # the same call as in a resumed run
-        values = asdict(config)
-        self._environment = environment(device, source) | {"config_sha256": _digest(values)}
+        values = plain(config)
+        self._environment = environment(device, source) | {"config_sha256": digest(values)}
         self.write_json(ENVIRONMENT, self._environment)
         self.write_json(CONFIG, {"task": task, "command": invocation(task), "config": values})
 
@@ -205,19 +165,28 @@ class Run:
         """Write arrays by name."""
         write_npz(self.path(name), arrays)
 
-    def step(self, name: str, compute: Callable[[], Row]) -> Row:
+    def step(self, name: str, title: str, compute: Callable[[], Row]) -> Row:
         """Return the plain values of `compute`, which is called once, also over a resumed run.
+
+        Args:
+            name: Key of the kept result.
+            title: What is computed, for the terminal.
+            compute: Computes the values.
 
         Raises:
             InputError: The kept result is damaged.
         """
         value = self.kept(name)
         if value is None:
-            console.print(f"[bold]{name}[/] ...", end=" " if not console.is_terminal else "\n")
+            terminal.begin(title)
             began = time.perf_counter()
             value = self.keep(name, compute(), time.perf_counter() - began)
-            console.print(f"{time.perf_counter() - began:.1f} s")
+            terminal.end()
         return value
+
+    def holds(self, name: str) -> bool:
+        """Return True if the result of a step is kept."""
+        return self.path(f"{STEPS}/{name}.json").exists()
 
     def kept(self, name: str) -> Row | None:
         """Return the kept result of a step, or None.
@@ -225,9 +194,9 @@ class Run:
         Raises:
             InputError: The kept result is damaged.
         """
-        file = self.path(f"{STEPS}/{name}.json")
-        if not file.exists():
+        if not self.holds(name):
             return None
+        file = self.path(f"{STEPS}/{name}.json")
         value = read_json(file).get("value")
         if not isinstance(value, dict):
             raise InputError(f"{file} does not hold what the step computed; remove it and resume again")
@@ -276,4 +245,4 @@ class Run:
             pass
         else:
             self._claim.release()
-            console.print(f"stopped; go on with [bold]--resume {self.folder}[/]")
+            print(f"stopped; continue with: swiftwrf resume {shlex.quote(str(self.folder))}", file=sys.stderr)

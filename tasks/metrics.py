@@ -44,8 +44,21 @@ class SynthesisMetrics(TypedDict):
     seconds: dict[str, float]
 
 
+class ChangeMetrics(TypedDict):
+    """Median error with synthetic spectra, its relative change (-0.3 is 30 % lower), and the change's 95 % interval."""
+
+    median_deg: float
+    change: float
+    low: float
+    high: float
+
+
 class MethodMetrics(TypedDict):
-    """Errors of one condition; seconds to `train` and to `estimate`, means of the repeats."""
+    """Errors of one condition; seconds to `train` and to `estimate`, means of the repeats.
+
+    `changes`, of conditions with synthetic spectra, is the change of the angular error by the method that it is compared to:
+    the same estimator on measured spectra, and the best one on measured spectra. Its interval is paired over test positions.
+    """
 
     estimator: str
     training: str
@@ -54,6 +67,7 @@ class MethodMetrics(TypedDict):
     azimuth_deg: ErrorSummary
     elevation_deg: ErrorSummary
     great_circle_deg: ErrorSummary
+    changes: dict[str, ChangeMetrics]
     seconds: dict[str, float]
 
 
@@ -63,15 +77,6 @@ class ChoiceMetrics(TypedDict):
     name: str
     psnr_db: dict[str, float]
     seconds: dict[str, float]
-
-
-class ChangeMetrics(TypedDict):
-    """Median error with synthetic spectra, its relative change (-0.3 is 30 % lower), and the change's 95 % interval."""
-
-    median_deg: float
-    change: float
-    low: float
-    high: float
 
 
 class GainMetrics(ChangeMetrics):
@@ -121,7 +126,8 @@ class LocatingMetrics(TypedDict):
 class MixMetrics(TypedDict):
     """One measured fraction; `choice`, `advice` (by field model) and `estimator_choice` of the first repeat, `counts` of
     spectra by origin in each training set, seconds to `fit` and `synthesize` of the trained field models and to `train` all
-    networks. `locating` by method, `left_out` says why a method is not there."""
+    networks. `reference` is the method on measured spectra with the smallest test error, other than matched-field
+    processing. `locating` by method, `left_out` says why a method is not there."""
 
     n_measured: int
     counts: dict[str, dict[str, int]]
@@ -130,6 +136,7 @@ class MixMetrics(TypedDict):
     estimator_choice: EstimatorChoiceMetrics | None
     synthesis: dict[str, SynthesisMetrics]
     methods: dict[str, MethodMetrics]
+    reference: str
     locating: dict[str, LocatingMetrics]
     left_out: dict[str, str]
     seconds: dict[str, float]
@@ -181,7 +188,12 @@ class ChosenMetrics(TypedDict):
 
 
 class RssiMetrics(RunMetrics):
-    """Of a run of tasks.rssi; `receivers` by receiver and method; `left_out` says why a method is not there."""
+    """Metrics of a run of tasks.rssi.
+
+    `notes` are those of the reader. `receivers` by receiver and method; `left_out` says why a method is not there.
+    """
+
+    notes: list[str]
 
     preset: str
     overall: dict[str, PredictorMetrics]
@@ -213,8 +225,11 @@ class LocateMetrics(RunMetrics):
     """Metrics of a run of tasks.locate.
 
     `n_undetected` test rows are left out, because no receiver detected them. `calibration` is the fraction of the test
-    positions in the posterior's credible regions by their probability. `weights` are those of its likelihoods.
+    positions in the posterior's credible regions by their probability. `weights` are those of its likelihoods. `notes` are
+    those of the reader.
     """
+
+    notes: list[str]
 
     n_receivers: int
     n_undetected: int

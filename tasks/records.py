@@ -1,4 +1,4 @@
-"""Tables and values on disk: written whole or not at all, refused if damaged.
+"""Tables and values on disk: written whole or not at all, refused if damaged. NumPy and pandas are imported at first use.
 
 Spreadsheet programs run a cell that begins with = + - @ as a formula. Receiver names come from files of others, so a text
 of that kind is written behind an apostrophe, which those programs take for a mark of text, and read without it.
@@ -11,14 +11,13 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import pandas as pd
-import torch
-
-from swiftwrf import InputError
+from swiftwrf.errors import InputError
 from swiftwrf.runtime.durable import replacing, write_text
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Row = dict[str, Any]
 NAMES = (  # columns of text, even if a cell reads NA, 1 or 12:34
@@ -46,7 +45,7 @@ def strict(value: Any) -> Any:
         return {str(key): strict(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [strict(item) for item in value]
-    if isinstance(value, torch.Tensor):
+    if hasattr(value, "tolist"):  # tensors and arrays
         return strict(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
@@ -87,6 +86,8 @@ def as_table(rows: Iterable[Row]) -> str:
         >>> as_table([{"receiver": "=1+1", "rssi_dbm": -60.5}])
         "receiver,rssi_dbm\\r\\n'=1+1,-60.5\\r\\n"
     """
+    import pandas as pd
+
     rows = list(rows)
     columns = dict.fromkeys(key for row in rows for key in row)
     cells = {name: pd.Series([_escaped(row.get(name)) for row in rows], dtype=object) for name in columns}
@@ -104,6 +105,8 @@ def read_table(file: Path) -> pd.DataFrame:
     Raises:
         InputError: There is no such file, or its content is no table.
     """
+    import pandas as pd
+
     try:
         columns = list(pd.read_csv(file, nrows=0))
         names = [name for name in NAMES if name in columns]
@@ -122,5 +125,7 @@ def read_table(file: Path) -> pd.DataFrame:
 
 def write_npz(file: Path, arrays: Mapping[str, Any]) -> None:
     """Write arrays by name."""
+    import numpy as np
+
     with replacing(file) as temporary, temporary.open("wb") as stream:
         np.savez_compressed(stream, **arrays)

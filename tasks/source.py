@@ -1,73 +1,38 @@
-"""Options of all commands that state how files are read, where the files leave it open, and reading by them."""
+"""Reading of measurements as the options of a command line state it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from swiftwrf import AngularGrid, InputError, Spectra
-from swiftwrf.array.beamforming import BEAMFORMERS
+from swiftwrf import AngularGrid, InputError, Rssi, Spectra
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data import ReadOptions, read_spectra
+from swiftwrf.data import ReadOptions, read_rssi, read_spectra
+from swiftwrf.data.rssi import Offsets
+from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
-from tasks.run import choice
-
-MAX_SIDE = 32  # elements: spectra of 32 x 32 elements have 7,938 independent numbers
-
-
-@dataclass(frozen=True, kw_only=True)
-class SpectraSource:
-    """Options of reading spectra."""
-
-    array: tuple[int, float, float] | tuple[int, int, float, float] | None = None
-    """array of the spectra if the data do not describe it, or for which spectra of ray paths are computed: elements a side,
-    spacing [m], carrier [Hz] of a square array, or rows, columns, spacing [m], carrier [Hz]"""
-    beamformer: Annotated[str | None, choice("beamformer for array snapshots (default: phase)", BEAMFORMERS)] = None
-    grid: tuple[int, int] | None = None
-    """elevations and azimuths of computed spectra (default: 90 360)"""
-    every: int | None = None
-    """reads one measurement of that many"""
-    station: int | None = None
-    """number of the array in a file with several, counted from 1"""
-    drop_null: bool = False
-    """whether to leave out null subcarriers of array snapshots, which are the same at every position and element"""
-    round_trip: bool = False
-    """whether phases of array snapshots are those of the way there and back, as of RFID and backscatter"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TableSource:
-    """Options of reading survey tables."""
-
-    columns: tuple[str, ...] = ()
-    """names of columns of a survey table that are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME ... (several with
-    rssi='WAP*')"""
+from swiftwrf.rssi import estimate_offsets
+from tasks.options import OffsetSource, SpectraSource, TableSource
 
 
 def reading(config: SpectraSource | TableSource) -> ReadOptions:
-    """Return the options of a command line for reading.
-
-    Raises:
-        InputError: An option that makes no sense whatever the data.
-    """
-    array = beamformer = grid = every = station = columns = drop_null = round_trip = None
+    """Return the options of a command line for reading."""
+    array = beamformer = grid = every = station = columns = filler = coordinates = offset_by = None
+    drop_null = round_trip = None
     if isinstance(config, SpectraSource):
-        array, beamformer, grid = _array(config), config.beamformer, _grid(config)
-        every, station = config.every, config.station
+        array, beamformer, every, station = _array(config), config.beamformer, config.every, config.station
+        grid = AngularGrid.hemisphere(*config.grid) if config.grid else None
         drop_null, round_trip = config.drop_null or None, config.round_trip or None
-        if beamformer is not None:
-            BEAMFORMERS[beamformer]  # refuses an unknown one
-        for name, value in (("every", every), ("station", station)):
-            if value is not None and value < 1:
-                raise InputError(f"--{name} must be at least 1, got {value}")
     if isinstance(config, TableSource):
-        columns = _columns(config.columns)
-    return ReadOptions(array, beamformer, grid, every, station, columns, drop_null, round_trip)
+        columns, filler, coordinates = config.column_names, config.fillers, config.coordinates
+    if isinstance(config, OffsetSource) and config.offset_by is not None:
+        offset_by = config.offset_by.partition("=")[0]
+    return ReadOptions(
+        array, beamformer, grid, every, station, columns, filler, coordinates, offset_by, drop_null, round_trip
+    )
 
 
 def _array(config: SpectraSource) -> PlanarArray | None:
@@ -75,32 +40,38 @@ def _array(config: SpectraSource) -> PlanarArray | None:
         return None
     *sides, spacing, frequency = config.array
     rows, columns = (int(side) for side in (sides[0], sides[-1]))
-    if not (1 <= min(rows, columns) <= max(rows, columns) <= MAX_SIDE and max(rows, columns) >= 2):
-        raise InputError(f"--array takes 2 to {MAX_SIDE} elements a side, got {rows} x {columns}")
-    if min(spacing, frequency) <= 0:
-        raise InputError(f"--array takes a spacing [m] and a carrier [Hz] above 0, got {spacing:g} and {frequency:g}")
     if rows == columns:
         return PlanarArray.square(rows, frequency, spacing)
     return PlanarArray.grid(rows, columns, spacing, frequency)
 
 
-def _grid(config: SpectraSource) -> AngularGrid | None:
-    if config.grid is None:
-        return None
-    if min(config.grid) < 2:
-        raise InputError(f"--grid takes numbers of elevations and azimuths, each at least 2, got {config.grid}")
-    return AngularGrid.hemisphere(*config.grid)
+def measured_rssi(data: str | None, config: TableSource) -> Rssi | None:
+    """Return the RSSI of an experiment in a folder or file, None without one.
+
+    Raises:
+        InputError: RSSI that cannot be read.
+    """
+    return None if data is None else read_rssi(data, reading(config))
 
 
-def _columns(columns: tuple[str, ...]) -> dict[str, str] | None:
-    pairs = [text.partition("=") for text in columns]
-    for text, (role, _, name) in zip(columns, pairs, strict=True):
-        if not role or not name:
-            raise InputError(f"--columns takes what a column holds and its name, e.g. x=NAME, got {text!r}")
-    roles = {role: name for role, _, name in pairs}
-    if len(roles) < len(pairs):
-        raise InputError(f"--columns names something twice: {' '.join(columns)}")
-    return roles or None
+def asked_offsets(train: Rssi, config: OffsetSource) -> Offsets | None:
+    """Return the offsets of the groups that a user asks for, estimated from training rows.
+
+    Raises:
+        InputError: One group only, or an unknown reference.
+    """
+    return None if config.offset_by is None else estimate_offsets(train, config.offset_by.partition("=")[2] or None)
+
+
+def split_notes(train: Rssi, test: Rssi) -> list[str]:
+    """Return a note on rows that share positions, or none."""
+    repeated = repeated_fraction(train.transmitter_position, test.transmitter_position)
+    if repeated > MAX_REPEATED:
+        return [f"this split tests look-up: {repeated:.0%} of the test rows are at positions of training rows"]
+    position = torch.cat([train.transmitter_position, test.transmitter_position])
+    n_places = len(position.unique(dim=0))
+    shared = f"{len(position)} rows are at {n_places} positions, each of which is in one part of the split"
+    return [shared] if n_places < len(position) and not repeated else []
 
 
 def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model: str) -> tuple[Store, Spectra | None]:

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 from swiftwrf.runtime.durable import write_bytes
 from tasks.claim import STEPS
 from tasks.cluster import Cluster
-from tasks.directory import Run, console
+from tasks.directory import Run
 from tasks.records import Row, strict
+from tasks.terminal import terminal
 
 if TYPE_CHECKING:
     from distributed import Future
@@ -30,6 +31,11 @@ class Step(ABC, Generic[Context]):
     @abstractmethod
     def name(self) -> str:
         """Key of the kept result. Steps with one name are one step."""
+
+    @property
+    def title(self) -> str:
+        """What is computed, for the terminal."""
+        return self.name
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -59,11 +65,12 @@ def computed(
     Raises:
         FitError: The cluster is lost.
     """
+    steps = list(steps)
     if cluster is not None:
-        steps = list(steps)
         _compute_on(cluster, run, steps, context)
+    terminal.expect(len({step.name for step in steps if not run.holds(step.name)}))
     for step in steps:
-        value = run.step(step.name, partial(step.compute, context, run.folder))
+        value = run.step(step.name, step.title, partial(step.compute, context, run.folder))
         yield step, value
         yield from computed(run, step.then(context, value), context, None)
 
@@ -82,6 +89,7 @@ def _compute_on(cluster: Cluster, run: Run, steps: Iterable[Step[Context]], cont
                 begin(step.then(context, value))
             elif step.name not in begun:
                 begun.add(step.name)
+                terminal.expect(1)
                 held |= {name: cluster.hold(run.path(name).read_bytes()) for name in step.reads if name not in held}
                 urgent = type(step).then is not Step.then  # other steps wait for it
                 future = cluster.submit(step.name, function, step, *(held[name] for name in step.reads), urgent=urgent)
@@ -95,7 +103,7 @@ def _compute_on(cluster: Cluster, run: Run, steps: Iterable[Step[Context]], cont
             write_bytes(run.path(name), content)
         value = run.keep(step.name, value, seconds)
         run.computed_on(cluster.machines)
-        console.print(f"[bold]{step.name}[/] {seconds:.1f} s")
+        terminal.end()
         begin(step.then(context, value))
 
 

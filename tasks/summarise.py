@@ -11,9 +11,11 @@ from numpy.typing import ArrayLike
 from pandas import DataFrame, Series
 
 from swiftwrf.metrics import summary
-from tasks.metrics import ErrorSummary
+from tasks.metrics import ChangeMetrics, ErrorSummary
 
 LEAST_ROWS = 10  # of a test, for an interval of differences
+N_BOOTSTRAP = 2000
+SMALLEST_ERROR = 1e-9  # degrees: a change is relative to at least this median
 SHORTEST = 1e-5  # seconds: what took less is drawn here, for logarithmic axes have no zero
 
 
@@ -61,6 +63,30 @@ def paired_difference(errors: DataFrame, method: str, other: str) -> tuple[float
     sums = difference[draws].sum(axis=1)
     low, high = np.percentile(sums[:, 0] / sums[:, 1], (2.5, 97.5))
     return mean, float(low), float(high)
+
+
+def paired_change(before: ArrayLike, after: ArrayLike) -> ChangeMetrics:
+    """Return the median of `after`, its change relative to the median of `before`, and the change's 95 % interval.
+
+    The interval is a bootstrap over test rows. Both errors of a row are resampled together, so that differences between rows
+    do not widen it.
+
+    Args:
+        before: Errors (n,). Repeats of a test row are averaged first, because they are not independent.
+        after: Errors (n,) of the same rows.
+
+    Example:
+        >>> change = paired_change([1.0, 2.0, 3.0], [0.5, 1.0, 1.5])
+        >>> change["change"], change["low"], change["high"]
+        (-0.5, -0.5, -0.5)
+    """
+    first, second = np.asarray(before, dtype=float), np.asarray(after, dtype=float)
+    rows = np.random.default_rng(0).integers(len(first), size=(N_BOOTSTRAP, len(first)))
+    ratio = np.median(second[rows], axis=1) / np.maximum(np.median(first[rows], axis=1), SMALLEST_ERROR)
+    low, high = np.percentile(ratio - 1, (2.5, 97.5))
+    median = float(np.median(second))
+    change = median / max(float(np.median(first)), SMALLEST_ERROR) - 1
+    return {"median_deg": median, "change": change, "low": float(low), "high": float(high)}
 
 
 def running_median(values: Series) -> Series:

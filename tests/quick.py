@@ -17,31 +17,32 @@ from swiftwrf import AngularGrid, RssiConfig, RssiModel, rssi_room, simulated_ro
 from swiftwrf.errors import LONGEST
 from swiftwrf.runtime.validation import configuration
 from tasks.aoa import experiment as aoa
-from tasks.aoa.condition import NETWORK
+from tasks.aoa.condition import NETWORKS
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.estimators.baselines import Constant
 from tasks.aoa.options import AoaConfig
-from tasks.convert import ConvertConfig
-from tasks.convert import run as convert
-from tasks.estimate import EstimateConfig
-from tasks.estimate import run as estimate
-from tasks.inspect import InspectConfig
-from tasks.inspect import run as inspect
+from tasks.command_line import command_line
+from tasks.convert.options import ConvertConfig
+from tasks.convert.run import run as convert
+from tasks.estimate.options import EstimateConfig
+from tasks.estimate.run import run as estimate
+from tasks.inspect.options import InspectConfig
+from tasks.inspect.run import run as inspect
 from tasks.locate import experiment as locate
 from tasks.locate.options import LocateConfig
-from tasks.report import ReportConfig
-from tasks.report import run as report
+from tasks.report.options import ReportConfig
+from tasks.report.run import run as report
 from tasks.rssi import experiment as rssi
+from tasks.rssi.options import RssiTaskConfig
 from tasks.rssi.predictors import PREDICTORS
-from tasks.run import command_line
-from tasks.scenes import ScenesConfig
-from tasks.scenes import run as scenes
-from tasks.view import ViewConfig
-from tasks.view import run as view
+from tasks.scenes.options import ScenesConfig
+from tasks.scenes.run import run as scenes
+from tasks.view.options import ViewConfig
+from tasks.view.run import run as view
 
 TASKS = {
     "aoa": (AoaConfig, aoa.run),
-    "rssi": (rssi.RssiTaskConfig, rssi.run),
+    "rssi": (RssiTaskConfig, rssi.run),
     "locate": (LocateConfig, locate.run),
     "report": (ReportConfig, report),
     "convert": (ConvertConfig, convert),
@@ -87,7 +88,7 @@ def quick() -> Iterator[None]:
         mock.patch.object(locate, "rssi_room", return_value=rssi_room(n=80)),
         mock.patch.object(RssiModel, "config_type", QuickRssiConfig),
         mock.patch("tasks.rssi.experiment.MAP_CELLS", 8),
-        mock.patch.dict(ESTIMATORS._registered, {NETWORK: QuickNetwork}),
+        mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
         mock.patch.object(PREDICTORS, "_registered", {name: PREDICTORS[name] for name in PREDICTORS_KEPT}),
     ):
         yield

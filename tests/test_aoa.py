@@ -18,23 +18,23 @@ from small import with_defaults
 
 from augment import Fold, Mixed, choose, sample_positions
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, load, make_model, simulated_room
-from swiftwrf.array.angles import to_angles, to_direction
 from swiftwrf.data.store import Store
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models import FIELD_MODELS, FieldModel
 from swiftwrf.models.geometry import model as geometry
 from tasks.aoa import context, cross_validation, experiment, steps
-from tasks.aoa.condition import Condition, MeasuredSubset, conditions_of, fraction_key, headline
-from tasks.aoa.estimators import ESTIMATORS, aann, radial
+from tasks.aoa.condition import Condition, MeasuredSubset, conditions_of, headline
+from tasks.aoa.estimators import ESTIMATORS, aann, make_estimator, nadaraya_watson
 from tasks.aoa.estimators.aann import AANN, AANNConfig
+from tasks.aoa.estimators.aann_kernel import AANNKernel, AANNKernelConfig
 from tasks.aoa.estimators.baselines import Constant, NearestSpectrum, Peak
-from tasks.aoa.estimators.kernel_ridge import KernelRegression
-from tasks.aoa.options import AoaConfig
+from tasks.aoa.estimators.kernel_regression import KernelRegression
+from tasks.aoa.options import AoaConfig, fraction_key
 from tasks.aoa.page.records import palette
+from tasks.command_line import command_line
 from tasks.page.palette import Palette
-from tasks.report import merge
-from tasks.run import command_line
+from tasks.report.run import merge
 
 TINY_FIT = FitConfig(model=ModelConfig(n_primitives=8), steps=20, check_every=10)
 
@@ -51,7 +51,8 @@ def small(monkeypatch):
             "candidates",
             lambda data: [name for name in ("idw", "gp", "coarray") if not FIELD_MODELS[name].lacking(data)],
         )
-    monkeypatch.setattr(AANNConfig, "quick", lambda n_spectra, **options: AANNConfig(steps=2, batch=4, **options))
+    for config in (AANNConfig, AANNKernelConfig):
+        monkeypatch.setattr(config, "quick", lambda n_spectra, **options: AANNKernelConfig(steps=2, batch=4, **options))
     return room
 
 
@@ -98,8 +99,8 @@ def test_nearest_spectrum_distinguishes_spectra_that_differ_in_their_last_digits
     assert torch.equal(NearestSpectrum().fit(train).predict(query), room.label[distance.argmin(dim=1)])
 
 
-def test_kernel_ridge_reads_only_the_spectra_that_it_keeps(room, monkeypatch):
-    monkeypatch.setattr(radial, "MAX_ROWS", 12)
+def test_kernel_regression_reads_only_the_spectra_that_it_keeps(room, monkeypatch):
+    monkeypatch.setattr(nadaraya_watson, "MAX_ROWS", 12)
     train, read = Mixed.measured(room), []
     select = Mixed.select
     monkeypatch.setattr(Mixed, "batches", lambda self: pytest.fail("all spectra were read"))
@@ -147,28 +148,28 @@ def test_circular_padding_makes_rolled_spectra_alike():
 def test_the_headline_is_of_the_network_that_is_kept():
     """Named by its training set, not by its error on test spectra."""
     conditions = [
-        Condition("aann", "measured"),
-        Condition("aann", "turbo", "gp"),
-        Condition("kernel_ridge", "turbo_extra", "gp"),
-        Condition("aann", "turbo_extra", "gp"),
-        Condition("aann", "turbo_extra", "idw"),
-        Condition("aann", "all"),
+        Condition("aann_kernel", "measured"),
+        Condition("aann_kernel", "turbo", "gp"),
+        Condition("kernel_regression", "turbo_extra", "gp"),
+        Condition("aann_kernel", "turbo_extra", "gp"),
+        Condition("aann_kernel", "turbo_extra", "idw"),
+        Condition("aann_kernel", "all"),
     ]
     assert headline(conditions).method == "turbo_gp_extra"
-    assert headline([conditions[1], Condition("aann", "turbo", "idw"), conditions[2]]).method == "turbo_gp"
+    assert headline([conditions[1], Condition("aann_kernel", "turbo", "idw"), conditions[2]]).method == "turbo_gp"
 
 
 @pytest.mark.parametrize(
     ("condition", "method"),
     [
-        (Condition("aann", "measured"), "measured_only"),
-        (Condition("aann", "all"), "measured_all"),
-        (Condition("aann", "turbo", "hybrid"), "turbo_hybrid"),
-        (Condition("aann", "turbo_extra", "hybrid"), "turbo_hybrid_extra"),
+        (Condition("aann_kernel", "measured"), "measured_only"),
+        (Condition("aann_kernel", "all"), "measured_all"),
+        (Condition("aann_kernel", "turbo", "hybrid"), "turbo_hybrid"),
+        (Condition("aann_kernel", "turbo_extra", "hybrid"), "turbo_hybrid_extra"),
         (Condition("peak", "measured"), "peak"),
-        (Condition("kernel_ridge", "all"), "kernel_ridge_measured_all"),
-        (Condition("kernel_ridge", "turbo_extra", "gp"), "kernel_ridge_turbo_gp_extra"),
-        (Condition("aann", "turbo", "auto"), "turbo_auto"),
+        (Condition("kernel_regression", "all"), "kernel_regression_measured_all"),
+        (Condition("kernel_regression", "turbo_extra", "gp"), "kernel_regression_turbo_gp_extra"),
+        (Condition("aann_kernel", "turbo", "auto"), "turbo_auto"),
     ],
 )
 def test_names_of_conditions_are_those_of_metrics_json(condition, method):
@@ -186,7 +187,7 @@ def test_keys_of_fractions_are_exact():
     assert keys[:3] == ["0.3", "1", "0.1"]
 
 
-def test_kernel_ridge_regression_is_what_its_definition_says():
+def test_kernel_regression_regression_is_what_its_definition_says():
     """The chosen width and penalty have the least error on held-out rows, each row's value found by plain inversion."""
     generator = np.random.default_rng(0)
     feature, target = generator.normal(size=(60, 2)), generator.normal(size=(60, 3))
@@ -207,14 +208,14 @@ def test_kernel_ridge_regression_is_what_its_definition_says():
         (width / median, alpha): sum(
             np.abs(told(*fold, width / median, alpha) - target[fold[1]]).mean() for fold in folds
         )
-        for width in radial.WIDTH_CANDIDATES
-        for alpha in radial.PENALTY_CANDIDATES
+        for width in nadaraya_watson.WIDTH_CANDIDATES
+        for alpha in nadaraya_watson.PENALTY_CANDIDATES
     }
     best = min(errors, key=errors.get)
-    assert radial.choose(apart, target, seed=3) == pytest.approx(best)
+    assert nadaraya_watson.choose(apart, target, seed=3) == pytest.approx(best)
     rows, new = np.arange(50), np.arange(50, 60)
-    gamma, alpha = radial.choose(apart[:50, :50], target[:50], seed=3)
-    found = radial.RadialRegression.fit(feature[:50], target[:50], seed=3)(feature[50:])
+    gamma, alpha = nadaraya_watson.choose(apart[:50, :50], target[:50], seed=3)
+    found = nadaraya_watson.NadarayaWatson.fit(feature[:50], target[:50], seed=3)(feature[50:])
     np.testing.assert_allclose(found, told(rows, new, gamma, alpha), rtol=1e-8)
 
 
@@ -222,7 +223,7 @@ def test_what_all_distances_have_in_common_does_not_move_an_estimate():
     """As noise does that a measured spectrum has and synthetic ones have not."""
     generator = np.random.default_rng(0)
     feature, new = generator.normal(size=(40, 3)), generator.normal(size=(5, 3))
-    regression = radial.RadialRegression.fit(np.c_[feature, np.zeros(40)], feature, seed=0)
+    regression = nadaraya_watson.NadarayaWatson.fit(np.c_[feature, np.zeros(40)], feature, seed=0)
     clean, noisy = (regression(np.c_[new, np.full(5, beside)]) for beside in (0, 100))
     np.testing.assert_allclose(noisy, clean, rtol=1e-8)
     assert np.abs(clean - new).mean() < 0.5 * np.abs(new).mean()
@@ -276,20 +277,26 @@ def test_batches_are_at_most_half_of_what_trains(room, monkeypatch, spectra, bat
 
 
 @pytest.mark.long
-def test_regression_takes_the_place_of_the_head_that_a_short_training_leaves():
+def test_kernel_regression_on_the_features_is_better_than_the_head_after_a_short_training():
     """On spectra that neither has seen."""
     room = simulated_room(n=300, grid=AngularGrid.hemisphere(10, 40))
     train, test = room.split("random")
-    network = AANN(steps=5).fit(Mixed.measured(train))
-    direction = to_direction(*train.label.unbind(-1)).float()
-    mean = torch.nn.functional.normalize(direction.mean(dim=0), dim=0)
-    spread = (direction - mean).square().sum(dim=1).mean().sqrt()
+    network = AANNKernel(steps=5).fit(Mixed.measured(train))
+    estimates = (network.predict(test.spectrum), AANN.predict(network, test.spectrum))
+    kernel, head = (angle_errors(estimate, test.label)["great_circle"].median() for estimate in estimates)
+    assert kernel < 0.5 * head
+
+
+def test_the_estimate_of_the_network_is_that_of_its_head(room):
+    """The direction of a changed head changes alike: no other regression stands between."""
+    train = Mixed.measured(room)
+    network = AANN(steps=2, batch=4).fit(train)
+    head = network._network.fc[2]
     with torch.no_grad():
-        offset = network._network(network._prepare(test.spectrum))
-    pointed = torch.nn.functional.normalize(mean + spread * offset, dim=1).double()
-    head = torch.stack(to_angles(pointed), dim=-1)
-    own, alone = (angle_errors(e, test.label)["great_circle"].median() for e in (network.predict(test.spectrum), head))
-    assert own < 0.5 * alone
+        head.weight.zero_()
+        head.bias.copy_(torch.tensor([0.0, 0.0, 100.0]))
+    upwards = network.predict(room.spectrum)[:, 1].rad2deg()
+    assert (upwards > 85).all()
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5])
@@ -297,14 +304,17 @@ def test_spectra_that_are_all_alike_are_in_the_mean_direction(value):
     label = torch.tensor([[0.0, 30], [90, 30]]).deg2rad().repeat(6, 1).double()
     alike = torch.full((12, 8, 32), value)
     train = labelled(alike, label, AngularGrid.hemisphere(8, 32))
-    estimates = [estimator.fit(train).predict(alike[:1]) for estimator in (AANN(steps=2, batch=4), Constant())]
-    torch.testing.assert_close(*estimates, atol=0.05, rtol=0)
+    estimators = (AANN(steps=2, batch=4), AANNKernel(steps=2, batch=4), Constant())
+    *networks, constant = (estimator.fit(train).predict(alike[:1]) for estimator in estimators)
+    for network in networks:
+        torch.testing.assert_close(network, constant, atol=0.05, rtol=0)
 
 
-def test_aann_is_seeded_and_leaves_the_global_generator_alone(room):
+@pytest.mark.parametrize("kind", [AANN, AANNKernel])
+def test_networks_are_seeded_and_leave_the_global_generator_alone(room, kind):
     state = torch.get_rng_state()
     train = Mixed.measured(room)
-    estimates = [AANN(seed=7, steps=2, batch=4).fit(train).predict(room.spectrum) for _ in range(2)]
+    estimates = [kind(seed=7, steps=2, batch=4).fit(train).predict(room.spectrum) for _ in range(2)]
     assert torch.equal(*estimates)
     assert torch.equal(torch.get_rng_state(), state)
 
@@ -388,6 +398,8 @@ def test_a_training_is_as_long_as_the_scene_needs():
         (715, 64),
         (1000, 64),
     ]
+    assert make_estimator("aann_kernel", 780).config.steps == AANNKernelConfig().steps < AANNConfig().steps
+    assert make_estimator("aann", 780, "paper").config.steps == AANNConfig.paper().steps
 
 
 def test_whole_run(small, tmp_path):
@@ -403,8 +415,9 @@ def test_whole_run(small, tmp_path):
     )
     methods = metrics["mixes"]["0.5"]["methods"]
     trainings = ["measured_all", *(f"turbo_{name}{more}" for name in ("swiftwrf", "idw") for more in ("", "_extra"))]
-    others = ("nearest_spectrum", "kernel_ridge")
-    expected = {"measured_only", "constant", "peak", *others, *trainings}
+    others = ("nearest_spectrum", "kernel_regression")
+    networks = {name for name in trainings if name == "measured_all" or name.endswith("_extra")}
+    expected = {"measured_only", "constant", "peak", *others, *networks}
     expected |= {f"{estimator}_{training}" for estimator in others for training in trainings}
     assert set(methods) == expected
     drawn = {"swiftwrf", "idw", "gp", "gp sample", "coarray", "coarray sample"}
@@ -414,14 +427,14 @@ def test_whole_run(small, tmp_path):
     assert set(metrics["mixes"]["1"]["seconds"]) == {"fit", "synthesize", "train"}
 
     errors = pd.read_csv(out / "errors.csv")
-    assert len(errors) == 2 * 2 * 20 * 10  # shares, repeats, methods, test spectra
-    own = errors[(errors.measured_fraction == 0.5) & (errors.method == "turbo_swiftwrf")]
-    assert set(own.estimator) == {"aann"}
-    assert set(own.training) == {"turbo"}
+    assert len(errors) == 2 * 2 * 18 * 10  # fractions, repeats, methods, test spectra
+    own = errors[(errors.measured_fraction == 0.5) & (errors.method == "turbo_swiftwrf_extra")]
+    assert set(own.estimator) == {"aann_kernel"}
+    assert set(own.training) == {"turbo_extra"}
     assert set(own.synthesizer) == {"swiftwrf"}
     median = own.groupby("index").great_circle_deg.mean().median()
-    assert methods["turbo_swiftwrf"]["great_circle_deg"]["median"] == pytest.approx(median)
-    assert methods["turbo_swiftwrf"]["great_circle_deg"]["low"] <= median
+    assert methods["turbo_swiftwrf_extra"]["great_circle_deg"]["median"] == pytest.approx(median)
+    assert methods["turbo_swiftwrf_extra"]["great_circle_deg"]["low"] <= median
     truth = np.degrees(small.label[own["index"].tolist()].numpy())
     np.testing.assert_allclose(own[["truth_azimuth_deg", "truth_elevation_deg"]], truth, rtol=1e-9)
 
@@ -504,7 +517,7 @@ def test_a_new_field_model_is_in_help_and_colours(monkeypatch, capsys):
     with pytest.raises(SystemExit):
         run("--help")
     assert "dark: No power anywhere" in " ".join(capsys.readouterr().out.replace("│", " ").split())
-    colours = palette([Condition("aann", "turbo", "dark")])
+    colours = palette([Condition("aann_kernel", "turbo", "dark")])
     assert colours.colour("dark") == colours.colour("turbo_dark") == Palette().colour("dark")
 
 
@@ -564,7 +577,7 @@ def test_fractions_of_many_digits_have_results_of_their_own(small, tmp_path, mon
     assert [float(key) for key in mixes] == list(fractions)
     for key in mixes:
         assert mixes[key]["methods"]["turbo_nearest"]["great_circle_deg"]["n"] == 10
-        for name in (f"suggested-mix{key}.csv", f"aann-mix{key}.safetensors"):
+        for name in (f"suggested-mix{key}.csv", f"aann_kernel-mix{key}.safetensors"):
             assert (tmp_path / "run" / name).is_file()
         assert list((tmp_path / "run" / "figures").glob(f"cdf-mix{key}-*.svg"))
 
@@ -581,7 +594,7 @@ def test_labels_of_synthetic_spectra_are_those_of_their_positions(small, tmp_pat
     position = sample_positions(measured.position, 20, 0)
     for place in ("augment.positions.sample_positions", "tasks.aoa.steps.synthetic_positions"):
         monkeypatch.setattr(place, lambda *_: pytest.fail("positions were computed again"))
-    condition = Condition("kernel_ridge", "turbo_extra", "idw", 20, 0.5)
+    condition = Condition("kernel_regression", "turbo_extra", "idw", 20, 0.5)
     mixed = steps.Evaluation(condition, synthesis)._training_set(data, tmp_path)
     torch.testing.assert_close(mixed.label[-20:], small.direction_at(position))
     expected = make_model("idw").fit(measured).synthesize(position)
@@ -635,6 +648,7 @@ def test_advice_is_that_of_each_field_model(small):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
+        (("--seed", 1), "got none"),
         (("--mix", 0), "in (0, 1]"),
         (("--mix", 1.5), "in (0, 1]"),
         (("--mix", 0.3, 0.3), "twice"),

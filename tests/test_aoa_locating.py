@@ -22,13 +22,13 @@ from swiftwrf.models.geometry import model as geometry
 from swiftwrf.models.geometry.planes import Plane
 from swiftwrf.testing.rooms import mirror_room
 from tasks.aoa import cross_validation, experiment
-from tasks.aoa.condition import LOCATOR, NETWORK
+from tasks.aoa.condition import LOCATOR, NETWORKS
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.locating import Locating, containing_level
 from tasks.aoa.options import AoaConfig
-from tasks.estimate import EstimateConfig
-from tasks.estimate import run as estimate
-from tasks.run import command_line
+from tasks.command_line import command_line
+from tasks.estimate.options import EstimateConfig
+from tasks.estimate.run import run as estimate
 
 PLANES = {(0.0, 0.0, -1.0): 0.0, (1.0, 0.0, 0.0): 5.0, (0.0, 1.0, 0.0): 4.0}  # outward normal to offset [m]
 FEW_CELLS = MatchedFieldConfig(max_cells=3000, n_best=60, n_background=20, n_rounds=2, n_calibration=40)
@@ -56,7 +56,7 @@ def quickly(data, planes=PLANES):
             mock.patch.object(matched_field, "MatchedFieldConfig", with_defaults(FEW_CELLS)),
             mock.patch.object(cross_validation, "FOLD_LOCATOR", FEW_CELLS),
             mock.patch.object(experiment, "simulated_room", return_value=data),
-            mock.patch.dict(ESTIMATORS._registered, {NETWORK: QuickNetwork}),
+            mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
             *(
                 mock.patch(f"{place}.candidates", lambda data: [n for n in ("idw", "geometry") if not lacking(n, data)])
                 for place in ("tasks.aoa.steps", "augment.choose")
@@ -114,10 +114,10 @@ def test_a_known_room_without_noise_is_located(finished):
     """Far below the error of every estimator that does not use the room."""
     mix = mix_of(finished)
     error = {name: method["great_circle_deg"]["median"] for name, method in mix["methods"].items()}
-    assert error[LOCATOR] < 0.3 * error["kernel_ridge"]
+    assert error[LOCATOR] < 0.3 * error["kernel_regression"]
     assert mix["locating"][LOCATOR]["position_error_m"]["median"] < 0.1
     assert mix["estimator_choice"]["name"] == LOCATOR
-    assert set(mix["estimator_choice"]["held_out_deg"]) == {"kernel_ridge", LOCATOR}
+    assert set(mix["estimator_choice"]["held_out_deg"]) == {"kernel_regression", LOCATOR}
 
 
 def test_the_report_shows_where_it_was(finished):
@@ -187,7 +187,7 @@ def test_without_array_or_planes_it_is_left_out_with_one_sentence(closed_form, t
     else:
         assert f"{LOCATOR} is left out with 60% measured: {reason}" in console
         assert reason == "no plane explains the spectra"
-    assert set(mix["estimator_choice"]["held_out_deg"]) == {"kernel_ridge"}
+    assert set(mix["estimator_choice"]["held_out_deg"]) == {"kernel_regression"}
     assert not (tmp_path / "run" / "positions.csv").exists()
     assert "Where was it?" in (tmp_path / "run" / "report.html").read_text()
 
@@ -209,16 +209,16 @@ def test_the_estimator_is_chosen_by_held_out_errors_alone(monkeypatch, closed_fo
     """Without a model that has a room, or with planes in one of two searches, it is not matched-field processing."""
     model = make_model("idw").fit(closed_form)
     folds = [Fold(model, closed_form, closed_form.subset(torch.arange(4))) for _ in range(4)]
-    errors = {"kernel_ridge": [np.full(4, 2.0)] * 4, "kernel_ridge_turbo_idw": [np.full(4, 1.0)] * 4}
+    errors = {"kernel_regression": [np.full(4, 2.0)] * 4, "kernel_regression_turbo_idw": [np.full(4, 1.0)] * 4}
     for given in ([], folds):
         choice = cross_validation.choose_estimator(errors, given, seed=0)
-        assert choice["name"] == "kernel_ridge_turbo_idw"
-        assert choice["held_out_deg"] == {"kernel_ridge": 2.0, "kernel_ridge_turbo_idw": 1.0}
+        assert choice["name"] == "kernel_regression_turbo_idw"
+        assert choice["held_out_deg"] == {"kernel_regression": 2.0, "kernel_regression_turbo_idw": 1.0}
         assert choice["n_held_out"] == 16
     located = iter([np.full(4, 0.1), None])
     monkeypatch.setattr(cross_validation, "_located_errors", lambda *_: next(located))
     assert LOCATOR not in cross_validation.choose_estimator(errors, folds, seed=0)["held_out_deg"]
-    for error, chosen in ((0.1, LOCATOR), (1.5, "kernel_ridge_turbo_idw")):
+    for error, chosen in ((0.1, LOCATOR), (1.5, "kernel_regression_turbo_idw")):
         monkeypatch.setattr(cross_validation, "_located_errors", lambda *_, error=error: np.full(4, error))
         choice = cross_validation.choose_estimator(errors, folds, seed=0)
         assert (choice["name"], choice["n_held_out"]) == (chosen, 8)
@@ -233,7 +233,7 @@ def test_the_benchmark_writes_every_draw_and_their_medians(closed_form, tmp_path
     assert {"command", "environment"} <= set(written)
     found = written["scenes"]["closed form"]["0.5"]
     assert [row["draw"] for row in found["draws"]] == [0, 1]
-    for name in ("angle_deg", "position_m", "kernel_ridge_angle_deg"):
+    for name in ("angle_deg", "position_m", "kernel_regression_angle_deg"):
         assert found["median"][name]["p90"] == pytest.approx(np.mean([row[name]["p90"] for row in found["draws"]]))
         assert found["median"][name]["median"] > 0
     assert 0 <= found["median"]["coverage_80"] <= 1

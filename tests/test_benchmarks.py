@@ -1,10 +1,11 @@
-"""The comparison of all methods can be stopped at any time, and added to."""
+"""The comparison of all methods can be stopped at any time, and added to; networks are compared on held-out spectra."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import comparison
+import networks
 import pytest
 
 from swiftwrf import AngularGrid, simulated_room
@@ -52,3 +53,19 @@ def test_a_scene_is_added_to_the_committed_comparison(tmp_path):
     assert list(found["room random"]) == ["80", "24"]
     assert found["room random"]["24"] == {"mean": {"ms": 2}, "gp": {"ms": 4}}
     assert earlier["room random"]["24"]["gp"] == {"ms": 1}
+
+
+def test_networks_are_compared_on_training_spectra_that_are_held_out(monkeypatch):
+    room, written = simulated_room(n=60, grid=AngularGrid.hemisphere(8, 32)), []
+    held_out = room.split("random")[0].split("random", seed=1)[1]
+    monkeypatch.setattr(networks, "simulated_room", lambda: room)
+    monkeypatch.setattr(networks, "has_room", lambda data: False)
+    monkeypatch.setattr(networks, "write_result", lambda name, content: written.append(content))
+    networks.main(networks.Config(trainings=("measured", "turbo"), steps=(1,), name="none"))
+    rows = written[-1]["scenes"]["room"]
+    assert [entry["n_train"] for entry in rows.values()] == [11, 38]
+    for entry in rows.values():
+        heads = {f"{name}, quick, 1 steps" for name in ("aann", "aann_kernel")}
+        assert set(entry["methods"]) == {"kernel_regression", "nearest_spectrum", *heads}
+        assert entry["methods"]["kernel_regression"]["change"]["change"] == 0
+        assert all(len(method["errors_deg"]) == len(held_out) == 10 for method in entry["methods"].values())

@@ -9,6 +9,7 @@ import sys
 import time
 import tomllib
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import get_type_hints
 
@@ -52,8 +53,11 @@ def test_help_lists_every_command_at_once(tmp_path):
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_options_and_a_package_of_its_name(name):
-    task = import_module(COMMANDS[name].module).run
-    assert get_type_hints(task)["config"].__doc__
+    task = import_module(f"tasks.{name}.{COMMANDS[name].module}").run
+    config_type = get_type_hints(task)["config"]
+    assert config_type is getattr(import_module(f"tasks.{name}.options"), COMMANDS[name].options)
+    assert config_type.__doc__
+    assert config_type.resumable == ("resume" in signature(task).parameters)
     assert f'run_command("{name}"' in (ROOT / "tasks" / name / "__main__.py").read_text()
 
 
@@ -86,7 +90,7 @@ def test_commands_shorten_the_wait_of_threads_and_libraries_do_not(given, spins)
         "for name in [name for name in sys.modules if name.startswith(('torch', 'swiftwrf'))]: del sys.modules[name]\n"
         "sys.meta_path.insert(0, Stop())\n"
         "from tasks.command import main\n"
-        "main(['rssi'])\n"
+        "main(['rssi', '--rx', '1'])\n"
     )
     own = {key: value for key, value in os.environ.items() if key not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}
     done = subprocess.run([sys.executable, "-c", code], env=own | given, stdout=subprocess.PIPE, text=True, check=True)

@@ -15,15 +15,16 @@ from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.metrics import psnr
 from swiftwrf.models.geometry import GeometryConfig, GeometryModel, Plane, fit_geometry, refit_geometry
 from swiftwrf.models.geometry.ambiguity import _AlternativeTable, phase_alternatives
+from swiftwrf.models.geometry.batched import batched, batched_field, batched_score
 from swiftwrf.models.geometry.fit import _with_weak_planes, _without_aliases, observe, split
 from swiftwrf.models.geometry.hybrid import HybridModel, fit_hybrid
 from swiftwrf.models.geometry.images import PhaseObservations, field, image_gain, images, mirror, sequences
 from swiftwrf.models.geometry.path_gains import PathGains, fit_path_gains
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation, correlations, retrieve_phases
-from swiftwrf.models.geometry.planes import PlaneSet
-from swiftwrf.models.geometry.refine import derivatives
+from swiftwrf.models.geometry.planes import PlaneSet, refined
+from swiftwrf.models.geometry.refine import image_jacobian, phase_jacobian
 from swiftwrf.models.geometry.responses import SteeringResponses
-from swiftwrf.models.geometry.search import SIGNS
+from swiftwrf.models.geometry.search import SIDES, SIGNS
 from swiftwrf.models.nearest import NearestModel
 from swiftwrf.runtime.checkpoint import write
 from swiftwrf.testing.rooms import ARRAY, GRID, mirror_room
@@ -88,35 +89,79 @@ def test_phases_of_the_elements_follow_from_the_spectra():
     assert float(match.min()) > 0.999
 
 
-def test_derivatives_of_the_field_are_its_differences():
-    data = mirror_room(SIX, n=5)
-    scene = PhaseObservations.of(
-        data.position, data.fixed_position, "receiver", ARRAY, data.rotation, torch.ones(5, 16)
-    )
-    normal = torch.tensor([list(SIX)], dtype=torch.float64)
-    offset, gain = torch.tensor([list(SIX.values())], dtype=torch.float64), torch.full((1, 6), -0.6)
-    chain, step = sequences(normal[0], 2), 1e-3
-    _, change = derivatives(scene, normal, offset, gain, chain, tilt=True)
+@pytest.mark.parametrize("moving", ["receiver", "transmitter"])
+def test_derivatives_of_the_phase_are_differences_of_the_field(moving):
+    """Of rooms with oblique planes, too, and of images that a plane makes twice."""
+    scene, _ = observe(mirror_room({}, moving=moving, n=10))
+    normal = torch.tensor([[[1, 0, 0], [0, 0, -1], [0, 1, 0]], [[1, 0.1, 0], [0.1, 0, -1], [-0.2, 1, 0.1]]]).double()
+    normal = torch.nn.functional.normalize(normal, dim=-1)
+    offset, gain = torch.tensor([[5.0, 0.4, 4.0], [4.8, 0.2, 4.1]]).double(), torch.full((2, 3), -0.6)
+    chain, step = [*sequences(normal[1], 2), (0, 1, 0)], 1e-3
     across = torch.linalg.svd(normal[:, :, None]).Vh[:, :, 1:]
-    for plane in (0, 3):
+    movement = image_jacobian(normal, offset, scene.transmitter, chain, tilt=True)
+    total, jacobian = phase_jacobian(scene, normal, offset, gain, chain, movement)
+    direct = scene.wave(scene.transmitter)
+    torch.testing.assert_close(total.permute(1, 2, 0), direct + field(scene, normal, offset, gain, chain))
+    for plane in range(3):
         for q in range(4):
             moved = []
             for side in (-step, step):
                 n, o, g = normal.clone(), offset.clone(), gain.clone()
                 if q == 0:
-                    o[0, plane] += side
+                    o[:, plane] += side
                 elif q == 1:
-                    g[0, plane] += side
+                    g[:, plane] += side
                 else:
-                    n[0, plane] += side * across[0, plane, q - 2]
-                moved.append(derivatives(scene, n, o, g, chain, tilt=False)[0])
-            difference = (moved[1] - moved[0]) / (2 * step)
-            assert float((change[:, q, plane] - difference).norm() / difference.norm()) < 0.02
+                    n[:, plane] += side * across[:, plane, q - 2]
+                moved.append(direct + field(scene, n, o, g, chain))
+            difference = (moved[1] / moved[0]).angle() / (2 * step)
+            found = jacobian[:, :, 3 * q + plane].permute(1, 2, 0)
+            assert float((found - difference).norm() / difference.norm()) < 0.02
+
+
+@pytest.mark.parametrize("moving", ["receiver", "transmitter"])
+def test_batched_fields_and_scores_are_the_plain_ones(moving):
+    """Also of an array that is no lattice, where each element is a step of its own."""
+    generator = torch.Generator().manual_seed(0)
+    scattered = PlanarArray(ARRAY.element + 0.02 * torch.rand(16, 2, generator=generator).double(), ARRAY.wavelength)
+    offset, gain = 4 + torch.rand(9, 3, generator=generator).double(), torch.rand(9, 3, generator=generator) - 0.5
+    tilted = torch.nn.functional.normalize(torch.tensor([[1, 0.3, 0], [-0.2, 1, 0.1], [0, 0, -1]]).double(), dim=1)
+    for array in (ARRAY, scattered):
+        data, observed = (
+            mirror_room({}, moving=moving, n=10),
+            torch.randn(10, 16, generator=generator, dtype=torch.complex64),
+        )
+        scene = PhaseObservations.of(data.position, data.fixed_position, moving, array, data.rotation, observed.sgn())
+        assert len(scene.chain.step) == (3 if array is ARRAY else 16)
+        for normal in (tilted, SIDES[[0, 1, 3]]):
+            planes, chain = (normal.expand(9, 3, 3), offset, gain), sequences(normal, 2)
+            plain, fast = field(scene, *planes, chain), batched_field(scene, *planes, chain)
+            torch.testing.assert_close(
+                torch.cat([plain.real, plain.imag], dim=-1).permute(1, 2, 0), fast, atol=1e-5, rtol=0
+            )
+            torch.testing.assert_close(batched_score(scene, fast), scene.score(plain), atol=1e-5, rtol=0)
+            torch.testing.assert_close(batched(plain[0]), fast[..., :1], atol=1e-5, rtol=0)
+
+
+def test_rooms_are_refined_together_as_one_by_one():
+    scene, _ = observe(mirror_room(SIX, n=20))
+    normal, offset = torch.tensor([list(SIX)]).double(), torch.tensor([list(SIX.values())]).double()
+    room = PlaneSet(normal, offset + 0.01, torch.full((1, 6), -0.5), 2)
+    rooms = [
+        room,
+        room.without(0),
+        replace(room, offset=offset - 0.01),
+        PlaneSet(normal[:, :0], offset[:, :0], offset[:, :0], 2),
+    ]
+    for together, given in zip(refined(rooms, scene, 3), rooms, strict=True):
+        alone = given.refined(scene, 3)
+        torch.testing.assert_close(together.offset, alone.offset, atol=1e-6, rtol=0)
+        torch.testing.assert_close(together.gain, alone.gain, atol=1e-4, rtol=0)
 
 
 def test_mirroring_twice_returns():
-    point = torch.randn(4, 3, dtype=torch.float64)
-    normal = torch.nn.functional.normalize(torch.randn(4, 3, dtype=torch.float64), dim=1)
+    point = torch.randn(3, 4, dtype=torch.float64)
+    normal = torch.nn.functional.normalize(torch.randn(3, 4, dtype=torch.float64), dim=0)
     offset = torch.randn(4, dtype=torch.float64)
     torch.testing.assert_close(mirror(mirror(point, normal, offset), normal, offset), point)
 
@@ -189,7 +234,7 @@ def test_scores_of_combinations_are_those_of_their_rooms():
     normal = torch.tensor(list(SIX)).double()
     offset = [o + 0.05 * torch.arange(1 + i % 3, dtype=torch.float64) for i, o in enumerate(SIX.values())]
     gain = [torch.linspace(-0.6, 0.4, len(o)) for o in offset]
-    direct, waves = scene.wave(scene.transmitter), SteeringResponses.of(scene, normal, offset, gain)
+    direct, waves = batched(scene.wave(scene.transmitter)), SteeringResponses.of(scene, normal, offset, gain)
     score = waves.scores(scene, direct)
     base, moving = waves.moved(direct, (1, 2, 4, 5))
     torch.testing.assert_close(moving.scores(scene, base), score[0, :, :, 0])
@@ -197,6 +242,8 @@ def test_scores_of_combinations_are_those_of_their_rooms():
         own = ([t[c] for t, c in zip(table, choice, strict=True)] for table in (offset, gain))
         room = PlaneSet(normal[None], *(torch.stack(row)[None] for row in own), 2)
         torch.testing.assert_close(score[choice], scene.score(room.field(scene)), atol=1e-5, rtol=0)
+        picked = batched_score(scene, direct + waves.of_choices([torch.tensor([c]) for c in choice]))
+        torch.testing.assert_close(score[choice], picked[0], atol=1e-5, rtol=0)
 
 
 @pytest.mark.long
@@ -219,11 +266,11 @@ def test_images_are_mirrored_in_one_plane_after_another():
     chain = [(1, 0, 2), (2,), (0, 1)]
     found, strength = images(scene, normal, offset, chain), image_gain(gain, chain)
     for row, sequence in enumerate(chain):
-        point, product = position, torch.ones(2)
+        point, product = position.T[:, None], torch.ones(2)
         for plane in sequence:
-            point = mirror(point, normal[:, plane, None], offset[:, plane, None])
+            point = mirror(point, normal[:, plane].T[..., None], offset[:, plane, None])
             product = product * gain[:, plane]
-        torch.testing.assert_close(found[:, row], point)
+        torch.testing.assert_close(found[:, row], point.movedim(0, -1))
         torch.testing.assert_close(strength[:, row], product)
 
 

@@ -201,7 +201,7 @@ def test_estimators_are_opened_with_swiftwrf_alone(tmp_path):
 
     kinds = {kind for kind, made in Saved.kinds.items() if made.__module__.startswith("tasks.aoa.estimators")}
     assert kinds
-    script = "import swiftwrf; from swiftwrf.runtime import checkpoint; checkpoint._import_extensions()"
+    script = "import swiftwrf; from swiftwrf.runtime import checkpoint; checkpoint._import_kinds()"
     script += "; print(*checkpoint.Saved.kinds, sep='|')"
     path = os.pathsep.join([str(tmp_path), str(ROOT)])
     opened = subprocess.run(

@@ -15,14 +15,14 @@ from tasks.aoa.options import AoaConfig
 from tasks.aoa.results import Results
 from tasks.aoa.steps import Evaluation, choose_model
 
-MEASURED = Condition("aann", "measured", measured_fraction=0.3)
-GP, IDW = (Condition("aann", "turbo", name, measured_fraction=0.3) for name in ("gp", "idw"))
+MEASURED = Condition("aann_kernel", "measured", measured_fraction=0.3)
+GP, IDW = (Condition("aann_kernel", "turbo", name, measured_fraction=0.3) for name in ("gp", "idw"))
 GP_EXTRA, IDW_EXTRA = (replace(condition, training="turbo_extra", n_synthetic=9) for condition in (GP, IDW))
 
 
 def regression(condition):
     """Return the condition with another estimator."""
-    return replace(condition, estimator="kernel_ridge")
+    return replace(condition, estimator="kernel_regression")
 
 
 def results(*repeats):
@@ -47,9 +47,9 @@ def test_the_choices_of_all_repeats_are_one_condition():
     given = results((GP, regression(GP)), (IDW, IDW_EXTRA, regression(IDW_EXTRA)))
     found = pooled(given, auto=True)
     methods = {condition.method for condition, _ in found}
-    assert methods == {"measured_only", "turbo_auto", "kernel_ridge_turbo_auto"}
+    assert methods == {"measured_only", "turbo_auto", "kernel_regression_turbo_auto"}
     assert values(found, "turbo_auto") == [1, 12]  # with further positions if there are some
-    assert values(found, "kernel_ridge_turbo_auto") == [2, 13]
+    assert values(found, "kernel_regression_turbo_auto") == [2, 13]
     assert values(found, "measured_only") == [0, 10]
 
 
@@ -57,6 +57,16 @@ def test_field_models_asked_for_by_name_add_no_positions_against_the_advice():
     found = pooled(results((GP,), (GP, GP_EXTRA)), auto=False)
     assert values(found, "turbo_gp") == [1, 11]
     assert values(found, "turbo_gp_extra") == [1, 12]
+
+
+def test_a_network_with_further_positions_alone_is_pooled_with_those_without_any():
+    """The network is trained one way in each repeat, other estimators both ways."""
+    given = results((GP, regression(GP)), (GP_EXTRA, regression(GP), regression(GP_EXTRA)))
+    found = pooled(given, auto=False)
+    assert values(found, "turbo_gp") == []
+    assert values(found, "turbo_gp_extra") == [1, 11]
+    assert values(found, "kernel_regression_turbo_gp") == [2, 12]
+    assert values(found, "kernel_regression_turbo_gp_extra") == [2, 13]
 
 
 def test_fractions_are_pooled_apart():

@@ -21,7 +21,7 @@ from tasks.claim import Claim
 from tasks.command import main
 from tasks.page.records import Records
 from tasks.records import read_table, write_table
-from tasks.report import merge
+from tasks.report.run import merge
 from tasks.rssi import experiment as rssi
 
 TABLES = ("errors.csv", "predictions.csv")

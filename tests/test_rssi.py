@@ -21,14 +21,14 @@ from swiftwrf.comparison import NeRF2Rssi, NeRF2RssiConfig, NeRF2RssiSize
 from swiftwrf.data.splits import folds
 from swiftwrf.rssi import RssiPredictor
 from swiftwrf.runtime import registry
-from tasks.page.labels import PREDICTORS as LABELS
-from tasks.report import merge
+from tasks.command_line import command_line
+from tasks.labels import PREDICTORS as LABELS
+from tasks.report.run import merge
 from tasks.rssi import experiment
 from tasks.rssi.page.summary import varies
 from tasks.rssi.predictors import PREDICTORS, make_predictor
 from tasks.rssi.predictors.blend import Blend, BlendConfig
 from tasks.rssi.predictors.regressors import NEIGHBOUR_COUNTS
-from tasks.run import command_line
 from tasks.summarise import paired_difference
 
 

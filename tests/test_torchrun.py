@@ -81,14 +81,14 @@ def commands(folder: Path) -> int:
 
 @pytest.fixture(scope="module")
 def ended(tmp_path_factory):
-    """The folder of the results of two processes, and their stderr."""
+    """The folder of the results of two processes, and what they printed."""
     folder = tmp_path_factory.mktemp("torchrun")
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", __file__]
     path = os.pathsep.join([str(HERE), str(HERE.parent)])
     environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
     done = subprocess.run([*command, str(folder)], env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-3000:]
-    return folder, done.stderr
+    return folder, done.stdout + done.stderr
 
 
 def main(folder: Path) -> None:

@@ -11,10 +11,10 @@ from swiftwrf import InputError, rssi_room
 from swiftwrf.locate import Posterior, RssiLocator, smoothed, track
 from swiftwrf.locate.posterior import normalised
 from swiftwrf.locate.track import joined
+from tasks.command_line import command_line
 from tasks.locate import experiment
 from tasks.locate.observations import row_times
 from tasks.locate.options import LocateConfig
-from tasks.run import command_line
 
 STEP_M, NOISE_M = 0.4, 1.5
 

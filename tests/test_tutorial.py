@@ -12,10 +12,10 @@ from quick import PREDICTORS_KEPT, TASKS, QuickNetwork, QuickRssiConfig
 from small import glances
 
 from swiftwrf import RssiConfig, RssiModel
-from tasks.aoa.condition import NETWORK
+from tasks.aoa.condition import NETWORKS
 from tasks.aoa.estimators import ESTIMATORS
+from tasks.command_line import command_line
 from tasks.rssi.predictors import PREDICTORS
-from tasks.run import command_line
 
 TEXT = (Path(__file__).parent.parent / "docs" / "tutorial.md").read_text()
 PARTS = re.split(r"^## ", TEXT, flags=re.MULTILINE)[1:]
@@ -41,7 +41,7 @@ def test_every_block_runs(part, tmp_path, monkeypatch):
         )  # files open with the class of their kind
         with (
             glances(),
-            mock.patch.dict(ESTIMATORS._registered, {NETWORK: QuickNetwork}),
+            mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
             mock.patch.object(RssiModel, "config_type", rssi_config),
             mock.patch.object(PREDICTORS, "_registered", {name: PREDICTORS[name] for name in PREDICTORS_KEPT}),
         ):

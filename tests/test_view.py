@@ -25,12 +25,14 @@ from PIL import Image
 from swiftwrf import AngularGrid, GeometryModel, InputError, load, load_rssi, rssi_room
 from swiftwrf.locate import MatchedField, RssiLocator
 from swiftwrf.models.geometry import Plane, fit_hybrid
+from tasks.command_line import command_line
 from tasks.locate.options import LocateConfig
-from tasks.run import command_line
-from tasks.view import ViewConfig, run, spectra
+from tasks.view import spectra
 from tasks.view.drawing import HemisphereProjection, PlanProjection, colour_image, data_url, text
 from tasks.view.locating import N_POSITIONS, RssiLocating
+from tasks.view.options import ViewConfig
 from tasks.view.rssi import MapSelection, probability_above
+from tasks.view.run import run
 from tasks.view.sources import open_source
 from tasks.view.spectra import angle_between
 

@@ -23,13 +23,11 @@ import torch
 from torch import Tensor
 
 from swiftwrf.errors import InputError
-from swiftwrf.runtime.registry import Registry
 
 DIAGONAL_LOADING = 1e-2  # of Capon's covariance, relative to its mean diagonal, which keeps it invertible
 PHASE = "phase"  # the beamformer of the paper
 
 Responses = Callable[[Tensor], Tensor]
-BEAMFORMERS: Registry[Tensor] = Registry("beamformer", "swiftwrf.beamformers")
 
 
 def covariance(channel: Tensor) -> Tensor:
@@ -38,20 +36,17 @@ def covariance(channel: Tensor) -> Tensor:
     return channel.mT @ channel.conj() / channel.shape[1]
 
 
-@BEAMFORMERS.register(PHASE)
 def phase(channel: Tensor, responses: Responses) -> Tensor:
     """Return squared spectra (n, ...) of the phases of channels (n, S, K)."""
     unit = torch.polar(torch.ones((), dtype=torch.float64), channel.angle().double())
     return responses(covariance(unit) / channel.shape[2] ** 2)
 
 
-@BEAMFORMERS.register("bartlett")
 def bartlett(channel: Tensor, responses: Responses) -> Tensor:
     """Return squared spectra (n, ...) of channels (n, S, K)."""
     return responses(_of_unit_power(channel) / channel.shape[2] ** 2)
 
 
-@BEAMFORMERS.register("capon")
 def capon(channel: Tensor, responses: Responses) -> Tensor:
     """Return squared spectra (n, ...) of channels (n, S, K).
 

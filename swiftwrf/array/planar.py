@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, folded_to_front, to_angles, to_direction
-from swiftwrf.array.beamforming import BEAMFORMERS, PHASE
+from swiftwrf.array.beamforming import PHASE
+from swiftwrf.choices import BEAMFORMERS
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.cache import cached_tensors
 

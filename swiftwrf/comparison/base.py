@@ -14,8 +14,9 @@ from annotated_types import Ge, Le, Lt
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
+from swiftwrf.choices import Moving
 from swiftwrf.comparison.network import LinkNetwork, Network, restored
-from swiftwrf.data.spectra import Moving, Spectra, fingerprint
+from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.models.base import FieldModel, FitContext
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.descent import Descent, Model, Schedule, warm_cosine

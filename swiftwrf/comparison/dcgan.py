@@ -27,7 +27,6 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.comparison.base import Config, Count, TrainedModel
 from swiftwrf.comparison.convolution import ConvolutionalNetwork, ConvolutionalSize, PairedTraining, decoder, encoder
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.models.base import FIELD_MODELS
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
 
@@ -118,7 +117,6 @@ class DcganTraining(PairedTraining[DcganConfig, DcganNetwork]):
         return discriminator.mean() + adversarial.mean() + self.config.l1_weight * error
 
 
-@FIELD_MODELS.register("dcgan")
 class Dcgan(TrainedModel):
     """Conditional generative adversarial network; a sample generates a spectrum from random noise.
 

@@ -23,11 +23,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from swiftwrf.array.angles import AngularGrid
+from swiftwrf.choices import Moving
 from swiftwrf.comparison.base import Config, Count, Depth, TrainedModel, Training
 from swiftwrf.comparison.network import LinkNetwork, chunks, draw_parameters
 from swiftwrf.comparison.volume import Medium, integrate
-from swiftwrf.data.spectra import Moving, Spectra
-from swiftwrf.models.base import FIELD_MODELS, FIXED_END
+from swiftwrf.data.spectra import Spectra
+from swiftwrf.models.base import FIXED_END
 from swiftwrf.models.swiftwrf.mlp import SkipMLP, encode
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
@@ -188,7 +189,6 @@ class NeRF2Training(Training[NeRF2Config, NeRF2Network]):
         return functional.mse_loss(predicted, measured)
 
 
-@FIELD_MODELS.register("nerf2")
 class NeRF2(TrainedModel):
     """Neural radio-frequency radiance field.
 

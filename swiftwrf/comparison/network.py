@@ -12,7 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.data.spectra import Moving, Spectra
+from swiftwrf.choices import Moving
+from swiftwrf.data.spectra import Spectra
 from swiftwrf.positions import frame, normalise
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.descent import Model

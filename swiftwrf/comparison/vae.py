@@ -21,7 +21,6 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.comparison.base import Config, Count, TrainedModel
 from swiftwrf.comparison.convolution import ConvolutionalNetwork, ConvolutionalSize, PairedTraining, decoder, encoder
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.models.base import FIELD_MODELS
 from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, configuration
 
 
@@ -113,7 +112,6 @@ class VaeTraining(PairedTraining[VaeConfig, VaeNetwork]):
         return (decoded - spectrum).square().mean() + 2 * self.config.noise**2 * divergence
 
 
-@FIELD_MODELS.register("vae")
 class Vae(TrainedModel):
     """Conditional variational autoencoder; a sample decodes latent variables sampled from their prior.
 

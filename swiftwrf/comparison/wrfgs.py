@@ -29,11 +29,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from swiftwrf.array.angles import AngularGrid
+from swiftwrf.choices import Moving
 from swiftwrf.comparison.base import Config, Count, Depth, TrainedModel, Training
 from swiftwrf.comparison.network import LinkNetwork, draw_parameters
 from swiftwrf.comparison.sphere import on_sphere
-from swiftwrf.data.spectra import Moving, Spectra
-from swiftwrf.models.base import FIELD_MODELS, FIXED_END
+from swiftwrf.data.spectra import Spectra
+from swiftwrf.models.base import FIXED_END
 from swiftwrf.models.swiftwrf.loss import spectrum_loss
 from swiftwrf.models.swiftwrf.mlp import SkipMLP, encode
 from swiftwrf.models.swiftwrf.primitives import min_width
@@ -272,7 +273,6 @@ class WrfGsTraining(Training[WrfGsConfig, WrfGsNetwork]):
         super()._restore(saved)
 
 
-@FIELD_MODELS.register("wrfgs")
 class WrfGs(TrainedModel):
     """3D Gaussian splatting with amplitudes by a network.
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data.coordinates import Coordinates
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, ReadOptions, read
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.rssi import Rssi
@@ -86,19 +87,41 @@ def load_snapshots(
 
 
 @checked
-def load_rssi(path: str | Path, *, columns: Mapping[str, str] | None = None) -> Rssi:
+def load_rssi(
+    path: str | Path,
+    *,
+    columns: Mapping[str, str] | None = None,
+    filler: Sequence[float] | None = None,
+    coordinates: Coordinates | None = None,
+    offset_by: str | None = None,
+) -> Rssi:
     """Read RSSI in any format of docs/formats.md: the NeRF2 layout, or a survey table (CSV, Parquet).
 
     Args:
         path: Folder or file.
-        columns: Names of columns of a table that are not recognised, by role: x, y, z, time, receiver, rssi.
+        columns: Names of columns of a table that are not recognised, by role: x, y, z, longitude, latitude, time, receiver,
+            rssi.
+        filler: Values that stand for not detected, [] for none. Defaults to those that are recognised.
+        coordinates: "degrees" or "metres", of the positions in a table. Defaults to the unit that is recognised.
+        offset_by: Column of a table with groups of rows, e.g. devices, between which RSSI has constant offsets.
 
     Raises:
         InputError: A part that is missing or invalid, parts that do not match, or an argument that does not apply.
     """
-    data: Rssi = read(path, ReadOptions(columns=columns), RSSI_FORMATS)
+    values = None if filler is None else tuple(map(float, filler))
+    options = ReadOptions(columns=columns, filler=values, coordinates=coordinates, offset_by=offset_by)
+    return read_rssi(path, options)
+
+
+def read_rssi(path: str | Path, options: ReadOptions) -> Rssi:
+    """Read RSSI as `load_rssi`, with its arguments in one object.
+
+    Raises:
+        InputError: As `load_rssi`.
+    """
+    data: Rssi = read(path, options, RSSI_FORMATS)
     return data
 
 
 __all__ = ["PropagationPaths", "ReadOptions", "Rssi", "Snapshots", "Spectra"]
-__all__ += ["load_rssi", "load_snapshots", "load_spectra", "read_spectra"]
+__all__ += ["load_rssi", "load_snapshots", "load_spectra", "read_rssi", "read_spectra"]

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, to_angles
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray, folded_angles
-from swiftwrf.data.spectra import GRID, Moving, Spectra, array_spectra, check_pixels
+from swiftwrf.choices import Moving
+from swiftwrf.data.spectra import GRID, Spectra, array_spectra, check_pixels
 from swiftwrf.errors import InputError
 
 ARRAY_SIDE = 4  # elements, of the array that is assumed

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -16,6 +16,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid, ArrayPose, to_angles
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray, folded_angles
+from swiftwrf.choices import Moving
 from swiftwrf.data.dataset import Numbers, PositionedData, to_positions, to_tensor
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.data.store import BATCH_PIXELS, MAX_MEMORY_PIXELS, Store, stored, too_many
@@ -23,7 +24,6 @@ from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
 from swiftwrf.runtime.validation import checked
 
-Moving = Literal["transmitter", "receiver"]
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
 MAGNITUDE_TOLERANCE = 1e-6  # beyond [0, 1], from rounding
 

@@ -1,6 +1,7 @@
 """Field models: each is fitted to measured spectra and predicts spectra at any position. One file, one model."""
 
-from swiftwrf.models import coarray, geometry, gp, idw, nearest, raytrace, swiftwrf  # noqa: F401 (each registers itself)
-from swiftwrf.models.base import ARRAY, FIELD_MODELS, FIXED_END, FieldConfig, FieldModel, Prediction, make_model
+from swiftwrf.choices import FIELD_MODELS
+from swiftwrf.models import coarray, geometry, gp, idw, nearest, raytrace, swiftwrf  # noqa: F401 (each defines a saved kind)
+from swiftwrf.models.base import ARRAY, FIXED_END, FieldConfig, FieldModel, Prediction, make_model
 
 __all__ = ["ARRAY", "FIELD_MODELS", "FIXED_END", "FieldConfig", "FieldModel", "Prediction", "make_model"]

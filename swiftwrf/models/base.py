@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.data.spectra import Moving, Spectra, check_training
+from swiftwrf.choices import FIELD_MODELS, Moving
+from swiftwrf.data.spectra import Spectra, check_training
 from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.options import Configured, Preset, from_plain
-from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.validation import NonNegativeInt, checked, configuration
 
@@ -354,9 +354,6 @@ def check_finite(spectrum: Tensor) -> Tensor:
     if not bool(spectrum.detach().isfinite().all()):
         raise InputError("the model predicts values that are not finite; its parameters overflow, so fit it again")
     return spectrum
-
-
-FIELD_MODELS: Registry[FieldModel] = Registry("field model", "swiftwrf.models")
 
 
 @checked

@@ -22,7 +22,7 @@ from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, choose_kernel, principal_components
-from swiftwrf.models.base import ARRAY, FIELD_MODELS, FieldModel, FitContext
+from swiftwrf.models.base import ARRAY, FieldModel, FitContext
 from swiftwrf.runtime.checkpoint import Header, expect, refusing, restore
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.session import Record
@@ -84,7 +84,6 @@ def _offset(flat: Tensor, functions: Tensor, inverse: Tensor) -> Tensor:
     return least.clamp_min(0)[:, None]
 
 
-@FIELD_MODELS.register("coarray")
 class CoarrayModel(FieldModel):
     """A Gaussian process in the linear space of the squared spectra that the array can produce.
 

@@ -12,12 +12,11 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, thinned
-from swiftwrf.models.base import FIELD_MODELS, FitContext
+from swiftwrf.models.base import FitContext
 from swiftwrf.models.nearest import MemoryModel
 from swiftwrf.runtime.checkpoint import Header
 
 
-@FIELD_MODELS.register("gp")
 class GPModel(MemoryModel):
     """Gaussian process regression of every pixel with one kernel, chosen by cross-validation.
 

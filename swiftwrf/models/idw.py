@@ -9,7 +9,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import dense_weights, inner_products, squared_errors, thinned
-from swiftwrf.models.base import FIELD_MODELS, FitContext
+from swiftwrf.models.base import FitContext
 from swiftwrf.models.nearest import MemoryModel
 from swiftwrf.positions import distance, nearest
 from swiftwrf.runtime.checkpoint import Header
@@ -19,7 +19,6 @@ MIN_DISTANCE_M = 1e-9
 MAX_CHOICE_SPECTRA = 2000  # that choose the number of neighbours
 
 
-@FIELD_MODELS.register("idw")
 class IDWModel(MemoryModel):
     """Inverse-distance weighting of the k nearest spectra; cross-validation chooses k.
 

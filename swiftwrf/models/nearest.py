@@ -7,7 +7,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.store import Store
-from swiftwrf.models.base import FIELD_MODELS, FieldModel, FitContext
+from swiftwrf.models.base import FieldModel, FitContext
 from swiftwrf.positions import nearest
 from swiftwrf.runtime.checkpoint import Header, expect
 
@@ -38,7 +38,6 @@ class MemoryModel(FieldModel):
         self.position, self.store = tensors["position"].double(), Store(tensors["spectrum"])
 
 
-@FIELD_MODELS.register("nearest")
 class NearestModel(MemoryModel):
     """The spectrum of the nearest measured position, a baseline that dense positions make hard to beat.
 

@@ -9,10 +9,11 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.choices import Moving
 from swiftwrf.data.raytraced import Material, Scene, Surface, Tracing, open_scene, sionna, trace
 from swiftwrf.data.raytraced.surfaces import rectangle
-from swiftwrf.data.spectra import Moving, Spectra
-from swiftwrf.models.base import ARRAY, FIELD_MODELS, FIXED_END, FieldModel, FitContext
+from swiftwrf.data.spectra import Spectra
+from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext
 from swiftwrf.models.geometry import GeometryConfig, GeometryModel
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.validation import check_value, configuration
@@ -31,7 +32,6 @@ class RaytraceConfig(GeometryConfig):
     """name of a built-in room or a scene file; by default the room is estimated from the spectra"""
 
 
-@FIELD_MODELS.register("raytrace")
 class RaytraceModel(FieldModel):
     """Paths by the laws of reflection between vertically polarised isotropic ends, traced by Sionna RT.
 

@@ -9,6 +9,7 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, ClassVar
@@ -22,6 +23,7 @@ from swiftwrf.errors import InputError
 from swiftwrf.runtime.durable import write_bytes
 
 FORMAT = 1
+DEFINING_PACKAGES = ("swiftwrf.models", "swiftwrf.comparison", "swiftwrf.rssi", "swiftwrf.locate")  # of saved kinds
 EXTENSION_GROUPS = ("swiftwrf.models", "swiftwrf.estimators")  # entry points of packages that define saved kinds
 Header = dict[str, Any]  # values that JSON can store
 
@@ -88,12 +90,14 @@ class Saved(ABC):
     """Base class of fitted models that one file stores. A subclass with a `kind` is registered for `load`."""
 
     kind: ClassVar[str]
+    former_kinds: ClassVar[tuple[str, ...]] = ()
+    """kinds in files of earlier versions"""
     kinds: ClassVar[dict[str, type[Saved]]] = {}
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         if "kind" in cls.__dict__:
-            Saved.kinds[cls.kind] = cls
+            Saved.kinds |= dict.fromkeys((cls.kind, *cls.former_kinds), cls)
 
     @abstractmethod
     def state(self) -> tuple[dict[str, Tensor], Header]:
@@ -137,12 +141,14 @@ def load(path: str | Path) -> Saved:
     """
     with suppress(OSError, SafetensorError), safe_open(path, framework="pt") as file:
         if (file.metadata() or {}).get("kind") not in Saved.kinds:
-            _import_extensions()
+            _import_kinds()
     return restore(path, *Saved.kinds)[0]
 
 
-def _import_extensions() -> None:
-    """Import all packages that define saved kinds; those that cannot be imported define none."""
+def _import_kinds() -> None:
+    """Import all packages that define saved kinds; those of others that cannot be imported define none."""
+    for package in DEFINING_PACKAGES:
+        import_module(package)
     for point in (point for group in EXTENSION_GROUPS for point in entry_points(group=group)):
         with suppress(Exception):  # code of another package may raise anything
             point.load()

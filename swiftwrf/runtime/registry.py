@@ -1,7 +1,7 @@
 """Registries of implementations by name: field models, estimators, readers, beamformers.
 
-An implementation of this package registers itself when its module is imported. An implementation of another package is
-found by an entry point of the registry's group and is imported at first use.
+An implementation registers itself when its module is imported, or is declared as `module:object` and imported at first use.
+Other packages declare theirs by entry points of the registry's group. Names are known without any import.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from importlib.metadata import entry_points
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 from swiftwrf.errors import InputError
@@ -27,6 +28,7 @@ class Registry(Mapping[str, type[Made]]):
     Args:
         kind: Kind of the implementations, for messages.
         group: Group of entry points by which other packages add implementations. None for a closed registry.
+        declared: References `module:object` to implementations of this package by name.
 
     Example:
         >>> shapes: Registry[object] = Registry("shape")
@@ -37,9 +39,10 @@ class Registry(Mapping[str, type[Made]]):
         ('Circle', 'A round shape')
     """
 
-    def __init__(self, kind: str, group: str | None = None) -> None:
+    def __init__(self, kind: str, group: str | None = None, declared: Mapping[str, str] = MappingProxyType({})) -> None:
         self.kind, self.group = kind, group
-        self._registered: dict[str, Any] = {}
+        self._registered: dict[str, Any] = dict(declared)  # implementations, and references before their first use
+        self._package: str | None = None  # whose modules register themselves
 
     def register(self, name: str) -> Callable[[Registered], Registered]:
         """Return a decorator that registers a class or function under a name.
@@ -57,8 +60,18 @@ class Registry(Mapping[str, type[Made]]):
 
     def discover(self, package: str, path: list[str], first: tuple[str, ...] = ()) -> None:
         """Import every module of a package, the modules named `first` before the others, so that each registers itself."""
+        self._package = package
         for module in (*first, *sorted(module.name for module in pkgutil.iter_modules(path))):
             importlib.import_module(f"{package}.{module}")
+
+    def check(self, name: str) -> None:
+        """Refuse an unknown name.
+
+        Raises:
+            InputError: There is no implementation of that name.
+        """
+        if name not in self:
+            raise InputError(f"unknown {self.kind} {name!r}; choose from {', '.join(self)}")
 
     def summary(self, name: str) -> str:
         """Return the first line of an implementation's docstring, without its full stop."""
@@ -66,7 +79,9 @@ class Registry(Mapping[str, type[Made]]):
 
     def _external(self) -> dict[str, Any]:
         found = _entry_points(self.group, tuple(sys.path)) if self.group else ()
-        return {point.name: point for point in found if point.name not in self._registered}
+        # the installed metadata may be older than the package and name modules that it no longer has
+        others = (point for point in found if not point.module.startswith(f"{self._package}."))
+        return {point.name: point for point in others if point.name not in self._registered}
 
     def __getitem__(self, name: str) -> Any:
         """Return the implementation of that name.
@@ -74,11 +89,13 @@ class Registry(Mapping[str, type[Made]]):
         Raises:
             InputError: There is none, or the package that provides it cannot be imported.
         """
-        if name in self._registered:
-            return self._registered[name]
-        point = self._external().get(name)
-        if point is None:
-            raise InputError(f"unknown {self.kind} {name!r}; choose from {', '.join(self)}")
+        self.check(name)
+        implementation = self._registered.get(name)
+        if isinstance(implementation, str):
+            implementation = self._registered[name] = pkgutil.resolve_name(implementation)
+        if implementation is not None:
+            return implementation
+        point = self._external()[name]
         try:
             implementation = point.load()
         except Exception as error:  # code of another package may raise anything

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.spectra import Moving, Spectra
+from swiftwrf.choices import Moving
+from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.store import Store
 from swiftwrf.models.geometry.images import PhaseObservations, field, sequences
 

@@ -8,26 +8,16 @@ from itertools import product
 from typing import Any, Literal, TypeVar, get_args
 
 from swiftwrf.models import FIELD_MODELS
+from tasks import labels
 from tasks.aoa.estimators import ESTIMATORS
-from tasks.page import labels
-from tasks.run import Row
+from tasks.aoa.options import AUTO, fraction_key
+from tasks.run import Preset, Row
 
 Training = Literal["measured", "turbo", "turbo_extra", "all"]
-NETWORK = "aann"  # estimator of the paper; names of its conditions omit it
+NETWORKS: dict[Preset, str] = {"quick": "aann_kernel", "paper": "aann"}
+"""network that a run of each preset trains; names of its conditions omit it"""
 LOCATOR = "matched_field"  # estimator that locates the moving end by the room; it needs positions, array and fixed end
-AUTO = "auto"  # --synthesizer: the field model that cross-validation chooses
 Value = TypeVar("Value")
-
-
-def fraction_key(fraction: float) -> str:
-    """Return the shortest text that reads back as the same number, for keys and file names.
-
-    Example:
-        >>> fraction_key(0.3), fraction_key(1.0), fraction_key(0.6666667)
-        ('0.3', '1', '0.6666667')
-    """
-    short = f"{fraction:g}"
-    return short if float(short) == fraction else repr(fraction)
 
 
 @dataclass(frozen=True)
@@ -73,8 +63,8 @@ class Condition:
         repeat: Number of the repeat.
 
     Example:
-        >>> Condition("kernel_ridge", "turbo_extra", "hybrid", 3000).method
-        'kernel_ridge_turbo_hybrid_extra'
+        >>> Condition("kernel_regression", "turbo_extra", "hybrid", 3000).method
+        'kernel_regression_turbo_hybrid_extra'
     """
 
     estimator: str
@@ -100,9 +90,22 @@ class Condition:
     @property
     def method(self) -> str:
         """Name of the condition in metrics.json and in reports, the same for all fractions and repeats."""
-        if self.estimator == NETWORK:
+        if self.is_network:
             return self.training_set
         return self.estimator if self.training == "measured" else f"{self.estimator}_{self.training_set}"
+
+    @property
+    def meaning(self) -> str:
+        """Training set in words."""
+        match self.training:
+            case "measured":
+                return "measured alone"
+            case "all":
+                return "everything measured"
+            case "turbo":
+                return f"with synthetic spectra ({self.synthesizer})"
+            case "turbo_extra":
+                return f"with {self.n_synthetic:,} further synthetic spectra ({self.synthesizer})"
 
     @property
     def subset(self) -> MeasuredSubset:
@@ -115,14 +118,19 @@ class Condition:
         return f"{self.method}-{f'r{self.repeat}' if self.training == 'all' else self.subset}"
 
     @property
+    def measured_only(self) -> Condition:
+        """The same estimator on the measured spectra alone."""
+        return replace(self, training="measured", synthesizer="", n_synthetic=0)
+
+    @property
     def is_turbo(self) -> bool:
         """Whether synthetic spectra are part of the training set."""
         return bool(self.synthesizer)
 
     @property
     def is_network(self) -> bool:
-        """Whether the estimator is the network."""
-        return self.estimator == NETWORK
+        """Whether the estimator is a network. A run has one."""
+        return self.estimator in NETWORKS.values()
 
     @property
     def columns(self) -> Row:
@@ -138,10 +146,15 @@ class Condition:
 DESCRIPTION = ("estimator", "training", "synthesizer", "n_synthetic")
 
 
-def trainable() -> list[str]:
-    """Return the names of the estimators that improve with the number of training spectra, the network first."""
-    names = [name for name, estimator in ESTIMATORS.items() if estimator.trainable]
-    return sorted(names, key=lambda name: name != NETWORK)
+def estimators(preset: Preset) -> list[str]:
+    """Return the names of the estimators that a run trains, the network first."""
+    network = NETWORKS[preset]
+    return [network, *(name for name in ESTIMATORS if name not in NETWORKS.values())]
+
+
+def trainable(preset: Preset) -> list[str]:
+    """Return the names of those estimators that improve with the number of training spectra, the network first."""
+    return [name for name in estimators(preset) if ESTIMATORS[name].trainable]
 
 
 def conditions_of(methods: Mapping[str, Mapping[str, Any]]) -> dict[str, Condition]:
@@ -152,7 +165,7 @@ def conditions_of(methods: Mapping[str, Mapping[str, Any]]) -> dict[str, Conditi
     """
     known: dict[str, Condition] = {}
     if any("estimator" not in entry for entry in methods.values()):
-        for estimator, training in product(ESTIMATORS, get_args(Training)):
+        for estimator, training in product(estimators("quick"), get_args(Training)):
             for synthesizer in ("",) if training in ("measured", "all") else (*FIELD_MODELS, AUTO):
                 condition = Condition(estimator, training, synthesizer)
                 known[condition.method] = condition
@@ -176,25 +189,45 @@ def headline(conditions: Iterable[Condition]) -> Condition:
     return max((c for c in conditions if c.is_turbo and c.is_network), key=lambda c: c.training == "turbo_extra")
 
 
+def reference_of(conditions: Mapping[str, Condition], error: Mapping[str, float]) -> str:
+    """Return the method with the smallest error among the estimators that are trained on measured spectra alone.
+
+    A gain by synthetic spectra is relative to it. It is chosen by its error on test spectra, which favours it: the gain is
+    not overestimated. Matched-field processing is left out, because it is no regression from spectra to directions.
+
+    Args:
+        conditions: Condition of each method.
+        error: Error of each method.
+
+    Example:
+        >>> conditions = {name: Condition(name, "measured") for name in ("peak", "kernel_regression")}
+        >>> reference_of(conditions, {"peak": 9.0, "kernel_regression": 2.0})
+        'kernel_regression'
+    """
+    alone = [name for name, c in conditions.items() if c.training == "measured" and c.estimator != LOCATOR]
+    return min(alone, key=lambda name: error[name])
+
+
 def pooled(results: list[tuple[Condition, Value]], auto: bool) -> list[tuple[Condition, Value]]:
     """Return results such that every condition with synthetic spectra has all repeats of its measured fraction.
 
     A repeat stands for a user, who chooses a field model and the number of further positions by cross-validation. Where
-    repeats chose differently, the choices of all repeats become one condition.
+    repeats chose differently, the choices of all repeats become one condition. The network is trained with further positions
+    or without them, other estimators both ways.
 
     Args:
         results: Results by condition.
         auto: Whether the repeats choose their field model. Their choices then become the condition `turbo_auto`. Otherwise
             `turbo_NAME_extra` contains the result without further positions of those repeats that were advised against them.
     """
-    trainings: dict[float, dict[int, set[tuple[str, str]]]] = {}
+    trainings: dict[tuple[float, str], dict[int, set[tuple[str, str]]]] = {}
     for condition, _ in results:
         if condition.is_turbo:
-            repeats = trainings.setdefault(condition.measured_fraction, {})
+            repeats = trainings.setdefault((condition.measured_fraction, condition.estimator), {})
             repeats.setdefault(condition.repeat, set()).add((condition.synthesizer, condition.training))
     found: list[tuple[Condition, Value]] = []
     for condition, value in results:
-        repeats = trainings.get(condition.measured_fraction, {})
+        repeats = trainings.get((condition.measured_fraction, condition.estimator), {})
         if not condition.is_turbo or len({frozenset(names) for names in repeats.values()}) == 1:
             found.append((condition, value))
             continue
@@ -203,7 +236,9 @@ def pooled(results: list[tuple[Condition, Value]], auto: bool) -> list[tuple[Con
             if condition.training == "turbo_extra" or not any(training == "turbo_extra" for _, training in own):
                 found.append((replace(condition, training="turbo", synthesizer=AUTO), value))
             continue
-        found.append((condition, value))
+        own_way = (condition.synthesizer, condition.training)
+        if own_way == extra or all(own_way in others for others in repeats.values()):
+            found.append((condition, value))
         if extra not in own and any(extra in others for others in repeats.values()):
             found.append((replace(condition, training="turbo_extra"), value))
     return found
@@ -219,5 +254,6 @@ def terms() -> dict[str, str]:
         "turbo_auto": "the choice of each repeat by cross-validation, where repeats chose differently",
         **{name: label.meaning for name, label in labels.labels(ESTIMATORS, labels.ESTIMATORS).items()},
         LOCATOR: labels.ESTIMATORS[LOCATOR].meaning,
-        "no estimator's name": f"the network ({NETWORK}); the name of another estimator alone: trained on measured spectra",
+        "no estimator's name": f"the network ({' or '.join(NETWORKS.values())}); the name of another estimator alone: "
+        "trained on measured spectra",
     }

@@ -1,12 +1,13 @@
 """Cross-validation on the measured spectra: do synthetic spectra reduce the error, how many, and which estimator is best?
 
-Kernel ridge regression stands in for the network, because it trains in a second. Withheld spectra and test spectra take no
+Kernel regression stands in for the network, because it trains in a second. Withheld spectra and test spectra take no
 part. The number of synthetic positions is chosen by the errors, so the error at the chosen number is too optimistic. The
 interval is therefore that of the rule: for each fold, the number is chosen on the other folds.
 """
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -23,18 +24,19 @@ from swiftwrf import FitError, InputError
 from swiftwrf.gp import thinned
 from swiftwrf.locate import MatchedField, MatchedFieldConfig
 from swiftwrf.metrics import angle_errors
-from swiftwrf.runtime.threads import single_thread
+from swiftwrf.runtime.threads import side_by_side
 from tasks.aoa.condition import LOCATOR
 from tasks.aoa.estimators import make_estimator
-from tasks.metrics import AdviceMetrics, ChangeMetrics, EstimatorChoiceMetrics
+from tasks.metrics import AdviceMetrics, EstimatorChoiceMetrics
+from tasks.summarise import paired_change
 
-STAND_IN = "kernel_ridge"
+STAND_IN = "kernel_regression"
 N_SYNTHETIC_CANDIDATES = (300, 1000, 3000)
 N_SYNTHETIC_COMPARED = 1000  # number of positions at which predicted means and samples are compared
-N_BOOTSTRAP = 2000
 MAX_LOCATED = 60  # held-out spectra of a fold that are located
 FOLD_LOCATOR = MatchedFieldConfig(n_calibration=40, max_cells=100_000)  # half the time of the defaults
 Errors = NDArray[np.float64]
+_PREDICTING = threading.Lock()  # folds are computed side by side, but parallel loops of numba take one caller at a time
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,6 @@ class Advice:
     turbo: list[Errors]
 
 
-@single_thread()
 def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> Advice:
     """Return the change of the error on held-out measured spectra by synthetic spectra of one field model.
 
@@ -66,20 +67,20 @@ def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> Advice:
     every = range(len(folds))
 
     @cache
-    def fold_errors(fold: int, number: int, sampled: bool) -> Errors:
-        return _errors(folds[fold], number, sampled, seed)
+    def fold_errors(number: int, sampled: bool) -> list[Errors]:
+        return side_by_side(lambda fold: _errors(fold, number, sampled, seed), folds)
 
     def errors(some: Iterable[int], number: int, sampled: bool = False) -> Errors:
-        return np.concatenate([fold_errors(fold, number, sampled) for fold in some])
+        return np.concatenate([fold_errors(number, sampled)[fold] for fold in some])
 
     def chosen(some: Sequence[int]) -> tuple[int, bool]:
         """Choose the number of positions, and whether to sample, by the errors of some folds."""
         means = errors(some, compared)
         # samples must be significantly better than means
-        sampled = folds[0].model.samples and _change(means, errors(some, compared, True))["high"] < 0
+        sampled = folds[0].model.samples and paired_change(means, errors(some, compared, True))["high"] < 0
         return min(numbers, key=lambda number: float(np.median(errors(some, number, sampled)))), sampled
 
-    alone = [fold_errors(fold, 0, False) for fold in every]
+    alone = fold_errors(0, False)
     measured_only = np.concatenate(alone)
     advice: AdviceMetrics = {
         "stand_in": STAND_IN,
@@ -96,10 +97,10 @@ def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> Advice:
     best, sampled = chosen(every)
     for with_samples in (False, True) if folds[0].model.samples else (False,):
         for number in numbers if with_samples == sampled else [compared]:
-            change = _change(measured_only, errors(every, number, with_samples))
+            change = paired_change(measured_only, errors(every, number, with_samples))
             advice["gains"].append({"extra": number, "sampled": with_samples, **change})
-    by_rule = [fold_errors(fold, *chosen([other for other in every if other != fold])) for fold in every]
-    rule = advice["rule"] = _change(measured_only, np.concatenate(by_rule))
+    by_rule = [fold_errors(*chosen([other for other in every if other != fold]))[fold] for fold in every]
+    rule = advice["rule"] = paired_change(measured_only, np.concatenate(by_rule))
     advice["sampled"] = sampled
     # a gain at one number of positions alone is likely chance, because few spectra are held out
     if all(gain["change"] < 0 for gain in advice["gains"] if gain["sampled"] == sampled):
@@ -125,7 +126,8 @@ def choose_estimator(
     compared = {name: np.concatenate(parts) for name, parts in errors.items()}
     scored = range(0, len(folds), len(BLIND_FOLDS[0]))[: len(BLIND_FOLDS)]
     rows = [thinned(torch.arange(len(folds[fold].test)), rows=MAX_LOCATED)[0] for fold in scored]
-    located = [_located_errors(folds[fold], some, seed) for fold, some in zip(scored, rows, strict=True)]
+    compared_folds = [(folds[fold], some) for fold, some in zip(scored, rows, strict=True)]
+    located = side_by_side(lambda item: _located_errors(*item, seed), compared_folds)
     if located and all(found is not None for found in located):
         compared = {
             name: np.concatenate([parts[fold][some.numpy()] for fold, some in zip(scored, rows, strict=True)])
@@ -155,10 +157,11 @@ def _errors(fold: Fold, n_synthetic: int, sampled: bool, seed: int) -> Errors:
     train = Mixed.measured(fold.train)
     if n_synthetic:
         positions = synthetic_positions(fold.train, n_synthetic, seed)
-        if sampled:
-            spectra = fold.model.sample(positions.position, generator=torch.Generator().manual_seed(seed))
-        else:
-            spectra = fold.model.synthesize(positions.position)
+        with _PREDICTING:
+            if sampled:
+                spectra = fold.model.sample(positions.position, generator=torch.Generator().manual_seed(seed))
+            else:
+                spectra = fold.model.synthesize(positions.position)
         train = train.add(positions, spectra.cpu())
     stand_in = make_estimator(STAND_IN, seed=seed).fit(train)
     return _degrees(stand_in.predict(fold.test.spectrum), fold.test.label)
@@ -167,13 +170,3 @@ def _errors(fold: Fold, n_synthetic: int, sampled: bool, seed: int) -> Errors:
 def _degrees(estimate: Tensor, label: Tensor) -> Errors:
     """Return the angular errors [deg] of directions (n, 2) [rad]."""
     return cast(Errors, angle_errors(estimate, label)["great_circle"].rad2deg().double().numpy())
-
-
-def _change(before: Errors, after: Errors) -> ChangeMetrics:
-    """Return the median of `after`, its relative change against that of `before`, and the change's 95 % bootstrap interval
-    over held-out spectra."""
-    rows = np.random.default_rng(0).integers(len(before), size=(N_BOOTSTRAP, len(before)))
-    medians = np.median(after[rows], axis=1), np.median(before[rows], axis=1)
-    low, high = np.percentile(medians[0] / np.maximum(medians[1], 1e-9) - 1, (2.5, 97.5))
-    change = float(np.median(after) / max(float(np.median(before)), 1e-9) - 1)
-    return {"median_deg": float(np.median(after)), "change": change, "low": float(low), "high": float(high)}

@@ -8,18 +8,22 @@ from augment import withhold
 from swiftwrf import InputError, Spectra, simulated_room
 from swiftwrf.data import read_spectra
 from swiftwrf.data.files import sha256
-from tasks.aoa.condition import MeasuredSubset, fraction_key
+from swiftwrf.data.raytraced import sionna
+from tasks.aoa.condition import MeasuredSubset
 from tasks.aoa.context import Experiment
-from tasks.aoa.options import AoaConfig, check, check_data, n_synthetic
+from tasks.aoa.options import RAYTRACE, AoaConfig, check_data, fraction_key, n_synthetic
 from tasks.aoa.page import page
+from tasks.aoa.page.summary import answer
 from tasks.aoa.results import Results
 from tasks.aoa.steps import Suggestion, first_steps
 from tasks.cluster import connected
 from tasks.metrics import AoaMetrics
 from tasks.page.page import reporting
-from tasks.run import Run, choose_device, console
+from tasks.page.records import Records
+from tasks.run import Run, choose_device
 from tasks.source import reading
 from tasks.steps import Step, computed
+from tasks.terminal import console, terminal
 
 
 def run(config: AoaConfig, resume: Path | None = None) -> None:
@@ -30,7 +34,8 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         FitError: A fit diverged, or the connection to the cluster was lost.
     """
     device = choose_device(config.device)
-    check(config)
+    if RAYTRACE in config.synthesizer:
+        sionna()  # refuses before anything is computed
     data = measurements(config)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
@@ -54,8 +59,9 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         Run("aoa", config.out, label, config, device, source, resume) as directory,
     ):
         results = Results(experiment, directory)
-        for step, value in computed(directory, steps, experiment, cluster):
-            results.add(step, value)
+        with terminal.progress():
+            for step, value in computed(directory, steps, experiment, cluster):
+                results.add(step, value)
         results.write()
         metrics: AoaMetrics = {
             "task": "aoa",
@@ -74,7 +80,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
             "mixes": {fraction_key(fraction): results.summary(fraction) for fraction in config.mix},
         }
         final = directory.finish(metrics, reporting(page))
-    console.print(f"report: [bold]{final / 'report.html'}[/]")
+    terminal.answer(answer(Records(final)), final / "report.html")
 
 
 def measurements(config: AoaConfig) -> Spectra:

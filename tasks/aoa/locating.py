@@ -47,6 +47,10 @@ class Locating(Step[Experiment]):
         return self.condition.result_name
 
     @property
+    def title(self) -> str:
+        return f"locating by the room, {self.condition.meaning}"
+
+    @property
     def reads(self) -> tuple[str, ...]:
         return (self.room_file,)
 

@@ -2,34 +2,39 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from augment.suggest import MAX_SUGGESTIONS
-from swiftwrf import InputError, Spectra
-from swiftwrf.data.raytraced import check_scene, sionna
-from swiftwrf.data.spectra import Moving
-from swiftwrf.metrics import WINDOW
-from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.condition import AUTO, fraction_key
-from tasks.page import labels
-from tasks.run import SEEDS, Preset, choice
-from tasks.source import SpectraSource, reading
+from augment.limits import MAX_SUGGESTIONS
+from swiftwrf.choices import FIELD_MODELS, Moving, check_scene
+from swiftwrf.errors import InputError
+from swiftwrf.runtime.options import Preset
+from tasks import labels
+from tasks.options import SEEDS, Output, SpectraSource, choice, command_options, given
 
+if TYPE_CHECKING:
+    from swiftwrf import Spectra
+
+AUTO = "auto"  # --synthesizer: the field model that cross-validation chooses
 RAYTRACE = "raytrace"  # the field model that takes --scene
+PAPER_FRACTIONS = (0.1, 0.3, 0.5, 0.7)
 DEFAULT_EXTRA = 3000  # further synthetic positions where cross-validation recommends some
 
 
-@dataclass(frozen=True)
-class AoaConfig(SpectraSource):
+@command_options
+class AoaConfig(SpectraSource, Output):
     """Angle of arrival with few measured spectra: turbo learning against its references and baselines.
 
     Without --data the built-in simulated room is used. --resume DIR.partial continues an interrupted run, on a cluster with
     --scheduler.
+
+    Example: python -m tasks.aoa --mix 0.3 --data DIR --split block
     """
 
-    mix: tuple[float, ...]
-    """measured fractions, each in (0, 1]: 0.3 keeps 30 % of the training spectra and synthesizes the others"""
+    resumable: ClassVar[bool] = True
+
+    mix: tuple[float, ...] = ()
+    """measured fractions in (0, 1]: 0.3 keeps 30 % of the training spectra and synthesizes the others. Required, except with
+    --preset paper"""
     data: str | None = None
     """folder or file of spectra, ray paths or array snapshots, see docs/formats.md"""
     split: str = "random"
@@ -47,13 +52,13 @@ class AoaConfig(SpectraSource):
     the room that it estimates from the spectra)"""
     extra: int | None = None
     """number of further synthetic positions in the region of the measured ones (default: 3000 if cross-validation on the
-    measured spectra shows a gain, else none)"""
+    measured spectra shows a gain, else none; none with --preset paper)"""
     suggest: int = 0
     """number of positions to suggest for the next measurements, those that reduce the uncertainty over the region most"""
     moving: Moving | None = None
     """which end moves in the built-in room (default: transmitter)"""
     preset: Preset = "quick"
-    """quick: sized for a CPU; paper: the paper's model and a long training, for a GPU"""
+    """quick: sized for a CPU; paper: the paper's model, network and measured fractions, and a long training, for a GPU"""
     repeats: int = 1
     """runs with different measured spectra and networks, pooled"""
     scheduler: str | None = None
@@ -65,50 +70,59 @@ class AoaConfig(SpectraSource):
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """device to compute on"""
 
+    def __post_init__(self) -> None:
+        if self.preset == "paper":
+            # the paper's training sets contain synthetic spectra at the withheld positions alone
+            object.__setattr__(self, "mix", self.mix or PAPER_FRACTIONS)
+            object.__setattr__(self, "extra", self.extra or 0)
 
-def check(config: AoaConfig) -> None:
-    """Refuse options that are wrong whatever the data.
+    def check(self) -> None:
+        super().check()
+        if not self.synthesizer:
+            raise InputError("--synthesizer takes at least one name")
+        if AUTO in self.synthesizer and len(self.synthesizer) > 1:
+            raise InputError(f"--synthesizer takes {AUTO} or names, not both: {' '.join(self.synthesizer)}")
+        for name in self.synthesizer:
+            if name != AUTO:
+                FIELD_MODELS.check(name)
+        if self.scene is not None:
+            self._check_scene(self.scene)
+        if self.extra is not None and self.extra < 0:
+            raise InputError(f"--extra takes a number of positions, got {self.extra}")
+        if not 0 <= self.suggest <= MAX_SUGGESTIONS:
+            raise InputError(f"--suggest takes 0 to {MAX_SUGGESTIONS} positions, got {self.suggest}")
+        if self.moving is not None and self.data is not None:
+            raise InputError("--moving is for the built-in room; with --data the data say which end moves")
+        if not self.mix or not all(0 < fraction <= 1 for fraction in self.mix):
+            raise InputError(f"--mix takes measured fractions in (0, 1], got {_listed(self.mix) or 'none'}")
+        if len(set(self.mix)) < len(self.mix):
+            raise InputError(f"--mix names a fraction twice: {_listed(self.mix)}")
+        if given(self) and self.data is None:
+            raise InputError(f"--{given(self)[0]} says how --data is read; give it with --data")
+        if self.repeats < 1:
+            raise InputError(f"--repeats must be at least 1, got {self.repeats}")
+        if self.seed + self.repeats > SEEDS:
+            raise InputError(f"--seed {self.seed} leaves no seeds for {self.repeats} repeats; choose a smaller one")
 
-    Raises:
-        InputError: The first such option.
+    def _check_scene(self, scene: str) -> None:
+        if RAYTRACE not in self.synthesizer:
+            raise InputError(f"--scene is for synthesizer {RAYTRACE}; add it to --synthesizer, or leave --scene out")
+        check_scene(scene, "--scene ")
+
+
+def fraction_key(fraction: float) -> str:
+    """Return the shortest text that reads back as the same number, for keys and file names.
+
+    Example:
+        >>> fraction_key(0.3), fraction_key(1.0), fraction_key(0.6666667)
+        ('0.3', '1', '0.6666667')
     """
-    if not config.synthesizer:
-        raise InputError("--synthesizer takes at least one name")
-    if AUTO in config.synthesizer and len(config.synthesizer) > 1:
-        raise InputError(f"--synthesizer takes {AUTO} or names, not both: {' '.join(config.synthesizer)}")
-    for name in config.synthesizer:
-        if name != AUTO:
-            FIELD_MODELS[name]  # refuses an unknown name
-    if RAYTRACE in config.synthesizer:
-        sionna()  # refuses before anything is computed
-    if config.scene is not None:
-        _check_scene(config.scene, config.synthesizer)
-    if config.extra is not None and config.extra < 0:
-        raise InputError(f"--extra takes a number of positions, got {config.extra}")
-    if not 0 <= config.suggest <= MAX_SUGGESTIONS:
-        raise InputError(f"--suggest takes 0 to {MAX_SUGGESTIONS} positions, got {config.suggest}")
-    if config.moving is not None and config.data is not None:
-        raise InputError("--moving is for the built-in room; with --data the data say which end moves")
-    if not config.mix or not all(0 < fraction <= 1 for fraction in config.mix):
-        raise InputError(f"--mix takes measured fractions in (0, 1], got {_listed(config.mix) or 'none'}")
-    if len(set(config.mix)) < len(config.mix):
-        raise InputError(f"--mix names a fraction twice: {_listed(config.mix)}")
-    if reading(config).given and config.data is None:
-        raise InputError(f"--{reading(config).given[0]} says how --data is read; give it with --data")
-    if config.repeats < 1:
-        raise InputError(f"--repeats must be at least 1, got {config.repeats}")
-    if config.seed + config.repeats > SEEDS:
-        raise InputError(f"--seed {config.seed} leaves no seeds for {config.repeats} repeats; choose a smaller one")
+    short = f"{fraction:g}"
+    return short if float(short) == fraction else repr(fraction)
 
 
 def _listed(fractions: tuple[float, ...]) -> str:
     return " ".join(map(fraction_key, fractions))
-
-
-def _check_scene(scene: str, synthesizers: tuple[str, ...]) -> None:
-    if RAYTRACE not in synthesizers:
-        raise InputError(f"--scene is for synthesizer {RAYTRACE}; add it to --synthesizer, or leave --scene out")
-    check_scene(scene, "--scene ")
 
 
 def check_data(data: Spectra, config: AoaConfig) -> None:
@@ -118,6 +132,8 @@ def check_data(data: Spectra, config: AoaConfig) -> None:
         InputError: Spectra too small to compute their SSIM, or a field model needs the array or the fixed end, and neither
             data nor command line describe it.
     """
+    from swiftwrf.metrics import WINDOW  # imports torch
+
     if min(data.grid.shape) < WINDOW:
         raise InputError(
             f"spectra of {data.name} have {data.grid.shape[0]} x {data.grid.shape[1]} pixels; SSIM, the measure "

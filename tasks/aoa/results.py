@@ -11,14 +11,16 @@ from torch import Tensor
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import angle_errors, covered, l1, psnr, ssim
 from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.condition import AUTO, EVERYTHING, LOCATOR, Condition, MeasuredSubset, fraction_key, pooled
+from tasks.aoa.condition import EVERYTHING, LOCATOR, Condition, MeasuredSubset, pooled, reference_of
 from tasks.aoa.context import ROOM_MODEL, Experiment
 from tasks.aoa.locating import LEVEL, NO_PLANE, Locating
+from tasks.aoa.options import AUTO, fraction_key
 from tasks.aoa.steps import CrossValidation, Evaluation, RoomSearch, Suggestion, Synthesis, as_bytes
-from tasks.metrics import ANGLES, SCORES, LocatingMetrics, MethodMetrics, MixMetrics, SynthesisMetrics
-from tasks.run import Row, Run, console
+from tasks.metrics import ANGLES, SCORES, ChangeMetrics, LocatingMetrics, MethodMetrics, MixMetrics, SynthesisMetrics
+from tasks.run import Row, Run
 from tasks.steps import Step
-from tasks.summarise import averaged, repeats_averaged
+from tasks.summarise import averaged, paired_change, repeats_averaged
+from tasks.terminal import console, terminal
 
 SCORE = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
 EXAMPLE_QUANTILES = (
@@ -70,6 +72,7 @@ class Results:
                 self._leave_out((step.condition,), value["refused"])
             case Evaluation() | Locating():
                 self.evaluated.append((step.condition, value))
+                self._show(step.condition, value)
                 self.history += [step.condition.columns | row for row in value["history"]]
             case Suggestion():
                 self._add_suggestion(step, value)
@@ -126,6 +129,14 @@ class Results:
             }
             rows += _rows(condition.columns, columns)
         return rows
+
+    def _show(self, condition: Condition, value: Row) -> None:
+        """Show the median angular error of a condition."""
+        error = angle_errors(torch.tensor(value["estimate"], dtype=torch.float64), self.test.label)["great_circle"]
+        name = f"{condition.estimator}, {condition.meaning}"
+        if condition.training != "all" and len(self.experiment.config.mix) > 1:
+            name = f"{condition.measured_fraction:.0%}: {name}"
+        terminal.result(name, f"{float(error.nanmedian().rad2deg()):.2f} deg")
 
     def _leave_out(self, conditions: Iterable[Condition], reason: str) -> None:
         """Record and print why conditions are not in the results, each sentence once."""
@@ -193,6 +204,7 @@ class Results:
             for rows in (self.synthesis, self.synthesis_seconds)
         )
         trained = fits[fits["trains"]]
+        methods, reference = self._method_metrics(fraction)
         return {
             "n_measured": round(fraction * len(self.experiment.train)),
             "counts": {condition.training_set: value["counts"] for condition, value in evaluated},
@@ -200,7 +212,8 @@ class Results:
             "advice": chosen.get("advice"),
             "estimator_choice": chosen.get("estimator_choice"),
             "synthesis": _synthesis_metrics(synthesis, fits),
-            "methods": self._method_metrics(fraction),
+            "methods": methods,
+            "reference": reference,
             "locating": self._locating_metrics(fraction),
             "left_out": {c.method: reason for c, reason in self.left_out.items() if c.measured_fraction == fraction},
             "seconds": {
@@ -210,17 +223,24 @@ class Results:
             },
         }
 
-    def _method_metrics(self, fraction: float) -> dict[str, MethodMetrics]:
+    def _method_metrics(self, fraction: float) -> tuple[dict[str, MethodMetrics], str]:
+        """Return the metrics of each method, and the reference of changes."""
         own = [(condition, value) for condition, value in self.pooled if condition.measured_fraction == fraction]
         conditions = {condition.method: condition for condition, _ in reversed(own)}  # of the first repeat
         errors = DataFrame([row for row in self.errors() if row["measured_fraction"] == fraction])
         seconds = averaged(
             DataFrame([c.columns | value["seconds"] for c, value in own]), "method", ("train", "estimate")
         )
-        return {
-            method: {**conditions[method].description, **summaries, "seconds": seconds[method]}  # type: ignore[typeddict-item]
-            for method, summaries in repeats_averaged(errors, "method", ANGLES).items()
+        summaries = repeats_averaged(errors, "method", ANGLES)
+        reference = reference_of(
+            conditions, {name: entry["great_circle_deg"]["median"] for name, entry in summaries.items()}
+        )
+        changes = _changes(errors, conditions, reference)
+        metrics = {
+            method: {**conditions[method].description, **entry, "changes": changes[method], "seconds": seconds[method]}
+            for method, entry in summaries.items()
         }
+        return metrics, reference  # type: ignore[return-value]
 
     def _locating_metrics(self, fraction: float) -> dict[str, LocatingMetrics]:
         rows = DataFrame([row for row in self.positions() if row["measured_fraction"] == fraction])
@@ -243,6 +263,21 @@ class Results:
             }
             for method, summaries in repeats_averaged(rows, "method", ("error_m",)).items()
         }
+
+
+def _changes(
+    errors: DataFrame, conditions: dict[str, Condition], reference: str
+) -> dict[str, dict[str, ChangeMetrics]]:
+    """Return the changes of the angular error by synthetic spectra of each method, by the method that it is compared to."""
+    error = errors.groupby(["method", "index"])["great_circle_deg"].mean()  # repeats of a position are not independent
+    compared = {
+        method: dict.fromkeys((condition.measured_only.method, reference)) if condition.is_turbo else ()
+        for method, condition in conditions.items()
+    }
+    return {
+        method: {other: paired_change(error[other], error[method]) for other in others}
+        for method, others in compared.items()
+    }
 
 
 def _synthesis_metrics(scores: DataFrame, seconds: DataFrame) -> dict[str, SynthesisMetrics]:

@@ -18,11 +18,12 @@ from swiftwrf.data.store import Store
 from swiftwrf.models import FIELD_MODELS, FieldModel
 from swiftwrf.runtime.checkpoint import read, write
 from tasks.aoa.artifacts import save_artifacts
-from tasks.aoa.condition import AUTO, EVERYTHING, Condition, MeasuredSubset, Training, trainable
+from tasks.aoa.condition import EVERYTHING, NETWORKS, Condition, MeasuredSubset, Training, estimators, trainable
 from tasks.aoa.context import ROOM_MODEL, Experiment
 from tasks.aoa.cross_validation import STAND_IN, advise, choose_estimator
-from tasks.aoa.estimators import ESTIMATORS, SavedEstimator, make_estimator
+from tasks.aoa.estimators import SavedEstimator, make_estimator
 from tasks.aoa.locating import Locating
+from tasks.aoa.options import AUTO
 from tasks.claim import STEPS
 from tasks.metrics import AdviceMetrics
 from tasks.run import Row
@@ -42,10 +43,10 @@ def first_steps(experiment: Experiment, subset: MeasuredSubset) -> list[Step[Exp
         return Evaluation(Condition(estimator, training, measured_fraction=fraction, repeat=repeat))
 
     steps: list[Step[Experiment]] = [
-        *(reference(estimator, "measured") for estimator in ESTIMATORS),
+        *(reference(estimator, "measured") for estimator in estimators(experiment.config.preset)),
         *(_syntheses(experiment, subset, named, {}) if named and not compared else [CrossValidation(subset, compared)]),
         # independent of the measured fraction, so all fractions share these steps
-        *(reference(estimator, "all") for estimator in trainable()),
+        *(reference(estimator, "all") for estimator in trainable(experiment.config.preset)),
     ]
     config = experiment.config
     if subset == MeasuredSubset(config.mix[0]) and 1.0 not in config.mix and ROOM_MODEL in candidates(experiment.train):
@@ -85,6 +86,10 @@ class CrossValidation(Step[Experiment]):
     @property
     def name(self) -> str:
         return f"choice-{self.subset}"
+
+    @property
+    def title(self) -> str:
+        return "comparing field models"
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.subset)
@@ -138,6 +143,10 @@ class RoomSearch(Step[Experiment]):
         return f"room-{self.subset}"
 
     @property
+    def title(self) -> str:
+        return "finding the room"
+
+    @property
     def file(self) -> str:
         """File of the fitted model in the run's directory."""
         return f"{STEPS}/{self.name}.safetensors"
@@ -186,6 +195,10 @@ class Synthesis(Step[Experiment]):
     @property
     def name(self) -> str:
         return f"synthesis_{self.synthesizer}-{self.subset}"
+
+    @property
+    def title(self) -> str:
+        return f"synthesizing spectra by {self.synthesizer}"
 
     @property
     def file(self) -> str:
@@ -275,7 +288,9 @@ class Synthesis(Step[Experiment]):
         return [
             Evaluation(Condition(estimator, training, self.synthesizer, number, fraction, repeat), self)
             for training, number in trainings
-            for estimator in trainable()
+            for estimator in trainable(experiment.config.preset)
+            # a training of the network takes most of the time
+            if training == trainings[-1][0] or estimator not in NETWORKS.values()
         ]
 
 
@@ -299,6 +314,10 @@ class Evaluation(Step[Experiment]):
     @property
     def name(self) -> str:
         return self.condition.result_name
+
+    @property
+    def title(self) -> str:
+        return f"training {self.condition.estimator}, {self.condition.meaning}"
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -349,6 +368,10 @@ class Suggestion(Step[Experiment]):
     @property
     def name(self) -> str:
         return f"suggestion-mix{self.subset.key}"
+
+    @property
+    def title(self) -> str:
+        return "choosing positions to measure next"
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.subset)

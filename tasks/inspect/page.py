@@ -141,8 +141,9 @@ def _floor(data: Rssi) -> Plot:
         place[:, 0], place[:, 1], s=8, c=strongest.where(strongest.isfinite(), torch.nan), cmap="viridis"
     )
     figure.colorbar(drawn, ax=axes[0], label="strongest RSSI [dBm]")
-    for name, at in zip(data.receiver_names, data.receiver_position.tolist(), strict=True):
-        if data.located:
+    places = zip(data.receiver_names, data.receiver_position.tolist(), data.receiver_located.tolist(), strict=True)
+    for name, at, is_located in places:
+        if is_located:
             axes[0].plot(*at[:2], "x", color="#ee6677", markersize=8, markeredgewidth=2)
             axes[0].annotate(figures.short(name), at[:2], fontsize=7, xytext=(3, 3), textcoords="offset points")
     axes[0].set(xlabel="x [m]", ylabel="y [m]", aspect="equal")

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from swiftwrf import InputError, Rssi, load_rssi, rssi_room
+from swiftwrf import InputError, Rssi, rssi_room
+from swiftwrf.data.coordinates import degree_columns
 from tasks.cluster import connected
 from tasks.locate.localizers import LEVELS
 from tasks.locate.observations import write_positions
-from tasks.locate.options import LocateConfig, check
+from tasks.locate.options import LocateConfig
 from tasks.locate.page import page
+from tasks.locate.page.summary import answer
 from tasks.locate.steps import MIN_ROWS, Experiment, Localization
 from tasks.metrics import LocateMetrics, StudyMetrics
 from tasks.page.page import reporting
-from tasks.run import Row, Run, choose_device, console
-from tasks.source import reading
+from tasks.page.records import Records
+from tasks.run import Row, Run, choose_device
+from tasks.source import asked_offsets, measured_rssi, split_notes
 from tasks.steps import computed
 from tasks.summarise import error_summary
+from tasks.terminal import console, terminal
 
 
 def run(config: LocateConfig, resume: Path | None = None) -> None:
@@ -28,7 +33,6 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     Raises:
         InputError: Data or options that do not exist or do not fit together.
     """
-    check(config)
     if config.model is not None:
         write_positions(config)
         return
@@ -39,18 +43,24 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     experiment, n_undetected = prepared(data, config.split, config.cells, config.seed, config.suggest)
     if n_undetected:
         console.print(f"{data.name}: test rows that no receiver detected are left out: {n_undetected}")
+    if (offsets := asked_offsets(experiment.train, config)) is not None:
+        train, test = offsets.removed(experiment.train), offsets.removed(experiment.test)
+        experiment = replace(experiment, train=train, test=test)
+        console.print(f"{data.name}: {offsets.note()}")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     with (
         connected(config.scheduler, device) as cluster,
         Run("locate", config.out, label, config, device, data.source, resume) as directory,
     ):
         results = Results(experiment)
-        for step, value in computed(directory, experiment.steps(), experiment, cluster):
-            assert isinstance(step, Localization)
-            results.add(step, value)
+        with terminal.progress():
+            for step, value in computed(directory, experiment.steps(), experiment, cluster):
+                assert isinstance(step, Localization)
+                results.add(step, value)
+                terminal.result(step.title, f"{results.median_m(step):.2f} m")
         directory.write_csv("errors.csv", results.errors)
-        final = directory.finish(results.metrics(data.name, n_undetected), reporting(page))
-    console.print(f"report: [bold]{final / 'report.html'}[/]")
+        final = directory.finish(results.metrics(data, n_undetected), reporting(page))
+    terminal.answer(answer(Records(final)), final / "report.html")
 
 
 def measurements(config: LocateConfig) -> Rssi:
@@ -59,11 +69,8 @@ def measurements(config: LocateConfig) -> Rssi:
     Raises:
         InputError: The data cannot be read, or have no such receiver.
     """
-    if config.data is not None:
-        return load_rssi(config.data, columns=reading(config).columns).receivers(config.rx)
-    if config.columns:
-        raise InputError("--columns is for a survey table; give it with --data, or with MODEL and SOURCE")
-    return rssi_room(seed=config.seed).receivers(config.rx)
+    measured = measured_rssi(config.data, config)
+    return (rssi_room(seed=config.seed) if measured is None else measured).receivers(config.rx)
 
 
 def prepared(data: Rssi, split: str, cells: int, seed: int, suggest: int = 0) -> tuple[Experiment, int]:
@@ -117,6 +124,8 @@ class Results:
         columns: Row = {"position_error_m": error, "horizontal_error_m": horizontal}
         columns |= dict(zip(("x_m", "y_m", "z_m"), estimate.T, strict=True))
         columns |= dict(zip(("truth_x_m", "truth_y_m", "truth_z_m"), truth.T, strict=True))
+        degrees = degree_columns(self.experiment.train.origin, estimate.numpy())
+        columns |= {name: torch.from_numpy(values.copy()) for name, values in degrees.items()}
         if "radius" in value:
             radius = torch.tensor(value["radius"], dtype=torch.float64)
             columns |= {f"credible_radius_{100 * p:.0f}_m": r for p, r in zip(LEVELS, radius.T, strict=True)}
@@ -133,12 +142,17 @@ class Results:
             "seconds": value["seconds"],
         }
 
-    def metrics(self, data: str, n_undetected: int) -> LocateMetrics:
-        """Return the content of metrics.json."""
+    def median_m(self, step: Localization) -> float:
+        """Return the median position error of a step [m]."""
+        return next(study["position_error_m"]["median"] for known, study in self._studies if known == step)
+
+    def metrics(self, data: Rssi, n_undetected: int) -> LocateMetrics:
+        """Return the content of metrics.json of a run on these data."""
         train, test = self.experiment.train, self.experiment.test
         return {
             "task": "locate",
-            "data": data,
+            "data": data.name,
+            "notes": [*split_notes(train, test), *data.notes, *([train.offsets.note()] if train.offsets else [])],
             "split": self.experiment.split,
             "seed": self.experiment.seed,
             "n_train": len(train),

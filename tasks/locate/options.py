@@ -2,27 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Annotated
+from dataclasses import fields
+from typing import Annotated, ClassVar
 
 import tyro
 
-from augment.suggest import MAX_SUGGESTIONS
-from swiftwrf import InputError
-from tasks.source import SpectraSource, TableSource
+from augment.limits import MAX_SUGGESTIONS
+from swiftwrf.errors import InputError
+from tasks.options import OffsetSource, Output, SpectraSource, command_options
 
 TABLE = "positions.csv"
 
 
-@dataclass(frozen=True)
-class LocateConfig(SpectraSource, TableSource):
+EXPERIMENT = ("data", "offset_by", "rx", "split", "cells", "suggest", "scheduler", "seed")
+SPECTRA = ("array", "beamformer", "grid", "every", "station")
+
+
+@command_options
+class LocateConfig(SpectraSource, OffsetSource, Output):
     """Positions of a transmitter from RSSI or spectra.
 
     Without MODEL and SOURCE: compare localizers on a split of measured RSSI, by default of the built-in simulated floor, and
     report their errors. Continue an interrupted run with --resume DIR.partial.
 
     With MODEL and SOURCE: write the positions of new observations to a table.
+
+    Example: python -m tasks.locate --rx all --data DIR
     """
+
+    resumable: ClassVar[bool] = True
 
     model: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[MODEL]")] = None
     """file of a locator of RSSI or spectra, e.g. runs/locate/first/locator.safetensors"""
@@ -48,32 +56,25 @@ class LocateConfig(SpectraSource, TableSource):
     out: str | None = None
     """directory of the run (default: a new one under runs/locate), or table (default: positions.csv); must not exist"""
 
-
-EXPERIMENT = ("data", "rx", "split", "cells", "suggest", "scheduler", "seed")
-SPECTRA = ("array", "beamformer", "grid", "every", "station")
-
-
-def check(config: LocateConfig) -> None:
-    """Refuse options of the use that is not asked for.
-
-    Raises:
-        InputError: MODEL without SOURCE, an option that does not apply, or fewer than 10 cells.
-    """
-    if config.model is not None and config.source is None:
-        raise InputError(
-            f"{config.model} needs observations: python -m tasks.locate MODEL SOURCE; the experiment takes options only, "
-            "e.g. --data"
-        )
-    default = {field.name: field.default for field in fields(config)}
-    reason = "spectra; give it with MODEL and SOURCE"
-    if config.model is not None:
-        reason = "the experiment; leave it out with MODEL and SOURCE"
-    if config.model is None and config.track is not None:
-        raise InputError("--track is for observations; give it with MODEL and SOURCE")
-    for name in SPECTRA if config.model is None else EXPERIMENT:
-        if getattr(config, name) != default[name]:
-            raise InputError(f"--{name} is for {reason}")
-    if not 10 <= config.cells <= 1_000_000:
-        raise InputError(f"--cells takes 10 to 1,000,000, got {config.cells}")
-    if not 0 <= config.suggest <= MAX_SUGGESTIONS:
-        raise InputError(f"--suggest takes 0 to {MAX_SUGGESTIONS} positions, got {config.suggest}")
+    def check(self) -> None:
+        super().check()
+        if self.model is not None and self.source is None:
+            raise InputError(
+                f"{self.model} needs observations: python -m tasks.locate MODEL SOURCE; the experiment takes options only, "
+                "e.g. --data"
+            )
+        default = {field.name: field.default for field in fields(self)}
+        reason = "spectra; give it with MODEL and SOURCE"
+        if self.model is not None:
+            reason = "the experiment; leave it out with MODEL and SOURCE"
+        if self.model is None and self.track is not None:
+            raise InputError("--track is for observations; give it with MODEL and SOURCE")
+        for name in SPECTRA if self.model is None else EXPERIMENT:
+            if getattr(self, name) != default[name]:
+                raise InputError(f"--{name.replace('_', '-')} is for {reason}")
+        if self.model is None:
+            self.check_used(self.data)
+        if not 10 <= self.cells <= 1_000_000:
+            raise InputError(f"--cells takes 10 to 1,000,000, got {self.cells}")
+        if not 0 <= self.suggest <= MAX_SUGGESTIONS:
+            raise InputError(f"--suggest takes 0 to {MAX_SUGGESTIONS} positions, got {self.suggest}")

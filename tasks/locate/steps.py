@@ -13,6 +13,7 @@ from torch import Tensor
 
 from augment.suggest import suggest_positions
 from swiftwrf import Rssi
+from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.splits import validation_for
 from swiftwrf.locate import Posterior, RssiLocator
 from swiftwrf.positions import nearest
@@ -97,6 +98,12 @@ class Localization(Step[Experiment]):
         return self.localizer + rows + (f"-receivers{self.receivers:g}" if self.receivers < 1 else "")
 
     @property
+    def title(self) -> str:
+        parts = [f"{self.rows:.0%} of the rows"] * (self.rows < 1)
+        parts += [f"{self.receivers:.0%} of the receivers"] * (self.receivers < 1)
+        return f"{self.localizer}, {' and '.join(parts)}" if parts else self.localizer
+
+    @property
     def is_whole(self) -> bool:
         """True if the localizer has all training rows and receivers."""
         return self.rows == 1 and self.receivers == 1
@@ -135,6 +142,7 @@ def write_suggestion(folder: Path, locator: RssiLocator, train: Rssi, context: E
     """Write the positions where a measurement reduces the position error most, as a table and for the report."""
     found = suggest_positions(locator, train, context.suggest, context.seed)
     columns = dict(zip(("x_m", "y_m", "z_m"), found.position.T.tolist(), strict=True))
+    columns |= degree_columns(train.origin, found.position.numpy())
     columns["variance_left"] = found.variance[1:].tolist()
     write_table(
         folder / f"{SUGGESTED}.csv",

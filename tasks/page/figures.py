@@ -10,6 +10,7 @@ from typing import Any
 import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.transforms import Bbox
@@ -70,8 +71,12 @@ def short(name: str) -> str:
 def as_svg(figure: Figure) -> str:
     """The figure as SVG without date or random names."""
     stream = io.StringIO()
+    canvas = FigureCanvasSVG(figure)
     with matplotlib.style.context(STYLE):
-        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
+        if (engine := figure.get_layout_engine()) is not None:  # savefig would draw the figure twice to place its parts
+            engine.execute(figure)
+            figure.set_layout_engine("none")
+        canvas.print_figure(stream, format="svg", metadata={"Date": None, "Creator": None})
     return stream.getvalue()
 
 

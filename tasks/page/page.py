@@ -86,12 +86,13 @@ class Number:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a reader sees first: numbers, a picture, what they mean, what to do next."""
+    """What a reader sees first: numbers, a picture, the verdict in one sentence, what they mean, what to do next."""
 
     numbers: list[Number]
     plot: Plot
     meaning: list[str]
     next_steps: list[str]
+    verdict: str = ""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from tasks.page.labels import OTHER_COLOURS, Label
+from tasks.labels import OTHER_COLOURS, Label
 
 
 @dataclass(frozen=True)

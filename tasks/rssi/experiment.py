@@ -3,66 +3,38 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from pandas import DataFrame
 from PIL import Image, UnidentifiedImageError
 
-from swiftwrf import InputError, Rssi, load_rssi, rssi_room
+from swiftwrf import InputError, Rssi, rssi_room
+from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.files import sha256
 from swiftwrf.data.splits import validation_for
 from swiftwrf.models.base import Prediction
 from swiftwrf.positions import distance
-from swiftwrf.rasterize import prepare
 from swiftwrf.rssi import LEVEL, RssiModel
 from tasks.cluster import connected
 from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
 from tasks.page.page import reporting
+from tasks.page.records import Records
+from tasks.rssi.options import RssiTaskConfig
 from tasks.rssi.page import page
+from tasks.rssi.page.summary import answer
 from tasks.rssi.predictors import PREDICTORS, make_predictor
-from tasks.run import Preset, Row, Run, choose_device, console
-from tasks.source import TableSource, reading
+from tasks.run import Row, Run, choose_device
+from tasks.source import asked_offsets, measured_rssi, split_notes
 from tasks.summarise import error_summary, grouped
+from tasks.terminal import console, terminal
 
 MODEL = "model.safetensors"
 MAP_CELLS = 80  # along the longer side of the floor
 MAX_PLAN_PIXELS = 2**24
-
-
-@dataclass(frozen=True)
-class RssiTaskConfig(TableSource):
-    """RSSI of a moving transmitter at fixed receivers, against baselines.
-
-    Without --data the built-in simulated floor is used. Continue an interrupted run with --resume DIR.partial, and with
-    --scheduler ADDRESS to continue on a cluster.
-    """
-
-    rx: tuple[str, ...]
-    """receivers: names, numbers counted from 1, or all"""
-    data: str | None = None
-    """survey table (CSV or Parquet), or folder with tx_pos.csv, gateway_rssi.csv and gateway_position.yml (NeRF2 layout)"""
-    split: str = "random"
-    """a split that comes with the data, or a seeded one: random or block"""
-    also: tuple[str, ...] = ()
-    """predictors that take minutes and are compared only when named: nerf2, blend"""
-    preset: Preset = "quick"
-    """of SwiftWRF and NeRF2: quick, or paper for the published head and field"""
-    floor_plan: str | None = None
-    """an image to draw behind the maps, PNG or JPEG"""
-    floor_extent: tuple[float, float, float, float] | None = None
-    """x0 x1 y0 y1 of that image [m]"""
-    scheduler: str | None = None
-    """address of a Dask scheduler whose workers fit groups of receivers (extra: cluster)"""
-    seed: int = 0
-    """seed of everything random"""
-    out: str | None = None
-    """directory of the run; must not exist (default: a new one under runs/rssi)"""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """where to compute; RSSI models are small, so auto is the CPU"""
 
 
 def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
@@ -72,8 +44,6 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         InputError: A configuration that the data cannot meet or that contradicts itself.
     """
     device = choose_device("cpu" if config.device == "auto" else config.device)
-    for name in config.also:
-        PREDICTORS[name]  # refuses an unknown one
     plan = _read_floor_plan(config)
     whole = _load(config)
     data, (pool, _) = whole.receivers(config.rx), whole.split(config.split, config.seed)
@@ -82,9 +52,13 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     train, test = data.split(config.split, config.seed)
     if not bool((~test.rssi_dbm.isnan()).any()):
         raise InputError(f"split {config.split!r} of {data.name} has no test rows that detect these receivers")
+    notes = [*split_notes(train, test), *data.notes]
+    if (offsets := asked_offsets(pool, config)) is not None:
+        train, pool = offsets.removed(train), offsets.removed(pool)
+        notes.append(offsets.note())
+        console.print(f"{data.name}: {notes[-1]}")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
-    prepare(device)  # compiles, which no predictor's time should contain
     with (
         connected(config.scheduler, device) as cluster,
         Run("rssi", config.out, label, config, device, source, resume) as directory,
@@ -93,17 +67,17 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         tables = _Tables(config, train, test, plan, directory, options)
         compared = [name for name in PREDICTORS if not PREDICTORS[name].slow or name in config.also]
         left_out = {name: reason for name in compared if (reason := PREDICTORS[name].lacking(data))}
-        for name in compared:
-            if name in left_out:
-                console.print(f"left out: {left_out[name]}")
-            else:
-                tables.add(name)
+        for reason in left_out.values():
+            console.print(f"left out: {reason}")
+        with terminal.progress():
+            tables.add([name for name in compared if name not in left_out])
         directory.computed_on(cluster.machines if cluster else ())
         directory.write_csv("errors.csv", tables.errors)
         directory.write_csv("predictions.csv", tables.predictions)
         metrics: RssiMetrics = {
             "task": "rssi",
             "data": data.name,
+            "notes": notes,
             "split": config.split,
             "preset": config.preset,
             "seed": config.seed,
@@ -117,26 +91,18 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             "chosen": {"n_primitives": tables.n_primitives},
         }
         final = directory.finish(metrics, reporting(page))
-    console.print(f"report: [bold]{final / 'report.html'}[/]")
+    terminal.answer(answer(Records(final)), final / "report.html")
 
 
 def _load(config: RssiTaskConfig) -> Rssi:
-    if config.data is None:
-        if config.columns:
-            raise InputError("--columns is for a survey table; give it with --data")
-        return rssi_room(seed=config.seed)
-    return load_rssi(config.data, columns=reading(config).columns)
+    measured = measured_rssi(config.data, config)
+    return rssi_room(seed=config.seed) if measured is None else measured
 
 
 def _read_floor_plan(config: RssiTaskConfig) -> dict[str, Any]:
     """Return the floor plan and its corners as maps.npz stores them, or nothing if there is no plan."""
-    if (config.floor_plan is None) != (config.floor_extent is None):
-        raise InputError("--floor-plan needs --floor-extent x0 x1 y0 y1 [m], and the other way round")
     if config.floor_plan is None or config.floor_extent is None:
         return {}
-    x0, x1, y0, y1 = config.floor_extent
-    if not (x0 < x1 and y0 < y1):
-        raise InputError(f"--floor-extent must be x0 x1 y0 y1 with x0 < x1 and y0 < y1, got {config.floor_extent}")
     try:
         # two formats only: Pillow starts other programs for some; the pixels are read here, since the file may be truncated
         with Image.open(config.floor_plan, formats=("PNG", "JPEG")) as image:
@@ -181,10 +147,18 @@ class _Tables:
         self.row, column = self.detected.nonzero(as_tuple=True)
         self.receiver = [test.receiver_names[number] for number in column.tolist()]
         self.from_receiver = distance(test.transmitter_position, test.receiver_position)
+        self.offset = train.offsets.of(test)[:, None] if train.offsets else torch.zeros(1, 1, dtype=torch.float64)
         self.from_training = distance(test.transmitter_position, train.transmitter_position).min(dim=1).values
 
-    def add(self, name: str) -> None:
-        """Fit and test one predictor."""
+    def add(self, names: Sequence[str]) -> None:
+        """Fit and test predictors."""
+        terminal.expect(sum(not self.directory.holds(name) for name in names))
+        for name in names:
+            self._add(name)
+            errors = DataFrame(self.errors[-len(self.row) :])["abs_error_db"]
+            terminal.result(name, f"{errors.median():.2f} dB")
+
+    def _add(self, name: str) -> None:
 
         def compute() -> Row:
             config = self.config
@@ -201,9 +175,9 @@ class _Tables:
                 self._write_maps(predictor)
             return result | {"predicted": prediction.mean, "std": prediction.std}
 
-        value = self.directory.step(name, compute)
+        value = self.directory.step(name, f"fitting {name}", compute)
         self.seconds[name] = {"fit": value["fit"], "predict": value["predict"]}
-        predicted, measured = torch.tensor(value["predicted"], dtype=torch.float64), self.test.rssi_dbm
+        predicted, measured = torch.tensor(value["predicted"], dtype=torch.float64) + self.offset, self.test.rssi_dbm
         self.errors += _rows(
             method=[name] * len(self.row),
             receiver=self.receiver,
@@ -225,14 +199,16 @@ class _Tables:
         x, y, z = self.test.transmitter_position[self.row].unbind(dim=1)
         values = {"measured": measured, "predicted": prediction.mean, "low": low, "high": high}
         columns = {name: value[detected] for name, value in values.items()}
-        self.predictions += _rows(x=x, y=y, z=z, receiver=self.receiver, **columns)
+        degrees = degree_columns(self.test.origin, self.test.transmitter_position[self.row].numpy())
+        columns |= {name: torch.from_numpy(value) for name, value in degrees.items()}
+        group = {"group": self.test.groups.subset(self.row).labels()} if self.test.groups else {}
+        self.predictions += _rows(x=x, y=y, z=z, receiver=self.receiver, **group, **columns)
 
     def _write_maps(self, model: RssiModel) -> None:
         """Write the prediction and the width of its interval over the floor, at the median height of the measurements."""
         position = self.train.transmitter_position
         shown = torch.cat([position, self.test.transmitter_position])
-        if self.train.located:
-            shown = torch.cat([shown, self.train.receiver_position])
+        shown = torch.cat([shown, self.train.receiver_position[self.train.receiver_located]])
         low, high = shown.min(dim=0).values, shown.max(dim=0).values
         cell = float((high - low)[:2].max()) / MAP_CELLS or 1.0
         xs, ys = (
@@ -253,6 +229,8 @@ class _Tables:
             "receiver": self.train.receiver_position.numpy(),
             "receiver_names": np.array(self.train.receiver_names),
         }
+        if self.train.origin is not None:
+            maps["origin"] = np.array(self.train.origin)
         self.directory.write_npz("maps.npz", maps | self.plan)
 
     def overall(self) -> dict[str, PredictorMetrics]:

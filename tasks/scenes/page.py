@@ -16,9 +16,9 @@ from pandas import DataFrame
 from torch import Tensor
 
 from swiftwrf.array.angles import to_angles
+from swiftwrf.choices import Moving
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.raytraced import Surface
-from swiftwrf.data.spectra import Moving
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table
 

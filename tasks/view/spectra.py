@@ -15,7 +15,8 @@ from torch import Tensor
 from swiftwrf import AngularGrid, FieldModel, Spectra
 from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.array.planar import PlanarArray, folded_angles
-from swiftwrf.data.spectra import Moving, direction_of_link
+from swiftwrf.choices import Moving
+from swiftwrf.data.spectra import direction_of_link
 from swiftwrf.positions import distance
 from tasks.aoa.page.room import MARGIN, extent
 from tasks.view.locating import Located, SpectrumLocating

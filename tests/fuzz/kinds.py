@@ -55,7 +55,7 @@ from swiftwrf.models.geometry import fit_geometry, fit_hybrid
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.path_gains import fit_path_gains
 from swiftwrf.models.swiftwrf import SwiftWRF
-from tasks.aoa.estimators.kernel_ridge import KernelRegression
+from tasks.aoa.estimators.kernel_regression import KernelRegression
 
 N = 12
 GRID = AngularGrid.hemisphere(8, 32)
@@ -143,7 +143,7 @@ def model_rssi(folder: Path) -> None:
     fit_rssi(rssi_room(n=40).receivers(["1", "2"])).save(folder / "model")
 
 
-def model_kernel_ridge(folder: Path) -> None:
+def model_kernel_regression(folder: Path) -> None:
     KernelRegression().fit(Mixed.measured(_room())).save(folder / "model")
 
 
@@ -252,7 +252,7 @@ KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "nerf2 rssi model": (model_nerf2_rssi, read_model),
     "vae model": (functools.partial(model_published, "vae"), read_model),
     "dcgan model": (functools.partial(model_published, "dcgan"), read_model),
-    "kernel ridge regression": (model_kernel_ridge, read_estimator),
+    "kernel regression": (model_kernel_regression, read_estimator),
     "RSSI locator": (model_rssi_locator, read_locator),
     "matched-field locator": (model_matched_field, read_locator),
     "fit state": (state_of_a_fit, go_on),

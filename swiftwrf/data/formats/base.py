@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data.coordinates import Coordinates
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
@@ -46,6 +47,12 @@ class ReadOptions:
     """number of the array in a file with several, counted from 1"""
     columns: Mapping[str, str] | None = None
     """names of the columns of a table, by what they hold"""
+    filler: tuple[float, ...] | None = None
+    """values of RSSI that stand for not detected, () for none (default: those that are recognised)"""
+    coordinates: Coordinates | None = None
+    """unit of the positions in a table (default: the one that is recognised)"""
+    offset_by: str | None = None
+    """column of a table with groups of rows, e.g. devices, between which RSSI has constant offsets"""
     drop_null: bool | None = None
     """leaves out null subcarriers, which are the same at every position and element"""
     round_trip: bool | None = None

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, ArrayPose
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
+from swiftwrf.choices import Moving
 from swiftwrf.data.archives import array_header, array_names, read_arrays, read_rows, refusing_broken
 from swiftwrf.data.files import (
     MAX_COORDINATE_M,
@@ -36,7 +37,7 @@ from swiftwrf.data.files import (
     sha256_of_all,
 )
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
-from swiftwrf.data.spectra import Moving, Spectra, check_pixels
+from swiftwrf.data.spectra import Spectra, check_pixels
 from swiftwrf.data.splits import read_splits
 from swiftwrf.data.store import BATCH_PIXELS, MAX_FINE_PIXELS, MAX_MEMORY_PIXELS, Store, stored, too_many
 from swiftwrf.errors import InputError

@@ -11,10 +11,8 @@ import yaml
 from torch import Tensor
 
 from swiftwrf.data.raytraced.surfaces import Material, Surface, box, rectangle
-from swiftwrf.errors import InputError
 
 Point = tuple[float, float, float]
-SCENE_FILE = ".xml"  # suffix of scene files; other names are those of rooms
 THICKNESS_M = {  # of panels, walls and sheets by material
     "brick": 0.12,
     "carpet_tile": 0.02,
@@ -48,7 +46,6 @@ class FurnishedRoom:
         furniture: Boxes that do not move.
         fixed: Default position of the fixed end [m].
         region: Default region of the moving end, as opposite corners [m].
-        summary: One line for the user.
 
     Example:
         >>> ROOMS["office"].size
@@ -62,7 +59,6 @@ class FurnishedRoom:
     furniture: tuple[Box, ...]
     fixed: Point
     region: tuple[Point, Point]
-    summary: str = ""
 
     def of_materials(self, walls: str | None, floor: str | None, ceiling: str | None) -> FurnishedRoom:
         """Return the room with the given materials in place of its own."""
@@ -118,19 +114,3 @@ def _read_rooms(file: Path) -> dict[str, FurnishedRoom]:
 
 
 ROOMS = _read_rooms(Path(__file__).with_name("rooms.yml"))
-
-
-def check_scene(name: str, said: str = "") -> None:
-    """Refuse a name that is neither a built-in room nor a scene file.
-
-    Args:
-        name: Name of a room, or a path that ends in `.xml`.
-        said: Text before the name in the message, e.g. the option.
-
-    Raises:
-        InputError: No such room or file.
-    """
-    if not name.endswith(SCENE_FILE) and name not in ROOMS:
-        raise InputError(f"unknown room {name!r}; choose from {', '.join(ROOMS)}")
-    if name.endswith(SCENE_FILE) and not Path(name).is_file():
-        raise InputError(f"{said}{name} is not there; expected a Mitsuba scene, or one of {', '.join(ROOMS)}")

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from swiftwrf.data.raytraced.rooms import ROOMS, SCENE_FILE, check_scene
+from swiftwrf.choices import SCENE_FILE, check_scene
+from swiftwrf.data.raytraced.rooms import ROOMS
 from swiftwrf.data.raytraced.surfaces import Material, Surface
 from swiftwrf.errors import InputError
 

@@ -18,9 +18,9 @@ from torch import Tensor
 
 from swiftwrf.array.angles import to_direction
 from swiftwrf.array.planar import LIGHT_SPEED
+from swiftwrf.choices import Moving
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.raytraced.scene import Scene, sionna
-from swiftwrf.data.spectra import Moving
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.validation import NonNegativeInt, configuration
 

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,6 +23,25 @@ from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, configu
 
 MAX_ORDER = 2  # reflections
 Point = tuple[float, float, float]
+
+
+class Rays(NamedTuple):
+    """Straight lines from receivers to the image sources of transmitters.
+
+    Args:
+        transmitter, receiver: Positions of both ends, (n, 3) [m].
+        vector: From receiver to image source, (n, 25, 3) [m].
+        length: Length of each path, (n, 25) [m].
+        n_reflections: Number of reflections of each path, (25,).
+        clear: Whether no box blocks the path, bool (n, 25).
+    """
+
+    transmitter: Tensor
+    receiver: Tensor
+    vector: Tensor
+    length: Tensor
+    n_reflections: Tensor
+    clear: Tensor
 
 
 @configuration
@@ -57,6 +78,28 @@ class ShoeboxRoom:
         Raises:
             InputError: A position outside the room, or both ends at one position.
         """
+        rays = self.rays(transmitter, receiver)
+        n, n_paths = rays.length.shape
+        return PropagationPaths(
+            transmitter=rays.transmitter,
+            receiver=rays.receiver,
+            count=torch.full((n,), n_paths),
+            direction=(rays.vector / rays.length[..., None]).flatten(0, 1),
+            gain=self.gain(rays).flatten(),
+            line_of_sight=rays.clear[:, 0],
+            frequency_hz=self.frequency_hz,
+            length=rays.length.flatten(),
+        )
+
+    def gain(self, rays: Rays) -> Tensor:
+        """Return the complex gain of each path at the carrier, (n, 25)."""
+        wavelength = LIGHT_SPEED / self.frequency_hz
+        amplitude = wavelength / (4 * math.pi * rays.length) * self.reflection**rays.n_reflections
+        amplitude = torch.where(rays.clear, amplitude, self.blockage * amplitude)
+        return amplitude * torch.polar(torch.ones_like(rays.length), -2 * math.pi / wavelength * rays.length)
+
+    def rays(self, transmitter: Tensor, receiver: Tensor) -> Rays:
+        """Return the geometry of the paths, which does not depend on the carrier; arguments and errors as `paths`."""
         transmitter, receiver = torch.broadcast_tensors(transmitter.double(), receiver.double())
         size = torch.tensor(self.size, dtype=torch.float64)
         for name, position in (("transmitter", transmitter), ("receiver", receiver)):
@@ -69,20 +112,7 @@ class ShoeboxRoom:
         if bool((length == 0).any()):
             raise InputError("transmitter and receiver stand at one place, so there is no direction between them")
         clear = ~self._blocked(receiver, ray, rooms)
-        wavelength = LIGHT_SPEED / self.frequency_hz
-        amplitude = wavelength / (4 * math.pi * length) * self.reflection ** rooms.abs().sum(-1)
-        amplitude = torch.where(clear, amplitude, self.blockage * amplitude)
-        gain = amplitude * torch.polar(torch.ones_like(length), -2 * math.pi / wavelength * length)
-        return PropagationPaths(
-            transmitter=transmitter,
-            receiver=receiver,
-            count=torch.full((len(ray),), len(rooms)),
-            direction=(ray / length[..., None]).flatten(0, 1),
-            gain=gain.flatten(),
-            line_of_sight=clear[:, 0],
-            frequency_hz=self.frequency_hz,
-            length=length.flatten(),
-        )
+        return Rays(transmitter, receiver, ray, length, rooms.abs().sum(-1), clear)
 
     def _blocked(self, receiver: Tensor, ray: Tensor, rooms: Tensor) -> Tensor:
         """Return whether a box blocks each path, bool (n, 25)."""
@@ -95,9 +125,12 @@ class ShoeboxRoom:
             crossing.append(torch.where(count.abs() > k, at, torch.ones_like(at)))
         parameter = torch.stack(crossing, dim=-1).sort(dim=-1).values  # corners along the line, 0 to 1
         corner = _fold(receiver[:, None, None] + parameter[..., None] * ray[:, :, None], size)
+        start, step = corner[:, :, :-1], corner.diff(dim=2)
+        step = torch.where(step == 0, torch.full_like(step, 1e-300), step)
+        segments = [(s.contiguous(), d.contiguous()) for s, d in zip(start.unbind(-1), step.unbind(-1), strict=True)]
         blocked = torch.zeros(ray.shape[:2], dtype=torch.bool)
-        for box in torch.tensor(self.boxes, dtype=torch.float64).reshape(-1, 2, 3):
-            blocked |= _hits(corner[:, :, :-1], corner[:, :, 1:], *box).any(dim=-1)
+        for low, high in self.boxes:
+            blocked |= _hits(segments, low, high).any(dim=-1)
         return blocked
 
 
@@ -115,11 +148,16 @@ def _fold(point: Tensor, size: Tensor) -> Tensor:
     return torch.minimum(within, 2 * size - within)
 
 
-def _hits(start: Tensor, end: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Return whether segments (..., 3) pass through the box between the corners low and high, bool (...)."""
-    step = end - start
-    step = torch.where(step == 0, torch.full_like(step, 1e-300), step)
-    a, b = (low - start) / step, (high - start) / step
-    enter = torch.minimum(a, b).amax(dim=-1).clamp_min(0)
-    leave = torch.maximum(a, b).amin(dim=-1).clamp_max(1)
+def _hits(segments: Sequence[tuple[Tensor, Tensor]], low: Point, high: Point) -> Tensor:
+    """Return whether segments pass through the box between the corners low and high, bool (...).
+
+    Args:
+        segments: Start and step (...) along each axis; no step is 0.
+        low, high: Corners.
+    """
+    enter = torch.zeros_like(segments[0][0])
+    leave = torch.ones_like(enter)
+    for (start, step), near, far in zip(segments, low, high, strict=True):
+        a, b = (near - start) / step, (far - start) / step
+        enter, leave = torch.maximum(enter, torch.minimum(a, b)), torch.minimum(leave, torch.maximum(a, b))
     return enter < leave

@@ -71,9 +71,6 @@ def rssi_room(n: PositiveInt = 600, seed: NonNegativeInt = 0) -> Rssi:
 def _power(position: Tensor, receiver: Tensor) -> Tensor:
     """Return the power gain of the coherent sum of all paths on each channel, (n, channels) [dB]."""
     floors = [replace(FLOOR, frequency_hz=f) for f in CHANNELS_HZ]
-    parts = position.split(BATCH_POSITIONS)
-    sums = [
-        torch.cat([floor.paths(some, receiver).gain.reshape(len(some), -1).sum(dim=1).abs() for some in parts])
-        for floor in floors
-    ]
-    return 20 * torch.stack(sums, dim=1).clamp_min(1e-9).log10()
+    rays = (FLOOR.rays(some, receiver) for some in position.split(BATCH_POSITIONS))
+    sums = torch.cat([torch.stack([floor.gain(part).sum(dim=1).abs() for floor in floors], dim=1) for part in rays])
+    return 20 * sums.clamp_min(1e-9).log10()

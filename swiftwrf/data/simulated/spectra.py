@@ -9,8 +9,9 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, ArrayPose
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.choices import Moving
 from swiftwrf.data.simulated.room import ShoeboxRoom
-from swiftwrf.data.spectra import Moving, Spectra, array_spectra
+from swiftwrf.data.spectra import Spectra, array_spectra
 from swiftwrf.runtime.validation import NonNegativeFloat, NonNegativeInt, PositiveInt, checked
 
 GRID = AngularGrid.hemisphere(30, 120)

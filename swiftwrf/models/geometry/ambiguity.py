@@ -15,13 +15,16 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from swiftwrf.models.geometry.batched import batched, batched_score
 from swiftwrf.models.geometry.images import PhaseObservations, images
-from swiftwrf.models.geometry.planes import PlaneSet
+from swiftwrf.models.geometry.planes import PlaneSet, refined
 from swiftwrf.models.geometry.responses import SteeringResponses
 
 MAX_MOVING = 6  # planes, one for each side of a room
 MAX_PERIODS = 4  # to either side
-N_POSITIONS = 18  # that all combinations are scored at
+N_POSITIONS = 18  # that the best combinations are scored at
+N_FIRST_POSITIONS = 6  # that all combinations are scored at
+N_RESCORED = 8  # times as many combinations as are wanted are scored at more than the first positions
 OFFSET_STEP_WAVELENGTHS = 0.125  # of the grid from which aliases are interpolated
 N_WHOLE = 32  # combinations of whole periods around which half periods are tried
 N_COARSE, N_FINE = 24, 8  # rooms that are refined with some positions, and with all
@@ -44,9 +47,9 @@ def phase_alternatives(scene: PhaseObservations, room: PlaneSet) -> list[PlaneSe
         around = [[h for h in (c - 1, c, c + 1) if h in p] for c, p in zip(choice, table.offsets, strict=True)]
         tried |= table.best(around, N_COARSE)
     tried.pop((0,) * planes, None)
-    rooms = [table.room(c).refined(few, 4) for c in sorted(tried, key=tried.__getitem__)[:N_COARSE]]
+    rooms = refined([table.room(c) for c in sorted(tried, key=tried.__getitem__)[:N_COARSE]], few, 4)
     rooms.sort(key=lambda r: float(few.score(r.field(few))))
-    rooms = [r.refined(scene, 12) for r in rooms[:N_FINE]]
+    rooms = refined(rooms[:N_FINE], scene, 12)
     return sorted(rooms, key=lambda r: float(scene.score(r.field(scene))))
 
 
@@ -81,11 +84,13 @@ class _AlternativeTable:
     """Steering responses of single and double reflections at all aliases of the planes."""
 
     def __init__(self, scene: PhaseObservations, room: PlaneSet) -> None:
-        self.scene, self.before, self.direct = scene, room, scene.wave(scene.transmitter)
+        self.before = room
         self.offsets = [_alias_offsets(scene, room, plane) for plane in range(room.normal.shape[1])]
         offset = [torch.tensor(list(p.values()), dtype=torch.float64) for p in self.offsets]
         gain = [g * (-1.0) ** torch.tensor(list(p)) for g, p in zip(room.gain[0], self.offsets, strict=True)]
-        self.waves = SteeringResponses.of(scene, room.normal[0], offset, gain, room.order)
+        self.scenes = [scene.few(N_FIRST_POSITIONS), scene]
+        self.direct = [batched(some.wave(some.transmitter)) for some in self.scenes]
+        self.waves = [SteeringResponses.of(some, room.normal[0], offset, gain, room.order) for some in self.scenes]
 
     def room(self, choice: HalfPeriods) -> PlaneSet:
         """Return the room whose planes are moved by half periods."""
@@ -93,12 +98,19 @@ class _AlternativeTable:
         return replace(self.before, offset=offset, gain=self.before.gain * (-1.0) ** torch.tensor(choice))
 
     def best(self, half_periods: list[list[int]], most: int) -> dict[HalfPeriods, float]:
-        """Return the best combinations of the given half periods of the planes, with their scores."""
+        """Return the best combinations of the given half periods of the planes, with their scores.
+
+        All combinations are scored at few positions, and the best of them at more.
+        """
         rows = [
             torch.tensor([list(p).index(h) for h in some]) for p, some in zip(self.offsets, half_periods, strict=True)
         ]
-        score = self.waves.at(rows).scores(self.scene, self.direct)
-        best = score.flatten().argsort()[:most].numpy()
-        choices = np.stack(np.unravel_index(best, score.shape), axis=1).tolist()  # torch's own loads its compiler
-        kept = [tuple(some[k] for some, k in zip(half_periods, choice, strict=True)) for choice in choices]
-        return dict(zip(kept, score.flatten()[best].tolist(), strict=True))
+        (first, scene), (direct, base), (few, waves) = self.scenes, self.direct, self.waves
+        score = few.at(rows).scores(first, direct)
+        best = score.flatten().argsort()[: N_RESCORED * most].numpy()
+        number = [torch.from_numpy(n) for n in np.unravel_index(best, score.shape)]  # torch's own loads its compiler
+        score = batched_score(scene, base + waves.of_choices([r[n] for r, n in zip(rows, number, strict=True)]))
+        kept = score.argsort()[:most]
+        choices = torch.stack([n[kept] for n in number], dim=1).tolist()
+        kept_ = [tuple(some[k] for some, k in zip(half_periods, choice, strict=True)) for choice in choices]
+        return dict(zip(kept_, score[kept].tolist(), strict=True))

@@ -25,6 +25,7 @@ from swiftwrf.models.geometry.planes import (
     RoomEstimate,
     advantage,
     correlation_score,
+    refined,
     robust_advantage,
     sign_alternatives,
 )
@@ -174,18 +175,19 @@ def observe(train: Spectra, config: GeometryConfig | None = None) -> tuple[Phase
     return scene, rows[solved]
 
 
-def _held_out(room: PlaneSet, splits: Splits, steps: int = 4) -> Tensor:
-    """Return the coherence at held-out positions (n,), with offsets and gains refined on the other positions."""
-    return torch.cat([held.coherence(room.refined(kept, steps).field(held)) for kept, held in splits])
+def _held_out(rooms: list[PlaneSet], splits: Splits, steps: int = 4) -> list[Tensor]:
+    """Return each room's coherence at held-out positions (n,), with offsets and gains refined on the other positions."""
+    found = [[held.coherence(r.field(held)) for r in refined(rooms, kept, steps)] for kept, held in splits]
+    return [torch.cat(parts) for parts in zip(*found, strict=True)]
 
 
 def _pruned(room: PlaneSet, scene: PhaseObservations, splits: Splits, config: GeometryConfig) -> PlaneSet:
     """Drop planes that hardly reflect or do not explain held-out spectra significantly, the least significant first."""
     while room.normal.shape[1]:
-        full = _held_out(room, splits)
-        rest = [room.without(i).refined(scene, 4) for i in range(room.normal.shape[1])]
+        rest = refined([room.without(i) for i in range(room.normal.shape[1])], scene, 4)
+        full, *held = _held_out([room, *rest], splits)
         faint = (room.gain[0].abs() < config.min_gain).tolist()
-        needed = [0.0 if f else robust_advantage(full, _held_out(r, splits)) for f, r in zip(faint, rest, strict=True)]
+        needed = [0.0 if f else robust_advantage(full, h) for f, h in zip(faint, held, strict=True)]
         least = min(range(len(rest)), key=needed.__getitem__)
         if needed[least] > config.significance:
             break
@@ -247,16 +249,15 @@ def _with_further_planes(
             normals = torch.cat([room.normal, normal[None, None]], dim=1)
             offsets = torch.cat([room.offset, torch.full((1, 1), offset, dtype=torch.float64)], dim=1)
             gains = torch.cat([room.gain, torch.full((1, 1), FURTHER_GAIN * sign)], dim=1)
-            wider.append(PlaneSet(normals, offsets, gains, room.order).refined(some, 8, tilt=True))
-        wider.sort(key=lambda r: float(some.score(r.field(some))))
-        wider = [
-            r.refined(some, 20, tilt=True) for other in wider[:2] for r in (other, *sign_alternatives(scene, other))
-        ]
+            wider.append(PlaneSet(normals, offsets, gains, room.order))
+        wider = sorted(refined(wider, some, 8, tilt=True), key=lambda r: float(some.score(r.field(some))))
+        wider = [r for other in wider[:2] for r in (other, *sign_alternatives(scene, other))]
+        wider = refined(wider, some, 20, tilt=True)
         best = min(wider, key=lambda r: float(some.score(r.field(some)))).refined(scene, 15, tilt=True)
         if advantage(scene.coherence(best.field(scene)), scene.coherence(room.field(scene))) < FURTHER_SIGNIFICANCE:
             break
         best = _pruned(best, scene, splits, config)
-        if advantage(_held_out(best, splits), _held_out(room, splits)) < FURTHER_SIGNIFICANCE:
+        if advantage(*_held_out([best, room], splits)) < FURTHER_SIGNIFICANCE:
             break
         room = best
     return room
@@ -269,7 +270,7 @@ def _with_order(room: PlaneSet, splits: Splits, config: GeometryConfig) -> Plane
     best, score = room, torch.empty(0)
     for order in range(1, config.max_order + 1):
         tried = replace(room, order=order)
-        held = _held_out(tried, splits, 8)
+        (held,) = _held_out([tried], splits, 8)
         if not len(score) or advantage(held, score) > config.significance:
             best, score = tried, held
     return best

@@ -18,7 +18,7 @@ from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, LeaveGroupOut, choose_kernel, principal_components
 from swiftwrf.metrics import psnr
-from swiftwrf.models.base import ARRAY, FIELD_MODELS, FIXED_END, FieldModel, FitContext
+from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.path_gains import PathGains, fit_path_gains, prior
@@ -34,7 +34,6 @@ CONSTANT_GAINS_MARGIN = 1.0  # standard errors by which constant path gains must
 FIRST_WEIGHT = 0.7  # mixing weight with which the kernel is chosen
 
 
-@FIELD_MODELS.register("hybrid")
 class HybridModel(FieldModel):
     """Geometry with position-dependent path gains, and a Gaussian process on the residual.
 

@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.spectra import Moving
+from swiftwrf.choices import Moving
+from swiftwrf.models.geometry.chain import ElementChain
 
 MAX_COSINE = 0.02  # of two planes that count as perpendicular; above 1 - MAX_COSINE**2 they count as parallel
 ROUNDING_RAD = 1e-3  # of phase, to which positions are rounded in a search
@@ -33,6 +34,7 @@ class PhaseObservations:
         transmitter, receiver: Positions, float64 (n, 3), of the fixed end (1, 3) [m].
         end: The end that moves.
         element: Phase of a wave from unit vector u at each element is element @ u, float32 (K, 3) [rad].
+        chain: The same phases in few steps, for many waves at once.
         wavenumber: Wavenumber [rad / m].
         channel: Observed phases, complex64 (n, 2, K) of unit modulus: the channel and its alternative, the conjugate
             observed by an array rotated by half a turn. Spectra cannot distinguish them if each element has an opposite one.
@@ -42,6 +44,7 @@ class PhaseObservations:
     receiver: Tensor
     end: Moving
     element: Tensor
+    chain: ElementChain
     wavenumber: float
     channel: Tensor
 
@@ -55,7 +58,8 @@ class PhaseObservations:
         element = wavenumber * array.element.double() @ rotation[:, :2].T.double()
         opposite = array.opposite
         both = torch.stack([channel, channel if opposite is None else channel.conj()[:, opposite]], dim=1)
-        return cls(transmitter, receiver, moving, element.float(), wavenumber, both.to(torch.complex64))
+        chain = ElementChain.of(array, element)
+        return cls(transmitter, receiver, moving, element.float(), chain, wavenumber, both.to(torch.complex64))
 
     def __len__(self) -> int:
         return len(self.moving)
@@ -89,6 +93,21 @@ class PhaseObservations:
         ray = (source - self.receiver).float()
         length = ray.norm(dim=-1, keepdim=True)
         return spherical((ray / length) @ self.element.T - self.wavenumber * length, length)
+
+    def waves(self, ray: Tensor, strength: Tensor) -> Tensor:
+        """Return strength times the waves that arrive along rays, as `wave`, in the order of memory for many waves.
+
+        Args:
+            ray: Vectors from the receiver to the source, float32 (3, ...) [m].
+            strength: Real strengths that broadcast to (...).
+
+        Returns:
+            Waves, complex64 (K, ...).
+        """
+        length = ray.square().sum(0).sqrt()  # the norm over a first dimension is slow
+        unit, amplitude = ray / length, strength / length
+        wave = self.chain.phasors(unit.flatten(1), amplitude.flatten(), -self.wavenumber * length.flatten())
+        return wave.reshape(-1, *length.shape)
 
     def coherence(self, field: Tensor) -> Tensor:
         """Return |x^H h|^2 / K^2 of the observed and the given phases, (..., n, K) to (..., n), in [0, 1].
@@ -157,18 +176,20 @@ def tree_of(sequence: tuple[Sequence, ...]) -> Tree:
 
 
 def mirror(source: Tensor, normal: Tensor, offset: Tensor) -> Tensor:
-    """Return sources (..., 3) [m] mirrored in planes normal . x = offset; the shapes (..., 3) and (...) broadcast."""
-    distance = (source * normal).sum(-1, keepdim=True) - offset[..., None]
-    return source - 2 * distance * normal
+    """Return sources (3, ...) [m] mirrored in planes normal . x = offset; the shapes (3, ...) and (...) broadcast.
+
+    Coordinates are the first dimension, because sums over a last dimension of three are slow.
+    """
+    return source - 2 * ((source * normal).sum(0) - offset) * normal
 
 
 def images(scene: PhaseObservations, normal: Tensor, offset: Tensor, sequence: list[Sequence]) -> Tensor:
     """Return the image positions, float64 (B, S, n or 1, 3) [m], in planes (B, P, 3) and (B, P) [m]."""
-    tree, last, found = tree_of(tuple(sequence)), scene.transmitter.expand(len(normal), 1, -1, -1), []
+    tree, last, found = tree_of(tuple(sequence)), scene.transmitter.T[:, None, None].expand(-1, len(normal), 1, -1), []
     for parent, plane in tree.levels:
-        last = mirror(last[:, parent], normal[:, plane, None], offset[:, plane, None])
+        last = mirror(last[:, :, parent], normal[:, plane].movedim(-1, 0)[..., None], offset[:, plane, None])
         found.append(last)
-    return torch.cat(found, dim=1)[:, tree.rows]
+    return torch.cat(found, dim=2)[:, :, tree.rows].movedim(0, -1)
 
 
 def phase_period_m(scene: PhaseObservations, normal: Tensor, offset: Tensor, plane: int) -> float:
@@ -208,16 +229,16 @@ def visibility(scene: PhaseObservations, normal: Tensor, offset: Tensor, sequenc
     cosine = (facing @ facing.mT).abs()
     if not bool(((cosine > MAX_COSINE) & (cosine < 1 - MAX_COSINE**2)).any()):
         return torch.ones(len(normal), len(sequence), 1)
-    begun = list(dict.fromkeys(s[:end] for s in sequence for end in range(1, len(s) + 1)))
-    source = dict(zip(begun, images(scene, normal, offset, begun).unbind(1), strict=True))
     there = torch.ones(len(normal), len(sequence), len(scene))
-    for number, s in enumerate(sequence):
-        point = scene.receiver.expand(len(normal), -1, -1)
-        for end in range(len(s), 0, -1):
-            n, o = normal[:, s[end - 1], None], offset[:, s[end - 1], None]
-            towards = source[s[:end]] - point
-            before, slope = o - (point * n).sum(-1), (towards * n).sum(-1)
-            share = before / slope
-            there[:, number] *= ((share > 0) & (share < 1)).float()
+    for length in sorted({len(s) for s in sequence}):
+        rows = [row for row, s in enumerate(sequence) if len(s) == length]
+        point = scene.receiver.expand(len(normal), len(rows), -1, -1)
+        for end in range(length, 0, -1):
+            begun = [sequence[row][:end] for row in rows]
+            last = [s[-1] for s in begun]
+            n, o = normal[:, last, None], offset[:, last, None]
+            towards = images(scene, normal, offset, begun) - point
+            share = (o - (point * n).sum(-1)) / (towards * n).sum(-1)
+            there[:, rows] *= ((share > 0) & (share < 1)).float()
             point = point + share[..., None] * towards
     return there

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.spectra import Moving, Spectra, fingerprint
+from swiftwrf.choices import Moving
+from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
-from swiftwrf.models.base import ARRAY, FIELD_MODELS, FIXED_END, FieldModel, FitContext, bounding_box
+from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext, bounding_box
 from swiftwrf.models.geometry.fit import MAX_ORDER, GeometryConfig, refine_room, search_room
 from swiftwrf.models.geometry.images import PhaseObservations, image_gain, images
 from swiftwrf.models.geometry.planes import Plane, PlaneSet, RoomEstimate
@@ -25,7 +26,6 @@ MAX_PLANES = 64  # of a room in a file
 MAX_DISTANCE_M = 1e7  # from the fixed end; beyond, rounding destroys the phases
 
 
-@FIELD_MODELS.register("geometry")
 class GeometryModel(FieldModel):
     """Image sources of the fixed end in mirror planes that are estimated from the spectra.
 

@@ -7,7 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from swiftwrf.models.geometry.images import PhaseObservations, mirror
+from swiftwrf.models.geometry.batched import batched, batched_field, batched_score
+from swiftwrf.models.geometry.images import PhaseObservations
 
 N_HORIZONTAL_NORMALS = 90  # of upright walls
 N_SPHERE_NORMALS = 1200  # in all directions
@@ -38,7 +39,7 @@ def candidates(scene: PhaseObservations, base: Tensor, reach: float, top: int) -
     """
     both = torch.cat([scene.transmitter, scene.receiver])
     rows = (scene.moving - scene.moving.mean(0)).norm(dim=1).argsort()[:N_NEAR]
-    near, base = scene.subset(rows), base[rows]
+    near, base = scene.subset(rows), batched(base[rows])
     found: list[tuple[float, Tensor, float, float]] = []
     distance = (
         torch.arange(MIN_DISTANCE_RAD, reach * scene.wavenumber, DISTANCE_STEP_RAD, dtype=torch.float64)
@@ -46,9 +47,10 @@ def candidates(scene: PhaseObservations, base: Tensor, reach: float, top: int) -
     )
     for normal in directions().split(BATCH_SIZE):
         offset = (both @ normal.T).amax(0)[:, None] + distance
-        wave = near.wave(mirror(near.transmitter, normal[:, None, None], offset[..., None]))
+        planes = normal.repeat_interleave(len(distance), dim=0)[:, None], offset.reshape(-1, 1)
+        wave = FURTHER_GAIN * batched_field(near, *planes, torch.ones(offset.numel(), 1), [(0,)])
         for sign in (-1.0, 1.0):
-            best = near.score(base + FURTHER_GAIN * sign * wave).min(1)
+            best = batched_score(near, base + sign * wave).view_as(offset).min(1)
             at = offset.gather(1, best.indices[:, None])[:, 0].tolist()
             found += [(v, n, o, sign) for v, n, o in zip(best.values.tolist(), normal, at, strict=True)]
     return [f[1:] for f in sorted(found, key=lambda f: f[0])[:top]]

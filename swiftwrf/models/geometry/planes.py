@@ -6,6 +6,7 @@ import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from swiftwrf.array.planar import PlanarArray
@@ -16,6 +17,7 @@ from swiftwrf.models.geometry.sample import Residual
 from swiftwrf.models.geometry.search import SIDES, CandidateRoom
 from swiftwrf.runtime.validation import NonNegativeFloat, configuration
 
+PLANE_TENSORS = ("normal", "offset", "gain")  # of a `PlaneSet`
 MIN_MISSING = 1e-5  # missing coherence by rounding of spectra and phases
 
 
@@ -107,12 +109,22 @@ class PlaneSet:
 
     def refined(self, scene: PhaseObservations, steps: int = 10, tilt: bool = False) -> PlaneSet:
         """Return the planes after Levenberg-Marquardt steps on offsets, gains and, with `tilt`, normals."""
-        if not self.sequence:
-            return self
-        _, normal, offset, gain = refine(
-            scene, self.normal, self.offset, self.gain, self.sequence, steps=steps, tilt=tilt
-        )
-        return replace(self, normal=normal, offset=offset, gain=gain)
+        return refined([self], scene, steps, tilt)[0]
+
+
+def refined(rooms: list[PlaneSet], scene: PhaseObservations, steps: int = 10, tilt: bool = False) -> list[PlaneSet]:
+    """Return the rooms, each as by `PlaneSet.refined`. Rooms with the same sequences are computed together."""
+    found = list(rooms)
+    groups: dict[tuple[Sequence, ...], list[int]] = {}
+    for number, room in enumerate(rooms):
+        if room.sequence:
+            groups.setdefault(tuple(room.sequence), []).append(number)
+    for sequence, numbers in groups.items():
+        normal, offset, gain = (torch.cat([getattr(rooms[i], name) for i in numbers]) for name in PLANE_TENSORS)
+        _, *planes = refine(scene, normal, offset, gain, list(sequence), steps=steps, tilt=tilt)
+        for number, *one in zip(numbers, *(t.split(1) for t in planes), strict=True):
+            found[number] = replace(rooms[number], **dict(zip(PLANE_TENSORS, one, strict=True)))
+    return found
 
 
 def advantage(a: Tensor, b: Tensor) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import torch
 from torch import Tensor
 
@@ -11,99 +13,107 @@ from swiftwrf.models.geometry.images import (
     image_gain,
     images,
     mirror,
-    spherical,
     tree_of,
     visibility,
 )
 
+MIN_FIELD, MIN_GAIN = 1e-9, 1e-6  # moduli by which derivatives are divided
 
-def derivatives(
-    scene: PhaseObservations, normal: Tensor, offset: Tensor, gain: Tensor, sequence: list[Sequence], tilt: bool
+
+def phase_jacobian(
+    scene: PhaseObservations, normal: Tensor, offset: Tensor, gain: Tensor, sequence: list[Sequence], movement: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the field with the direct wave, (B, n, K), and its derivatives (B, Q, P, n, K).
+    """Return the field h with the direct wave, complex64 (K, B, n), and the derivatives of its phase, (K, B, Q P, n).
 
-    The Q parameters of each plane are offset [m], gain and, with `tilt`, two rotation angles of its normal [rad].
+    The Q parameters of each plane are offset [m], gain and, if planes tilt, two rotation angles of the normal [rad]. A
+    change dh of the field changes its phase by Im(dh / h). The wave w of an image at position x, distance d and direction u
+    changes by
+
+        dw_k / w_k = j e_k . du - j k dd - dd / d,    dd = u . dx,    du = (dx - u dd) / d,
+
+    where e_k . u is the phase at element k. So the derivatives are sums over images of a vector times dx.
 
     Args:
-        sequence: All `sequences` up to an order.
+        movement: `image_jacobian` of the planes.
     """
-    source = images(scene, normal, offset, sequence)
-    ray = (source - scene.receiver).float()
-    length = ray.norm(dim=-1, keepdim=True)
-    unit = ray / length
-    phase = unit @ scene.element.T - scene.wavenumber * length
+    ray = (images(scene, normal, offset, sequence) - scene.receiver).permute(3, 0, 1, 2).float().contiguous()
     strength = image_gain(gain, sequence)[..., None] * visibility(scene, normal, offset, sequence)
-    wave = spherical(phase, length) * strength[..., None]
-    total = scene.wave(scene.transmitter) + wave.sum(1)
-    change = torch.zeros(len(normal), 4 if tilt else 2, normal.shape[1], *total.shape[1:], dtype=total.dtype)
-    safe = torch.where(gain.abs() < 1e-6, torch.full_like(gain, 1e-6), gain)
-    for owner, steps in tangents(normal, offset, scene.transmitter, sequence, tilt):
-        part, ray, far = (t[:, -len(owner) :] for t in (wave, unit, length))  # the longest sequences are the last ones
-        change[:, 1].index_add_(1, owner, part / safe[:, owner, None, None])
-        for q, step in zip([0, 2, 3] if tilt else [0], steps, strict=True):
-            along = (ray * step.float()).sum(-1, keepdim=True)
-            turned = (step.float() - ray * along) / far
-            advance = turned @ scene.element.T - scene.wavenumber * along
-            change[:, q].index_add_(1, owner, part * torch.complex((-along / far).expand_as(advance), advance))
-    return total, change
+    wave = scene.waves(ray, strength)  # (K, B, S, n)
+    total = scene.wave(scene.transmitter).T[:, None] + wave.sum(2)
+    safe = torch.where(total.abs() < MIN_FIELD, torch.full_like(total, MIN_FIELD), total)
+    ratio = wave * safe.reciprocal()[:, :, None]
+    length = ray.square().sum(0).sqrt()
+    unit = ray / length
+    real, imaginary = ratio.real / length, ratio.imag.contiguous()
+    along = (scene.element @ unit.flatten(1)).view_as(real) + scene.wavenumber * length
+    along = along.mul_(real).addcdiv_(imaginary, length)
+    moved = torch.zeros(())
+    for e, u, dx in zip(scene.element.T, unit, movement, strict=True):
+        moved = moved + _over_images((real * e[:, None, None, None]).addcmul_(along, u, value=-1), dx)
+    planes = gain.shape[1]
+    safe_gain = torch.where(gain.abs() < MIN_GAIN, torch.full_like(gain, MIN_GAIN), gain)
+    scaled = (_reflections(tuple(sequence), planes) / safe_gain[..., None]) @ imaginary
+    return total, torch.cat([moved[:, :, :planes], scaled, moved[:, :, planes:]], dim=2)
 
 
-def tangents(
-    normal: Tensor, offset: Tensor, transmitter: Tensor, sequence: list[Sequence], tilt: bool
-) -> list[tuple[Tensor, list[Tensor]]]:
-    """Return the derivatives of the image positions with respect to offset and tilts of the planes that make them.
+def _over_images(values: Tensor, weights: Tensor) -> Tensor:
+    """Return the sums over images of values (K, B, S, n) with weights (B, R, S, n or 1), (K, B, R, n)."""
+    if weights.shape[-1] == 1:
+        return weights[..., 0] @ values
+    return torch.einsum("kbsn,brsn->kbrn", values, weights)
+
+
+@lru_cache(maxsize=1024)
+def _reflections(sequence: tuple[Sequence, ...], planes: int) -> Tensor:
+    """Return how many times each plane reflects each sequence, (P, S)."""
+    return torch.tensor([[float(s.count(plane)) for s in sequence] for plane in range(planes)])
+
+
+def image_jacobian(normal: Tensor, offset: Tensor, transmitter: Tensor, sequence: list[Sequence], tilt: bool) -> Tensor:
+    """Return the derivatives of the image positions with respect to offset and, with `tilt`, two tilts of each plane.
+
+    Without tilts they depend on the normals alone.
 
     Returns:
-        One entry for the first plane of the sequences, the second plane of those that have one, and so on: the number of the
-        plane (R,), and for each of the 1 or 3 parameters the derivative (B, R, n or 1, 3). The R sequences are the last ones
-        of `sequence`.
+        Derivatives, float32 (3, B, P or 3 P, S, n or 1).
     """
-    across = torch.linalg.svd(normal[:, :, None]).Vh[:, :, 1:].unbind(2) if tilt else ()
-    here = offset.new_zeros(())  # displacements are mirrored as points are in planes through the origin
-    point = transmitter.expand(len(normal), 1, -1, -1)
-    last: list[tuple[Tensor, list[Tensor]]] = []
-    found: list[list[tuple[Tensor, list[Tensor]]]] = []
-    for parent, plane in tree_of(tuple(sequence)).levels:
-        n, o, point = normal[:, plane, None], offset[:, plane, None, None], point[:, parent]
-        distance = (point * n).sum(-1, keepdim=True) - o
-        last = [(owner[parent], [mirror(step[:, parent], n, here) for step in steps]) for owner, steps in last]
-        turns = [tilted[:, plane, None] for tilted in across]
-        own = [-2 * (point * turn).sum(-1, keepdim=True) * n - 2 * distance * turn for turn in turns]
-        own = [2 * n.expand_as(point), *own]
-        last, point = [*last, (plane, own)], point - 2 * distance * n
+    (rooms, planes), turns = offset.shape, 2 if tilt else 0
+    across = torch.linalg.svd(normal[:, :, None]).Vh[:, :, 1:].permute(3, 2, 0, 1)  # (3, 2, B, P)
+    point = transmitter.T[:, None, None].expand(-1, rooms, 1, -1)
+    last, found = point.new_zeros(3, rooms, 1, planes, 1 + turns, len(transmitter) if tilt else 1), []
+    tree = tree_of(tuple(sequence))
+    for parent, plane in tree.levels:
+        n, o, point = normal[:, plane].movedim(-1, 0)[..., None], offset[:, plane, None], point[:, :, parent]
+        last = mirror(last[:, :, parent], n[..., None, None], o.new_zeros(()))  # as points in planes through the origin
+        rows = torch.arange(len(plane))
+        last[:, :, rows, plane, 0] += 2 * n
+        for q in range(turns):
+            turn = across[:, q, :, plane, None]
+            last[:, :, rows, plane, 1 + q] -= 2 * ((point * turn).sum(0) * n + ((point * n).sum(0) - o) * turn)
+        point = mirror(point, n, o)
         found.append(last)
-    whole = []
-    for member in range(len(found)):
-        owners, steps = zip(*[level[member] for level in found[member:]], strict=True)
-        whole.append((torch.cat(owners), [torch.cat(q, dim=1) for q in zip(*steps, strict=True)]))
-    return whole
+    return torch.cat(found, dim=2)[:, :, tree.rows].permute(0, 1, 4, 3, 2, 5).flatten(2, 3).float()
 
 
 def normal_equations(
-    scene: PhaseObservations, total: Tensor, change: Tensor, exact: bool = False
+    scene: PhaseObservations, total: Tensor, jacobian: Tensor, exact: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the score (B,), half its gradient at each position (B, Q, n) and its Gauss-Newton matrix (B, Q, Q), times n.
+    """Return the score (B,), half its gradient at each position (B, Q P, n) and its Gauss-Newton matrix (B, Q P, Q P).
 
-    Only phases count: a change dh of the field h changes its phase by Im(dh / h), and one phase of each position is free.
-    With `exact`, the matrix includes the phase errors, as standard deviations require; it may then be singular.
+    Gradient and matrix are times n. Only phases count, and one phase of each position is free. With `exact`, the matrix
+    includes the phase errors, as standard deviations require. It may then be singular.
     """
-    change = change.flatten(1, 2)
-    safe = torch.where(total.abs() < 1e-9, torch.full_like(total, 1e-9), total)
-    match = torch.einsum("bnk,nfk->bnfk", safe.sgn(), scene.channel.conj())
-    sum_ = match.sum(-1)
-    better = sum_.abs().argmax(-1)
-    pick = better[..., None, None].expand(*better.shape, 1, match.shape[-1])
-    chosen = match.gather(2, pick)[:, :, 0]
-    mean = chosen.mean(-1)
+    match = total.sgn()[..., None] * scene.channel.conj().permute(2, 0, 1)[:, None]
+    better = match.sum(0).abs().argmax(-1, keepdim=True)
+    chosen = match.gather(-1, better.expand(*total.shape, 1))[..., 0]
+    mean = chosen.mean(0)
     score = 1 - mean.abs().square().mean(-1)
-    error = chosen * torch.polar(torch.ones_like(mean.abs()), -mean.angle())[..., None]
-    inverse = (1 / safe)[:, None]
-    turn = (change.real * inverse.imag + change.imag * inverse.real).clamp(-1e3, 1e3)
-    turn = turn - turn.mean(-1, keepdim=True)
-    weight = mean.abs()[:, None, :, None] / match.shape[-1]
-    slope = (turn * weight * error.imag[:, None]).sum(-1)
-    curve = torch.einsum("bqnk,brnk->bqr", turn * weight * (error.real[:, None] if exact else 1), turn)
-    return score, slope, curve
+    error = chosen * (mean.conj() / len(chosen))  # |mean| exp(-j arg mean) / K
+    turn = jacobian.clamp(-1e3, 1e3)
+    turn = turn - turn.mean(0)
+    slope = (turn * error.imag[:, :, None]).sum(0)
+    weight = error.real[:, :, None] if exact else mean.abs()[:, None] / len(chosen)
+    return score, slope, ((turn * weight) @ turn.mT).sum(0)
 
 
 def refine(
@@ -125,8 +135,9 @@ def refine(
         limit: Maximum movement [m] or tilt [rad] of a plane in one step.
     """
     damping = torch.full((len(normal),), 1e-2)
-    total, change = derivatives(scene, normal, offset, gain, sequence, tilt)
-    score, slope, curve = normal_equations(scene, total, change)
+    movement = image_jacobian(normal, offset, scene.transmitter, sequence, tilt)
+    jacobian = phase_jacobian(scene, normal, offset, gain, sequence, movement)
+    score, slope, curve = normal_equations(scene, *jacobian)
     planes = normal.shape[1]
     for _ in range(steps):
         diagonal = curve.diagonal(dim1=1, dim2=2)
@@ -143,8 +154,9 @@ def refine(
             turn = step[:, 2:].clamp(-limit, limit).double()
             trial_normal = normal + (turn.transpose(1, 2)[..., None] * across).sum(2)
             trial_normal = trial_normal / trial_normal.norm(dim=-1, keepdim=True)
-        total, change = derivatives(scene, trial_normal, trial_offset, trial_gain, sequence, tilt)
-        after = normal_equations(scene, total, change)
+            movement = image_jacobian(trial_normal, trial_offset, scene.transmitter, sequence, tilt)
+        jacobian = phase_jacobian(scene, trial_normal, trial_offset, trial_gain, sequence, movement)
+        after = normal_equations(scene, *jacobian)
         better = after[0] < score
         damping = torch.where(better, damping * 0.3, damping * 6).clamp(1e-6, 1e4)
         offset, gain = (torch.where(better[:, None], a, b) for a, b in ((trial_offset, offset), (trial_gain, gain)))
@@ -162,8 +174,9 @@ def offset_covariance(
     The sandwich estimator, inverse curvature around the scatter of the positions' gradients, counts unexplained paths as
     noise (P. J. Huber 1967).
     """
-    total, change = derivatives(scene, normal, offset, gain, sequence, tilt=False)
-    _, slope, curve = normal_equations(scene, total, change, exact=True)
+    movement = image_jacobian(normal, offset, scene.transmitter, sequence, tilt=False)
+    jacobian = phase_jacobian(scene, normal, offset, gain, sequence, movement)
+    _, slope, curve = normal_equations(scene, *jacobian, exact=True)
     n, q = len(scene), curve.shape[-1]
     inverse = torch.linalg.pinv(curve[0].double(), hermitian=True)
     scatter = slope[0].double() @ slope[0].double().T * (n / max(n - q, 1))

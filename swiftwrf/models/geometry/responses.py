@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from swiftwrf.models.geometry.images import PhaseObservations, field, sequences
+from swiftwrf.models.geometry.batched import batched_field, batched_score
+from swiftwrf.models.geometry.images import PhaseObservations, sequences
 
-N_INNER = 3  # planes whose combinations are scored at a time
+MAX_INNER = 1000  # combinations that are scored at a time
 
 
 @dataclass(frozen=True)
 class SteeringResponses:
-    """Waves of single and double reflections in P planes.
+    """Waves of single and double reflections in P planes, in the order of `batched` fields.
 
     Args:
-        single: Waves of each plane at each of its A offsets, complex64 (A, n, K).
-        double: Waves of each pair i < j of planes at all their offsets, both orders of reflection together, (A, B, n, K).
+        single: Waves of each plane at each of its A offsets, float32 (n, 2 K, A).
+        double: Waves of each pair i < j of planes at all their offsets, both orders of reflection together,
+            (n, 2 K, A, B).
     """
 
     single: list[Tensor]
@@ -31,59 +34,74 @@ class SteeringResponses:
     ) -> SteeringResponses:
         """Return the waves of planes with normals (P, 3) at offsets (A,) [m] with gains (A,); none are double at order 1."""
         single = [
-            field(scene, normal[i].expand(len(o), 1, 3), o[:, None], g[:, None], [(0,)])
+            batched_field(scene, normal[i].expand(len(o), 1, 3), o[:, None], g[:, None], [(0,)])
             for i, (o, g) in enumerate(zip(offset, gain, strict=True))
         ]
         double = {}
         for i, j in itertools.combinations(range(len(normal)), 2):
             both, pair = normal[[i, j]], torch.cartesian_prod(offset[i], offset[j])
-            chain = [s for s in sequences(both, min(order, 2)) if len(s) > 1]
-            gains = torch.cartesian_prod(gain[i], gain[j])
-            waves = field(scene, both.expand(len(pair), 2, 3), pair, gains, chain)
-            double[i, j] = waves.reshape(len(offset[i]), len(offset[j]), *waves.shape[1:])
+            if chain := [s for s in sequences(both, min(order, 2)) if len(s) > 1]:
+                gains = torch.cartesian_prod(gain[i], gain[j])
+                waves = batched_field(scene, both.expand(len(pair), 2, 3), pair, gains, chain)
+                double[i, j] = waves.unflatten(-1, (len(offset[i]), len(offset[j])))
         return cls(single, double)
 
     def at(self, rows: list[Tensor]) -> SteeringResponses:
         """Return the waves at the given offset numbers (A,) of each plane."""
-        double = {(i, j): waves[rows[i]][:, rows[j]] for (i, j), waves in self.double.items()}
-        return SteeringResponses([waves[r] for waves, r in zip(self.single, rows, strict=True)], double)
+        double = {(i, j): w.index_select(2, rows[i]).index_select(3, rows[j]) for (i, j), w in self.double.items()}
+        return SteeringResponses([w.index_select(2, r) for w, r in zip(self.single, rows, strict=True)], double)
+
+    def of_choices(self, rows: list[Tensor]) -> Tensor:
+        """Return the fields (n, 2 K, C) of C combinations with these offset numbers (C,) of each plane."""
+        total = torch.zeros(())
+        for waves, r in zip(self.single, rows, strict=True):
+            total = total + waves.index_select(-1, r)
+        for (i, j), waves in self.double.items():
+            total += waves.flatten(2).index_select(-1, rows[i] * waves.shape[-1] + rows[j])
+        return total
 
     def moved(self, direct: Tensor, moving: tuple[int, ...]) -> tuple[Tensor, SteeringResponses]:
-        """Return the field (n, K) of the planes that stay at their first offsets, with the direct wave.
+        """Return the field (n, 2 K, 1) of the planes that stay at their first offsets, with the direct wave.
 
         Also return the waves that the moving planes add to it.
         """
         stay = [i for i in range(len(self.single)) if i not in moving]
-        base = sum((self.single[i][0] for i in stay), start=direct)
-        base = sum((self.double[pair][0, 0] for pair in itertools.combinations(stay, 2)), start=base)
+        base = sum((self.single[i][..., :1] for i in stay), start=direct)
+        base = sum((d[..., 0, :1] for (i, j), d in self.double.items() if {i, j} <= {*stay}), start=base)
         single = []
         for i in moving:
-            beside = [self.double[i, j][:, 0] if i < j else self.double[j, i][0] for j in stay]
-            single.append(sum(beside, start=self.single[i]))
-        double = {(p, q): self.double[i, j] for (p, i), (q, j) in itertools.combinations(enumerate(moving), 2)}
+            before = [self.double[j, i][..., 0, :] for j in stay if (j, i) in self.double]
+            after = [self.double[i, j][..., 0] for j in stay if (i, j) in self.double]
+            single.append(sum([*before, *after], start=self.single[i]))
+        pairs = itertools.combinations(enumerate(moving), 2)
+        double = {(p, q): self.double[i, j] for (p, i), (q, j) in pairs if (i, j) in self.double}
         return base, SteeringResponses(single, double)
 
     def scores(self, scene: PhaseObservations, base: Tensor) -> Tensor:
-        """Return the scores (A, B, ...) of all combinations of the planes' offsets, added to a field (n, K)."""
-        planes = len(self.single)
-        outer, inner = range(max(planes - N_INNER, 0)), range(max(planes - N_INNER, 0), planes)
-        among = base
+        """Return the scores (A, B, ...) of all combinations of the planes' offsets, added to a field (n, 2 K, 1)."""
+        size = [waves.shape[-1] for waves in self.single]
+        begin = next(i for i in range(len(size)) if math.prod(size[i:]) <= MAX_INNER or i == len(size) - 1)
+        outer, inner = range(begin), range(begin, len(size))
+        choices = list(itertools.product(*map(range, size[:begin])))
+        first = SteeringResponses(self.single[:begin], {p: w for p, w in self.double.items() if p[1] < begin})
+        fixed = base + first.of_choices(list(torch.tensor(choices, dtype=torch.int64).reshape(len(choices), begin).T))
+        among = torch.zeros(())
         for i, j in itertools.combinations(inner, 2):
-            among = among + _spread(self.double[i, j], [i - inner.start, j - inner.start], len(inner))
+            if (i, j) in self.double:
+                among = among + _spread(self.double[i, j], [i - begin, j - begin], len(inner))
         found = []
-        for choice in itertools.product(*[range(len(self.single[i])) for i in outer]):
-            total = among + sum(self.single[i][choice[i]] for i in outer)
-            total = total + sum(self.double[i, j][choice[i], choice[j]] for i, j in itertools.combinations(outer, 2))
-            for axis, j in enumerate(inner):
-                own = sum((self.double[i, j][choice[i]] for i in outer), start=self.single[j])
-                total = total + _spread(own, [axis], len(inner))
-            found.append(scene.score(total))
-        return torch.stack(found).reshape([len(waves) for waves in self.single])
+        for choice, stay in zip(choices, fixed.split(1, dim=-1), strict=True):
+            total = _spread(stay, [0], len(inner))
+            for axis, j in enumerate(inner):  # small sums first
+                beside = [self.double[i, j][..., choice[i], :] for i in outer if (i, j) in self.double]
+                total = total + _spread(sum(beside, start=self.single[j]), [axis], len(inner))
+            found.append(batched_score(scene, (total + among).flatten(2)))
+        return torch.cat(found).reshape(size)
 
 
 def _spread(waves: Tensor, axes: list[int], k: int) -> Tensor:
-    """Return waves (A, [B,] n, K) with their first dimensions at the given ones of k dimensions."""
+    """Return waves (n, 2 K, A, [B]) with their last dimensions at the given ones of k dimensions."""
     shape = [1] * k
-    for axis, size in zip(axes, waves.shape, strict=False):
+    for axis, size in zip(axes, waves.shape[2:], strict=True):
         shape[axis] = size
-    return waves.reshape(*shape, *waves.shape[-2:])
+    return waves.reshape(*waves.shape[:2], *shape)

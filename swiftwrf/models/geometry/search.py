@@ -18,7 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from swiftwrf.models.geometry.images import PhaseObservations, field, phase_period_m, sequences
+from swiftwrf.models.geometry.batched import batched, batched_field, batched_score
+from swiftwrf.models.geometry.images import PhaseObservations, phase_period_m, sequences
 from swiftwrf.models.geometry.refine import refine
 from swiftwrf.models.geometry.responses import SteeringResponses
 
@@ -34,7 +35,6 @@ PERFECT_SCORE = 2e-6  # needs no further moves
 N_STARTS = 2 * len(SIGNS)  # of a search
 MAX_START_RATIO = 1.4  # of a start's score and the best one, beyond which the start is given up
 Alternatives = list[list[tuple[float, float]]]  # offset [m] and gain, for each side
-BATCH_SIZE = 256  # candidates
 MAX_ALTERNATIVES = {2: 99, 3: 7, 4: 4}  # of each side, by the number of sides that move at once
 SEARCH_ORDER = 2  # reflections of an image while planes move together
 N_MINIMA = 8  # of a scan, for each side
@@ -78,7 +78,7 @@ class Search:
         near = (both @ SIDES.T).amax(0)
         self.step = 0.5 / scene.wavenumber
         self.offsets = [n + torch.arange(self.step, reach, self.step, dtype=torch.float64) for n in near]
-        self.direct = scene.wave(scene.transmitter)
+        self.direct = batched(scene.wave(scene.transmitter))
 
     @cached_property
     def single(self) -> list[Tensor]:
@@ -86,38 +86,32 @@ class Search:
         return [self._waves(SIDES[i : i + 1], o[:, None]) for i, o in enumerate(self.offsets)]
 
     def _waves(self, normal: Tensor, offset: Tensor) -> Tensor:
-        """Return the waves of single reflections with gain 1, (C, n, K), at offsets (C, 1)."""
+        """Return the waves of single reflections with gain 1, (n, 2 K, C), at offsets (C, 1)."""
         one = torch.ones(len(offset), 1)
-        return field(self.scene, normal.expand(len(offset), 1, 3), offset, one, [(0,)])
+        return batched_field(self.scene, normal.expand(len(offset), 1, 3), offset, one, [(0,)])
 
     def total(self, room: CandidateRoom, order: int) -> Tensor:
-        """Return the field of a room with images up to an order, (n, K)."""
+        """Return the field of a room with images up to an order, (n, 2 K, 1)."""
         if not room.offset:
             return self.direct
         normal, offset, gain = room.tensors()
-        return self.direct + field(self.scene, normal, offset, gain, sequences(normal[0], order))[0]
+        return self.direct + batched_field(self.scene, normal, offset, gain, sequences(normal[0], order))
 
     def scan(self, room: CandidateRoom, side: int, order: int) -> Tensor:
         """Return the scores (C,) over the offsets of a side, without the plane that the room has there."""
         rest = CandidateRoom(0.0, {i: o for i, o in room.offset.items() if i != side}, room.gain)
-        base, gain = self.total(rest, order), room.gain.get(side, self.usual[side])
+        gain, offsets = room.gain.get(side, self.usual[side]), self.offsets[side]
+        total = self.total(rest, order) + gain * self.single[side]
         sides = sorted([*rest.offset, side])
         own = sides.index(side)
-        chain = [s for s in sequences(SIDES[sides], order) if own in s and len(s) > 1]
-        gains = torch.tensor([[gain if i == side else rest.gain[i] for i in sides]])
-        values = []
-        for waves, offsets in zip(
-            self.single[side].split(BATCH_SIZE), self.offsets[side].split(BATCH_SIZE), strict=True
-        ):
-            h = base + gain * waves
-            if chain:
-                offset = torch.tensor([rest.offset.get(i, 0.0) for i in sides], dtype=torch.float64)
-                offset = offset.repeat(len(offsets), 1)
-                offset[:, own] = offsets
-                normal = SIDES[sides].expand(len(offsets), -1, -1)
-                h = h + field(self.scene, normal, offset, gains.expand(len(offsets), -1), chain)
-            values.append(self.scene.score(h))
-        return torch.cat(values)
+        if chain := [s for s in sequences(SIDES[sides], order) if own in s and len(s) > 1]:
+            offset = torch.tensor([rest.offset.get(i, 0.0) for i in sides], dtype=torch.float64)
+            offset = offset.repeat(len(offsets), 1)
+            offset[:, own] = offsets
+            gains = torch.tensor([gain if i == side else rest.gain[i] for i in sides]).expand(len(offsets), -1)
+            normal = SIDES[sides].expand(len(offsets), -1, -1)
+            total += batched_field(self.scene, normal, offset, gains, chain)
+        return batched_score(self.scene, total)
 
     def minima(self, room: CandidateRoom, side: int, order: int, top: int) -> list[tuple[float, float]]:
         """Return score and offset of the lowest local minima over the offsets of a side."""
@@ -134,7 +128,7 @@ class Search:
             by_sides.setdefault(tuple(sorted(room.offset)), []).append(room)
         for sides, group in by_sides.items():
             if not sides:
-                done += [CandidateRoom(float(self.scene.score(self.direct)))]
+                done += [CandidateRoom(float(batched_score(self.scene, self.direct)))]
                 continue
             normal, offset, gain = (torch.cat(t) for t in zip(*[r.tensors() for r in group], strict=True))
             chain = sequences(SIDES[list(sides)], order)
@@ -147,7 +141,7 @@ class Search:
 
     def beam(self, width: int, order: int) -> list[CandidateRoom]:
         """Return the best rooms of a beam search that adds one plane at a time."""
-        rooms = [CandidateRoom(float(self.scene.score(self.direct)))]
+        rooms = [CandidateRoom(float(batched_score(self.scene, self.direct)))]
         for _ in SIDES:
             pool: dict[tuple[tuple[int, int], ...], CandidateRoom] = {}
             for room in rooms:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.models.geometry.ambiguity import phase_alternatives
+from swiftwrf.models.geometry.batched import batched, batched_field, batched_score
 from swiftwrf.models.geometry.images import PhaseObservations, field, phase_period_m
 from swiftwrf.models.geometry.planes import (
     Plane,
@@ -18,6 +19,7 @@ from swiftwrf.models.geometry.planes import (
     advantage,
     correlation_score,
     log_explained,
+    refined,
     sign_alternatives,
 )
 from swiftwrf.models.geometry.refine import offset_covariance
@@ -93,12 +95,13 @@ def _nearest_alternative(
     rest = [s for s in room.sequence if plane not in s]
     own = [s for s in room.sequence if plane in s]
     base = scene.wave(scene.transmitter) + field(scene, room.normal, room.offset, room.gain, rest)[0]
-    value = torch.stack([scene.score(base + field(scene, room.normal, o[None], room.gain, own)[0]) for o in offset])
+    expanded = room.normal.expand(len(offset), -1, -1), offset, room.gain.expand(len(offset), -1)
+    value = batched_score(scene, batched(base) + batched_field(scene, *expanded, own))
     moved = room.offset.clone()
     moved[:, plane] += beside[value.argmin()]
     here = log_explained(scene.coherence(room.field(scene)))
     nearest = math.inf, 0.0
-    near = [other.refined(scene, 5) for other in (replace(room, offset=moved), *sign_alternatives(scene, room, plane))]
+    near = refined([replace(room, offset=moved), *sign_alternatives(scene, room, plane)], scene, 5)
     for other, there in [*((o, log_explained(scene.coherence(o.field(scene)))) for o in near), *alternatives]:
         distance = abs(float(other.offset[0, plane] - room.offset[0, plane]))
         if distance > period / 4:

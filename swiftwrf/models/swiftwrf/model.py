@@ -12,7 +12,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.models.base import FIELD_MODELS, FieldModel, FitContext
+from swiftwrf.models.base import FieldModel, FitContext
 from swiftwrf.models.swiftwrf.config import FitConfig, ModelConfig
 from swiftwrf.models.swiftwrf.field import DeformableGaussians
 from swiftwrf.models.swiftwrf.fit import MAX_PRIMITIVES, fit_field
@@ -23,7 +23,6 @@ from swiftwrf.runtime.session import Record
 MAX_CACHED_VALUES = 2**26  # float32 values that one model caches: 256 MiB
 
 
-@FIELD_MODELS.register("swiftwrf")
 class SwiftWRF(FieldModel):
     """2D Gaussians whose parameters deform with the position (M. Liu et al., 2025).
 

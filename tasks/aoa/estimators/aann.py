@@ -1,12 +1,8 @@
 """The angular neural network: ResNet-50 with a small head (paper, section 6; iArk 2020).
 
-The paper leaves head, loss and schedule open. Here the head predicts a unit vector, so that azimuths of 359 and 1 degree are
-neighbours and the pole needs no special case. The vector is an offset from the mean training direction in units of the
-labels' spread, so that training starts from the constant estimator.
-
-After training, the head is replaced by kernel ridge regression on the network's features and the raw pixels, because a short
-training leaves the head under-fitted. Features separate training spectra better than unseen ones (over-fitting), so their
-distance is down-weighted by 1 / (1 + HALF_TRUST_SPECTRA / n) for n training spectra.
+The paper leaves the perceptron that is the head, loss and schedule open. Here the head predicts a unit vector, so that
+azimuths of 359 and 1 degree are neighbours and the pole needs no special case. The vector is an offset from the mean
+training direction in units of the labels' spread, so that training starts from the constant estimator.
 """
 
 from __future__ import annotations
@@ -17,7 +13,6 @@ import time
 from typing import Any, Self
 
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch import distributed as dist
 from torch.nn import functional
@@ -31,8 +26,7 @@ from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.progress import progress
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, configuration
 from tasks.aoa.estimators.base import ESTIMATORS, EstimatorConfig, SavedEstimator
-from tasks.aoa.estimators.radial import RadialRegression, coarse_pixels, kept_rows
-from tasks.aoa.estimators.resnet import FEATURES, backbone, distributed
+from tasks.aoa.estimators.resnet import backbone, distributed
 from tasks.run import Preset
 from tasks.torchrun import distribute, process_count
 
@@ -41,8 +35,7 @@ EVALUATIONS = 30  # of each spectrum of a scene in a quick training
 MAX_QUICK_STEPS = 1000
 WARM_UP_FRACTION = 0.11  # of the steps with a rising learning rate; if one in a whole number, torch would divide by 0
 MAX_NORM_SPECTRA = 512  # spectra for the final statistics of the batch norms
-MAX_FEATURE = 1e4  # larger features are clipped; typical ones are a thousandth of that
-HALF_TRUST_SPECTRA = 1000  # training spectra after which squared distances of features count half
+BATCH_SPECTRA = 64  # spectra that pass through the trained network at a time
 
 
 @configuration
@@ -67,8 +60,9 @@ class AANNConfig(EstimatorConfig):
 
     @classmethod
     def quick(cls, n_spectra: int, **options: Any) -> Self:
-        """Return options whose steps grow with the scene: 125 steps under-fit 1,500 spectra."""
-        return cls(steps=min(max(round(EVALUATIONS * n_spectra / cls.batch), cls.steps), MAX_QUICK_STEPS), **options)
+        """Return options whose steps grow with the scene: few steps under-fit 1,500 spectra."""
+        steps = round(EVALUATIONS * n_spectra / cls.batch)
+        return cls(steps=min(max(steps, cls.steps), MAX_QUICK_STEPS), **options)
 
     @classmethod
     def paper(cls, **options: Any) -> Self:
@@ -78,7 +72,7 @@ class AANNConfig(EstimatorConfig):
 
 @ESTIMATORS.register("aann")
 class AANN(SavedEstimator):
-    """ResNet-50 whose head is replaced by kernel regression after the training, from a seeded start without downloads.
+    """ResNet-50 and a multilayer perceptron, the network of the paper, from a seeded start without downloads.
 
     The processes of torchrun share each batch and its statistics in the batch norms. They train the network of one process,
     up to the rounding of sums.
@@ -90,7 +84,7 @@ class AANN(SavedEstimator):
         torch.Size([20, 2])
     """
 
-    kind = "angle-of-arrival network"
+    kind = "angular neural network"
     config_type = AANNConfig
 
     def _build(self, device: torch.device) -> None:
@@ -113,6 +107,10 @@ class AANN(SavedEstimator):
         return (2 * small - 1).to(self._device, memory_format=torch.channels_last)
 
     def _fit(self, train: Mixed, device: torch.device) -> None:
+        self._fit_network(train, device)
+
+    def _fit_network(self, train: Mixed, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Train the network. Return the prepared spectra and their unit vectors (n, 3)."""
         self._build(device)
         config, network = self.config, self._network
         generator = torch.Generator().manual_seed(config.seed)
@@ -126,6 +124,7 @@ class AANN(SavedEstimator):
         mean = functional.normalize(direction.mean(dim=0), dim=0)
         spread = (direction - mean).square().sum(dim=1).mean().sqrt().clamp_min(1e-4)
         batches = _batches(len(train), size, config.steps, generator)
+        self._offset = torch.cat([mean, spread[None]]).cpu()
         given = prepared, direction, mean, spread
         if process_count() > 1:
             away = copy.deepcopy(network).cpu()
@@ -136,66 +135,49 @@ class AANN(SavedEstimator):
         # a short training leaves the batch norms' running statistics behind the weights, so they are computed again
         some = torch.randperm(len(train), generator=generator)[:MAX_NORM_SPECTRA]
         with _autocast(device):
-            update_bn(prepared[some].tensor_split(math.ceil(len(some) / 64)), network)  # parts of equal weight
+            update_bn(
+                prepared[some].tensor_split(math.ceil(len(some) / BATCH_SPECTRA)), network
+            )  # parts of equal weight
         network.eval()
         with torch.no_grad():
             for value in network.state_dict().values():
-                value.copy_(_halved(value))
-        rows = torch.from_numpy(kept_rows(len(train), config.seed))
-        self._replace_head(prepared[rows], direction[rows], 1 / (1 + HALF_TRUST_SPECTRA / len(train)))
-
-    def _replace_head(self, prepared: Tensor, direction: Tensor, trust: float) -> None:
-        """Fit the regression that replaces the head.
-
-        Args:
-            prepared: Prepared spectra.
-            direction: Unit vectors (n, 3).
-            trust: Weight of squared distances of features.
-        """
-        features = self._features(prepared)
-        self._scale = torch.stack([_scale_of(part) for part in features])
-        self._scale[0] /= math.sqrt(trust)
-        target = direction.double().cpu().numpy()
-        self._direction = RadialRegression.fit(self._scaled(features), target, self.config.seed)
+                value.copy_(halved(value))
+        return prepared, direction
 
     @torch.no_grad()
-    def _features(self, prepared: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the network's features (n, 2048) of prepared spectra, and their coarse pixels (n, p), on the CPU."""
-        without_head = nn.Sequential(*list(self._network.children())[:-1])
-        with _autocast(self._device):
-            features = torch.cat([without_head(part).flatten(1).float() for part in prepared.split(64)])
-        # if all spectra are equal, batch norms amplify rounding errors
-        return torch.nan_to_num(features).clamp(max=MAX_FEATURE).cpu(), coarse_pixels(prepared[:, 0]).float().cpu()
-
-    def _scaled(self, features: tuple[Tensor, Tensor]) -> NDArray[Any]:
-        """Return features and pixels divided by their scales, (n, 2048 + p), with the precision of a file."""
-        scaled = torch.cat([part / scale for part, scale in zip(features, self._scale, strict=True)], dim=1)
-        rounded: NDArray[Any] = _halved(scaled).double().numpy()
-        return rounded
-
     def predict(self, spectra: Tensor) -> Tensor:
-        direction = torch.from_numpy(self._direction(self._scaled(self._features(self._prepare(spectra)))))
-        return torch.stack(to_angles(direction), dim=-1)
+        mean, spread = self._offset[:3], self._offset[3]
+        direction = functional.normalize(mean + spread * self._passed(self._network, self._prepare(spectra)), dim=1)
+        return torch.stack(to_angles(direction.double()), dim=-1)
+
+    @torch.no_grad()
+    def _passed(self, network: nn.Module, prepared: Tensor) -> Tensor:
+        """Return the outputs (n, k) of the network, or of a part of it, on the CPU."""
+        with _autocast(self._device):
+            outputs = [network(part).flatten(1).float().cpu() for part in prepared.split(BATCH_SPECTRA)]
+        # if all spectra are equal, batch norms amplify rounding errors
+        return torch.nan_to_num(torch.cat(outputs), posinf=0, neginf=0)
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
-        weights = {f"network.{name}": value for name, value in self._network.state_dict().items()}
-        regression, header = self._direction.state()
-        halved = {name: _halved(value) for name, value in (weights | {"known": regression.pop("known")}).items()}
-        return halved | regression | {"scale": self._scale}, header
+        return self._weights() | {"offset": self._offset}, {}
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
+        self._restore_network(tensors, {"offset": (4,)})
+        self._offset = tensors["offset"]
+
+    def _weights(self) -> dict[str, Tensor]:
+        """Return the network's tensors by their names in a file."""
+        return {f"network.{name}": halved(value) for name, value in self._network.state_dict().items()}
+
+    def _restore_network(self, tensors: dict[str, Tensor], others: dict[str, tuple[int, ...]]) -> None:
+        """Take the network over from a file, checking the shapes of its tensors and of others first."""
         self._build(torch.device("cpu"))
         weights = self._network.state_dict()
-        expect(tensors, {f"network.{name}": tuple(value.shape) for name, value in weights.items()} | {"scale": (2,)})
+        expect(tensors, {f"network.{name}": tuple(value.shape) for name, value in weights.items()} | others)
         self._network.load_state_dict(
             {name: tensors[f"network.{name}"].to(value.dtype) for name, value in weights.items()}
         )
         self._network.eval()
-        self._scale = tensors["scale"]
-        if not bool((self._scale > 0).all()):
-            raise InputError(f"scales must be positive, got {self._scale.tolist()}")
-        pixels = coarse_pixels(self._prepare(torch.zeros(1, *self.grid.shape))[:, 0]).shape[1]
-        self._direction = RadialRegression.from_state(tensors, header, FEATURES + pixels, 3)
 
 
 def _batches(rows: int, size: int, steps: int, generator: torch.Generator) -> Tensor:
@@ -260,13 +242,7 @@ def _autocast(device: torch.device) -> torch.autocast:
     return torch.autocast(device.type, torch.bfloat16, enabled=_gains_from_bfloat16(device))
 
 
-def _scale_of(rows: Tensor) -> Tensor:
-    """Return the root mean square distance of rows (n, p) from their mean, at least a thousandth of that from 0."""
-    spread, size = ((rows - origin).square().sum(dim=1).mean().sqrt() for origin in (rows.mean(dim=0), 0))
-    return torch.maximum(spread, 1e-3 * size).clamp_min(1e-6)
-
-
-def _halved(value: Tensor) -> Tensor:
+def halved(value: Tensor) -> Tensor:
     """Return floating-point values in half precision, the precision of a file."""
     return value.half() if value.is_floating_point() else value
 

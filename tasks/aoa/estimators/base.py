@@ -116,7 +116,7 @@ def make_estimator(name: str, n_spectra: int = 0, preset: Preset = "quick", **op
     """Return an estimator by its name.
 
     Args:
-        name: Name in the registry, e.g. "kernel_ridge".
+        name: Name in the registry, e.g. "kernel_regression".
         n_spectra: Number of training spectra of the scene, which determines the length of a training.
         preset: Size and length of the training.
         options: Options such as the seed.
@@ -125,7 +125,7 @@ def make_estimator(name: str, n_spectra: int = 0, preset: Preset = "quick", **op
         InputError: An unknown name, or a value outside its range.
 
     Example:
-        >>> make_estimator("kernel_ridge", seed=3).config.seed
+        >>> make_estimator("kernel_regression", seed=3).config.seed
         3
     """
     estimator: type[Estimator] = ESTIMATORS[name]

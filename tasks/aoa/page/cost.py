@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from pandas import DataFrame, concat
 
 from swiftwrf.models import FIELD_MODELS
@@ -14,40 +16,63 @@ from tasks.summarise import SHORTEST, rms_of_psnr
 
 
 def speed_section(fraction: FractionRecords) -> Section:
-    """Return the time of each field model and estimator against its error."""
+    """Return the time of each field model and of each estimator against its error."""
+    return Section(
+        f"Speed against error ({fraction.title})", plots=[_synthesizer_speed(fraction), _estimator_speed(fraction)]
+    )
+
+
+def _synthesizer_speed(fraction: FractionRecords) -> Plot:
     synthesis = {name: scores for name, scores in fraction.mix["synthesis"].items() if name in FIELD_MODELS}
-    methods = {name: fraction.mix["methods"][name] for name in fraction.in_overviews}
-    error = {name: rms_of_psnr(scores["psnr_db"]["median"]) for name, scores in synthesis.items()}
-    fit = {name: max(scores["seconds"]["fit"], SHORTEST) for name, scores in synthesis.items()}
-    draw = {name: max(scores["seconds"]["synthesize"], SHORTEST) for name, scores in synthesis.items()}
-    estimators = {
-        name: (max(sum(method["seconds"].values()), SHORTEST), method["great_circle_deg"]["median"])
-        for name, method in methods.items()
+    points = {
+        stage: {
+            name: (max(scores["seconds"][stage], SHORTEST), rms_of_psnr(scores["psnr_db"]["median"]))
+            for name, scores in synthesis.items()
+        }
+        for stage in ("fit", "synthesize")
     }
-    palette = fraction.palette
-    figure, axes = figures.new_figure(1, 3, 12, 4.2)
-    for ax, stage, seconds in zip(axes, ("fit", "synthesize"), (fit, draw), strict=False):
-        points = {name: (seconds[name], error[name]) for name in synthesis}
-        figures.speed(ax, palette, points, f"seconds to {stage}", "RMS error of a spectrum", also=["swiftwrf"])
-    figures.speed(axes[2], palette, estimators, "seconds to train and estimate", "median great-circle error [deg]")
+    caption = "Synthesizers: seconds to fit and to predict the test spectra. The line is the Pareto front."
+    return _speed(
+        f"speed-{fraction.file_name}", fraction, points, "RMS error of a spectrum", caption, also=["swiftwrf"]
+    )
+
+
+def _estimator_speed(fraction: FractionRecords) -> Plot:
+    """Return the figure of the networks on all training sets, and of the other estimators on the measured spectra."""
+    methods = {name: fraction.mix["methods"][name] for name in fraction.in_overviews}
+    count = {"train": 1, "estimate a spectrum": fraction.run.metrics["n_test"]}
+    points = {
+        stage: {
+            name: (
+                max(method["seconds"][stage.partition(" ")[0]] / n, SHORTEST),
+                method["great_circle_deg"]["median"],
+            )
+            for name, method in methods.items()
+        }
+        for stage, n in count.items()
+    }
     caption = (
-        "Left and middle: synthesizers, seconds to fit and to predict the test spectra. Right: estimators, without the "
-        "synthesizer's time. The line is the Pareto front."
+        "Estimators: seconds to train, without the synthesizer's time, and to estimate the direction of one spectrum. The "
+        "line is the Pareto front."
     )
-    figures.legend_of(figure, palette, [*synthesis, *methods])
-    data = concat(
-        [
-            DataFrame({"name": name, "stage": stage, "seconds": seconds[name], "rms_error": error[name]}, index=[0])
-            for stage, seconds in (("fit", fit), ("synthesize", draw))
-            for name in synthesis
-        ]
-        + [
-            DataFrame({"name": name, "stage": "train and estimate", "seconds": cost, "error_deg": wrong}, index=[0])
-            for name, (cost, wrong) in estimators.items()
-        ]
-    )
-    plot = Plot(f"speed-{fraction.file_name}", figure, caption, data)
-    return Section(f"Speed against error ({fraction.title})", plots=[plot])
+    return _speed(f"estimators-{fraction.file_name}", fraction, points, "median angular error [deg]", caption)
+
+
+def _speed(
+    name: str,
+    fraction: FractionRecords,
+    points: dict[str, dict[str, tuple[float, float]]],
+    error: str,
+    caption: str,
+    also: Sequence[str] = (),
+) -> Plot:
+    """Return a figure of seconds against error, one panel for each stage."""
+    figure, axes = figures.new_figure(1, len(points), 10, 4.2)
+    for ax, (stage, of_stage) in zip(axes, points.items(), strict=True):
+        figures.speed(ax, fraction.palette, of_stage, f"seconds to {stage}", error, also=also)
+    figures.legend_of(figure, fraction.palette, list(next(iter(points.values()))))
+    rows = [(method, stage, *point) for stage, of_stage in points.items() for method, point in of_stage.items()]
+    return Plot(name, figure, caption, DataFrame(rows, columns=["name", "stage", "seconds", "error"]))
 
 
 def sizes(runs: list[AoaRecords]) -> list[Plot]:

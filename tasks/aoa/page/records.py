@@ -9,9 +9,11 @@ from functools import cached_property
 from pandas import DataFrame
 
 from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.condition import AUTO, Condition, conditions_of, fraction_key
+from tasks import labels
+from tasks.aoa.condition import Condition, conditions_of
+from tasks.aoa.former import table_with_present_names, with_present_names
+from tasks.aoa.options import AUTO, fraction_key
 from tasks.metrics import AoaMetrics, MixMetrics
-from tasks.page import labels
 from tasks.page.palette import Palette
 from tasks.page.records import Records
 
@@ -40,15 +42,21 @@ class FractionRecords:
         """Return all measured fractions of a run."""
         return [cls(run, key) for key in run.metrics["mixes"]]
 
-    @property
+    @cached_property
     def mix(self) -> MixMetrics:
         """Metrics of the measured fraction."""
-        return self.run.metrics["mixes"][self.key]
+        metrics: MixMetrics = with_present_names(self.run.metrics["mixes"][self.key])
+        return metrics
 
     @cached_property
     def conditions(self) -> dict[str, Condition]:
         """Condition of each method."""
         return conditions_of(self.mix["methods"])
+
+    @property
+    def medians(self) -> dict[str, float]:
+        """Median angular error [deg] of each method."""
+        return {name: method["great_circle_deg"]["median"] for name, method in self.mix["methods"].items()}
 
     @property
     def in_overviews(self) -> list[str]:
@@ -57,7 +65,7 @@ class FractionRecords:
 
     def table(self, name: str) -> DataFrame:
         """Return the rows of a table of the run, e.g. `errors`, with this measured fraction."""
-        return of_fraction(self.run.table(name), self.key)
+        return table_with_present_names(of_fraction(self.run.table(name), self.key))
 
     def synthesizers(self, methods: Iterable[str]) -> list[str]:
         """Return the field models behind these methods, that of the first repeat where repeats chose differently."""

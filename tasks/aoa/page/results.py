@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from tasks.aoa.condition import LOCATOR, NETWORK, terms, trainable
+from tasks.aoa.condition import LOCATOR, terms
+from tasks.aoa.page.gains import gain_table
 from tasks.aoa.page.records import FractionRecords, palette
 from tasks.metrics import Angle, ErrorSummary
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
 from tasks.page.provenance import number
+from tasks.page.records import notes
 
 ERRORS: dict[Angle, str] = {
     "azimuth_deg": "azimuth",
@@ -20,7 +22,7 @@ ERRORS: dict[Angle, str] = {
 }
 # median elevation and azimuth errors in degrees by measured fraction (paper, table of the AoA case study)
 PAPER = {"0.1": (0.592, 1.769), "0.3": (0.5527, 1.7369), "0.5": (0.410, 1.498), "0.7": (0.370, 1.173)}
-OFF_SCALE = ("peak", "constant")  # with errors so large that they would hide the differences of the others
+MUST_BEAT = ("peak", "constant")  # estimators that others must beat; their errors may leave the axes
 
 
 def results_section(fraction: FractionRecords, several: bool) -> Section:
@@ -34,7 +36,7 @@ def results_section(fraction: FractionRecords, several: bool) -> Section:
     ]
     columns = ["method", *(f"{name} [deg]" for name in ERRORS.values()), "great circle, 90 %"]
     strong = frozenset(name for name, condition in fraction.conditions.items() if condition.is_turbo)
-    paragraphs = [f"{note}." for note in fraction.run.metrics.get("notes", ())]
+    paragraphs = notes(fraction.run)
     if fraction.key in PAPER:
         elevation, azimuth = PAPER[fraction.key]
         paragraphs.append(
@@ -44,7 +46,9 @@ def results_section(fraction: FractionRecords, several: bool) -> Section:
     table = Table(columns, rows, "Median error with its 95 % interval over the test spectra.", strong)
     parts = [[name, *(str(n) for n in counts.values())] for name, counts in fraction.mix["counts"].items()]
     origin = Table(["training set", "measured", "withheld positions", "further positions"], parts, "Spectra by origin.")
-    return Section(title, paragraphs, [table, origin], [_cdf(fraction), *_turbo_cdf(fraction)], terms())
+    return Section(
+        title, paragraphs, [table, *gain_table(fraction), origin], [_cdf(fraction), *_turbo_cdf(fraction)], terms()
+    )
 
 
 def estimator_section(fraction: FractionRecords) -> Section | None:
@@ -53,11 +57,11 @@ def estimator_section(fraction: FractionRecords) -> Section | None:
     if choice is None:
         return None
     held_out = sorted(choice["held_out_deg"].items(), key=lambda item: item[1])
-    tested = {name: method["great_circle_deg"]["median"] for name, method in fraction.mix["methods"].items()}
-    rows = [[name, number(error), number(tested.get(name))] for name, error in held_out]
+    rows = [[name, number(error), number(fraction.medians.get(name))] for name, error in held_out]
+    rows += [[name, "", number(fraction.medians[name])] for name in MUST_BEAT if name in fraction.medians]
     caption = (
         f"Median angular error over {choice['n_held_out']} held-out measured spectra, and over the test spectra, which "
-        "take no part in the choice."
+        "take no part in the choice. Estimators without a held-out error are no candidates."
     )
     table = Table(["method", "held out [deg]", "test [deg]"], rows, caption, frozenset({choice["name"]}))
     return Section(f"Which estimator? ({fraction.percent} measured)", [choice_sentence(fraction)], [table])
@@ -88,7 +92,7 @@ def _cdf(fraction: FractionRecords) -> Plot:
     figure, axes = figures.new_figure(1, 3, 12, 3.8)
     for ax, (column, name) in zip(axes, ERRORS.items(), strict=True):
         groups = {str(method): part[column] for method, part in own.groupby("method", sort=False)}
-        shown = [float(part.quantile(0.95)) for method, part in groups.items() if method not in OFF_SCALE]
+        shown = [float(part.quantile(0.95)) for method, part in groups.items() if method not in MUST_BEAT]
         figures.cdf(ax, fraction.palette, groups, f"{name} error [deg]", limit=max(*shown, 1e-3))
     axes[1].set_ylabel("")
     axes[2].set_ylabel("")
@@ -101,10 +105,9 @@ def _cdf(fraction: FractionRecords) -> Plot:
 
 def _turbo_cdf(fraction: FractionRecords) -> list[Plot]:
     """Return the paper's figure if there are several field models: the network between its references, one curve a model."""
-    networks = {name: condition for name, condition in fraction.conditions.items() if condition.is_network}
-    if sum(condition.training == "turbo" for condition in networks.values()) < 2:
+    shown = [name for name, condition in fraction.conditions.items() if condition.is_network]
+    if sum(fraction.conditions[name].is_turbo for name in shown) < 2:
         return []
-    shown = [name for name, condition in networks.items() if condition.training != "turbo_extra"]
     own = fraction.table("errors")
     own = own[own["method"].isin(shown)]
     figure, axes = figures.new_figure(1, 2, 12, 3.8)
@@ -114,42 +117,41 @@ def _turbo_cdf(fraction: FractionRecords) -> list[Plot]:
         figures.cdf(ax, fraction.palette, groups, f"{name} error [deg]", limit=limit)
     axes[1].set_ylabel("")
     figures.legend_below(figure, axes[0])
-    caption = "The network with spectra of each synthesizer at the withheld positions, between its references."
+    caption = "The network with spectra of each synthesizer, between its references."
     return [Plot(f"turbo-{fraction.file_name}", figure, caption, own[["repeat", "index", "method", *ERRORS]])]
 
 
 def over_fractions(fractions: list[FractionRecords], name: str) -> Plot:
     """Return the median error of each condition against the measured fraction."""
-    conditions = {
-        name: fraction.conditions[name]
-        for fraction in fractions
-        for name in fraction.in_overviews
-        if name not in OFF_SCALE
-    }
+    conditions = {name: fraction.conditions[name] for fraction in fractions for name in fraction.in_overviews}
     labels = [fraction.percent for fraction in fractions]
     if len({fraction.run.place for fraction in fractions}) > 1:
         labels = [figures.short(f"{s.percent}\n{s.run.metrics['data']}\n{s.run.metrics['split']}") for s in fractions]
     heights = {method: [_median_and_interval(fraction, method) for fraction in fractions] for method in conditions}
     figure, axes = figures.new_figure(1, 1, 7.2, 4)
-    figures.bars(axes[0], palette(conditions.values()), labels, heights, "median great-circle error [deg]")
+    figures.bars(axes[0], palette(conditions.values()), labels, heights, "median angular error [deg]")
+    axes[0].set_yscale("log")
     figures.legend_below(figure, axes[0])
     caption = "Median error of each condition against the measured fraction; whiskers: 95 % intervals."
     return Plot(name, figure, caption, figures.bars_data("measured_fraction", labels, heights, "deg"))
 
 
 def over_estimators(fraction: FractionRecords) -> Plot:
-    """Return the errors of each trainable estimator on the measured spectra, with synthetic ones, and on all spectra."""
-    estimators, heights = trainable(), {}
-    if any(condition.estimator == LOCATOR for condition in fraction.conditions.values()):
-        estimators.append(LOCATOR)
+    """Return the errors of each estimator on the measured spectra, with synthetic ones, and on all spectra."""
+    networks = [condition.estimator for condition in fraction.conditions.values() if condition.is_network]
+    trained = {c.estimator for c in fraction.conditions.values() if c.training == "all"} - {LOCATOR}
+    located = any(condition.estimator == LOCATOR for condition in fraction.conditions.values())
+    estimators, heights = sorted(trained, key=lambda name: (name not in networks, name)), {}
+    estimators += [*([LOCATOR] if located else []), *(name for name in MUST_BEAT if name in fraction.conditions)]
     trainings = {condition.training_set: condition for condition in fraction.conditions.values()}
     for name, condition in trainings.items():
         methods = [replace(condition, estimator=estimator).method for estimator in estimators]
         heights[name] = [_median_and_interval(fraction, method) for method in methods]
-    colours = palette(replace(condition, estimator=NETWORK) for condition in trainings.values())
+    colours = palette(replace(condition, estimator=networks[0]) for condition in trainings.values())
     figure, axes = figures.new_figure(1, 1, 7.2, 4)
-    labels = [f"network ({name})" if name == NETWORK else name.replace("_", " ") for name in estimators]
-    figures.bars(axes[0], colours, labels, heights, "median great-circle error [deg]")
+    labels = [f"network ({name})" if name in networks else name.replace("_", " ") for name in estimators]
+    figures.bars(axes[0], colours, labels, heights, "median angular error [deg]")
+    axes[0].set_yscale("log")
     figures.legend_below(figure, axes[0])
     caption = f"Median error of each estimator on each training set, {fraction.title}; whiskers: 95 % intervals."
     return Plot("summary", figure, caption, figures.bars_data("estimator", estimators, heights, "deg"))

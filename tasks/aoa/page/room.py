@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from pandas import DataFrame, concat
 
 from swiftwrf.models import FIELD_MODELS
+from tasks import labels
 from tasks.aoa.page.records import FractionRecords
-from tasks.metrics import AdviceMetrics, GainMetrics
-from tasks.page import figures, labels
+from tasks.metrics import AdviceMetrics, ChangeMetrics, GainMetrics
+from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
 from tasks.page.provenance import number
 
@@ -22,7 +23,7 @@ MARGIN = 0.5  # [m] around the room in a plan
 FIXED, MEASURED, IMAGE = "#cc3311", "#4477aa", "#ee8866"
 
 
-def advice_of(fraction: FractionRecords) -> dict[str, AdviceMetrics]:
+def _advice_of(fraction: FractionRecords) -> dict[str, AdviceMetrics]:
     """Return the cross-validation of each field model, if it has further positions. Older runs have the chosen one alone."""
     advice: dict[str, Any] = dict(fraction.mix["advice"] or {})
     choice = fraction.mix["choice"]
@@ -34,10 +35,8 @@ def advice_of(fraction: FractionRecords) -> dict[str, AdviceMetrics]:
 def advice_sentences(fraction: FractionRecords) -> list[str]:
     """Return a text for each field model that was compared: does turbo learning help?"""
     texts = []
-    for name, advice in advice_of(fraction).items():
-        gains = [gain for gain in advice["gains"] if gain["sampled"] == advice["sampled"]]
-        best = min(gains, key=lambda gain: gain["median_deg"])
-        rule = advice.get("rule") or best  # older runs have the best number alone
+    for name, advice in _advice_of(fraction).items():
+        best, rule = _best_and_rule(advice)
         how = "chosen on other held-out spectra" if advice.get("rule") else "chosen on the same spectra"
         found = (
             f"Cross-validation inside the measured fraction ({advice['n_held_out']} spectra held out, {advice['stand_in']} "
@@ -46,14 +45,24 @@ def advice_sentences(fraction: FractionRecords) -> list[str]:
             f"{advice['measured_only_deg']:.2f} to {rule['median_deg']:.2f} degrees, with their number {how}. "
             f"The best number is {best['extra']}."
         )
-        if advice["helps"]:
-            verdict = f"Turbo learning helps here: use --extra {advice['recommended_extra']} with this fraction."
-        elif rule["low"] > 0:
-            verdict = "Turbo learning harms here: measure more instead, or use another synthesizer."
-        else:
-            verdict = "The change is not significant: more measured positions are the safer way."
-        texts.append(f"{found} {verdict}")
+        texts.append(f"{found} {_verdict(advice)}")
     return texts
+
+
+def _verdict(advice: AdviceMetrics) -> str:
+    """Return in one sentence whether turbo learning helps by a field model."""
+    if advice["helps"]:
+        return f"Turbo learning helps here: use --extra {advice['recommended_extra']} with this fraction."
+    if _best_and_rule(advice)[1]["low"] > 0:
+        return "Turbo learning harms here: measure more instead, or use another synthesizer."
+    return "The change is not significant: more measured positions are the safer way."
+
+
+def _best_and_rule(advice: AdviceMetrics) -> tuple[GainMetrics, ChangeMetrics]:
+    """Return the number with the lowest error, and the number chosen on other folds."""
+    gains = [gain for gain in advice["gains"] if gain["sampled"] == advice["sampled"]]
+    best = min(gains, key=lambda gain: gain["median_deg"])
+    return best, advice.get("rule") or best  # older runs have the best number alone
 
 
 def choice_section(fraction: FractionRecords) -> Section | None:
@@ -75,7 +84,7 @@ def choice_section(fraction: FractionRecords) -> Section | None:
     name = choice["name"]
     meaning = labels.labels(FIELD_MODELS, labels.FIELD_MODELS, [name])
     text = f"{name} predicts held-out measured spectra best" + (f": {meaning[name].meaning}." if meaning else ".")
-    plots = [_gain(fraction, *item) for item in advice_of(fraction).items()]
+    plots = [_gain(fraction, *item) for item in _advice_of(fraction).items()]
     title = f"Which synthesizer, and does it help? ({fraction.percent} measured)"
     return Section(title, [text, *advice_sentences(fraction)], [table], plots)
 

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from pandas import DataFrame, concat
 
 from swiftwrf.models import FIELD_MODELS
+from tasks import labels
 from tasks.aoa.page.records import FractionRecords
-from tasks.page import figures, labels
+from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
 from tasks.page.provenance import number
 

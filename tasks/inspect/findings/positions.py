@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data import Rssi, Snapshots, Spectra
+from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.positions import distance
 from tasks.inspect.findings.base import Findings
 
@@ -34,7 +35,7 @@ def check_positions(position: Tensor, findings: Findings, wavelength: float | No
     _, times = position.unique(dim=0, return_counts=True)
     same = int(times[times > 1].sum())
     if same:
-        findings.warn(f"{same} positions occur more than once; a random split puts the same place into both parts.")
+        findings.say(f"{same} positions occur more than once; the split random keeps each place in one part.")
     middle = float(near.median())
     findings.numbers["nearest_m"] = middle
     if wavelength is None:
@@ -77,3 +78,6 @@ def say_splits(data: Spectra | Snapshots | Rssi, findings: Findings) -> None:
     """Report the splits that came with the measurements."""
     for name, (train, test) in data.named_splits.items():
         findings.say(f"Split {name}: {len(train)} for training, {len(test)} for testing.")
+        position = data.transmitter_position if isinstance(data, Rssi) else data.position
+        if (repeated := repeated_fraction(position[train], position[test])) > MAX_REPEATED:
+            findings.warn(f"Split {name} tests look-up: {repeated:.0%} of its test rows are at training positions.")

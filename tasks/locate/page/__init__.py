@@ -6,12 +6,12 @@ import math
 
 from pandas import concat
 
+from tasks.labels import LOCALIZERS as LABELS
+from tasks.labels import labels
 from tasks.locate.localizers import LOCALIZERS
 from tasks.locate.page import drawing
 from tasks.locate.page.summary import OWN, LocateRecords, by_method, summary
 from tasks.locate.steps import SUGGESTED
-from tasks.page.labels import LOCALIZERS as LABELS
-from tasks.page.labels import labels
 from tasks.page.page import Page, Plot, Section, Table
 from tasks.page.provenance import number, provenance
 from tasks.page.suggestion import suggestion_plot
@@ -130,7 +130,7 @@ def _limits(run: LocateRecords) -> Section:
         "Intervals of medians treat test rows as independent. Along a walked path they are not, and the intervals are too "
         "narrow.",
         "Training and test rows are of one device and one time, unless the split separates these. Another device has "
-        "another offset.",
+        "another offset, which --offset-by COLUMN estimates if the table names devices.",
     ]
     if run.metrics["data"] == "simulated-floor":
         texts.append(

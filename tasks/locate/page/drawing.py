@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from pandas import DataFrame
 from scipy.stats import binomtest
 
+from tasks.labels import LOCALIZERS as LABELS
+from tasks.labels import labels
 from tasks.locate.localizers import LOCALIZERS
 from tasks.locate.page.summary import OWN
 from tasks.metrics import StudyMetrics
 from tasks.page import figures
-from tasks.page.labels import LOCALIZERS as LABELS
-from tasks.page.labels import labels
 from tasks.page.palette import Palette
 
 MAX_VECTOR_LINES = 300  # more lines become an image, so that the page stays small

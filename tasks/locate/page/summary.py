@@ -9,8 +9,9 @@ from pandas import DataFrame
 from tasks.locate.steps import MODEL
 from tasks.metrics import LocateMetrics
 from tasks.page.page import Number, Plot, Summary
-from tasks.page.records import Records
+from tasks.page.records import Records, notes
 from tasks.summarise import paired_difference
+from tasks.terminal import Answer
 
 LocateRecords = Records[LocateMetrics]
 OWN = "posterior"  # the localizer that all others are compared with
@@ -40,18 +41,26 @@ def summary(run: LocateRecords, picture: Plot) -> Summary:
             f"of the true positions lie in the {LEVEL:.0%} credible region that comes with each estimate",
         ),
     ]
-    rest = min((name for name in error if name != OWN), key=lambda name: error[name]["median"])
     receivers = run.metrics["n_receivers"]
     meaning = [
         f"On {run.scene}: {run.metrics['n_train']} training rows and {run.metrics['n_test']} test rows at {receivers} "
         f"{'receiver' if receivers == 1 else 'receivers'}.",
-        _against(run, rest),
+        *notes(run),
     ]
-    return Summary(numbers, picture, meaning, _next_steps(run))
+    return Summary(numbers, picture, meaning, _next_steps(run), verdict(run))
 
 
-def _against(run: LocateRecords, best: str) -> str:
+def answer(run: LocateRecords) -> Answer:
+    """Return what the terminal shows of a run."""
+    overall = sorted(run.metrics["overall"].items(), key=lambda item: item[1]["position_error_m"]["median"])
+    rows = [({"localizer": name}, entry["position_error_m"]) for name, entry in overall]
+    return Answer("m", rows, verdict(run), _next_steps(run))
+
+
+def verdict(run: LocateRecords) -> str:
     """Return a sentence that compares the posterior with the best other localizer."""
+    error = {name: entry["position_error_m"]["median"] for name, entry in run.metrics["overall"].items() if name != OWN}
+    best = min(error, key=lambda name: error[name])
     mean, low, high = paired_difference(by_method(run), OWN, best)
     if math.isnan(low):
         return f"{run.metrics['n_test']} test rows are too few to compare the posterior with {best}."

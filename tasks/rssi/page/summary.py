@@ -10,8 +10,9 @@ from pandas import DataFrame
 
 from tasks.metrics import RssiMetrics
 from tasks.page.page import Number, Plot, Summary
-from tasks.page.records import Records
+from tasks.page.records import Records, notes
 from tasks.summarise import paired_difference
+from tasks.terminal import Answer
 
 RssiRecords = Records[RssiMetrics]
 OWN = "swiftwrf"  # the predictor that all others are compared with
@@ -22,8 +23,7 @@ MAX_COVERAGE_ERROR = 0.05  # difference from the nominal coverage above which th
 def summary(run: RssiRecords, picture: Plot) -> Summary:
     """Return the summary of one run."""
     error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
-    own = error[OWN]
-    best = min((name for name in error if name != OWN), key=lambda name: error[name]["median"])
+    own, best = error[OWN], best_baseline(run)
     interval = run.metrics["interval"]
     shared = error.get("mri_pooled")
     also = f"; one path-loss model for all receivers: {shared['median']:.2f} dB" if shared else ""
@@ -43,13 +43,27 @@ def summary(run: RssiRecords, picture: Plot) -> Summary:
     meaning = [
         f"On {run.scene}: {run.metrics['n_train']} training rows and {run.metrics['n_test']} test rows with {own['n']} "
         f"detected pairs at {receivers} {'receiver' if receivers == 1 else 'receivers'}.",
-        _against(run, best),
+        *notes(run),
     ]
-    return Summary(numbers, picture, meaning, _next_steps(run))
+    return Summary(numbers, picture, meaning, _next_steps(run), verdict(run))
 
 
-def _against(run: RssiRecords, best: str) -> str:
+def answer(run: RssiRecords) -> Answer:
+    """Return what the terminal shows of a run."""
+    overall = sorted(run.metrics["overall"].items(), key=lambda item: item[1]["abs_error_db"]["median"])
+    rows = [({"model": name}, entry["abs_error_db"]) for name, entry in overall]
+    return Answer("dB", rows, verdict(run), _next_steps(run))
+
+
+def best_baseline(run: RssiRecords) -> str:
+    """Return the name of the baseline with the lowest median error."""
+    error = {name: entry["abs_error_db"]["median"] for name, entry in run.metrics["overall"].items() if name != OWN}
+    return min(error, key=lambda name: error[name])
+
+
+def verdict(run: RssiRecords) -> str:
     """Return a sentence that compares the model with the best baseline."""
+    best = best_baseline(run)
     mean, low, high = paired_difference(by_method(run), OWN, best)
     if math.isnan(low):
         return f"{run.metrics['n_test']} test rows are too few to compare SwiftWRF with {best}."

@@ -1,11 +1,32 @@
 """Predictors of RSSI at every receiver from the position of the transmitter."""
 
-from swiftwrf.comparison import NeRF2Rssi
-from swiftwrf.rssi import RssiModel
-from tasks.rssi.predictors.base import PREDICTORS, make_predictor
+from __future__ import annotations
 
-PREDICTORS.register("swiftwrf")(RssiModel)
-PREDICTORS.discover(__name__, __path__, first=("path_loss", "regressors"))
-PREDICTORS.register("nerf2")(NeRF2Rssi)
+from typing import TYPE_CHECKING
+
+from swiftwrf.runtime.lazy import lazy_imports
+from swiftwrf.runtime.registry import Registry
+
+if TYPE_CHECKING:
+    from swiftwrf.rssi import RssiPredictor
+
+with lazy_imports(globals()):
+    from tasks.rssi.predictors.base import make_predictor
+
+PREDICTORS: Registry[RssiPredictor] = Registry(
+    "predictor",
+    "swiftwrf.rssi_predictors",
+    {
+        "swiftwrf": "swiftwrf.rssi:RssiModel",
+        "mean": "tasks.rssi.predictors.path_loss:Mean",
+        "mri_pooled": "tasks.rssi.predictors.path_loss:SharedPathLoss",
+        "mri_receiver": "tasks.rssi.predictors.path_loss:ReceiverPathLoss",
+        "knn": "tasks.rssi.predictors.regressors:KNNPredictor",
+        "mri_residual": "tasks.rssi.predictors.regressors:ResidualKNNPredictor",
+        "gp": "tasks.rssi.predictors.regressors:GPPredictor",
+        "blend": "tasks.rssi.predictors.blend:Blend",
+        "nerf2": "swiftwrf.comparison:NeRF2Rssi",
+    },
+)
 
 __all__ = ["PREDICTORS", "make_predictor"]

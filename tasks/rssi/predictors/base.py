@@ -1,4 +1,4 @@
-"""The registry of RSSI predictors."""
+"""Construction of RSSI predictors by name."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ from typing import Any
 
 from swiftwrf.rssi import RssiPredictor
 from swiftwrf.runtime.options import Preset
-from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.validation import checked
-
-PREDICTORS: Registry[RssiPredictor] = Registry("predictor", "swiftwrf.rssi_predictors")
+from tasks.rssi.predictors import PREDICTORS
 
 
 @checked

@@ -15,7 +15,7 @@ from swiftwrf.rssi import RssiFitContext, RssiPredictor
 from swiftwrf.rssi.stacking import mixing_weights
 from swiftwrf.runtime.options import Preset
 from swiftwrf.runtime.validation import configuration
-from tasks.rssi.predictors.base import PREDICTORS, make_predictor
+from tasks.rssi.predictors import PREDICTORS, make_predictor
 
 
 @configuration
@@ -33,7 +33,6 @@ class BlendConfig(FieldConfig):
         return replace(cls(member_preset="paper"), **changes)
 
 
-@PREDICTORS.register("blend")
 class Blend(RssiPredictor):
     """A weighted mean of other predictors, weights by cross-validation.
 

@@ -20,7 +20,6 @@ from swiftwrf import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.rssi import RssiFitContext, RssiPredictor
 from swiftwrf.runtime.threads import side_by_side
-from tasks.rssi.predictors.base import PREDICTORS
 from tasks.rssi.predictors.path_loss import Mean, ReceiverPathLoss
 
 # scikit-learn's own choice for many neighbours computes distances from squares and a product, which cancel map coordinates
@@ -76,7 +75,6 @@ class ReceiverRegressors(RssiPredictor):
         return predicted if self._simpler is None else predicted + self._simpler.predict(position.detach()).mean, None
 
 
-@PREDICTORS.register("knn")
 class KNNPredictor(ReceiverRegressors):
     """Inverse-distance mean of the k nearest measurements of RSSI; k by cross-validation in the training rows."""
 
@@ -102,7 +100,6 @@ class KNNPredictor(ReceiverRegressors):
         return KNeighborsRegressor(k, weights=weights, algorithm=NEIGHBOUR_SEARCH).fit(x, y)
 
 
-@PREDICTORS.register("mri_residual")
 class ResidualKNNPredictor(KNNPredictor):
     """The receiver's path-loss model, and the mean of its nearest residuals.
 
@@ -116,7 +113,6 @@ class ResidualKNNPredictor(KNNPredictor):
         return ReceiverPathLoss()
 
 
-@PREDICTORS.register("gp")
 class GPPredictor(ReceiverRegressors):
     """A Gaussian process on the residual of the receiver's path-loss model.
 
@@ -131,7 +127,9 @@ class GPPredictor(ReceiverRegressors):
 
     def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
         scale = max(float(np.var(y)), 1e-6)
-        kernel = ConstantKernel(scale / 3, (scale * 1e-3, scale * 10)) * Matern(2.0, (0.1, 50.0), nu=1.5)
+        extent = float(np.ptp(x, axis=0).max()) or 1.0
+        length = Matern(extent / 10, (extent / 200, 2.5 * extent), nu=1.5)
+        kernel = ConstantKernel(scale / 3, (scale * 1e-3, scale * 10)) * length
         kernel = kernel + WhiteKernel(scale / 2, (scale * 1e-3, scale * 10))
         order = np.random.default_rng(self.config.seed).permutation(len(y))
         tuned, kept = order[:MAX_TUNING_ROWS], order[:MAX_GP_ROWS]

@@ -1,8 +1,12 @@
-"""Kernel ridge regression (Saunders et al. 1998) with a normalised Gaussian kernel, width and penalty by cross-validation.
+"""Kernel regression with Nadaraya-Watson weights, width and penalty by cross-validation.
+
+A prediction is the mean of dual coefficients, weighted by a Gaussian kernel whose weights sum to one. With the targets as
+dual coefficients it is the estimator of Nadaraya (1964) and Watson (1964). The dual coefficients here reproduce the targets
+up to a penalty, as those of a normalised radial basis function network do (Moody and Darken 1989).
 
 Measurement noise and model error add a nearly constant offset to the squared distances between a measured spectrum and all
 synthetic ones, which multiplies every Gaussian kernel value by the same factor. Normalising each kernel row cancels that
-factor (Nadaraya 1964, Watson 1964; Moody and Darken 1989).
+factor.
 """
 
 from __future__ import annotations
@@ -44,7 +48,7 @@ def coarse_pixels(spectrum: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class RadialRegression:
+class NadarayaWatson:
     """A fitted regression: the prediction is the mean of dual coefficients, weighted by the normalised kernel.
 
     Args:
@@ -54,7 +58,7 @@ class RadialRegression:
 
     Example:
         >>> x = np.linspace(0, 1, 20)[:, None]
-        >>> bool(np.abs(RadialRegression.fit(x, x, seed=0)(x) - x).max() < 0.05)
+        >>> bool(np.abs(NadarayaWatson.fit(x, x, seed=0)(x) - x).max() < 0.05)
         True
     """
 
@@ -63,7 +67,7 @@ class RadialRegression:
     gamma: float
 
     @classmethod
-    def fit(cls, feature: NDArray[Any], target: NDArray[Any], seed: int) -> RadialRegression:
+    def fit(cls, feature: NDArray[Any], target: NDArray[Any], seed: int) -> NadarayaWatson:
         """Fit a regression from features (n, p) to values (n, k).
 
         Args:
@@ -90,7 +94,7 @@ class RadialRegression:
         }
 
     @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header, features: int, values: int) -> RadialRegression:
+    def from_state(cls, tensors: dict[str, Tensor], header: Header, features: int, values: int) -> NadarayaWatson:
         """Return the regression that `state` describes.
 
         Args:

@@ -40,9 +40,16 @@ FIELD_MODELS = {
     "dcgan": Label("a convolutional generator trained against a discriminator (DCGAN)", "#661100"),
 }
 
+BEAMFORMERS = {
+    "phase": Label("from the phases alone, the paper's spectrum of one snapshot"),
+    "bartlett": Label("the fraction of the power that a beam collects"),
+    "capon": Label("minimum variance; needs as many snapshots as elements"),
+}
+
 ESTIMATORS = {
-    "aann": Label("the angular neural network (ResNet-50), its head replaced by kernel regression"),
-    "kernel_ridge": Label("kernel regression from the spectrum to the direction", "#44aa99"),
+    "aann": Label("the paper's angular neural network: ResNet-50 and a multilayer perceptron"),
+    "aann_kernel": Label("kernel regression on the features of a briefly trained ResNet-50 and on coarse pixels"),
+    "kernel_regression": Label("kernel regression from the spectrum to the direction", "#44aa99"),
     "matched_field": Label(
         "the position whose spectrum, predicted by the room, matches, and its direction (matched-field processing)",
         "#ddaa33",

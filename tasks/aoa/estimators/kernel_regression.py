@@ -1,4 +1,4 @@
-"""Kernel ridge regression from coarse spectra to directions."""
+"""Kernel regression from coarse spectra to directions."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from augment import Mixed
 from swiftwrf.array.angles import to_angles, to_direction
 from swiftwrf.runtime.checkpoint import Header
 from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator
-from tasks.aoa.estimators.radial import RadialRegression, coarse_pixels, kept_rows
+from tasks.aoa.estimators.nadaraya_watson import NadarayaWatson, coarse_pixels, kept_rows
 
 BATCH_SPECTRA = 512  # spectra that are loaded at a time
 
 
-@ESTIMATORS.register("kernel_ridge")
+@ESTIMATORS.register("kernel_regression")
 class KernelRegression(SavedEstimator):
-    """Kernel ridge regression from coarse spectra to directions, accurate for few training spectra.
+    """Kernel regression from coarse spectra to directions, accurate for few training spectra.
 
     Example:
         >>> import swiftwrf
@@ -29,13 +29,14 @@ class KernelRegression(SavedEstimator):
         torch.Size([40, 2])
     """
 
-    kind = "kernel ridge regression"
+    kind = "kernel regression"
+    former_kinds = ("kernel ridge regression",)
 
     def _fit(self, train: Mixed, device: torch.device) -> None:
         rows = torch.from_numpy(kept_rows(len(train), self.config.seed))
         features = np.concatenate([_features(train.select(some)) for some in rows.split(BATCH_SPECTRA)])
         direction = to_direction(*train.label[rows].unbind(-1)).numpy()
-        self._direction = RadialRegression.fit(features, direction, self.config.seed)
+        self._direction = NadarayaWatson.fit(features, direction, self.config.seed)
 
     def predict(self, spectra: Tensor) -> Tensor:
         return torch.stack(to_angles(torch.from_numpy(self._direction(_features(spectra)))), dim=-1)
@@ -45,7 +46,7 @@ class KernelRegression(SavedEstimator):
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         pixels = _features(torch.zeros(1, *self.grid.shape)).shape[1]
-        self._direction = RadialRegression.from_state(tensors, header, pixels, 3)
+        self._direction = NadarayaWatson.from_state(tensors, header, pixels, 3)
 
 
 def _features(spectra: Tensor) -> NDArray[Any]:

@@ -1,0 +1,73 @@
+"""Measure how long commands take from the command line: help, refusals, and a whole run of RSSI.
+
+python benchmarks/startup.py [--against CHECKOUT]
+
+Rounds alternate between this checkout and the other one, so that other work on the machine slows both. Wall time is what a
+user waits; processor time, of all threads, depends less on other work.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import tyro
+from record import write_result
+
+HERE = Path(__file__).parent.parent
+ROUNDS = 5
+COMMANDS = {
+    "import swiftwrf": ("-c", "import swiftwrf"),
+    "swiftwrf --help": ("-m", "tasks.command", "--help"),
+    **{
+        f"tasks.{name} --help": ("-m", f"tasks.{name}", "--help")
+        for name in ("aoa", "rssi", "locate", "report", "inspect", "convert", "estimate", "scenes", "view")
+    },
+    "unknown option": ("-m", "tasks.aoa", "--mix", "0.3", "--no-such-option"),
+    "wrong value": ("-m", "tasks.aoa", "--mix", "2"),
+    "tasks.rssi --rx 6": ("-m", "tasks.rssi", "--rx", "6", "--out", "run"),
+}
+
+
+@dataclass(frozen=True)
+class Config:
+    """Seconds of commands, medians of 5 rounds after one that is not counted."""
+
+    against: Path | None = None
+    """another checkout, measured in turn with this one"""
+
+
+def seconds(checkout: Path, arguments: tuple[str, ...]) -> tuple[float, float]:
+    """Return the wall and processor time of one command of a checkout [s]."""
+    with TemporaryDirectory() as folder:
+        before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        environment = os.environ | {"PYTHONPATH": str(checkout)}
+        subprocess.run([sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, check=False)
+        wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def main(config: Config) -> None:
+    checkouts = {"this": HERE} | ({"other": config.against.resolve()} if config.against else {})
+    rows = []
+    for name, arguments in COMMANDS.items():
+        taken: dict[str, list[tuple[float, float]]] = {checkout: [] for checkout in checkouts}
+        for _ in range(ROUNDS + 1):
+            for checkout, folder in checkouts.items():
+                taken[checkout].append(seconds(folder, arguments))
+        for checkout, values in taken.items():
+            wall, processor = (statistics.median(column) for column in zip(*values[1:], strict=True))
+            rows.append({"command": name, "checkout": checkout, "wall_s": wall, "processor_s": processor})
+            print(f"{name:<24} {checkout:<6} {wall:6.2f} s, processor {processor:6.2f} s", flush=True)
+    write_result("startup", {"rounds": ROUNDS, "rows": rows})
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

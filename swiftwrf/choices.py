@@ -1,0 +1,73 @@
+"""Names that options take: of implementations, rooms, ends of a link. Imports no torch, so a command line answers at once.
+
+Implementations are named as in an entry point, `module:object`, and imported at first use.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from swiftwrf.errors import InputError
+from swiftwrf.runtime.registry import Registry
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from swiftwrf.models.base import FieldModel
+
+Moving = Literal["transmitter", "receiver"]
+CARRIERS_HZ = (1e6, 1e13)
+SCENE_FILE = ".xml"  # suffix of scene files; other names are those of rooms
+
+FIELD_MODELS: Registry[FieldModel] = Registry(
+    "field model",
+    "swiftwrf.models",
+    {
+        "coarray": "swiftwrf.models.coarray:CoarrayModel",
+        "geometry": "swiftwrf.models.geometry:GeometryModel",
+        "hybrid": "swiftwrf.models.geometry:HybridModel",
+        "nearest": "swiftwrf.models.nearest:NearestModel",
+        "gp": "swiftwrf.models.gp:GPModel",
+        "idw": "swiftwrf.models.idw:IDWModel",
+        "raytrace": "swiftwrf.models.raytrace:RaytraceModel",
+        "swiftwrf": "swiftwrf.models.swiftwrf:SwiftWRF",
+        "dcgan": "swiftwrf.comparison:Dcgan",
+        "nerf2": "swiftwrf.comparison:NeRF2",
+        "vae": "swiftwrf.comparison:Vae",
+        "wrfgs": "swiftwrf.comparison:WrfGs",
+    },
+)
+BEAMFORMERS: Registry[Tensor] = Registry(
+    "beamformer",
+    "swiftwrf.beamformers",
+    {
+        "phase": "swiftwrf.array.beamforming:phase",
+        "bartlett": "swiftwrf.array.beamforming:bartlett",
+        "capon": "swiftwrf.array.beamforming:capon",
+    },
+)
+ROOMS = {  # what stands in the rooms of data/raytraced/rooms.yml
+    "conference": "conference room, 8 x 5 x 2.8 m: a table with ten chairs, screen, whiteboard, sideboard",
+    "office": "office, 6 x 5 x 2.7 m: four desks with screens, a partition, metal cabinets, shelves",
+    "bedroom": "bedroom, 4.2 x 3.6 x 2.5 m: a double bed, wardrobe, chest of drawers, nightstands",
+}
+
+
+def check_scene(name: str, said: str = "") -> None:
+    """Refuse a name that is neither a built-in room nor a scene file.
+
+    Args:
+        name: Name of a room, or a path that ends in `.xml`.
+        said: Text before the name in the message, e.g. the option.
+
+    Raises:
+        InputError: No such room or file.
+
+    Example:
+        >>> check_scene("office")
+    """
+    if not name.endswith(SCENE_FILE) and name not in ROOMS:
+        raise InputError(f"unknown room {name!r}; choose from {', '.join(ROOMS)}")
+    if name.endswith(SCENE_FILE) and not Path(name).is_file():
+        raise InputError(f"{said}{name} is not there; expected a Mitsuba scene, or one of {', '.join(ROOMS)}")

@@ -1,0 +1,38 @@
+"""Names of estimators in runs of earlier versions.
+
+There `kernel_ridge` is kernel regression, and `aann` is kernel regression on the features of the network, not the network
+with its own head. A run of an earlier version contains the name `kernel_ridge`.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from pandas import DataFrame
+
+FORMER_NAMES = {"kernel_ridge": "kernel_regression", "aann": "aann_kernel"}
+(_KERNEL, _PRESENT_KERNEL), (_NETWORK, _PRESENT_NETWORK) = FORMER_NAMES.items()
+
+
+def with_present_names(values: Any) -> Any:
+    """Return plain values of a run with the present names of the estimators.
+
+    Example:
+        >>> with_present_names({"kernel_ridge_turbo_gp": 1, "turbo_gp": {"estimator": "aann"}})
+        {'kernel_regression_turbo_gp': 1, 'turbo_gp': {'estimator': 'aann_kernel'}}
+        >>> with_present_names({"turbo_gp": {"estimator": "aann"}})
+        {'turbo_gp': {'estimator': 'aann'}}
+    """
+    text = json.dumps(values)
+    if _KERNEL not in text:
+        return values
+    return json.loads(text.replace(_KERNEL, _PRESENT_KERNEL).replace(f'"{_NETWORK}"', f'"{_PRESENT_NETWORK}"'))
+
+
+def table_with_present_names(table: DataFrame) -> DataFrame:
+    """Return a table of a run with the present names of the estimators."""
+    if "method" not in table or not table["method"].astype(str).str.startswith(_KERNEL).any():
+        return table
+    names = {f"^{_KERNEL}": _PRESENT_KERNEL, f"^{_NETWORK}$": _PRESENT_NETWORK}
+    return table.replace({column: names for column in ("method", "estimator") if column in table}, regex=True)

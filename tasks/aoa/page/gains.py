@@ -1,0 +1,80 @@
+"""Gains by synthetic spectra, with intervals that are paired over test positions."""
+
+from __future__ import annotations
+
+from tasks.aoa.condition import headline, reference_of
+from tasks.aoa.page.records import FractionRecords
+from tasks.metrics import ChangeMetrics
+from tasks.page.page import Table
+from tasks.page.provenance import number
+
+
+def turbo_method(fraction: FractionRecords) -> str:
+    """Return the method of the network with all spectra of the first field model."""
+    return headline(fraction.conditions.values()).method
+
+
+def reference(fraction: FractionRecords) -> str:
+    """Return the best method that is trained on measured spectra alone."""
+    return fraction.mix.get("reference") or reference_of(fraction.conditions, fraction.medians)
+
+
+def change_text(change: ChangeMetrics) -> str:
+    """Return a change with its 95 % interval.
+
+    Example:
+        >>> change_text({"median_deg": 1.0, "change": -0.49, "low": -0.6, "high": -0.3})
+        '-49% [-60%, -30%]'
+    """
+    return f"{change['change']:+.0%} [{change['low']:+.0%}, {change['high']:+.0%}]"
+
+
+def judgement(change: ChangeMetrics) -> str:
+    """Return what the interval of a change says.
+
+    Example:
+        >>> judgement({"median_deg": 1.0, "change": -0.17, "low": -0.4, "high": 0.1})
+        'not significant'
+    """
+    if change["high"] < 0:
+        return "a gain"
+    return "a loss" if change["low"] > 0 else "not significant"
+
+
+def changes_of(fraction: FractionRecords, method: str) -> dict[str, ChangeMetrics]:
+    """Return the changes of a method, by the method that it is compared to. Runs of earlier versions have none."""
+    return fraction.mix["methods"][method].get("changes") or {}
+
+
+def gain_sentence(fraction: FractionRecords) -> str:
+    """Return the change of the network's error by synthetic spectra, and whether it is significant; empty if unknown."""
+    method = turbo_method(fraction)
+    best = reference(fraction)
+    parts = [
+        f"{change_text(change)} against {other}"
+        f"{', the best one without synthetic spectra,' if other == best else ''} ({judgement(change)})"
+        for other, change in changes_of(fraction, method).items()
+    ]
+    if not parts:
+        return ""
+    return (
+        f"Synthetic spectra change the median angular error of the network ({method}) by {' and '.join(parts)}. Intervals "
+        "are paired over the test positions."
+    )
+
+
+def gain_table(fraction: FractionRecords) -> list[Table]:
+    """Return the changes of all methods with synthetic spectra."""
+    best = reference(fraction)
+    rows = []
+    for method in fraction.mix["methods"]:
+        for other, change in changes_of(fraction, method).items():
+            name = f"{other} (best)" if other == best else other
+            rows.append([method, name, number(change["median_deg"]), change_text(change), judgement(change)])
+    caption = (
+        "Change of the median angular error by synthetic spectra, with its 95 % interval: a paired bootstrap over the test "
+        "positions. Repeats are averaged at each position. Best: the smallest test error of all estimators without "
+        "synthetic spectra other than matched_field."
+    )
+    columns = ["method", "compared to", "median [deg]", "change", ""]
+    return [Table(columns, rows, caption)] if rows else []

@@ -1,0 +1,144 @@
+"""From a command line to a checked configuration, and from errors to sentences and exit codes. Loads no torch."""
+
+from __future__ import annotations
+
+import errno
+import inspect
+import os
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import tyro
+
+from swiftwrf.errors import FitError, InputError, one_line
+from tasks.options import OUTPUT, Options
+from tasks.records import Row
+from tasks.resume import saved_config
+from tasks.terminal import terminal
+
+Config = TypeVar("Config", bound=Options)
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+def command_line(
+    name: str,
+    config_type: type[Config],
+    task: Callable[..., None],
+    arguments: Sequence[str],
+    program: str | None = None,
+) -> int:
+    """Run a task with the options of a command line; see `execute` and `exit_code`."""
+    return exit_code(partial(execute, name, config_type, task, arguments, program))
+
+
+def exit_code(action: Callable[[], None]) -> int:
+    """Return the exit code of an action and print its error as one sentence. Under torchrun the first process acts.
+
+    Returns:
+        0: done. 1: a fit failed. 2: wrong input, or a file that cannot be written. 130: interrupted.
+    """
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        return _exit_code(action)
+    from tasks.torchrun import together  # imports torch
+
+    return together(partial(_exit_code, action))
+
+
+def _exit_code(action: Callable[[], None]) -> int:
+    try:
+        action()
+    except InputError as error:
+        return _report(str(error), 2)
+    except FitError as error:
+        return _report(str(error), 1)
+    except OSError as error:  # readers raise InputError, so this is about writing
+        return _report(_not_written(error), 2)
+    except MemoryError as error:
+        return _report(f"not enough memory ({error}); use less data or a smaller model", 2)
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+def _report(sentence: str, code: int) -> int:
+    print(f"error: {one_line(sentence)}", file=sys.stderr)
+    return code
+
+
+def _not_written(error: OSError) -> str:
+    file = error.filename2 or error.filename or "the run's files"
+    if error.errno in DISK_FULL:
+        return f"no space left to write {file}; make room and go on with --resume, or choose another --out"
+    reason = "no permission" if isinstance(error, PermissionError) else error.strerror or str(error)
+    return f"cannot write {file} ({reason}); choose another --out"
+
+
+def execute(
+    name: str,
+    config_type: type[Config],
+    task: Callable[..., None],
+    arguments: Sequence[str],
+    program: str | None = None,
+) -> None:
+    """Parse a command line and run the task.
+
+    A resumable task takes a second argument, the directory to resume or None. For such a task `--resume DIR` takes the
+    configuration of an interrupted run. `--scheduler ADDRESS` continues it on a cluster, and options of `Output` may follow.
+
+    Args:
+        name: Module of the task, e.g. tasks.aoa.
+        config_type: Dataclass of the options. Its docstring is the description in the help.
+        task: Function of the configuration and, if it can be resumed, of the directory.
+        arguments: Options of the command line.
+        program: Name of the command in the help. Defaults to `python -m NAME`.
+
+    Raises:
+        InputError: Wrong options, or the error of the task.
+    """
+    folder = None
+    match arguments:
+        case ["--resume", *_] if not config_type.resumable:
+            raise InputError(f"a run of {name} cannot be resumed; start it again")
+        case ["--resume", *options]:
+            folder, changed = _resumed(options)
+            config = configured(config_type, saved_config(folder, name.removeprefix("tasks.")) | changed, folder)
+        case _:
+            description = inspect.cleandoc(config_type.__doc__ or "")
+            config = tyro.cli(
+                config_type,
+                prog=program or f"python -m {name}",
+                description=description,
+                args=arguments,
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
+    config.check()
+    with terminal.of(config):
+        task(*((config, folder) if config_type.resumable else (config,)))
+
+
+def _resumed(options: Sequence[str]) -> tuple[Path, Row]:
+    """Return the directory after `--resume`, and the options that may change."""
+    shown = {name: True for name in OUTPUT if f"--{name}" in options}
+    match [option for option in options if option.removeprefix("--") not in shown]:
+        case [folder]:
+            return Path(folder), {"scheduler": None, **shown}
+        case [folder, "--scheduler", address]:
+            return Path(folder), {"scheduler": address, **shown}
+    raise InputError(
+        "--resume takes one directory, --scheduler to use a cluster, and --open, --quiet, --json; no other option can change"
+    )
+
+
+def configured(config_type: type[Config], values: Row, folder: Path) -> Config:
+    """Return the configuration that a run has kept as plain values.
+
+    Raises:
+        InputError: The values are of another version of the command.
+    """
+    try:
+        return config_type(**{key: tuple(v) if isinstance(v, list) else v for key, v in values.items()})
+    except TypeError as error:
+        raise InputError(f"{folder} was begun by another version of this command ({error}); start a new run") from None

@@ -1,0 +1,41 @@
+"""Directions from spectra, by an estimator that a run of tasks.aoa trained."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from swiftwrf import InputError, load
+from swiftwrf.locate import MatchedField
+from swiftwrf.metrics import angle_errors
+from tasks.aoa.estimators import SavedEstimator
+from tasks.directory import check_new_table
+from tasks.estimate.options import EstimateConfig
+from tasks.records import write_table
+from tasks.source import observed_spectra, reading
+
+
+def run(config: EstimateConfig) -> None:
+    """Writes a row a spectrum: azimuth and elevation [deg] and, where positions are known, the truth and the error.
+
+    Raises:
+        InputError: no such estimator, spectra that cannot be read or are not like those it was trained on, or `out` exists.
+    """
+    out = Path(config.out)
+    check_new_table(out)
+    estimator = load(config.estimator)
+    if not isinstance(estimator, SavedEstimator | MatchedField):
+        raise InputError(f"{config.estimator} holds a {estimator.kind}; give an estimator that tasks.aoa trained")
+    store, known = observed_spectra(config.source, reading(config), estimator.grid, "estimator")
+    estimate = torch.cat([estimator.predict(part) for part in store.batches()])
+    columns = {"azimuth_deg": estimate[:, 0].rad2deg(), "elevation_deg": estimate[:, 1].rad2deg()}
+    if known is not None:
+        truth = known.label.rad2deg()
+        columns |= {"truth_azimuth_deg": truth[:, 0], "truth_elevation_deg": truth[:, 1]}
+        columns["great_circle_deg"] = angle_errors(estimate, known.label)["great_circle"].rad2deg()
+    index = torch.arange(len(store)) if known is None else known.index
+    rows = zip(index.tolist(), *(column.tolist() for column in columns.values()), strict=True)
+    write_table(out, [dict(zip(("index", *columns), row, strict=True)) for row in rows])
+    error = f", median error {columns['great_circle_deg'].median():.2f} degrees" if known is not None else ""
+    print(f"{len(store)} directions{error}: {out}")

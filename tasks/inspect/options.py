@@ -1,0 +1,22 @@
+"""Options of python -m tasks.inspect, and their checks."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import tyro
+
+from tasks.options import Output, SpectraSource, TableSource, command_options
+
+
+@command_options
+class InspectConfig(SpectraSource, TableSource, Output):
+    """What measurements of any known format hold: counts, extents, neighbours, frames, calibration, suspicious columns.
+
+    Example: python -m tasks.inspect DIR
+    """
+
+    source: Annotated[str, tyro.conf.Positional]
+    """folder or file of measurements"""
+    out: str | None = None
+    """directory of the page; must not exist (default: a new one under runs/inspect)"""

@@ -1,0 +1,45 @@
+"""Inspect measurements before a model is fitted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+from swiftwrf.data import Rssi, Snapshots
+from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
+from tasks.directory import new_directory
+from tasks.inspect.findings import inspect
+from tasks.inspect.findings.rssi import propose_offsets
+from tasks.inspect.options import InspectConfig
+from tasks.inspect.page import page
+from tasks.page.page import write_page
+from tasks.records import write_json
+from tasks.source import reading
+from tasks.terminal import terminal
+
+
+def run(config: InspectConfig) -> None:
+    """Print the findings, and write a page and inspect.json.
+
+    Raises:
+        InputError: Measurements that cannot be read.
+    """
+    options = reading(config)
+    out = Path(config.out) if config.out else Path("runs") / "inspect" / f"{datetime.now():%Y%m%d-%H%M%S}"
+    with new_directory(out, "an inspection") as folder:
+        data = read(config.source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
+        kind = "RSSI" if isinstance(data, Rssi) else "array snapshots" if isinstance(data, Snapshots) else "spectra"
+        findings, shown = inspect(data, options)
+        for column in data.labels if isinstance(data, Rssi) else ():
+            propose_offsets(read(config.source, replace(options, offset_by=column), RSSI_FORMATS), findings)
+        content = {
+            "source": config.source,
+            "kind": kind,
+            "findings": [{"level": finding.level, "text": finding.text} for finding in findings.sentences],
+            "numbers": findings.numbers,
+        }
+        write_json(folder / "inspect.json", content)
+        write_page(folder, page(shown, kind, findings))
+    marked = (f"{'! ' if finding.level == 'warning' else '  '}{finding.text}" for finding in findings.sentences)
+    terminal.page(content, "\n".join([f"{config.source}: {kind}", *marked]), out / "report.html")

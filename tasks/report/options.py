@@ -1,0 +1,22 @@
+"""Options of python -m tasks.report, and their checks."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import tyro
+
+from tasks.options import Options, command_options
+
+
+@command_options
+class ReportConfig(Options):
+    """One report over several finished runs of one task.
+
+    Example: python -m tasks.report runs/rssi/first runs/rssi/second --out runs/report
+    """
+
+    runs: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """directories of the runs"""
+    out: str = "runs/report"
+    """directory of the report; must not exist"""

@@ -1,0 +1,56 @@
+"""One report over several finished runs of one task."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from swiftwrf import InputError
+from tasks.aoa import page as aoa
+from tasks.directory import new_directory
+from tasks.locate import page as locate
+from tasks.page.page import Page, write_page
+from tasks.page.records import Records
+from tasks.report.options import ReportConfig
+from tasks.rssi import page as rssi
+
+PAGES: dict[str, Callable[[list[Records[Any]]], Page]] = {"aoa": aoa.page, "rssi": rssi.page, "locate": locate.page}
+
+
+def run(config: ReportConfig) -> None:
+    """Write the report and print its place."""
+    merge([Path(folder) for folder in config.runs], Path(config.out))
+    print(f"report: {Path(config.out) / 'report.html'}")
+
+
+def merge(folders: list[Path], out: Path) -> None:
+    """Write one report over several finished runs of one task.
+
+    Raises:
+        InputError: There are no runs, one is unfinished, their tasks differ, their records are damaged, or `out` exists.
+    """
+    several = len(folders) > 1
+    runs: list[Records[Any]] = [Records(f, number=n if several else 0) for n, f in enumerate(folders, start=1)]
+    tasks = sorted({str(run.metrics.get("task")) for run in runs})
+    if len(tasks) != 1 or tasks[0] not in PAGES:
+        raise InputError(
+            f"a report takes finished runs of one task ({' or '.join(PAGES)}), got {', '.join(tasks) or 'no runs'}"
+        )
+    with new_directory(out, "a report") as unfinished:
+        _write(unfinished, tasks[0], runs)
+
+
+def _write(folder: Path, task: str, runs: list[Records[Any]]) -> None:
+    try:
+        write_page(folder, PAGES[task](runs))
+    except InputError:
+        raise
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        # the records are files that anybody may have changed, and the page uses all of them
+        names = ", ".join(os.fspath(run.folder) for run in runs)
+        raise InputError(
+            f"the records in {names} do not hold what a report shows ({type(error).__name__}: {error}); they were changed "
+            "or written by another version"
+        ) from error

@@ -1,0 +1,60 @@
+"""Options of python -m tasks.rssi, and their checks."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from swiftwrf.errors import InputError
+from swiftwrf.runtime.options import Preset
+from tasks.options import OffsetSource, Output, command_options
+from tasks.rssi.predictors import PREDICTORS
+
+
+@command_options
+class RssiTaskConfig(OffsetSource, Output):
+    """RSSI of a moving transmitter at fixed receivers, against baselines.
+
+    Without --data the built-in simulated floor is used. Continue an interrupted run with --resume DIR.partial, and with
+    --scheduler ADDRESS to continue on a cluster.
+
+    Example: python -m tasks.rssi --rx 6 --data DIR
+    """
+
+    resumable: ClassVar[bool] = True
+
+    rx: tuple[str, ...]
+    """receivers: names, numbers counted from 1, or all"""
+    data: str | None = None
+    """survey table (CSV or Parquet), or folder with tx_pos.csv, gateway_rssi.csv and gateway_position.yml (NeRF2 layout)"""
+    split: str = "random"
+    """a split that comes with the data, or a seeded one: random or block"""
+    also: tuple[str, ...] = ()
+    """predictors that take minutes and are compared only when named: nerf2, blend"""
+    preset: Preset = "quick"
+    """of SwiftWRF and NeRF2: quick, or paper for the published head and field"""
+    floor_plan: str | None = None
+    """an image to draw behind the maps, PNG or JPEG"""
+    floor_extent: tuple[float, float, float, float] | None = None
+    """x0 x1 y0 y1 of that image [m]"""
+    scheduler: str | None = None
+    """address of a Dask scheduler whose workers fit groups of receivers (extra: cluster)"""
+    seed: int = 0
+    """seed of everything random"""
+    out: str | None = None
+    """directory of the run; must not exist (default: a new one under runs/rssi)"""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """where to compute; RSSI models are small, so auto is the CPU"""
+
+    def check(self) -> None:
+        super().check()
+        for name in self.also:
+            PREDICTORS.check(name)
+        self.check_used(self.data)
+        if (self.floor_plan is None) != (self.floor_extent is None):
+            raise InputError("--floor-plan needs --floor-extent x0 x1 y0 y1 [m], and the other way round")
+        if self.floor_extent is not None:
+            x0, x1, y0, y1 = self.floor_extent
+            if not (x0 < x1 and y0 < y1):
+                raise InputError(
+                    f"--floor-extent must be x0 x1 y0 y1 with x0 < x1 and y0 < y1, got {self.floor_extent}"
+                )

@@ -1,0 +1,34 @@
+"""Options of python -m tasks.view, and their checks."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import tyro
+
+from swiftwrf.errors import InputError
+from tasks.options import Options, command_options
+
+MAX_PORT = 65535
+
+
+@command_options
+class ViewConfig(Options):
+    """A page to explore a fitted model: drag the moving end and see its spectrum, or hover over a map of RSSI.
+
+    Needs the optional extra: pip install 'swiftwrf-tasks[view]'. Ctrl-C ends it.
+
+    Example: python -m tasks.view runs/aoa/first
+    """
+
+    source: Annotated[str, tyro.conf.Positional]
+    """directory of a run of tasks.aoa, tasks.rssi or tasks.locate, or a saved model"""
+    port: int = 8080
+    """port of the page; 0 takes any free port"""
+    host: str = "127.0.0.1"
+    """address to listen on; with any other address, other machines see the page without a password"""
+
+    def check(self) -> None:
+        super().check()
+        if not 0 <= self.port <= MAX_PORT:
+            raise InputError(f"--port must be from 0 to {MAX_PORT}, got {self.port}")

@@ -1,0 +1,100 @@
+"""Help and refusals answer at once: they import none of the packages that compute or draw."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+import augment
+import swiftwrf
+from swiftwrf.choices import BEAMFORMERS, FIELD_MODELS, ROOMS
+from swiftwrf.data.raytraced import ROOMS as BUILT_IN_ROOMS
+from tasks import labels
+from tasks.command import COMMANDS
+from tasks.rssi.predictors import PREDICTORS
+
+HEAVY = ("torch", "torchvision", "numba", "sklearn", "matplotlib", "scipy", "pandas")
+RUN = """
+import sys
+from tasks.command import main
+try:
+    code = main(sys.argv[1:])
+except SystemExit as end:
+    code = end.code
+print(code, *sys.modules, file=sys.stderr)
+"""
+
+
+def imported(code: str, *arguments: str) -> tuple[int, list[str]]:
+    """Run code in a new process. Return its exit code, and the heavy packages that it imported."""
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True)
+    exit_code, *modules = done.stderr.splitlines()[-1].split()
+    return int(exit_code), sorted({*HEAVY} & {*modules})
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_imports_nothing_heavy(name):
+    assert imported(RUN, name, "--help") == (0, [])
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("aoa", "--no-such-option"),
+        ("aoa", "--mix", "0.3", "--seed", "x"),
+        ("aoa", "--mix", "2"),
+        ("aoa", "--mix", "0.3", "--synthesizer", "none"),
+        ("aoa", "--mix", "0.3", "--suggest", "1000"),
+        ("aoa", "--mix", "0.3", "--data", "x", "--beamformer", "none"),
+        ("rssi", "--rx", "1", "--also", "none"),
+        ("rssi", "--rx", "1", "--floor-extent", "3", "2", "1", "0"),
+        ("locate", "--cells", "1"),
+        ("inspect", "x", "--grid", "1", "1"),
+        ("convert", "x", "y", "--split", "block"),
+        ("estimate", "x", "y", "--array", "4", "0", "1e9"),
+        ("view", "x", "--port", "-1"),
+        ("scenes", "--room", "none", "--moving", "receiver", "--positions", "9", "--out", "x"),
+        ("resume", "x"),
+    ],
+)
+def test_wrong_options_import_nothing_heavy(arguments):
+    assert imported(RUN, *arguments) == (2, [])
+
+
+@pytest.mark.parametrize("package", ["swiftwrf", "augment", "tasks.rssi.predictors"])
+def test_packages_import_their_members_at_first_use(package):
+    assert imported(f"import {package}, sys; print(0, *sys.modules, file=sys.stderr)") == (0, [])
+
+
+def test_every_member_of_a_lazy_package_exists():
+    for package in (swiftwrf, augment):
+        assert {*package.__all__} <= {*dir(package)}
+        for name in package.__all__:
+            assert getattr(package, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nowhere'"):
+        _ = swiftwrf.nowhere
+
+
+def test_a_submodule_does_not_hide_the_function_of_its_name():
+    code = """
+import augment.mix, swiftwrf.rasterize.cpu, sys
+print(int(not callable(swiftwrf.rasterize) or not callable(augment.mix)), file=sys.stderr)
+"""
+    assert imported(code)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("registry", "known"),
+    [(FIELD_MODELS, labels.FIELD_MODELS), (BEAMFORMERS, labels.BEAMFORMERS), (PREDICTORS, labels.PREDICTORS)],
+    ids=["field models", "beamformers", "predictors"],
+)
+def test_what_is_declared_has_a_label_and_can_be_imported(registry, known):
+    assert {*registry} == {*known}
+    for name in registry:
+        assert callable(registry[name])
+
+
+def test_every_room_has_a_description():
+    assert {*ROOMS} == {*BUILT_IN_ROOMS}
