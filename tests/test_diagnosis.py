@@ -150,7 +150,10 @@ CAUSES = {  # measurements, and the statement of the cause of an error
     "half-turn flips": (flipped, "jumps by half a turn"),
     "uncalibrated": (uncalibrated, "The array is not calibrated"),
     "tilted": (tilted, "constant rotation of"),
-    "x and y swapped": (lambda s: replace(d := scene(s), position=d.position[:, [1, 0, 2]]), "x and y of the positions"),
+    "x and y swapped": (
+        lambda s: replace(d := scene(s), position=d.position[:, [1, 0, 2]]),
+        "x and y of the positions",
+    ),
     "millimetres": (lambda s: replace(d := scene(s), position=1000 * d.position), "the positions are in millimetres"),
     "image axes": (image_axes, "y of the positions counts from the other side"),
     "one direction": (narrow, "nearly one direction"),

@@ -1,4 +1,4 @@
-"""Arrays in npy files, npz archives, HDF5 and MATLAB files: never unpickled, with sizes checked before memory is allocated."""
+"""Arrays in npy, npz, HDF5 and MATLAB files: never unpickled, with sizes checked before memory is allocated."""
 
 from __future__ import annotations
 
@@ -21,7 +21,12 @@ MAX_ROWS_BYTES = 2**36  # of an array that is read some rows at a time
 NUMPY, HDF5, MATLAB = (".npz",), (".h5", ".hdf5"), (".mat",)
 ARCHIVES = (*NUMPY, *HDF5, *MATLAB)  # suffixes of files that hold arrays by name
 MATLAB_HDF5 = (b"MATLAB 7.3", b"\x89HDF")  # first bytes of .mat files that are HDF5, of MATLAB and of Octave
-MATLAB_NUMBERS = {"double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}
+MATLAB_NUMBERS = {
+    "double",
+    "single",
+    "logical",
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
+}
 COMPLEX_FIELDS = (("real", "imag"), ("r", "i"))  # of the compounds that stand for complex numbers in HDF5
 Arrays = dict[str, NDArray[Any]]
 
@@ -201,11 +206,12 @@ def _read_hdf5(content: Any, names: Sequence[str], file: Path) -> Arrays:
     for name in names:
         owner, key = (content[name], "value") if _is_octave(content, name) else (content, name)
         own = isinstance(owner.get(key, getlink=True), h5py.HardLink) and isinstance(owner[key], h5py.Dataset)
-        if not own or owner[key].is_virtual or owner[key].external or _number_type(owner[key].dtype) is None:
+        dtype = _number_type(owner[key].dtype) if own and not (owner[key].is_virtual or owner[key].external) else None
+        if dtype is None:
             raise ValueError(f"{name} is no array of numbers in this file")
-        found[name] = owner[key]
-    _check_total(sum(math.prod(array.shape) * array.dtype.itemsize for array in found.values()), file)
-    return {name: np.asarray(array[()]).view(_number_type(array.dtype)) for name, array in found.items()}
+        found[name] = owner[key], dtype
+    _check_total(sum(math.prod(array.shape) * dtype.itemsize for array, dtype in found.values()), file)
+    return {name: np.asarray(array[()]).view(dtype) for name, (array, dtype) in found.items()}
 
 
 def _is_octave(content: Any, name: str) -> bool:

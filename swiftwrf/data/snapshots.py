@@ -155,14 +155,14 @@ def without_null(channel: Tensor, drop: bool | None) -> tuple[Tensor, tuple[str,
         >>> channel = torch.randn(5, 4, 3, dtype=torch.complex64)
         >>> channel[:, 2] = 12 + 3j
         >>> without_null(channel, drop=True)
-        (..., ('Null subcarriers, the same at every position and element, are left out (1 of 4, counted from 0): 2',))
+        (..., ('null subcarriers, the same at every position and element, are left out (1 of 4, counted from 0): 2',))
     """
     first = channel[:1, :, :1]
     null = ((channel - first).abs() <= NULL_TOLERANCE * first.abs()).all(dim=2).all(dim=0)
     if not bool(null.any()) or bool(null.all()) or len(channel) < 2:
         return channel, ()
     which = f"({int(null.sum())} of {len(null)}, counted from 0): {ranges(null.nonzero()[:, 0].tolist())}"
-    name = "Null subcarriers, the same at every position and element, are"
+    name = "null subcarriers, the same at every position and element, are"
     if drop:
         return channel[:, ~null], (f"{name} left out {which}",)
     return channel, (f"{name} used like the others {which}; --drop-null leaves them out",)
@@ -170,5 +170,5 @@ def without_null(channel: Tensor, drop: bool | None) -> tuple[Tensor, tuple[str,
 
 def round_trip_array(array: PlanarArray) -> tuple[PlanarArray, tuple[str, ...]]:
     """Return the array for phases of the way there and back, which change as those of half the wavelength, and a note."""
-    note = "Phases are those of the way there and back, so half the wavelength counts"
+    note = "phases are those of the way there and back, so half the wavelength counts"
     return PlanarArray(array.element, array.wavelength / 2), (note,)

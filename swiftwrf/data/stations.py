@@ -129,11 +129,11 @@ class RecordFormat(Format[Snapshots]):
             raise InputError(f"{path} holds no record with a position and a channel")
         if without:
             notes = (*notes, f"records without a finite position or channel are left out: {without}")
-        channel, null = without_null(torch.from_numpy(np.stack(channels)), options.drop_null)
+        kept, null = without_null(torch.from_numpy(np.stack(channels)), options.drop_null)
         array, turned = round_trip_array(array) if options.round_trip else (array, ())
         name = path.resolve().name if path.is_dir() else path.stem
         return Snapshots(
-            channel,
+            kept,
             np.stack(positions),
             array=array,
             name=f"{name}-{station.name}" if station.name else name,

@@ -95,8 +95,8 @@ def calibrate(train: Snapshots) -> Calibration:
         train: Snapshots of training positions. Those without line of sight are omitted.
 
     Raises:
-        InputError: Fewer than 20 positions with line of sight, fewer than 10 where the direct path dominates, a linear array,
-            phases that do not depend on the position, a rotation beyond 45 degrees or one that is not identifiable.
+        InputError: Fewer than 20 positions with line of sight, fewer than 10 where the direct path dominates, a linear
+            array, phases that do not depend on the position, a rotation beyond 45 degrees or one that is not identifiable.
     """
     seen = train.subset(train.line_of_sight.nonzero()[:, 0])
     if len(seen) < 2 * MIN_TRAINING:

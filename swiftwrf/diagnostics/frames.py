@@ -4,12 +4,12 @@ The peak of a spectrum is often in the direction of the line of sight. The score
 
     a(frame) = mean over positions of exp(-theta^2 / (2 sigma^2)),    sigma = 10 degrees,
 
-with theta the angle between peak and line of sight in that frame, both folded to the directions that the array distinguishes:
-for a linear array it is the difference of their angles to its axis. Of peaks of nearly equal height, the nearest one counts.
-The chance level is the mean over pairs of different positions; only the excess counts as evidence. An error of frames (axes
-swapped, a quaternion in another order, millimetres, azimuths clockwise, elements in another order, ...) is named if its
-agreement clearly exceeds that of the declared frame and it explains most of the peaks, and so is any other constant rotation,
-if it is the same in both halves of the positions.
+with theta the angle between peak and line of sight in that frame, both folded to the directions that the array distinguishes.
+For a linear array, theta is the difference of their angles to its axis. Of peaks of nearly equal height, the nearest one
+counts. The chance level is the mean over pairs of different positions; only the excess counts as evidence. An error of frames
+(axes swapped, a quaternion in another order, millimetres, azimuths clockwise, elements in another order, ...) is named if its
+agreement clearly exceeds that of the declared frame and it explains most of the peaks. So is any other constant rotation, if
+both halves of the positions have it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,9 @@ TIE = 0.03  # difference in agreement of explanations that are not distinguished
 EQUAL_PEAKS = 0.97  # of the largest magnitude: peaks above it are alternatives
 MAX_PEAKS = 8
 SCANNED_ROTATIONS = 4000
-MIN_TURN = math.radians(5)  # of a constant rotation that is reported, and the most that two halves of the positions differ
+MIN_TURN = math.radians(
+    5
+)  # of a constant rotation that is reported, and the most that two halves of the positions differ
 MIN_TURN_EXPLAINED = 0.8  # agreement with a constant rotation that is reported: with three angles, much is explained
 MIN_TURN_GAIN = 0.03  # in agreement, of such a rotation
 NARROW_DEG = 10.0  # angle between lines of sight (median of pairs), below which no frame can be checked
@@ -170,9 +172,7 @@ class _Frame:
         return replace(self, position=self.position @ matrix, fixed=self.fixed @ matrix if both else self.fixed)
 
 
-def check_frames(
-    spectra: Spectra, snapshots: Snapshots | None = None, beamformer: str = PHASE
-) -> FrameReport | None:
+def check_frames(spectra: Spectra, snapshots: Snapshots | None = None, beamformer: str = PHASE) -> FrameReport | None:
     """Compare the peaks of the spectra with the lines of sight, in the declared frame and in others.
 
     Args:
@@ -199,7 +199,9 @@ def check_frames(
     found = {name: _agreement(to, peak) for name, to in _others(frame, computed=snapshots is not None)}
     if snapshots is not None:
         for name, other in other_readings(snapshots.subset(rows)).items():
-            found[name] = _agreement(declared, frame.peaks(other.spectra(spectra.grid, beamformer).store[:], spectra.grid))
+            found[name] = _agreement(
+                declared, frame.peaks(other.spectra(spectra.grid, beamformer).store[:], spectra.grid)
+            )
     best = max(value for value, _ in found.values())
     found |= {name: pair for name, pair in _mirrors(frame, peak) if pair[0] >= best + MIN_TURN_GAIN}
     named, by_chance = max(found.values())
@@ -315,16 +317,18 @@ def _mirrors(frame: _Frame, peak: Tensor) -> Iterator[tuple[str, tuple[float, fl
 
 
 def _constant_turn(frame: _Frame, peak: Tensor) -> tuple[NDArray[np.float64], float, float]:
-    """Return the rotation of the array with most agreement, as a rotation vector in its coordinates, its agreement and chance.
+    """Return the rotation of the array with most agreement, its agreement and its chance level.
 
-    A linear array does not determine its rotation, so it keeps the declared one.
+    The rotation is a rotation vector in array coordinates [rad]. A linear array does not determine its rotation, so it keeps the declared one.
     """
     if frame.linear:
         return np.zeros(3), *_agreement(frame.direction(), peak)
     scanned = Rotation.random(SCANNED_ROTATIONS, rng=np.random.default_rng(0))
     turns = Rotation.concatenate([Rotation.identity(), scanned])
     matrices, towards = torch.from_numpy(turns.as_matrix()).float(), frame.towards().float()
-    score = torch.cat([_kernel(_nearest(frame.folded(towards @ m), peak.float())).mean(-1) for m in matrices.split(200)])
+    score = torch.cat(
+        [_kernel(_nearest(frame.folded(towards @ m), peak.float())).mean(-1) for m in matrices.split(200)]
+    )
     starts = [np.zeros(3), *(turns[int(i)].as_rotvec() for i in score.topk(3).indices)]
     turn = max((_refined(start, frame, peak) for start in starts), key=_turned(frame, peak))
     return turn, *_agreement(frame.folded(frame.towards() @ _matrix(turn)), peak)
@@ -343,7 +347,8 @@ def _refined(start: NDArray[np.float64], frame: _Frame, peak: Tensor) -> NDArray
     score = _turned(frame, peak)
     options = {"xatol": 1e-4, "fatol": 1e-6, "initial_simplex": np.vstack([start, start + 0.1 * np.eye(3)])}
     found: NDArray[np.float64] = minimize(lambda turn: -score(turn), start, method="Nelder-Mead", options=options).x
-    return Rotation.from_rotvec(found).as_rotvec()  # the shortest one
+    shortest: NDArray[np.float64] = Rotation.from_rotvec(found).as_rotvec()
+    return shortest
 
 
 def _turned(frame: _Frame, peak: Tensor) -> Callable[[NDArray[np.float64]], float]:

@@ -1,8 +1,8 @@
 """Check that RSSI decreases with the distance from the receivers, and diagnose the error of frames or units if not.
 
 The score of a frame is the fraction of the variance of RSSI that path-loss models explain. An error is named if its fraction
-clearly exceeds that of the declared frame. Errors that the positions cannot show are not tried, e.g. swaps with an axis along
-which all positions are equal.
+clearly exceeds that of the declared frame. Errors that the positions cannot show are not tried, e.g. swaps with an axis
+along which all positions are equal.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.validation import PositiveInt, configuration
 
 LINEAR_ARRAY = (
-    "The elements lie on a line, so the array receives the angle to its axis only; directions are folded to the half-plane "
+    "the elements lie on a line, so the array receives the angle to its axis only; directions are folded to the half-plane "
     "of axis and normal"
 )
 Data = TypeVar("Data", bound=Spectra | Snapshots | Rssi)

@@ -3,7 +3,8 @@
 `{key}_t{set}_tx{index}_r{set}.npz` holds `key`: power [dB], phase [deg], delay [s], aoa_az, aoa_el [deg] of up to 25 paths a
 receiver, nan for missing ones; inter, the interactions of a path as digits (0: line of sight, 1: reflection, 2: diffraction,
 3: scattering, 4: transmission); rx_pos and tx_pos [m]. params.json holds the carrier and the name of the ray tracer. aoa_el
-is the angle from the zenith, or that from the horizon (AODT), which direct paths show. Angles point from the receiver to where a path arrives from, in world coordinates.
+is the angle from the zenith, or from the horizon (AODT), which direct paths show. Angles point from the receiver to where a
+path arrives from, in world coordinates.
 
 Wireless InSite gives the phase of a path over its whole length. Sionna gives that of the passband coefficient, to which the
 phase -2 pi f delay of the propagation is added here. The line-of-sight paths, whose phase is known, show the convention.

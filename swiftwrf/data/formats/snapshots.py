@@ -98,7 +98,7 @@ def _turned_round(arrays: Arrays) -> tuple[Arrays, tuple[str, ...]]:
     element = arrays.get("element_position")
     if element is not None and element.ndim == 2 and element.shape[1] == csi.shape[0]:
         turned["element_position"] = element.T
-    return arrays | turned, ("Axes are in reverse order, as MATLAB and Octave write HDF5; they are turned round",)
+    return arrays | turned, ("axes are in reverse order, as MATLAB and Octave write HDF5; they are turned round",)
 
 
 def _points(file: Path, arrays: Arrays, name: str, columns: int) -> Tensor:

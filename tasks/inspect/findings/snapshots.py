@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import torch
-
 from swiftwrf import InputError
 from swiftwrf.data import Snapshots
 from swiftwrf.diagnostics.calibration import calibrate
-from swiftwrf.positions import distance
 from tasks.inspect.findings.base import Findings
 from tasks.inspect.findings.positions import ROUGH
 
