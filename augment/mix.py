@@ -10,6 +10,7 @@ from torch import Tensor
 
 from augment.positions import NO_INDEX, SyntheticPositions
 from swiftwrf import AngularGrid, InputError, Spectra
+from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.splits import MIN_TRAINING, random_rows
 from swiftwrf.data.store import Store
 
@@ -24,6 +25,7 @@ class Mixed:
         index: Number of each spectrum's position in the data set, (n,). -1 for synthetic positions outside of it.
         synthetic: Origin of each spectrum, bool (n,).
         grid: Directions of the pixels.
+        array: Antenna array, if it is known.
     """
 
     stores: tuple[Store, ...]
@@ -31,6 +33,7 @@ class Mixed:
     index: Tensor
     synthetic: Tensor
     grid: AngularGrid
+    array: PlanarArray | None = None
 
     def __len__(self) -> int:
         return len(self.label)
@@ -48,7 +51,7 @@ class Mixed:
     def measured(cls, spectra: Spectra) -> Mixed:
         """Return a training set of measured spectra alone."""
         synthetic = torch.zeros(len(spectra), dtype=torch.bool)
-        return cls((spectra.store,), spectra.label, spectra.index, synthetic, spectra.grid)
+        return cls((spectra.store,), spectra.label, spectra.index, synthetic, spectra.grid, spectra.array)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -90,6 +93,7 @@ class Mixed:
             torch.cat([self.index, positions.index]),
             torch.cat([self.synthetic, torch.ones(len(synthetic), dtype=torch.bool)]),
             self.grid,
+            self.array,
         )
 
 

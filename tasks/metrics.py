@@ -143,11 +143,12 @@ class MixMetrics(TypedDict):
 
 
 class AoaMetrics(RunMetrics):
-    """Metrics of a run of tasks.aoa; `mixes` by measured fraction."""
+    """Metrics of a run of tasks.aoa; `mixes` by measured fraction, `notes` of the reader of the data."""
 
     preset: str
     repeats: int
     moving: str
+    notes: list[str]
     extra: int
     grid: tuple[int, int]
     line_of_sight_share: float

@@ -117,6 +117,10 @@ class SpectraSource(Options):
     """reads one measurement of that many"""
     station: int | None = None
     """number of the array in a file with several, counted from 1"""
+    drop_null: bool = False
+    """leave out null subcarriers of array snapshots, which are the same at every position and element"""
+    round_trip: bool = False
+    """phases of array snapshots are those of the way there and back, as of RFID and backscatter"""
 
     def check(self) -> None:
         super().check()

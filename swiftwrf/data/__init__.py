@@ -23,9 +23,11 @@ def load_spectra(
     *,
     array: PlanarArray | None = None,
     beamformer: str | None = None,
-    grid: AngularGrid | None = None,
+    grid: AngularGrid | tuple[PositiveInt, PositiveInt] | None = None,
     every: PositiveInt | None = None,
     station: PositiveInt | None = None,
+    drop_null: bool = False,
+    round_trip: bool = False,
 ) -> Spectra:
     """Read spectra in any format of docs/formats.md: images or arrays of spectra, ray paths, array snapshots.
 
@@ -34,9 +36,11 @@ def load_spectra(
         array: Array of the spectra if the files do not describe it, or for which spectra of ray paths are computed. Defaults
             to 4 x 4 elements at half a wavelength.
         beamformer: Beamformer for array snapshots: phase (default), bartlett or capon.
-        grid: Directions of computed spectra. Defaults to 90 x 360.
+        grid: Directions of computed spectra, or their numbers of elevations and azimuths. Defaults to 90 x 360.
         every: Reads one measurement of that many.
         station: Number of the array in a file with several, counted from 1.
+        drop_null: Leaves out null subcarriers of array snapshots, which are the same at every position and element.
+        round_trip: Phases of array snapshots are those of the way there and back, as of RFID and backscatter.
 
     Raises:
         InputError: A part that is missing or invalid, parts that do not match, or an argument that does not apply.
@@ -46,7 +50,11 @@ def load_spectra(
         Traceback (most recent call last):
         swiftwrf.errors.InputError: nowhere is not a folder or file; expected measurements (formats: ...)
     """
-    return read_spectra(path, ReadOptions(array, beamformer, grid, every, station))
+    directions = None if grid is None else AngularGrid.of(grid)
+    options = ReadOptions(
+        array, beamformer, directions, every, station, drop_null=drop_null or None, round_trip=round_trip or None
+    )
+    return read_spectra(path, options)
 
 
 def read_spectra(path: str | Path, options: ReadOptions) -> Spectra:
@@ -61,14 +69,20 @@ def read_spectra(path: str | Path, options: ReadOptions) -> Spectra:
 
 @checked
 def load_snapshots(
-    path: str | Path, *, every: PositiveInt | None = None, station: PositiveInt | None = None
+    path: str | Path,
+    *,
+    every: PositiveInt | None = None,
+    station: PositiveInt | None = None,
+    drop_null: bool = False,
+    round_trip: bool = False,
 ) -> Snapshots:
     """Read array snapshots, with arguments as in `load_spectra`.
 
     Raises:
         InputError: As `load_spectra`.
     """
-    data: Snapshots = read(path, ReadOptions(every=every, station=station), SNAPSHOT_FORMATS)
+    options = ReadOptions(every=every, station=station, drop_null=drop_null or None, round_trip=round_trip or None)
+    data: Snapshots = read(path, options, SNAPSHOT_FORMATS)
     return data
 
 

@@ -107,7 +107,7 @@ def _draw_axes(ax: Axes, data: Spectra, a: int, b: int) -> None:
 
 def _directions(data: Spectra) -> Plot:
     rows = data.line_of_sight.nonzero()[:MOST_DOTS, 0]
-    peak = to_direction(*data.grid.peak_direction(data.store[rows]).unbind(-1))
+    peak = to_direction(*data.peak_direction(rows).unbind(-1))
     line = to_direction(*data.label[rows].unbind(-1))
     figure, axes = figures.new_figure(1, 3, 11, 3.6)
     for ax, (title, direction) in zip(axes, {"line of sight": line, "peak": peak}.items(), strict=False):

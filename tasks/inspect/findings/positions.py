@@ -12,6 +12,7 @@ from tasks.inspect.findings.base import Findings
 
 MAX_POSITIONS = 3000  # whose neighbours are searched
 SMOOTH, ROUGH = 0.25, 0.5  # wavelengths between neighbours: below, fields are smooth; above, fringes are lost
+MAX_END_OFFSET = 1e-3  # of normalised coordinates from the ends of their interval
 MAX_EXTENT_M = 1000.0  # beyond, coordinates may be millimetres
 
 
@@ -49,6 +50,20 @@ def check_positions(position: Tensor, findings: Findings, wavelength: float | No
         findings.say(f"{text}: interpolation will work in part; half a wavelength is the limit.")
     else:
         findings.warn(f"{text}: interpolators see no fringes between such positions; geometry needs none.")
+
+
+def normalised(position: Tensor) -> str:
+    """Return the interval that every coordinate of positions (n, 3) fills exactly, as normalised ones do, or an empty text.
+
+    Coordinates without extent are left out; one coordinate alone is no evidence.
+    """
+    low, high = position.amin(dim=0), position.amax(dim=0)
+    varying = high > low
+    for name, start in (("[-1, 1]", -1.0), ("[0, 1]", 0.0)):
+        ends = torch.cat([low[varying] - start, high[varying] - 1])
+        if int(varying.sum()) >= 2 and bool((ends.abs() <= MAX_END_OFFSET).all()):
+            return name
+    return ""
 
 
 def nearest(position: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from swiftwrf.data import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
-from swiftwrf.diagnostics.frames import check_path_loss
+from swiftwrf.diagnostics.path_loss import check_path_loss
 from swiftwrf.errors import listed
 from swiftwrf.rssi import estimate_offsets
 from tasks.inspect.findings.base import Findings
