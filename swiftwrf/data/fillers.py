@@ -46,7 +46,7 @@ def find_fillers(rssi: Floats) -> list[float]:
         found.append(float(value[-1]))
         value, count = value[:-1], count[:-1]
     usual = np.flatnonzero(value == NOT_DETECTED_DBM)
-    if len(usual) and (usual[0] == 0 or _is_frequent(value, count, usual[0], N_NEIGHBOURS_DB)):
+    if len(usual) and (usual[0] == 0 or _is_frequent(value, count, int(usual[0]), N_NEIGHBOURS_DB)):
         found.append(NOT_DETECTED_DBM)
     elif _fills_the_lower_edge(rssi, value, count):
         found.append(float(value[0]))
