@@ -6,9 +6,10 @@ The peak of a spectrum is often in the direction of the line of sight. The score
 
 with theta the angle between peak and line of sight in that frame, both folded to the directions that the array
 distinguishes. For a linear array, theta is the difference of their angles to its axis. Of peaks of nearly equal height, the
-nearest one counts. The chance level is the mean over pairs of different positions; only the excess counts as evidence. An
-error of frames (axes swapped, a quaternion in another order, millimetres, azimuths clockwise, elements in another order, ...)
-is named if its agreement clearly exceeds that of the declared frame and it explains most of the peaks. So is any other
+nearest one counts. The chance level is the mean over pairs of different positions. Only the excess over it counts.
+
+An error of frames is named if its agreement clearly exceeds that of the declared frame and it explains most of the peaks:
+axes swapped, a quaternion in another order, millimetres, azimuths clockwise, elements in another order. So is any other
 constant rotation, if both halves of the positions have it.
 """
 
