@@ -207,4 +207,8 @@ def given(config: SpectraSource) -> list[str]:
         >>> given(SpectraSource(every=2))
         ['every']
     """
-    return [option.name for option in fields(SpectraSource) if getattr(config, option.name) is not None]
+    return [
+        option.name.replace("_", "-")
+        for option in fields(SpectraSource)
+        if getattr(config, option.name) != option.default
+    ]
