@@ -17,7 +17,6 @@ from swiftwrf.models.geometry.images import (
     visibility,
 )
 
-MIN_PROGRESS, MAX_STALLED = 1e-4, 2  # relative decrease of a score that counts, and steps without one before the last
 MIN_FIELD, MIN_GAIN = 1e-9, 1e-6  # moduli by which derivatives are divided
 
 
@@ -132,11 +131,10 @@ def refine(
     """Return score (B,), normals (B, P, 3), offsets and gains (B, P) after Levenberg-Marquardt steps.
 
     Args:
-        steps: Maximum number of steps. There are fewer if no score decreases any more.
         signs: Fixed signs of the gains (P,). Defaults to free signs.
         limit: Maximum movement [m] or tilt [rad] of a plane in one step.
     """
-    damping, stalled = torch.full((len(normal),), 1e-2), 0
+    damping = torch.full((len(normal),), 1e-2)
     movement = image_jacobian(normal, offset, scene.transmitter, sequence, tilt)
     jacobian = phase_jacobian(scene, normal, offset, gain, sequence, movement)
     score, slope, curve = normal_equations(scene, *jacobian)
@@ -160,14 +158,11 @@ def refine(
         jacobian = phase_jacobian(scene, trial_normal, trial_offset, trial_gain, sequence, movement)
         after = normal_equations(scene, *jacobian)
         better = after[0] < score
-        stalled = 0 if bool((after[0] < (1 - MIN_PROGRESS) * score).any()) else stalled + 1
         damping = torch.where(better, damping * 0.3, damping * 6).clamp(1e-6, 1e4)
         offset, gain = (torch.where(better[:, None], a, b) for a, b in ((trial_offset, offset), (trial_gain, gain)))
         normal = torch.where(better[:, None, None], trial_normal, normal)
         score, slope = torch.where(better, after[0], score), torch.where(better[:, None, None], after[1], slope)
         curve = torch.where(better[:, None, None], after[2], curve)
-        if stalled == MAX_STALLED:
-            break
     return score, normal, offset, gain
 
 
