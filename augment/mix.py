@@ -10,7 +10,8 @@ from torch import Tensor
 
 from augment.positions import NO_INDEX, SyntheticPositions
 from swiftwrf import AngularGrid, InputError, Spectra
-from swiftwrf.data.splits import MIN_TRAINING
+from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data.splits import MIN_TRAINING, random_rows
 from swiftwrf.data.store import Store
 
 
@@ -24,6 +25,7 @@ class Mixed:
         index: Number of each spectrum's position in the data set, (n,). -1 for synthetic positions outside of it.
         synthetic: Origin of each spectrum, bool (n,).
         grid: Directions of the pixels.
+        array: Antenna array, if it is known.
     """
 
     stores: tuple[Store, ...]
@@ -31,6 +33,7 @@ class Mixed:
     index: Tensor
     synthetic: Tensor
     grid: AngularGrid
+    array: PlanarArray | None = None
 
     def __len__(self) -> int:
         return len(self.label)
@@ -48,7 +51,7 @@ class Mixed:
     def measured(cls, spectra: Spectra) -> Mixed:
         """Return a training set of measured spectra alone."""
         synthetic = torch.zeros(len(spectra), dtype=torch.bool)
-        return cls((spectra.store,), spectra.label, spectra.index, synthetic, spectra.grid)
+        return cls((spectra.store,), spectra.label, spectra.index, synthetic, spectra.grid, spectra.array)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -90,11 +93,14 @@ class Mixed:
             torch.cat([self.index, positions.index]),
             torch.cat([self.synthetic, torch.ones(len(synthetic), dtype=torch.bool)]),
             self.grid,
+            self.array,
         )
 
 
 def withhold(train: Spectra, measured_fraction: float, seed: int) -> tuple[Spectra, SyntheticPositions]:
     """Return a random fraction of the training spectra as measured, and the positions of the others.
+
+    Spectra at one position are in one part.
 
     Args:
         train: Training spectra.
@@ -118,9 +124,9 @@ def withhold(train: Spectra, measured_fraction: float, seed: int) -> tuple[Spect
             f"a measured fraction of {measured_fraction:g} leaves {n} of {len(train)} training spectra; "
             f"at least {MIN_TRAINING} are needed, a fraction of {MIN_TRAINING / len(train):.2g}"
         )
-    order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
-    measured, others = train.subset(order[:n].sort().values), train.subset(order[n:].sort().values)
-    return measured, SyntheticPositions(others.position, others.label, others.index)
+    rows = random_rows(train.position, n, seed)
+    others = train.subset(torch.ones(len(train), dtype=torch.bool).index_fill(0, rows, value=False))
+    return train.subset(rows), SyntheticPositions(others.position, others.label, others.index)
 
 
 def mix(measured: Spectra, withheld: SyntheticPositions, synthetic: Tensor) -> Mixed:

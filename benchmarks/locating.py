@@ -70,7 +70,7 @@ def measure(data: Rssi, split: str, cells: int, seed: int) -> dict[str, Any]:
         for name in LOCALIZERS:
             step = Localization(name)
             results.add(step, strict(step.compute(experiment, Path(folder))))
-    metrics = results.metrics(data.name, n_undetected)
+    metrics = results.metrics(data, n_undetected)
     kept = ("n_train", "n_test", "n_receivers", "n_undetected", "seed", "weights")
     content = {name: value for name, value in metrics.items() if name in kept}
     return content | {"cells": cells, "localizers": metrics["overall"], "coverage": metrics["calibration"]}

@@ -24,6 +24,22 @@ def listed(names: Iterable[object]) -> str:
     return ", ".join(found[:MOST]) + (f" and {len(found) - MOST} more" if found[MOST:] else "")
 
 
+def ranges(numbers: Iterable[int]) -> str:
+    """Return ascending numbers in words, neighbours joined.
+
+    Example:
+        >>> ranges([1, 4, 5, 6, 9])
+        '1, 4 to 6, 9'
+    """
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    return ", ".join(f"{run[0]} to {run[-1]}" if len(run) > 1 else str(run[0]) for run in runs)
+
+
 class InputError(ValueError):
     """Wrong input: one sentence saying what was expected, what came and what to do.
 

@@ -143,11 +143,12 @@ class MixMetrics(TypedDict):
 
 
 class AoaMetrics(RunMetrics):
-    """Metrics of a run of tasks.aoa; `mixes` by measured fraction."""
+    """Metrics of a run of tasks.aoa; `mixes` by measured fraction, `notes` of the reader of the data."""
 
     preset: str
     repeats: int
     moving: str
+    notes: list[str]
     extra: int
     grid: tuple[int, int]
     line_of_sight_share: float
@@ -187,7 +188,12 @@ class ChosenMetrics(TypedDict):
 
 
 class RssiMetrics(RunMetrics):
-    """Of a run of tasks.rssi; `receivers` by receiver and method; `left_out` says why a method is not there."""
+    """Metrics of a run of tasks.rssi.
+
+    `notes` are those of the reader. `receivers` by receiver and method; `left_out` says why a method is not there.
+    """
+
+    notes: list[str]
 
     preset: str
     overall: dict[str, PredictorMetrics]
@@ -219,8 +225,11 @@ class LocateMetrics(RunMetrics):
     """Metrics of a run of tasks.locate.
 
     `n_undetected` test rows are left out, because no receiver detected them. `calibration` is the fraction of the test
-    positions in the posterior's credible regions by their probability. `weights` are those of its likelihoods.
+    positions in the posterior's credible regions by their probability. `weights` are those of its likelihoods. `notes` are
+    those of the reader.
     """
+
+    notes: list[str]
 
     n_receivers: int
     n_undetected: int

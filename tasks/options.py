@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import MISSING, Field, asdict, dataclass, fields
-from typing import Annotated, Any, ClassVar, TypeVar, dataclass_transform
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, dataclass_transform
 from unicodedata import category
 
 import tyro
@@ -117,6 +117,10 @@ class SpectraSource(Options):
     """reads one measurement of that many"""
     station: int | None = None
     """number of the array in a file with several, counted from 1"""
+    drop_null: bool = False
+    """leave out null subcarriers of array snapshots, which are the same at every position and element"""
+    round_trip: bool = False
+    """phases of array snapshots are those of the way there and back, as of RFID and backscatter"""
 
     def check(self) -> None:
         super().check()
@@ -143,11 +147,17 @@ class SpectraSource(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class TableSource(Options):
-    """Options of reading survey tables."""
+    """Options of reading RSSI."""
 
     columns: tuple[str, ...] = ()
     """names of columns of a survey table that are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME ... (several with
     rssi='WAP*')"""
+    filler: tuple[float, ...] = ()
+    """values of RSSI that stand for not detected (default: those that are recognised)"""
+    keep_filler: bool = False
+    """count all values of RSSI as measured"""
+    coordinates: Literal["degrees", "metres"] | None = None
+    """unit of the positions in a survey table (default: the one that is recognised)"""
 
     @property
     def column_names(self) -> dict[str, str] | None:
@@ -162,6 +172,32 @@ class TableSource(Options):
                 raise InputError(f"--columns takes what a column holds and its name, e.g. x=NAME, got {text!r}")
         if len(self.column_names or {}) < len(self.columns):
             raise InputError(f"--columns names something twice: {' '.join(self.columns)}")
+        if self.filler and self.keep_filler:
+            raise InputError("--filler and --keep-filler exclude each other")
+
+    @property
+    def fillers(self) -> tuple[float, ...] | None:
+        """Values that stand for not detected, none with --keep-filler. None for those that are recognised."""
+        return self.filler if self.filler or self.keep_filler else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffsetSource(TableSource):
+    """Options of reading RSSI of several devices or channels."""
+
+    offset_by: str | None = None
+    """column of a survey table with groups of rows, e.g. devices, whose constant offsets are estimated; COLUMN=VALUE makes
+    that group the reference of maps (default: the most frequent one)"""
+
+    def check_used(self, data: str | None) -> None:
+        """Refuse options of reading RSSI without measured data.
+
+        Raises:
+            InputError: Such an option, but no data.
+        """
+        for option in (*fields(TableSource), *fields(OffsetSource)):
+            if data is None and getattr(self, option.name) != option.default:
+                raise InputError(f"--{option.name.replace('_', '-')} is for measured RSSI; give it with --data")
 
 
 def given(config: SpectraSource) -> list[str]:
@@ -171,4 +207,8 @@ def given(config: SpectraSource) -> list[str]:
         >>> given(SpectraSource(every=2))
         ['every']
     """
-    return [option.name for option in fields(SpectraSource) if getattr(config, option.name) is not None]
+    return [
+        option.name.replace("_", "-")
+        for option in fields(SpectraSource)
+        if getattr(config, option.name) != option.default
+    ]

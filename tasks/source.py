@@ -8,22 +8,31 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from swiftwrf import AngularGrid, InputError, Spectra
+from swiftwrf import AngularGrid, InputError, Rssi, Spectra
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data import ReadOptions, read_spectra
+from swiftwrf.data import ReadOptions, read_rssi, read_spectra
+from swiftwrf.data.rssi import Offsets
+from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
-from tasks.options import SpectraSource, TableSource
+from swiftwrf.rssi import estimate_offsets
+from tasks.options import OffsetSource, SpectraSource, TableSource
 
 
 def reading(config: SpectraSource | TableSource) -> ReadOptions:
     """Return the options of a command line for reading."""
-    array = beamformer = grid = every = station = columns = None
+    array = beamformer = grid = every = station = columns = filler = coordinates = offset_by = None
+    drop_null = round_trip = None
     if isinstance(config, SpectraSource):
         array, beamformer, every, station = _array(config), config.beamformer, config.every, config.station
         grid = AngularGrid.hemisphere(*config.grid) if config.grid else None
+        drop_null, round_trip = config.drop_null or None, config.round_trip or None
     if isinstance(config, TableSource):
-        columns = config.column_names
-    return ReadOptions(array, beamformer, grid, every, station, columns)
+        columns, filler, coordinates = config.column_names, config.fillers, config.coordinates
+    if isinstance(config, OffsetSource) and config.offset_by is not None:
+        offset_by = config.offset_by.partition("=")[0]
+    return ReadOptions(
+        array, beamformer, grid, every, station, columns, filler, coordinates, offset_by, drop_null, round_trip
+    )
 
 
 def _array(config: SpectraSource) -> PlanarArray | None:
@@ -34,6 +43,35 @@ def _array(config: SpectraSource) -> PlanarArray | None:
     if rows == columns:
         return PlanarArray.square(rows, frequency, spacing)
     return PlanarArray.grid(rows, columns, spacing, frequency)
+
+
+def measured_rssi(data: str | None, config: TableSource) -> Rssi | None:
+    """Return the RSSI of an experiment in a folder or file, None without one.
+
+    Raises:
+        InputError: RSSI that cannot be read.
+    """
+    return None if data is None else read_rssi(data, reading(config))
+
+
+def asked_offsets(train: Rssi, config: OffsetSource) -> Offsets | None:
+    """Return the offsets of the groups that a user asks for, estimated from training rows.
+
+    Raises:
+        InputError: One group only, or an unknown reference.
+    """
+    return None if config.offset_by is None else estimate_offsets(train, config.offset_by.partition("=")[2] or None)
+
+
+def split_notes(train: Rssi, test: Rssi) -> list[str]:
+    """Return a note on rows that share positions, or none."""
+    repeated = repeated_fraction(train.transmitter_position, test.transmitter_position)
+    if repeated > MAX_REPEATED:
+        return [f"this split tests look-up: {repeated:.0%} of the test rows are at positions of training rows"]
+    position = torch.cat([train.transmitter_position, test.transmitter_position])
+    n_places = len(position.unique(dim=0))
+    shared = f"{len(position)} rows are at {n_places} positions, each of which is in one part of the split"
+    return [shared] if n_places < len(position) and not repeated else []
 
 
 def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model: str) -> tuple[Store, Spectra | None]:

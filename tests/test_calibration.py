@@ -101,18 +101,18 @@ REFUSED = {
         "has 0 training positions",
     ),
     "noise": (lambda: snapshots(n=200, noise=30.0), "positions where a direct path stands out"),
-    "a cone": (lambda: narrow(snapshots(n=900, noise=0.5)), "cannot tell the array's orientation"),
+    "a cone": (lambda: narrow(snapshots(n=900, noise=0.5)), "measure positions in more directions"),
     "a line": (
         lambda: replace(
             (data := snapshots()),
             channel=data.channel[..., :4],
             array=PlanarArray(data.array.element[:4], data.array.wavelength),
         ),
-        "cannot tell the array's orientation",
+        "the elements of made lie on a line",
     ),
     "positions of others": (
         lambda: replace(snapshots(), position=snapshots().position.flip(0)),
-        "a direct path stands out|cannot tell|does harm",
+        "a direct path stands out|does not determine|does harm",
     ),
 }
 

@@ -203,4 +203,4 @@ def test_every_format_is_described():
         for name in formats:
             assert f"[{name}](#" in text, f"describe {name} in docs/formats.md"
     for option in ReadOptions.__dataclass_fields__:
-        assert f"`--{option} " in text, f"describe --{option} in docs/formats.md"
+        assert f"`--{option.replace('_', '-')} " in text, f"describe --{option} in docs/formats.md"

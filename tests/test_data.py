@@ -185,7 +185,7 @@ def test_refuses_a_broken_archive(tmp_path):
 
 def test_seeded_splits_are_partitions(generator):
     position = torch.rand(57, 3, generator=generator)
-    for split in (lambda seed: random_split(57, seed), lambda seed: block_split(position, seed)):
+    for split in (lambda seed: random_split(position, seed), lambda seed: block_split(position, seed)):
         train, test = split(3)
         assert sorted([*train.tolist(), *test.tolist()]) == list(range(57))
         assert len(test) in (11, 12)

@@ -17,7 +17,7 @@ import torch
 
 from swiftwrf import simulated_room
 from tasks.aoa.condition import LOCATOR, Condition
-from tasks.aoa.options import AoaConfig, with_preset
+from tasks.aoa.options import AoaConfig
 from tasks.aoa.page.gains import gain_sentence, gain_table
 from tasks.aoa.page.records import FractionRecords
 from tasks.aoa.page.summary import summary
@@ -25,7 +25,7 @@ from tasks.aoa.results import Results
 from tasks.aoa.steps import Evaluation
 from tasks.page.page import Plot
 from tasks.page.records import Records
-from tasks.report import merge
+from tasks.report.run import merge
 from tasks.summarise import paired_change
 
 MEASURED = Condition("aann_kernel", "measured", measured_fraction=0.3)
@@ -158,6 +158,8 @@ def test_results_of_earlier_versions_are_read_by_the_present_names():
 
 
 def test_the_preset_of_the_paper_has_its_fractions_and_no_further_positions():
-    assert with_preset(AoaConfig(preset="paper")) == AoaConfig((0.1, 0.3, 0.5, 0.7), preset="paper", extra=0)
-    assert with_preset(AoaConfig((0.2,), preset="paper", extra=9)) == AoaConfig((0.2,), preset="paper", extra=9)
-    assert with_preset(AoaConfig((0.3,))).extra is None
+    paper = AoaConfig(preset="paper")
+    assert (paper.mix, paper.extra) == ((0.1, 0.3, 0.5, 0.7), 0)
+    given = AoaConfig(mix=(0.2,), preset="paper", extra=9)
+    assert (given.mix, given.extra) == ((0.2,), 9)
+    assert AoaConfig(mix=(0.3,)).extra is None

@@ -16,6 +16,7 @@ from quick import said
 from small import glances
 
 from swiftwrf import AngularGrid, InputError, RssiModel, load, make_model, rssi_room, simulated_room
+from swiftwrf.data import ReadOptions
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
 from swiftwrf.runtime.registry import Registry
@@ -227,13 +228,13 @@ def test_receivers_of_the_model_are_found_by_name(finished, tmp_path, capsys):
 
 
 def test_a_table_without_positions(tmp_path):
-    data, is_known = read_rssi(str(write_rssi(tmp_path / "a.csv", rssi_room(n=20), located=False)), {})
+    data, is_known = read_rssi(str(write_rssi(tmp_path / "a.csv", rssi_room(n=20), located=False)), ReadOptions())
     assert (len(data), len(data.receiver_names), is_known) == (20, 12, False)
     long = pd.DataFrame({"receiver": ["a", "b", "a"], "time": [1, 1, 2], "rssi": [-50, -60, -55]})
     long.to_csv(tmp_path / "b.csv", index=False)
-    data, is_known = read_rssi(str(tmp_path / "b.csv"), {})
+    data, is_known = read_rssi(str(tmp_path / "b.csv"), ReadOptions())
     assert (len(data), is_known) == (2, False)
-    assert read_rssi(str(write_rssi(tmp_path / "c.csv", rssi_room(n=20))), {})[1]
+    assert read_rssi(str(write_rssi(tmp_path / "c.csv", rssi_room(n=20))), ReadOptions())[1]
 
 
 def test_other_rows_are_refused(finished, matched, tmp_path, capsys):

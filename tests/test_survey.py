@@ -31,7 +31,10 @@ def test_wide_table(tmp_path):
     assert data.receiver_names == tuple(NAMES[3:])
     assert same(data)
     assert not data.located
-    assert (data.name, data.notes) == ("walk", ())
+    assert data.name == "walk"
+    assert data.notes == (
+        f"-100 counts as not detected: {NOT_HEARD.sum().sum()} of 120 cells ({NOT_HEARD.to_numpy().mean():.0%})",
+    )
 
 
 @pytest.mark.parametrize("sentinel", [-200, 100, ""])
@@ -121,7 +124,7 @@ def test_columns_named_by_the_user(tmp_path):
     assert load_rssi(named, columns={"rssi": "a[1]"}).receiver_names == ("a[1]",)  # before it is taken for a pattern
     with pytest.raises(InputError, match="no column 'nowhere' for y"):
         load_rssi(file, columns={"x": "easting_of_robot", "y": "nowhere"})
-    with pytest.raises(InputError, match="columns takes x, y, z, time, receiver, rssi, got 'w'"):
+    with pytest.raises(InputError, match="columns takes x, y, z, longitude, latitude, time, receiver, rssi, got 'w'"):
         load_rssi(file, columns={"w": "y"})
 
 
@@ -140,8 +143,11 @@ def test_positions_of_receivers_beside_the_table(tmp_path):
     assert data.located
     assert data.receiver_position[:, 0].tolist() == [2, 1, 0]
     assert set(data.source) == {"walk.csv", "receivers.csv"}
-    (tmp_path / "receivers.csv").write_text("\n".join(lines[:3]))
+    (tmp_path / "receivers.csv").write_text("\n".join([*lines, lines[1]]))
     with pytest.raises(InputError, match="must have each receiver once"):
+        load_rssi(file)
+    (tmp_path / "receivers.csv").write_text("\n".join([lines[0], "elsewhere,1,2,3"]))
+    with pytest.raises(InputError, match="has none of the receivers"):
         load_rssi(file)
 
 
@@ -163,10 +169,11 @@ REFUSED = {
     "positive RSSI": (_table("x,y,a", "1,2,45", "1,2,90"), "numbers below 0"),
     "receiver without RSSI": (_table("x,y,receiver", "1,2,a"), "no RSSI beside"),
     "two columns for x": (_table("x,pos_x,y,a", "1,1,2,-50"), "may be x"),
-    "degrees": (_table("lon,lat,a", "11.5,48.1,-50"), "hold degrees"),
+    "degrees or metres": (_table("lon,lat,a", "11.5,48.1,-50", "17.5,40.1,-50"), "--coordinates metres"),
+    "latitude beyond 90": (_table("lat,lon,a", "111.5,48.1,-50"), "are they swapped"),
     "text as position": (_table("x,y,a", "here,2,-50"), "'here' is not a number"),
     "text as RSSI": (_table("x,y,a", "1,2,-50", "1,2,-51", "1,2,loud"), "'loud' is not a number"),
-    "empty position": (_table("x,y,a", ",2,-50", "1,2,-50"), "row 1 has no usable x"),
+    "no position": (_table("x,y,a", ",2,-50", "1,,-50"), "without a position are left out: 2 of 2"),
     "far position": (_table("x,y,a", "1e12,2,-50"), "at most 1e"),
     "too strong": (_table("x,y,a", "1,2,-50", "1,2,-50", "1,2,31"), "row 3, receiver a: 31 dBm"),
     "too strong, long": (

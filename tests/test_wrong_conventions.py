@@ -62,7 +62,6 @@ def shrunk(p):
 
 
 ALL_SHRUNK = replace(DATA, position=shrunk(DATA.position), fixed_position=shrunk(DATA.fixed_position))
-REPEATED = moved(lambda p: p.roll(1, 0).where(torch.arange(150)[:, None] == 3, p))
 FLIP_Y = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
 TURNED = oriented(FACING_X * Rotation.from_euler("x", 20, degrees=True))
 
@@ -80,7 +79,6 @@ NAMED = {
     "zenith for elevation": (drawn(lambda s: s.flip(1)), "run from the zenith down"),
     "phases reversed": (replace(DATA, channel=DATA.channel.conj()), "phases have the wrong sign"),
     "phases uncalibrated": (offsets(), "The array is not calibrated"),
-    "a place twice": (REPEATED, "occur more than once"),
     "RSSI, x and y swapped": (placed(lambda p: p[:, [1, 0, 2]]), "x and y of the positions are swapped"),
     "RSSI, positions in millimetres": (placed(shrunk), "the positions are in millimetres"),
     "RSSI, everything in millimetres": (placed(shrunk, receivers=True), "are positions in millimetres"),
@@ -148,9 +146,11 @@ REFUSED = {
     "quaternion in degrees": (_snapshots(array_orientation=np.array([0.0, 90.0, 25.0, 1.0])), "unit quaternion"),
     "subcarriers and elements swapped": (_snapshots(csi=DATA.channel.numpy().transpose(0, 2, 1)), "transpose"),
     "missing columns": (_survey(["a", "y", "z", *survey_rows()[0][3:]]), "no column for x"),
-    "degrees of longitude": (
-        lambda folder: load_rssi(write_survey(folder, header=["lon", "lat", "a"], rows=[[11.5, 48.1, -50]] * 12)),
-        "hold degrees",
+    "metres called longitude": (
+        lambda folder: load_rssi(
+            write_survey(folder, header=["lon", "lat", "a"], rows=[[11.5 + i, 48.1, -50] for i in range(12)])
+        ),
+        "may be degrees or metres",
     ),
 }
 

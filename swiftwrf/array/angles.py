@@ -84,6 +84,11 @@ class AngularGrid:
             azimuth=[360 / n_azimuth * column for column in range(n_azimuth)],
         )
 
+    @classmethod
+    def of(cls, grid: AngularGrid | tuple[int, int]) -> AngularGrid:
+        """Return a grid as it is, or `hemisphere` of a pair of rows and columns."""
+        return grid if isinstance(grid, AngularGrid) else cls.hemisphere(*grid)
+
     def coarsen(self, factor: int) -> AngularGrid:
         """Return the grid of the centres of factor x factor pixels. Both sizes must be multiples of the factor."""
         middle = (factor - 1) / 2
@@ -159,6 +164,11 @@ def to_angles(direction: Tensor) -> tuple[Tensor, Tensor]:
     azimuth = torch.remainder(torch.atan2(y, x), math.tau)
     azimuth = azimuth.where(azimuth < math.tau, torch.zeros_like(azimuth))  # remainder rounds -tiny up to 2 pi
     return azimuth, torch.atan2(z.abs(), torch.hypot(x, y))
+
+
+def folded_to_front(direction: Tensor) -> Tensor:
+    """Return vectors (..., 3) with z made positive: a planar array does not distinguish +z from -z."""
+    return torch.cat([direction[..., :2], direction[..., 2:].abs()], dim=-1)
 
 
 def wrap(angle: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from swiftwrf.array.angles import AngularGrid
+from swiftwrf.array.angles import AngularGrid, folded_to_front, to_angles, to_direction
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.choices import BEAMFORMERS
 from swiftwrf.errors import InputError
@@ -20,6 +20,7 @@ MAX_ELEMENTS = 4096  # of an array: the co-array grows with their square
 MAX_BASIS_VALUES = 2**28  # of the co-array's basis functions on a grid: 2 GiB
 LAG_TOLERANCE_WAVELENGTHS = 1e-6  # closer differences of element positions are one
 OPPOSITE_TOLERANCE_WAVELENGTHS = 1e-2  # between an element and the mirror image of another one
+LINE_TOLERANCE_WAVELENGTHS = 1e-2  # between the elements of a linear array and their line
 BATCH_SPECTRA, MAX_ELEMENT_PAIRS = 256, 2**24  # in double precision at a time
 
 
@@ -92,6 +93,12 @@ class PlanarArray:
         return cls(torch.cartesian_prod(y, x).flip(1), LIGHT_SPEED / frequency_hz)
 
     @property
+    def spacing_wavelengths(self) -> float:
+        """Median distance of an element from the nearest other one [wavelengths]."""
+        apart = torch.cdist(self.element, self.element).fill_diagonal_(torch.inf).amin(dim=1)
+        return float(apart.median()) / self.wavelength
+
+    @property
     def opposite(self) -> Tensor | None:
         """Index of the element at the point reflection of each one in the array's centre, (K,). None if one has none.
 
@@ -100,6 +107,35 @@ class PlanarArray:
         centre = (self.element.amax(dim=0) + self.element.amin(dim=0)) / 2
         apart, number = torch.cdist(2 * centre - self.element, self.element).min(dim=1)
         return number if bool((apart < OPPOSITE_TOLERANCE_WAVELENGTHS * self.wavelength).all()) else None
+
+    @cached_property
+    def axis(self) -> Tensor | None:
+        """Unit vector along the elements of a linear array in array coordinates, float64 (3,). None if they span a plane."""
+        offset = self.element.double() - self.element.double().mean(dim=0)
+        _, size, axes = torch.linalg.svd(offset, full_matrices=True)
+        beside = float((offset @ axes[1]).abs().max())
+        if float(size[0]) == 0 or beside > LINE_TOLERANCE_WAVELENGTHS * self.wavelength:
+            return None
+        first = axes[0] * torch.sign(axes[0][axes[0].abs().argmax()])
+        return torch.nn.functional.pad(first, (0, 1))
+
+    def folded(self, direction: Tensor) -> Tensor:
+        """Return unit vectors (..., 3), folded to one of the directions that the array does not distinguish.
+
+        A planar array does not distinguish +z from -z, so directions behind it are folded to the front. A linear array
+        receives the angle to its axis only, so directions are folded to the half-plane of its axis and +z. The angle between
+        two folded directions is the difference of their angles to the axis.
+
+        Example:
+            >>> row = PlanarArray.grid(1, 3, spacing=0.06, frequency_hz=2.4e9)
+            >>> row.folded(torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64)).tolist()
+            [0.6, 0.0, 0.8]
+        """
+        if self.axis is None:
+            return folded_to_front(direction)
+        along = (direction @ self.axis.to(direction)).clamp(-1, 1)
+        beside = (1 - along.square()).sqrt()
+        return along[..., None] * self.axis.to(direction) + torch.nn.functional.pad(beside[..., None], (2, 0))
 
     def phase(self, direction: Tensor) -> Tensor:
         """Return the phase lead (..., K) [rad] of each element over the origin for waves from unit vectors (..., 3).
@@ -152,6 +188,13 @@ class PlanarArray:
         phase = self.phase(direction.double())
         wave = gain.to(torch.complex128)[:, None] * torch.polar(torch.ones_like(phase), phase)
         return torch.zeros(n, len(self.element), dtype=torch.complex128).index_add(0, owner, wave)
+
+
+def folded_angles(array: PlanarArray | None, angles: Tensor) -> Tensor:
+    """Return azimuth and elevation (..., 2) [rad], folded as `PlanarArray.folded`; as they are if the array is unknown."""
+    if array is None or array.axis is None:
+        return angles
+    return torch.stack(to_angles(array.folded(to_direction(*angles.unbind(-1)))), dim=-1)
 
 
 def differences(array: PlanarArray) -> Tensor:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data.coordinates import Coordinates
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, ReadOptions, read
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.rssi import Rssi
@@ -22,9 +23,11 @@ def load_spectra(
     *,
     array: PlanarArray | None = None,
     beamformer: str | None = None,
-    grid: AngularGrid | None = None,
+    grid: AngularGrid | tuple[PositiveInt, PositiveInt] | None = None,
     every: PositiveInt | None = None,
     station: PositiveInt | None = None,
+    drop_null: bool = False,
+    round_trip: bool = False,
 ) -> Spectra:
     """Read spectra in any format of docs/formats.md: images or arrays of spectra, ray paths, array snapshots.
 
@@ -33,9 +36,11 @@ def load_spectra(
         array: Array of the spectra if the files do not describe it, or for which spectra of ray paths are computed. Defaults
             to 4 x 4 elements at half a wavelength.
         beamformer: Beamformer for array snapshots: phase (default), bartlett or capon.
-        grid: Directions of computed spectra. Defaults to 90 x 360.
+        grid: Directions of computed spectra, or their numbers of elevations and azimuths. Defaults to 90 x 360.
         every: Reads one measurement of that many.
         station: Number of the array in a file with several, counted from 1.
+        drop_null: Leaves out null subcarriers of array snapshots, which are the same at every position and element.
+        round_trip: Phases of array snapshots are those of the way there and back, as of RFID and backscatter.
 
     Raises:
         InputError: A part that is missing or invalid, parts that do not match, or an argument that does not apply.
@@ -45,7 +50,11 @@ def load_spectra(
         Traceback (most recent call last):
         swiftwrf.errors.InputError: nowhere is not a folder or file; expected measurements (formats: ...)
     """
-    return read_spectra(path, ReadOptions(array, beamformer, grid, every, station))
+    directions = None if grid is None else AngularGrid.of(grid)
+    options = ReadOptions(
+        array, beamformer, directions, every, station, drop_null=drop_null or None, round_trip=round_trip or None
+    )
+    return read_spectra(path, options)
 
 
 def read_spectra(path: str | Path, options: ReadOptions) -> Spectra:
@@ -60,31 +69,59 @@ def read_spectra(path: str | Path, options: ReadOptions) -> Spectra:
 
 @checked
 def load_snapshots(
-    path: str | Path, *, every: PositiveInt | None = None, station: PositiveInt | None = None
+    path: str | Path,
+    *,
+    every: PositiveInt | None = None,
+    station: PositiveInt | None = None,
+    drop_null: bool = False,
+    round_trip: bool = False,
 ) -> Snapshots:
     """Read array snapshots, with arguments as in `load_spectra`.
 
     Raises:
         InputError: As `load_spectra`.
     """
-    data: Snapshots = read(path, ReadOptions(every=every, station=station), SNAPSHOT_FORMATS)
+    options = ReadOptions(every=every, station=station, drop_null=drop_null or None, round_trip=round_trip or None)
+    data: Snapshots = read(path, options, SNAPSHOT_FORMATS)
     return data
 
 
 @checked
-def load_rssi(path: str | Path, *, columns: Mapping[str, str] | None = None) -> Rssi:
+def load_rssi(
+    path: str | Path,
+    *,
+    columns: Mapping[str, str] | None = None,
+    filler: Sequence[float] | None = None,
+    coordinates: Coordinates | None = None,
+    offset_by: str | None = None,
+) -> Rssi:
     """Read RSSI in any format of docs/formats.md: the NeRF2 layout, or a survey table (CSV, Parquet).
 
     Args:
         path: Folder or file.
-        columns: Names of columns of a table that are not recognised, by role: x, y, z, time, receiver, rssi.
+        columns: Names of columns of a table that are not recognised, by role: x, y, z, longitude, latitude, time, receiver,
+            rssi.
+        filler: Values that stand for not detected, [] for none. Defaults to those that are recognised.
+        coordinates: "degrees" or "metres", of the positions in a table. Defaults to the unit that is recognised.
+        offset_by: Column of a table with groups of rows, e.g. devices, between which RSSI has constant offsets.
 
     Raises:
         InputError: A part that is missing or invalid, parts that do not match, or an argument that does not apply.
     """
-    data: Rssi = read(path, ReadOptions(columns=columns), RSSI_FORMATS)
+    values = None if filler is None else tuple(map(float, filler))
+    options = ReadOptions(columns=columns, filler=values, coordinates=coordinates, offset_by=offset_by)
+    return read_rssi(path, options)
+
+
+def read_rssi(path: str | Path, options: ReadOptions) -> Rssi:
+    """Read RSSI as `load_rssi`, with its arguments in one object.
+
+    Raises:
+        InputError: As `load_rssi`.
+    """
+    data: Rssi = read(path, options, RSSI_FORMATS)
     return data
 
 
 __all__ = ["PropagationPaths", "ReadOptions", "Rssi", "Snapshots", "Spectra"]
-__all__ += ["load_rssi", "load_snapshots", "load_spectra", "read_spectra"]
+__all__ += ["load_rssi", "load_snapshots", "load_spectra", "read_rssi", "read_spectra"]

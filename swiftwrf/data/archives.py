@@ -1,4 +1,4 @@
-"""Arrays in npy files, npz archives and HDF5: never unpickled, with sizes checked before memory is allocated."""
+"""Arrays in npy, npz, HDF5 and MATLAB files: never unpickled, with sizes checked before memory is allocated."""
 
 from __future__ import annotations
 
@@ -12,22 +12,33 @@ from typing import Any
 import numpy as np
 from numpy.lib.format import read_array_header_1_0, read_array_header_2_0, read_magic
 from numpy.typing import NDArray
+from scipy.io import loadmat, whosmat
 
 from swiftwrf.errors import InputError
 
 MAX_UNPACKED_BYTES, MAX_STORED_BYTES = 2**30, 2**33  # of arrays that are compressed, and not
 MAX_ROWS_BYTES = 2**36  # of an array that is read some rows at a time
-NUMPY, HDF5 = (".npz",), (".h5", ".hdf5")
-ARCHIVES = (*NUMPY, *HDF5)  # suffixes of files that hold arrays by name
+NUMPY, HDF5, MATLAB = (".npz",), (".h5", ".hdf5"), (".mat",)
+ARCHIVES = (*NUMPY, *HDF5, *MATLAB)  # suffixes of files that hold arrays by name
+MATLAB_HDF5 = (b"MATLAB 7.3", b"\x89HDF")  # first bytes of .mat files that are HDF5, of MATLAB and of Octave
+MATLAB_NUMBERS = {
+    "double",
+    "single",
+    "logical",
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
+}
+COMPLEX_FIELDS = (("real", "imag"), ("r", "i"))  # of the compounds that stand for complex numbers in HDF5
 Arrays = dict[str, NDArray[Any]]
 
 
 def array_names(file: Path) -> set[str]:
     """Return the names of the arrays in an npz archive or HDF5 file, none if it is no such file."""
     try:
-        if file.suffix in HDF5:
+        if _is_hdf5(file):
             with _hdf5(file) as content:
                 return set(content)
+        if file.suffix in MATLAB:
+            return set(_matlab_shapes(file))
         with zipfile.ZipFile(file) as archive:
             return _stored(archive)
     except InputError:
@@ -37,7 +48,7 @@ def array_names(file: Path) -> set[str]:
 
 
 def read_arrays(file: Path, needed: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
-    """Return arrays of numbers from an npz archive or HDF5 file.
+    """Return arrays of numbers from an npz archive, HDF5 or MATLAB file. Compounds of real and imaginary parts are complex.
 
     Raises:
         InputError: No such file, a broken one, an array that is missing or holds no numbers, or one that unpacks to more
@@ -45,11 +56,14 @@ def read_arrays(file: Path, needed: Sequence[str], optional: Sequence[str] = ())
     """
     if not file.is_file():
         raise InputError(f"{file} is missing")
-    with refusing_broken(file, f"{'an HDF5 file' if file.suffix in HDF5 else 'an npz archive'} of plain numbers"):
-        if file.suffix in HDF5:
+    kind = "an HDF5 file" if _is_hdf5(file) else "a MATLAB file" if file.suffix in MATLAB else "an npz archive"
+    with refusing_broken(file, f"{kind} of plain numbers"):
+        if _is_hdf5(file):
             with _hdf5(file) as content:
                 names = _choose(file, set(content), needed, optional)
                 return _read_hdf5(content, names, file)
+        if file.suffix in MATLAB:
+            return _read_matlab(file, needed, optional)
         with zipfile.ZipFile(file) as archive:
             names = _choose(file, _stored(archive), needed, optional)
             members = {name: archive.getinfo(f"{name}.npy") for name in names}
@@ -150,6 +164,30 @@ def _header(stream: Any, name: str, size: int) -> tuple[tuple[int, ...], bool, n
     return shape, by_columns, dtype
 
 
+def _is_hdf5(file: Path) -> bool:
+    """Return True for the suffixes of HDF5, and for MATLAB files of version 7.3."""
+    if file.suffix not in MATLAB:
+        return file.suffix in HDF5
+    with file.open("rb") as stream:
+        return stream.read(len(MATLAB_HDF5[0])).startswith(MATLAB_HDF5)
+
+
+def _matlab_shapes(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
+    """Return shape and class of the variables of a MATLAB file before version 7.3."""
+    return {name: (tuple(shape), kind) for name, shape, kind in whosmat(file)}
+
+
+def _read_matlab(file: Path, needed: Sequence[str], optional: Sequence[str]) -> Arrays:
+    shapes = _matlab_shapes(file)
+    names = _choose(file, set(shapes), needed, optional)
+    for name in names:
+        if shapes[name][1] not in MATLAB_NUMBERS:
+            raise ValueError(f"{name} holds {shapes[name][1]}, expected numbers")
+    _check_total(sum(math.prod(shapes[name][0]) * np.dtype(complex).itemsize for name in names), file)
+    content = loadmat(file, variable_names=names)
+    return {name: np.ascontiguousarray(content[name]) for name in names}
+
+
 def _hdf5(file: Path) -> Any:
     try:
         import h5py
@@ -164,9 +202,32 @@ def _read_hdf5(content: Any, names: Sequence[str], file: Path) -> Arrays:
     """Return datasets of an HDF5 file. Links to other files are refused, because HDF5 follows them silently."""
     import h5py
 
+    found = {}
     for name in names:
-        own = isinstance(content.get(name, getlink=True), h5py.HardLink) and isinstance(content[name], h5py.Dataset)
-        if not own or content[name].is_virtual or content[name].external or content[name].dtype.kind not in "biufc":
+        owner, key = (content[name], "value") if _is_octave(content, name) else (content, name)
+        own = isinstance(owner.get(key, getlink=True), h5py.HardLink) and isinstance(owner[key], h5py.Dataset)
+        dtype = _number_type(owner[key].dtype) if own and not (owner[key].is_virtual or owner[key].external) else None
+        if dtype is None:
             raise ValueError(f"{name} is no array of numbers in this file")
-    _check_total(sum(math.prod(content[name].shape) * content[name].dtype.itemsize for name in names), file)
-    return {name: np.asarray(content[name][()]) for name in names}
+        found[name] = owner[key], dtype
+    _check_total(sum(math.prod(array.shape) * dtype.itemsize for array, dtype in found.values()), file)
+    return {name: np.asarray(array[()]).view(dtype) for name, (array, dtype) in found.items()}
+
+
+def _is_octave(content: Any, name: str) -> bool:
+    """Return True for a variable that Octave saved: a group with its type and its value."""
+    import h5py
+
+    own = isinstance(content.get(name, getlink=True), h5py.HardLink)
+    return own and isinstance(content[name], h5py.Group) and {"type", "value"} <= set(content[name])
+
+
+def _number_type(dtype: np.dtype[Any]) -> np.dtype[Any] | None:
+    """Return the type of numbers in HDF5: complex for compounds of real and imaginary parts, None for anything else."""
+    if dtype.kind in "biufc":
+        return dtype
+    if dtype.names not in COMPLEX_FIELDS or dtype.itemsize not in (8, 16):
+        return None
+    part = dtype[0]
+    is_complex = part == dtype[1] and part.kind == "f" and 2 * part.itemsize == dtype.itemsize
+    return np.dtype(f"{part.byteorder}c{dtype.itemsize}") if is_complex else None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import itertools
 import math
 import re
 from collections.abc import Iterable, Iterator
@@ -22,6 +23,7 @@ from swiftwrf.errors import InputError
 
 MAX_TEXT_BYTES = 2**28  # a million rows of positions take a tenth of it
 MAX_COORDINATE_M = 1e9  # beyond, float64 does not resolve a wavelength
+MAX_PREAMBLE_LINES = 20  # before the header of a table
 DECIMAL_COMMA = re.compile(r"^(\s*[+-]?\d+),(\d+\s*)$")
 PLAIN_TAGS = {
     f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "timestamp", "seq", "map")
@@ -140,18 +142,40 @@ def numbers(value: Any, count: int) -> tuple[float, ...] | None:
     return found if all(map(math.isfinite, found)) else None
 
 
-def read_cells(file: Path, separators: str = ",") -> tuple[list[str], list[list[str]]]:
+def lines_before_header(file: Path, separators: str = ",") -> int:
+    """Return the number of lines before the header of a table, e.g. 1 for a first line of metadata.
+
+    The header is the first line of names that has as many cells as the line below.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
+    lines = read_text(file).split("\n", MAX_PREAMBLE_LINES + 2)[: MAX_PREAMBLE_LINES + 2]
+    for skipped, (line, below) in enumerate(itertools.pairwise(lines)):
+        separator = max(separators, key=line.count)
+        try:
+            header, row = (next(csv.reader([text], delimiter=separator), []) for text in (line, below))
+        except csv.Error:  # read_cells refuses it
+            return 0
+        is_header = all(cell.strip() and math.isnan(number(cell)) for cell in header)
+        if len(header) == len(row) > 1 and (is_header or not skipped):
+            return skipped
+    return 0
+
+
+def read_cells(file: Path, separators: str = ",", skipped: int = 0) -> tuple[list[str], list[list[str]]]:
     """Return header and rows of a table, as text.
 
     Args:
         file: One row a line, with separators between values.
         separators: Possible separators; the most frequent one in the header counts. Numbers may have a decimal comma if it
             is not the comma.
+        skipped: Number of lines before the header.
 
     Raises:
         InputError: No such file, a column without name or a name twice, rows of unequal length, no rows.
     """
-    text = read_text(file)
+    text = read_text(file).split("\n", skipped)[-1]
     first = text.split("\n", 1)[0]
     separator = max(separators, key=first.count)
     try:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, to_angles
-from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
+from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray, folded_angles
 from swiftwrf.choices import Moving
 from swiftwrf.data.spectra import GRID, Spectra, array_spectra, check_pixels
 from swiftwrf.errors import InputError
@@ -136,7 +136,7 @@ class PropagationPaths:
             position=position,
             array=array,
             grid=grid,
-            label=torch.stack(to_angles(self.transmitter - self.receiver), dim=-1),
+            label=folded_angles(array, torch.stack(to_angles(self.transmitter - self.receiver), dim=-1)),
             line_of_sight=self.line_of_sight,
             moving=moving,
             name=name,

@@ -11,11 +11,77 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin
 from swiftwrf.data.dataset import Numbers, PositionedData, to_positions
 from swiftwrf.data.splits import MIN_TRAINING
-from swiftwrf.data.survey import read_survey
+from swiftwrf.data.survey import SurveyOptions, read_survey
 from swiftwrf.errors import InputError, listed
 from swiftwrf.runtime.validation import checked
+
+UNKNOWN = (float("nan"),) * 3  # position of a receiver
+
+
+@dataclass(frozen=True, eq=False)
+class Groups:
+    """Groups of rows between which RSSI has constant offsets, e.g. devices or channels.
+
+    Args:
+        column: Name of the column with the groups' names.
+        names: Names of the groups.
+        code: Group of each row, int64 (n,).
+    """
+
+    column: str
+    names: tuple[str, ...]
+    code: Tensor
+
+    @classmethod
+    def of(cls, column: str, values: Sequence[str]) -> Groups:
+        """Return the groups of n rows by their values in a column."""
+        code, names = pd.factorize(np.asarray(values, dtype=object), sort=True)
+        return cls(column, tuple(map(str, names)), torch.from_numpy(code.astype(np.int64)))
+
+    def __len__(self) -> int:
+        return len(self.code)
+
+    def subset(self, rows: Tensor) -> Groups:
+        """Return the groups of the given rows."""
+        return replace(self, code=self.code[rows])
+
+    def labels(self) -> list[str]:
+        """Return the name of each row's group."""
+        return [self.names[code] for code in self.code.tolist()]
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """Offsets of RSSI between groups of rows.
+
+    Args:
+        column: Name of the column with the groups' names.
+        reference: Group whose offset is 0.
+        offset_db: Offset of each group [dB].
+        explained: Fraction of the variance about the field that the offsets explain.
+    """
+
+    column: str
+    reference: str
+    offset_db: Mapping[str, float]
+    explained: float
+
+    def of(self, data: Rssi) -> Tensor:
+        """Return the offset of each row, float64 (n,) [dB]; 0 for a group without an estimate, or without groups."""
+        labels = data.groups.labels() if data.groups else [self.reference] * len(data)
+        return torch.tensor([self.offset_db.get(label, 0.0) for label in labels], dtype=torch.float64)
+
+    def removed(self, data: Rssi) -> Rssi:
+        """Return the data as the reference group would have measured them."""
+        return replace(data, rssi_dbm=data.rssi_dbm - self.of(data)[:, None], offsets=self)
+
+    def note(self) -> str:
+        """Return a sentence with all offsets."""
+        each = listed(f"{name} {db:+.1f} dB" for name, db in self.offset_db.items() if name != self.reference)
+        return f"offsets of {self.column} relative to {self.reference}, which maps are of: {each}"
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -25,13 +91,17 @@ class Rssi(PositionedData):
     Args:
         rssi_dbm: RSSI, (n, R) [dBm], nan where a receiver did not detect the transmitter.
         transmitter_position: Positions of the transmitter, (n, 3) [m].
-        receiver_position: Positions of the receivers, (R, 3) [m]. Defaults to nan for all, which stands for unknown.
+        receiver_position: Positions of the receivers, (R, 3) [m], nan where unknown. Defaults to nan for all.
         receiver_names: Names of the receivers. Defaults to receiver1, receiver2, ...
+        origin: Latitude and longitude of x = y = 0, if the positions were projected from degrees.
+        groups: Groups of rows between which RSSI has constant offsets.
+        offsets: Offsets that were removed from the RSSI.
+        labels: Names of columns of the table that distinguish groups of rows.
         name: Name of the data set.
         details: index, named_splits, source and notes of `PositionedData`.
 
     Raises:
-        InputError: A length that does not match, an infinite number, or positions of some receivers only.
+        InputError: A length that does not match, or an infinite number.
 
     Example:
         >>> data = Rssi([[-60.0, float("nan")]] * 20, torch.rand(20, 3), receiver_names=["hall", "office"])
@@ -43,8 +113,12 @@ class Rssi(PositionedData):
     transmitter_position: Tensor
     receiver_position: Tensor
     receiver_names: tuple[str, ...]
+    origin: GeodeticOrigin | None
+    groups: Groups | None
+    offsets: Offsets | None
+    labels: tuple[str, ...]
 
-    row_fields: ClassVar[tuple[str, ...]] = ("transmitter_position", "rssi_dbm", "index")
+    row_fields: ClassVar[tuple[str, ...]] = ("transmitter_position", "rssi_dbm", "index", "groups")
 
     @checked
     def __init__(
@@ -54,6 +128,10 @@ class Rssi(PositionedData):
         *,
         receiver_position: Numbers | None = None,
         receiver_names: Sequence[str] | None = None,
+        origin: GeodeticOrigin | None = None,
+        groups: Groups | None = None,
+        offsets: Offsets | None = None,
+        labels: tuple[str, ...] = (),
         name: str = "rssi",
         **details: Any,
     ) -> None:
@@ -72,9 +150,9 @@ class Rssi(PositionedData):
         places = torch.full((count, 3), torch.nan, dtype=torch.float64)
         if receiver_position is not None:
             places = torch.as_tensor(receiver_position, dtype=torch.float64)
-        if places.shape != (count, 3) or not (bool(places.isfinite().all()) or bool(places.isnan().all())):
+        if places.shape != (count, 3) or not bool((places.isfinite().all(dim=1) | places.isnan().all(dim=1)).all()):
             raise InputError(
-                f"receiver_position must hold ({count}, 3) finite numbers [m], or nan for all receivers, got shape "
+                f"receiver_position must hold ({count}, 3) numbers [m], for each receiver finite ones or nan, got shape "
                 f"{tuple(places.shape)}"
             )
         super().__init__(
@@ -84,6 +162,10 @@ class Rssi(PositionedData):
             transmitter_position=position,
             receiver_position=places,
             receiver_names=names,
+            origin=origin,
+            groups=groups,
+            offsets=offsets,
+            labels=labels,
         )
 
     @classmethod
@@ -92,6 +174,9 @@ class Rssi(PositionedData):
         frame: pd.DataFrame,
         *,
         columns: Mapping[str, str] | None = None,
+        filler: Sequence[float] | None = None,
+        coordinates: Coordinates | None = None,
+        offset_by: str | None = None,
         receiver_position: Mapping[str, Sequence[float]] | None = None,
         name: str = "rssi",
     ) -> Rssi:
@@ -99,33 +184,69 @@ class Rssi(PositionedData):
 
         Args:
             frame: Columns of positions [m] and RSSI [dBm], recognised by their names as in docs/formats.md.
-            columns: Names of columns that are not recognised, by role: x, y, z, time, receiver, rssi.
-            receiver_position: Positions [m] by name of the receiver.
+            columns: Names of columns that are not recognised, by role: x, y, z, longitude, latitude, time, receiver, rssi.
+            filler: Values that stand for not detected, [] for none. Defaults to those that are recognised.
+            coordinates: "degrees" or "metres". Defaults to the unit that is recognised.
+            offset_by: Column with the groups of rows between which RSSI has constant offsets.
+            receiver_position: Positions [m] by name of the receiver; those of others are unknown.
             name: Name of the data set.
 
         Raises:
-            InputError: A column that is missing or ambiguous, a value that is no position or received power, or a receiver
-                without a position.
+            InputError: A column that is missing or ambiguous, or a value that is no position or received power.
 
         Example:
             >>> Rssi.from_frame(pd.DataFrame({"x": [0, 1], "y": [0, 1], "z": [1, 1], "hall": [-50, -60]})).receiver_names
             ('hall',)
         """
-        names, rssi, position, notes = read_survey("the table", frame, columns or {})
-        if receiver_position is not None and (missing := [r for r in names if r not in receiver_position]):
-            raise InputError(f"receiver_position lacks {listed(missing)}")
-        places = None if receiver_position is None else [list(receiver_position[receiver]) for receiver in names]
-        return cls(rssi, position, receiver_position=places, receiver_names=names, name=name, notes=notes)
+        options = SurveyOptions(columns, None if filler is None else tuple(filler), coordinates, offset_by)
+        survey = read_survey("the table", frame, options)
+        known = receiver_position or {}
+        return cls(
+            survey.rssi_dbm,
+            survey.position,
+            receiver_position=[list(known.get(receiver, UNKNOWN)) for receiver in survey.receiver_names],
+            receiver_names=survey.receiver_names,
+            origin=survey.origin,
+            groups=Groups.of(offset_by, survey.group) if offset_by else None,
+            labels=survey.labels,
+            name=name,
+            index=survey.row,
+            notes=survey.notes,
+        )
 
     @property
     def located(self) -> bool:
-        """True if the positions of the receivers are known."""
-        return bool(self.receiver_position.isfinite().all())
+        """True if the position of a receiver is known."""
+        return bool(self.receiver_located.any())
+
+    @property
+    def receiver_located(self) -> Tensor:
+        """Whether the position of each receiver is known, bool (R,)."""
+        return self.receiver_position.isfinite().all(dim=1)
 
     @property
     def detected(self) -> Tensor:
         """Whether a receiver detected the transmitter, bool (n, R)."""
         return ~self.rssi_dbm.isnan()
+
+    def about(self, origin: GeodeticOrigin | None) -> Rssi:
+        """Return the data in local metres about another origin.
+
+        Args:
+            origin: Origin of the metres. With None, or if the data have none, nothing changes.
+        """
+        if origin is None or self.origin is None or origin == self.origin:
+            return self
+        own = self.origin
+
+        def moved(position: Tensor) -> Tensor:
+            xy = origin.to_metres(own.to_degrees(position[:, :2].numpy()))
+            return torch.cat([torch.from_numpy(xy), position[:, 2:]], dim=1)
+
+        places = self.receiver_position.clone()
+        places[self.receiver_located] = moved(places[self.receiver_located])
+        position = moved(self.transmitter_position)
+        return replace(self, transmitter_position=position, receiver_position=places, origin=origin)
 
     def receivers(self, asked: Sequence[str]) -> Rssi:
         """Return the data of some receivers.

@@ -14,9 +14,10 @@ from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.dataset import Numbers, PositionedData, to_positions, to_tensor
 from swiftwrf.data.spectra import GRID, Spectra, array_spectra, check_pixels
-from swiftwrf.errors import InputError
+from swiftwrf.errors import InputError, ranges
 from swiftwrf.runtime.validation import checked
 
+NULL_TOLERANCE = 1e-3  # relative difference between values of a null subcarrier
 SPACING_WAVELENGTHS = (0.01, 20.0)  # of neighbouring elements: beyond, positions are in another unit than metres
 
 
@@ -99,17 +100,17 @@ class Snapshots(PositionedData):
         direction: Tensor = away / away.norm(dim=1, keepdim=True) @ self.rotation
         return direction
 
-    def spectra(self, grid: AngularGrid | None = None, beamformer: str = PHASE) -> Spectra:
+    def spectra(self, grid: AngularGrid | tuple[int, int] | None = None, beamformer: str = PHASE) -> Spectra:
         """Return the spectra of the array, from all snapshots of a position together.
 
         Args:
-            grid: Directions. Defaults to 90 x 360.
+            grid: Directions, or their numbers of elevations and azimuths. Defaults to 90 x 360.
             beamformer: Name in `swiftwrf.array.beamforming`: phase, bartlett or capon.
 
         Raises:
             InputError: An unknown beamformer, too few snapshots for it, or spectra of too many pixels.
         """
-        grid = grid or GRID
+        grid = AngularGrid.of(grid or GRID)
         check_pixels(self.name, len(self), grid)
         same = ("position", "line_of_sight", "index", "named_splits", "array", "source", "fixed_position", "rotation")
         return Spectra(
@@ -137,10 +138,37 @@ def check_spacing(file: Path, array: PlanarArray) -> None:
     """
     if len(array.element) < 2:
         raise InputError(f"{file} describes an array of one element, which sees no directions; at least 2 are needed")
-    apart = torch.cdist(array.element, array.element).fill_diagonal_(torch.inf).amin(dim=1).median() / array.wavelength
-    low, high = SPACING_WAVELENGTHS
-    if not low <= float(apart) <= high:
+    apart, (low, high) = array.spacing_wavelengths, SPACING_WAVELENGTHS
+    if not low <= apart <= high:
         raise InputError(
-            f"{file}: neighbouring elements are {float(apart) * array.wavelength:.4g} m, {float(apart):.3g} wavelengths "
+            f"{file}: neighbouring elements are {apart * array.wavelength:.4g} m, {apart:.3g} wavelengths "
             f"apart; expected {low:g} to {high:g} wavelengths, so is the spacing in metres and the carrier in Hz?"
         )
+
+
+def without_null(channel: Tensor, drop: bool | None) -> tuple[Tensor, tuple[str, ...]]:
+    """Return the channel (n, S, K), without null subcarriers on request, and a note that names them.
+
+    Null, guard and DC subcarriers hold a constant or nothing: they are the same at every position and element.
+
+    Example:
+        >>> channel = torch.randn(5, 4, 3, dtype=torch.complex64)
+        >>> channel[:, 2] = 12 + 3j
+        >>> without_null(channel, drop=True)
+        (..., ('null subcarriers, the same at every position and element, are left out (1 of 4, counted from 0): 2',))
+    """
+    first = channel[:1, :, :1]
+    null = ((channel - first).abs() <= NULL_TOLERANCE * first.abs()).all(dim=2).all(dim=0)
+    if not bool(null.any()) or bool(null.all()) or len(channel) < 2:
+        return channel, ()
+    which = f"({int(null.sum())} of {len(null)}, counted from 0): {ranges(null.nonzero()[:, 0].tolist())}"
+    name = "null subcarriers, the same at every position and element, are"
+    if drop:
+        return channel[:, ~null], (f"{name} left out {which}",)
+    return channel, (f"{name} used like the others {which}; --drop-null leaves them out",)
+
+
+def round_trip_array(array: PlanarArray) -> tuple[PlanarArray, tuple[str, ...]]:
+    """Return the array for phases of the way there and back, which change as those of half the wavelength, and a note."""
+    note = "phases are those of the way there and back, so half the wavelength counts"
+    return PlanarArray(array.element, array.wavelength / 2), (note,)

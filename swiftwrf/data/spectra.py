@@ -15,7 +15,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, ArrayPose, to_angles
 from swiftwrf.array.beamforming import PHASE
-from swiftwrf.array.planar import PlanarArray
+from swiftwrf.array.planar import PlanarArray, folded_angles
 from swiftwrf.choices import Moving
 from swiftwrf.data.dataset import Numbers, PositionedData, to_positions, to_tensor
 from swiftwrf.data.splits import MIN_TRAINING
@@ -112,7 +112,7 @@ class Spectra(PositionedData):
         elif fixed_position is not None and rotation is not None:
             if bool((same := (position == fixed_position).all(dim=1)).any()):
                 raise InputError(f"position {int(same.nonzero()[0])} is that of the fixed end, so it has no direction")
-            label = direction_of_link(position, fixed_position, rotation, moving)
+            label = direction_of_link(position, fixed_position, rotation, moving, array)
         else:
             label = torch.full((len(position), 2), torch.nan, dtype=torch.float64)
         if label.dim() != 2 or label.shape[1] != 2:
@@ -161,7 +161,11 @@ class Spectra(PositionedData):
                 f"{self.name} does not describe the position of the fixed end and the orientation of the array, so the "
                 "direction at synthetic positions is unknown"
             )
-        return direction_of_link(position, self.fixed_position, self.rotation, self.moving)
+        return direction_of_link(position, self.fixed_position, self.rotation, self.moving, self.array)
+
+    def peak_direction(self, rows: Tensor) -> Tensor:
+        """Return azimuth and elevation (m, 2) [rad] of the largest magnitude of some spectra, folded as the labels."""
+        return folded_angles(self.array, self.grid.peak_direction(self.store[rows]))
 
     def coarsen(self, factor: int) -> Spectra:
         """Return the spectra averaged over squares of factor x factor pixels.
@@ -217,11 +221,16 @@ def array_spectra(array: PlanarArray, channel: Tensor, grid: AngularGrid, beamfo
     return stored(shape, torch.float32, key, lambda: (array.spectrum(channel[r], grid, beamformer) for r in rows))
 
 
-def direction_of_link(position: Tensor, fixed_position: Tensor, rotation: Tensor, moving: Moving) -> Tensor:
-    """Return azimuth and elevation (n, 2) [rad] of the transmitter in array coordinates, with arguments as in `Spectra`."""
+def direction_of_link(
+    position: Tensor, fixed_position: Tensor, rotation: Tensor, moving: Moving, array: PlanarArray | None = None
+) -> Tensor:
+    """Return azimuth and elevation (n, 2) [rad] of the transmitter in array coordinates, with arguments as in `Spectra`.
+
+    Directions that the array does not distinguish are folded (`PlanarArray.folded`).
+    """
     away = position.double() - fixed_position
     towards = away if moving == "transmitter" else -away
-    return torch.stack(to_angles(towards @ rotation), dim=-1)
+    return folded_angles(array, torch.stack(to_angles(towards @ rotation), dim=-1))
 
 
 def check_pixels(name: str, n: int, grid: AngularGrid) -> None:

@@ -14,6 +14,7 @@ from swiftwrf.runtime.validation import PositiveInt, checked
 
 TEST_SHARE = 0.2
 MIN_TRAINING = 10  # measurements
+MAX_REPEATED = 0.1  # fraction of test rows at training positions, beyond which a split tests look-up
 MAX_INDEX_DIGITS = 18
 FOLDS = 5
 
@@ -74,11 +75,69 @@ def _read_indices(file: Path, n: int, first: int) -> list[int]:
     return list(rows)
 
 
-def random_split(n: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Return training rows and a random fifth as test rows, both ascending. Suits positions drawn independently."""
-    order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))
-    n_test = round(TEST_SHARE * n)
-    return order[n_test:].sort().values, order[:n_test].sort().values
+def kept_splits(splits: dict[str, tuple[Tensor, Tensor]], kept: Tensor, n: int) -> dict[str, tuple[Tensor, Tensor]]:
+    """Return splits of n rows as splits of those that are kept, given by their numbers.
+
+    Example:
+        >>> kept_splits({"days": (torch.tensor([0, 1]), torch.tensor([2]))}, torch.tensor([1, 2]), 3)
+        {'days': (tensor([0]), tensor([1]))}
+    """
+    number = torch.full((n,), -1).scatter(0, kept, torch.arange(len(kept)))
+    return {
+        name: (a[a >= 0], b[b >= 0]) for name, (a, b) in ((k, (number[x], number[y])) for k, (x, y) in splits.items())
+    }
+
+
+def places(position: Tensor, n_parts: int) -> Tensor:
+    """Return the number of the place of each row (n, 3), in the order in which the places first occur, int64 (n,).
+
+    Rows at one position share a place. Each row is a place of its own if there are fewer places than parts.
+    """
+    rows = torch.arange(len(position))
+    spots, spot = position.unique(dim=0, return_inverse=True)
+    if len(spots) < n_parts:
+        return rows
+    first = torch.full((len(spots),), len(position)).scatter_reduce(0, spot, rows, "amin")
+    return first.argsort().argsort()[spot]
+
+
+def random_rows(position: Tensor, n: int, seed: int) -> Tensor:
+    """Return at most n random rows, ascending, that share no position with the others. Exactly n if no position repeats.
+
+    If every position has more than n rows, those of one with the fewest are returned.
+    """
+    place = places(position, 2)
+    size = place.bincount()
+    order = torch.randperm(len(size), generator=torch.Generator().manual_seed(seed))
+    chosen = torch.zeros(len(size), dtype=torch.bool)
+    left = n
+    for number, rows in zip(order.tolist(), size[order].tolist(), strict=True):
+        if rows <= left:
+            chosen[number], left = True, left - rows
+    if n and left == n:
+        chosen[size.argmin()] = True
+    return chosen[place].nonzero()[:, 0]
+
+
+def random_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:
+    """Return training rows and a random fifth as test rows, both ascending. Rows at one position are in one part.
+
+    Suits positions drawn independently.
+    """
+    test = random_rows(position, round(TEST_SHARE * len(position)), seed)
+    is_test = torch.zeros(len(position), dtype=torch.bool).index_fill(0, test, value=True)
+    return (~is_test).nonzero()[:, 0], test
+
+
+def repeated_fraction(train: Tensor, test: Tensor) -> float:
+    """Return the fraction of test positions (n, 3) that are training positions (m, 3), too.
+
+    Example:
+        >>> repeated_fraction(torch.zeros(1, 3), torch.tensor([[0.0, 0, 0], [1, 0, 0]]))
+        0.5
+    """
+    known = set(map(tuple, train.tolist()))
+    return sum(tuple(row) in known for row in test.tolist()) / max(len(test), 1)
 
 
 def slabs(position: Tensor, n_slabs: int) -> Tensor:
@@ -107,7 +166,7 @@ def block_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:
 
 @checked
 def folds(position: Tensor, validation: Validation, seed: int, number: PositiveInt = FOLDS) -> Tensor:
-    """Return the fold of each training position (n, 3), counted from 0.
+    """Return the fold of each training position (n, 3), counted from 0. Rows at one position share a fold.
 
     Args:
         position: Training positions, (n, 3) [m].
@@ -124,8 +183,9 @@ def folds(position: Tensor, validation: Validation, seed: int, number: PositiveI
     """
     if validation == "block":
         return slabs(position, number)
-    order = torch.randperm(len(position), generator=torch.Generator().manual_seed(seed))
-    return order % number
+    place = places(position, number)
+    order = torch.randperm(len(place.unique()), generator=torch.Generator().manual_seed(seed))
+    return (order % number)[place]
 
 
 def validation_for(split: str) -> Validation:
@@ -144,7 +204,7 @@ def choose_split(
     if name in named:
         train, test = named[name]
     elif name == "random":
-        train, test = random_split(len(position), seed)
+        train, test = random_split(position, seed)
     elif name == "block":
         train, test = block_split(position, seed)
     else:

@@ -24,7 +24,7 @@ from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES
 from swiftwrf.data.files import MAX_COORDINATE_M, check_carrier, digests, read_text
 from swiftwrf.data.formats.base import Format, ReadOptions
-from swiftwrf.data.snapshots import Snapshots, check_spacing
+from swiftwrf.data.snapshots import Snapshots, check_spacing, round_trip_array, without_null
 from swiftwrf.data.tfrecords import records
 from swiftwrf.errors import InputError
 
@@ -76,7 +76,7 @@ class Station:
 class RecordFormat(Format[Snapshots]):
     """Reader of TFRecord files with channel and position, one record a measurement."""
 
-    takes = frozenset({"beamformer", "grid", "every", "station"})
+    takes = frozenset({"beamformer", "grid", "every", "station", "drop_null", "round_trip"})
     assigned: ClassVar[bool]
     """whether the description assigns antennas to rows and columns"""
 
@@ -129,9 +129,11 @@ class RecordFormat(Format[Snapshots]):
             raise InputError(f"{path} holds no record with a position and a channel")
         if without:
             notes = (*notes, f"records without a finite position or channel are left out: {without}")
+        kept, null = without_null(torch.from_numpy(np.stack(channels)), options.drop_null)
+        array, turned = round_trip_array(array) if options.round_trip else (array, ())
         name = path.resolve().name if path.is_dir() else path.stem
         return Snapshots(
-            np.stack(channels),
+            kept,
             np.stack(positions),
             array=array,
             name=f"{name}-{station.name}" if station.name else name,
@@ -139,7 +141,7 @@ class RecordFormat(Format[Snapshots]):
             rotation=station.rotation,
             index=index,
             source=digests([*files, described, *beside]),
-            notes=notes,
+            notes=(*notes, *null, *turned),
         )
 
     def _records(

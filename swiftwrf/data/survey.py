@@ -16,38 +16,61 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES, refusing_broken
-from swiftwrf.data.files import MAX_COORDINATE_M, read_cells
+from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin, degrees_in, without_fix
+from swiftwrf.data.files import MAX_COORDINATE_M, lines_before_header, read_cells
+from swiftwrf.data.fillers import KNOWN_FILLERS, MIN_RSSI_DBM, check_powers, find_fillers, without_fillers
 from swiftwrf.errors import InputError, listed
 
 Floats = NDArray[np.float64]
 SUFFIXES = (".csv", ".parquet")
 SEPARATORS = ",;\t"
 EMPTY_CELLS = {"", "nan", "na", "n/a", "null", "none", "-"}
-NOT_DETECTED_DBM = -100.0  # a missing value, not a weak one
-SENTINELS_DBM = (NOT_DETECTED_DBM, -200.0, 100.0)  # values that tables use for a receiver that detected nothing
-MIN_RSSI_DBM, MAX_RSSI_DBM = -150.0, 30.0
 STOREY_M = 4.0  # height of a floor, in a table with numbers of floors and no heights
 MAX_VALUES = 2**27  # rows x receivers
-AXIS = "(?:(?:pos|position|coord|tx)_)?{0}(?:_(?:pos|position|coord))?(?:_m)?"
+MAX_GROUPS, MIN_GROUP_ROWS = 30, 10  # of a column that may distinguish devices or channels
+AXIS = "(?:(?:pos|position|coord|tx|rx)_)?{0}(?:_(?:pos|position|coord))?(?:_m)?"
 ROLES = {  # names of columns, in lower case with underscores
-    "x": re.compile(AXIS.format("x") + "|easting|longitude|lon"),
-    "y": re.compile(AXIS.format("y") + "|northing|latitude|lat"),
-    "z": re.compile(AXIS.format("z") + "|(?:height|altitude)(?:_m)?"),
-    "floor": re.compile("floor"),
-    "time": re.compile("time(?:_s)?|timestamp|t|date(?:_?time)?"),
+    "x": re.compile(AXIS.format("x") + "|east(?:ing)?|e_?coord"),
+    "y": re.compile(AXIS.format("y") + "|north(?:ing)?|n_?coord"),
+    "z": re.compile(AXIS.format("z") + "|(?:height|alt|altitude|elevation)_?(?:m|meters|metres)?"),
+    "longitude": re.compile("(?:gps_?|current_?)?(?:lon|lng|long|longitude)(?:_deg(?:rees)?)?"),
+    "latitude": re.compile("(?:gps_?|current_?)?(?:lat|latitude)(?:_deg(?:rees)?)?"),
+    "floor": re.compile("floor(?:_?id)?"),
+    "time": re.compile("time(?:_s)?|timestamp|t|date(?:_?time)?|first_?seen"),
     "receiver": re.compile("receiver(?:_(?:name|id))?|rx|gateway|ap|bssid|mac|sensor|anchor"),
     "rssi": re.compile("(?:rssi?|rsrp|signal|power)(?:_dbm)?|rss_dbm|dbm"),
 }
 NAMED_ROLES = tuple(role for role in ROLES if role != "floor")  # roles that a user can assign
-DEGREES = {"longitude", "lon", "latitude", "lat"}
+GEODETIC = {"x": "longitude", "y": "latitude"}  # that take the place of x and y
+
+
+class SurveyOptions(NamedTuple):
+    """What a user states about a table.
+
+    Args:
+        columns: Names of columns that are not recognised, by role.
+        filler: Values that stand for not detected. Defaults to those that are recognised; none if it is empty.
+        coordinates: Unit of the positions. Defaults to the one that is recognised.
+        offset_by: Column with the group of each row. Packets of a row of RSSI are of one group.
+    """
+
+    columns: Mapping[str, str] | None = None
+    filler: tuple[float, ...] | None = None
+    coordinates: Coordinates | None = None
+    offset_by: str | None = None
 
 
 class Survey(NamedTuple):
-    """Content of a survey table."""
+    """Content of a survey table: n rows with a position at R receivers."""
 
     receiver_names: list[str]
     rssi_dbm: Floats  # (n, R), nan where a receiver detected nothing
     position: Floats  # (n, 3) [m]
+    row: NDArray[np.int64]  # number of each row in the table, before those without a position are left out
+    n_rows: int  # of the table
+    origin: GeodeticOrigin | None  # of positions in degrees
+    group: list[str]  # of each row; empty if it was not asked for
+    labels: tuple[str, ...]  # columns that distinguish groups of rows
     notes: tuple[str, ...]
 
 
@@ -58,7 +81,7 @@ def read_frame(file: Path) -> pd.DataFrame:
         InputError: No such file, or one that is broken, has no rows, or a column without a name of its own.
     """
     if file.suffix.lower() != ".parquet":
-        header, rows = read_cells(file, SEPARATORS)
+        header, rows = read_cells(file, SEPARATORS, lines_before_header(file, SEPARATORS))
         return pd.DataFrame(rows, columns=header, dtype=object)
     try:
         from pyarrow import parquet
@@ -76,23 +99,47 @@ def read_frame(file: Path) -> pd.DataFrame:
 
 def has_positions(table: pd.DataFrame, columns: Mapping[str, str]) -> bool:
     """Return True if a column of a table holds positions, by its name or by the names of columns given by role."""
-    return any(column_of(table, role, columns) is not None for role in ("x", "y"))
+    return any(column_of(table, role, columns) is not None for role in ("x", "y", *GEODETIC.values()))
 
 
 def column_of(table: pd.DataFrame, role: str, columns: Mapping[str, str]) -> str | None:
     """Return the first column of a role, by the names of columns given by role or by its own name. None without one."""
-    if role in columns:
-        return columns[role]
-    return next((name for name in map(str, table.columns) if ROLES[role].fullmatch(_plain(name))), None)
+    return columns[role] if role in columns else next(iter(_candidates(table, role)), None)
 
 
-def read_survey(label: object, table: pd.DataFrame, columns: Mapping[str, str]) -> Survey:
+def _candidates(table: pd.DataFrame, role: str) -> list[str]:
+    """Return the columns whose names are of a role. A column of powers does not hold names of receivers."""
+    found = [name for name in map(str, table.columns) if ROLES[role].fullmatch(_plain(name))]
+    return [name for name in found if role != "receiver" or not _is_rssi(table[name])]
+
+
+def first_rows(table: pd.DataFrame, columns: Mapping[str, str], offset_by: str | None = None) -> NDArray[np.int64]:
+    """Return the first row in the table of each row of RSSI: packets of a long table share rows of RSSI.
+
+    Args:
+        table: Survey table, with or without positions.
+        columns: Names of columns that are not recognised, by role.
+        offset_by: Column with the group of each row.
+    """
+    receiver, time = (column_of(table, role, columns) for role in ("receiver", "time"))
+    if receiver is None:
+        return np.arange(len(table))
+    roles = ("x", "y", "z", "longitude", "latitude", "floor")
+    keys = {role: name for role in roles if (name := column_of(table, role, columns)) is not None}
+    coordinate = pd.DataFrame({role: column_of_numbers("the table", table, name) for role, name in keys.items()})
+    if offset_by is not None:
+        coordinate["group"] = _text(table[offset_by])
+    row = _row_of_packet(coordinate, _text(table[receiver]), None if time is None else _text(table[time]))
+    return np.unique(row, return_index=True)[1]
+
+
+def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> Survey:
     """Return receivers, RSSI and positions of a survey table.
 
     Args:
         label: Name of the table, for messages.
         table: One row a position (wide) or a packet (long).
-        columns: Names of columns that are not recognised, by role: x, y, z, time, receiver, rssi.
+        options: What the user states about it.
 
     Raises:
         InputError: A column that is missing or ambiguous, or a value that is no position or received power.
@@ -100,19 +147,45 @@ def read_survey(label: object, table: pd.DataFrame, columns: Mapping[str, str]) 
     table = table.set_axis([str(name).strip() for name in table.columns], axis=1)
     if not len(table) or not table.columns.is_unique:
         raise InputError(f"{label} must have rows, and a name of its own for each column")
-    roles = _roles(label, table, columns)
-    position, notes = _positions(label, table, roles)
+    asked = options.columns or {}
+    roles = _roles(label, table, asked)
+    coordinate, notes = _coordinates(label, table, roles)
+    if options.offset_by is not None and options.offset_by not in table.columns:
+        raise InputError(f"{label} has no column {options.offset_by!r} for offsets; there are {listed(table.columns)}")
+    group = _text(table[options.offset_by]) if options.offset_by else pd.Series([""] * len(table))
     if "receiver" in roles:
-        names, rssi, position = _long(label, table, roles, position)
+        names, rssi, source, coordinate = _long(label, table, roles, coordinate, group)
+        unused = [name for name in table.columns if name not in roles.values()]
     else:
-        names, rssi = _wide(label, table, roles, columns, notes)
-    rssi = _without_sentinels(rssi, notes)
-    kept = (~np.isnan(rssi)).any(axis=0)
+        names, rssi = _wide(label, table, roles, asked)
+        source = np.arange(len(table))[:, None]
+        unused = [name for name in table.columns if name not in roles.values() and name not in names]
+    unused = [name for name in unused if name != options.offset_by]
+    if unused:
+        notes.append(f"columns that are not used: {listed(unused)}")
+    fillers = find_fillers(rssi) if options.filler is None else list(options.filler)
+    check_powers(label, rssi, names, fillers, source)
+    rssi, found = without_fillers(rssi, fillers)
+    omitted, missing = without_fix(coordinate)
+    notes += found + missing
+    if omitted.all():
+        raise InputError(f"{label} has no row with a position; {missing[0]}")
+    row = np.flatnonzero(~omitted)
+    position, origin = _in_metres(label, roles, coordinate[row], options.coordinates)
+    if origin is not None:
+        x, y = (roles.get(role) or roles[GEODETIC[role]] for role in "xy")
+        if np.abs(coordinate[row, 1]).max() > 90:  # only a longitude does
+            x, y = y, x
+        notes.append(f"longitude {x} and latitude {y} are projected to local metres about {origin}")
+    kept = (~np.isnan(rssi[row])).any(axis=0)
     if not kept.any():
         raise InputError(f"{label} holds no RSSI that a receiver detected")
     if not kept.all():
         notes.append(f"receivers that never detected the transmitter are left out: {int((~kept).sum())}")
-    return Survey([names[i] for i in np.flatnonzero(kept)], rssi[:, kept], position, tuple(notes))
+    names = [names[i] for i in np.flatnonzero(kept)]
+    groups = group.to_numpy()[source.max(axis=1)[row]].tolist() if options.offset_by else []
+    labels = tuple(name for name in unused if _distinguishes(table[name]))
+    return Survey(names, rssi[row][:, kept], position, row, len(rssi), origin, groups, labels, tuple(notes))
 
 
 def column_of_numbers(label: object, table: pd.DataFrame, name: str) -> Floats:
@@ -128,22 +201,6 @@ def column_of_numbers(label: object, table: pd.DataFrame, name: str) -> Floats:
     return values
 
 
-def check_powers(label: object, values: Floats, receiver: NDArray[np.object_], sentinels: tuple[float, ...]) -> None:
-    """Refuse values (rows, columns) that are neither received powers nor sentinels; `receiver` names each of them.
-
-    Raises:
-        InputError: The first such value, with its row and receiver.
-    """
-    bad = np.argwhere(~((values >= MIN_RSSI_DBM) & (values <= MAX_RSSI_DBM)) & ~np.isin(values, sentinels))
-    if len(bad):
-        row, column = bad[0]
-        name = np.broadcast_to(receiver, values.shape)[row, column]
-        raise InputError(
-            f"{label} row {row + 1}, receiver {name}: {values[row, column]:g} dBm is no received power; expected "
-            f"{MIN_RSSI_DBM:g} to {MAX_RSSI_DBM:g}, or {', '.join(f'{v:g}' for v in sentinels)} for not detected"
-        )
-
-
 def _roles(label: object, table: pd.DataFrame, asked: Mapping[str, str]) -> dict[str, str]:
     """Return the column of each role: the one asked for, or else the one with a known name."""
     for role in asked:
@@ -154,8 +211,8 @@ def _roles(label: object, table: pd.DataFrame, asked: Mapping[str, str]) -> dict
         pattern = role == "rssi" and fnmatch.filter(table.columns, name)
         if role not in roles and not pattern:
             raise InputError(f"{label} has no column {name!r} for {role}; there are {listed(table.columns)}")
-    for role, known in ROLES.items():
-        found = [name for name in table.columns if known.fullmatch(_plain(name)) and name not in roles.values()]
+    for role in ROLES:
+        found = [name for name in _candidates(table, role) if name not in roles.values()]
         if role in asked or not found:
             continue
         if len(found) > 1:
@@ -163,8 +220,10 @@ def _roles(label: object, table: pd.DataFrame, asked: Mapping[str, str]) -> dict
                 f"{label} has {len(found)} columns that may be {role} ({listed(found)}); say which: columns {role}=NAME"
             )
         roles[role] = found[0]
-    for role in ("x", "y"):
-        if role not in roles:
+    for role, other in GEODETIC.items():
+        if other in roles and role in roles:
+            del roles[other]
+        if role not in roles and other not in roles:
             raise InputError(
                 f"{label} has no column for {role}; there are {listed(table.columns)}; say which: columns {role}=NAME"
             )
@@ -180,14 +239,9 @@ def _plain(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
 
 
-def _positions(label: object, table: pd.DataFrame, roles: dict[str, str]) -> tuple[Floats, list[str]]:
-    """Return the positions of the rows (n, 3) [m], and notes on heights that are missing."""
-    x, y = (column_of_numbers(label, table, roles[role]) for role in ("x", "y"))
-    degrees = {_plain(roles["x"]), _plain(roles["y"])} & DEGREES
-    if degrees and np.nanmax(np.abs(x)) <= 180 and np.nanmax(np.abs(y)) <= 90:
-        raise InputError(
-            f"{label}: columns {roles['x']} and {roles['y']} hold degrees; give positions in metres, projected to the plane"
-        )
+def _coordinates(label: object, table: pd.DataFrame, roles: dict[str, str]) -> tuple[Floats, list[str]]:
+    """Return the coordinates of the rows (n, 3) as they are, nan where empty, and notes on heights that are missing."""
+    x, y = (column_of_numbers(label, table, roles.get(role) or roles[GEODETIC[role]]) for role in "xy")
     notes = []
     if "z" in roles:
         z = column_of_numbers(label, table, roles["z"])
@@ -197,38 +251,59 @@ def _positions(label: object, table: pd.DataFrame, roles: dict[str, str]) -> tup
     else:
         z = np.zeros(len(table))
         notes.append("there is no height, so z is 0 m everywhere")
-    position = np.stack([x, y, z], axis=1)
-    bad = np.argwhere(~(np.abs(position) <= MAX_COORDINATE_M))  # nan compares false, so it is bad too
+    coordinate = np.stack([x, y, z], axis=1)
+    bad = np.argwhere(np.abs(coordinate) > MAX_COORDINATE_M)
     if len(bad):
         row, axis = bad[0]
         raise InputError(
-            f"{label} row {row + 1} has no usable {'xyz'[axis]} ({position[row, axis]:g}); positions must be finite numbers "
-            f"[m], at most {MAX_COORDINATE_M:g}"
+            f"{label} row {row + 1} has no usable {'xyz'[axis]} ({coordinate[row, axis]:g}); positions must be finite "
+            f"numbers [m], at most {MAX_COORDINATE_M:g}"
         )
-    return position, notes
+    return coordinate, notes
+
+
+def _in_metres(
+    label: object, roles: dict[str, str], coordinate: Floats, asked: Coordinates | None
+) -> tuple[Floats, GeodeticOrigin | None]:
+    """Return positions (n, 3) [m], and their origin if they were in degrees."""
+    names = roles.get("x") or roles["longitude"], roles.get("y") or roles["latitude"]
+    degrees = degrees_in(label, names, coordinate[:, :2], "longitude" in roles and "latitude" in roles, asked)
+    if degrees is None:
+        return coordinate, None
+    origin = GeodeticOrigin.amid(degrees)
+    return np.column_stack([origin.to_metres(degrees), coordinate[:, 2]]), origin
 
 
 def _long(
-    label: object, table: pd.DataFrame, roles: dict[str, str], position: Floats
-) -> tuple[list[str], Floats, Floats]:
-    """Return receivers, RSSI and positions with one row for each time and place; repeated packets have a row each."""
+    label: object, table: pd.DataFrame, roles: dict[str, str], coordinate: Floats, group: pd.Series
+) -> tuple[list[str], Floats, NDArray[np.int64], Floats]:
+    """Return receivers, RSSI (n, R), its row in the table (n, R), and coordinates, with one row for each time and place.
+
+    Repeated packets have a row each.
+    """
     receiver = _text(table[roles["receiver"]])
     nameless = (receiver == "").to_numpy().nonzero()[0]
     if len(nameless):
         raise InputError(f"{label} row {nameless[0] + 1} has no receiver in column {roles['receiver']}")
     power = column_of_numbers(label, table, roles["rssi"])
-    check_powers(label, _filled(power[:, None]), receiver.to_numpy()[:, None], SENTINELS_DBM)
-    keys = pd.DataFrame(position, columns=list("xyz"))
-    if "time" in roles:
-        keys["time"] = _text(table[roles["time"]]).to_numpy()
-    keys["repeat"] = keys.assign(receiver=receiver.to_numpy()).groupby([*keys.columns, "receiver"]).cumcount()
-    row = keys.groupby(list(keys.columns), sort=False).ngroup().to_numpy()
+    time = _text(table[roles["time"]]) if "time" in roles else None
+    row = _row_of_packet(pd.DataFrame(coordinate).assign(group=group.to_numpy()), receiver, time)
     column, names = pd.factorize(receiver)
     _, first = np.unique(row, return_index=True)
     _check_size(label, len(first), len(names))
-    values = np.full((len(first), len(names)), np.nan)
-    values[row, column] = power
-    return list(names), values, position[first]
+    values, source = np.full((len(first), len(names)), np.nan), np.zeros((len(first), len(names)), dtype=np.int64)
+    values[row, column], source[row, column] = power, np.arange(len(table))
+    return list(names), values, source, coordinate[first]
+
+
+def _row_of_packet(coordinate: pd.DataFrame, receiver: pd.Series, time: pd.Series | None) -> NDArray[np.int64]:
+    """Return the row of RSSI of each packet, counted from 0: one for each place, time and repetition at a receiver."""
+    keys = coordinate.assign(time="" if time is None else time.to_numpy())
+    grouping = {"sort": False, "dropna": False}
+    packets = keys.assign(receiver=receiver.to_numpy())
+    keys["repeat"] = packets.groupby(list(packets.columns), **grouping).cumcount()
+    row: NDArray[np.int64] = keys.groupby(list(keys.columns), **grouping).ngroup().to_numpy()
+    return row
 
 
 def _text(column: pd.Series) -> pd.Series:
@@ -237,29 +312,21 @@ def _text(column: pd.Series) -> pd.Series:
 
 
 def _wide(
-    label: object, table: pd.DataFrame, roles: dict[str, str], asked: Mapping[str, str], notes: list[str]
+    label: object, table: pd.DataFrame, roles: dict[str, str], asked: Mapping[str, str]
 ) -> tuple[list[str], Floats]:
     """Return receivers and RSSI: the columns that match the name asked for, or all that hold RSSI only."""
     others = [name for name in table.columns if name not in roles.values() or name == roles.get("rssi")]
     if "rssi" in asked:
         names = [asked["rssi"]] if asked["rssi"] in others else fnmatch.filter(others, asked["rssi"])
     else:
-        names = [name for name in others if _is_rssi(table[name])]
-        if unused := [name for name in others if name not in names]:
-            notes.append(f"columns that hold no RSSI in dBm are not used: {listed(unused)}")
+        names = [name for name in others if _is_rssi(table[name]) and not _is_coordinate(name)]
     if not names:
         raise InputError(
             f"{label} has no column of RSSI in dBm (numbers below 0) besides positions; there are {listed(table.columns)}; "
             "say which: columns rssi=NAME or rssi='PREFIX*'"
         )
     _check_size(label, len(table), len(names))
-    values = np.stack([column_of_numbers(label, table, name) for name in names], axis=1)
-    check_powers(label, _filled(values), np.array(names, dtype=object), SENTINELS_DBM)
-    return names, values
-
-
-def _filled(values: Floats) -> Floats:
-    return np.nan_to_num(values, nan=NOT_DETECTED_DBM, posinf=np.inf, neginf=-np.inf)
+    return names, np.stack([column_of_numbers(label, table, name) for name in names], axis=1)
 
 
 def _parsed(column: pd.Series) -> tuple[Floats, NDArray[np.bool_]]:
@@ -273,24 +340,29 @@ def _parsed(column: pd.Series) -> tuple[Floats, NDArray[np.bool_]]:
 
 
 def _is_rssi(column: pd.Series) -> bool:
-    """Return True if most cells are received powers, or all numbers are sentinels."""
+    """Return True if most cells are received powers or fillers, whatever the number of these."""
     values, text = _parsed(column)
-    known = values[~np.isnan(values)]
-    if text.sum() > len(known) or not len(known):
+    known = np.unique(values[~np.isnan(values)])
+    if not len(known) or text.sum() > np.isfinite(values).sum():
         return False
-    power = known[~np.isin(known, SENTINELS_DBM)]
-    return not len(power) or MIN_RSSI_DBM <= float(np.median(power)) < 0
+    power = known[~np.isin(known, KNOWN_FILLERS) & np.isfinite(known)]
+    if not len(power):
+        return bool((known != 0).any())
+    below = power[power < 0]
+    mostly_below = len(power) - len(below) <= 1 or np.median(power) < 0
+    return bool(mostly_below and len(below) and np.median(below) >= MIN_RSSI_DBM)
+
+
+def _distinguishes(column: pd.Series) -> bool:
+    """Return True if a column has few different values, each of them in several rows."""
+    times = _text(column).value_counts()
+    return 2 <= len(times) <= MAX_GROUPS and int(times.min()) >= MIN_GROUP_ROWS
+
+
+def _is_coordinate(name: str) -> bool:
+    return any(ROLES[role].fullmatch(_plain(name)) for role in ("x", "y", "z", "longitude", "latitude"))
 
 
 def _check_size(label: object, rows: int, receivers: int) -> None:
     if rows * receivers > MAX_VALUES:
         raise InputError(f"{label} has {rows} rows and {receivers} receivers; at most {MAX_VALUES} values are read")
-
-
-def _without_sentinels(rssi: Floats, notes: list[str]) -> Floats:
-    """Return RSSI with nan in place of sentinels. -100 dBm is a measured value if weaker ones occur."""
-    always = np.isin(rssi, SENTINELS_DBM[1:])
-    weaker = bool((rssi[~always] < NOT_DETECTED_DBM).any())
-    if weaker and bool((rssi == NOT_DETECTED_DBM).any()):
-        notes.append(f"values below {NOT_DETECTED_DBM:g} dBm occur, so {NOT_DETECTED_DBM:g} counts as measured")
-    return np.where(always | ((rssi == NOT_DETECTED_DBM) & (not weaker)), np.nan, rssi)

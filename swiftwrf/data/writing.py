@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
+from swiftwrf.data.fillers import NOT_DETECTED_DBM
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.store import write_npy
-from swiftwrf.data.survey import NOT_DETECTED_DBM
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.durable import replacing, write_bytes, write_text
 
@@ -54,7 +54,7 @@ def write_spectra(data: Spectra, folder: Path) -> None:
 
 
 def write_rssi(data: Rssi, folder: Path) -> None:
-    """Write tx_pos.csv, gateway_rssi.csv, the splits, and gateway_position.yml if the receivers' positions are known.
+    """Write tx_pos.csv, gateway_rssi.csv, the splits, and gateway_position.yml with the known positions of receivers.
 
     Measurements of exactly -100 dBm, which the layout uses for not detected, are written as -99.99.
 
@@ -67,7 +67,8 @@ def write_rssi(data: Rssi, folder: Path) -> None:
     write_text(folder / "gateway_rssi.csv", _csv(quoted, rssi.nan_to_num(NOT_DETECTED_DBM)))
     write_text(folder / "tx_pos.csv", _csv("x,y,z", data.transmitter_position))
     if data.located:
-        places = dict(zip(data.receiver_names, data.receiver_position.tolist(), strict=True))
+        known = zip(data.receiver_names, data.receiver_position.tolist(), data.receiver_located.tolist(), strict=True)
+        places = {name: position for name, position, is_located in known if is_located}
         write_text(folder / "gateway_position.yml", yaml.safe_dump(places, sort_keys=False, allow_unicode=True))
     _write_splits(data.named_splits, folder, first=0)
 

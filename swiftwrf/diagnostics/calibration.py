@@ -25,11 +25,12 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from swiftwrf.array.angles import wrap
+from swiftwrf.array.angles import angular_distance, wrap
 from swiftwrf.array.beamforming import covariance
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.splits import FOLDS, MIN_TRAINING, slabs
+from swiftwrf.diagnostics.elements import phases_are_constant
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.threads import single_thread
 
@@ -41,6 +42,7 @@ SINGULAR = 1e-9  # relative eigenvalue below which a matrix is singular
 CLEAR_SHARE = 0.5  # of the received power, along a clear line of sight
 NEIGHBOURHOODS = 20
 MAX_LOSS = 0.02  # of that share at held-out positions
+MIN_CONE = math.radians(20)  # angle between the lines of sight and their mean (median), below which they are too narrow
 MAX_TURN_STD, MAX_PHASE_STD = math.radians(3), math.radians(30)  # beyond, the rotation is not identifiable
 
 
@@ -93,8 +95,8 @@ def calibrate(train: Snapshots) -> Calibration:
         train: Snapshots of training positions. Those without line of sight are omitted.
 
     Raises:
-        InputError: Fewer than 20 positions with line of sight, fewer than 10 where the direct path dominates, or a rotation
-            that is not identifiable.
+        InputError: Fewer than 20 positions with line of sight, fewer than 10 where the direct path dominates, a linear
+            array, phases that do not depend on the position, a rotation beyond 45 degrees or one that is not identifiable.
     """
     seen = train.subset(train.line_of_sight.nonzero()[:, 0])
     if len(seen) < 2 * MIN_TRAINING:
@@ -102,8 +104,23 @@ def calibrate(train: Snapshots) -> Calibration:
             f"{train.name} has {len(seen)} training positions with line of sight; a calibration needs at least "
             f"{2 * MIN_TRAINING}"
         )
+    if train.array.axis is not None:
+        raise InputError(
+            f"the elements of {train.name} lie on a line, which receives the angle to its axis only, so the array's "
+            "orientation cannot be estimated"
+        )
+    if phases_are_constant(seen):
+        raise InputError(
+            f"the phases between the elements of {train.name} hardly depend on the position, so they do not contain the "
+            "direction of the line of sight"
+        )
     problem = _Problem.of(seen)
     found = problem.descend(problem.scan())
+    if (turn := float(found.turn.norm())) > MAX_TURN:
+        raise InputError(
+            f"the phases of {train.name} fit best with the array turned by {math.degrees(turn):.0f} degrees; beyond "
+            f"{math.degrees(MAX_TURN):.0f} degrees that is an error of frames, not of mounting, so nothing is calibrated"
+        )
     clear = int((problem.shares(found) >= CLEAR_SHARE).sum())
     if clear < MIN_TRAINING:
         raise InputError(
@@ -112,10 +129,13 @@ def calibrate(train: Snapshots) -> Calibration:
         )
     phase_std, turn_std = problem.standard_errors(found)
     if float(turn_std.max()) > MAX_TURN_STD or float(phase_std.max()) > MAX_PHASE_STD:
+        narrow = problem.cone() < MIN_CONE
+        reason = "measure positions in more directions from the array" if narrow else (
+            "phases change from position to position as no direct path explains"
+        )  # fmt: skip
         raise InputError(
-            f"the positions of {train.name} cannot tell the array's orientation from its elements' phases (standard errors "
-            f"{math.degrees(float(turn_std.max())):.1f} and {math.degrees(float(phase_std.max())):.0f} degrees); measure "
-            "positions in more directions from the array"
+            f"{train.name} does not determine the array's orientation and its elements' phases (standard errors "
+            f"{math.degrees(float(turn_std.max())):.1f} and {math.degrees(float(phase_std.max())):.0f} degrees); {reason}"
         )
     before, after = problem.held_out(found, slabs(seen.position, FOLDS))
     if after < before - MAX_LOSS:
@@ -156,6 +176,11 @@ class _Problem:
         return cls(
             data.array, data.position, data.direction, received, torch.linalg.eigh(received).eigenvectors[..., -1]
         )
+
+    def cone(self) -> float:
+        """Return the median angle [rad] between the lines of sight and their mean direction."""
+        mean = self.direction.mean(dim=0).expand_as(self.direction)
+        return float(angular_distance(self.direction, mean).median())
 
     def subset(self, rows: Tensor) -> _Problem:
         return _Problem(

@@ -4,15 +4,19 @@ The peak of a spectrum is often in the direction of the line of sight. The score
 
     a(frame) = mean over positions of exp(-theta^2 / (2 sigma^2)),    sigma = 10 degrees,
 
-with theta the angle between peak and line of sight in that frame. Its chance level is the mean over pairs of different
-positions; only the excess counts as evidence, and there is none if all positions lie in one direction. An error of frames
-(axes swapped, a quaternion in another order, millimetres, azimuths clockwise, ...) is named if its agreement clearly exceeds
-that of the declared frame, and so is any other constant rotation.
+with theta the angle between peak and line of sight in that frame, both folded to the directions that the array
+distinguishes. For a linear array, theta is the difference of their angles to its axis. Of peaks of nearly equal height, the
+nearest one counts. The chance level is the mean over pairs of different positions. Only the excess over it counts.
+
+An error of frames is named if its agreement clearly exceeds that of the declared frame and it explains most of the peaks:
+axes swapped, a quaternion in another order, millimetres, azimuths clockwise, elements in another order. So is any other
+constant rotation, if both halves of the positions have it.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,33 +25,65 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from torch import Tensor
+from torch.nn import functional
 
-from swiftwrf.array.angles import angular_distance, to_angles, to_direction
-from swiftwrf.data.rssi import Rssi
+from swiftwrf.array.angles import AngularGrid, folded_to_front, to_angles, to_direction
+from swiftwrf.array.beamforming import PHASE
+from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
+from swiftwrf.data.splits import slabs
+from swiftwrf.diagnostics.elements import other_readings, power_share
 
 SIGMA = math.radians(10)
+MAX_ANGLE_DEG = 10.0  # median angle between peak and line of sight in a frame that fits
 MAX_POSITIONS = 300
 MIN_EVIDENCE = 0.15  # agreement above chance to accept a frame, and above the declared frame to prefer another one
-TIE = 0.02  # difference in agreement of explanations that are not distinguished
+MIN_EXPLAINED = 0.5  # agreement with an error that is named
+TIE = 0.03  # difference in agreement of explanations that are not distinguished
+EQUAL_PEAKS = 0.97  # of the largest magnitude: peaks above it are alternatives
+MAX_PEAKS = 8
 SCANNED_ROTATIONS = 4000
-MIN_TURN = math.radians(5)  # of a constant rotation that is reported
+MIN_TURN = math.radians(
+    5
+)  # of a constant rotation that is reported, and the most that two halves of the positions differ
+MIN_TURN_EXPLAINED = 0.8  # agreement with a constant rotation that is reported: with three angles, much is explained
 MIN_TURN_GAIN = 0.03  # in agreement, of such a rotation
+NARROW_DEG = 10.0  # angle between lines of sight (median of pairs), below which no frame can be checked
+MAX_STEADY = 0.25  # angle between peaks relative to that between lines of sight, below which spectra hardly differ
+SCANNED_OFFSETS = 40  # of a mirror
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
 AXES = torch.eye(3, dtype=torch.float64)
 SWAPS = {"x and y": AXES[[1, 0, 2]], "y and z": AXES[[0, 2, 1]], "x and z": AXES[[2, 1, 0]]}
 MIRRORS = {axis: AXES - 2 * torch.outer(unit, unit) for axis, unit in zip("xyz", AXES, strict=True)}
-AZIMUTH_ERRORS = {  # maps from x, y of the line of sight to those of the peaks
-    "azimuths of the spectra turn clockwise (or the array's y axis is reversed)": ((1, 0), (0, -1)),
-    "azimuths of the spectra turn clockwise from -x (or the array's x axis is reversed)": ((-1, 0), (0, 1)),
-    "azimuths of the spectra are half a turn off (or phases have the wrong sign)": ((-1, 0), (0, -1)),
-    "azimuths of the spectra count from y instead of x": ((0, 1), (-1, 0)),
-    "azimuths of the spectra count from -y instead of x": ((0, -1), (1, 0)),
-    "azimuths turn clockwise from y, as on a compass (or the array's x and y are swapped)": ((0, 1), (1, 0)),
+# maps from x, y of the line of sight to those of the peaks; of spectra, and of spectra that are computed from snapshots
+AZIMUTH_ERRORS = {
+    ("azimuths of the spectra turn clockwise (or the array's y axis is reversed)", "the array's y axis is reversed"): (
+        (1, 0),
+        (0, -1),
+    ),
+    (
+        "azimuths of the spectra turn clockwise from -x (or the array's x axis is reversed)",
+        "the array's x axis is reversed",
+    ): ((-1, 0), (0, 1)),
+    (
+        "azimuths of the spectra are half a turn off (or phases have the wrong sign)",
+        "phases have the wrong sign (or the array is half a turn off)",
+    ): ((-1, 0), (0, -1)),
+    ("azimuths of the spectra count from y instead of x", "the array is a quarter turn off, its x axis at y"): (
+        (0, 1),
+        (-1, 0),
+    ),
+    ("azimuths of the spectra count from -y instead of x", "the array is a quarter turn off, its x axis at -y"): (
+        (0, -1),
+        (1, 0),
+    ),
+    (
+        "azimuths turn clockwise from y, as on a compass (or the array's x and y are swapped)",
+        "the array's x and y are swapped",
+    ): ((0, 1), (1, 0)),
 }
 MIN_CLEAR_POSITIONS = 20  # with line of sight, to check frames
-MIN_VARIANCE_GAIN = 0.1  # in explained variance of RSSI, to prefer another frame
 
 
 @dataclass(frozen=True)
@@ -58,6 +94,9 @@ class FrameReport:
         agreement: Agreement in the declared frame, in [0, 1].
         chance: Chance level of the agreement.
         angle_deg: Median angle between peak and line of sight [deg].
+        span_deg: Median angle between the lines of sight of two positions [deg].
+        peak_span_deg: Median angle between the peaks of two positions [deg].
+        behind: Fraction of the lines of sight that lie behind the array. 0 for a linear array, which has no front.
         explanations: Errors with clearly more agreement than the declared frame, in words; several are not distinguished.
         explained: Agreement with them.
         turn_deg: Constant rotation with more agreement, as a rotation vector in array coordinates [deg], or None.
@@ -67,25 +106,44 @@ class FrameReport:
     agreement: float
     chance: float
     angle_deg: float
+    span_deg: float
+    peak_span_deg: float
+    behind: float
     explanations: tuple[str, ...]
     explained: float
     turn_deg: tuple[float, float, float] | None
     positions: int
 
     @property
-    def fits(self) -> bool:
-        """True if the declared frame explains the peaks, and no other frame does clearly better."""
+    def follows(self) -> bool:
+        """True if peaks follow the line of sight more than by chance, and no other frame does clearly better."""
         return self.agreement - self.chance >= MIN_EVIDENCE and not self.explanations and self.turn_deg is None
+
+    @property
+    def fits(self) -> bool:
+        """True if the declared frame explains most peaks, and no other frame does clearly better."""
+        return self.follows and self.angle_deg <= MAX_ANGLE_DEG
+
+    @property
+    def narrow(self) -> bool:
+        """True if all lines of sight have nearly one direction, so that frames cannot be checked."""
+        return self.span_deg < NARROW_DEG
+
+    @property
+    def steady(self) -> bool:
+        """True if the spectra hardly differ, although the lines of sight do."""
+        return not self.narrow and self.peak_span_deg < MAX_STEADY * self.span_deg
 
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """Positions of the moving end (n, 3) and of the fixed one (3,), rotation (3, 3), sign of the line of sight."""
+    """Positions of the moving end (n, 3) and of the fixed one (3,), rotation (3, 3), sign of the line of sight, array."""
 
     position: Tensor
     fixed: Tensor
     rotation: Tensor
     sign: float
+    array: PlanarArray | None
 
     def towards(self) -> Tensor:
         """Return unit vectors of the line of sight in array coordinates, (n, 3)."""
@@ -94,19 +152,34 @@ class _Frame:
         return direction
 
     def direction(self) -> Tensor:
-        """Return `towards`, folded to the front of the array."""
-        return _folded(self.towards())
+        """Return `towards`, folded to the directions that the array distinguishes."""
+        return self.folded(self.towards())
+
+    def folded(self, direction: Tensor) -> Tensor:
+        """Return directions (..., 3), folded to those that the array distinguishes."""
+        return folded_to_front(direction) if self.array is None else self.array.folded(direction)
+
+    @property
+    def linear(self) -> bool:
+        """True if the array is known to lie on a line."""
+        return self.array is not None and self.array.axis is not None
+
+    def peaks(self, spectra: Tensor, grid: AngularGrid) -> Tensor:
+        """Return the directions of the largest magnitude and of others of nearly equal height, (n, P, 3)."""
+        return self.folded(_peaks(spectra, grid))
 
     def mapped(self, matrix: Tensor, both: bool = False) -> _Frame:
         """Return the frame with a matrix (3, 3) applied to the positions, and to the fixed one if `both`."""
         return replace(self, position=self.position @ matrix, fixed=self.fixed @ matrix if both else self.fixed)
 
 
-def check_frames(spectra: Spectra) -> FrameReport | None:
+def check_frames(spectra: Spectra, snapshots: Snapshots | None = None, beamformer: str = PHASE) -> FrameReport | None:
     """Compare the peaks of the spectra with the lines of sight, in the declared frame and in others.
 
     Args:
         spectra: Spectra with known fixed end and orientation. Positions without line of sight are omitted.
+        snapshots: Snapshots that the spectra were computed from, to try other orders of their elements and axes.
+        beamformer: Beamformer of those spectra.
 
     Returns:
         The report, or None with fewer than 20 such positions or an unknown frame.
@@ -120,148 +193,171 @@ def check_frames(spectra: Spectra) -> FrameReport | None:
     if len(rows) < MIN_CLEAR_POSITIONS or spectra.fixed_position is None or spectra.rotation is None:
         return None
     rows = rows[torch.linspace(0, len(rows) - 1, min(MAX_POSITIONS, len(rows))).round().long()]
-    peak = to_direction(*spectra.grid.peak_direction(spectra.store[rows]).unbind(-1))
     sign = 1.0 if spectra.moving == "transmitter" else -1.0
-    frame = _Frame(spectra.position[rows], spectra.fixed_position, spectra.rotation, sign)
-    declared = frame.direction()
+    frame = _Frame(spectra.position[rows], spectra.fixed_position, spectra.rotation, sign, spectra.array)
+    peak, declared = frame.peaks(spectra.store[rows], spectra.grid), frame.direction()
     agreement, chance = _agreement(declared, peak)
-    found = {meaning: _agreement(direction, peak) for meaning, direction in _others(frame).items()}
+    found = {name: _agreement(to, peak) for name, to in _others(frame, computed=snapshots is not None)}
+    if snapshots is not None:
+        for name, other in other_readings(snapshots.subset(rows)).items():
+            found[name] = _agreement(
+                declared, frame.peaks(other.spectra(spectra.grid, beamformer).store[:], spectra.grid)
+            )
+    best = max(value for value, _ in found.values())
+    found |= {name: pair for name, pair in _mirrors(frame, peak) if pair[0] >= best + MIN_TURN_GAIN}
     named, by_chance = max(found.values())
-    turn, angle = _constant_turn(frame, peak)
-    turned, turned_by_chance = _agreement(_folded(frame.towards() @ _matrix(turn)), peak)
-    error = named - by_chance >= MIN_EVIDENCE and named - agreement >= MIN_EVIDENCE and named >= turned - MIN_TURN_GAIN
-    rotates = turned - turned_by_chance >= MIN_EVIDENCE and turned - agreement >= MIN_TURN_GAIN and angle >= MIN_TURN
+    turn, turned, turned_by_chance = _constant_turn(frame, peak)
+    clear = named - max(by_chance, agreement) >= MIN_EVIDENCE
+    error = clear and named >= max(MIN_EXPLAINED, turned - MIN_TURN_GAIN)
+    rotates = not error and turned >= MIN_TURN_EXPLAINED and turned - turned_by_chance >= MIN_EVIDENCE
+    rotates = rotates and float(np.linalg.norm(turn)) >= MIN_TURN and turned - agreement >= MIN_TURN_GAIN
+    if rotates and snapshots is not None:
+        seen = snapshots.subset(rows)
+        rotates = power_share(seen, seen.direction @ _matrix(turn)) >= MIN_EXPLAINED
+    rotates = rotates and _constant(turn, frame, peak)
     return FrameReport(
         agreement=agreement,
         chance=chance,
-        angle_deg=math.degrees(float(angular_distance(declared, peak).median())),
+        angle_deg=math.degrees(float(_nearest(declared, peak).median())),
+        span_deg=_span_deg(declared),
+        peak_span_deg=_span_deg(peak[:, 0]),
+        behind=0.0 if frame.linear else float((frame.towards()[:, 2] < 0).double().mean()),
         explanations=tuple(name for name, (value, _) in found.items() if value >= named - TIE) if error else (),
         explained=named if error else turned if rotates else agreement,
-        turn_deg=tuple(np.degrees(turn).tolist()) if rotates and not error else None,
+        turn_deg=tuple(np.degrees(turn).tolist()) if rotates else None,
         positions=len(rows),
     )
 
 
-def _folded(direction: Tensor) -> Tensor:
-    return torch.cat([direction[..., :2], direction[..., 2:].abs()], dim=-1)
+def _peaks(spectra: Tensor, grid: AngularGrid) -> Tensor:
+    """Return the directions of the largest magnitude of each spectrum and of other peaks of nearly its height, (n, P, 3)."""
+    padded = functional.pad(functional.pad(spectra, (1, 1), mode="circular"), (0, 0, 1, 1), value=-math.inf)
+    highest = spectra.amax(dim=(1, 2), keepdim=True)
+    is_peak = (spectra == functional.max_pool2d(padded, 3, stride=1)) & (spectra >= EQUAL_PEAKS * highest)
+    height, pixel = (spectra * is_peak).flatten(1).topk(min(MAX_PEAKS, spectra[0].numel()))
+    used = height >= EQUAL_PEAKS * height[:, :1]
+    pixel = pixel.where(used, pixel[:, :1])[:, : int(used.sum(dim=1).max())]
+    return grid.direction.flatten(0, 1)[pixel]
+
+
+def _nearest(direction: Tensor, peak: Tensor) -> Tensor:
+    """Return the angle [rad] between directions (..., n, 3) and the nearest of the peaks (n, P, 3) of each."""
+    return (direction[..., None, :] * peak).sum(dim=-1).amax(dim=-1).clamp(-1, 1).arccos()
+
+
+def _kernel(angle: Tensor) -> Tensor:
+    return torch.exp(-0.5 * (angle / SIGMA).square())
 
 
 def _agreement(direction: Tensor, peak: Tensor) -> tuple[float, float]:
-    """Return the agreement of directions and peaks (n, 3) of the same positions, and of different ones."""
-    angle = angular_distance(peak[:, None].expand(-1, len(direction), -1), direction.expand(len(peak), -1, -1))
-    kernel = torch.exp(-0.5 * (angle / SIGMA).square())
+    """Return the agreement of directions (n, 3) and peaks (n, P, 3) of the same positions, and of different ones."""
     n = len(peak)
+    cosine = (direction @ peak.flatten(0, 1).T).reshape(n, n, -1).amax(dim=-1)
+    kernel = _kernel(cosine.clamp(-1, 1).arccos())
     same = float(kernel.diagonal().mean())
     return same, float((kernel.sum() - kernel.diagonal().sum()) / (n * (n - 1)))
 
 
-def _others(frame: _Frame) -> dict[str, Tensor]:
-    """Return the directions (n, 3) of the line of sight under each error."""
+def _span_deg(direction: Tensor) -> float:
+    """Return the median angle [deg] between two of the directions (n, 3)."""
+    first, second = torch.triu_indices(len(direction), len(direction), offset=1)
+    return float((direction @ direction.T)[first, second].clamp(-1, 1).arccos().rad2deg().median())
+
+
+def _others(frame: _Frame, computed: bool) -> Iterator[tuple[str, Tensor]]:
+    """Yield the directions (n, 3) of the line of sight under each error; of `computed` spectra the grid is right."""
+    for meaning, other in _frames(frame):
+        yield meaning, other.direction()
+    towards = frame.towards()
+    for meanings, matrix in AZIMUTH_ERRORS.items():
+        turned = torch.cat([towards[:, :2] @ torch.tensor(matrix).double().T, towards[:, 2:]], dim=1)
+        yield meanings[computed], frame.folded(turned)
+    if not computed and not frame.linear:
+        azimuth, elevation = to_angles(towards)
+        zenith = "rows of the spectra run from the zenith down; row 0 must be the lowest elevation"
+        yield zenith, to_direction(azimuth, math.pi / 2 - elevation)
+
+
+def _frames(frame: _Frame) -> Iterator[tuple[str, _Frame]]:
+    """Yield the frame of positions and array under each error."""
     quaternion = Rotation.from_matrix(frame.rotation.numpy()).as_quat()
     reordered = torch.from_numpy(Rotation.from_quat(np.roll(quaternion, -1)).as_matrix())
-    frames = {
-        "the quaternion is in the order w, x, y, z; it must be x, y, z, w": replace(frame, rotation=reordered),
-        "the quaternion turns world into array coordinates; it must turn array into world": replace(
-            frame, rotation=frame.rotation.T
-        ),
-    }
+    yield (
+        "the quaternion is in the order w, x, y, z; it must be x, y, z, w",
+        replace(frame, rotation=reordered),
+    )
+    yield (
+        "the quaternion turns world into array coordinates; it must turn array into world",
+        replace(frame, rotation=frame.rotation.T),
+    )
     for names, swap in SWAPS.items():
-        frames[f"{names} of the positions are swapped"] = frame.mapped(swap)
-        frames[f"{names} of positions and array are swapped against the orientation"] = frame.mapped(swap, both=True)
+        yield f"{names} of the positions are swapped", frame.mapped(swap)
+        yield f"{names} of positions and array are swapped against the orientation", frame.mapped(swap, both=True)
     for axis, mirror in MIRRORS.items():
-        frames[f"{axis} of the positions has the wrong sign"] = frame.mapped(mirror)
+        yield f"{axis} of the positions has the wrong sign", frame.mapped(mirror)
         against = f"{axis} of positions and array has the wrong sign against the orientation"
-        frames[against] = frame.mapped(mirror, both=True)
+        yield against, frame.mapped(mirror, both=True)
     for unit, scale in UNITS.items():
-        frames[f"the positions are in {unit}, the array's is in metres"] = frame.mapped(scale * AXES)
+        yield f"the positions are in {unit}, the array's is in metres", frame.mapped(scale * AXES)
         metres = f"the array's position is in {unit}, the others are in metres"
-        frames[metres] = replace(frame, fixed=scale * frame.fixed)
-    found = {meaning: other.direction() for meaning, other in frames.items()}
-    declared = frame.direction()
-    for meaning, matrix in AZIMUTH_ERRORS.items():
-        found[meaning] = torch.cat([declared[:, :2] @ torch.tensor(matrix).double().T, declared[:, 2:]], dim=1)
-    azimuth, elevation = to_angles(declared)
-    zenith = "rows of the spectra run from the zenith down; row 0 must be the lowest elevation"
-    return found | {zenith: to_direction(azimuth, math.pi / 2 - elevation)}
+        yield metres, replace(frame, fixed=scale * frame.fixed)
 
 
-def _constant_turn(frame: _Frame, peak: Tensor) -> tuple[NDArray[np.float64], float]:
-    """Return the rotation of the array with most agreement, as a rotation vector in its coordinates, and its angle."""
-    towards = frame.towards()
+def _mirrors(frame: _Frame, peak: Tensor) -> Iterator[tuple[str, tuple[float, float]]]:
+    """Yield the mirror c - x of each axis of the positions with most agreement."""
+    every = torch.cat([frame.position, frame.fixed[None]])
+    for number, axis in enumerate("xyz"):
+        low, high = 2 * float(every[:, number].amin()), 2 * float(every[:, number].amax())
+        mirrored = []
+        for offset in torch.linspace(low, high, SCANNED_OFFSETS).tolist():
+            position = frame.position.clone()
+            position[:, number] = offset - position[:, number]
+            mirrored.append((_agreement(replace(frame, position=position).direction(), peak), offset))
+        pair, offset = max(mirrored)
+        yield f"{axis} of the positions counts from the other side (near {axis} = {offset:.1f} - {axis})", pair
+
+
+def _constant_turn(frame: _Frame, peak: Tensor) -> tuple[NDArray[np.float64], float, float]:
+    """Return the rotation of the array with most agreement, its agreement and its chance level.
+
+    The rotation is a rotation vector in array coordinates [rad]. A linear array does not determine its rotation, so it keeps
+    the declared one.
+    """
+    if frame.linear:
+        return np.zeros(3), *_agreement(frame.direction(), peak)
     scanned = Rotation.random(SCANNED_ROTATIONS, rng=np.random.default_rng(0))
     turns = Rotation.concatenate([Rotation.identity(), scanned])
-    matrices = torch.from_numpy(turns.as_matrix()).float()
-    score = torch.cat([_mean_kernel(_folded(towards.float() @ part), peak.float()) for part in matrices.split(200)])
-
-    def miss(turn: NDArray[np.float64]) -> float:
-        return -float(_mean_kernel(_folded(towards @ _matrix(turn)), peak))
-
+    matrices, towards = torch.from_numpy(turns.as_matrix()).float(), frame.towards().float()
+    score = torch.cat(
+        [_kernel(_nearest(frame.folded(towards @ m), peak.float())).mean(-1) for m in matrices.split(200)]
+    )
     starts = [np.zeros(3), *(turns[int(i)].as_rotvec() for i in score.topk(3).indices)]
-    options = {"xatol": 1e-4, "fatol": 1e-6}
-    results = [
-        minimize(miss, start, method="Nelder-Mead", options=options | {"initial_simplex": simplex})
-        for start, simplex in ((s, np.vstack([s, s + 0.1 * np.eye(3)])) for s in starts)
-    ]
-    rotation = Rotation.from_rotvec(min(results, key=lambda result: result.fun).x)
-    return rotation.as_rotvec(), float(rotation.magnitude())
+    turn = max((_refined(start, frame, peak) for start in starts), key=_turned(frame, peak))
+    return turn, *_agreement(frame.folded(frame.towards() @ _matrix(turn)), peak)
+
+
+def _constant(turn: NDArray[np.float64], frame: _Frame, peak: Tensor) -> bool:
+    """Return True if both halves of the positions have the same rotation."""
+    half = slabs(frame.position, 2)
+    found = [_refined(turn, replace(frame, position=frame.position[half == h]), peak[half == h]) for h in (0, 1)]
+    first, second = (Rotation.from_rotvec(each) for each in found)
+    return float((first.inv() * second).magnitude()) <= MIN_TURN
+
+
+def _refined(start: NDArray[np.float64], frame: _Frame, peak: Tensor) -> NDArray[np.float64]:
+    """Return the rotation vector with most agreement near a start."""
+    score = _turned(frame, peak)
+    options = {"xatol": 1e-4, "fatol": 1e-6, "initial_simplex": np.vstack([start, start + 0.1 * np.eye(3)])}
+    found: NDArray[np.float64] = minimize(lambda turn: -score(turn), start, method="Nelder-Mead", options=options).x
+    shortest: NDArray[np.float64] = Rotation.from_rotvec(found).as_rotvec()
+    return shortest
+
+
+def _turned(frame: _Frame, peak: Tensor) -> Callable[[NDArray[np.float64]], float]:
+    """Return the agreement as a function of the rotation vector."""
+    towards = frame.towards()
+    return lambda turn: float(_kernel(_nearest(frame.folded(towards @ _matrix(turn)), peak)).mean())
 
 
 def _matrix(turn: NDArray[np.float64]) -> Tensor:
     return torch.from_numpy(Rotation.from_rotvec(turn).as_matrix())
-
-
-def _mean_kernel(direction: Tensor, peak: Tensor) -> Tensor:
-    """Return the agreement of directions (..., n, 3) and peaks (n, 3), (...)."""
-    angle = angular_distance(direction, peak.expand_as(direction))
-    mean: Tensor = torch.exp(-0.5 * (angle / SIGMA).square()).mean(-1)
-    return mean
-
-
-@dataclass(frozen=True)
-class PathLossReport:
-    """Result of `check_path_loss`.
-
-    Args:
-        explained: Fraction of the variance of RSSI that path-loss models of each receiver explain.
-        level_dbm: RSSI at 1 m by one path-loss model of all receivers [dBm].
-        exponent: Path-loss exponent of that model.
-        explanation: Error of frames with clearly more explained variance, in words, or an empty text.
-    """
-
-    explained: float
-    level_dbm: float
-    exponent: float
-    explanation: str
-
-
-def check_path_loss(data: Rssi) -> PathLossReport | None:
-    """Compare RSSI with the distances from the receivers, in the declared frame and in others.
-
-    Returns:
-        The report, or None if the receivers' positions are unknown.
-    """
-    if not data.located:
-        return None
-    place = data.transmitter_position
-    others = {f"{names} of the positions are swapped": place @ swap for names, swap in SWAPS.items()}
-    others |= {f"the positions are in {unit}, the receivers' in metres": place * scale for unit, scale in UNITS.items()}
-    others |= {f"{axis} of the positions has the wrong sign": place @ mirror for axis, mirror in MIRRORS.items()}
-    declared = _explained(place, data)
-    found = {meaning: _explained(other, data) for meaning, other in others.items()}
-    meaning, best = max(found.items(), key=lambda pair: pair[1])
-    model = fit_path_loss(log_distance(place, data.receiver_position), data.rssi_dbm, shared=True)
-    return PathLossReport(
-        explained=declared,
-        level_dbm=float(model.level),
-        exponent=float(-model.slope / 10),
-        explanation=meaning if best - declared >= MIN_VARIANCE_GAIN else "",
-    )
-
-
-def _explained(position: Tensor, data: Rssi) -> float:
-    """Return the fraction of the variance of RSSI that path-loss models explain, if RSSI decreases with distance."""
-    distance = log_distance(position, data.receiver_position)
-    constant = PathLoss(data.rssi_dbm.nanmean(dim=0), torch.zeros(data.rssi_dbm.shape[1], dtype=torch.float64))
-    model = fit_path_loss(distance, data.rssi_dbm)
-    residual = data.rssi_dbm - model.where(model.slope < 0, constant)(distance)
-    return 1 - float(residual.square().nansum() / (data.rssi_dbm - constant.level).square().nansum().clamp_min(1e-12))

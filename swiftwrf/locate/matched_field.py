@@ -288,7 +288,7 @@ class MatchedField(Configured, Saved):
     def direction(self, posterior: Posterior) -> Tensor:
         """Return azimuth and elevation (n, 2) [rad] of the smallest expected angular error under a posterior."""
         room, at = self.room, posterior.position
-        label = direction_of_link(at.reshape(-1, 3), room.fixed_position, room.rotation, room.moving)
+        label = direction_of_link(at.reshape(-1, 3), room.fixed_position, room.rotation, room.moving, room.array)
         vectors = to_direction(*label.unbind(-1)).reshape(at.shape)
         return torch.stack(to_angles(posterior.direction(vectors)), dim=-1)
 

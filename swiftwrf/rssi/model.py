@@ -20,7 +20,8 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from swiftwrf.data.rssi import Rssi
+from swiftwrf.data.coordinates import GeodeticOrigin
+from swiftwrf.data.rssi import Offsets, Rssi
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, thinned
 from swiftwrf.rssi.base import Map, RssiFitContext, RssiPredictor, fingerprint, map_threads
@@ -70,6 +71,10 @@ class RssiModel(RssiPredictor, Saved):
     name = "swiftwrf"
     config_type = RssiConfig
 
+    origin: GeodeticOrigin | None
+    """latitude and longitude of x = y = 0, if the positions were projected from degrees"""
+    offsets: Offsets | None
+    """offsets that were removed from the training rows; predictions are of their reference"""
     n_primitives: int
     """primitives a receiver; 0 if there is no field"""
     kernel: Kernel
@@ -146,6 +151,7 @@ class RssiModel(RssiPredictor, Saved):
         def mixed(own: Tensor, baselines: Tensor) -> Tensor:
             return (weight * torch.cat([own[None], baselines])).sum(dim=0)
 
+        self.origin, self.offsets = train.origin, train.offsets
         self.n_primitives, self.kernel, self.mixing_weight = training.n_primitives, training.kernel, weight
         # an unknown position has no effect: slope and directivity are 0
         self.receiver, self.centre = train.receiver_position.double().nan_to_num(0.0), training.centre
@@ -185,6 +191,8 @@ class RssiModel(RssiPredictor, Saved):
         tensors = {name: getattr(self, name) for name in _shapes(0, 0)}
         header = {
             "options": asdict(self.config),
+            "origin": self.origin,
+            "offsets": self.offsets and asdict(self.offsets),
             "receiver_names": self.receiver_names,
             "n_primitives": self.n_primitives,
             "kernel": asdict(self.kernel),
@@ -195,6 +203,8 @@ class RssiModel(RssiPredictor, Saved):
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         model = cls(from_plain(RssiConfig, header["options"]))
         model.receiver_names = tuple(map(str, header["receiver_names"]))
+        model.origin = GeodeticOrigin(*map(float, header["origin"])) if header.get("origin") else None
+        model.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
         model.n_primitives, model.kernel = int(header["n_primitives"]), Kernel(**header["kernel"])
         shapes = _shapes(len(model.receiver_names), len(tensors["anchor"]))
         files.expect(tensors, shapes)

@@ -12,7 +12,7 @@ from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.gp import Kernel, LeaveGroupOut, candidates, thinned
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import Head, render
-from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
+from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, fit_shared_path_loss, log_distance
 from swiftwrf.runtime.threads import single_thread
 
 PAPER_LEVEL_DBM = -100.0  # of the paper's head where nothing is received
@@ -77,8 +77,9 @@ def prepare(train: Rssi, pool: Rssi, config: RssiConfig) -> RssiTraining:
     def fit_baselines(rows: Tensor) -> PathLoss:
         """Fit the simple predictors to some of the bins."""
         detected = ~rssi[rows].isnan()
-        shared = fit_path_loss(pool_distance[rows], pool_rssi[rows], shared=True)
-        shared = PathLoss(*(x.expand(rssi.shape[1]) for x in shared))
+        shared = fit_shared_path_loss(
+            pool_distance[rows], pool_rssi[rows], pool.receiver_located, train.receiver_located
+        )
         own = fit_path_loss(distance[rows], rssi[rows]).where(detected.sum(dim=0) >= MIN_TRAINING, shared)
         mean = PathLoss(rssi[rows].nanmean(dim=0), torch.zeros_like(own.slope)).where(detected.any(dim=0), shared)
         return PathLoss(*(torch.stack(values) for values in zip(own, shared, mean, strict=True)))

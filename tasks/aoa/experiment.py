@@ -71,6 +71,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
             "seed": config.seed,
             "repeats": config.repeats,
             "moving": data.moving,
+            "notes": list(data.notes),
             "extra": experiment.n_synthetic,
             "n_train": len(train),
             "n_test": len(test),

@@ -33,8 +33,8 @@ class AoaConfig(SpectraSource, Output):
     resumable: ClassVar[bool] = True
 
     mix: tuple[float, ...] = ()
-    """measured fractions in (0, 1], required without --preset paper: 0.3 keeps 30 % of the training spectra and synthesizes the
-    others"""
+    """measured fractions in (0, 1]: 0.3 keeps 30 % of the training spectra and synthesizes the others. Required, except with
+    --preset paper"""
     data: str | None = None
     """folder or file of spectra, ray paths or array snapshots, see docs/formats.md"""
     split: str = "random"

@@ -107,7 +107,7 @@ def _draw_axes(ax: Axes, data: Spectra, a: int, b: int) -> None:
 
 def _directions(data: Spectra) -> Plot:
     rows = data.line_of_sight.nonzero()[:MOST_DOTS, 0]
-    peak = to_direction(*data.grid.peak_direction(data.store[rows]).unbind(-1))
+    peak = to_direction(*data.peak_direction(rows).unbind(-1))
     line = to_direction(*data.label[rows].unbind(-1))
     figure, axes = figures.new_figure(1, 3, 11, 3.6)
     for ax, (title, direction) in zip(axes, {"line of sight": line, "peak": peak}.items(), strict=False):
@@ -141,8 +141,9 @@ def _floor(data: Rssi) -> Plot:
         place[:, 0], place[:, 1], s=8, c=strongest.where(strongest.isfinite(), torch.nan), cmap="viridis"
     )
     figure.colorbar(drawn, ax=axes[0], label="strongest RSSI [dBm]")
-    for name, at in zip(data.receiver_names, data.receiver_position.tolist(), strict=True):
-        if data.located:
+    places = zip(data.receiver_names, data.receiver_position.tolist(), data.receiver_located.tolist(), strict=True)
+    for name, at, is_located in places:
+        if is_located:
             axes[0].plot(*at[:2], "x", color="#ee6677", markersize=8, markeredgewidth=2)
             axes[0].annotate(figures.short(name), at[:2], fontsize=7, xytext=(3, 3), textcoords="offset points")
     axes[0].set(xlabel="x [m]", ylabel="y [m]", aspect="equal")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from swiftwrf.data import Rssi, Snapshots
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
 from tasks.directory import new_directory
 from tasks.inspect.findings import inspect
+from tasks.inspect.findings.rssi import propose_offsets
 from tasks.inspect.options import InspectConfig
 from tasks.inspect.page import page
 from tasks.page.page import write_page
@@ -29,6 +31,8 @@ def run(config: InspectConfig) -> None:
         data = read(config.source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
         kind = "RSSI" if isinstance(data, Rssi) else "array snapshots" if isinstance(data, Snapshots) else "spectra"
         findings, shown = inspect(data, options)
+        for column in data.labels if isinstance(data, Rssi) else ():
+            propose_offsets(read(config.source, replace(options, offset_by=column), RSSI_FORMATS), findings)
         content = {
             "source": config.source,
             "kind": kind,

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from swiftwrf import InputError, Rssi, load_rssi, rssi_room
+from swiftwrf import InputError, Rssi, rssi_room
+from swiftwrf.data.coordinates import degree_columns
 from tasks.cluster import connected
 from tasks.locate.localizers import LEVELS
 from tasks.locate.observations import write_positions
@@ -19,7 +21,7 @@ from tasks.metrics import LocateMetrics, StudyMetrics
 from tasks.page.page import reporting
 from tasks.page.records import Records
 from tasks.run import Row, Run, choose_device
-from tasks.source import reading
+from tasks.source import asked_offsets, measured_rssi, split_notes
 from tasks.steps import computed
 from tasks.summarise import error_summary
 from tasks.terminal import console, terminal
@@ -41,6 +43,10 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     experiment, n_undetected = prepared(data, config.split, config.cells, config.seed, config.suggest)
     if n_undetected:
         console.print(f"{data.name}: test rows that no receiver detected are left out: {n_undetected}")
+    if (offsets := asked_offsets(experiment.train, config)) is not None:
+        train, test = offsets.removed(experiment.train), offsets.removed(experiment.test)
+        experiment = replace(experiment, train=train, test=test)
+        console.print(f"{data.name}: {offsets.note()}")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     with (
         connected(config.scheduler, device) as cluster,
@@ -53,7 +59,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
                 results.add(step, value)
                 terminal.result(step.title, f"{results.median_m(step):.2f} m")
         directory.write_csv("errors.csv", results.errors)
-        final = directory.finish(results.metrics(data.name, n_undetected), reporting(page))
+        final = directory.finish(results.metrics(data, n_undetected), reporting(page))
     terminal.answer(answer(Records(final)), final / "report.html")
 
 
@@ -63,11 +69,8 @@ def measurements(config: LocateConfig) -> Rssi:
     Raises:
         InputError: The data cannot be read, or have no such receiver.
     """
-    if config.data is not None:
-        return load_rssi(config.data, columns=reading(config).columns).receivers(config.rx)
-    if config.columns:
-        raise InputError("--columns is for a survey table; give it with --data, or with MODEL and SOURCE")
-    return rssi_room(seed=config.seed).receivers(config.rx)
+    measured = measured_rssi(config.data, config)
+    return (rssi_room(seed=config.seed) if measured is None else measured).receivers(config.rx)
 
 
 def prepared(data: Rssi, split: str, cells: int, seed: int, suggest: int = 0) -> tuple[Experiment, int]:
@@ -121,6 +124,8 @@ class Results:
         columns: Row = {"position_error_m": error, "horizontal_error_m": horizontal}
         columns |= dict(zip(("x_m", "y_m", "z_m"), estimate.T, strict=True))
         columns |= dict(zip(("truth_x_m", "truth_y_m", "truth_z_m"), truth.T, strict=True))
+        degrees = degree_columns(self.experiment.train.origin, estimate.numpy())
+        columns |= {name: torch.from_numpy(values.copy()) for name, values in degrees.items()}
         if "radius" in value:
             radius = torch.tensor(value["radius"], dtype=torch.float64)
             columns |= {f"credible_radius_{100 * p:.0f}_m": r for p, r in zip(LEVELS, radius.T, strict=True)}
@@ -141,12 +146,13 @@ class Results:
         """Return the median position error of a step [m]."""
         return next(study["position_error_m"]["median"] for known, study in self._studies if known == step)
 
-    def metrics(self, data: str, n_undetected: int) -> LocateMetrics:
-        """Return the content of metrics.json."""
+    def metrics(self, data: Rssi, n_undetected: int) -> LocateMetrics:
+        """Return the content of metrics.json of a run on these data."""
         train, test = self.experiment.train, self.experiment.test
         return {
             "task": "locate",
-            "data": data,
+            "data": data.name,
+            "notes": [*split_notes(train, test), *data.notes, *([train.offsets.note()] if train.offsets else [])],
             "split": self.experiment.split,
             "seed": self.experiment.seed,
             "n_train": len(train),

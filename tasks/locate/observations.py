@@ -10,9 +10,12 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from swiftwrf import InputError, Rssi, Spectra, load, load_rssi
+from swiftwrf import InputError, Rssi, Spectra, load
+from swiftwrf.data import ReadOptions
+from swiftwrf.data.coordinates import degree_columns
+from swiftwrf.data.formats import RSSI_FORMATS, read
 from swiftwrf.data.store import Store
-from swiftwrf.data.survey import SUFFIXES, column_of, has_positions, read_frame
+from swiftwrf.data.survey import SUFFIXES, column_of, first_rows, has_positions, read_frame
 from swiftwrf.errors import listed
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
 from swiftwrf.locate.track import joined
@@ -61,8 +64,19 @@ def _of_rssi(locator: RssiLocator, config: LocateConfig, source: str) -> Columns
     unused = [name for name in SPECTRA if getattr(config, name) is not None]
     if unused:
         raise InputError(f"--{unused[0]} is for spectra, and {config.model} locates by RSSI")
-    data, is_known = read_rssi(source, reading(config).columns or {})
-    data = aligned(data, locator.receiver_names)
+    options = reading(config)
+    offsets = locator.model.offsets
+    if offsets is not None and has_column(source, offsets.column):
+        options = replace(options, offset_by=offsets.column)
+    data, is_known = read_rssi(source, options)
+    origin = locator.model.origin
+    if is_known and data.origin is not None and origin is None:
+        raise InputError(f"{source} has positions in degrees, {config.model} was fitted to metres; give metres")
+    if offsets is not None:
+        if data.groups is None:
+            console.print(f"{data.name}: rows count as those of {offsets.column} {offsets.reference}")
+        data = offsets.removed(data)
+    data = aligned(data.about(origin), locator.receiver_names)
     kept = data.detected.any(dim=1)
     if not bool(kept.any()):
         raise InputError(f"no receiver of {config.model} detected the transmitter in any row of {source}")
@@ -70,13 +84,15 @@ def _of_rssi(locator: RssiLocator, config: LocateConfig, source: str) -> Columns
         console.print(f"{data.name}: rows that no receiver detected are left out: {int((~kept).sum())}")
     posteriors: Iterable[Posterior] = map(locator.locate, data.rssi_dbm[kept].split(BATCH_ROWS))
     if config.track is not None:
-        time = _times(source, reading(config).columns or {}, len(data))
+        time = _times(source, options, data.index)
         posteriors = _tracked(posteriors, time[kept], config.track)
     data = data.subset(kept)
-    return _located(posteriors, data.index, data.transmitter_position if is_known else None)
+    columns = _located(posteriors, data.index, data.transmitter_position if is_known else None)
+    degrees = degree_columns(origin, torch.stack([columns["x_m"], columns["y_m"]], dim=1).numpy())
+    return columns | {name: torch.from_numpy(values.copy()) for name, values in degrees.items()}
 
 
-def read_rssi(source: str, columns: Mapping[str, str]) -> tuple[Rssi, bool]:
+def read_rssi(source: str, options: ReadOptions) -> tuple[Rssi, bool]:
     """Read RSSI, and return it with True if its positions are known. A survey table may have none.
 
     Raises:
@@ -85,9 +101,18 @@ def read_rssi(source: str, columns: Mapping[str, str]) -> tuple[Rssi, bool]:
     file = Path(source)
     if file.is_file() and file.suffix.lower() in SUFFIXES:
         frame = read_frame(file)
-        if not has_positions(frame, columns):
-            return Rssi.from_frame(frame.assign(x=0.0, y=0.0, z=0.0), columns=columns, name=file.stem), False
-    return load_rssi(source, columns=columns or None), True
+        if not has_positions(frame, options.columns or {}):
+            somewhere = frame.assign(x=0.0, y=0.0, z=0.0)
+            columns, filler, offset_by = options.columns, options.filler, options.offset_by
+            data = Rssi.from_frame(somewhere, columns=columns, filler=filler, offset_by=offset_by, name=file.stem)
+            return data, False
+    return read(source, options, RSSI_FORMATS), True
+
+
+def has_column(source: str, name: str) -> bool:
+    """Return True if a source is a table that has a column of this name."""
+    file = Path(source)
+    return file.is_file() and file.suffix.lower() in SUFFIXES and name in read_frame(file).columns
 
 
 def aligned(data: Rssi, names: tuple[str, ...]) -> Rssi:
@@ -148,25 +173,26 @@ def _direction_errors(direction: Tensor, known: Spectra | None) -> Columns:
     return {"truth_azimuth_deg": truth[:, 0], "truth_elevation_deg": truth[:, 1], "great_circle_deg": error}
 
 
-def _times(source: str, columns: Mapping[str, str], n: int) -> Tensor:
-    """Return the times of the n rows of RSSI in a file (n,) [s]: one second a row if it has no column of time."""
+def _times(source: str, options: ReadOptions, index: Tensor) -> Tensor:
+    """Return the times (n,) [s] of rows of RSSI in a file, given by number: one second a row without a column of time."""
     file = Path(source)
     if file.is_file() and file.suffix.lower() in SUFFIXES:
-        time = row_times(source, read_frame(file), columns)
+        time = row_times(source, read_frame(file), options.columns or {}, options.offset_by)
         if time is not None:
-            if len(time) != n:
-                raise InputError(f"{source} has {n} positions at {len(time)} times; a walk has one position at a time")
-            return time
-    return torch.arange(n, dtype=torch.float64)
+            return time[index]
+    return index.double()
 
 
-def row_times(label: str, frame: pd.DataFrame, columns: Mapping[str, str]) -> Tensor | None:
+def row_times(
+    label: str, frame: pd.DataFrame, columns: Mapping[str, str], offset_by: str | None = None
+) -> Tensor | None:
     """Return the time since the first row [s] for each row of the RSSI in a survey table. None without a column of time.
 
     Args:
         label: Name of the table, for messages.
         frame: Survey table, wide or long. Times are numbers [s] or dates.
         columns: Names of columns that are not recognised, by role.
+        offset_by: Column with the group of each row.
 
     Raises:
         InputError: A cell that is no time.
@@ -183,15 +209,8 @@ def row_times(label: str, frame: pd.DataFrame, columns: Mapping[str, str]) -> Te
     if numbers.isna().any():
         row = int(numbers.isna().to_numpy().argmax())
         raise InputError(f"{label} row {row + 1}, column {name}: {cells.iloc[row]!r} is no time [s] or date")
-    time = numbers - numbers.iloc[0]
-    if column_of(frame, "receiver", columns) is None:
-        return torch.from_numpy(time.to_numpy(dtype="float64", copy=True))
-    # packets of a long table form rows by time, position and repetition: with the time as x, the rows' positions are times
-    marked = frame.assign(**{"time as x": time})
-    roles = {**columns, "x": "time as x"}
-    if column_of(frame, "y", columns) is None:
-        marked, roles["y"] = marked.assign(**{"no y": 0.0}), "no y"
-    return Rssi.from_frame(marked, columns=roles).transmitter_position[:, 0]
+    time = (numbers - numbers.iloc[0]).to_numpy(dtype="float64")
+    return torch.from_numpy(time[first_rows(frame, columns, offset_by)])
 
 
 def _tracked(posteriors: Iterable[Posterior], time: Tensor, speed_m_s: float) -> Iterator[Posterior]:

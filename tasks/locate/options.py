@@ -9,17 +9,17 @@ import tyro
 
 from augment.limits import MAX_SUGGESTIONS
 from swiftwrf.errors import InputError
-from tasks.options import Output, SpectraSource, TableSource, command_options
+from tasks.options import OffsetSource, Output, SpectraSource, command_options
 
 TABLE = "positions.csv"
 
 
-EXPERIMENT = ("data", "rx", "split", "cells", "suggest", "scheduler", "seed")
+EXPERIMENT = ("data", "offset_by", "rx", "split", "cells", "suggest", "scheduler", "seed")
 SPECTRA = ("array", "beamformer", "grid", "every", "station")
 
 
 @command_options
-class LocateConfig(SpectraSource, TableSource, Output):
+class LocateConfig(SpectraSource, OffsetSource, Output):
     """Positions of a transmitter from RSSI or spectra.
 
     Without MODEL and SOURCE: compare localizers on a split of measured RSSI, by default of the built-in simulated floor, and
@@ -71,7 +71,9 @@ class LocateConfig(SpectraSource, TableSource, Output):
             raise InputError("--track is for observations; give it with MODEL and SOURCE")
         for name in SPECTRA if self.model is None else EXPERIMENT:
             if getattr(self, name) != default[name]:
-                raise InputError(f"--{name} is for {reason}")
+                raise InputError(f"--{name.replace('_', '-')} is for {reason}")
+        if self.model is None:
+            self.check_used(self.data)
         if not 10 <= self.cells <= 1_000_000:
             raise InputError(f"--cells takes 10 to 1,000,000, got {self.cells}")
         if not 0 <= self.suggest <= MAX_SUGGESTIONS:

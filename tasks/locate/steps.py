@@ -13,6 +13,7 @@ from torch import Tensor
 
 from augment.suggest import suggest_positions
 from swiftwrf import Rssi
+from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.splits import validation_for
 from swiftwrf.locate import Posterior, RssiLocator
 from swiftwrf.positions import nearest
@@ -141,6 +142,7 @@ def write_suggestion(folder: Path, locator: RssiLocator, train: Rssi, context: E
     """Write the positions where a measurement reduces the position error most, as a table and for the report."""
     found = suggest_positions(locator, train, context.suggest, context.seed)
     columns = dict(zip(("x_m", "y_m", "z_m"), found.position.T.tolist(), strict=True))
+    columns |= degree_columns(train.origin, found.position.numpy())
     columns["variance_left"] = found.variance[1:].tolist()
     write_table(
         folder / f"{SUGGESTED}.csv",

@@ -18,6 +18,11 @@ from tasks.records import read_json, read_table
 Metrics = TypeVar("Metrics", bound=RunMetrics)
 
 
+def notes(run: Records[Any]) -> list[str]:
+    """Return what the reader of the data found, in sentences; nothing for a run that did not keep it."""
+    return [f"{note[0].upper()}{note[1:]}." for note in run.metrics.get("notes", [])]
+
+
 class Records(Generic[Metrics]):
     """The files of one run.
 

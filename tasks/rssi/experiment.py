@@ -12,7 +12,8 @@ import torch
 from pandas import DataFrame
 from PIL import Image, UnidentifiedImageError
 
-from swiftwrf import InputError, Rssi, load_rssi, rssi_room
+from swiftwrf import InputError, Rssi, rssi_room
+from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.files import sha256
 from swiftwrf.data.splits import validation_for
 from swiftwrf.models.base import Prediction
@@ -27,7 +28,7 @@ from tasks.rssi.page import page
 from tasks.rssi.page.summary import answer
 from tasks.rssi.predictors import PREDICTORS, make_predictor
 from tasks.run import Row, Run, choose_device
-from tasks.source import reading
+from tasks.source import asked_offsets, measured_rssi, split_notes
 from tasks.summarise import error_summary, grouped
 from tasks.terminal import console, terminal
 
@@ -51,6 +52,11 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     train, test = data.split(config.split, config.seed)
     if not bool((~test.rssi_dbm.isnan()).any()):
         raise InputError(f"split {config.split!r} of {data.name} has no test rows that detect these receivers")
+    notes = [*split_notes(train, test), *data.notes]
+    if (offsets := asked_offsets(pool, config)) is not None:
+        train, pool = offsets.removed(train), offsets.removed(pool)
+        notes.append(offsets.note())
+        console.print(f"{data.name}: {notes[-1]}")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
     with (
@@ -71,6 +77,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         metrics: RssiMetrics = {
             "task": "rssi",
             "data": data.name,
+            "notes": notes,
             "split": config.split,
             "preset": config.preset,
             "seed": config.seed,
@@ -88,9 +95,8 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
 
 
 def _load(config: RssiTaskConfig) -> Rssi:
-    if config.data is None:
-        return rssi_room(seed=config.seed)
-    return load_rssi(config.data, columns=reading(config).columns)
+    measured = measured_rssi(config.data, config)
+    return rssi_room(seed=config.seed) if measured is None else measured
 
 
 def _read_floor_plan(config: RssiTaskConfig) -> dict[str, Any]:
@@ -141,6 +147,7 @@ class _Tables:
         self.row, column = self.detected.nonzero(as_tuple=True)
         self.receiver = [test.receiver_names[number] for number in column.tolist()]
         self.from_receiver = distance(test.transmitter_position, test.receiver_position)
+        self.offset = train.offsets.of(test)[:, None] if train.offsets else torch.zeros(1, 1, dtype=torch.float64)
         self.from_training = distance(test.transmitter_position, train.transmitter_position).min(dim=1).values
 
     def add(self, names: Sequence[str]) -> None:
@@ -170,7 +177,7 @@ class _Tables:
 
         value = self.directory.step(name, f"fitting {name}", compute)
         self.seconds[name] = {"fit": value["fit"], "predict": value["predict"]}
-        predicted, measured = torch.tensor(value["predicted"], dtype=torch.float64), self.test.rssi_dbm
+        predicted, measured = torch.tensor(value["predicted"], dtype=torch.float64) + self.offset, self.test.rssi_dbm
         self.errors += _rows(
             method=[name] * len(self.row),
             receiver=self.receiver,
@@ -192,14 +199,16 @@ class _Tables:
         x, y, z = self.test.transmitter_position[self.row].unbind(dim=1)
         values = {"measured": measured, "predicted": prediction.mean, "low": low, "high": high}
         columns = {name: value[detected] for name, value in values.items()}
-        self.predictions += _rows(x=x, y=y, z=z, receiver=self.receiver, **columns)
+        degrees = degree_columns(self.test.origin, self.test.transmitter_position[self.row].numpy())
+        columns |= {name: torch.from_numpy(value) for name, value in degrees.items()}
+        group = {"group": self.test.groups.subset(self.row).labels()} if self.test.groups else {}
+        self.predictions += _rows(x=x, y=y, z=z, receiver=self.receiver, **group, **columns)
 
     def _write_maps(self, model: RssiModel) -> None:
         """Write the prediction and the width of its interval over the floor, at the median height of the measurements."""
         position = self.train.transmitter_position
         shown = torch.cat([position, self.test.transmitter_position])
-        if self.train.located:
-            shown = torch.cat([shown, self.train.receiver_position])
+        shown = torch.cat([shown, self.train.receiver_position[self.train.receiver_located]])
         low, high = shown.min(dim=0).values, shown.max(dim=0).values
         cell = float((high - low)[:2].max()) / MAP_CELLS or 1.0
         xs, ys = (
@@ -220,6 +229,8 @@ class _Tables:
             "receiver": self.train.receiver_position.numpy(),
             "receiver_names": np.array(self.train.receiver_names),
         }
+        if self.train.origin is not None:
+            maps["origin"] = np.array(self.train.origin)
         self.directory.write_npz("maps.npz", maps | self.plan)
 
     def overall(self) -> dict[str, PredictorMetrics]:

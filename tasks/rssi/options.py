@@ -6,12 +6,12 @@ from typing import ClassVar, Literal
 
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.options import Preset
-from tasks.options import Output, TableSource, command_options
+from tasks.options import OffsetSource, Output, command_options
 from tasks.rssi.predictors import PREDICTORS
 
 
 @command_options
-class RssiTaskConfig(TableSource, Output):
+class RssiTaskConfig(OffsetSource, Output):
     """RSSI of a moving transmitter at fixed receivers, against baselines.
 
     Without --data the built-in simulated floor is used. Continue an interrupted run with --resume DIR.partial, and with
@@ -49,8 +49,7 @@ class RssiTaskConfig(TableSource, Output):
         super().check()
         for name in self.also:
             PREDICTORS.check(name)
-        if self.columns and self.data is None:
-            raise InputError("--columns is for a survey table; give it with --data")
+        self.check_used(self.data)
         if (self.floor_plan is None) != (self.floor_extent is None):
             raise InputError("--floor-plan needs --floor-extent x0 x1 y0 y1 [m], and the other way round")
         if self.floor_extent is not None:

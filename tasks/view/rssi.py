@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from swiftwrf import Prediction, Rssi, RssiModel
+from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.rssi import LEVEL
 from tasks.page import figures
 from tasks.records import as_table
@@ -290,6 +291,7 @@ class RssiView:
                 "x_m": x.ravel(),
                 "y_m": y.ravel(),
                 "z_m": selection.height,
+                **degree_columns(self.model.origin, np.stack([x.ravel(), y.ravel()], axis=1)),
                 "receiver": self.receivers[r],
                 **{name: values.double().numpy().ravel().round(2) for name, values in columns.items()},
                 f"above_{selection.threshold:g}_dbm_with_{selection.certainty:.0%}": self._covered(selection)

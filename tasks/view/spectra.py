@@ -14,6 +14,7 @@ from torch import Tensor
 
 from swiftwrf import AngularGrid, FieldModel, Spectra
 from swiftwrf.array.angles import angular_distance, to_direction
+from swiftwrf.array.planar import PlanarArray, folded_angles
 from swiftwrf.choices import Moving
 from swiftwrf.data.spectra import direction_of_link
 from swiftwrf.positions import distance
@@ -110,6 +111,11 @@ class SpectraView:
         return self.data.fixed_position, self.data.rotation, self.data.moving
 
     @property
+    def array(self) -> PlanarArray | None:
+        """Antenna array of the data. None if it is unknown."""
+        return None if self.data is None else self.data.array
+
+    @property
     def moving(self) -> str:
         """Name of the moving end."""
         if self.data is not None:
@@ -158,8 +164,8 @@ class SpectraView:
             grid,
             prediction.mean[0].numpy(),
             None if prediction.std is None else prediction.std[0].numpy(),
-            peak(prediction.mean[0], grid),
-            None if self.fixed_end is None else _degrees(direction_of_link(query, *self.fixed_end)[0]),
+            peak(prediction.mean[0], grid, self.array),
+            None if self.fixed_end is None else _degrees(direction_of_link(query, *self.fixed_end, self.array)[0]),
             seconds,
         )
 
@@ -176,9 +182,9 @@ class SpectraView:
         return loaded.locating.located(self.data.store[index : index + 1][0], self.data.position[index].double())
 
 
-def peak(spectrum: Tensor, grid: AngularGrid) -> Direction:
-    """Return the direction of the largest magnitude of a spectrum (n_elevation, n_azimuth)."""
-    return _degrees(grid.peak_direction(spectrum[None])[0])
+def peak(spectrum: Tensor, grid: AngularGrid, array: PlanarArray | None = None) -> Direction:
+    """Return the direction of the largest magnitude of a spectrum (n_elevation, n_azimuth), folded as the labels."""
+    return _degrees(folded_angles(array, grid.peak_direction(spectrum[None]))[0])
 
 
 def angle_between(a: Direction, b: Direction) -> float:

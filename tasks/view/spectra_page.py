@@ -270,7 +270,7 @@ class SpectraPage:
 
     def _show_measured(self, data: Spectra, index: int, away_m: float) -> None:
         spectrum = data.store[index : index + 1][0]
-        found, in_training = peak(spectrum, data.grid), self._model.in_training
+        found, in_training = peak(spectrum, data.grid, data.array), self._model.in_training
         trained = "in the training set" if in_training is not None and in_training[index] else "not in the training set"
         self._measured.caption.set_text(f"{away_m:.2f} m away, {trained}; peak {_described(found)}")
         if index != self._shown_measurement:

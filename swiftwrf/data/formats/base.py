@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data.coordinates import Coordinates
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
@@ -18,6 +19,10 @@ from swiftwrf.errors import InputError
 from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.validation import PositiveInt, configuration
 
+LINEAR_ARRAY = (
+    "the elements lie on a line, so the array receives the angle to its axis only; directions are folded to the half-plane "
+    "of axis and normal"
+)
 Data = TypeVar("Data", bound=Spectra | Snapshots | Rssi)
 
 
@@ -42,6 +47,16 @@ class ReadOptions:
     """number of the array in a file with several, counted from 1"""
     columns: Mapping[str, str] | None = None
     """names of the columns of a table, by what they hold"""
+    filler: tuple[float, ...] | None = None
+    """values of RSSI that stand for not detected, () for none (default: those that are recognised)"""
+    coordinates: Coordinates | None = None
+    """unit of the positions in a table (default: the one that is recognised)"""
+    offset_by: str | None = None
+    """column of a table with groups of rows, e.g. devices, between which RSSI has constant offsets"""
+    drop_null: bool | None = None
+    """leaves out null subcarriers, which are the same at every position and element"""
+    round_trip: bool | None = None
+    """phases are those of the way there and back"""
 
     @property
     def given(self) -> list[str]:
@@ -106,10 +121,16 @@ def read(path: str | Path, options: ReadOptions, *registries: Registry[Format[An
         for option in options.given:
             if option not in reader.takes:
                 raise InputError(f"{source} is read as {name}, which takes no {option}; leave it out")
-        return reader.read(source, options)
+        return _with_limits(reader.read(source, options))
     except OSError as error:
         reason = "no permission to read it" if isinstance(error, PermissionError) else error.strerror
         raise InputError(f"{error.filename or source} cannot be read ({reason})") from None
+
+
+def _with_limits(data: Any) -> Any:
+    """Return the measurements with a note on directions that their array does not distinguish."""
+    array = getattr(data, "array", None)
+    return data if array is None or array.axis is None else replace(data, notes=(*data.notes, LINEAR_ARRAY))
 
 
 def _find(source: Path, known: str, registries: tuple[Registry[Any], ...]) -> tuple[str, Format[Any]]:

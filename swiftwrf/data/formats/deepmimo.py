@@ -3,7 +3,8 @@
 `{key}_t{set}_tx{index}_r{set}.npz` holds `key`: power [dB], phase [deg], delay [s], aoa_az, aoa_el [deg] of up to 25 paths a
 receiver, nan for missing ones; inter, the interactions of a path as digits (0: line of sight, 1: reflection, 2: diffraction,
 3: scattering, 4: transmission); rx_pos and tx_pos [m]. params.json holds the carrier and the name of the ray tracer. aoa_el
-is the angle from the zenith. Angles point from the receiver to where a path arrives from, in world coordinates.
+is the angle from the zenith, or from the horizon (AODT), which direct paths show. Angles point from the receiver to where a
+path arrives from, in world coordinates.
 
 Wireless InSite gives the phase of a path over its whole length. Sionna gives that of the passband coefficient, to which the
 phase -2 pi f delay of the propagation is added here. The line-of-sight paths, whose phase is known, show the convention.
@@ -158,8 +159,9 @@ def _paths(
         direct, notes = known & (table[INTERACTIONS] == LINE_OF_SIGHT), []
     else:
         direct, notes = np.abs(detour - 1) < DIRECT_DETOUR, [NO_INTERACTIONS]
-    if direct.sum() >= MIN_DIRECT_PATHS:
-        _check_angles(folder, azimuth[direct], zenith[direct], away[direct.nonzero()[0]])
+    if _from_horizon(folder, azimuth, zenith, direct, away, known):
+        zenith = 90 - zenith
+        notes.append("aoa_el is the angle from the horizon, as of AODT; 90 - aoa_el is taken")
     phase, lag = np.deg2rad(table["phase"]), 2 * math.pi * frequency * table["delay"]
     convention = _convention(phase[direct], lag[direct], tracer)
     if convention == "passband":
@@ -187,27 +189,40 @@ def _direction(azimuth: Floats, zenith: Floats) -> Floats:
     return to_direction(torch.from_numpy(azimuth).deg2rad(), elevation).numpy()
 
 
-def _check_angles(folder: Path, azimuth: Floats, zenith: Floats, away: Floats) -> None:
-    """Refuse angles of another convention, which direct paths reveal: they come from the transmitter.
+def _from_horizon(
+    folder: Path,
+    azimuth: Floats,
+    zenith: Floats,
+    direct: NDArray[np.bool_],
+    away: Floats,
+    known: NDArray[np.bool_],
+) -> bool:
+    """Return True if elevations count from the horizon, and refuse other conventions than those of docs/formats.md.
+
+    Direct paths come from the transmitter, which reveals the convention. With few of them negative angles do.
 
     Args:
         folder: Source, for the message.
-        azimuth, zenith: Angles of direct paths, (m,) [deg].
-        away: Vectors from their receivers to the transmitter, (m, 3).
+        azimuth, zenith: Angles of the paths, (n, paths) [deg].
+        direct, known: Whether a path is direct, and whether there is one, (n, paths).
+        away: Vectors from the receivers to the transmitter, (n, 3).
 
     Raises:
-        InputError: An elevation from the horizon, angles that point the other way, or another frame.
+        InputError: Angles that point the other way, or another frame.
     """
+    if direct.sum() < MIN_DIRECT_PATHS:
+        return bool((zenith[known] < 0).any())
+    azimuth, zenith, away = azimuth[direct], zenith[direct], away[direct.nonzero()[0]]
 
     def offset(claimed: Floats) -> float:
         """Return the median angle [deg] to the transmitter."""
         return float(angular_distance(torch.from_numpy(claimed), torch.from_numpy(away)).rad2deg().median())
 
     declared = offset(_direction(azimuth, zenith))
-    if declared <= MAX_ANGLE_OFFSET_DEG:
-        return
+    horizon = offset(_direction(azimuth, 90 - zenith))
+    if min(declared, horizon) <= MAX_ANGLE_OFFSET_DEG:
+        return horizon < declared
     others: dict[str, Any] = {
-        "aoa_el is the angle from the horizon; give that from the zenith, 90 - aoa_el": (azimuth, 90 - zenith),
         "the angles say where a path goes; give those from the receiver to where it comes from": (
             azimuth + 180,
             180 - zenith,

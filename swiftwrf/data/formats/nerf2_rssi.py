@@ -1,4 +1,8 @@
-"""Reader of the NeRF2 layout for RSSI: gateway_position.yml, tx_pos.csv, gateway_rssi.csv (-100: not detected)."""
+"""Reader of the NeRF2 layout for RSSI: a table of RSSI, positions with the same rows, and positions of the receivers.
+
+The files are gateway_rssi.csv, tx_pos.csv or rx_pos.csv, and gateway_position.yml; or, as the BLE data of the paper are
+offered, rssi.csv, beacon_pos.csv and gateway_pos.csv.
+"""
 
 from __future__ import annotations
 
@@ -8,54 +12,107 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from swiftwrf.data.files import MAX_COORDINATE_M, digests, numbers, read_positions, read_table, read_yaml
+from swiftwrf.data.coordinates import without_fix
+from swiftwrf.data.files import MAX_COORDINATE_M, digests, numbers, read_yaml
+from swiftwrf.data.fillers import NOT_DETECTED_DBM, check_powers, find_fillers, without_fillers
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
+from swiftwrf.data.receivers import read_receivers, unknown_positions
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import read_splits
-from swiftwrf.data.survey import NOT_DETECTED_DBM, check_powers
-from swiftwrf.errors import InputError
+from swiftwrf.data.splits import kept_splits, read_splits
+from swiftwrf.data.survey import column_of_numbers, read_frame
+from swiftwrf.errors import InputError, listed
+
+TABLES = ("gateway_rssi.csv", "rssi.csv")
+POSITIONS = ("tx_pos.csv", "rx_pos.csv", "beacon_pos.csv")
+RECEIVERS = ("gateway_position.yml", "gateway_pos.csv")
+FILES = ("gateway_rssi.csv", *POSITIONS, *RECEIVERS)  # any of which marks the layout
+AXES = ["x", "y", "z"]
+EMPTY_VALUES = ("", "~", "null", "none")  # of a receiver whose position is unknown
 
 
 @RSSI_FORMATS.register("nerf2")
 class Nerf2Rssi(Format[Rssi]):
-    """One row a position of the transmitter, one column a receiver."""
+    """One row a position of the end that moves, one column a receiver."""
+
+    takes = frozenset({"filler"})
 
     def recognises(self, path: Path) -> bool:
-        return (path / "gateway_rssi.csv").is_file() or (path / "gateway_position.yml").is_file()
+        return any((path / name).is_file() for name in (*TABLES[:1], *RECEIVERS[:1])) or _is_raw(path)
 
     def read(self, path: Path, options: ReadOptions) -> Rssi:
-        table, positions, receivers = (
-            path / name for name in ("gateway_rssi.csv", "tx_pos.csv", "gateway_position.yml")
-        )
-        names, rssi = read_table(table)
-        position = read_positions(positions)
-        if len(rssi) != len(position):
+        table, positions = _one_of(path, TABLES), _one_of(path, POSITIONS)
+        receivers = next((path / name for name in RECEIVERS if (path / name).is_file()), None)
+        frame, places = read_frame(table), read_frame(positions)
+        names = list(map(str, frame.columns))
+        if list(places.columns) != AXES:
+            raise InputError(f"{positions} must start with the header x,y,z, got {','.join(places.columns)}")
+        position = np.stack([column_of_numbers(positions, places, axis) for axis in AXES], axis=1)
+        omitted, missing = without_fix(position)
+        if omitted.all() or (np.abs(position) > MAX_COORDINATE_M).any():
+            raise InputError(f"{positions} needs 3 finite numbers [m], at most {MAX_COORDINATE_M:g}, in each row")
+        if len(frame) != len(places):
             raise InputError(
-                f"{path}: gateway_rssi.csv has {len(rssi)} rows, tx_pos.csv {len(position)}; they must match"
+                f"{path}: {table.name} has {len(frame)} rows, {positions.name} {len(places)}; they must match"
             )
-        check_powers(table, rssi.numpy(), np.array(names, dtype=object), (NOT_DETECTED_DBM,))
+        rssi = np.stack([column_of_numbers(table, frame, name) for name in names], axis=1)
+        fillers = sorted({NOT_DETECTED_DBM, *find_fillers(rssi)}) if options.filler is None else list(options.filler)
+        check_powers(table, rssi, names, fillers, np.arange(len(rssi))[:, None])
+        rssi, notes = without_fillers(rssi, fillers)
+        row = torch.from_numpy(~omitted).nonzero()[:, 0]
+        receiver_position, unknown = _receiver_positions(receivers, names)
+        if positions.name == "rx_pos.csv":
+            missing.append(
+                "the receiver moves; RSSI is reciprocal, so it counts as the transmitter and the others as receivers"
+            )
         return Rssi(
-            torch.where(rssi == NOT_DETECTED_DBM, torch.nan, rssi),
-            position,
+            rssi[row],
+            position[row],
             name=path.resolve().name,
             receiver_names=names,
-            receiver_position=_read_receivers(receivers, names) if receivers.is_file() else None,
-            named_splits=read_splits(path, len(position), first=0),
-            source=digests([f for f in (positions, table, receivers) if f.is_file()], path),
+            receiver_position=receiver_position,
+            index=row,
+            named_splits=kept_splits(read_splits(path, len(rssi), first=0), row, len(rssi)),
+            source=digests([f for f in (positions, table, receivers) if f], path),
+            notes=(*notes, *missing, *unknown),
         )
 
 
-def _read_receivers(file: Path, names: list[str]) -> Tensor:
-    """Return the positions of the receivers, float64 (R, 3) [m]."""
-    content = read_yaml(file)
-    missing = [name for name in names if name not in content]
-    if missing:
-        raise InputError(f"{file} has no position of receiver {missing[0]!r}, which gateway_rssi.csv names")
-    positions = [numbers(content[name], 3) for name in names]
-    for name, position in zip(names, positions, strict=True):
-        if position is None or max(map(abs, position)) > MAX_COORDINATE_M:
-            raise InputError(
-                f"{file}: receiver {name!r} needs a position of 3 finite numbers [m], at most {MAX_COORDINATE_M:g}, got "
-                f"{content[name]}"
-            )
-    return torch.tensor(positions, dtype=torch.float64)
+def _is_raw(path: Path) -> bool:
+    return (path / TABLES[1]).is_file() and any((path / name).is_file() for name in POSITIONS)
+
+
+def _one_of(path: Path, names: tuple[str, ...]) -> Path:
+    """Return the only file with one of these names.
+
+    Raises:
+        InputError: None of them, or several.
+    """
+    found = [path / name for name in names if (path / name).is_file()]
+    if len(found) > 1:
+        raise InputError(f"{path} holds {' and '.join(file.name for file in found)}; keep one of them")
+    if not found:
+        raise InputError(f"{path / names[0]} is missing")
+    return found[0]
+
+
+def _receiver_positions(file: Path | None, names: list[str]) -> tuple[Tensor | None, list[str]]:
+    """Return the positions of the receivers, float64 (R, 3) [m], nan where unknown, and a note on these."""
+    if file is None:
+        return None, []
+    if file.suffix == ".csv":
+        return read_receivers(file, names)
+    content = {name: value for name, value in read_yaml(file).items() if value not in EMPTY_VALUES}
+    unknown = [name for name in names if name not in content]
+    if len(unknown) == len(names):
+        raise InputError(f"{file} has no position of the receivers that the table names: {listed(names)}")
+    found = torch.full((len(names), 3), torch.nan, dtype=torch.float64)
+    for number, name in enumerate(names):
+        if name in content:
+            position = numbers(content[name], 3)
+            if position is None or max(map(abs, position)) > MAX_COORDINATE_M:
+                raise InputError(
+                    f"{file}: receiver {name!r} needs a position of 3 finite numbers [m], at most {MAX_COORDINATE_M:g}, got "
+                    f"{content[name]}"
+                )
+            found[number] = torch.tensor(position, dtype=torch.float64)
+    return found, unknown_positions(unknown)

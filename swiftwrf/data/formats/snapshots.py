@@ -1,4 +1,4 @@
-"""Reader of array snapshots: snapshots.npz or snapshots.h5 with the complex channel of each element."""
+"""Reader of array snapshots: snapshots.npz, snapshots.h5 or snapshots.mat with the complex channel of each element."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import ARCHIVES, Arrays, array_names, read_arrays
 from swiftwrf.data.files import MAX_COORDINATE_M, check_carrier, digests
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
-from swiftwrf.data.snapshots import Snapshots, check_spacing
+from swiftwrf.data.snapshots import Snapshots, check_spacing, round_trip_array, without_null
 from swiftwrf.data.splits import read_splits
 from swiftwrf.errors import InputError
 
 NEEDED = ("csi", "position", "frequency_hz", "array_position", "array_orientation")
 OPTIONAL = ("element_position", "rows", "columns", "spacing_m", "line_of_sight", "time")
+SCALARS = ("frequency_hz", "rows", "columns", "spacing_m")
+VECTORS = ("array_position", "array_orientation", "line_of_sight", "time")
 MAX_HEIGHT_WAVELENGTHS = 1e-3  # of elements over their plane
 
 
@@ -27,7 +29,7 @@ MAX_HEIGHT_WAVELENGTHS = 1e-3  # of elements over their plane
 class SnapshotArrays(Format[Snapshots]):
     """Arrays by name, one row a position of the transmitter."""
 
-    takes = frozenset({"beamformer", "grid", "every"})
+    takes = frozenset({"beamformer", "grid", "every", "drop_null", "round_trip"})
 
     def recognises(self, path: Path) -> bool:
         return _file(path) is not None
@@ -41,9 +43,13 @@ class SnapshotArrays(Format[Snapshots]):
                 raise InputError(f"{file}: {name} holds complex numbers, expected real ones")
             if not np.isfinite(values).all():
                 raise InputError(f"{file}: {name} holds a value that is not finite; leave that row out")
+        arrays, reversed_axes = _turned_round(_without_unit_axes(arrays))
         position, array = _points(file, arrays, "position", 3), _array(file, arrays)
         n, folder, pose = len(position), file.parent, _pose(file, arrays)
-        channel = _channel(file, arrays["csi"], n, len(array.element))
+        raw = _channel(file, arrays["csi"], n, len(array.element))
+        raw, null = without_null(raw, options.drop_null)
+        channel = _scaled(file, raw)
+        array, turned = round_trip_array(array) if options.round_trip else (array, ())
         if bool((position == torch.tensor(pose.position, dtype=torch.float64)).all(dim=1).any()):
             raise InputError(f"{file} has a position equal to array_position, from which there is no direction")
         data = Snapshots(
@@ -56,6 +62,7 @@ class SnapshotArrays(Format[Snapshots]):
             source=digests([file], folder),
             line_of_sight=_one_each(file, arrays, "line_of_sight", n),
             time=_one_each(file, arrays, "time", n),
+            notes=(*reversed_axes, *null, *turned),
         )
         return data if options.every in (None, 1) else data.subset(torch.arange(0, n, options.every))
 
@@ -66,6 +73,32 @@ def _file(path: Path) -> Path | None:
             (path / f"snapshots{suffix}" for suffix in ARCHIVES if (path / f"snapshots{suffix}").is_file()), None
         )
     return path if path.suffix in ARCHIVES and "csi" in array_names(path) else None
+
+
+def _without_unit_axes(arrays: Arrays) -> Arrays:
+    """Return the arrays with scalars and vectors as such, which MATLAB stores as matrices."""
+    vectors = {name: arrays[name].reshape(-1) for name in VECTORS if name in arrays and _is_row(arrays[name])}
+    scalars = {name: arrays[name].reshape(()) for name in SCALARS if name in arrays and arrays[name].size == 1}
+    return arrays | vectors | scalars
+
+
+def _is_row(values: NDArray[np.generic]) -> bool:
+    return values.ndim == 2 and 1 in values.shape
+
+
+def _turned_round(arrays: Arrays) -> tuple[Arrays, tuple[str, ...]]:
+    """Return the arrays with the positions as first axis, as MATLAB and Octave store them last in HDF5, and a note."""
+    position, csi = arrays["position"], arrays["csi"]
+    if position.ndim != 2 or (position.shape[1] == 3 and csi.shape[:1] == position.shape[:1]):
+        return arrays, ()
+    position = position if position.shape[1] == 3 else position.T
+    if position.shape[1] != 3 or csi.shape[-1:] != position.shape[:1]:
+        return arrays, ()  # refused with its shape
+    turned = {"position": position, "csi": csi.T}
+    element = arrays.get("element_position")
+    if element is not None and element.ndim == 2 and element.shape[1] == csi.shape[0]:
+        turned["element_position"] = element.T
+    return arrays | turned, ("axes are in reverse order, as MATLAB and Octave write HDF5; they are turned round",)
 
 
 def _points(file: Path, arrays: Arrays, name: str, columns: int) -> Tensor:
@@ -92,7 +125,7 @@ def _one_each(file: Path, arrays: Arrays, name: str, n: int) -> Tensor | None:
 
 
 def _channel(file: Path, csi: NDArray[np.generic], n: int, elements: int) -> Tensor:
-    """Return channels, complex64 (n, S, K), each row scaled to unit mean power, because their unit is arbitrary."""
+    """Return channels, complex128 (n, S, K)."""
     if csi.dtype.kind != "c":
         hint = "; join real and imaginary parts as csi[..., 0] + 1j * csi[..., 1]" if csi.shape[-1:] == (2,) else ""
         raise InputError(f"{file}: csi must hold complex numbers, got {csi.dtype}{hint}")
@@ -106,7 +139,11 @@ def _channel(file: Path, csi: NDArray[np.generic], n: int, elements: int) -> Ten
             f"{file}: csi must have shape ({n}, [subcarriers or packets,] {elements}) for {n} positions and {elements} "
             f"elements, got {csi.shape}"
         )
-    channel = torch.from_numpy(csi.reshape(n, -1, elements).astype(np.complex128))
+    return torch.from_numpy(csi.reshape(n, -1, elements).astype(np.complex128))
+
+
+def _scaled(file: Path, channel: Tensor) -> Tensor:
+    """Return channels, complex64 (n, S, K), each row scaled to unit mean power, because their unit is arbitrary."""
     power = torch.view_as_real(channel).square().sum(-1).mean(dim=(1, 2), keepdim=True)
     silent = (~((power > 0) & power.isfinite())).flatten().nonzero()
     if len(silent):

@@ -4,27 +4,25 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-import pandas as pd
 import torch
-from torch import Tensor
 
-from swiftwrf.data.files import MAX_COORDINATE_M, digests
+from swiftwrf.data.files import digests, lines_before_header
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
-from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import read_splits
-from swiftwrf.data.survey import SUFFIXES, column_of_numbers, read_frame, read_survey
+from swiftwrf.data.formats.nerf2_rssi import FILES as NERF2_FILES
+from swiftwrf.data.receivers import read_receivers
+from swiftwrf.data.rssi import Groups, Rssi
+from swiftwrf.data.splits import kept_splits, read_splits
+from swiftwrf.data.survey import SEPARATORS, SUFFIXES, SurveyOptions, read_frame, read_survey
 from swiftwrf.errors import InputError
 
 RECEIVERS = "receivers.csv"  # beside the table: receiver,x,y,z
-NERF2_FILES = ("tx_pos.csv", "rx_pos.csv", "gateway_rssi.csv")
 
 
 @RSSI_FORMATS.register("survey")
 class SurveyTable(Format[Rssi]):
-    """Table of a walk test; positions of the receivers are unknown unless receivers.csv lies beside it."""
+    """Table of a walk test; positions of receivers are unknown unless receivers.csv beside it contains them."""
 
-    takes = frozenset({"columns"})
+    takes = frozenset({"columns", "filler", "coordinates", "offset_by"})
 
     def recognises(self, path: Path) -> bool:
         return bool(_tables(path))
@@ -36,16 +34,30 @@ class SurveyTable(Format[Rssi]):
                 f"{path} holds {len(tables)} tables ({', '.join(file.name for file in tables)}); name the one to read"
             )
         file, receivers = tables[0], tables[0].with_name(RECEIVERS)
-        names, rssi, position, notes = read_survey(file, read_frame(file), options.columns or {})
+        survey = read_survey(
+            file,
+            read_frame(file),
+            SurveyOptions(options.columns, options.filler, options.coordinates, options.offset_by),
+        )
+        known, unknown = (
+            read_receivers(receivers, survey.receiver_names, survey.origin) if receivers.is_file() else (None, [])
+        )
+        skipped = file.suffix.lower() == ".csv" and lines_before_header(file, SEPARATORS)
+        notes = [f"lines before the header are skipped: {skipped}"] * bool(skipped)
+        splits = read_splits(file.parent, survey.n_rows, first=0)
         return Rssi(
-            rssi,
-            position,
+            survey.rssi_dbm,
+            survey.position,
             name=file.stem,
-            receiver_names=names,
-            receiver_position=_receiver_positions(receivers, names) if receivers.is_file() else None,
-            named_splits=read_splits(file.parent, len(position), first=0),
+            receiver_names=survey.receiver_names,
+            receiver_position=known,
+            origin=survey.origin,
+            groups=Groups.of(options.offset_by, survey.group) if options.offset_by else None,
+            labels=survey.labels,
+            index=survey.row,
+            named_splits=kept_splits(splits, torch.from_numpy(survey.row), survey.n_rows),
             source=digests([file, *([receivers] if receivers.is_file() else [])], file.parent),
-            notes=notes,
+            notes=(*notes, *survey.notes, *unknown),
         )
 
 
@@ -55,20 +67,3 @@ def _tables(path: Path) -> list[Path]:
     if any((path / name).is_file() for name in NERF2_FILES):
         return []
     return sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.name != RECEIVERS)
-
-
-def _receiver_positions(file: Path, names: list[str]) -> Tensor:
-    """Return the positions of the receivers, float64 (R, 3) [m]."""
-    table = read_frame(file)
-    if list(table.columns) != ["receiver", "x", "y", "z"]:
-        raise InputError(f"{file} must start with the header receiver,x,y,z, got {','.join(table.columns)}")
-    table.index = pd.Index(table["receiver"].str.strip())
-    missing = [name for name in names if name not in table.index]
-    if missing or not table.index.is_unique:
-        raise InputError(
-            f"{file} must have each receiver once; {', '.join(missing[:5]) or 'one name'} is missing or comes twice"
-        )
-    position = np.stack([column_of_numbers(file, table.loc[names], axis) for axis in "xyz"], axis=1)
-    if not (np.abs(position) <= MAX_COORDINATE_M).all():
-        raise InputError(f"{file} needs 3 finite numbers [m], at most {MAX_COORDINATE_M:g}, for each receiver")
-    return torch.from_numpy(position)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import math
 import time
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -31,6 +31,7 @@ from tasks.run import Preset
 from tasks.torchrun import distribute, process_count
 
 MIN_ROWS = 8  # fewest elevations after averaging; a prime number of rows could only be averaged to one
+EVALUATIONS = 30  # of each spectrum of a scene in a quick training
 MAX_QUICK_STEPS = 1000
 WARM_UP_FRACTION = 0.11  # of the steps with a rising learning rate; if one in a whole number, torch would divide by 0
 MAX_NORM_SPECTRA = 512  # spectra for the final statistics of the batch norms
@@ -41,8 +42,6 @@ BATCH_SPECTRA = 64  # spectra that pass through the trained network at a time
 class AANNConfig(EstimatorConfig):
     """Options of the network and its training."""
 
-    evaluations: ClassVar[int] = 30
-    """times that a quick training passes each spectrum of a scene whose spectra are all measured"""
     steps: PositiveInt = 125
     """optimisation steps, the same for every training set"""
     batch: PositiveInt = 64
@@ -62,7 +61,7 @@ class AANNConfig(EstimatorConfig):
     @classmethod
     def quick(cls, n_spectra: int, **options: Any) -> Self:
         """Return options whose steps grow with the scene: few steps under-fit 1,500 spectra."""
-        steps = round(cls.evaluations * n_spectra / cls.batch)
+        steps = round(EVALUATIONS * n_spectra / cls.batch)
         return cls(steps=min(max(steps, cls.steps), MAX_QUICK_STEPS), **options)
 
     @classmethod

@@ -8,7 +8,7 @@ training spectra.
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar
+from typing import Any, Self
 
 import torch
 from numpy.typing import NDArray
@@ -30,11 +30,15 @@ HALF_TRUST_SPECTRA = 1000  # training spectra after which squared distances of f
 
 @configuration
 class AANNKernelConfig(AANNConfig):
-    """Options of the network and its short training: more steps do not improve the regression on held-out spectra."""
+    """Options of the network and its short training."""
 
-    evaluations: ClassVar[int] = 8
     steps: PositiveInt = 30
     """optimisation steps, the same for every training set"""
+
+    @classmethod
+    def quick(cls, n_spectra: int, **options: Any) -> Self:
+        """Return options whose steps do not grow with the scene: more do not improve the regression on held-out spectra."""
+        return cls(**options)
 
 
 @ESTIMATORS.register("aann_kernel")

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from augment import Mixed
 from swiftwrf.array.angles import to_angles, to_direction
+from swiftwrf.array.planar import folded_angles
 from tasks.aoa.estimators.base import ESTIMATORS, Estimator
 
 SHORTLIST = 8  # candidates found by inner products, whose differences are then computed
@@ -14,7 +15,7 @@ SHORTLIST = 8  # candidates found by inner products, whose differences are then 
 
 @ESTIMATORS.register("peak")
 class Peak(Estimator):
-    """The direction with the largest magnitude. A reflection is often stronger than the line of sight.
+    """The direction with the largest magnitude, folded as the labels. A reflection is often stronger than the line of sight.
 
     Example:
         >>> import swiftwrf
@@ -26,10 +27,10 @@ class Peak(Estimator):
     trainable = False
 
     def _fit(self, train: Mixed, device: torch.device) -> None:
-        pass
+        self._array = train.array
 
     def predict(self, spectra: Tensor) -> Tensor:
-        return self.grid.peak_direction(spectra)
+        return folded_angles(self._array, self.grid.peak_direction(spectra))
 
 
 @ESTIMATORS.register("constant")

@@ -13,6 +13,7 @@ from tasks.metrics import Angle, ErrorSummary
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
 from tasks.page.provenance import number
+from tasks.page.records import notes
 
 ERRORS: dict[Angle, str] = {
     "azimuth_deg": "azimuth",
@@ -35,7 +36,7 @@ def results_section(fraction: FractionRecords, several: bool) -> Section:
     ]
     columns = ["method", *(f"{name} [deg]" for name in ERRORS.values()), "great circle, 90 %"]
     strong = frozenset(name for name, condition in fraction.conditions.items() if condition.is_turbo)
-    paragraphs = []
+    paragraphs = notes(fraction.run)
     if fraction.key in PAPER:
         elevation, azimuth = PAPER[fraction.key]
         paragraphs.append(

@@ -6,11 +6,13 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data import Rssi, Snapshots, Spectra
+from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.positions import distance
 from tasks.inspect.findings.base import Findings
 
 MAX_POSITIONS = 3000  # whose neighbours are searched
 SMOOTH, ROUGH = 0.25, 0.5  # wavelengths between neighbours: below, fields are smooth; above, fringes are lost
+MAX_END_OFFSET = 1e-3  # of normalised coordinates from the ends of their interval
 MAX_EXTENT_M = 1000.0  # beyond, coordinates may be millimetres
 
 
@@ -33,7 +35,7 @@ def check_positions(position: Tensor, findings: Findings, wavelength: float | No
     _, times = position.unique(dim=0, return_counts=True)
     same = int(times[times > 1].sum())
     if same:
-        findings.warn(f"{same} positions occur more than once; a random split puts the same place into both parts.")
+        findings.say(f"{same} positions occur more than once; the split random keeps each place in one part.")
     middle = float(near.median())
     findings.numbers["nearest_m"] = middle
     if wavelength is None:
@@ -50,6 +52,20 @@ def check_positions(position: Tensor, findings: Findings, wavelength: float | No
         findings.warn(f"{text}: interpolators see no fringes between such positions; geometry needs none.")
 
 
+def normalised(position: Tensor) -> str:
+    """Return the interval that every coordinate of positions (n, 3) fills exactly, as normalised ones do, or an empty text.
+
+    Coordinates without extent are left out; one coordinate alone is no evidence.
+    """
+    low, high = position.amin(dim=0), position.amax(dim=0)
+    varying = high > low
+    for name, start in (("[-1, 1]", -1.0), ("[0, 1]", 0.0)):
+        ends = torch.cat([low[varying] - start, high[varying] - 1])
+        if int(varying.sum()) >= 2 and bool((ends.abs() <= MAX_END_OFFSET).all()):
+            return name
+    return ""
+
+
 def nearest(position: Tensor) -> tuple[Tensor, Tensor]:
     """Return rows of positions (n, 3), a subset of many, and the distance from each to the nearest other one [m]."""
     some = torch.linspace(0, len(position) - 1, min(MAX_POSITIONS, len(position))).round().long()
@@ -62,3 +78,6 @@ def say_splits(data: Spectra | Snapshots | Rssi, findings: Findings) -> None:
     """Report the splits that came with the measurements."""
     for name, (train, test) in data.named_splits.items():
         findings.say(f"Split {name}: {len(train)} for training, {len(test)} for testing.")
+        position = data.transmitter_position if isinstance(data, Rssi) else data.position
+        if (repeated := repeated_fraction(position[train], position[test])) > MAX_REPEATED:
+            findings.warn(f"Split {name} tests look-up: {repeated:.0%} of its test rows are at training positions.")

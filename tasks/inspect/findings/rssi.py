@@ -8,12 +8,14 @@ from torch import Tensor
 
 from swiftwrf.data import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
-from swiftwrf.diagnostics.frames import check_path_loss
+from swiftwrf.diagnostics.path_loss import check_path_loss
 from swiftwrf.errors import listed
+from swiftwrf.rssi import estimate_offsets
 from tasks.inspect.findings.base import Findings
 from tasks.inspect.findings.positions import check_positions, say_splits
 
 MAX_LEVEL_DBM = 10.0  # at 1 m, which no usual transmitter reaches
+MIN_EXPLAINED, MIN_SPREAD_DB = 0.15, 1.0  # of offsets that are proposed
 MAX_EDGE_SHARE = 0.2  # of the weakest value, if it stands apart
 
 
@@ -36,6 +38,27 @@ def check_rssi(data: Rssi, findings: Findings) -> None:
     _columns(data, detected, findings)
     _path_loss(data, findings)
     say_splits(data, findings)
+
+
+def propose_offsets(data: Rssi, findings: Findings) -> None:
+    """Warn of a column whose values have constant offsets of RSSI.
+
+    Args:
+        data: RSSI with the groups of such a column.
+        findings: Where the warning is added.
+    """
+    if data.groups is None or len(data.groups.code.unique()) < 2:
+        return
+    column = data.groups.column
+    offsets = estimate_offsets(data)
+    spread = max(offsets.offset_db.values()) - min(offsets.offset_db.values())
+    if offsets.explained < MIN_EXPLAINED or spread < MIN_SPREAD_DB:
+        return
+    findings.warn(
+        f"Offsets of up to {spread:.1f} dB between the values of column {column} explain {offsets.explained:.0%} of the "
+        f"variance about a smooth field; --offset-by {column} estimates them.",
+        **{f"offsets_explained_{column}": offsets.explained},
+    )
 
 
 def _columns(data: Rssi, detected: Tensor, findings: Findings) -> None:
@@ -75,7 +98,7 @@ def _columns(data: Rssi, detected: Tensor, findings: Findings) -> None:
 
 
 def _path_loss(data: Rssi, findings: Findings) -> None:
-    report = check_path_loss(data)
+    report = check_path_loss(data.columns(data.receiver_located.nonzero()[:, 0].tolist()))
     if report is None:
         findings.say("The receivers' positions are unknown, so there is no path-loss model; other predictors work.")
         return

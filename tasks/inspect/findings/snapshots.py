@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import torch
-
 from swiftwrf import InputError
 from swiftwrf.data import Snapshots
 from swiftwrf.diagnostics.calibration import calibrate
-from swiftwrf.positions import distance
 from tasks.inspect.findings.base import Findings
 from tasks.inspect.findings.positions import ROUGH
 
@@ -17,8 +14,7 @@ MIN_GAIN = 0.1  # of a recommended calibration, in the fraction of the power alo
 def check_snapshots(data: Snapshots, findings: Findings) -> None:
     """Report number, spacing and times of snapshots."""
     count, elements = data.channel.shape[1:]
-    apart = distance(*(2 * [torch.nn.functional.pad(data.array.element, (0, 1))])).fill_diagonal_(torch.inf).amin(dim=1)
-    spacing = float(apart.median() / data.array.wavelength)
+    spacing = data.array.spacing_wavelengths
     findings.say(
         f"{len(data)} array snapshots of {count} subcarriers or packets x {elements} elements, {spacing:.2f} wavelengths "
         f"apart, at {data.array.frequency_hz / 1e9:.4g} GHz.",

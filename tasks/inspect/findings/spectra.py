@@ -1,11 +1,10 @@
-"""Findings on spectra: their size and range, and whether their frames match."""
+"""Findings on spectra: their size and range."""
 
 from __future__ import annotations
 
 import torch
 
 from swiftwrf.data import Spectra
-from swiftwrf.diagnostics.frames import MIN_CLEAR_POSITIONS, check_frames
 from tasks.inspect.findings.base import Findings
 from tasks.inspect.findings.positions import check_positions, say_splits
 
@@ -34,45 +33,3 @@ def check_spectra(data: Spectra, findings: Findings) -> None:
     if bool((least == peak).any()):
         findings.warn("Some spectra have one value everywhere.")
     say_splits(data, findings)
-
-
-def check_peaks(data: Spectra, findings: Findings) -> None:
-    """Report whether the peaks of the spectra follow the lines of sight."""
-    report = check_frames(data)
-    if report is None:
-        findings.warn(
-            "Frames cannot be checked: that needs the fixed end, the orientation and "
-            f"{MIN_CLEAR_POSITIONS} positions with line of sight."
-        )
-        return
-    numbers = {
-        "peak_to_line_of_sight_deg": report.angle_deg,
-        "agreement": report.agreement,
-        "agreement_by_chance": report.chance,
-        "frame": "fits" if report.fits else "explained" if report.explanations or report.turn_deg else "undecided",
-        "explanations": list(report.explanations),
-        "turn_deg": report.turn_deg,
-    }
-    text = f"Peaks are {report.angle_deg:.1f} degrees beside the line of sight (median)"
-    if report.explanations:
-        findings.warn(f"{text}. That would fit if {'; or if '.join(report.explanations)}.", **numbers)
-    elif report.turn_deg:
-        angle = sum(a * a for a in report.turn_deg) ** 0.5
-        axis = ", ".join(f"{a / angle:.2f}" for a in report.turn_deg)
-        findings.warn(
-            f"{text}. A constant rotation of {angle:.0f} degrees about ({axis}) in array coordinates would mend most of it: "
-            "is the orientation right?",
-            **numbers,
-        )
-    elif report.fits:
-        findings.say(f"{text} and follow it: positions, orientation and angles are in one frame.", **numbers)
-    elif report.chance >= report.agreement - 0.05 and report.chance > 0.2:
-        findings.warn(
-            f"{text}; all positions lie in nearly one direction from the array, so frames cannot be checked.", **numbers
-        )
-    else:
-        findings.warn(
-            f"{text} and do not follow it in any frame that was tried: reflections are stronger, or the elements' phases "
-            "are not calibrated.",
-            **numbers,
-        )

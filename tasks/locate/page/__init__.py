@@ -130,7 +130,7 @@ def _limits(run: LocateRecords) -> Section:
         "Intervals of medians treat test rows as independent. Along a walked path they are not, and the intervals are too "
         "narrow.",
         "Training and test rows are of one device and one time, unless the split separates these. Another device has "
-        "another offset.",
+        "another offset, which --offset-by COLUMN estimates if the table names devices.",
     ]
     if run.metrics["data"] == "simulated-floor":
         texts.append(

@@ -9,7 +9,7 @@ from pandas import DataFrame
 from tasks.locate.steps import MODEL
 from tasks.metrics import LocateMetrics
 from tasks.page.page import Number, Plot, Summary
-from tasks.page.records import Records
+from tasks.page.records import Records, notes
 from tasks.summarise import paired_difference
 from tasks.terminal import Answer
 
@@ -45,6 +45,7 @@ def summary(run: LocateRecords, picture: Plot) -> Summary:
     meaning = [
         f"On {run.scene}: {run.metrics['n_train']} training rows and {run.metrics['n_test']} test rows at {receivers} "
         f"{'receiver' if receivers == 1 else 'receivers'}.",
+        *notes(run),
     ]
     return Summary(numbers, picture, meaning, _next_steps(run), verdict(run))
 

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pandas import DataFrame
 
+from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
 from tasks.labels import PREDICTORS as LABELS
 from tasks.labels import labels
 from tasks.page import figures
@@ -166,7 +167,9 @@ def _cells(run: RssiRecords, n_maps: int = MAX_MAPS) -> DataFrame:
     shown = _most_detected(maps, n_maps)
     names, ys, xs = (a.ravel() for a in np.meshgrid(maps["receiver_names"][shown], maps["y"], maps["x"], indexing="ij"))
     values = {field: maps[kind][shown].ravel().round(2) for kind, field in _FIELDS.items()}
-    return DataFrame({"receiver": names, "x_m": xs.round(3), "y_m": ys.round(3)} | values)
+    origin = GeodeticOrigin(*maps["origin"].tolist()) if "origin" in maps else None
+    degrees = {name: value.round(7) for name, value in degree_columns(origin, np.stack([xs, ys], axis=1)).items()}
+    return DataFrame({"receiver": names, "x_m": xs.round(3), "y_m": ys.round(3)} | degrees | values)
 
 
 def _maps(run: RssiRecords, field: str, label: str, n_maps: int = MAX_MAPS) -> Figure:

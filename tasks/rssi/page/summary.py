@@ -10,7 +10,7 @@ from pandas import DataFrame
 
 from tasks.metrics import RssiMetrics
 from tasks.page.page import Number, Plot, Summary
-from tasks.page.records import Records
+from tasks.page.records import Records, notes
 from tasks.summarise import paired_difference
 from tasks.terminal import Answer
 
@@ -43,6 +43,7 @@ def summary(run: RssiRecords, picture: Plot) -> Summary:
     meaning = [
         f"On {run.scene}: {run.metrics['n_train']} training rows and {run.metrics['n_test']} test rows with {own['n']} "
         f"detected pairs at {receivers} {'receiver' if receivers == 1 else 'receivers'}.",
+        *notes(run),
     ]
     return Summary(numbers, picture, meaning, _next_steps(run), verdict(run))
 

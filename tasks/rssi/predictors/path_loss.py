@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from swiftwrf import Rssi
-from swiftwrf.rssi import PathLoss, RssiFitContext, RssiPredictor, fit_path_loss, log_distance
+from swiftwrf.rssi import PathLoss, RssiFitContext, RssiPredictor, fit_path_loss, fit_shared_path_loss, log_distance
 
 
 class Mean(RssiPredictor):
@@ -26,6 +26,8 @@ class Mean(RssiPredictor):
 class SharedPathLoss(RssiPredictor):
     """One log-distance path-loss model for all receivers of the pool, by least squares.
 
+    Receivers of unknown position share one level.
+
     "MRI" is its name in the NeRF2 repository and, most likely, in the paper's table.
     """
 
@@ -34,7 +36,7 @@ class SharedPathLoss(RssiPredictor):
 
     def _fit(self, train: Rssi, context: RssiFitContext) -> None:
         self._receiver = train.receiver_position
-        self._path_loss = _fit_path_loss(context.pool, shared=True)
+        self._path_loss = _fit_shared(context.pool, train)
 
     def _predict(self, position: Tensor) -> tuple[Tensor, None]:
         return self._path_loss(log_distance(position, self._receiver)), None
@@ -48,9 +50,10 @@ class ReceiverPathLoss(SharedPathLoss):
     def _fit(self, train: Rssi, context: RssiFitContext) -> None:
         self._receiver = train.receiver_position
         detected = (~train.rssi_dbm.isnan()).any(dim=0)
-        self._path_loss = _fit_path_loss(train).where(detected, _fit_path_loss(train, shared=True))
+        own = fit_path_loss(log_distance(train.transmitter_position, train.receiver_position), train.rssi_dbm)
+        self._path_loss = own.where(detected, _fit_shared(train, train))
 
 
-def _fit_path_loss(rows: Rssi, shared: bool = False) -> PathLoss:
+def _fit_shared(rows: Rssi, applied: Rssi) -> PathLoss:
     distance = log_distance(rows.transmitter_position, rows.receiver_position)
-    return fit_path_loss(distance, rows.rssi_dbm, shared=shared)
+    return fit_shared_path_loss(distance, rows.rssi_dbm, rows.receiver_located, applied.receiver_located)

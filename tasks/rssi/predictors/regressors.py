@@ -127,7 +127,9 @@ class GPPredictor(ReceiverRegressors):
 
     def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
         scale = max(float(np.var(y)), 1e-6)
-        kernel = ConstantKernel(scale / 3, (scale * 1e-3, scale * 10)) * Matern(2.0, (0.1, 50.0), nu=1.5)
+        extent = float(np.ptp(x, axis=0).max()) or 1.0
+        length = Matern(extent / 10, (extent / 200, 2.5 * extent), nu=1.5)
+        kernel = ConstantKernel(scale / 3, (scale * 1e-3, scale * 10)) * length
         kernel = kernel + WhiteKernel(scale / 2, (scale * 1e-3, scale * 10))
         order = np.random.default_rng(self.config.seed).permutation(len(y))
         tuned, kept = order[:MAX_TUNING_ROWS], order[:MAX_GP_ROWS]

@@ -1,0 +1,151 @@
+"""Positions in tables: rows without a fix, and latitude and longitude as local metres."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from swiftwrf.errors import InputError
+
+Floats = NDArray[np.float64]
+Coordinates = Literal["degrees", "metres"]
+FAR_RATIO = 10.0  # distance of the origin relative to the distance between positions, or to their extent
+MAX_EXTENT_DEG = 2.0  # of positions that are recognised as degrees
+MAX_FINE_EXTENT = 0.05  # extent that is a walk in degrees (5 km), and none in metres (5 cm)
+
+
+class GeodeticOrigin(NamedTuple):
+    """Point where local metres (x east, y north) touch the WGS84 ellipsoid, by azimuthal equidistant projection.
+
+    Args:
+        latitude: Latitude of x = y = 0 [deg].
+        longitude: Longitude of x = y = 0 [deg].
+
+    Example:
+        >>> origin = GeodeticOrigin(48.0, 11.0)
+        >>> origin.to_metres(np.array([[48.001, 11.0]])).round(1)
+        array([[  0. , 111.2]])
+        >>> origin.to_degrees(np.array([[0.0, 111.2]])).round(4)
+        array([[48.001, 11.   ]])
+    """
+
+    latitude: float
+    longitude: float
+
+    @classmethod
+    def amid(cls, degrees: Floats) -> GeodeticOrigin:
+        """Return the median of latitudes and longitudes (n, 2) [deg], on either side of the antimeridian."""
+        first = degrees[0, 1]
+        east = (degrees[:, 1] - first + 180) % 360 - 180
+        longitude = (first + float(np.median(east)) + 180) % 360 - 180
+        return cls(round(float(np.median(degrees[:, 0])), 7), round(longitude, 7))
+
+    def to_metres(self, degrees: Floats) -> Floats:
+        """Return x and y (n, 2) [m] of latitudes and longitudes (n, 2) [deg]."""
+        return self._projected(degrees[:, 1], degrees[:, 0])
+
+    def to_degrees(self, xy: Floats) -> Floats:
+        """Return latitudes and longitudes (n, 2) [deg] of x and y (n, 2) [m]."""
+        return self._projected(xy[:, 0], xy[:, 1], inverse=True)[:, ::-1]
+
+    def _projected(self, a: Floats, b: Floats, inverse: bool = False) -> Floats:
+        from pyproj import Proj  # takes a moment, and most data are in metres
+
+        projection = Proj(proj="aeqd", lat_0=self.latitude, lon_0=self.longitude, ellps="WGS84")
+        return np.stack(projection(a, b, inverse=inverse), axis=1)
+
+    def __str__(self) -> str:
+        return f"latitude {self.latitude:.7g}, longitude {self.longitude:.7g}"
+
+
+def degree_columns(origin: GeodeticOrigin | None, xy: Floats) -> dict[str, Floats]:
+    """Return columns with latitude and longitude [deg] of positions (n, 2 or more) [m]; none without an origin.
+
+    Example:
+        >>> degree_columns(GeodeticOrigin(48.0, 11.0), np.zeros((1, 2)))
+        {'latitude_deg': array([48.]), 'longitude_deg': array([11.])}
+    """
+    if origin is None:
+        return {}
+    return dict(zip(("latitude_deg", "longitude_deg"), origin.to_degrees(xy).T, strict=True))
+
+
+def without_fix(position: Floats) -> tuple[NDArray[np.bool_], list[str]]:
+    """Return which positions are no fix, and notes on them.
+
+    An empty position is no fix. Neither is x = y = 0 if it is far from all others, or if it occurs more often than any other
+    position without being the neighbour of one.
+
+    Args:
+        position: Coordinates (n, 3) in any unit, nan where they are empty.
+
+    Example:
+        >>> without_fix(np.array([[50.0, 5.0, 1.0], [50.0, 6.0, 1.0], [np.nan, 5.0, 1.0], [0.0, 0.0, 0.0]]))[0]
+        array([False, False,  True,  True])
+    """
+    empty = np.isnan(position).any(axis=1)
+    at_origin = (position[:, :2] == 0).all(axis=1)
+    places, times = np.unique(position[~empty & ~at_origin, :2], axis=0, return_counts=True)
+    if at_origin.any():
+        at_origin &= len(places) > 1 and _is_apart(places, int(times.max()), int(at_origin.sum()))
+    notes = [
+        f"rows {what} are left out: {int(rows.sum())} of {len(position)}"
+        for what, rows in (("without a position", empty), ("at 0, 0, apart from all others", at_origin))
+        if rows.any()
+    ]
+    return empty | at_origin, notes
+
+
+def _is_apart(places: Floats, most: int, at_origin: int) -> bool:
+    tree = cKDTree(places)
+    spacing = float(np.median(tree.query(places, k=2)[0][:, 1]))
+    distance = float(tree.query(np.zeros(2))[0])
+    return distance > FAR_RATIO * spacing or (at_origin > most and distance > spacing)
+
+
+def degrees_in(
+    label: object, names: tuple[str, str], xy: Floats, named: bool, asked: Coordinates | None
+) -> Floats | None:
+    """Return latitudes and longitudes (n, 2) [deg], None if the coordinates are metres.
+
+    Args:
+        label: Name of the table, for messages.
+        names: Names of both columns.
+        xy: Longitude or x, and latitude or y, (n, 2). Without names, x is the latitude if y exceeds 90.
+        named: Whether the columns are named after longitude and latitude.
+        asked: What the user states.
+
+    Raises:
+        InputError: Values that are no degrees though the user states it, or that may be either.
+
+    Example:
+        >>> degrees_in("walk.csv", ("x", "y"), np.array([[11.0, 48.0], [11.0, 48.001]]), False, None)
+        array([[48.   , 11.   ],
+               [48.001, 11.   ]])
+    """
+    columns = f"{label}: columns {names[0]} and {names[1]}"
+    if asked == "metres":
+        return None
+    swapped = not named and bool((np.abs(xy[:, 1]) > 90).any())
+    degrees = xy if swapped else xy[:, ::-1]
+    if not (np.abs(degrees) <= (90, 180)).all():
+        if asked == "degrees" or (named and (np.abs(degrees) <= 180).all()):
+            raise InputError(
+                f"{columns} hold latitudes beyond 90 degrees; are they swapped? say which: columns latitude=NAME "
+                "longitude=NAME"
+            )
+        return None
+    extent, distance = float(np.ptp(xy, axis=0).max()), float(np.abs(xy).max())
+    if asked == "degrees" or (named and extent <= MAX_EXTENT_DEG):
+        return degrees
+    if not named and (distance <= FAR_RATIO * extent or extent == 0 or extent > MAX_EXTENT_DEG):
+        return None
+    if not named and extent <= MAX_FINE_EXTENT:
+        return degrees
+    raise InputError(
+        f"{columns} extend over {extent:.3g} and may be degrees or metres; say which: --coordinates degrees or "
+        "--coordinates metres"
+    )

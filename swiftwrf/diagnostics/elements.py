@@ -1,0 +1,134 @@
+"""Diagnose errors of array snapshots before their frames: order of elements and axes, sign flips, phases without delay.
+
+A wave from the line of sight has the phases a_k at the elements (`PlanarArray.phase`). The residual phases
+r_k = h_k conj(a_k) of a channel h are equal at all elements if the direct path dominates, so |mean r_k|^2 is the fraction of
+the power along the line of sight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data.snapshots import Snapshots
+
+LATTICE_TOLERANCE_WAVELENGTHS = 1e-3  # between coordinates of elements in one row or column
+MIN_FLIP_GAIN = 0.15  # in the fraction of the power along the line of sight, above no flips and above chance
+MIN_FLIP_SHARE = 0.75  # of the power along the line of sight, once flips are taken back
+MIN_DOUBLED_SHARE = 0.5  # of the power of the squared channel along the line of sight, which flips do not change
+MIN_CORRELATION = 0.8  # between the signs of elements that flip together
+MIN_COMMON_SHARE = 0.8  # of the power in one direction, to call phases constant
+MAX_GEOMETRIC_SHARE = 0.65  # the same by the lines of sight: beyond, they are too close to each other
+MAX_SNAPSHOTS = 8  # subcarriers or packets of a position that are used
+CHANCE_SHIFTS = 5  # pairings of channels with lines of sight of other positions
+ROUND_TRIP = (
+    "the phases are those of the way there and back, as of RFID and backscatter (--round-trip); elements are then "
+    "{spacing:.2f} wavelengths apart{ambiguous}"
+)
+
+
+def other_readings(data: Snapshots) -> dict[str, Snapshots]:
+    """Return the snapshots as they would be read under each error, by its description."""
+    channel, array = data.channel, data.array
+    found = {
+        f"the elements are given {name}": replace(data, channel=channel[..., order])
+        for name, order in _element_orders(array).items()
+    }
+    if channel.shape[1] == channel.shape[2]:
+        swapped = "the axes of elements and subcarriers are swapped: give csi.transpose(0, 2, 1)"
+        found[swapped] = replace(data, channel=channel.mT.contiguous())
+    halved = PlanarArray(array.element, array.wavelength / 2)
+    ambiguous = ", so directions are ambiguous" if halved.spacing_wavelengths > 0.51 else ""
+    meaning = ROUND_TRIP.format(spacing=halved.spacing_wavelengths, ambiguous=ambiguous)
+    return {meaning: replace(data, array=halved), **found}
+
+
+def _element_orders(array: PlanarArray) -> dict[str, Tensor]:
+    """Return the order (K,) of the channels if elements of a lattice are given along its other axis, by description."""
+    tolerance = LATTICE_TOLERANCE_WAVELENGTHS * array.wavelength
+    sites = [_ranks(array.element[:, axis], tolerance) for axis in (0, 1)]
+    columns, rows = (int(rank.max()) + 1 for rank in sites)
+    if columns * rows != len(array.element) or min(rows, columns) < 2:
+        return {}
+    declared = sites[1] * columns + sites[0]
+    by_row = torch.arange(rows * columns).reshape(rows, columns)
+    row_wise = bool((sites[1].diff() == 0).sum() > (sites[0].diff() == 0).sum())
+    name = "column by column" if row_wise else "row by row"
+    ends = {"": (), ", from the highest y": (0,), ", from the highest x": (1,), ", from the highest x and y": (0, 1)}
+    orders = {}
+    for end, flipped in ends.items():
+        sequence = by_row.flip(flipped)
+        given = (sequence.T if row_wise else sequence).flatten()  # lattice site of each channel
+        orders[name + end] = given.argsort()[declared]
+    return {meaning: order for meaning, order in orders.items() if not torch.equal(order, torch.arange(len(order)))}
+
+
+def _ranks(values: Tensor, tolerance: float) -> Tensor:
+    """Return the rank of each value among the distinct ones."""
+    ordered, order = values.sort()
+    rank = torch.empty_like(order)
+    rank[order] = torch.nn.functional.pad((ordered.diff() > tolerance).long().cumsum(0), (1, 0))
+    return rank
+
+
+def power_share(data: Snapshots, direction: Tensor) -> float:
+    """Return the mean fraction of the power that arrives along directions (n, 3) in array coordinates."""
+    residual = _unit_channel(data) * _steering(data.array, direction)[:, None].conj()
+    return float(residual.mean(dim=-1).abs().square().mean())
+
+
+def flipping_elements(data: Snapshots) -> list[int]:
+    """Return the elements whose phase changes by half a turn from measurement to measurement, counted from 1.
+
+    Of two groups that flip against each other, the larger one counts as steady.
+    """
+    channel, steering = _unit_channel(data), _steering(data.array, data.direction)
+    residual = channel * steering[:, None].conj()
+    plain, doubled = (residual.pow(power).mean(dim=-1).abs().square() for power in (1, 2))
+    sign, mended = _without_flips(residual)
+    rolled = (steering.roll(shift, 0) for shift in _shifts(len(data)))
+    chance = torch.stack([_without_flips(channel * other[:, None].conj())[1].mean() for other in rolled]).mean()
+    gain = min(mended.mean() - plain.mean(), mended.mean() - chance)
+    if gain < MIN_FLIP_GAIN or mended.median() < MIN_FLIP_SHARE or doubled.median() < MIN_DOUBLED_SHARE:
+        return []
+    signs = sign.flatten(0, 1)
+    together = (signs.T @ signs / len(signs)).abs() > MIN_CORRELATION
+    steady = together[int(together.sum(dim=1).argmax())]
+    return [number + 1 for number in (~steady).nonzero()[:, 0].tolist()]
+
+
+def _without_flips(residual: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the signs (n, S, K) that align residual phases best, and the fraction of the power with them (n, S)."""
+    axis = residual.square().mean(dim=-1, keepdim=True).angle() / 2
+    aligned = residual * torch.polar(torch.ones_like(axis), -axis)
+    sign = torch.where(aligned.real < 0, -1.0, 1.0).double()
+    return sign, (aligned * sign).mean(dim=-1).abs().square()
+
+
+def _shifts(n: int) -> list[int]:
+    return sorted({max(1, n * k // (CHANCE_SHIFTS + 1)) for k in range(1, CHANCE_SHIFTS + 1)})
+
+
+def phases_are_constant(data: Snapshots) -> bool:
+    """Return True if the phases between elements hardly depend on the position, although the lines of sight differ."""
+    channel, steering = _unit_channel(data), _steering(data.array, data.direction)
+    each = channel.mT @ channel.conj() / channel.shape[1]
+    of_one_position = torch.linalg.eigvalsh(each)[:, -1].mean()
+    common = torch.linalg.eigvalsh(each.mean(dim=0))[-1] / of_one_position
+    geometric = torch.linalg.eigvalsh(steering.T @ steering.conj() / len(data))[-1] / len(data.array.element)
+    return bool(common > MIN_COMMON_SHARE and geometric < MAX_GEOMETRIC_SHARE)
+
+
+def _unit_channel(data: Snapshots) -> Tensor:
+    """Return the phases of some snapshots of each position, complex128 (n, S, K)."""
+    few = data.channel[:, :: max(1, data.channel.shape[1] // MAX_SNAPSHOTS)]
+    phase = few.angle().double()
+    return torch.polar(torch.ones_like(phase), phase)
+
+
+def _steering(array: PlanarArray, direction: Tensor) -> Tensor:
+    phase = array.phase(direction)
+    return torch.polar(torch.ones_like(phase), phase)
