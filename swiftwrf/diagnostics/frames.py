@@ -4,12 +4,12 @@ The peak of a spectrum is often in the direction of the line of sight. The score
 
     a(frame) = mean over positions of exp(-theta^2 / (2 sigma^2)),    sigma = 10 degrees,
 
-with theta the angle between peak and line of sight in that frame, both folded to the directions that the array distinguishes.
-For a linear array, theta is the difference of their angles to its axis. Of peaks of nearly equal height, the nearest one
-counts. The chance level is the mean over pairs of different positions; only the excess counts as evidence. An error of frames
-(axes swapped, a quaternion in another order, millimetres, azimuths clockwise, elements in another order, ...) is named if its
-agreement clearly exceeds that of the declared frame and it explains most of the peaks. So is any other constant rotation, if
-both halves of the positions have it.
+with theta the angle between peak and line of sight in that frame, both folded to the directions that the array
+distinguishes. For a linear array, theta is the difference of their angles to its axis. Of peaks of nearly equal height, the
+nearest one counts. The chance level is the mean over pairs of different positions; only the excess counts as evidence. An
+error of frames (axes swapped, a quaternion in another order, millimetres, azimuths clockwise, another order of elements, ...)
+is named if its agreement clearly exceeds that of the declared frame and it explains most of the peaks. So is any other
+constant rotation, if both halves of the positions have it.
 """
 
 from __future__ import annotations
@@ -319,7 +319,8 @@ def _mirrors(frame: _Frame, peak: Tensor) -> Iterator[tuple[str, tuple[float, fl
 def _constant_turn(frame: _Frame, peak: Tensor) -> tuple[NDArray[np.float64], float, float]:
     """Return the rotation of the array with most agreement, its agreement and its chance level.
 
-    The rotation is a rotation vector in array coordinates [rad]. A linear array does not determine its rotation, so it keeps the declared one.
+    The rotation is a rotation vector in array coordinates [rad]. A linear array does not determine its rotation, so it keeps
+    the declared one.
     """
     if frame.linear:
         return np.zeros(3), *_agreement(frame.direction(), peak)
