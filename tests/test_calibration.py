@@ -89,6 +89,9 @@ def test_positions_without_line_of_sight_do_not_count():
     assert known.clear == int((~hidden).sum())
 
 
+QUARTER_TURN = Rotation.from_euler("z", 90, degrees=True)
+
+
 def narrow(data):
     """Only positions straight in front of the array."""
     return data.subset((data.direction[:, 2] > 0.97).nonzero()[:, 0])
@@ -109,6 +112,14 @@ REFUSED = {
             array=PlanarArray(data.array.element[:4], data.array.wavelength),
         ),
         "the elements of made lie on a line",
+    ),
+    "constant phases": (
+        lambda: replace((data := snapshots()), channel=data.channel[..., :1].expand_as(data.channel)),
+        "hardly depend on the position",
+    ),
+    "a quarter turn": (
+        lambda: replace((data := snapshots()), rotation=data.rotation @ torch.from_numpy(QUARTER_TURN.as_matrix())),
+        "an error of frames, not of mounting|a direct path stands out|does not determine",
     ),
     "positions of others": (
         lambda: replace(snapshots(), position=snapshots().position.flip(0)),

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from samples import FREQUENCY, WAVELENGTH, snapshot_arrays, snapshots, write_snapshots
 
+from augment import Mixed
 from swiftwrf import AngularGrid, InputError, load_snapshots, load_spectra
 from swiftwrf.array.angles import angular_distance, to_direction
+from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.archives import read_arrays
+from swiftwrf.metrics import angle_errors
+from tasks.aoa.estimators import make_estimator
 
 GRID = AngularGrid.hemisphere(24, 96)
 
@@ -157,3 +162,131 @@ def test_label_is_that_of_the_pose(tmp_path):
     data = load_spectra(write_snapshots(tmp_path / "a"), grid=GRID)
     away = (data.position[0] - data.fixed_position) @ data.rotation
     assert data.label[0, 1].item() == pytest.approx(abs(math.asin(float(away[2] / away.norm()))))
+
+
+def test_a_grid_is_given_as_a_pair(tmp_path):
+    folder = write_snapshots(tmp_path / "a", data=snapshots(n=20))
+    assert load_spectra(folder, grid=(12, 48)).grid == AngularGrid.hemisphere(12, 48)
+    assert load_snapshots(folder).spectra((12, 48)).grid == AngularGrid.hemisphere(12, 48)
+    with pytest.raises(InputError, match="grid must be"):
+        load_spectra(folder, grid=(0, 48))
+
+
+def _matlab(name):
+    """The arrays as MATLAB stores them: matrices only."""
+    arrays = snapshot_arrays(snapshots())
+    return {key: np.atleast_2d(value) for key, value in arrays.items()}
+
+
+def write_matlab(file):
+    from scipy.io import savemat
+
+    savemat(file, _matlab(file))
+
+
+def write_matlab_hdf5(file):
+    """MATLAB 7.3: HDF5 with axes in reverse order and complex numbers as compounds."""
+    import h5py
+
+    with h5py.File(file, "w", userblock_size=512) as content:
+        for key, value in _matlab(file).items():
+            content[key] = _compound(value.T)
+    with open(file, "r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file")
+
+
+def write_octave(file):
+    """Octave's HDF5: a group a variable, axes in reverse order, scalars as such."""
+    import h5py
+
+    with h5py.File(file, "w") as content:
+        for key, value in snapshot_arrays(snapshots()).items():
+            content[f"{key}/type"] = np.bytes_("matrix")
+            content[f"{key}/value"] = _compound(np.asarray(value).T)
+
+
+def _compound(values, names=("real", "imag")):
+    if values.dtype.kind != "c":
+        return values
+    return np.ascontiguousarray(values).view([(name, values.real.dtype) for name in names])
+
+
+WRITERS = {
+    "snapshots.mat": write_matlab,
+    "monday.mat": write_matlab_hdf5,
+    "snapshots.h5": write_octave,
+    "octave.mat": write_octave,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_reads_what_matlab_and_octave_write(tmp_path, name):
+    usual = load_snapshots(write_snapshots(tmp_path / "a"))
+    WRITERS[name](tmp_path / name)
+    data = load_snapshots(tmp_path / name if "snapshots" not in name else tmp_path)
+    torch.testing.assert_close(data.channel, usual.channel)
+    torch.testing.assert_close(data.position, usual.position)
+    assert data.array == usual.array
+    assert any("reverse order" in note for note in data.notes) == (name != "snapshots.mat")
+
+
+@pytest.mark.parametrize("names", [("real", "imag"), ("r", "i")])
+def test_reads_complex_numbers_as_compounds(tmp_path, names):
+    import h5py
+
+    usual = load_snapshots(write_snapshots(tmp_path / "a"))
+    with h5py.File(tmp_path / "b.h5", "w") as content:
+        for key, value in snapshot_arrays(snapshots()).items():
+            content[key] = _compound(np.asarray(value), names)
+    torch.testing.assert_close(load_snapshots(tmp_path / "b.h5").channel, usual.channel)
+
+
+def test_other_compounds_are_refused(tmp_path):
+    import h5py
+
+    with h5py.File(tmp_path / "b.h5", "w") as content:
+        content["csi"] = np.zeros(3, dtype=[("real", "f8"), ("weight", "f8")])
+    with pytest.raises(InputError, match="no array of numbers"):
+        read_arrays(tmp_path / "b.h5", ["csi"])
+
+
+def test_null_subcarriers_are_named_and_left_out_on_request(tmp_path):
+    made = snapshots(count=9)
+    spoilt = made.channel.clone()
+    spoilt[:, 0], spoilt[:, [4, 5]] = 0, 30 - 4j
+    folder = write_snapshots(tmp_path / "a", data=replace(made, channel=spoilt))
+    (note,) = load_snapshots(folder).notes
+    assert "(3 of 9, counted from 0): 0, 4 to 5" in note
+    data = load_snapshots(folder, drop_null=True)
+    kept = load_snapshots(
+        write_snapshots(tmp_path / "b", data=replace(made, channel=made.channel[:, [1, 2, 3, 6, 7, 8]]))
+    )
+    torch.testing.assert_close(data.channel, kept.channel)
+    assert kept.notes == ()
+    assert "left out" in data.notes[0]
+
+
+def test_phases_of_the_way_there_and_back(tmp_path):
+    made = snapshots(n=60, count=1)
+    folder = write_snapshots(tmp_path / "a", data=replace(made, channel=made.channel**2))
+    data = load_spectra(folder, grid=(24, 96), round_trip=True)
+    assert data.array.wavelength == pytest.approx(WAVELENGTH / 2)
+    assert "way there and back" in data.notes[0]
+    here = data.grid.direction.flatten(0, 1) @ to_direction(*data.label.T).T  # pixels x positions
+    along = data.spectrum.flatten(1).gather(1, here.argmax(dim=0)[:, None])
+    assert float(along.median()) > 0.9
+
+
+def test_a_linear_array_receives_the_angle_to_its_axis(tmp_path):
+    made = snapshots(n=50)
+    row = PlanarArray(made.array.element[:4], WAVELENGTH)
+    folder = write_snapshots(tmp_path / "a", data=replace(made, channel=made.channel[..., :4], array=row))
+    data = load_spectra(folder, grid=(45, 180))
+    to_axis = (made.direction @ row.axis).arccos()
+    label, peak = (to_direction(*a.T) for a in (data.label, data.peak_direction(torch.arange(50))))
+    torch.testing.assert_close((label @ row.axis).arccos(), to_axis)
+    assert float(angular_distance(label, peak).rad2deg().median()) < 2.5
+    assert "angle to its axis" in data.notes[-1]
+    estimator = make_estimator("peak").fit(Mixed.measured(data))
+    error = angle_errors(estimator.predict(data.spectrum), data.label)["great_circle"]
+    torch.testing.assert_close(error, angular_distance(label, peak), atol=1e-6, rtol=0)

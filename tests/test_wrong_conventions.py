@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from swiftwrf import AngularGrid, InputError, load_rssi, load_snapshots, load_spectra, rssi_room
 from swiftwrf.data import ReadOptions
 from swiftwrf.data.store import Store
+from swiftwrf.diagnostics.path_loss import check_path_loss
 from tasks.inspect.findings import inspect
 
 GRID = AngularGrid.hemisphere(24, 96)
@@ -80,6 +81,10 @@ NAMED = {
     "phases reversed": (replace(DATA, channel=DATA.channel.conj()), "phases have the wrong sign"),
     "phases uncalibrated": (offsets(), "The array is not calibrated"),
     "RSSI, x and y swapped": (placed(lambda p: p[:, [1, 0, 2]]), "x and y of the positions are swapped"),
+    "RSSI, y counts down an image": (
+        placed(lambda p: p * FLIP_Y + torch.tensor([0.0, 17.0, 0.0], dtype=torch.float64)),
+        "y of the positions counts from the other side (y = 17.",
+    ),
     "RSSI, positions in millimetres": (placed(shrunk), "the positions are in millimetres"),
     "RSSI, everything in millimetres": (placed(shrunk, receivers=True), "are positions in millimetres"),
     "RSSI, one value everywhere": (column(torch.full((300,), -70.0)), "one value everywhere: receiver01"),
@@ -121,7 +126,6 @@ def _survey(header):
 
 
 REFUSED = {
-    "elevation for zenith": (_deepmimo(aoa_el=lambda a: 90 - a["aoa_el"]), "angle from the horizon"),
     "radians for degrees": (
         _deepmimo(aoa_el=lambda a: np.deg2rad(a["aoa_el"]), aoa_az=lambda a: np.deg2rad(a["aoa_az"])),
         "look like radians",
@@ -166,4 +170,11 @@ def test_a_rotation_is_told_from_the_axes_of_the_array():
     turned = oriented(FACING_X * Rotation.from_rotvec([0, 0, math.radians(-20)]))
     findings, _ = inspect(turned, HOW)
     assert findings.numbers["turn_deg"] == pytest.approx([0, 0, 20], abs=1.5)
-    assert findings.numbers["frame"] == "explained"
+    assert findings.numbers["frame"] == "turned"
+
+
+def test_axes_along_which_all_positions_are_equal_are_not_swapped():
+    flat = replace(ROOM, transmitter_position=ROOM.transmitter_position * torch.tensor([1.0, 1.0, 0.0]))
+    mirrored = replace(flat, transmitter_position=11.0 - flat.transmitter_position)
+    report = check_path_loss(mirrored)
+    assert "z" not in report.explanation

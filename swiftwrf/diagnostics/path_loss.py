@@ -8,7 +8,7 @@ along which all positions are equal.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from scipy.optimize import minimize_scalar
@@ -19,7 +19,8 @@ from swiftwrf.diagnostics.frames import MIRRORS, SWAPS, UNITS
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
 
 MIN_VARIANCE_GAIN = 0.1  # in explained variance, to prefer another frame
-MIN_EXPLAINED = 0.5  # of the variance, by an error that is named
+MIN_EXPLAINED = 0.25  # of the variance, by an error that is named
+MAX_ROWS = 2000  # that are compared
 TIE = 0.02  # difference in explained variance of errors that are not distinguished
 MIN_EXTENT_M = 1e-6  # of an axis along which positions differ
 SCANNED_OFFSETS = 40  # of a mirror
@@ -55,6 +56,8 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
     """
     if not data.located:
         return None
+    report = _declared(data)
+    data = data.subset(torch.linspace(0, len(data) - 1, min(MAX_ROWS, len(data))).round().long())
     place = data.transmitter_position
     found = {meaning: _explained(other, data) for meaning, other in _others(place)}
     best = max(found.values(), default=0.0)
@@ -65,14 +68,17 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
     }
     found |= mirrors
     best, declared = max(found.values(), default=0.0), _explained(place, data)
-    named = best >= MIN_EXPLAINED and best - declared >= MIN_VARIANCE_GAIN
-    model = fit_path_loss(log_distance(place, data.receiver_position), data.rssi_dbm, shared=True)
-    return PathLossReport(
-        explained=declared,
-        level_dbm=float(model.level),
-        exponent=float(-model.slope / 10),
-        explanation="; or if ".join(name for name, value in found.items() if value >= best - TIE) if named else "",
-    )
+    if best < MIN_EXPLAINED or best - declared < MIN_VARIANCE_GAIN:
+        return report
+    return replace(report, explanation="; or if ".join(name for name, value in found.items() if value >= best - TIE))
+
+
+def _declared(data: Rssi) -> PathLossReport:
+    """Return the report of the declared frame."""
+    distance = log_distance(data.transmitter_position, data.receiver_position)
+    model = fit_path_loss(distance, data.rssi_dbm, shared=True)
+    explained = _explained(data.transmitter_position, data)
+    return PathLossReport(explained, float(model.level), float(-model.slope / 10), explanation="")
 
 
 def _others(place: Tensor) -> Iterator[tuple[str, Tensor]]:
