@@ -71,7 +71,11 @@ def test_one_display_has_the_fraction_of_all_steps():
 
 @pytest.mark.parametrize(
     ("arguments", "first"),
-    [(("rssi", "--rx", "1"), "model"), (("locate",), "localizer"), (("aoa", "--mix", "0.5"), "condition")],
+    [
+        (("rssi", "--rx", "1"), "model"),
+        (("locate",), "localizer"),
+        (("aoa", "--mix", "0.5", "--synthesizer", "nearest", "--extra", "0"), "condition"),
+    ],
 )
 def test_a_run_shows_results_and_its_answer(tmp_path, capsys, arguments, first):
     assert quick.run(*arguments, "--out", tmp_path / "run") == 0
