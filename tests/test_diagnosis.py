@@ -100,13 +100,13 @@ def flipped(seed):
 
 
 def uncalibrated(seed):
-    data = scene(seed, n=150)
+    data = scene(seed, n=100)
     phase = 2 * math.pi * torch.rand(data.channel.shape[2], generator=torch.Generator().manual_seed(seed))
     return replace(data, channel=data.channel * torch.polar(torch.ones_like(phase), phase))
 
 
 def tilted(seed):
-    data = scene(seed, n=150, shape=(4, 4))
+    data = scene(seed)
     wrong = Rotation.from_rotvec([0, 0, math.radians(25 + seed)])
     return replace(data, rotation=data.rotation @ torch.from_numpy(wrong.as_matrix()))
 

@@ -150,9 +150,9 @@ def test_a_run_of_an_earlier_version_is_shown_by_the_present_names(aoa_run, tmp_
 
 
 def test_results_of_earlier_versions_are_read_by_the_present_names():
-    text = (Path(committed.RESULTS) / "aoa_room.json").read_text()
+    text = (Path(committed.RESULTS) / "aoa_room_receiver.json").read_text()
     assert "kernel_ridge" in text
-    (mix,) = committed.load("aoa_room")["metrics"]["mixes"].values()
+    (mix,) = committed.load("aoa_room_receiver")["metrics"]["mixes"].values()
     assert "kernel_regression" in mix["methods"]
     assert not any("kernel_ridge" in name for name in mix["methods"])
 
