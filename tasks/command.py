@@ -38,18 +38,9 @@ COMMANDS = {
     "rssi": Command("predict RSSI maps of receivers, and report the errors", "RssiTaskConfig", "experiment"),
     "locate": Command("locate transmitters from RSSI or spectra, and report the errors", "LocateConfig", "experiment"),
     "report": Command("merge finished runs of one task into one report", "ReportConfig"),
-    "inspect": Command(
-        "check measurements before a run: counts, frames, calibration",
-        "InspectConfig",
-    ),
-    "convert": Command(
-        "write measurements of any known format in the toolkit's layout",
-        "ConvertConfig",
-    ),
-    "estimate": Command(
-        "estimate directions of new spectra with a trained estimator",
-        "EstimateConfig",
-    ),
+    "inspect": Command("check measurements before a run: counts, frames, calibration", "InspectConfig"),
+    "convert": Command("write measurements of any known format in the toolkit's layout", "ConvertConfig"),
+    "estimate": Command("estimate directions of new spectra with a trained estimator", "EstimateConfig"),
     "scenes": Command("trace ray paths in a room (extra: raytrace)", "ScenesConfig"),
     "view": Command("show a fitted field in the browser (extra: view)", "ViewConfig"),
 }

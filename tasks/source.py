@@ -21,11 +21,11 @@ from tasks.options import OffsetSource, SpectraSource, TableSource
 def reading(config: SpectraSource | TableSource) -> ReadOptions:
     """Return the options of a command line for reading."""
     array = beamformer = grid = every = station = columns = filler = coordinates = offset_by = None
-    drop_null = round_trip = None
+    drop_null = round_trip = False
     if isinstance(config, SpectraSource):
         array, beamformer, every, station = _array(config), config.beamformer, config.every, config.station
         grid = AngularGrid.hemisphere(*config.grid) if config.grid else None
-        drop_null, round_trip = config.drop_null or None, config.round_trip or None
+        drop_null, round_trip = config.drop_null, config.round_trip
     if isinstance(config, TableSource):
         columns, filler, coordinates = config.column_names, config.fillers, config.coordinates
     if isinstance(config, OffsetSource) and config.offset_by is not None:

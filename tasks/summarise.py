@@ -65,6 +65,33 @@ def paired_difference(errors: DataFrame, method: str, other: str) -> tuple[float
     return mean, float(low), float(high)
 
 
+def verdict_of_difference(
+    errors: DataFrame, method: str, other: str, *, name: str, unit: str, rows: str, n_test: int
+) -> str:
+    """Return one sentence that compares the mean errors of two methods.
+
+    Args:
+        errors: As in `paired_difference`.
+        method: Method that the sentence is about.
+        other: Method it is compared with.
+        name: Name of the first method in the sentence.
+        unit: Unit of the errors.
+        rows: Word for the rows of the errors, e.g. pairs.
+        n_test: Number of test rows.
+    """
+    mean, low, high = paired_difference(errors, method, other)
+    if math.isnan(low):
+        return f"{n_test} test rows are too few to compare {name} with {other}."
+    interval = f"{mean:+.2f} {unit} [{low:+.2f}, {high:+.2f}]"
+    if high < 0:
+        return f"On the same {rows} {name}'s mean error is lower than that of {other}: {interval}."
+    if low > 0:
+        return (
+            f"On the same {rows} {other} has the lower mean error: {name}'s differs by {interval}. Take {other} here."
+        )
+    return f"On the same {rows} the errors of {name} and {other} do not differ significantly: {interval}."
+
+
 def paired_change(before: ArrayLike, after: ArrayLike) -> ChangeMetrics:
     """Return the median of `after`, its change relative to the median of `before`, and the change's 95 % interval.
 

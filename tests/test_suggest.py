@@ -15,7 +15,7 @@ from swiftwrf.gp import choose_kernel, most_informative
 from swiftwrf.metrics import psnr
 from tasks.aoa.condition import MeasuredSubset
 from tasks.aoa.results import Results
-from tasks.aoa.steps import Suggestion
+from tasks.aoa.suggestion import Suggestion
 
 
 def test_suggestions_lie_in_the_region_and_lower_the_variance(room):

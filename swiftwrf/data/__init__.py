@@ -51,9 +51,7 @@ def load_spectra(
         swiftwrf.errors.InputError: nowhere is not a folder or file; expected measurements (formats: ...)
     """
     directions = None if grid is None else AngularGrid.of(grid)
-    options = ReadOptions(
-        array, beamformer, directions, every, station, drop_null=drop_null or None, round_trip=round_trip or None
-    )
+    options = ReadOptions(array, beamformer, directions, every, station, drop_null=drop_null, round_trip=round_trip)
     return read_spectra(path, options)
 
 
@@ -81,7 +79,7 @@ def load_snapshots(
     Raises:
         InputError: As `load_spectra`.
     """
-    options = ReadOptions(every=every, station=station, drop_null=drop_null or None, round_trip=round_trip or None)
+    options = ReadOptions(every=every, station=station, drop_null=drop_null, round_trip=round_trip)
     data: Snapshots = read(path, options, SNAPSHOT_FORMATS)
     return data
 

@@ -17,10 +17,8 @@ Floats = NDArray[np.float64]
 NOT_DETECTED_DBM = -100.0  # the usual filler
 KNOWN_FILLERS = (NOT_DETECTED_DBM, -200.0, 0.0, 100.0, 127.0)
 MIN_RSSI_DBM, MAX_RSSI_DBM = -150.0, 30.0
-STRONG_DBM, STRONG_GAP_DB = (
-    -1.0,
-    10.0,
-)  # a frequent value from -1 dBm on fills, unless values within 10 dB are as frequent
+# a frequent value from -1 dBm on is a filler, unless values within 10 dB are as frequent
+STRONG_DBM, STRONG_GAP_DB = -1.0, 10.0
 N_NEIGHBOURS_DB = 5  # of the next stronger values that a filler at the lower edge is compared with
 MIN_FREQUENCY_RATIO = 3.0  # of a filler to the values beside it
 MIN_REPEATS = 5  # cells with a filler that is not known

@@ -221,7 +221,7 @@ class Rssi(PositionedData):
 
     @property
     def receiver_located(self) -> Tensor:
-        """Whether the position of each receiver is known, bool (R,)."""
+        """Mask of the receivers whose position is known, bool (R,)."""
         return self.receiver_position.isfinite().all(dim=1)
 
     @property

@@ -146,7 +146,7 @@ def check_spacing(file: Path, array: PlanarArray) -> None:
         )
 
 
-def without_null(channel: Tensor, drop: bool | None) -> tuple[Tensor, tuple[str, ...]]:
+def without_null(channel: Tensor, drop: bool) -> tuple[Tensor, tuple[str, ...]]:
     """Return the channel (n, S, K), without null subcarriers on request, and a note that names them.
 
     Null, guard and DC subcarriers hold a constant or nothing: they are the same at every position and element.

@@ -45,7 +45,7 @@ GEODETIC = {"x": "longitude", "y": "latitude"}  # that take the place of x and y
 
 
 class SurveyOptions(NamedTuple):
-    """What a user states about a table.
+    """Options of reading a table.
 
     Args:
         columns: Names of columns that are not recognised, by role.

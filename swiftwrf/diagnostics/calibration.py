@@ -129,10 +129,9 @@ def calibrate(train: Snapshots) -> Calibration:
         )
     phase_std, turn_std = problem.standard_errors(found)
     if float(turn_std.max()) > MAX_TURN_STD or float(phase_std.max()) > MAX_PHASE_STD:
-        narrow = problem.cone() < MIN_CONE
-        reason = "measure positions in more directions from the array" if narrow else (
-            "phases change from position to position as no direct path explains"
-        )  # fmt: skip
+        reason = "phases change from position to position as no direct path explains"
+        if problem.cone() < MIN_CONE:
+            reason = "measure positions in more directions from the array"
         raise InputError(
             f"{train.name} does not determine the array's orientation and its elements' phases (standard errors "
             f"{math.degrees(float(turn_std.max())):.1f} and {math.degrees(float(phase_std.max())):.0f} degrees); {reason}"

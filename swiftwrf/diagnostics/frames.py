@@ -44,9 +44,8 @@ TIE = 0.03  # difference in agreement of explanations that are not distinguished
 EQUAL_PEAKS = 0.97  # of the largest magnitude: peaks above it are alternatives
 MAX_PEAKS = 8
 SCANNED_ROTATIONS = 4000
-MIN_TURN = math.radians(
-    5
-)  # of a constant rotation that is reported, and the most that two halves of the positions differ
+# of a constant rotation that is reported, and the largest difference between those of two halves of the positions
+MIN_TURN = math.radians(5)
 MIN_TURN_EXPLAINED = 0.8  # agreement with a constant rotation that is reported: with three angles, much is explained
 MIN_TURN_GAIN = 0.03  # in agreement, of such a rotation
 NARROW_DEG = 10.0  # angle between lines of sight (median of pairs), below which no frame can be checked

@@ -83,13 +83,14 @@ def _declared(data: Rssi) -> PathLossReport:
 
 def _others(place: Tensor) -> Iterator[tuple[str, Tensor]]:
     """Yield the positions under each error that they can show."""
+    varying = _varying(place)
     for names, swap in SWAPS.items():
-        if {names[0], names[-1]} <= _varying(place):
+        if {names[0], names[-1]} <= varying:
             yield f"{names} of the positions are swapped", place @ swap
     for unit, scale in UNITS.items():
         yield f"the positions are in {unit}, the receivers' in metres", place * scale
     for axis, mirror in MIRRORS.items():
-        if axis in _varying(place):
+        if axis in varying:
             yield f"{axis} of the positions has the wrong sign", place @ mirror
 
 
@@ -101,9 +102,10 @@ def _varying(place: Tensor) -> set[str]:
 
 def _mirrors(place: Tensor, data: Rssi) -> Iterator[tuple[str, float, float]]:
     """Yield each axis, the offset c [m] of the mirror c - x that explains most, and the fraction that it explains."""
-    every = torch.cat([place, data.receiver_position[data.receiver_position.isfinite().all(dim=1)]])
+    every = torch.cat([place, data.receiver_position[data.receiver_located]])
+    varying = _varying(place)
     for number, axis in enumerate("xyz"):
-        if axis not in _varying(place):
+        if axis not in varying:
             continue
 
         def explained(offset: float, number: int = number) -> float:
@@ -115,7 +117,7 @@ def _mirrors(place: Tensor, data: Rssi) -> Iterator[tuple[str, float, float]]:
         offsets = torch.linspace(low, high, SCANNED_OFFSETS).tolist()
         start, step = max(offsets, key=explained), (high - low) / (SCANNED_OFFSETS - 1)
         result = minimize_scalar(lambda c: -explained(float(c)), bounds=(start - step, start + step), method="bounded")
-        yield axis, float(result.x), explained(float(result.x))
+        yield axis, float(result.x), -float(result.fun)
 
 
 def _explained(position: Tensor, data: Rssi) -> float:

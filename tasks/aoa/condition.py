@@ -119,7 +119,7 @@ class Condition:
 
     @property
     def measured_only(self) -> Condition:
-        """The same estimator on the measured spectra alone."""
+        """Condition of this estimator on the measured spectra alone."""
         return replace(self, training="measured", synthesizer="", n_synthetic=0)
 
     @property
@@ -129,7 +129,7 @@ class Condition:
 
     @property
     def is_network(self) -> bool:
-        """Whether the estimator is a network. A run has one."""
+        """True if the estimator is a network. A run has one network."""
         return self.estimator in NETWORKS.values()
 
     @property

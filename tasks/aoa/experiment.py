@@ -15,7 +15,8 @@ from tasks.aoa.options import RAYTRACE, AoaConfig, check_data, fraction_key, n_s
 from tasks.aoa.page import page
 from tasks.aoa.page.summary import answer
 from tasks.aoa.results import Results
-from tasks.aoa.steps import Suggestion, first_steps
+from tasks.aoa.steps import first_steps
+from tasks.aoa.suggestion import Suggestion
 from tasks.cluster import connected
 from tasks.metrics import AoaMetrics
 from tasks.page.page import reporting

@@ -15,7 +15,8 @@ from tasks.aoa.condition import EVERYTHING, LOCATOR, Condition, MeasuredSubset, 
 from tasks.aoa.context import ROOM_MODEL, Experiment
 from tasks.aoa.locating import LEVEL, NO_PLANE, Locating
 from tasks.aoa.options import AUTO, fraction_key
-from tasks.aoa.steps import CrossValidation, Evaluation, RoomSearch, Suggestion, Synthesis, as_bytes
+from tasks.aoa.steps import CrossValidation, Evaluation, RoomSearch, Synthesis, as_bytes
+from tasks.aoa.suggestion import Suggestion
 from tasks.metrics import ANGLES, SCORES, ChangeMetrics, LocatingMetrics, MethodMetrics, MixMetrics, SynthesisMetrics
 from tasks.run import Row, Run
 from tasks.steps import Step

@@ -11,7 +11,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from augment import Mixed, SyntheticPositions, choose_model, mix, suggest, synthetic_positions
+from augment import Mixed, SyntheticPositions, choose_model, mix, synthetic_positions
 from augment.choose import candidates
 from swiftwrf import FitError, InputError, Spectra, load
 from swiftwrf.data.store import Store
@@ -353,30 +353,6 @@ class Evaluation(Step[Experiment]):
         if self.condition.training == "turbo_extra":
             train = train.add(*self.synthesis.training_spectra(folder, "extra"))
         return train
-
-
-@dataclass(frozen=True)
-class Suggestion(Step[Experiment]):
-    """Suggest positions for the next measurements.
-
-    Args:
-        subset: Measured spectra.
-    """
-
-    subset: MeasuredSubset
-
-    @property
-    def name(self) -> str:
-        return f"suggestion-mix{self.subset.key}"
-
-    @property
-    def title(self) -> str:
-        return "choosing positions to measure next"
-
-    def compute(self, experiment: Experiment, folder: Path) -> Row:
-        measured, _ = experiment.withhold(self.subset)
-        found = suggest(measured, experiment.config.suggest, experiment.config.seed)
-        return {"measured": measured.position, "position": found.position, "variance": found.variance}
 
 
 class _FitHistory:

@@ -28,7 +28,7 @@ Data = TypeVar("Data", bound=Spectra | Snapshots | Rssi)
 
 @configuration
 class ReadOptions:
-    """What a user states about files that leave it open. A reader names the options it takes; others are refused.
+    """Options of reading that files leave open. A reader names those that it takes, and others are refused.
 
     Example:
         >>> ReadOptions(every=2).given
@@ -53,15 +53,15 @@ class ReadOptions:
     """unit of the positions in a table (default: the one that is recognised)"""
     offset_by: str | None = None
     """column of a table with groups of rows, e.g. devices, between which RSSI has constant offsets"""
-    drop_null: bool | None = None
+    drop_null: bool = False
     """leaves out null subcarriers, which are the same at every position and element"""
-    round_trip: bool | None = None
+    round_trip: bool = False
     """phases are those of the way there and back"""
 
     @property
     def given(self) -> list[str]:
-        """Names of the options that are set."""
-        return [field.name for field in fields(self) if getattr(self, field.name) is not None]
+        """Names of the options that differ from their defaults."""
+        return [field.name for field in fields(self) if getattr(self, field.name) != field.default]
 
 
 class Format(ABC, Generic[Data]):

@@ -112,5 +112,5 @@ class _AlternativeTable:
         score = batched_score(scene, base + waves.of_choices([r[n] for r, n in zip(rows, number, strict=True)]))
         kept = score.argsort()[:most]
         choices = torch.stack([n[kept] for n in number], dim=1).tolist()
-        kept_ = [tuple(some[k] for some, k in zip(half_periods, choice, strict=True)) for choice in choices]
-        return dict(zip(kept_, score[kept].tolist(), strict=True))
+        best_choices = [tuple(some[k] for some, k in zip(half_periods, choice, strict=True)) for choice in choices]
+        return dict(zip(best_choices, score[kept].tolist(), strict=True))

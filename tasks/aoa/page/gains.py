@@ -30,7 +30,7 @@ def change_text(change: ChangeMetrics) -> str:
 
 
 def judgement(change: ChangeMetrics) -> str:
-    """Return what the interval of a change says.
+    """Return whether a change is a gain, a loss or not significant, by its interval.
 
     Example:
         >>> judgement({"median_deg": 1.0, "change": -0.17, "low": -0.4, "high": 0.1})

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 from pandas import DataFrame
 
 from tasks.locate.steps import MODEL
 from tasks.metrics import LocateMetrics
 from tasks.page.page import Number, Plot, Summary
 from tasks.page.records import Records, notes
-from tasks.summarise import paired_difference
+from tasks.summarise import verdict_of_difference
 from tasks.terminal import Answer
 
 LocateRecords = Records[LocateMetrics]
@@ -61,15 +59,8 @@ def verdict(run: LocateRecords) -> str:
     """Return a sentence that compares the posterior with the best other localizer."""
     error = {name: entry["position_error_m"]["median"] for name, entry in run.metrics["overall"].items() if name != OWN}
     best = min(error, key=lambda name: error[name])
-    mean, low, high = paired_difference(by_method(run), OWN, best)
-    if math.isnan(low):
-        return f"{run.metrics['n_test']} test rows are too few to compare the posterior with {best}."
-    interval = f"{mean:+.2f} m [{low:+.2f}, {high:+.2f}]"
-    if high < 0:
-        return f"On the same rows the posterior's mean error is lower than that of {best}: {interval}."
-    if low > 0:
-        return f"On the same rows {best} has the lower mean error: the posterior's differs by {interval}. Take {best} here."
-    return f"On the same rows the errors of the posterior and {best} do not differ significantly: {interval}."
+    n_test = run.metrics["n_test"]
+    return verdict_of_difference(by_method(run), OWN, best, name="the posterior", unit="m", rows="rows", n_test=n_test)
 
 
 def _next_steps(run: LocateRecords) -> list[str]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 from pandas import DataFrame
@@ -11,7 +9,7 @@ from pandas import DataFrame
 from tasks.metrics import RssiMetrics
 from tasks.page.page import Number, Plot, Summary
 from tasks.page.records import Records, notes
-from tasks.summarise import paired_difference
+from tasks.summarise import verdict_of_difference
 from tasks.terminal import Answer
 
 RssiRecords = Records[RssiMetrics]
@@ -64,15 +62,8 @@ def best_baseline(run: RssiRecords) -> str:
 def verdict(run: RssiRecords) -> str:
     """Return a sentence that compares the model with the best baseline."""
     best = best_baseline(run)
-    mean, low, high = paired_difference(by_method(run), OWN, best)
-    if math.isnan(low):
-        return f"{run.metrics['n_test']} test rows are too few to compare SwiftWRF with {best}."
-    interval = f"{mean:+.2f} dB [{low:+.2f}, {high:+.2f}]"
-    if high < 0:
-        return f"On the same pairs SwiftWRF's mean error is lower than that of {best}: {interval}."
-    if low > 0:
-        return f"On the same pairs {best} has the lower mean error: SwiftWRF's differs by {interval}. Take {best} here."
-    return f"On the same pairs the errors of SwiftWRF and {best} do not differ significantly: {interval}."
+    n_test = run.metrics["n_test"]
+    return verdict_of_difference(by_method(run), OWN, best, name="SwiftWRF", unit="dB", rows="pairs", n_test=n_test)
 
 
 def _next_steps(run: RssiRecords) -> list[str]:
