@@ -16,9 +16,8 @@ from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, Spectra, f
 from swiftwrf.data.raytraced import sionna
 from swiftwrf.data.writing import write_spectra
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # one thread a process: more would wait for each other
-    torch.set_num_threads(1)
-    os.environ["OMP_NUM_THREADS"] = "1"
+torch.set_num_threads(1)  # tests run side by side, and mocks reach steps that are computed in this process alone
+os.environ["OMP_NUM_THREADS"] = "1"
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

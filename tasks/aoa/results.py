@@ -73,10 +73,20 @@ class Results:
                 self._leave_out((step.condition,), value["refused"])
             case Evaluation() | Locating():
                 self.evaluated.append((step.condition, value))
-                self._show(step.condition, value)
                 self.history += [step.condition.columns | row for row in value["history"]]
             case Suggestion():
                 self._add_suggestion(step, value)
+
+    def show(self, step: Step[Experiment], value: Row) -> None:
+        """Show the median angular error of a condition on the terminal."""
+        if not isinstance(step, Evaluation | Locating) or "refused" in value:
+            return
+        condition = step.condition
+        error = angle_errors(torch.tensor(value["estimate"], dtype=torch.float64), self.test.label)["great_circle"]
+        name = f"{condition.estimator}, {condition.meaning}"
+        if condition.training != "all" and len(self.experiment.config.mix) > 1:
+            name = f"{condition.measured_fraction:.0%}: {name}"
+        terminal.result(name, f"{float(error.nanmedian().rad2deg()):.2f} deg")
 
     @property
     def pooled(self) -> list[tuple[Condition, Row]]:
@@ -130,14 +140,6 @@ class Results:
             }
             rows += _rows(condition.columns, columns)
         return rows
-
-    def _show(self, condition: Condition, value: Row) -> None:
-        """Show the median angular error of a condition."""
-        error = angle_errors(torch.tensor(value["estimate"], dtype=torch.float64), self.test.label)["great_circle"]
-        name = f"{condition.estimator}, {condition.meaning}"
-        if condition.training != "all" and len(self.experiment.config.mix) > 1:
-            name = f"{condition.measured_fraction:.0%}: {name}"
-        terminal.result(name, f"{float(error.nanmedian().rad2deg()):.2f} deg")
 
     def _leave_out(self, conditions: Iterable[Condition], reason: str) -> None:
         """Record and print why conditions are not in the results, each sentence once."""

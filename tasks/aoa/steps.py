@@ -45,11 +45,13 @@ def first_steps(experiment: Experiment, subset: MeasuredSubset) -> list[Step[Exp
     steps: list[Step[Experiment]] = [
         *(reference(estimator, "measured") for estimator in estimators(experiment.config.preset)),
         *(_syntheses(experiment, subset, named, {}) if named and not compared else [CrossValidation(subset, compared)]),
-        # independent of the measured fraction, so all fractions share these steps
-        *(reference(estimator, "all") for estimator in trainable(experiment.config.preset)),
     ]
-    config = experiment.config
-    if subset == MeasuredSubset(config.mix[0]) and 1.0 not in config.mix and ROOM_MODEL in candidates(experiment.train):
+    config, has_room = experiment.config, ROOM_MODEL in candidates(experiment.train)
+    if has_room:
+        steps.append(RoomSearch(subset, (), experiment.located_by(subset)))
+    # independent of the measured fraction, so all fractions share these steps
+    steps += (reference(estimator, "all") for estimator in trainable(experiment.config.preset))
+    if has_room and subset == MeasuredSubset(config.mix[0]) and 1.0 not in config.mix:
         steps.append(RoomSearch(EVERYTHING, (), experiment.located_by(EVERYTHING)))
     return steps
 
@@ -67,7 +69,7 @@ def _syntheses(
         (with_room if experiment.finds_room(name) else direct).append(synthesis)
     search: list[Step[Experiment]] = []
     if with_room:
-        search.append(RoomSearch(subset, tuple(with_room), experiment.located_by(subset)))
+        search.append(RoomSearch(subset, tuple(with_room)))
     return search + direct if with_room and with_room[0].trains else direct + search
 
 

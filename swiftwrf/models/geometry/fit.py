@@ -38,6 +38,7 @@ from swiftwrf.runtime.validation import NonNegativeFloat, NonNegativeInt, Positi
 MAX_PHASE_ERROR = 0.1  # relative error of a spectrum's autocorrelation up to which its phases are used
 MAX_ALIAS_STEPS = 3  # times that planes move to other phase aliases
 FURTHER_SIGNIFICANCE = 4.0  # standard errors for a plane of any orientation, of which far more are tried
+PROMISING_SIGNIFICANCE = 1.0  # standard errors by which one must be better after a few steps to be refined further
 MAX_FURTHER_TRIED = 8  # candidates of any orientation that are refined
 MAX_ORDER = 4  # reflections of an image source
 MIN_HELD_OUT = 300  # positions to decide by: folds are held out in turn until their number is reached
@@ -109,19 +110,14 @@ def search_room(train: Spectra, config: GeometryConfig, progress: bool = False) 
 
 
 @single_thread()
-def refine_room(room: RoomEstimate, planes: PlaneSet, train: Spectra, config: GeometryConfig) -> RoomEstimate:
+def refine_room(room: RoomEstimate, planes: PlaneSet, scene: PhaseObservations) -> RoomEstimate:
     """Refine offsets and gains of a room on other spectra of the scene, without a search, in under a second.
 
     Args:
         room: Estimate from other spectra.
         planes: Its planes as tensors.
-        train: Spectra to refine on.
-        config: Options, of which the seed and the number of spectra count.
-
-    Raises:
-        InputError: As `search_room`.
+        scene: Observed phases of the spectra to refine on.
     """
-    scene, _ = observe(train, config)
     new = planes.refined(scene)
     found = zip(room.planes, new.normal[0].tolist(), new.offset[0].tolist(), new.gain[0].tolist(), strict=True)
     return replace(room, planes=[replace(p, normal=tuple(n), offset_m=o, gain=g) for p, n, o, g in found])
@@ -251,6 +247,8 @@ def _with_further_planes(
             gains = torch.cat([room.gain, torch.full((1, 1), FURTHER_GAIN * sign)], dim=1)
             wider.append(PlaneSet(normals, offsets, gains, room.order))
         wider = sorted(refined(wider, some, 8, tilt=True), key=lambda r: float(some.score(r.field(some))))
+        if advantage(some.coherence(wider[0].field(some)), some.coherence(room.field(some))) < PROMISING_SIGNIFICANCE:
+            break
         wider = [r for other in wider[:2] for r in (other, *sign_alternatives(scene, other))]
         wider = refined(wider, some, 20, tilt=True)
         best = min(wider, key=lambda r: float(some.score(r.field(some)))).refined(scene, 15, tilt=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import asdict
 from typing import Any, Self
 
@@ -15,7 +16,7 @@ from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext, bounding_box
-from swiftwrf.models.geometry.fit import MAX_ORDER, GeometryConfig, refine_room, search_room
+from swiftwrf.models.geometry.fit import MAX_ORDER, GeometryConfig, observe, refine_room, search_room
 from swiftwrf.models.geometry.images import PhaseObservations, image_gain, images
 from swiftwrf.models.geometry.planes import Plane, PlaneSet, RoomEstimate
 from swiftwrf.models.geometry.sample import Residual, sample_field
@@ -109,8 +110,14 @@ class GeometryModel(FieldModel):
         elif known.fingerprint == owner:
             self.estimate = known.estimate
         else:
-            self.estimate = refine_room(known.estimate, known.tensors(), train, self.config)
+            self.estimate = known.refined_on(observe(train, self.config)[0]).estimate
         self.fingerprint = owner
+
+    def refined_on(self, scene: PhaseObservations) -> Self:
+        """Return the room with offsets and gains refined on the observed phases of some spectra, without a search."""
+        model = copy(self)
+        model.estimate = refine_room(self.estimate, self.tensors(), scene)
+        return model
 
     @property
     def room(self) -> GeometryModel:
