@@ -49,9 +49,9 @@ class Step(ABC, Generic[Context]):
         """Return plain values. Files are read and written in `folder`: the run's directory, or a copy on a worker."""
 
     @property
-    def is_urgent(self) -> bool:
-        """Return True if other steps wait for this one."""
-        return type(self).then is not Step.then
+    def priority(self) -> int:
+        """Priority among the steps that could begin: 2 if other steps wait for this one, 1 if it takes long, else 0."""
+        return 2 if type(self).then is not Step.then else 0
 
     def then(self, context: Context, value: Row) -> Sequence[Step[Context]]:
         """Return the steps that follow from the result."""
@@ -144,7 +144,7 @@ def _compute_on(
 
     begin(steps)
     while pending or waiting:
-        waiting.sort(key=lambda step: not step.is_urgent)
+        waiting.sort(key=lambda step: -step.priority)
         while waiting and len(pending) < workers.slots:
             step = waiting.pop(0)
             pending[workers.submit(step)] = step
@@ -181,7 +181,7 @@ class _ClusterWorkers(Generic[Context]):
             name: known[name] if name in known else self._cluster.hold(self._run.path(name).read_bytes())
             for name in step.reads
         }
-        return self._cluster.submit(step.name, self._function, step, *self._held.values(), urgent=step.is_urgent)
+        return self._cluster.submit(step.name, self._function, step, *self._held.values(), priority=step.priority)
 
     def next(self, pending: Collection[Future[Any]]) -> tuple[Future[Any], Row, float]:
         """Wait for one of the steps, write its files, and return it with its values and its seconds."""

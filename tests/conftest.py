@@ -96,7 +96,7 @@ def aoa_run(tmp_path_factory: pytest.TempPathFactory, room: Spectra) -> Path:
     (folder / "data").mkdir()
     write_spectra(room, folder / "data")
     options = ("--synthesizer", "swiftwrf", "--extra", 0, "--data", folder / "data", "--out", folder / "run")
-    with mock.patch("tasks.aoa.steps.candidates", return_value=["idw"]):  # finding a room has tests of its own
+    with mock.patch("tasks.aoa.context.candidates", return_value=["idw"]):  # finding a room has tests of its own
         assert quick.run("aoa", "--mix", 0.5, 1, *options) == 0
     config = FitConfig(model=ModelConfig(n_primitives=16, rank=4))
     fit(room, config).save(folder / "run" / "model-mix1.safetensors")

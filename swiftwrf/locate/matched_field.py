@@ -63,7 +63,7 @@ class MatchedFieldConfig:
     """cells that are split in each round"""
     n_rounds: Annotated[int, Ge(0), Le(20)] = 3
     """rounds of splitting"""
-    n_calibration: PositiveInt = 200
+    n_calibration: PositiveInt = 120
     """held-out spectra that determine the weights of the likelihoods, at most"""
     seed: NonNegativeInt = 0
     """seed of everything random"""

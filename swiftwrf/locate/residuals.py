@@ -93,4 +93,5 @@ def _roots(residual: Tensor, kept: Tensor, size: float, shrinkage: Tensor, degre
 
 def _squared_distance(root: Tensor, residual: Tensor) -> Tensor:
     """Return squared Mahalanobis distances (B, n) of residuals (n, F) for Cholesky factors (B, F, F)."""
-    return torch.linalg.solve_triangular(root, residual.T, upper=False).square().sum(dim=1)
+    white: Tensor = torch.linalg.solve_triangular(root, residual.T, upper=False)
+    return white.square().sum(dim=1)
