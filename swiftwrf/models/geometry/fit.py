@@ -30,7 +30,15 @@ from swiftwrf.models.geometry.planes import (
     robust_advantage,
     sign_alternatives,
 )
-from swiftwrf.models.geometry.search import N_STARTS, PERFECT_SCORE, SIGNS, WEAK_GAIN, Search, find_room
+from swiftwrf.models.geometry.search import (
+    MAX_SCORE_RATIO,
+    N_STARTS,
+    PERFECT_SCORE,
+    SIGNS,
+    WEAK_GAIN,
+    Search,
+    find_room,
+)
 from swiftwrf.models.geometry.uncertainty import assess
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
@@ -42,6 +50,7 @@ FURTHER_SIGNIFICANCE = 4.0  # standard errors for a plane of any orientation, of
 PROMISING_SIGNIFICANCE = 1.0  # standard errors by which one must be better after a few steps to be refined further
 MAX_FURTHER_TRIED = 8  # candidates of any orientation that are refined
 MAX_ORDER = 4  # reflections of an image source
+MIN_SEARCHED = 50  # spectra of a search whose room is extended; searches in fewer end at phase aliases more often
 MAX_MISSING_RATIO = 1.4  # of the missing coherence of new spectra and of those of a search, geometric means
 MIN_HELD_OUT = 300  # positions to decide by: folds are held out in turn until their number is reached
 
@@ -108,7 +117,8 @@ def extend_room(room: PlaneSet, train: Spectra, is_new: Tensor, config: Geometry
         config: Options of the search.
 
     Returns:
-        The room, with the planes that all spectra together resolve, or None if it does not explain the new spectra.
+        The room, with the planes that all spectra together resolve, or None if it does not explain the new spectra or its
+        search had fewer than 50.
 
     Raises:
         InputError: As `search_room`.
@@ -118,11 +128,16 @@ def extend_room(room: PlaneSet, train: Spectra, is_new: Tensor, config: Geometry
     new = is_new[evidence.rows]
     explained = log_explained(scene.coherence(room.field(scene)))
     excess = explained[~new].mean() - explained[new].mean()
-    if not room.normal.shape[1] or not float(excess) < math.log(MAX_MISSING_RATIO):
+    if int((~new).sum()) < MIN_SEARCHED or not room.normal.shape[1] or not float(excess) < math.log(MAX_MISSING_RATIO):
         return None
     gains = room.by_side().gain
     signs = max(SIGNS, key=lambda row: sum(float(row[side]) * gain > 0 for side, gain in gains.items()))
-    return _completed(room.refined(scene), signs, evidence.held_out_score(room), evidence, config)
+    score, room = evidence.held_out_score(room), room.refined(scene)
+    improved = PlaneSet.of(Search(evidence.some, config.reach, signs).improve(room.by_side())).refined(scene)
+    # a phase alias explains new spectra nearly as well as others, but all positions together less than the right room
+    if scene.score(improved.field(scene)) < MAX_SCORE_RATIO * scene.score(room.field(scene)):
+        room = improved
+    return _completed(room, signs, score, evidence, config)
 
 
 @dataclass(frozen=True, eq=False)

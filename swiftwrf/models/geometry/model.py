@@ -121,18 +121,19 @@ class GeometryModel(FieldModel):
             is_new: Whether the search did not use a spectrum, (n,).
 
         Returns:
-            The fitted model, or None if the room explains the new spectra worse than those of its search. Search anew then.
+            The fitted model. None if the search had fewer than 50 spectra, or if the room does not explain the new spectra as
+            well as those of its search: then only another search helps.
 
         Raises:
             InputError: As `fit`.
 
         Example:
             >>> import swiftwrf
-            >>> train = swiftwrf.simulated_room(n=60)
-            >>> is_new = torch.arange(60) >= 50
-            >>> room = GeometryModel(further=0).fit(train.subset((~is_new).nonzero()[:, 0]))
-            >>> len(room.extended(train, is_new).planes)
-            6
+            >>> data = swiftwrf.simulated_room(n=60)
+            >>> floor = Plane((0.0, 0.0, -1.0), offset_m=0.0, gain=-0.6)
+            >>> found_in_few = GeometryModel.of_planes(data.subset(torch.arange(20)), [floor])
+            >>> found_in_few.extended(data, is_new=torch.arange(60) >= 20) is None
+            True
         """
         check_training(train)
         estimate = extend_room(self.tensors(), train, is_new, self.config)
