@@ -121,7 +121,7 @@ class GeometryModel(FieldModel):
             is_new: Whether the search did not use a spectrum, (n,).
 
         Returns:
-            The fitted model. None if the search had fewer than 50 spectra, or if the room does not explain the new spectra as
+            The fitted model. None if the search had fewer than 50 spectra, or if the room does not explain the new ones as
             well as those of its search: then only another search helps.
 
         Raises:
