@@ -20,6 +20,7 @@ from swiftwrf.data import ReadOptions
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
 from swiftwrf.runtime.registry import Registry
+from tasks.claim import LOCATOR as MODEL
 from tasks.command_line import command_line
 from tasks.labels import LOCALIZERS as LABELS
 from tasks.locate import experiment
@@ -27,7 +28,7 @@ from tasks.locate.experiment import prepared
 from tasks.locate.localizers import LEVELS, LOCALIZERS, RegressedCoordinates
 from tasks.locate.observations import aligned, read_rssi
 from tasks.locate.options import LocateConfig
-from tasks.locate.steps import MODEL, Localization, in_plan
+from tasks.locate.steps import Localization, in_plan
 
 GRID = AngularGrid.hemisphere(8, 32)
 

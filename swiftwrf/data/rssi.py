@@ -13,6 +13,7 @@ from torch import Tensor
 
 from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin
 from swiftwrf.data.dataset import Numbers, PositionedData, to_positions
+from swiftwrf.data.labelled import Variable, position_coordinates, receiver_coordinates
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.data.survey import SurveyOptions, read_survey
 from swiftwrf.errors import InputError, listed
@@ -302,6 +303,20 @@ class Rssi(PositionedData):
 
     def _columns(self) -> dict[str, Any]:
         return dict(zip(self.receiver_names, self.rssi_dbm.numpy().T, strict=True))
+
+    def coordinates(self) -> dict[str, Variable]:
+        position = position_coordinates(self.transmitter_position.numpy(), self.origin)
+        return super().coordinates() | position | receiver_coordinates(self.receiver_names)
+
+    def variables(self) -> dict[str, Variable]:
+        places = Variable(("receiver", "axis"), self.receiver_position.numpy(), "m")
+        return {
+            "rssi": Variable(("position", "receiver"), self.rssi_dbm.numpy(), "dBm"),
+            "receiver_position": places,
+        }
+
+    def _measured(self) -> Tensor:
+        return self.rssi_dbm
 
     def _summary(self) -> str:
         share = float(self.detected.double().mean()) if len(self) else 0.0
