@@ -12,7 +12,7 @@ Gaussian Splatting for Efficient Wireless Radiance Field Rendering", 2025.
 from swiftwrf.runtime.lazy import lazy_imports
 
 with lazy_imports(globals()):
-    from swiftwrf import comparison
+    from swiftwrf import comparison, datasets
     from swiftwrf.array.angles import AngularGrid, ArrayPose
     from swiftwrf.choices import FIELD_MODELS
     from swiftwrf.data import Rssi, Snapshots, Spectra, load_rssi, load_snapshots, load_spectra
@@ -54,6 +54,7 @@ __all__ = [
     "SwiftWRF",
     "calibrate",
     "comparison",
+    "datasets",
     "fit",
     "fit_coarray",
     "fit_geometry",

@@ -27,7 +27,7 @@ class ConvertConfig(SpectraSource, TableSource):
     """
 
     source: Annotated[str, tyro.conf.Positional]
-    """folder or file of measurements, directory of a run, or saved model"""
+    """folder or file of measurements, name of a public data set, directory of a run, or saved model"""
     out: Annotated[str, tyro.conf.Positional]
     """directory to write, or file: .csv, .mat, and of RSSI maps .tif (GeoTIFF), .geojson, .png (with a world file); must
     not exist"""

@@ -19,7 +19,7 @@ from tasks.convert.outputs import predicted, saved_model, write_file
 from tasks.directory import check_new_file, new_directory
 from tasks.environment import invocation
 from tasks.records import write_json
-from tasks.source import reading
+from tasks.source import located, reading
 from tasks.terminal import console
 
 
@@ -58,7 +58,7 @@ def _write_new_file(config: ConvertConfig, model: FieldModel | RssiModel | None)
 
 def _read(config: ConvertConfig) -> Spectra | Snapshots | Rssi:
     data: Spectra | Snapshots | Rssi = read(
-        config.source, reading(config), SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS
+        located(config.source), reading(config), SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS
     )
     return data
 
