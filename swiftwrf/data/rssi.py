@@ -261,7 +261,7 @@ class Rssi(PositionedData):
         """
         if list(asked) == ["all"]:
             return self._detected_enough()
-        columns = [self._column(a) for a in asked]
+        columns = [receiver_row(self.receiver_names, name, self.name) for name in asked]
         if not columns or len(set(columns)) < len(columns):
             raise InputError(f"ask for each receiver once, got {' '.join(asked) or 'none'}")
         for column in columns:
@@ -293,14 +293,6 @@ class Rssi(PositionedData):
             rssi_dbm=self.rssi_dbm[:, columns],
         )
 
-    def _column(self, asked: str) -> int:
-        if asked in self.receiver_names:
-            return self.receiver_names.index(asked)
-        if asked.isdecimal() and 1 <= int(asked) <= len(self.receiver_names):
-            return int(asked) - 1
-        known = ", ".join(f"{i} {name}" for i, name in enumerate(self.receiver_names, start=1))
-        raise InputError(f"{self.name} has no receiver {asked!r}; there are {known}")
-
     def _columns(self) -> dict[str, Any]:
         return dict(zip(self.receiver_names, self.rssi_dbm.numpy().T, strict=True))
 
@@ -321,3 +313,26 @@ class Rssi(PositionedData):
     def _summary(self) -> str:
         share = float(self.detected.double().mean()) if len(self) else 0.0
         return f"{len(self)} rows at {len(self.receiver_names)} receivers, {share:.0%} detected"
+
+
+def receiver_row(names: Sequence[str], asked: str, owner: str) -> int:
+    """Return the index of a receiver.
+
+    Args:
+        names: Names of all receivers.
+        asked: Name, or number counted from 1.
+        owner: What has these receivers, for the message.
+
+    Raises:
+        InputError: An unknown receiver.
+
+    Example:
+        >>> receiver_row(["hall", "office"], "office", "floor"), receiver_row(["hall", "office"], "1", "floor")
+        (1, 0)
+    """
+    if asked in names:
+        return list(names).index(asked)
+    if asked.isdecimal() and 1 <= int(asked) <= len(names):
+        return int(asked) - 1
+    known = ", ".join(f"{number} {name}" for number, name in enumerate(names, start=1))
+    raise InputError(f"{owner} has no receiver {asked!r}; there are {known}")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
 from swiftwrf.data.labelled import Labelled, Variable, receiver_coordinates
+from swiftwrf.data.rssi import receiver_row
 from swiftwrf.errors import InputError
 
 if TYPE_CHECKING:
@@ -62,7 +64,7 @@ class RssiMap(Labelled):
             >>> import swiftwrf
             >>> model = swiftwrf.RssiModel().fit(swiftwrf.rssi_room(n=60))
             >>> RssiMap.predict(model, cell=1.0).mean.shape
-            (12, 16, 19)
+            (12, 15, 19)
         """
         position = (model.anchor + model.centre).double()
         low, high = (end[:2].numpy() for end in (position.amin(dim=0), position.amax(dim=0)))
@@ -82,17 +84,18 @@ class RssiMap(Labelled):
         mean, std = (values.T.reshape(-1, len(y), len(x)).float().numpy() for values in (found.mean, found.std))
         return cls(x, y, z, cell, mean, std, model.receiver_names, model.origin)
 
-    def receivers(self, names: tuple[str, ...]) -> RssiMap:
+    def receivers(self, asked: Sequence[str]) -> RssiMap:
         """Return the map of some receivers.
+
+        Args:
+            asked: Names, or numbers counted from 1.
 
         Raises:
             InputError: An unknown receiver.
         """
-        unknown = [name for name in names if name not in self.receiver_names]
-        if unknown:
-            raise InputError(f"the map has no receiver {unknown[0]!r}; there are {', '.join(self.receiver_names)}")
-        rows = [self.receiver_names.index(name) for name in names]
-        return RssiMap(self.x, self.y, self.height, self.cell, self.mean[rows], self.std[rows], names, self.origin)
+        rows = [receiver_row(self.receiver_names, name, "the map") for name in asked]
+        names = tuple(self.receiver_names[row] for row in rows)
+        return replace(self, mean=self.mean[rows], std=self.std[rows], receiver_names=names)
 
     def to_frame(self) -> pd.DataFrame:
         """Return a table with one row for each cell and receiver."""

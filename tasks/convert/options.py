@@ -43,7 +43,7 @@ class ConvertConfig(SpectraSource, TableSource):
     at: str | None = None
     """table of positions (x, y, z) at which a model predicts, for .csv and .mat (default: the map of an RSSI model)"""
     rx: tuple[str, ...] = ()
-    """receivers of the map (default: all); a .png shows the strongest of them"""
+    """receivers of the map, names or numbers counted from 1 (default: all); a .png shows the strongest of them"""
     cell: float | None = None
     """edge of the map's cells [m] (default: 1/120 of the longer side)"""
     height: float | None = None
