@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -13,18 +16,25 @@ FAR = 1e6  # normalised: beyond, all is equally far, and float32 must not overfl
 MANY = 2000  # known positions from which on a tree finds the nearest ones faster than all distances do
 
 
-def check_positions(position: Tensor) -> Tensor:
-    """Positions [m] as float64 (n, 3).
+def check_positions(position: Any) -> Tensor:
+    """Return positions (tensor, array or list) as float64 (n, 3) [m].
 
     Raises:
         InputError: another shape, or not finite.
+
+    Example:
+        >>> check_positions([[0, 1, 2]])
+        tensor([[0., 1., 2.]], dtype=torch.float64)
     """
-    position = torch.as_tensor(position, dtype=torch.float64)
-    if position.dim() != 2 or position.shape[1] != 3:
-        raise InputError(f"positions must have shape (n, 3), got {tuple(position.shape)}")
-    if not position.isfinite().all():
+    try:
+        tensor = position if isinstance(position, Tensor) else torch.from_numpy(np.array(position))
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(f"positions must be numbers of shape (n, 3), got {type(position).__name__}") from None
+    if tensor.dim() != 2 or tensor.shape[1] != 3:
+        raise InputError(f"positions must have shape (n, 3), got {tuple(tensor.shape)}")
+    if not tensor.isfinite().all():
         raise InputError("positions must be finite numbers [m]")
-    return position
+    return tensor.double()
 
 
 def frame(position: Tensor) -> tuple[Tensor, Tensor]:

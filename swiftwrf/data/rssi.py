@@ -13,6 +13,7 @@ from torch import Tensor
 
 from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin
 from swiftwrf.data.dataset import Numbers, PositionedData, to_positions
+from swiftwrf.data.labelled import Variable, position_coordinates, receiver_coordinates
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.data.survey import SurveyOptions, read_survey
 from swiftwrf.errors import InputError, listed
@@ -260,7 +261,7 @@ class Rssi(PositionedData):
         """
         if list(asked) == ["all"]:
             return self._detected_enough()
-        columns = [self._column(a) for a in asked]
+        columns = [receiver_row(self.receiver_names, name, self.name) for name in asked]
         if not columns or len(set(columns)) < len(columns):
             raise InputError(f"ask for each receiver once, got {' '.join(asked) or 'none'}")
         for column in columns:
@@ -292,17 +293,46 @@ class Rssi(PositionedData):
             rssi_dbm=self.rssi_dbm[:, columns],
         )
 
-    def _column(self, asked: str) -> int:
-        if asked in self.receiver_names:
-            return self.receiver_names.index(asked)
-        if asked.isdecimal() and 1 <= int(asked) <= len(self.receiver_names):
-            return int(asked) - 1
-        known = ", ".join(f"{i} {name}" for i, name in enumerate(self.receiver_names, start=1))
-        raise InputError(f"{self.name} has no receiver {asked!r}; there are {known}")
-
     def _columns(self) -> dict[str, Any]:
         return dict(zip(self.receiver_names, self.rssi_dbm.numpy().T, strict=True))
+
+    def coordinates(self) -> dict[str, Variable]:
+        position = position_coordinates(self.transmitter_position.numpy(), self.origin)
+        return super().coordinates() | position | receiver_coordinates(self.receiver_names)
+
+    def variables(self) -> dict[str, Variable]:
+        places = Variable(("receiver", "axis"), self.receiver_position.numpy(), "m")
+        return {
+            "rssi": Variable(("position", "receiver"), self.rssi_dbm.numpy(), "dBm"),
+            "receiver_position": places,
+        }
+
+    def _measured(self) -> Tensor:
+        return self.rssi_dbm
 
     def _summary(self) -> str:
         share = float(self.detected.double().mean()) if len(self) else 0.0
         return f"{len(self)} rows at {len(self.receiver_names)} receivers, {share:.0%} detected"
+
+
+def receiver_row(names: Sequence[str], asked: str, owner: str) -> int:
+    """Return the index of a receiver.
+
+    Args:
+        names: Names of all receivers.
+        asked: Name, or number counted from 1.
+        owner: What has these receivers, for the message.
+
+    Raises:
+        InputError: An unknown receiver.
+
+    Example:
+        >>> receiver_row(["hall", "office"], "office", "floor"), receiver_row(["hall", "office"], "1", "floor")
+        (1, 0)
+    """
+    if asked in names:
+        return list(names).index(asked)
+    if asked.isdecimal() and 1 <= int(asked) <= len(names):
+        return int(asked) - 1
+    known = ", ".join(f"{number} {name}" for number, name in enumerate(names, start=1))
+    raise InputError(f"{owner} has no receiver {asked!r}; there are {known}")

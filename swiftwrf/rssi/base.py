@@ -13,10 +13,12 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
+from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError
-from swiftwrf.models.base import FieldConfig, FitContext, Prediction
+from swiftwrf.models.base import FieldConfig, FitContext
+from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import check_positions
 from swiftwrf.runtime.options import Configured
 from swiftwrf.runtime.session import Record
@@ -131,13 +133,13 @@ class RssiPredictor(Configured, ABC):
     def _predict(self, position: Tensor) -> tuple[Tensor, Tensor | None]:
         """Return RSSI (b, R) [dBm] and its standard deviation, or None, for a batch of positions (b, 3), float64 [m]."""
 
-    def predict(self, position: Tensor) -> Prediction:
+    def predict(self, position: Numbers) -> Prediction:
         """Predict the RSSI at every receiver.
 
         Gradients flow to the positions where the mathematics is differentiable, unless torch.no_grad is active.
 
         Args:
-            position: Positions of the transmitter, (n, 3) [m].
+            position: Positions of the transmitter, tensor or array (n, 3) [m].
 
         Returns:
             Mean (n, R) [dBm], and the standard deviation of a measurement (n, R) [dB] if the predictor has one.
@@ -150,7 +152,8 @@ class RssiPredictor(Configured, ABC):
         with torch.set_grad_enabled(torch.is_grad_enabled() and position.requires_grad):
             parts = [self._predict(some) for some in position.split(self.batch_size)]
         stds = [std for _, std in parts if std is not None]
-        return Prediction(torch.cat([mean for mean, _ in parts]), torch.cat(stds) if stds else None)
+        mean, std = torch.cat([mean for mean, _ in parts]), torch.cat(stds) if stds else None
+        return Prediction(mean, std, position, receiver_names=self.receiver_names)
 
     def check_fitted(self) -> None:
         """Raise InputError if the predictor is not fitted."""

@@ -16,9 +16,10 @@ from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.files import sha256
 from swiftwrf.data.splits import validation_for
-from swiftwrf.models.base import Prediction
+from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance
 from swiftwrf.rssi import LEVEL, RssiModel
+from tasks.claim import MODEL
 from tasks.cluster import connected
 from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
 from tasks.page.page import reporting
@@ -32,7 +33,6 @@ from tasks.source import asked_offsets, measured_rssi, split_notes
 from tasks.summarise import error_summary, grouped
 from tasks.terminal import console, terminal
 
-MODEL = "model.safetensors"
 MAP_CELLS = 80  # along the longer side of the floor
 MAX_PLAN_PIXELS = 2**24
 
@@ -198,11 +198,12 @@ class _Tables:
         self.coverage = float(((measured >= low) & (measured <= high))[detected].double().mean())
         x, y, z = self.test.transmitter_position[self.row].unbind(dim=1)
         values = {"measured": measured, "predicted": prediction.mean, "low": low, "high": high}
-        columns = {name: value[detected] for name, value in values.items()}
+        columns = {name: value[detected].round(decimals=2) for name, value in values.items()}
         degrees = degree_columns(self.test.origin, self.test.transmitter_position[self.row].numpy())
         columns |= {name: torch.from_numpy(value) for name, value in degrees.items()}
         group = {"group": self.test.groups.subset(self.row).labels()} if self.test.groups else {}
-        self.predictions += _rows(x=x, y=y, z=z, receiver=self.receiver, **group, **columns)
+        metres = {name: axis.round(decimals=3) for name, axis in (("x", x), ("y", y), ("z", z))}
+        self.predictions += _rows(**metres, receiver=self.receiver, **group, **columns)
 
     def _write_maps(self, model: RssiModel) -> None:
         """Write the prediction and the width of its interval over the floor, at the median height of the measurements."""

@@ -25,7 +25,8 @@ class RssiTaskConfig(OffsetSource, Output):
     rx: tuple[str, ...]
     """receivers: names, numbers counted from 1, or all"""
     data: str | None = None
-    """survey table (CSV or Parquet), or folder with tx_pos.csv, gateway_rssi.csv and gateway_position.yml (NeRF2 layout)"""
+    """survey table (CSV or Parquet), folder with tx_pos.csv, gateway_rssi.csv and gateway_position.yml (NeRF2 layout), or
+    name of a public data set, see docs/formats.md"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
     also: tuple[str, ...] = ()
