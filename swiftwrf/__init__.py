@@ -25,7 +25,7 @@ with lazy_imports(globals()):
     from swiftwrf.models.geometry import GeometryModel, HybridModel, fit_geometry, fit_hybrid
     from swiftwrf.models.swiftwrf import FitConfig, ModelConfig, SwiftWRF, fit
     from swiftwrf.rasterize import rasterize, rasterize_magnitude
-    from swiftwrf.rssi import RssiConfig, RssiModel, fit_rssi
+    from swiftwrf.rssi import PairModel, RssiConfig, RssiModel, fit_rssi
     from swiftwrf.runtime.checkpoint import load
 
 __all__ = [
@@ -42,6 +42,7 @@ __all__ = [
     "InputError",
     "MatchedField",
     "ModelConfig",
+    "PairModel",
     "Posterior",
     "Prediction",
     "Rssi",

@@ -158,6 +158,9 @@ class TableSource(Options):
     """count all values of RSSI as measured"""
     coordinates: Literal["degrees", "metres"] | None = None
     """unit of the positions in a survey table (default: the one that is recognised)"""
+    transmitter: tuple[str, ...] = ()
+    """columns of a survey table with the position of the transmitter, where both ends move: x y [z]; or the one column with
+    names of its positions, which receivers.csv contains (default: those that are recognised, e.g. tx_x tx_y)"""
 
     @property
     def column_names(self) -> dict[str, str] | None:
@@ -172,6 +175,8 @@ class TableSource(Options):
                 raise InputError(f"--columns takes what a column holds and its name, e.g. x=NAME, got {text!r}")
         if len(self.column_names or {}) < len(self.columns):
             raise InputError(f"--columns names something twice: {' '.join(self.columns)}")
+        if len(self.transmitter) > 3:
+            raise InputError(f"--transmitter takes 1 to 3 columns, got {' '.join(self.transmitter)}")
         if self.filler and self.keep_filler:
             raise InputError("--filler and --keep-filler exclude each other")
 

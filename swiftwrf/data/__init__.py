@@ -92,6 +92,7 @@ def load_rssi(
     filler: Sequence[float] | None = None,
     coordinates: Coordinates | None = None,
     offset_by: str | None = None,
+    transmitter: Sequence[str] = (),
 ) -> Rssi:
     """Read RSSI in any format of docs/formats.md: the NeRF2 layout, or a survey table (CSV, Parquet).
 
@@ -102,12 +103,20 @@ def load_rssi(
         filler: Values that stand for not detected, [] for none. Defaults to those that are recognised.
         coordinates: "degrees" or "metres", of the positions in a table. Defaults to the unit that is recognised.
         offset_by: Column of a table with groups of rows, e.g. devices, between which RSSI has constant offsets.
+        transmitter: Columns of a table with the position of the transmitter where both ends move: x, y and optionally z, or
+            the one column with names of its positions, which receivers.csv contains. Defaults to those recognised.
 
     Raises:
         InputError: A part that is missing or invalid, parts that do not match, or an argument that does not apply.
     """
     values = None if filler is None else tuple(map(float, filler))
-    options = ReadOptions(columns=columns, filler=values, coordinates=coordinates, offset_by=offset_by)
+    options = ReadOptions(
+        columns=columns,
+        filler=values,
+        coordinates=coordinates,
+        offset_by=offset_by,
+        transmitter=tuple(transmitter),
+    )
     return read_rssi(path, options)
 
 

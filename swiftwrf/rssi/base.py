@@ -78,6 +78,11 @@ class RssiPredictor(Configured, ABC):
     """names of the receivers, set by `fit`"""
 
     @classmethod
+    def compared(cls, data: Rssi) -> bool:
+        """Return whether the predictor is compared on these data without a request."""
+        return not cls.slow
+
+    @classmethod
     def lacking(cls, data: Rssi) -> str:
         """Return a sentence about what the data lack for this predictor, or an empty text if they have it."""
         if cls.requires_receiver_position and not data.located:
@@ -151,6 +156,10 @@ class RssiPredictor(Configured, ABC):
             parts = [self._predict(some) for some in position.split(self.batch_size)]
         stds = [std for _, std in parts if std is not None]
         return Prediction(torch.cat([mean for mean, _ in parts]), torch.cat(stds) if stds else None)
+
+    def predict_detected(self, data: Rssi) -> Prediction:
+        """Predict the RSSI at least where it is measured, with shapes of `predict` at the positions of the data."""
+        return self.predict(data.transmitter_position)
 
     def check_fitted(self) -> None:
         """Raise InputError if the predictor is not fitted."""

@@ -10,6 +10,7 @@ from torch import Tensor
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.gp import Kernel, LeaveGroupOut, candidates, thinned
+from swiftwrf.positions import cells
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import Head, render
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, fit_shared_path_loss, log_distance
@@ -19,7 +20,6 @@ PAPER_LEVEL_DBM = -100.0  # of the paper's head where nothing is received
 # variance of a packet relative to the variance of the field: fading is as large as shadowing
 RELATIVE_NOISE_VARIANCES = (0.3, 1.0, 2.0, 3.0)
 MAX_KERNEL_ROWS, MAX_KERNEL_RECEIVERS = 300, 12  # more do not change the choice of the kernel
-BISECTIONS = 20  # of the bins' edge, which find it to a millionth of the extent
 
 
 @dataclass(frozen=True)
@@ -136,15 +136,7 @@ def bin_locations(rows: Rssi, max_locations: int) -> tuple[Tensor, Tensor, Tenso
     position = rows.transmitter_position
     bin_of_row = torch.arange(len(position))
     if len(position) > max_locations:
-        local = position - position.min(dim=0).values
-        fine, coarse = 0.0, float(local.max()) or 1.0
-        for _ in range(BISECTIONS):
-            edge = (fine + coarse) / 2
-            number = torch.unique((local / edge).floor().long(), dim=0, return_inverse=True)[1]
-            if int(number.max()) < max_locations:
-                coarse, bin_of_row = edge, number
-            else:
-                fine = edge
+        bin_of_row = cells(position, max_locations)[0]
     n = int(bin_of_row.max()) + 1
 
     def mean(values: Tensor) -> tuple[Tensor, Tensor]:

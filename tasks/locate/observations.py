@@ -12,10 +12,11 @@ from torch import Tensor
 
 from swiftwrf import InputError, Rssi, Spectra, load
 from swiftwrf.data import ReadOptions
+from swiftwrf.data.columns import column_of
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.formats import RSSI_FORMATS, read
 from swiftwrf.data.store import Store
-from swiftwrf.data.survey import SUFFIXES, column_of, first_rows, has_positions, read_frame
+from swiftwrf.data.survey import SUFFIXES, first_rows, has_positions, read_frame
 from swiftwrf.errors import listed
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
 from swiftwrf.locate.track import joined

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,10 +16,11 @@ from PIL import Image, UnidentifiedImageError
 from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.files import sha256
+from swiftwrf.data.rssi import PLACE
 from swiftwrf.data.splits import validation_for
 from swiftwrf.models.base import Prediction
 from swiftwrf.positions import distance
-from swiftwrf.rssi import LEVEL, RssiModel
+from swiftwrf.rssi import LEVEL, PairModel, RssiModel
 from tasks.cluster import connected
 from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
 from tasks.page.page import reporting
@@ -34,6 +36,7 @@ from tasks.terminal import console, terminal
 
 MODEL = "model.safetensors"
 MAP_CELLS = 80  # along the longer side of the floor
+MAX_MAP_VALUES = 200_000  # of all maps together
 MAX_PLAN_PIXELS = 2**24
 
 
@@ -65,7 +68,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     ):
         options = {"pool": pool, "device": device, "parallel": cluster.map if cluster else None}
         tables = _Tables(config, train, test, plan, directory, options)
-        compared = [name for name in PREDICTORS if not PREDICTORS[name].slow or name in config.also]
+        compared = [name for name in PREDICTORS if PREDICTORS[name].compared(data) or name in config.also]
         left_out = {name: reason for name in compared if (reason := PREDICTORS[name].lacking(data))}
         for reason in left_out.values():
             console.print(f"left out: {reason}")
@@ -86,7 +89,8 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             "overall": tables.overall(),
             "left_out": left_out,
             "receivers": tables.receivers(),
-            "seconds": tables.seconds["swiftwrf"],
+            "model": tables.model,
+            "seconds": tables.seconds[tables.model],
             "interval": {"nominal": LEVEL, "coverage": tables.coverage},
             "chosen": {"n_primitives": tables.n_primitives},
         }
@@ -143,6 +147,7 @@ class _Tables:
         self.seconds: dict[str, PredictorSeconds] = {}
         self.coverage = float("nan")
         self.n_primitives = 0
+        self.model = PairModel.name if train.receiver_moves else RssiModel.name
         self.detected = ~test.rssi_dbm.isnan()
         self.row, column = self.detected.nonzero(as_tuple=True)
         self.receiver = [test.receiver_names[number] for number in column.tolist()]
@@ -163,21 +168,25 @@ class _Tables:
         def compute() -> Row:
             config = self.config
             options = {"validation": validation_for(config.split), "seed": config.seed}
+            options["new_places"] = config.split == PLACE
             predictor = make_predictor(name, config.preset, **options)
             began = time.perf_counter()
             predictor.fit(self.train, progress=True, **self.options)
             fitted = time.perf_counter()
-            prediction = predictor.predict(self.test.transmitter_position)
+            prediction = predictor.predict_detected(self.test)
             result: Row = {"fit": fitted - began, "predict": time.perf_counter() - fitted}
             if isinstance(predictor, RssiModel):
                 result["n_primitives"] = predictor.n_primitives
+            if name == self.model:
+                assert isinstance(predictor, RssiModel | PairModel)
                 predictor.save(self.directory.path(MODEL))
                 self._write_maps(predictor)
-            return result | {"predicted": prediction.mean, "std": prediction.std}
+            std = None if prediction.std is None else prediction.std[self.detected]
+            return result | {"predicted": prediction.mean[self.detected], "std": std}
 
         value = self.directory.step(name, f"fitting {name}", compute)
         self.seconds[name] = {"fit": value["fit"], "predict": value["predict"]}
-        predicted, measured = torch.tensor(value["predicted"], dtype=torch.float64) + self.offset, self.test.rssi_dbm
+        predicted, measured = self._spread(value["predicted"]) + self.offset, self.test.rssi_dbm
         self.errors += _rows(
             method=[name] * len(self.row),
             receiver=self.receiver,
@@ -188,9 +197,15 @@ class _Tables:
             from_receiver_m=self.from_receiver[self.detected],
             from_training_m=self.from_training[self.row],
         )
-        if name == "swiftwrf":
-            self.n_primitives = value["n_primitives"]
-            self._add_predictions(Prediction(predicted, torch.tensor(value["std"], dtype=torch.float64)))
+        self.n_primitives = value.get("n_primitives", self.n_primitives)
+        if name == self.model:
+            self._add_predictions(Prediction(predicted, self._spread(value["std"])))
+
+    def _spread(self, values: list[float]) -> torch.Tensor:
+        """Return values of the detected test pairs as a matrix (rows, R), nan elsewhere."""
+        matrix = torch.full(self.detected.shape, torch.nan, dtype=torch.float64)
+        matrix[self.detected] = torch.tensor(values, dtype=torch.float64)
+        return matrix
 
     def _add_predictions(self, prediction: Prediction) -> None:
         measured, detected = self.test.rssi_dbm, self.detected
@@ -204,13 +219,14 @@ class _Tables:
         group = {"group": self.test.groups.subset(self.row).labels()} if self.test.groups else {}
         self.predictions += _rows(x=x, y=y, z=z, receiver=self.receiver, **group, **columns)
 
-    def _write_maps(self, model: RssiModel) -> None:
+    def _write_maps(self, model: RssiModel | PairModel) -> None:
         """Write the prediction and the width of its interval over the floor, at the median height of the measurements."""
         position = self.train.transmitter_position
         shown = torch.cat([position, self.test.transmitter_position])
         shown = torch.cat([shown, self.train.receiver_position[self.train.receiver_located]])
         low, high = shown.min(dim=0).values, shown.max(dim=0).values
-        cell = float((high - low)[:2].max()) / MAP_CELLS or 1.0
+        n_cells = min(MAP_CELLS, math.isqrt(MAX_MAP_VALUES // len(self.train.receiver_names)))
+        cell = float((high - low)[:2].max()) / n_cells or 1.0
         xs, ys = (
             torch.arange(float(a), float(b) + cell, cell, dtype=torch.float64)
             for a, b in zip(low[:2], high[:2], strict=True)

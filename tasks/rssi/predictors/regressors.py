@@ -81,23 +81,7 @@ class KNNPredictor(ReceiverRegressors):
     name = "knn"
 
     def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
-        numbers = np.unique(fold)
-        fewest = len(y) - int(np.bincount(fold).max())
-        errors = {(k, weights): 0.0 for k in NEIGHBOUR_COUNTS if k <= fewest for weights in ("uniform", "distance")}
-        for number in numbers:  # one search for neighbours serves all settings; GridSearchCV repeats it
-            out, kept = fold == number, fold != number
-            search = NearestNeighbors(n_neighbors=max(errors)[0], algorithm=NEIGHBOUR_SEARCH)
-            distance, row = search.fit(x[kept]).kneighbors(x[out])
-            near = y[kept][row]
-            with np.errstate(divide="ignore"):
-                inverse = 1 / distance
-            inverse = np.where(np.isinf(inverse).any(axis=1, keepdims=True), np.isinf(inverse), inverse)
-            for k, weights in errors:
-                weight = inverse[:, :k] if weights == "distance" else np.ones_like(inverse[:, :k])
-                predicted = (weight * near[:, :k]).sum(axis=1) / weight.sum(axis=1)
-                errors[k, weights] += float(np.abs(predicted - y[out]).mean()) / len(numbers)
-        k, weights = min(errors, key=lambda setting: errors[setting])
-        return KNeighborsRegressor(k, weights=weights, algorithm=NEIGHBOUR_SEARCH).fit(x, y)
+        return choose_neighbours(x, y, fold)
 
 
 class ResidualKNNPredictor(KNNPredictor):
@@ -135,3 +119,24 @@ class GPPredictor(ReceiverRegressors):
         tuned, kept = order[:MAX_TUNING_ROWS], order[:MAX_GP_ROWS]
         fitted = GaussianProcessRegressor(kernel, random_state=self.config.seed).fit(x[tuned], y[tuned])
         return GaussianProcessRegressor(fitted.kernel_, optimizer=None).fit(x[kept], y[kept])
+
+
+def choose_neighbours(x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> KNeighborsRegressor:
+    """Return a regressor fitted to coordinates (n, d) and values (n,) whose settings predict held-out folds (n,) best."""
+    numbers = np.unique(fold)
+    fewest = len(y) - int(np.bincount(fold).max())
+    errors = {(k, weights): 0.0 for k in NEIGHBOUR_COUNTS if k <= fewest for weights in ("uniform", "distance")}
+    for number in numbers:  # one search for neighbours serves all settings; GridSearchCV repeats it
+        out, kept = fold == number, fold != number
+        search = NearestNeighbors(n_neighbors=max(errors)[0], algorithm=NEIGHBOUR_SEARCH)
+        distance, row = search.fit(x[kept]).kneighbors(x[out])
+        near = y[kept][row]
+        with np.errstate(divide="ignore"):
+            inverse = 1 / distance
+        inverse = np.where(np.isinf(inverse).any(axis=1, keepdims=True), np.isinf(inverse), inverse)
+        for k, weights in errors:
+            weight = inverse[:, :k] if weights == "distance" else np.ones_like(inverse[:, :k])
+            predicted = (weight * near[:, :k]).sum(axis=1) / weight.sum(axis=1)
+            errors[k, weights] += float(np.abs(predicted - y[out]).mean()) / len(numbers)
+    k, weights = min(errors, key=lambda setting: errors[setting])
+    return KNeighborsRegressor(k, weights=weights, algorithm=NEIGHBOUR_SEARCH).fit(x, y)
