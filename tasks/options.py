@@ -161,6 +161,9 @@ class TableSource(Options):
     transmitter: tuple[str, ...] = ()
     """columns of a survey table with the position of the transmitter, where both ends move: x y [z]; or the one column with
     names of its positions, which receivers.csv contains (default: those that are recognised, e.g. tx_x tx_y)"""
+    pool_by: str | None = None
+    """pool radios of one access point into one receiver, by the mean of their powers: mac (the first five bytes of their
+    addresses), a regular expression whose group is the access point, or the column of a long table that contains it"""
 
     @property
     def column_names(self) -> dict[str, str] | None:

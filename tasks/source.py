@@ -40,6 +40,7 @@ def reading(config: SpectraSource | TableSource) -> ReadOptions:
             filler=config.fillers,
             coordinates=config.coordinates,
             transmitter=config.transmitter,
+            pool_by=config.pool_by,
         )
     if isinstance(config, OffsetSource) and config.offset_by is not None:
         options = replace(options, offset_by=config.offset_by.partition("=")[0])

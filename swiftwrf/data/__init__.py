@@ -93,6 +93,7 @@ def load_rssi(
     coordinates: Coordinates | None = None,
     offset_by: str | None = None,
     transmitter: Sequence[str] = (),
+    pool_by: str | None = None,
 ) -> Rssi:
     """Read RSSI in any format of docs/formats.md: the NeRF2 layout, or a survey table (CSV, Parquet).
 
@@ -105,6 +106,8 @@ def load_rssi(
         offset_by: Column of a table with groups of rows, e.g. devices, between which RSSI has constant offsets.
         transmitter: Columns of a table with the position of the transmitter where both ends move: x, y and optionally z, or
             the one column with names of its positions, which receivers.csv contains. Defaults to those recognised.
+        pool_by: Radios of one access point to pool by the mean of their powers: "mac" for the first five bytes of MAC
+            addresses, a regular expression whose group is the access point, or the column of a long table that contains it.
 
     Raises:
         InputError: A part that is missing or invalid, parts that do not match, or an argument that does not apply.
@@ -116,6 +119,7 @@ def load_rssi(
         coordinates=coordinates,
         offset_by=offset_by,
         transmitter=tuple(transmitter),
+        pool_by=pool_by,
     )
     return read_rssi(path, options)
 

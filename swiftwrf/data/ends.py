@@ -71,7 +71,8 @@ def as_receivers(label: object, rssi: Floats, ends: Floats) -> tuple[list[str], 
     """
     if rssi.shape[1] != 1:
         raise InputError(
-            f"{label} has positions of both ends and RSSI of {rssi.shape[1]} receivers; name one: columns rssi=NAME"
+            f"{label} has positions of both ends and RSSI of {rssi.shape[1]} receivers; name one: columns rssi=NAME, or "
+            "pool them: pool_by"
         )
     own, other = ends[:, :3], ends[:, 3:]
     if len(np.unique(own, axis=0)) < len(np.unique(other, axis=0)):

@@ -183,6 +183,7 @@ class Rssi(PositionedData):
         coordinates: Coordinates | None = None,
         offset_by: str | None = None,
         transmitter: Sequence[str] = (),
+        pool_by: str | None = None,
         receiver_position: Mapping[str, Sequence[float]] | None = None,
         name: str = "rssi",
     ) -> Rssi:
@@ -196,6 +197,7 @@ class Rssi(PositionedData):
             offset_by: Column with the groups of rows between which RSSI has constant offsets.
             transmitter: Columns with the position of the second end of the link where both ends move: x, y and optionally z,
                 or the one column with names of its positions. Defaults to those recognised.
+            pool_by: Radios of one access point to pool, as in `load_rssi`.
             receiver_position: Positions [m] by name of the receiver; those of others are unknown.
             name: Name of the data set.
 
@@ -206,9 +208,8 @@ class Rssi(PositionedData):
             >>> Rssi.from_frame(pd.DataFrame({"x": [0, 1], "y": [0, 1], "z": [1, 1], "hall": [-50, -60]})).receiver_names
             ('hall',)
         """
-        options = SurveyOptions(
-            columns, None if filler is None else tuple(filler), coordinates, offset_by, tuple(transmitter)
-        )
+        values = None if filler is None else tuple(filler)
+        options = SurveyOptions(columns, values, coordinates, offset_by, tuple(transmitter), pool_by)
         survey = read_survey("the table", frame, options)
         known = receiver_position or survey.receiver_position or {}
         return cls(

@@ -28,6 +28,7 @@ from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin, degrees_in, w
 from swiftwrf.data.ends import as_receivers, transmitter_columns
 from swiftwrf.data.files import MAX_COORDINATE_M, lines_before_header, read_cells
 from swiftwrf.data.fillers import check_powers, find_fillers, without_fillers
+from swiftwrf.data.pooling import pool_names, pooled
 from swiftwrf.errors import InputError, listed
 
 Floats = NDArray[np.float64]
@@ -47,6 +48,7 @@ class SurveyOptions(NamedTuple):
         coordinates: Unit of the positions. Defaults to the one that is recognised.
         offset_by: Column with the group of each row. Packets of a row of RSSI are of one group.
         transmitter: Columns of the second end where both ends move: x, y and z, or one with names of its positions.
+        pool_by: Radios to pool, as in `pool_names`, or the column with the access point of each packet.
     """
 
     columns: Mapping[str, str] | None = None
@@ -54,6 +56,7 @@ class SurveyOptions(NamedTuple):
     coordinates: Coordinates | None = None
     offset_by: str | None = None
     transmitter: tuple[str, ...] = ()
+    pool_by: str | None = None
 
 
 class Survey(NamedTuple):
@@ -151,12 +154,18 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
         names, rssi = _wide(label, table, roles, asked)
         source = np.arange(len(table))[:, None]
         unused = [name for name in table.columns if name not in roles.values() and name not in names]
-    unused = [name for name in unused if name != options.offset_by]
+    unused = [name for name in unused if name not in (options.offset_by, options.pool_by)]
     if unused:
         notes.append(f"columns that are not used: {listed(unused)}")
     fillers = find_fillers(rssi) if options.filler is None else list(options.filler)
     check_powers(label, rssi, names, fillers, source)
     rssi, found = without_fillers(rssi, fillers)
+    if options.pool_by is not None:
+        n_radios, pools = len(names), _pools(label, table, roles, names, options.pool_by)
+        names, rssi = pooled(rssi, pools)
+        found.append(
+            f"{n_radios} radios are pooled into {len(names)} receivers by {options.pool_by}: mean of their powers"
+        )
     omitted, missing = without_fix(coordinate[:, :3])
     notes += found + missing
     if omitted.all():
@@ -182,6 +191,21 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
     labels = tuple(name for name in unused if _distinguishes(table[name]))
     moves = bool(end or options.transmitter)
     return Survey(names, rssi, position, row, len(omitted), origin, groups, labels, moves, places, tuple(notes))
+
+
+def _pools(label: object, table: pd.DataFrame, roles: dict[str, str], names: list[str], by: str) -> list[str]:
+    """Return the access point of each radio, by a column of a long table or by the radio's name."""
+    if by not in table.columns:
+        return pool_names(names, by)
+    if "receiver" not in roles:
+        raise InputError(f"{label} has a column for each receiver; pool by their names: mac or a regular expression")
+    pairs = pd.DataFrame({"radio": text_of(table[roles["receiver"]]), "pool": text_of(table[by])}).drop_duplicates()
+    if len(several := pairs["radio"][pairs["radio"].duplicated()]):
+        raise InputError(
+            f"{label}: receiver {several.iloc[0]!r} has several values in column {by!r}, so it is no access point"
+        )
+    pool = dict(zip(pairs["radio"], pairs["pool"], strict=True))
+    return [pool[name] or name for name in names]
 
 
 def _second_end(label: object, table: pd.DataFrame, options: SurveyOptions) -> tuple[Mapping[str, str], dict[str, str]]:

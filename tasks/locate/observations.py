@@ -105,7 +105,9 @@ def read_rssi(source: str, options: ReadOptions) -> tuple[Rssi, bool]:
         if not has_positions(frame, options.columns or {}):
             somewhere = frame.assign(x=0.0, y=0.0, z=0.0)
             columns, filler, offset_by = options.columns, options.filler, options.offset_by
-            data = Rssi.from_frame(somewhere, columns=columns, filler=filler, offset_by=offset_by, name=file.stem)
+            data = Rssi.from_frame(
+                somewhere, columns=columns, filler=filler, offset_by=offset_by, pool_by=options.pool_by, name=file.stem
+            )
             return data, False
     return read(source, options, RSSI_FORMATS), True
 

@@ -23,7 +23,7 @@ RECEIVERS = "receivers.csv"  # beside the table: receiver,x,y,z
 class SurveyTable(Format[Rssi]):
     """Table of a walk test; positions of receivers are unknown unless receivers.csv beside it contains them."""
 
-    takes = frozenset({"columns", "filler", "coordinates", "offset_by", "transmitter"})
+    takes = frozenset({"columns", "filler", "coordinates", "offset_by", "transmitter", "pool_by"})
 
     def recognises(self, path: Path) -> bool:
         return bool(_tables(path))
@@ -36,7 +36,12 @@ class SurveyTable(Format[Rssi]):
             )
         file, receivers = tables[0], tables[0].with_name(RECEIVERS)
         stated = SurveyOptions(
-            options.columns, options.filler, options.coordinates, options.offset_by, options.transmitter
+            options.columns,
+            options.filler,
+            options.coordinates,
+            options.offset_by,
+            options.transmitter,
+            options.pool_by,
         )
         survey = read_survey(file, read_frame(file), stated)
         known: Tensor | None = None
