@@ -185,6 +185,7 @@ class ChosenMetrics(TypedDict):
     """What the fit of SwiftWRF chose."""
 
     n_primitives: int
+    floor_attenuation_db: NotRequired[float | None]
 
 
 class RssiMetrics(RunMetrics):

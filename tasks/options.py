@@ -150,8 +150,8 @@ class TableSource(Options):
     """Options of reading RSSI."""
 
     columns: tuple[str, ...] = ()
-    """names of columns of a survey table that are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME ... (several with
-    rssi='WAP*')"""
+    """names of columns of a survey table that are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME
+    floor=NAME ... (several with rssi='WAP*')"""
     filler: tuple[float, ...] = ()
     """values of RSSI that stand for not detected (default: those that are recognised)"""
     keep_filler: bool = False

@@ -28,7 +28,6 @@ ROLES = {  # names of columns, in lower case with underscores
     "receiver": re.compile("receiver(?:_(?:name|id))?|rx|gateway|ap|bssid|mac|sensor|anchor"),
     "rssi": re.compile("(?:rssi?|rsrp|signal|power)(?:_dbm)?|rss_dbm|dbm"),
 }
-NAMED_ROLES = tuple(role for role in ROLES if role != "floor")  # roles that a user can assign
 GEODETIC = {"x": "longitude", "y": "latitude"}  # that take the place of x and y
 
 
@@ -49,7 +48,7 @@ def column_of_numbers(label: object, table: pd.DataFrame, name: str) -> Floats:
     Raises:
         InputError: A cell holds text.
     """
-    values, text = _parsed(table[name])
+    values, text = parsed(table[name])
     if text.any():
         row = int(text.argmax())
         raise InputError(f"{label} row {row + 1}, column {name}: {table[name].iloc[row]!r} is not a number")
@@ -61,8 +60,8 @@ def find_roles(
 ) -> dict[str, str]:
     """Return the column of each role: the one asked for, or else the one with a known name that is not taken."""
     for role in asked:
-        if role not in NAMED_ROLES:
-            raise InputError(f"columns takes {', '.join(NAMED_ROLES)}, got {role!r}")
+        if role not in ROLES:
+            raise InputError(f"columns takes {', '.join(ROLES)}, got {role!r}")
     roles = {role: name for role, name in asked.items() if name in table.columns}
     for role, name in asked.items():
         pattern = role == "rssi" and fnmatch.filter(table.columns, name)
@@ -101,7 +100,7 @@ def text_of(column: pd.Series) -> pd.Series:
     return column.astype(object).where(column.notna(), "").astype(str).str.strip()
 
 
-def _parsed(column: pd.Series) -> tuple[Floats, NDArray[np.bool_]]:
+def parsed(column: pd.Series) -> tuple[Floats, NDArray[np.bool_]]:
     """Return numbers, nan elsewhere, and a mask of cells that hold text."""
     if column.dtype.kind in "biuf":
         return column.to_numpy(np.float64), np.zeros(len(column), dtype=bool)
@@ -113,7 +112,7 @@ def _parsed(column: pd.Series) -> tuple[Floats, NDArray[np.bool_]]:
 
 def is_rssi(column: pd.Series) -> bool:
     """Return True if most cells are received powers or fillers, whatever the number of these."""
-    values, text = _parsed(column)
+    values, text = parsed(column)
     known = np.unique(values[~np.isnan(values)])
     if not len(known) or text.sum() > np.isfinite(values).sum():
         return False

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin
 from swiftwrf.data.dataset import Numbers, PositionedData, to_positions
+from swiftwrf.data.floors import Floors
 from swiftwrf.data.splits import MIN_TRAINING, random_split
 from swiftwrf.data.survey import SurveyOptions, read_survey
 from swiftwrf.errors import InputError, listed
@@ -98,6 +99,7 @@ class Rssi(PositionedData):
         groups: Groups of rows between which RSSI has constant offsets.
         offsets: Offsets that were removed from the RSSI.
         labels: Names of columns of the table that distinguish groups of rows.
+        floors: Floors of the building, by height.
         receiver_moves: Whether the receivers are positions of one receiver that moves, too.
         name: Name of the data set.
         details: index, named_splits, source and notes of `PositionedData`.
@@ -119,6 +121,7 @@ class Rssi(PositionedData):
     groups: Groups | None
     offsets: Offsets | None
     labels: tuple[str, ...]
+    floors: Floors | None
     receiver_moves: bool
 
     row_fields: ClassVar[tuple[str, ...]] = ("transmitter_position", "rssi_dbm", "index", "groups")
@@ -135,6 +138,7 @@ class Rssi(PositionedData):
         groups: Groups | None = None,
         offsets: Offsets | None = None,
         labels: tuple[str, ...] = (),
+        floors: Floors | None = None,
         receiver_moves: bool = False,
         name: str = "rssi",
         **details: Any,
@@ -170,6 +174,7 @@ class Rssi(PositionedData):
             groups=groups,
             offsets=offsets,
             labels=labels,
+            floors=floors,
             receiver_moves=receiver_moves,
         )
 
@@ -191,7 +196,8 @@ class Rssi(PositionedData):
 
         Args:
             frame: Columns of positions [m] and RSSI [dBm], recognised by their names as in docs/formats.md.
-            columns: Names of columns that are not recognised, by role: x, y, z, longitude, latitude, time, receiver, rssi.
+            columns: Names of columns that are not recognised, by role: x, y, z, longitude, latitude, floor,
+                time, receiver, rssi.
             filler: Values that stand for not detected, [] for none. Defaults to those that are recognised.
             coordinates: "degrees" or "metres". Defaults to the unit that is recognised.
             offset_by: Column with the groups of rows between which RSSI has constant offsets.
@@ -220,6 +226,7 @@ class Rssi(PositionedData):
             origin=survey.origin,
             groups=Groups.of(offset_by, survey.group) if offset_by else None,
             labels=survey.labels,
+            floors=survey.floors,
             receiver_moves=survey.receiver_moves,
             name=name,
             index=survey.row,

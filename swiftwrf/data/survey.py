@@ -22,19 +22,20 @@ from swiftwrf.data.columns import (
     find_roles,
     is_coordinate,
     is_rssi,
+    parsed,
     text_of,
 )
 from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin, degrees_in, without_fix
 from swiftwrf.data.ends import as_receivers, transmitter_columns
 from swiftwrf.data.files import MAX_COORDINATE_M, lines_before_header, read_cells
 from swiftwrf.data.fillers import check_powers, find_fillers, without_fillers
+from swiftwrf.data.floors import STOREY_M, Floors, floors_of, height_of_floors
 from swiftwrf.data.pooling import pool_names, pooled
 from swiftwrf.errors import InputError, listed
 
 Floats = NDArray[np.float64]
 SUFFIXES = (".csv", ".parquet")
 SEPARATORS = ",;\t"
-STOREY_M = 4.0  # height of a floor, in a table with numbers of floors and no heights
 MAX_VALUES = 2**27  # rows x receivers
 MAX_GROUPS, MIN_GROUP_ROWS = 30, 10  # of a column that may distinguish devices or channels
 
@@ -70,6 +71,7 @@ class Survey(NamedTuple):
     origin: GeodeticOrigin | None  # of positions in degrees
     group: list[str]  # of each row; empty if it was not asked for
     labels: tuple[str, ...]  # columns that distinguish groups of rows
+    floors: Floors | None  # if the table contains them
     receiver_moves: bool  # receivers are positions of one that moves
     receiver_position: dict[str, list[float]] | None  # by name, if the table contains them [m]
     notes: tuple[str, ...]
@@ -173,6 +175,10 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
     row = np.flatnonzero(~omitted)
     position, origin = _in_metres(label, roles, coordinate[row].reshape(-1, 3), options.coordinates)
     position = position.reshape(len(row), -1)
+    floors = None
+    if "floor" in roles:
+        name = text_of(table[roles["floor"]]).to_numpy()[source.max(axis=1)[row]]
+        floors = floors_of(name.tolist(), position[:, 2])
     if origin is not None:
         x, y = (roles.get(role) or roles[GEODETIC[role]] for role in "xy")
         if np.abs(coordinate[row, 1]).max() > 90:  # only a longitude does
@@ -190,7 +196,7 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
     groups = group.to_numpy()[source.max(axis=1)[row]].tolist() if options.offset_by else []
     labels = tuple(name for name in unused if _distinguishes(table[name]))
     moves = bool(end or options.transmitter)
-    return Survey(names, rssi, position, row, len(omitted), origin, groups, labels, moves, places, tuple(notes))
+    return Survey(names, rssi, position, row, len(omitted), origin, groups, labels, floors, moves, places, tuple(notes))
 
 
 def _pools(label: object, table: pd.DataFrame, roles: dict[str, str], names: list[str], by: str) -> list[str]:
@@ -224,6 +230,12 @@ def _coordinates(label: object, table: pd.DataFrame, roles: dict[str, str]) -> t
     notes = []
     if "z" in roles:
         z = column_of_numbers(label, table, roles["z"])
+        if "floor" in roles and not (numbers := parsed(table[roles["floor"]]))[1].any():
+            own, z = z, height_of_floors(z, numbers[0])
+            if z is not own:
+                notes.append(
+                    f"heights count from the floor, so each floor of column {roles['floor']} adds {STOREY_M:g} m"
+                )
     elif "floor" in roles:
         z = STOREY_M * column_of_numbers(label, table, roles["floor"])
         notes.append(f"there is no height, so each floor of column {roles['floor']} counts as {STOREY_M:g} m")

@@ -2,6 +2,7 @@
 
 from swiftwrf.rssi.base import Map, RssiFitContext, RssiPredictor
 from swiftwrf.rssi.config import RssiConfig
+from swiftwrf.rssi.floors import FloorAttenuation, estimate_floor_attenuation
 from swiftwrf.rssi.model import LEVEL, RssiModel, fit_rssi
 from swiftwrf.rssi.offsets import estimate_offsets
 from swiftwrf.rssi.pairs import PairConfig, PairModel, PairPredictor
@@ -19,4 +20,12 @@ __all__ = [
     "RssiModel",
     "RssiPredictor",
 ]
-__all__ += ["estimate_offsets", "fit_path_loss", "fit_rssi", "fit_shared_path_loss", "log_distance"]
+__all__ += [
+    "FloorAttenuation",
+    "estimate_floor_attenuation",
+    "estimate_offsets",
+    "fit_path_loss",
+    "fit_rssi",
+    "fit_shared_path_loss",
+    "log_distance",
+]

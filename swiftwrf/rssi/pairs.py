@@ -25,6 +25,7 @@ from swiftwrf.gp.process import N_NEIGHBOURS, local_weights
 from swiftwrf.models.base import FieldConfig, Prediction
 from swiftwrf.positions import Neighbours, check_positions
 from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiFitContext, RssiPredictor
+from swiftwrf.rssi.floors import FloorAttenuation
 from swiftwrf.rssi.model import LEVEL
 from swiftwrf.rssi.path_loss import MIN_DISTANCE_M, fit_path_loss
 from swiftwrf.runtime import checkpoint as files
@@ -35,7 +36,7 @@ from swiftwrf.runtime.validation import configuration
 
 RATIOS = (0.5, 1.0, 2.0)  # distance that the receiver moves, relative to an equivalent one of the transmitter
 RELATIVE_NOISE_VARIANCES = (0.03, 0.1, 0.3, 1.0, 3.0)  # variance of a measurement relative to that of the field
-MAX_HELD_OUT = 500  # pairs that choose the kernel; more do not change it
+MAX_HELD_OUT = 300  # pairs that choose the kernel; more hardly change it
 PAIRS_AT_ONCE = 2048  # each needs a matrix of 64 x 64
 
 
@@ -135,7 +136,8 @@ class PairPredictor(RssiPredictor):
         if len(ends[0]) != len(ends[1]):
             raise InputError(f"each pair needs two positions, got {len(ends[0])} and {len(ends[1])}")
         with torch.set_grad_enabled(torch.is_grad_enabled() and any(end.requires_grad for end in ends)):
-            return Prediction(*self._batches(torch.cat(ends, dim=1)))
+            mean, std = self._batches(torch.cat(ends, dim=1))
+        return Prediction(mean if self.attenuation is None else mean + self.attenuation.between(*ends).to(mean), std)
 
 
 class Metric(NamedTuple):
@@ -258,6 +260,7 @@ class PairModel(PairPredictor, Saved):
             "options": asdict(self.config),
             "origin": self.origin,
             "offsets": self.offsets and asdict(self.offsets),
+            "attenuation": self.attenuation and asdict(self.attenuation),
             "receiver_names": self.receiver_names,
             "metric": self.metric,
             "kernel": asdict(self.kernel),
@@ -269,6 +272,7 @@ class PairModel(PairPredictor, Saved):
         model = cls(from_plain(PairConfig, header["options"]))
         model.receiver_names = tuple(map(str, header["receiver_names"]))
         model.origin = GeodeticOrigin(*map(float, header["origin"])) if header.get("origin") else None
+        model.attenuation = FloorAttenuation.from_plain(header.get("attenuation"))
         model.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
         ratio, reciprocal = header["metric"]
         model.metric, model.kernel = Metric(float(ratio), bool(reciprocal)), Kernel(**header["kernel"])

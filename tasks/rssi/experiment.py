@@ -80,7 +80,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         metrics: RssiMetrics = {
             "task": "rssi",
             "data": data.name,
-            "notes": notes,
+            "notes": [*notes, *tables.notes()],
             "split": config.split,
             "preset": config.preset,
             "seed": config.seed,
@@ -92,7 +92,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             "model": tables.model,
             "seconds": tables.seconds[tables.model],
             "interval": {"nominal": LEVEL, "coverage": tables.coverage},
-            "chosen": {"n_primitives": tables.n_primitives},
+            "chosen": {"n_primitives": tables.n_primitives, "floor_attenuation_db": tables.floor_attenuation_db},
         }
         final = directory.finish(metrics, reporting(page))
     terminal.answer(answer(Records(final)), final / "report.html")
@@ -147,6 +147,7 @@ class _Tables:
         self.seconds: dict[str, PredictorSeconds] = {}
         self.coverage = float("nan")
         self.n_primitives = 0
+        self.floor_attenuation_db: float | None = None
         self.model = PairModel.name if train.receiver_moves else RssiModel.name
         self.detected = ~test.rssi_dbm.isnan()
         self.row, column = self.detected.nonzero(as_tuple=True)
@@ -181,6 +182,7 @@ class _Tables:
                 assert isinstance(predictor, RssiModel | PairModel)
                 predictor.save(self.directory.path(MODEL))
                 self._write_maps(predictor)
+                result["floor_attenuation_db"] = predictor.attenuation and predictor.attenuation.db
             std = None if prediction.std is None else prediction.std[self.detected]
             return result | {"predicted": prediction.mean[self.detected], "std": std}
 
@@ -199,6 +201,7 @@ class _Tables:
         )
         self.n_primitives = value.get("n_primitives", self.n_primitives)
         if name == self.model:
+            self.floor_attenuation_db = value.get("floor_attenuation_db")
             self._add_predictions(Prediction(predicted, self._spread(value["std"])))
 
     def _spread(self, values: list[float]) -> torch.Tensor:
@@ -232,7 +235,10 @@ class _Tables:
             for a, b in zip(low[:2], high[:2], strict=True)
         )
         grid = torch.stack([*torch.meshgrid(xs, ys, indexing="xy")], dim=-1).reshape(-1, 2)
-        prediction = model.predict(torch.cat([grid, position[:, 2].median().expand(len(grid), 1)], dim=1))
+        height = position[:, 2].median()
+        if self.train.floors is not None:  # the floor with most measurements, since the median may be between two
+            height = torch.tensor(self.train.floors.height_m)[self.train.floors.number(position).mode().values]
+        prediction = model.predict(torch.cat([grid, height.double().expand(len(grid), 1)], dim=1))
         lower, upper = prediction.interval(LEVEL)
         predicted, width = (x.T.reshape(-1, len(ys), len(xs)).numpy() for x in (prediction.mean, upper - lower))
         maps = {
@@ -248,6 +254,11 @@ class _Tables:
         if self.train.origin is not None:
             maps["origin"] = np.array(self.train.origin)
         self.directory.write_npz("maps.npz", maps | self.plan)
+
+    def notes(self) -> list[str]:
+        """Return a note on the attenuation of floors, if there are any."""
+        db, floors = self.floor_attenuation_db, self.train.floors
+        return [] if db is None or floors is None else [f"each of the {len(floors.names)} floors takes {db:.1f} dB"]
 
     def overall(self) -> dict[str, PredictorMetrics]:
         """Return the entries of each method for metrics.json."""

@@ -68,6 +68,7 @@ class SurveyTable(Format[Rssi]):
             origin=survey.origin,
             groups=Groups.of(options.offset_by, survey.group) if options.offset_by else None,
             labels=survey.labels,
+            floors=survey.floors,
             receiver_moves=survey.receiver_moves,
             index=survey.row,
             named_splits=kept_splits(splits, torch.from_numpy(survey.row), survey.n_rows),

@@ -25,6 +25,7 @@ from tasks.rssi.predictors.path_loss import Mean, ReceiverPathLoss
 # scikit-learn's own choice for many neighbours computes distances from squares and a product, which cancel map coordinates
 NEIGHBOUR_SEARCH = "kd_tree"
 NEIGHBOUR_COUNTS = (1, 3, 5, 8, 12, 20, 40, 80, 120)
+FLOOR_STRETCH = 5.0  # of heights where there are floors, so that neighbours are on one floor
 MAX_TUNING_ROWS, MAX_GP_ROWS = 500, 1500  # the cost of the Gaussian process grows with their cube
 
 
@@ -50,7 +51,8 @@ class ReceiverRegressors(RssiPredictor):
         if self._simpler is not None:
             residual = residual - self._simpler.predict(train.transmitter_position).mean
         fold = folds(train.transmitter_position, self.config.validation, self.config.seed).numpy()
-        position = train.transmitter_position.numpy()
+        self._scale = torch.tensor([1.0, 1.0, FLOOR_STRETCH if train.floors else 1.0], dtype=torch.float64)
+        position = (train.transmitter_position * self._scale).numpy()
         mean = float(residual.nanmean())
 
         def fit(values: NDArray[Any]) -> Any:
@@ -70,7 +72,7 @@ class ReceiverRegressors(RssiPredictor):
     def _predict(self, position: Tensor) -> tuple[Tensor, None]:
         if not len(position):  # scikit-learn refuses it
             return torch.zeros(0, len(self._regressors), dtype=torch.float64), None
-        x = position.detach().numpy()
+        x = (position.detach() * self._scale).numpy()
         predicted = torch.from_numpy(np.stack([regressor.predict(x) for regressor in self._regressors], axis=1))
         return predicted if self._simpler is None else predicted + self._simpler.predict(position.detach()).mean, None
 
