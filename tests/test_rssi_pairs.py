@@ -216,7 +216,7 @@ def test_whole_run_at_new_places(tmp_path, monkeypatch):
     assert set(errors.receiver) == {name for name, e in metrics["receivers"].items() if e["pairs"]["abs_error_db"]["n"]}
     assert errors.receiver.nunique() == 2
     assert isinstance(swiftwrf.load(tmp_path / "run" / "model.safetensors"), PairModel)
-    assert "the errors of `pairs`" in (tmp_path / "run" / "report.html").read_text()
+    assert "the errors of pairs" in (tmp_path / "run" / "report.html").read_text()
 
 
 @pytest.mark.data

@@ -57,7 +57,10 @@ class Kernel:
         if self.vertical != 1:
             scale = a.new_tensor([1.0, 1.0, self.vertical])
             a, b = a * scale, b * scale
-        r = distance(a, b)
+        return self.at(distance(a, b))
+
+    def at(self, r: Tensor) -> Tensor:
+        """Return k at distances of any shape."""
         if self.share == 1:
             return torch.exp(-r / self.long)
         near = math.sqrt(3) * r / self.short

@@ -126,14 +126,20 @@ class GaussianProcess:
         """Return row numbers (m, k), weights (m, k) and posterior variance (m,) from the nearest positions."""
         position = position.to(self.known)
         number = self._neighbours(position, min(N_NEIGHBOURS, len(self.known)))[1].to(self.known.device)
-        return number, *local_weights(self.kernel, self.known[number], position)
+        near = self.known[number]
+        cross = self.kernel(position[:, None], near)[:, 0]
+        return number, *local_weights(self.kernel(near, near), cross, self.kernel.noise)
 
 
-def local_weights(kernel: Kernel, near: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
-    """Return weights (m, k) and posterior variance (m,) at positions (m, d) from k values near each of them (m, k, d)."""
-    noisy = kernel(near, near) + kernel.noise * torch.eye(near.shape[1]).to(near)
-    cross = kernel(position[:, None], near)[:, 0]
-    weight = torch.linalg.solve(noisy, cross)
+def local_weights(covariance: Tensor, cross: Tensor, noise: float) -> tuple[Tensor, Tensor]:
+    """Return weights (m, k) and posterior variance (m,) from the k values near each of m positions.
+
+    Args:
+        covariance: Covariance of the values without noise, (m, k, k).
+        cross: Covariance of the values and the field at the positions, (m, k).
+        noise: Variance of the noise.
+    """
+    weight = torch.linalg.solve(covariance + noise * torch.eye(cross.shape[1]).to(cross), cross)
     return weight, (1 - (weight * cross).sum(dim=1)).clamp(0, 1)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import asdict
+from itertools import groupby
 from statistics import NormalDist
 from typing import ClassVar, NamedTuple, Self
 
@@ -23,7 +24,7 @@ from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, candidates
 from swiftwrf.gp.process import N_NEIGHBOURS, local_weights
 from swiftwrf.models.base import FieldConfig, Prediction
-from swiftwrf.positions import Neighbours, check_positions
+from swiftwrf.positions import Neighbours, check_positions, distance
 from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiFitContext, RssiPredictor
 from swiftwrf.rssi.floors import FloorAttenuation
 from swiftwrf.rssi.model import LEVEL
@@ -36,7 +37,7 @@ from swiftwrf.runtime.validation import configuration
 
 RATIOS = (0.5, 1.0, 2.0)  # distance that the receiver moves, relative to an equivalent one of the transmitter
 RELATIVE_NOISE_VARIANCES = (0.03, 0.1, 0.3, 1.0, 3.0)  # variance of a measurement relative to that of the field
-MAX_HELD_OUT = 300  # pairs that choose the kernel; more hardly change it
+MAX_HELD_OUT = 500  # pairs that choose the kernel; more do not change it
 PAIRS_AT_ONCE = 2048  # each needs a matrix of 64 x 64
 
 
@@ -221,24 +222,28 @@ class PairModel(PairPredictor, Saved):
 
     def _judged(self, metric: Metric, fold: Tensor, sample: Tensor) -> list[tuple[float, Metric, Kernel, Tensor]]:
         """Return kernels with their mean absolute error at held-out pairs, and the errors by their relative deviations."""
-        parts = []
+        n_near = min(N_NEIGHBOURS, int((fold[:, None] != fold.unique()).sum(dim=0).min()))
+        between, across, value, residual = [], [], [], []
         for number in fold[sample].unique():
             out, kept = sample[fold[sample] == number], fold != number
-            known, value = metric.known(self.pair[kept]), metric.values(self.residual[kept])
-            query = metric.coordinates(self.pair[out])
-            near = Neighbours(known)(query, min(N_NEIGHBOURS, len(known)))[1]
-            parts.append((query, known[near], value[near], self.residual[out]))
+            known, query = metric.known(self.pair[kept]), metric.coordinates(self.pair[out])
+            near = Neighbours(known)(query, n_near)[1]
+            between.append(distance(known[near], known[near]))
+            across.append(distance(query[:, None], known[near])[:, 0])
+            value.append(metric.values(self.residual[kept])[near])
+            residual.append(self.residual[out])
+        r_between, r_across, values, truth = (torch.cat(parts) for parts in (between, across, value, residual))
+        # rough fields only, as in the model of each receiver
+        kernels = [k for k in candidates(metric.coordinates(self.pair), RELATIVE_NOISE_VARIANCES) if k.share == 1]
         judged = []
-        for kernel in candidates(metric.coordinates(self.pair), RELATIVE_NOISE_VARIANCES):
-            if kernel.share < 1:  # rough fields only, as in the model of each receiver
-                continue
-            errors, deviations = [], []
-            for query, near, value, residual in parts:
-                weight, variance = local_weights(kernel, near, query)
-                errors.append((residual - (weight * value).sum(dim=1)).abs())
-                deviations.append((variance + kernel.noise).sqrt())
-            error = torch.cat(errors)
-            judged.append((float(error.mean()), metric, kernel, error / torch.cat(deviations)))
+        for long, alike in groupby(sorted(kernels, key=lambda kernel: kernel.long), key=lambda kernel: kernel.long):
+            shape = Kernel(long=long, share=1.0)
+            covariance, cross = shape.at(r_between), shape.at(r_across)
+            for kernel in alike:
+                weight, variance = local_weights(covariance, cross, kernel.noise)
+                error = (truth - (weight * values).sum(dim=1)).abs()
+                score = error / (variance + kernel.noise).sqrt()
+                judged.append((float(error.mean()), metric, kernel, score))
         return judged
 
     def _path_loss(self, pair: Tensor) -> Tensor:

@@ -59,7 +59,7 @@ def model_of(run: RssiRecords) -> str:
 
 def title(run: RssiRecords) -> str:
     """Return the name of that predictor in sentences."""
-    return {"swiftwrf": "SwiftWRF"}.get(model_of(run), f"`{model_of(run)}`")
+    return {"swiftwrf": "SwiftWRF"}.get(model_of(run), model_of(run))
 
 
 def best_baseline(run: RssiRecords) -> str:

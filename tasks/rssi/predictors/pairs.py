@@ -17,4 +17,6 @@ class PairKNN(PairPredictor):
         self._regressor = choose_neighbours(pair.numpy(), rssi.numpy(), fold.numpy())
 
     def _at_pairs(self, pair: Tensor) -> tuple[Tensor, None]:
+        if not len(pair):  # scikit-learn refuses it
+            return pair.new_zeros(0), None
         return from_numpy(self._regressor.predict(pair.detach().numpy())), None
