@@ -93,6 +93,7 @@ def test_names_of_places_with_their_positions_beside(tmp_path):
     data = load_rssi(tmp_path, transmitter=["router"])
     assert data.receiver_moves
     assert data.receiver_names == tuple(places.receiver)
+    assert "both ends move; 12 positions of column router count as receivers" in data.notes
     np.testing.assert_allclose(data.receiver_position[:, :2], places[["x", "y"]])
     places[1:].to_csv(tmp_path / "receivers.csv", index=False)
     with pytest.raises(InputError, match="must contain each of them"):

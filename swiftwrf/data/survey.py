@@ -196,6 +196,8 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
     groups = group.to_numpy()[source.max(axis=1)[row]].tolist() if options.offset_by else []
     labels = tuple(name for name in unused if _distinguishes(table[name]))
     moves = bool(end or options.transmitter)
+    if moves and not end:
+        notes.append(f"both ends move; {len(names)} positions of column {options.transmitter[0]} count as receivers")
     return Survey(names, rssi, position, row, len(omitted), origin, groups, labels, floors, moves, places, tuple(notes))
 
 

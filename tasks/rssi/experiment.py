@@ -36,7 +36,7 @@ from tasks.terminal import console, terminal
 
 MODEL = "model.safetensors"
 MAP_CELLS = 80  # along the longer side of the floor
-MAX_MAP_VALUES = 200_000  # of all maps together
+MAX_PAIR_CELLS = 60_000  # of all maps together: each needs a system of 64 equations
 MAX_PLAN_PIXELS = 2**24
 
 
@@ -228,7 +228,9 @@ class _Tables:
         shown = torch.cat([position, self.test.transmitter_position])
         shown = torch.cat([shown, self.train.receiver_position[self.train.receiver_located]])
         low, high = shown.min(dim=0).values, shown.max(dim=0).values
-        n_cells = min(MAP_CELLS, math.isqrt(MAX_MAP_VALUES // len(self.train.receiver_names)))
+        n_cells = MAP_CELLS
+        if isinstance(model, PairModel):
+            n_cells = min(n_cells, math.isqrt(MAX_PAIR_CELLS // len(self.train.receiver_names)))
         cell = float((high - low)[:2].max()) / n_cells or 1.0
         xs, ys = (
             torch.arange(float(a), float(b) + cell, cell, dtype=torch.float64)
