@@ -70,6 +70,7 @@ def estimate_floor_attenuation(train: Rssi, pool: Rssi | None = None) -> FloorAt
         pool: The same rows at more receivers, which determine the attenuation. Defaults to `train`.
 
     Example:
+        >>> import pandas as pd
         >>> table = pd.DataFrame({"x": [0.0, 5, 9] * 4, "y": 0.0, "floor": [0] * 6 + [1] * 6})
         >>> table["hall"] = [-50.0, -60, -64] * 2 + [-65.0, -75, -79] * 2
         >>> round(estimate_floor_attenuation(Rssi.from_frame(table)).db, 1)
