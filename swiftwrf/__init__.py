@@ -26,7 +26,7 @@ with lazy_imports(globals()):
     from swiftwrf.models.prediction import Prediction
     from swiftwrf.models.swiftwrf import FitConfig, ModelConfig, SwiftWRF, fit
     from swiftwrf.rasterize import rasterize, rasterize_magnitude
-    from swiftwrf.rssi import RssiConfig, RssiModel, fit_rssi
+    from swiftwrf.rssi import PairModel, RssiConfig, RssiModel, fit_rssi
     from swiftwrf.runtime.checkpoint import load
 
 __all__ = [
@@ -43,6 +43,7 @@ __all__ = [
     "InputError",
     "MatchedField",
     "ModelConfig",
+    "PairModel",
     "Posterior",
     "Prediction",
     "Rssi",

@@ -13,6 +13,7 @@ from swiftwrf.errors import InputError
 
 FARTHEST = 1e15
 FAR = 1e6  # normalised: beyond, all is equally far, and float32 must not overflow
+BISECTIONS = 20  # of the edge of cells, which find it to a millionth of the extent
 MANY = 2000  # known positions from which on a tree finds the nearest ones faster than all distances do
 
 
@@ -57,6 +58,26 @@ def distance(a: Tensor, b: Tensor) -> Tensor:
     would give weights of inf / inf.
     """
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist").clamp(max=FARTHEST)
+
+
+def cells(position: Tensor, n: int) -> tuple[Tensor, float]:
+    """Return the number of the cell of each position (m, 3), int64 (m,), with at most n cells, and the edge of the cells.
+
+    Each distinct position is a cell, with edge 0, unless there are more than n. Then cells are the cubes of a grid.
+    """
+    spot = torch.unique(position, dim=0, return_inverse=True)[1]
+    if int(spot.max()) < n:
+        return spot, 0.0
+    local = position - position.min(dim=0).values
+    fine, coarse, found = 0.0, float(local.max()), torch.zeros(len(position), dtype=torch.int64)
+    for _ in range(BISECTIONS):
+        edge = (fine + coarse) / 2
+        number = torch.unique((local / edge).floor().long(), dim=0, return_inverse=True)[1]
+        if int(number.max()) < n:
+            coarse, found = edge, number
+        else:
+            fine = edge
+    return found, coarse
 
 
 class Neighbours:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,19 +25,30 @@ from tasks.terminal import console
 
 def reading(config: SpectraSource | TableSource) -> ReadOptions:
     """Return the options of a command line for reading."""
-    array = beamformer = grid = every = station = columns = filler = coordinates = offset_by = None
-    drop_null = round_trip = False
+    options = ReadOptions()
     if isinstance(config, SpectraSource):
-        array, beamformer, every, station = _array(config), config.beamformer, config.every, config.station
-        grid = AngularGrid.hemisphere(*config.grid) if config.grid else None
-        drop_null, round_trip = config.drop_null, config.round_trip
+        options = replace(
+            options,
+            array=_array(config),
+            beamformer=config.beamformer,
+            grid=AngularGrid.hemisphere(*config.grid) if config.grid else None,
+            every=config.every,
+            station=config.station,
+            drop_null=config.drop_null,
+            round_trip=config.round_trip,
+        )
     if isinstance(config, TableSource):
-        columns, filler, coordinates = config.column_names, config.fillers, config.coordinates
+        options = replace(
+            options,
+            columns=config.column_names,
+            filler=config.fillers,
+            coordinates=config.coordinates,
+            transmitter=config.transmitter,
+            pool_by=config.pool_by,
+        )
     if isinstance(config, OffsetSource) and config.offset_by is not None:
-        offset_by = config.offset_by.partition("=")[0]
-    return ReadOptions(
-        array, beamformer, grid, every, station, columns, filler, coordinates, offset_by, drop_null, round_trip
-    )
+        options = replace(options, offset_by=config.offset_by.partition("=")[0])
+    return options
 
 
 def _array(config: SpectraSource) -> PlanarArray | None:

@@ -10,9 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from swiftwrf.data.columns import GEODETIC, column_of, column_of_numbers
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.files import MAX_COORDINATE_M
-from swiftwrf.data.survey import GEODETIC, column_of, column_of_numbers, read_frame
+from swiftwrf.data.survey import read_frame
 from swiftwrf.errors import InputError, listed
 
 MAX_FROM_ORIGIN_DEG = 2.0  # of receivers in degrees

@@ -64,8 +64,7 @@ class GaussianProcess:
         if self.exact:
             mean: Tensor = self.kernel(position.double(), self.known).to(self.coefficient) @ self.coefficient
             return mean
-        number, weight, _ = self._local(position)
-        return torch.einsum("mk,mkc->mc", weight, self.coefficient[number].double())
+        return self.local(position)[0]
 
     def weights(self, position: Tensor) -> tuple[Tensor, Tensor]:
         """Return the posterior mean at positions (m, 3) as a linear function of the values.
@@ -117,15 +116,31 @@ class GaussianProcess:
     def _neighbours(self) -> Neighbours:
         return Neighbours(self.known)
 
+    def local(self, position: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean (m, K) and variance (m,) at positions from the nearest known ones, whatever their number."""
+        assert self.coefficient is not None
+        number, weight, variance = self._local(position)
+        return torch.einsum("mk,mkc->mc", weight, self.coefficient[number].double()), variance
+
     def _local(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return row numbers (m, k), weights (m, k) and posterior variance (m,) from the nearest positions."""
         position = position.to(self.known)
         number = self._neighbours(position, min(N_NEIGHBOURS, len(self.known)))[1].to(self.known.device)
         near = self.known[number]
-        noisy = self.kernel(near, near) + self.kernel.noise * torch.eye(number.shape[1]).to(near)
         cross = self.kernel(position[:, None], near)[:, 0]
-        weight = torch.linalg.solve(noisy, cross)
-        return number, weight, (1 - (weight * cross).sum(dim=1)).clamp(0, 1)
+        return number, *local_weights(self.kernel(near, near), cross, self.kernel.noise)
+
+
+def local_weights(covariance: Tensor, cross: Tensor, noise: float) -> tuple[Tensor, Tensor]:
+    """Return weights (m, k) and posterior variance (m,) from the k values near each of m positions.
+
+    Args:
+        covariance: Covariance of the values without noise, (m, k, k).
+        cross: Covariance of the values and the field at the positions, (m, k).
+        noise: Variance of the noise.
+    """
+    weight = torch.linalg.solve(covariance + noise * torch.eye(cross.shape[1]).to(cross), cross)
+    return weight, (1 - (weight * cross).sum(dim=1)).clamp(0, 1)
 
 
 def dense_weights(number: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:

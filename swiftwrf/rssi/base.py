@@ -6,7 +6,7 @@ import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -20,6 +20,7 @@ from swiftwrf.errors import InputError
 from swiftwrf.models.base import FieldConfig, FitContext
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import check_positions
+from swiftwrf.rssi.floors import FloorAttenuation, estimate_floor_attenuation, receiver_floors
 from swiftwrf.runtime.options import Configured
 from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.threads import side_by_side
@@ -46,6 +47,8 @@ class RssiFitContext(FitContext):
 
 class RssiPredictor(Configured, ABC):
     """Base class of all predictors of RSSI at fixed receivers from the position of the transmitter.
+
+    If the data have floors, `fit` removes the attenuation of those between transmitter and receiver, and `predict` adds it.
 
     A subclass sets `name` and `config_type`, and implements `_fit` and `_predict`. Options are keyword arguments of the
     constructor; `config_type` declares their ranges.
@@ -78,6 +81,13 @@ class RssiPredictor(Configured, ABC):
 
     receiver_names: tuple[str, ...]
     """names of the receivers, set by `fit`"""
+    attenuation: FloorAttenuation | None = None
+    """attenuation of the floors between transmitter and receiver, set by `fit` if the data have floors"""
+
+    @classmethod
+    def compared(cls, data: Rssi) -> bool:
+        """Return whether the predictor is compared on these data without a request."""
+        return not cls.slow
 
     @classmethod
     def lacking(cls, data: Rssi) -> str:
@@ -119,6 +129,11 @@ class RssiPredictor(Configured, ABC):
         check_training(train, pool)
         if lacking := self.lacking(train):
             raise InputError(lacking)
+        self.attenuation = None
+        if train.floors is not None:
+            self.attenuation = estimate_floor_attenuation(train, pool)
+            pool = replace(self.attenuation, receiver_floor=tuple(receiver_floors(pool).tolist())).removed(pool)
+            train = self.attenuation.removed(train)
         where = torch.device(device)
         context = RssiFitContext(None, where, checkpoint, on_record, progress, pool=pool, parallel=parallel)
         self._fit(train, context)
@@ -152,8 +167,15 @@ class RssiPredictor(Configured, ABC):
         with torch.set_grad_enabled(torch.is_grad_enabled() and position.requires_grad):
             parts = [self._predict(some) for some in position.split(self.batch_size)]
         stds = [std for _, std in parts if std is not None]
-        mean, std = torch.cat([mean for mean, _ in parts]), torch.cat(stds) if stds else None
+        mean = torch.cat([mean for mean, _ in parts])
+        if self.attenuation is not None:
+            mean = mean + self.attenuation.of(position).to(mean)
+        std = torch.cat(stds) if stds else None
         return Prediction(mean, std, position, receiver_names=self.receiver_names)
+
+    def predict_detected(self, data: Rssi) -> Prediction:
+        """Predict the RSSI at least where it is measured, with shapes of `predict` at the positions of the data."""
+        return self.predict(data.transmitter_position)
 
     def check_fitted(self) -> None:
         """Raise InputError if the predictor is not fitted."""

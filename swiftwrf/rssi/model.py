@@ -26,6 +26,7 @@ from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, thinned
 from swiftwrf.rssi.base import Map, RssiFitContext, RssiPredictor, fingerprint, map_threads
 from swiftwrf.rssi.config import RssiConfig
+from swiftwrf.rssi.floors import FloorAttenuation
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.paper_head import HELD_OUT_FOLD, learn_receivers
 from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
@@ -193,6 +194,7 @@ class RssiModel(RssiPredictor, Saved):
             "options": asdict(self.config),
             "origin": self.origin,
             "offsets": self.offsets and asdict(self.offsets),
+            "attenuation": self.attenuation and asdict(self.attenuation),
             "receiver_names": self.receiver_names,
             "n_primitives": self.n_primitives,
             "kernel": asdict(self.kernel),
@@ -204,6 +206,7 @@ class RssiModel(RssiPredictor, Saved):
         model = cls(from_plain(RssiConfig, header["options"]))
         model.receiver_names = tuple(map(str, header["receiver_names"]))
         model.origin = GeodeticOrigin(*map(float, header["origin"])) if header.get("origin") else None
+        model.attenuation = FloorAttenuation.from_plain(header.get("attenuation"))
         model.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
         model.n_primitives, model.kernel = int(header["n_primitives"]), Kernel(**header["kernel"])
         shapes = _shapes(len(model.receiver_names), len(tensors["anchor"]))

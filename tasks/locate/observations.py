@@ -12,10 +12,11 @@ from torch import Tensor
 
 from swiftwrf import InputError, Rssi, Spectra, load
 from swiftwrf.data import ReadOptions
+from swiftwrf.data.columns import column_of
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.formats import RSSI_FORMATS, read
 from swiftwrf.data.store import Store
-from swiftwrf.data.survey import SUFFIXES, column_of, first_rows, has_positions, read_frame
+from swiftwrf.data.survey import SUFFIXES, first_rows, has_positions, read_frame
 from swiftwrf.errors import listed
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
 from swiftwrf.locate.track import joined
@@ -104,7 +105,9 @@ def read_rssi(source: str, options: ReadOptions) -> tuple[Rssi, bool]:
         if not has_positions(frame, options.columns or {}):
             somewhere = frame.assign(x=0.0, y=0.0, z=0.0)
             columns, filler, offset_by = options.columns, options.filler, options.offset_by
-            data = Rssi.from_frame(somewhere, columns=columns, filler=filler, offset_by=offset_by, name=file.stem)
+            data = Rssi.from_frame(
+                somewhere, columns=columns, filler=filler, offset_by=offset_by, pool_by=options.pool_by, name=file.stem
+            )
             return data, False
     return read(located(source), options, RSSI_FORMATS), True
 
