@@ -95,8 +95,8 @@ class GaussianProcess:
         root = torch.linalg.solve_triangular(self._factor, cross.T, upper=False)  # (n, k)
         corner = torch.linalg.cholesky(self.kernel.covariance(position) - root.T @ root)
         new = torch.cholesky_solve(value.double() - cross @ coefficient, corner)
-        explained = torch.linalg.solve_triangular(self._factor.T, root @ new, upper=True)
-        coefficient = torch.cat([coefficient - explained, new]).to(self.coefficient)
+        weight = torch.linalg.solve_triangular(self._factor.T, root, upper=True)
+        coefficient = torch.cat([coefficient - weight @ new, new]).to(self.coefficient)
         process = GaussianProcess(self.kernel, known, coefficient, self._asked_exact, correlation)
         factor = corner.new_zeros(len(known), len(known))
         factor[:n, :n], factor[n:, :n], factor[n:, n:] = self._factor, root.T, corner

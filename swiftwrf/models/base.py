@@ -22,6 +22,7 @@ from swiftwrf.positions import check_positions
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.options import Configured, Preset, from_plain
 from swiftwrf.runtime.session import Record
+from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import NonNegativeInt, checked, configuration
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ class FieldModel(Configured, Saved):
     slow: ClassVar[bool] = False
     """whether a fit takes minutes, so that it is compared only on request"""
     updates: ClassVar[bool] = False
-    """whether `update`, `forget` and `aged` are available; other models must be fitted again"""
+    """whether `update` is available; other models must be fitted again"""
     any_grid: ClassVar[bool] = False
     """whether `predict` takes other grids than that of the training spectra"""
     batch: ClassVar[int] = 64
@@ -177,10 +178,12 @@ class FieldModel(Configured, Saved):
             raise
         return self
 
+    @single_thread()
     def update(self, new: Spectra) -> Self:
         """Return the model with more training spectra, by an update of its factorisation. This model stays as it is.
 
-        The result equals a fit to all spectra with the same kernel, noise and components.
+        The result equals a fit to all spectra with the same kernel, noise and components. The planes of a room are refined
+        and not searched, which needs 10 new positions.
 
         Args:
             new: Spectra of the same scene on the grid of the training spectra, any number.
@@ -195,7 +198,7 @@ class FieldModel(Configured, Saved):
             >>> model.update(data.subset(torch.arange(40, 50))).process.known.shape
             torch.Size([50, 3])
         """
-        model = self._updatable("updated with new spectra")
+        model = self._copy()
         if new.grid != self.grid:
             raise InputError(f"{new.name} has another grid than the training spectra; give spectra of {self.grid.shape}")
         check_spectra(new)
@@ -213,7 +216,7 @@ class FieldModel(Configured, Saved):
         Raises:
             InputError: A model that must be fitted again, or a number outside the range.
         """
-        model = self._updatable("fitted without some spectra")
+        model = self._copy()
         model._forget(rows)
         return model
 
@@ -228,28 +231,26 @@ class FieldModel(Configured, Saved):
         """
         if not 0 < correlation <= 1:
             raise InputError(f"correlation must be above 0 and at most 1, got {correlation}")
-        model = self._updatable("aged")
+        model = self._copy()
         model._age(correlation)
         return model
 
-    def _updatable(self, what: str) -> Self:
-        """Return a copy that shares all tensors, to be changed."""
+    def _copy(self) -> Self:
+        """Return a copy that shares all tensors."""
         self._checked_grid(None)
-        if not self.updates:
-            raise InputError(f"a {self.kind} cannot be {what}; it must be fitted again")
         return copy(self)
 
     def _update(self, new: Spectra) -> None:
         """Add checked spectra to this copy."""
-        raise NotImplementedError
+        raise InputError(f"a {self.kind} cannot be updated; fit it again to all spectra")
 
     def _forget(self, rows: Tensor) -> None:
         """Remove training spectra from this copy."""
-        raise NotImplementedError
+        raise InputError(f"a {self.kind} cannot forget single spectra; fit it again to the others")
 
     def _age(self, correlation: float) -> None:
         """Lower the weight of the training spectra of this copy."""
-        raise NotImplementedError
+        raise InputError(f"a {self.kind} cannot weigh earlier spectra less; fit it again to the new ones")
 
     @abstractmethod
     def _fit(self, train: Spectra, context: FitContext) -> None:

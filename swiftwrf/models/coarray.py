@@ -177,9 +177,9 @@ class CoarrayModel(ProcessModel):
         functions, inverse = basis(self.array, self.grid, torch.float32), _inverse(self.array, self.grid).float()
         spectrum = new.store[:]
         offset = _offset(spectrum.flatten(1), functions, inverse)
-        mean, component = self.component[0].flatten(), self.component[1:].flatten(1)
-        change = _coarse(Store(spectrum + offset[..., None])).flatten(1) - mean
-        score = torch.linalg.lstsq(component.T.double(), change.T.double()).solution.T
+        component = self.component[1:].flatten(1).double()
+        change = (_coarse(Store(spectrum + offset[..., None])) - self.component[0]).flatten(1).double()
+        score = torch.linalg.solve(component @ component.T, component @ change.T).T
         return torch.cat([score, (offset - self.offset).double()], dim=1)
 
     def _spectra(self, score: Tensor, grid: AngularGrid) -> Tensor:

@@ -15,7 +15,7 @@ from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext, bounding_box
-from swiftwrf.models.geometry.fit import MAX_ORDER, GeometryConfig, refine_room, search_room
+from swiftwrf.models.geometry.fit import MAX_ORDER, GeometryConfig, refine_room, search_room, update_room
 from swiftwrf.models.geometry.images import PhaseObservations, image_gain, images
 from swiftwrf.models.geometry.planes import Plane, PlaneSet, RoomEstimate
 from swiftwrf.models.geometry.sample import Residual, sample_field
@@ -45,6 +45,7 @@ class GeometryModel(FieldModel):
     config_type = GeometryConfig
     requires = (ARRAY, FIXED_END)
     samples = True
+    updates = True
     any_grid = True
     batch = 256
 
@@ -111,6 +112,10 @@ class GeometryModel(FieldModel):
         else:
             self.estimate = refine_room(known.estimate, known.tensors(), train, self.config)
         self.fingerprint = owner
+
+    def _update(self, new: Spectra) -> None:
+        if self.planes:
+            self.estimate, self.fingerprint = update_room(self.estimate, self.tensors(), new, self.config), ""
 
     @property
     def room(self) -> GeometryModel:

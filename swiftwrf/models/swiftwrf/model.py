@@ -95,8 +95,8 @@ class SwiftWRF(ProcessModel):
 
     def _values(self, new: Spectra) -> Tensor:
         work = new.at_most(self.config.max_azimuths)
-        mean, *projection = self._cached("projection", work.grid, self.field.projection)
-        return (work.store[:] - mean).flatten(1).double() @ torch.stack(projection).flatten(1).T.double()
+        projection = self._cached("projection", work.grid, self.field.projection)
+        return (work.store[:] - projection[0]).flatten(1) @ projection[1:].flatten(1).T
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         field, x = self.field, self.field.normalise(position)
