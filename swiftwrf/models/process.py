@@ -23,12 +23,20 @@ class ProcessModel(FieldModel):
     process: GaussianProcess
     """process of the values"""
 
+    def expected_error(self, position: Tensor) -> Tensor:
+        """Return the expected error at positions (n, 3) [m] relative to that far from all training positions, (n,)."""
+        return (self.process.variance(self._process_position(position)) + self.process.kernel.noise).sqrt()
+
+    def _process_position(self, position: Tensor) -> Tensor:
+        """Return positions (n, 3) [m] in the frame of the process."""
+        return position
+
     @abstractmethod
     def _values(self, new: Spectra) -> Tensor:
         """Return the values (k, K) of the process that represent spectra."""
 
     def _update(self, new: Spectra) -> None:
-        self.process = self.process.updated(new.position, self._values(new))
+        self.process = self.process.updated(self._process_position(new.position), self._values(new))
 
     def _forget(self, rows: Tensor) -> None:
         n = len(self.process.known)

@@ -177,6 +177,10 @@ class RssiModel(RssiPredictor, Saved):
         self.field_db, self.noise_db = (scale * training.field_db).float(), (scale * training.noise_db).float()
         self._precompute()
 
+    def region(self) -> Tensor:
+        """Return the positions (n, 3) [m] of the location bins."""
+        return self.anchor.double() + self.centre
+
     def _precompute(self) -> None:
         """Compute what all predictions share."""
         self._table = HeadTable(self.rendered)

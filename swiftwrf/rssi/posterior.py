@@ -16,8 +16,9 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
-from scipy.linalg.blas import ssymm
+from scipy.linalg.blas import ssymv
 from torch import Tensor
 from torch.nn import functional
 
@@ -153,7 +154,7 @@ class RssiPosterior:
             whole = self.state.field_variance[r] * slope[:, None] * covariance * slope
             whole.diagonal().add_(variance.where(variance > 0, 1.0))
             factor = torch.linalg.cholesky(whole)
-            inverses.append(torch.cholesky_inverse(factor).float().numpy().T)  # by columns, as BLAS reads it
+            inverses.append(np.asfortranarray(torch.cholesky_inverse(factor).float().numpy()))  # as BLAS reads it
             products.append(torch.cholesky_solve(feature, factor))
             posteriors.append(torch.linalg.inv(torch.eye(feature.shape[1]).double() + feature.T @ products[-1]))
         return inverses, torch.stack(products), torch.stack(posteriors)
@@ -204,10 +205,11 @@ class RssiPosterior:
         inverses, product, posterior = self._base
         scaled = (state.field_variance[:, None] * tangent)[..., None]  # (R, m, 1)
         own = scaled * cross * state.tangent.T[:, None]  # covariances with the bins by the latent field, (R, m, n)
-        white = [torch.from_numpy(ssymm(1.0, p, c.float().numpy().T)).T for p, c in zip(inverses, own, strict=True)]
+        # half of each inverse is read, because its time in memory is most of the time of a row
+        white = [np.stack([ssymv(1.0, p, x, lower=1) for x in c]) for p, c in zip(inverses, own.float().numpy(), strict=True)]
         left = feature * detected[..., None] - own @ product  # regressors that the bins do not explain, (R, m, k)
         gain = left @ posterior
-        influence = torch.stack(white) + (gain @ product.mT).float()
+        influence = torch.from_numpy(np.stack(white)) + (gain @ product.mT).float()
         new = NewRows(
             position=torch.cat([self.new.position, position]),
             error=torch.cat([self.new.error, (rssi - predicted).T.where(detected, 0.0)], dim=1),

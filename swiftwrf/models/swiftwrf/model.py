@@ -90,8 +90,8 @@ class SwiftWRF(ProcessModel):
         self.field = copy(self.field)
         self.field._modules = self.field._modules | {"deformation": deformation}
 
-    def _update(self, new: Spectra) -> None:
-        self.process = self.process.updated(self.field.normalise(new.position), self._values(new))
+    def _process_position(self, position: Tensor) -> Tensor:
+        return self.field.normalise(position)
 
     def _values(self, new: Spectra) -> Tensor:
         work = new.at_most(self.config.max_azimuths)
@@ -109,6 +109,11 @@ class SwiftWRF(ProcessModel):
             mean = field.render(gaussians, len(x), grid)
         scale = field.deformation.unscaled_std(x) if with_std else None
         return mean, None if scale is None else scale[:, None, None] * self._cached("spread", grid, field.spread)
+
+    def region(self) -> Tensor:
+        if not isinstance(self.field.deformation, LowRankDeformation):
+            return super().region()
+        return self.field.deformation.field.anchor.double() * self.field.scale + self.field.centre
 
     def _cached(self, quantity: str, grid: AngularGrid, compute: Callable[[AngularGrid], Tensor]) -> Tensor:
         """Return a quantity of grid, primitives and their basis, from the cache if all are unchanged."""
