@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import fields
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from annotated_types import Ge, Gt, Lt
@@ -106,6 +107,20 @@ class Monitor:
         series[[0, 1 + int(nearest(position[None], self.centre, 1)[1])]] = standard
         self.cusum, alarms = self.cusum.updated(series.flatten(), self.threshold)
         return alarms
+
+    def state(self) -> dict[str, Any]:
+        """Return reference, regions and sums as plain values."""
+        sums = {"value": self.cusum.value.tolist(), "since": self.cusum.since.tolist(), "count": self.cusum.count}
+        return {"reference": self.reference.tolist(), "centre": self.centre.tolist(), "cusum": sums}
+
+    def continued(self, state: dict[str, Any]) -> Monitor:
+        """Return this monitor with the regions and sums of a `state`."""
+        monitor, sums = copy(self), state["cusum"]
+        monitor.reference, monitor.centre = (
+            torch.tensor(state[name], dtype=torch.float64) for name in ("reference", "centre")
+        )
+        monitor.cusum = Cusum(torch.tensor(sums["value"]).double(), torch.tensor(sums["since"]), int(sums["count"]))
+        return monitor
 
     def describe(self, alarm: Alarm) -> str:
         """Return what changed and where, in words."""

@@ -53,8 +53,8 @@ class Boxes:
         """Return boxes on the floor of a room, all over the box around planes, positions and fixed end."""
         corners = torch.cat([room.region(), room.bounds, room.fixed_position[None]])
         low, high = corners.amin(0), corners.amax(0)
-        axes = [torch.arange(float(a), float(b), CELL_M, dtype=torch.float64) + CELL_M / 2 for a, b in zip(low[:2], high[:2])]
-        centre = torch.cartesian_prod(*axes)
+        ends = zip(low[:2].tolist(), high[:2].tolist(), strict=True)
+        centre = torch.cartesian_prod(*(torch.arange(a + CELL_M / 2, b, CELL_M, dtype=torch.float64) for a, b in ends))
         lows, highs = [], []
         for height in HEIGHTS_M:
             floor = low[2].expand(len(centre), 1)
