@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import permutations
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from swiftwrf.data.spectra import Spectra
 from swiftwrf.models.geometry.images import PhaseObservations, images
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.path_gains import paths
+from swiftwrf.models.geometry.planes import PlaneSet
 from swiftwrf.models.geometry.phase_retrieval import correlations, retrieve_phases
 from swiftwrf.online.change import Alarm
 
@@ -86,16 +88,31 @@ def corners(room: GeometryModel, scene: PhaseObservations) -> Tensor:
     size = room.order + 2
     found = [torch.stack([receiver] + [transmitter] * (size - 1), dim=1)]
     for sequence in planes.sequence:
-        point, path = receiver, [receiver]
-        for end in range(len(sequence), 0, -1):
-            towards = images(scene, planes.normal, planes.offset, [sequence[:end]])[0, 0] - point
-            normal, offset = planes.normal[0, sequence[end - 1]], planes.offset[0, sequence[end - 1]]
-            share = (offset - point @ normal) / (towards @ normal)
-            point = point + share.clamp(0, 1)[:, None] * towards
-            path.append(point)
-        path += [transmitter] * (size - len(path))
-        found.append(torch.stack(path, dim=1))
+        target = images(scene, planes.normal, planes.offset, [sequence])[0, 0]
+        path = transmitter[:, None].repeat(1, size, 1)
+        path[:, 0] = receiver
+        # perpendicular planes give one image for both orders of reflection; each link takes the order that it can take
+        for order in sorted(set(permutations(sequence))):
+            if torch.allclose(images(scene, planes.normal, planes.offset, [order])[0, 0], target):
+                point, possible = _reflections(scene, planes, order, receiver)
+                path[possible, 1 : 1 + len(order)] = point[possible]
+        found.append(path)
     return torch.stack(found, dim=1)
+
+
+def _reflections(
+    scene: PhaseObservations, planes: PlaneSet, order: tuple[int, ...], receiver: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the points of reflection in planes, last one first, (n, len(order), 3) [m], and whether the path exists (n,)."""
+    point, points, possible = receiver, [], torch.ones(len(receiver), dtype=torch.bool)
+    for end in range(len(order), 0, -1):
+        towards = images(scene, planes.normal, planes.offset, [order[:end]])[0, 0] - point
+        normal, offset = planes.normal[0, order[end - 1]], planes.offset[0, order[end - 1]]
+        share = (offset - point @ normal) / (towards @ normal)
+        possible &= (share >= 0) & (share <= 1)
+        point = point + share[:, None] * towards
+        points.append(point)
+    return torch.stack(points, dim=1), possible
 
 
 def evidence(scene: PhaseObservations, wave: Tensor, gain: Tensor, base: Tensor, blocked: Tensor) -> Tensor:
@@ -173,20 +190,24 @@ class ObstacleMonitor:
             chosen.append(best)
             base |= blocked[best]
         self.standing = Boxes(self.candidates.low[chosen], self.candidates.high[chosen])
-        touched = ((base | blocked) != base).any(-1)
+        base, alternatives = self._alternatives(point)
+        ratio, touched = evidence(scene, wave, gain, base, alternatives), (alternatives != base).any(-1)
         count = touched.sum(1).clamp_min(1)
         mean = (ratio * touched).sum(1) / count
         std = ((ratio - mean[:, None]).square() * touched).sum(1).div(count).sqrt().clamp_min(MIN_STD_NATS)
-        self.allowance = ALLOWANCE_NATS + (mean + N_ERRORS * std / count.sqrt()).clamp_min(0).where(touched.any(1), 0.0)
-        self.allowance = torch.cat([self.allowance, torch.full((len(chosen),), ALLOWANCE_NATS)])
+        self.allowance = ALLOWANCE_NATS + (mean + N_ERRORS * std / count.sqrt()).clamp_min(0) * touched.any(1)
+
+    def _alternatives(self, point: Tensor) -> tuple[Tensor, Tensor]:
+        """Return which paths with corners (n, S, C, 3) [m] are blocked, bool (n, S), and if each box came or left, (M, n, S)."""
+        came, here = self.candidates.block(point), self.standing.block(point)
+        base = here.any(0)
+        others = [torch.cat([here[:k], here[k + 1 :]]).any(0) for k in range(len(here))]
+        return base, torch.cat([base | came, *(other[None] for other in others)])
 
     def observe(self, new: Spectra) -> list[Alarm]:
         """Add spectra in order; return the alarms, each of the box with the largest sum."""
         scene, wave, gain, point = _links(self.room, new)
-        appeared, here = self.candidates.block(point), self.standing.block(point)
-        base = here.any(0)
-        others = [here[[j for j in range(len(here)) if j != k]].any(0) for k in range(len(here))]
-        alternatives = torch.cat([base | appeared, torch.stack(others) if others else appeared[:0]])
+        base, alternatives = self._alternatives(point)
         touched = (alternatives != base).any(-1)  # (M, n)
         ratio = evidence(scene, wave, gain, base, alternatives) - self.allowance[:, None] * touched
         alarms = []
