@@ -1,4 +1,4 @@
-"""Measure updates: speed, detection of a box that appears in the built-in room, adaptation to it, and walks in their order."""
+"""Measure updates: speed, detection of a box in the built-in room and adaptation to it, and walks in their order."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torch import Tensor
 
 import swiftwrf
 from swiftwrf import AngularGrid, GeometryModel, Rssi, RssiModel, Spectra, rssi_room, simulated_room
-from swiftwrf.data import read_rssi
+from swiftwrf.data import ReadOptions, read_rssi
 from swiftwrf.data.simulated.room import ShoeboxRoom
 from swiftwrf.metrics import psnr
 from swiftwrf.online import ObstacleMonitor, Scores, adapted, prequential, score
@@ -68,9 +68,7 @@ def spectra(config: Config) -> list[dict[str, Any]]:
         new = [data.subset(torch.tensor([n + number])) for number in range(REPEATS)]
         found = milliseconds(lambda number, model=model, new=new: model.update(new[number]))
         process = model.process
-        again = milliseconds(
-            lambda _, process=process: process.regress(process.kernel, process.known, process.value)
-        )
+        again = milliseconds(lambda _, process=process: process.regress(process.kernel, process.known, process.value))
         rows.append({"model": name, "spectra": n, "fit_s": fit, "regression_ms": again["least_ms"], **found})
         print(rows[-1], flush=True)
     return rows
@@ -149,7 +147,7 @@ def unchanged(config: Config) -> list[dict[str, Any]]:
 def tracks(config: Config) -> dict[str, Any]:
     """Measure prequential errors along walks, of a model that learns beside one that does not."""
     assert config.tracks is not None
-    data: Rssi = read_rssi(config.tracks)
+    data: Rssi = read_rssi(config.tracks, ReadOptions())
     n = int(TRACK_TRAINING * len(data))
     new = data.subset(torch.arange(n, len(data)))
     model = RssiModel().fit(data.subset(torch.arange(n)))
@@ -162,7 +160,11 @@ def tracks(config: Config) -> dict[str, Any]:
 
     def summary(scores: Scores) -> dict[str, Any]:
         quarters = [float(part.nanmean()) for part in scores.error.chunk(4)]
-        return {"mae_db": float(scores.error.nanmean()), "quarters_db": quarters, "coverage": float(scores.covered.nanmean())}
+        return {
+            "mae_db": float(scores.error.nanmean()),
+            "quarters_db": quarters,
+            "coverage": float(scores.covered.nanmean()),
+        }
 
     return {
         "name": data.name,

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -21,14 +22,31 @@ from swiftwrf.data.simulated.room import ShoeboxRoom
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.metrics import psnr
 from swiftwrf.models.geometry.planes import Plane
-from swiftwrf.online import Boxes, Cusum, Follower, Monitor, MonitorConfig, ObstacleMonitor
-from swiftwrf.online import adapted, alarm_threshold, prequential, score
+from swiftwrf.online import (
+    Boxes,
+    Cusum,
+    Follower,
+    Monitor,
+    MonitorConfig,
+    ObstacleMonitor,
+    adapted,
+    alarm_threshold,
+    prequential,
+    score,
+)
 from swiftwrf.online.obstacles import corners
 from swiftwrf.testing.rooms import room_with_box
 from tasks.command import main
 
 GRID = AngularGrid.hemisphere(15, 60)
-WALLS = [((-1.0, 0, 0), 0.0), ((1.0, 0, 0), 6.0), ((0, -1.0, 0), 0.0), ((0, 1.0, 0), 5.0), ((0, 0, -1.0), 0.0), ((0, 0, 1.0), 3.0)]
+WALLS = [
+    ((-1.0, 0, 0), 0.0),
+    ((1.0, 0, 0), 6.0),
+    ((0, -1.0, 0), 0.0),
+    ((0, 1.0, 0), 5.0),
+    ((0, 0, -1.0), 0.0),
+    ((0, 0, 1.0), 3.0),
+]
 PLACE = (1.6, 2.4)
 
 
@@ -59,11 +77,11 @@ def test_thresholds_have_the_run_length_of_simulated_series(generator):
     threshold = alarm_threshold(rate)
     lengths = []
     for _ in range(150):
-        value = 0.0
-        for length, z in enumerate(torch.randn(20 * n, generator=generator).tolist(), start=1):
-            value = max(0.0, value + z - 0.5)
-            if value > threshold:
-                break
+        value, length = 0.0, 0
+        series = torch.randn(20 * n, generator=generator).tolist()
+        while value <= threshold and length < len(series):
+            value = max(0.0, value + series[length] - 0.5)
+            length += 1
         lengths.append(length)
     mean = sum(lengths) / len(lengths)
     assert 0.7 / rate < mean < 1.4 / rate
@@ -107,7 +125,8 @@ def test_a_model_adapts_to_a_change():
     after, test = spectra(40, 2, PLACE), spectra(60, 3, PLACE)
     model, correlation = adapted(coarray(), after)
     found, updated, stale = (
-        float(psnr(m.synthesize(test.position), test.spectrum).mean()) for m in (model, coarray().update(after), coarray())
+        float(psnr(m.synthesize(test.position), test.spectrum).mean())
+        for m in (model, coarray().update(after), coarray())
     )
     assert correlation < 0.7
     assert found > updated + 1 > stale + 1
@@ -191,7 +210,13 @@ def follow(model_file, source, out, **options):
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "tasks.update", str(model_file), str(source), "--out", str(out), "--follow"]
     return subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=model_file.parent, **options
+        command,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=model_file.parent,
+        **options,
     )
 
 
@@ -216,11 +241,17 @@ def test_kills_lose_nothing_and_repeat_at_most_the_last_line(tmp_path, model_fil
         time.sleep(wait.uniform(0, 0.3))
         process.send_signal(signal.SIGKILL)
         rest, _ = process.communicate(timeout=60)
-        answered.append([json.loads(line)["measurement"] for line in [first, *rest.splitlines()] if line.endswith("}") or line == first])
+        answered.append(
+            [
+                json.loads(line)["measurement"]
+                for line in [first, *rest.splitlines()]
+                if line.endswith("}") or line == first
+            ]
+        )
         if (out / "model.safetensors").exists():
             assert len(load(out / "model.safetensors").anchor) - 60 in (answered[-1][-1] - 1, answered[-1][-1])
         if answered[-1][-1] >= 38:
             break
-    for before, after in zip(answered, answered[1:], strict=False):
+    for before, after in pairwise(answered):
         assert after[0] - before[-1] in (0, 1)
         assert after == list(range(after[0], after[0] + len(after)))

@@ -200,7 +200,9 @@ class FieldModel(Configured, Saved):
         """
         model = self._copy()
         if new.grid != self.grid:
-            raise InputError(f"{new.name} has another grid than the training spectra; give spectra of {self.grid.shape}")
+            raise InputError(
+                f"{new.name} has another grid than the training spectra; give spectra of {self.grid.shape}"
+            )
         check_spectra(new)
         if len(new):
             model.bounds = bounding_box(torch.cat([self.bounds, new.position]))

@@ -116,7 +116,7 @@ class CoarrayModel(ProcessModel):
     form: Tensor
     """quadratic form from scores, after a 1, to coefficients, float32 (1 + 2 P, K + 1, K + 1)"""
     component: Tensor | None
-    """mean magnitude, then its components, averaged to few pixels, float32 (1 + K, h, w); None in files of earlier versions"""
+    """mean magnitude and its components, averaged to few pixels, float32 (1 + K, h, w); None in files of earlier versions"""
 
     @property
     def n_parameters(self) -> int:

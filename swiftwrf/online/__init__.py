@@ -8,4 +8,4 @@ from swiftwrf.online.obstacles import Boxes, ObstacleMonitor
 from swiftwrf.online.prequential import Scores, prequential, score
 
 __all__ = ["Alarm", "Boxes", "Cusum", "Follower", "Monitor", "MonitorConfig", "ObstacleMonitor", "Scores"]
-__all__ += ["adapted", "alarm_threshold", "prequential", "score", "Step"]
+__all__ += ["Step", "adapted", "alarm_threshold", "prequential", "score"]

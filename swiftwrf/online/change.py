@@ -9,7 +9,9 @@ import torch
 from scipy.optimize import brentq
 from torch import Tensor
 
-ALLOWANCE = 0.5  # standard deviations per measurement that a series may exceed its mean; detects changes of twice as much
+ALLOWANCE = (
+    0.5  # standard deviations per measurement that a series may exceed its mean; detects changes of twice as much
+)
 
 
 def alarm_threshold(rate: float, n_series: int = 1) -> float:
@@ -76,9 +78,7 @@ class Cusum:
         """Return sums of 0."""
         return cls(torch.zeros(n_series, dtype=torch.float64), torch.zeros(n_series, dtype=torch.int64), 0)
 
-    def updated(
-        self, series: Tensor, threshold: float, allowance: float = ALLOWANCE
-    ) -> tuple[Cusum, list[Alarm]]:
+    def updated(self, series: Tensor, threshold: float, allowance: float = ALLOWANCE) -> tuple[Cusum, list[Alarm]]:
         """Return the sums with one more value of each series (C,), nan for none, and the alarms, largest sum first.
 
         A sum that raises an alarm starts again at 0.

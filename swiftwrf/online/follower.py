@@ -14,7 +14,7 @@ from swiftwrf.models.process import ProcessModel
 from swiftwrf.online.adaptation import adapted
 from swiftwrf.online.change import Alarm
 from swiftwrf.online.monitor import Monitor, MonitorConfig
-from swiftwrf.online.prequential import Scores, score
+from swiftwrf.online.prequential import Scores, learnt, score
 from swiftwrf.rssi.model import RssiModel
 
 MAX_RECENT = 500  # spectra that are kept to adapt the model to a change
@@ -74,7 +74,7 @@ class Follower:
         scores = score(self.model, new)
         alarms = self.monitor.observe(scores.position[0], scores.innovation[0])
         words, correlation = tuple(map(self.monitor.describe, alarms)), None
-        self.model = self.model.update(new)
+        self.model = learnt(self.model, new)
         self.count += 1
         if isinstance(new, Spectra) and isinstance(self.model, ProcessModel):
             self._recent = [*self._recent, new][-MAX_RECENT:]

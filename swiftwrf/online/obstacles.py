@@ -18,8 +18,8 @@ from swiftwrf.data.spectra import Spectra
 from swiftwrf.models.geometry.images import PhaseObservations, images
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.path_gains import paths
-from swiftwrf.models.geometry.planes import PlaneSet
 from swiftwrf.models.geometry.phase_retrieval import correlations, retrieve_phases
+from swiftwrf.models.geometry.planes import PlaneSet
 from swiftwrf.online.change import Alarm
 
 BLOCKED_GAIN = 0.2  # amplitude factor of a path through an obstacle, 14 dB
@@ -71,7 +71,9 @@ class Boxes:
         enter = torch.zeros(len(self), *step.shape[:-1])
         leave = torch.ones_like(enter)
         for axis in range(3):
-            low, high = ((edge[:, axis, None, None, None] - start[..., axis]) / step[..., axis] for edge in (self.low, self.high))
+            low, high = (
+                (edge[:, axis, None, None, None] - start[..., axis]) / step[..., axis] for edge in (self.low, self.high)
+            )
             enter = torch.maximum(enter, torch.minimum(low, high).float())
             leave = torch.minimum(leave, torch.maximum(low, high).float())
         return (enter < leave).any(-1)
@@ -103,7 +105,7 @@ def corners(room: GeometryModel, scene: PhaseObservations) -> Tensor:
 def _reflections(
     scene: PhaseObservations, planes: PlaneSet, order: tuple[int, ...], receiver: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the points of reflection in planes, last one first, (n, len(order), 3) [m], and whether the path exists (n,)."""
+    """Return the points of reflection, last one first, (n, len(order), 3) [m], and whether the path exists, (n,)."""
     point, points, possible = receiver, [], torch.ones(len(receiver), dtype=torch.bool)
     for end in range(len(order), 0, -1):
         towards = images(scene, planes.normal, planes.offset, [order[:end]])[0, 0] - point
@@ -140,8 +142,8 @@ def evidence(scene: PhaseObservations, wave: Tensor, gain: Tensor, base: Tensor,
 class ObstacleMonitor:
     """Sequential test for obstacles that appeared in a room or left it, and a map of where they can stand.
 
-    Every candidate has a cumulative sum of log likelihood ratios. A sum above log(candidates / rate) is an alarm, which bounds
-    the rate of false alarms (G. Lorden, Annals of Mathematical Statistics 42, 1971).
+    Every candidate has a cumulative sum of log likelihood ratios. A sum above log(candidates / rate) is an alarm, which
+    bounds the rate of false alarms (G. Lorden, Annals of Mathematical Statistics 42, 1971).
 
     Args:
         room: Fitted room.
@@ -174,7 +176,9 @@ class ObstacleMonitor:
     @property
     def boxes(self) -> Boxes:
         """Candidates that can have appeared, then obstacles that can have left."""
-        return Boxes(*(torch.cat([getattr(b, end) for b in (self.candidates, self.standing)]) for end in ("low", "high")))
+        return Boxes(
+            *(torch.cat([getattr(b, end) for b in (self.candidates, self.standing)]) for end in ("low", "high"))
+        )
 
     def _learn(self, train: Spectra) -> None:
         """Find standing obstacles one after the other, and the evidence that the unchanged scene gives every box."""
@@ -198,7 +202,7 @@ class ObstacleMonitor:
         self.allowance = ALLOWANCE_NATS + (mean + N_ERRORS * std / count.sqrt()).clamp_min(0) * touched.any(1)
 
     def _alternatives(self, point: Tensor) -> tuple[Tensor, Tensor]:
-        """Return which paths with corners (n, S, C, 3) [m] are blocked, bool (n, S), and if each box came or left, (M, n, S)."""
+        """Return which paths with corners (n, S, C, 3) [m] are blocked, (n, S), and if each box came or left, (M, n, S)."""
         came, here = self.candidates.block(point), self.standing.block(point)
         base = here.any(0)
         others = [torch.cat([here[:k], here[k + 1 :]]).any(0) for k in range(len(here))]

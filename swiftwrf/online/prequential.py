@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TypeVar, overload
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from swiftwrf.models.process import ProcessModel
 from swiftwrf.rssi.base import RssiPredictor
 
 LEVEL = 0.8  # nominal coverage of the intervals
-Model = TypeVar("Model", FieldModel, RssiPredictor)
+Model = TypeVar("Model", bound=FieldModel | RssiPredictor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +58,6 @@ class Scores:
         return (total[end] - total[begin]) / (count[end] - count[begin])
 
 
-@overload
-def score(model: FieldModel, new: Spectra) -> Scores: ...
-@overload
-def score(model: RssiPredictor, new: Rssi) -> Scores: ...
 def score(model: FieldModel | RssiPredictor, new: Spectra | Rssi) -> Scores:
     """Return the scores of measurements that a model has not learnt.
 
@@ -100,6 +96,13 @@ def _of_rssi(model: RssiPredictor, new: Rssi) -> Scores:
     return Scores(new.transmitter_position, miss.abs().nanmean(dim=1), innovation, covered.nanmean(dim=1))
 
 
+def learnt(model: Model, new: Spectra | Rssi) -> Model:
+    """Return the model after an update with measurements of its kind."""
+    update: Any = model.update
+    found: Model = update(new)
+    return found
+
+
 def prequential(model: Model, new: Spectra | Rssi, batch: int = 1) -> tuple[Scores, Model]:
     """Score measurements in order, each before the model learns it.
 
@@ -125,6 +128,6 @@ def prequential(model: Model, new: Spectra | Rssi, batch: int = 1) -> tuple[Scor
     parts = []
     for rows in torch.arange(len(new)).split(batch):
         some = new.subset(rows)
-        parts.append(score(model, some))  # type: ignore[call-overload]
-        model = model.update(some)  # type: ignore[arg-type]
+        parts.append(score(model, some))
+        model = learnt(model, some)
     return Scores.joined(parts), model

@@ -166,7 +166,9 @@ class RssiModel(RssiPredictor, Saved):
         self._posterior = None
         if not self.config.paper_head:
             state = FitState(
-                *(found[name].T.double() for name in ("dual", "tangent", "variance")),
+                dual=found["dual"].T,
+                tangent=found["tangent"].T,
+                variance=found["variance"].T,
                 prior_level=training.prior_mean.level,
                 prior_slope=training.prior_mean.slope,
                 field_variance=training.field_db.square(),
@@ -199,7 +201,9 @@ class RssiModel(RssiPredictor, Saved):
     @single_thread()
     def _update(self, new: Rssi) -> None:
         if self._posterior is None:
-            raise InputError(f"this {self.kind} has the paper's head or is of an earlier version; fit it again to all rows")
+            raise InputError(
+                f"this {self.kind} has the paper's head or is of an earlier version; fit it again to all rows"
+            )
         if self.offsets is not None:
             new = self.offsets.removed(new)
         new, before = new.about(self.origin), self._posterior.linear

@@ -4,9 +4,9 @@ At the end of `swiftwrf.rssi.regression.solve` the rows of one receiver have the
 
     C = (slope slope^T) * covariance of the latent field + diag(noise / weight),    F = scaled regressors of the path loss.
 
-The inverse of C, and the posterior covariance B of the regressors' coefficients, are computed once. A new row then costs one
-product with inv(C). Slopes and weights of the rows of the fit stay. Those of new rows are found with all new rows together, so
-their order has no effect.
+The inverse of C, and the posterior covariance B of the regressors' coefficients, are computed once. A new row then costs
+one product with inv(C). Slopes and weights of the rows of the fit stay. Those of new rows are found with all new rows
+together, so their order has no effect.
 """
 
 from __future__ import annotations
@@ -206,7 +206,9 @@ class RssiPosterior:
         scaled = (state.field_variance[:, None] * tangent)[..., None]  # (R, m, 1)
         own = scaled * cross * state.tangent.T[:, None]  # covariances with the bins by the latent field, (R, m, n)
         # half of each inverse is read, because its time in memory is most of the time of a row
-        white = [np.stack([ssymv(1.0, p, x, lower=1) for x in c]) for p, c in zip(inverses, own.float().numpy(), strict=True)]
+        white = [
+            np.stack([ssymv(1.0, p, x, lower=1) for x in c]) for p, c in zip(inverses, own.float().numpy(), strict=True)
+        ]
         left = feature * detected[..., None] - own @ product  # regressors that the bins do not explain, (R, m, k)
         gain = left @ posterior
         influence = torch.from_numpy(np.stack(white)) + (gain @ product.mT).float()

@@ -41,7 +41,8 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
 
     Returns:
         With R = 1: level (R,) [dBm], slope (R,) [dB a decade] and directivity (R, 8) [dB]; coefficient (R, n) of the kernel
-        to the bins, whose sum is the latent field [dB]; dual, tangent and variance (R, n), see `posterior.FitState`; rendered fields of the heads (R, 2, 2, directions); held_out (R, n),
+        to the bins, whose sum is the latent field [dB]; dual, tangent and variance (R, n), see `posterior.FitState`;
+        rendered fields of the heads (R, 2, 2, directions); held_out (R, n),
         predictions of detected bins by all other folds [dBm].
 
     Raises:

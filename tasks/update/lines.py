@@ -53,17 +53,17 @@ def measurement(line: str, number: int, model: FieldModel | RssiModel) -> Rssi |
             [value],
             position,
             grid=model.grid,
-            array=getattr(model, "array", None) or (room and room.array),
+            array=room.array if room is not None else getattr(model, "array", None),
             moving="transmitter" if room is None else room.moving,
-            fixed_position=room and room.fixed_position,
-            rotation=room and room.rotation,
+            fixed_position=None if room is None else room.fixed_position,
+            rotation=None if room is None else room.rotation,
             name=f"line {number}",
         )
     except InputError as error:
         raise InputError(f"line {number}: {error}") from None
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise InputError(
-            f"line {number} is no JSON object with position and {needed} ({type(error).__name__}: {error}); mend or remove it"
+            f"line {number} is no JSON object with position and {needed} ({type(error).__name__}: {error}); mend it"
         ) from None
 
 
@@ -73,7 +73,10 @@ def _rssi(position: list[list[float]], value: dict[str, float | None], model: Rs
         raise InputError(f"the model has no receiver {unknown[0]!r}; leave it out")
     row = [value.get(name) for name in model.receiver_names]
     return Rssi(
-        [[torch.nan if x is None else float(x) for x in row]], position, receiver_names=model.receiver_names, origin=model.origin
+        [[torch.nan if x is None else float(x) for x in row]],
+        position,
+        receiver_names=model.receiver_names,
+        origin=model.origin,
     )
 
 

@@ -93,7 +93,12 @@ class Followed:
             region = obstacles.region().nonzero()[:, 0]
             boxes, n = obstacles.boxes, len(obstacles.candidates)
             found["obstacles"] = [
-                {"low_m": boxes.low[i], "high_m": boxes.high[i], "evidence_nats": obstacles.value[i], "left": bool(i >= n)}
+                {
+                    "low_m": boxes.low[i],
+                    "high_m": boxes.high[i],
+                    "evidence_nats": obstacles.value[i],
+                    "left": bool(i >= n),
+                }
                 for i in region
             ]
         return found
@@ -125,8 +130,7 @@ def page(followed: Followed, obstacles: ObstacleMonitor | None) -> Page:
     rows = followed.rows()
     order = followed.surprise.nan_to_num().argsort(descending=True)[:MOST_SURPRISING].tolist()
     cells = [
-        [str(rows[i]["index"]), *(f"{rows[i][axis]:.2f}" for axis in ("x_m", "y_m", "z_m"))]
-        + [f"{rows[i]['error']:.3g}", f"{rows[i]['innovation']:.2f}"]
+        [str(rows[i]["index"]), *(f"{rows[i][name]:.3g}" for name in ("x_m", "y_m", "z_m", "error", "innovation"))]
         for i in order
     ]
     columns = ["measurement", "x [m]", "y [m]", "z [m]", f"error{followed.unit}", "innovation"]
@@ -166,7 +170,9 @@ def _map(followed: Followed, obstacles: ObstacleMonitor | None) -> Plot:
         region = obstacles.region()
         standing = torch.arange(len(region)) >= len(obstacles.candidates)
         for chosen, colour in ((standing, figures.RULE), (region, RED)):
-            for low, high in zip(obstacles.boxes.low[chosen].tolist(), obstacles.boxes.high[chosen].tolist(), strict=True):
+            for low, high in zip(
+                obstacles.boxes.low[chosen].tolist(), obstacles.boxes.high[chosen].tolist(), strict=True
+            ):
                 size = high[0] - low[0], high[1] - low[1]
                 axes[0].add_patch(Rectangle((low[0], low[1]), *size, fill=False, edgecolor=colour))
         axes[0].autoscale_view()

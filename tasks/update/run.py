@@ -51,7 +51,9 @@ def run(config: UpdateConfig) -> None:
         write_table(folder / "measurements.csv", followed.rows())
         write_json(folder / "update.json", followed.summary(obstacles))
         write_page(folder, page(followed, obstacles))
-    terminal.page(followed.summary(obstacles), "\n".join(followed.sentences(obstacles)), Path(config.out) / "report.html")
+    terminal.page(
+        followed.summary(obstacles), "\n".join(followed.sentences(obstacles)), Path(config.out) / "report.html"
+    )
 
 
 def follow(config: UpdateConfig) -> None:

@@ -153,10 +153,13 @@ class DeformableGaussians(nn.Module):
         kernel, canonical = self.kernels(grid).flatten(1), self.primitives()
         component = (self._component_weight() @ kernel).double()
         dual = torch.linalg.pinv(component @ component.T, hermitian=True) @ component
-        return torch.cat([canonical.weight[:, 0] @ kernel[None], dual.float()]).unflatten(1, grid.shape)
+        projection = torch.cat([(canonical.weight[:, 0] @ kernel)[None], dual.float()])
+        whole: Tensor = projection.unflatten(1, grid.shape)
+        return whole
 
     def _component_weight(self) -> Tensor:
         """Return the weights (K, N) of the primitives in each component of a regression."""
         response = Offsets.of(torch.as_tensor(self.deformation.basis), self.config.components).response
         assert response is not None  # a regression deforms responses
-        return self.primitives().attenuation * response[..., 0]
+        weight: Tensor = self.primitives().attenuation * response[..., 0]
+        return weight

@@ -56,7 +56,9 @@ class LowRankDeformation(Deformation):
     def restore(cls, components: tuple[str, ...], header: Header, tensors: Mapping[str, Tensor]) -> LowRankDeformation:
         rank, n, m = header["config"]["rank"], header["config"]["n_primitives"], len(tensors["field.anchor"])
         kernel, regressed = gp.Kernel(**header["kernel"]), "field.value" in tensors
-        own = {"value": (m, rank)} if regressed else {"whiten": (m, m), "coefficient": (m, rank)}
+        own: dict[str, tuple[int, ...]] = (
+            {"value": (m, rank)} if regressed else {"whiten": (m, m), "coefficient": (m, rank)}
+        )
         own |= {"correlation": (m,)} if "field.correlation" in tensors else {}
         field_shapes = {f"field.{name}": shape for name, shape in ({"anchor": (m, 3)} | own).items()}
         basis_shape = (rank, n, sum(COMPONENTS[c] for c in components))
