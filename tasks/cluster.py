@@ -104,13 +104,11 @@ class Cluster:
             warnings.filterwarnings("ignore", message="Sending large graph")
             return self.client.submit(bytes, cloudpickle.dumps(thing), key=f"data-{uuid4().hex}")
 
-    def submit(
-        self, name: str, function: Future[Any], item: Any, *held: Future[Any], urgent: bool = False
-    ) -> Future[Any]:
-        """Call a held function with the item and held objects on a worker. Urgent calls come first."""
+    def submit(self, name: str, function: Future[Any], item: Any, *held: Future[Any], priority: int = 0) -> Future[Any]:
+        """Call a held function with the item and held objects on a worker. Calls of higher priority come first."""
         terms = (torch.get_num_threads(), self._device, packages())
         key = f"{name}-{uuid4().hex}"
-        return self.client.submit(_call, terms, function, item, *held, key=key, priority=int(urgent))
+        return self.client.submit(_call, terms, function, item, *held, key=key, priority=priority)
 
     def next(self, pending: Collection[Future[Any]]) -> tuple[Future[Any], Any]:
         """Wait for one of the calls and return it with its result.

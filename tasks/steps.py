@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from swiftwrf.runtime.durable import write_bytes
 from tasks.claim import STEPS
 from tasks.cluster import Cluster
 from tasks.directory import Run
+from tasks.processes import local_processes
 from tasks.records import Row, strict
 from tasks.terminal import terminal
 
@@ -46,13 +48,40 @@ class Step(ABC, Generic[Context]):
     def compute(self, context: Context, folder: Path) -> Row:
         """Return plain values. Files are read and written in `folder`: the run's directory, or a copy on a worker."""
 
+    @property
+    def priority(self) -> int:
+        """Priority among the steps that could begin: 2 if other steps wait for this one, 1 if it takes long, else 0."""
+        return 2 if type(self).then is not Step.then else 0
+
     def then(self, context: Context, value: Row) -> Sequence[Step[Context]]:
         """Return the steps that follow from the result."""
         return ()
 
 
+Arrived = Callable[[Step[Context], Row], None]
+"""function that shows a result when it arrives"""
+
+
+class Workers(Protocol):
+    """Processes that compute steps, on this machine or on a cluster. The type of a future is theirs."""
+
+    slots: float
+    """number of steps that are computed at a time; infinite if the workers keep a queue"""
+
+    def submit(self, step: Step[Any]) -> Any:
+        """Begin a step and return its future."""
+
+    def next(self, pending: Collection[Any]) -> tuple[Any, Row, float]:
+        """Wait for one of the futures and return it with the values of its step and the seconds."""
+
+
 def computed(
-    run: Run, steps: Iterable[Step[Context]], context: Context, cluster: Cluster | None
+    run: Run,
+    steps: Iterable[Step[Context]],
+    context: Context,
+    cluster: Cluster | None,
+    processes: int = 1,
+    arrived: Arrived[Context] = lambda step, value: None,
 ) -> Iterator[tuple[Step[Context], Row]]:
     """Yield each step with its result, followed by the steps that follow from it.
 
@@ -60,51 +89,107 @@ def computed(
         run: Run that keeps the results. A kept result is not computed again.
         steps: The first steps.
         context: Data and configuration that all steps share.
-        cluster: Cluster that computes the steps in parallel. With None they are computed here, one after the other.
+        cluster: Cluster that computes the steps in parallel.
+        processes: Number of processes of this machine that compute the steps. With 1 they are computed in this process.
+        arrived: Called with each step and its result as soon as it arrives, in any order.
 
     Raises:
-        FitError: The cluster is lost.
+        FitError: The cluster or a process is lost.
     """
     steps = list(steps)
     if cluster is not None:
-        _compute_on(cluster, run, steps, context)
+        _compute_on(_ClusterWorkers(cluster, run, context), run, steps, context, arrived)
+    elif processes > 1:
+        with local_processes(processes, run.folder, context) as local:
+            _compute_on(local, run, steps, context, arrived)
+    yield from _computed_here(run, steps, context, None if cluster or processes > 1 else arrived)
+
+
+def _computed_here(
+    run: Run, steps: Sequence[Step[Context]], context: Context, arrived: Arrived[Context] | None
+) -> Iterator[tuple[Step[Context], Row]]:
+    """Yield each step with its result, computed in this process unless it is kept, and the steps that follow."""
     terminal.expect(len({step.name for step in steps if not run.holds(step.name)}))
     for step in steps:
+        is_new = not run.holds(step.name)
         value = run.step(step.name, step.title, partial(step.compute, context, run.folder))
+        if arrived is not None and is_new:
+            arrived(step, value)
         yield step, value
-        yield from computed(run, step.then(context, value), context, None)
+        yield from _computed_here(run, step.then(context, value), context, arrived)
 
 
-def _compute_on(cluster: Cluster, run: Run, steps: Iterable[Step[Context]], context: Context) -> None:
-    """Compute steps, and those that follow, on a cluster and keep each result in the run when it arrives."""
-    function = cluster.hold(partial(_compute_away, context))
-    pending: dict[Future[Any], Step[Context]] = {}
-    begun: set[str] = set()
+def _compute_on(
+    workers: Workers, run: Run, steps: Iterable[Step[Context]], context: Context, arrived: Arrived[Context]
+) -> None:
+    """Compute steps, and those that follow, on workers and keep each result in the run when it arrives.
+
+    A step that was begun already under its name is not begun again, but the steps that follow from it are.
+    """
+    waiting: list[Step[Context]] = []
+    pending: dict[Any, Step[Context]] = {}
+    same: dict[str, list[Step[Context]]] = {}
 
     def begin(steps: Iterable[Step[Context]]) -> None:
-        held: dict[str, Future[Any]] = {}
         for step in steps:
             value = run.kept(step.name)
             if value is not None:
                 begin(step.then(context, value))
-            elif step.name not in begun:
-                begun.add(step.name)
+            elif step.name in same:
+                same[step.name].append(step)
+            else:
+                same[step.name] = [step]
                 terminal.expect(1)
-                held |= {name: cluster.hold(run.path(name).read_bytes()) for name in step.reads if name not in held}
-                urgent = type(step).then is not Step.then  # other steps wait for it
-                future = cluster.submit(step.name, function, step, *(held[name] for name in step.reads), urgent=urgent)
-                pending[future] = step
+                waiting.append(step)
 
     begin(steps)
-    while pending:
-        future, (value, seconds, files) = cluster.next(pending)
+    while pending or waiting:
+        waiting.sort(key=lambda step: -step.priority)
+        while waiting and len(pending) < workers.slots:
+            step = waiting.pop(0)
+            pending[workers.submit(step)] = step
+        terminal.begin(", ".join(dict.fromkeys(step.title for step in pending.values())))
+        future, value, seconds = workers.next(pending)
         step = pending.pop(future)
-        for name, content in files.items():
-            write_bytes(run.path(name), content)
         value = run.keep(step.name, value, seconds)
-        run.computed_on(cluster.machines)
         terminal.end()
-        begin(step.then(context, value))
+        arrived(step, value)
+        for one in same.pop(step.name):
+            begin(one.then(context, value))
+
+
+class _ClusterWorkers(Generic[Context]):
+    """The workers of a cluster, which compute steps in copies of a run's directory.
+
+    Args:
+        cluster: Cluster.
+        run: Run whose files the steps read and write.
+        context: Data and configuration that all steps share.
+    """
+
+    slots = math.inf
+
+    def __init__(self, cluster: Cluster, run: Run, context: Context) -> None:
+        self._cluster, self._run = cluster, run
+        self._function = cluster.hold(partial(_compute_away, context))
+        self._held: dict[str, Future[Any]] = {}
+
+    def submit(self, step: Step[Context]) -> Future[Any]:
+        """Begin a step on a worker, with the files that it reads."""
+        known = self._held  # steps that follow from one step read the same files and come one after the other
+        self._held = {
+            name: known[name] if name in known else self._cluster.hold(self._run.path(name).read_bytes())
+            for name in step.reads
+        }
+        return self._cluster.submit(step.name, self._function, step, *self._held.values(), priority=step.priority)
+
+    def next(self, pending: Collection[Future[Any]]) -> tuple[Future[Any], Row, float]:
+        """Wait for one of the steps, write its files, and return it with its values and its seconds."""
+        future, (value, seconds, files) = self._cluster.next(pending)
+        for name, content in files.items():
+            write_bytes(self._run.path(name), content)
+        self._run.computed_on(self._cluster.machines)
+        return future, value, seconds
 
 
 def _compute_away(context: Context, step: Step[Context], *contents: bytes) -> tuple[Row, float, dict[str, bytes]]:

@@ -16,9 +16,8 @@ from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, Spectra, f
 from swiftwrf.data.raytraced import sionna
 from swiftwrf.data.writing import write_spectra
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # one thread a process: more would wait for each other
-    torch.set_num_threads(1)
-    os.environ["OMP_NUM_THREADS"] = "1"
+torch.set_num_threads(1)  # tests run side by side, and mocks reach steps that are computed in this process alone
+os.environ["OMP_NUM_THREADS"] = "1"
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -97,7 +96,7 @@ def aoa_run(tmp_path_factory: pytest.TempPathFactory, room: Spectra) -> Path:
     (folder / "data").mkdir()
     write_spectra(room, folder / "data")
     options = ("--synthesizer", "swiftwrf", "--extra", 0, "--data", folder / "data", "--out", folder / "run")
-    with mock.patch("tasks.aoa.steps.candidates", return_value=["idw"]):  # finding a room has tests of its own
+    with mock.patch("tasks.aoa.context.candidates", return_value=["idw"]):  # finding a room has tests of its own
         assert quick.run("aoa", "--mix", 0.5, 1, *options) == 0
     config = FitConfig(model=ModelConfig(n_primitives=16, rank=4))
     fit(room, config).save(folder / "run" / "model-mix1.safetensors")

@@ -23,13 +23,15 @@ from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models import FIELD_MODELS, FieldModel
 from swiftwrf.models.geometry import model as geometry
-from tasks.aoa import context, cross_validation, experiment, steps
+from tasks.aoa import context, cross_validation, experiment
+from tasks.aoa import synthesis as synthesizing
 from tasks.aoa.condition import Condition, MeasuredSubset, conditions_of, headline
 from tasks.aoa.estimators import ESTIMATORS, aann, make_estimator, nadaraya_watson
 from tasks.aoa.estimators.aann import AANN, AANNConfig
 from tasks.aoa.estimators.aann_kernel import AANNKernel, AANNKernelConfig
 from tasks.aoa.estimators.baselines import Constant, NearestSpectrum, Peak
 from tasks.aoa.estimators.kernel_regression import KernelRegression
+from tasks.aoa.evaluation import Evaluation
 from tasks.aoa.options import AoaConfig, fraction_key
 from tasks.aoa.page.records import palette
 from tasks.command_line import command_line
@@ -45,7 +47,7 @@ def small(monkeypatch):
     room = simulated_room(n=50, grid=AngularGrid.hemisphere(10, 40))
     monkeypatch.setattr(experiment, "simulated_room", lambda **_: room)
     monkeypatch.setattr(FIELD_MODELS["swiftwrf"], "config_type", with_defaults(TINY_FIT))
-    for place in (steps, choose):  # the search for a room has its own tests
+    for place in (context, choose):  # the search for a room has its own tests
         monkeypatch.setattr(
             place,
             "candidates",
@@ -586,16 +588,16 @@ def test_labels_of_synthetic_spectra_are_those_of_their_positions(small, tmp_pat
     """Stored with the spectra: a program that chooses positions differently does not mislabel those of an earlier one."""
     given = AoaConfig((0.5,), synthesizer=("idw",), extra=20)
     train, test = small.split("random", 0)
-    data = steps.Experiment(given, train, test, 20, torch.device("cpu"))
-    synthesis = steps.Synthesis(MeasuredSubset(0.5), "idw", trains=True, n_synthetic=20, sampled=False)
+    data = context.Experiment(given, train, test, 20, torch.device("cpu"))
+    synthesis = synthesizing.Synthesis(MeasuredSubset(0.5), "idw", trains=True, n_synthetic=20, sampled=False)
     (tmp_path / "steps").mkdir()
     synthesis.compute(data, tmp_path)
     measured, _ = data.withhold(synthesis.subset)
     position = sample_positions(measured.position, 20, 0)
-    for place in ("augment.positions.sample_positions", "tasks.aoa.steps.synthetic_positions"):
+    for place in ("augment.positions.sample_positions", "tasks.aoa.synthesis.synthetic_positions"):
         monkeypatch.setattr(place, lambda *_: pytest.fail("positions were computed again"))
     condition = Condition("kernel_regression", "turbo_extra", "idw", 20, 0.5)
-    mixed = steps.Evaluation(condition, synthesis)._training_set(data, tmp_path)
+    mixed = Evaluation(condition, synthesis)._training_set(data, tmp_path)
     torch.testing.assert_close(mixed.label[-20:], small.direction_at(position))
     expected = make_model("idw").fit(measured).synthesize(position)
     torch.testing.assert_close(mixed.spectrum[-20:], expected, atol=1 / 255, rtol=0)
@@ -605,13 +607,13 @@ def test_models_for_comparison_are_always_quick(small, monkeypatch):
     """A field model asked for by name does not bring fits of the published size of others along."""
     given = AoaConfig((0.5,), synthesizer=("idw",), preset="paper", extra=0)
     train, test = small.split("random", 0)
-    data = steps.Experiment(given, train, test, 0, torch.device("cpu"))
+    data = context.Experiment(given, train, test, 0, torch.device("cpu"))
     made = []
     monkeypatch.setattr(
         context, "make_model", lambda name, preset, **options: made.append((name, preset)) or mock.Mock()
     )
-    for synthesis in steps._syntheses(data, MeasuredSubset(0.5), ["idw"], {}):
-        synthesis._fitted(data, train, steps._FitHistory(), Path())
+    for synthesis in synthesizing.syntheses(data, MeasuredSubset(0.5), ["idw"], {}):
+        synthesis._fitted(data, train, synthesizing._FitHistory(), Path())
     assert made == [("idw", "paper"), ("gp", "quick"), ("coarray", "quick")]
 
 
@@ -619,12 +621,12 @@ def test_the_room_is_searched_once_for_all_models_with_one(room, glances, tmp_pa
     """Its time counts as part of the fit of each of them."""
     given = AoaConfig((0.5,), synthesizer=("hybrid",), extra=0)
     train, test = room.split("random", 0)
-    data = steps.Experiment(given, train, test, 0, torch.device("cpu"))
-    monkeypatch.setattr(steps, "candidates", lambda data: ["geometry", "hybrid"])
+    data = context.Experiment(given, train, test, 0, torch.device("cpu"))
+    monkeypatch.setattr(context, "candidates", lambda data: ["geometry", "hybrid"])
     searched, search = [], geometry.search_room
     monkeypatch.setattr(geometry, "search_room", lambda *given: searched.append(1) or search(*given))
     (tmp_path / "steps").mkdir()
-    (first,) = steps._syntheses(data, MeasuredSubset(0.7), ["hybrid"], {})
+    (first,) = synthesizing.syntheses(data, MeasuredSubset(0.7), ["hybrid"], {})
     value = first.compute(data, tmp_path)
     syntheses = first.then(data, value)
     assert [synthesis.synthesizer for synthesis in syntheses] == ["hybrid", "geometry"]
@@ -638,9 +640,9 @@ def test_advice_is_that_of_each_field_model(small):
     """A model without cross-validation adds no further positions by default."""
     given = AoaConfig((0.5,), synthesizer=("idw", "gp", "vae"))
     train, test = small.split("random", 0)
-    data = steps.Experiment(given, train, test, 3000, torch.device("cpu"))
+    data = context.Experiment(given, train, test, 3000, torch.device("cpu"))
     advice = {"idw": {"recommended_extra": 300, "sampled": False}, "gp": {"recommended_extra": 0, "sampled": True}}
-    found = {s.synthesizer: s for s in steps._syntheses(data, MeasuredSubset(0.5), given.synthesizer, advice)}
+    found = {s.synthesizer: s for s in synthesizing.syntheses(data, MeasuredSubset(0.5), given.synthesizer, advice)}
     assert {name: found[name].n_synthetic for name in given.synthesizer} == {"idw": 3000, "gp": 0, "vae": 0}
     assert {name: found[name].sampled for name in given.synthesizer} == {"idw": False, "gp": True, "vae": False}
 

@@ -59,7 +59,7 @@ def quickly(data, planes=PLANES):
             mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
             *(
                 mock.patch(f"{place}.candidates", lambda data: [n for n in ("idw", "geometry") if not lacking(n, data)])
-                for place in ("tasks.aoa.steps", "augment.choose")
+                for place in ("tasks.aoa.context", "augment.choose")
             ),
         ):
             patches.enter_context(patch)
@@ -210,17 +210,19 @@ def test_the_estimator_is_chosen_by_held_out_errors_alone(monkeypatch, closed_fo
     model = make_model("idw").fit(closed_form)
     folds = [Fold(model, closed_form, closed_form.subset(torch.arange(4))) for _ in range(4)]
     errors = {"kernel_regression": [np.full(4, 2.0)] * 4, "kernel_regression_turbo_idw": [np.full(4, 1.0)] * 4}
-    for given in ([], folds):
+    compared = cross_validation.located_folds(folds)
+    assert list(compared) == [0, 2]
+    for given in ({}, compared):
         choice = cross_validation.choose_estimator(errors, given, seed=0)
         assert choice["name"] == "kernel_regression_turbo_idw"
         assert choice["held_out_deg"] == {"kernel_regression": 2.0, "kernel_regression_turbo_idw": 1.0}
         assert choice["n_held_out"] == 16
     located = iter([np.full(4, 0.1), None])
     monkeypatch.setattr(cross_validation, "_located_errors", lambda *_: next(located))
-    assert LOCATOR not in cross_validation.choose_estimator(errors, folds, seed=0)["held_out_deg"]
+    assert LOCATOR not in cross_validation.choose_estimator(errors, compared, seed=0)["held_out_deg"]
     for error, chosen in ((0.1, LOCATOR), (1.5, "kernel_regression_turbo_idw")):
         monkeypatch.setattr(cross_validation, "_located_errors", lambda *_, error=error: np.full(4, error))
-        choice = cross_validation.choose_estimator(errors, folds, seed=0)
+        choice = cross_validation.choose_estimator(errors, compared, seed=0)
         assert (choice["name"], choice["n_held_out"]) == (chosen, 8)
 
 

@@ -63,7 +63,7 @@ def cluster(local):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """The run of AOA here; nowhere a room is searched, which has tests of its own."""
-    with mock.patch("tasks.aoa.steps.candidates", return_value=["idw", "gp"]):
+    with mock.patch("tasks.aoa.context.candidates", return_value=["idw", "gp"]):
         out = tmp_path_factory.mktemp("whole") / "run"
         assert run(*AOA, "--out", out) == 0
         yield out

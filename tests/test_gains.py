@@ -17,12 +17,12 @@ import torch
 
 from swiftwrf import simulated_room
 from tasks.aoa.condition import LOCATOR, Condition
+from tasks.aoa.evaluation import Evaluation
 from tasks.aoa.options import AoaConfig
 from tasks.aoa.page.gains import gain_sentence, gain_table
 from tasks.aoa.page.records import FractionRecords
 from tasks.aoa.page.summary import summary
 from tasks.aoa.results import Results
-from tasks.aoa.steps import Evaluation
 from tasks.page.page import Plot
 from tasks.page.records import Records
 from tasks.report.run import merge

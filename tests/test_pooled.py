@@ -11,9 +11,10 @@ from quick import run
 
 from swiftwrf import simulated_room
 from tasks.aoa.condition import Condition, MeasuredSubset, pooled
+from tasks.aoa.evaluation import Evaluation
 from tasks.aoa.options import AoaConfig
 from tasks.aoa.results import Results
-from tasks.aoa.steps import Evaluation, choose_model
+from tasks.aoa.steps import choose_model
 
 MEASURED = Condition("aann_kernel", "measured", measured_fraction=0.3)
 GP, IDW = (Condition("aann_kernel", "turbo", name, measured_fraction=0.3) for name in ("gp", "idw"))
@@ -110,7 +111,7 @@ def test_a_run_whose_repeats_choose_differently(tmp_path):
 
     with (
         mock.patch("tasks.aoa.steps.choose_model", choose),
-        mock.patch("tasks.aoa.steps.candidates", return_value=[]),  # a search for rooms would take most of the time
+        mock.patch("tasks.aoa.context.candidates", return_value=[]),  # a search for rooms would take most of the time
     ):
         assert run("aoa", "--mix", 0.7, "--repeats", 2, "--extra", 0, "--out", tmp_path / "run") == 0
     methods = json.loads((tmp_path / "run" / "metrics.json").read_text())["mixes"]["0.7"]["methods"]

@@ -36,6 +36,7 @@ from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.path_gains import PathGains, fit_path_gains, prior
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
 from swiftwrf.runtime.options import Configured
+from swiftwrf.runtime.threads import side_by_side
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 
 FOLDS = 5
@@ -62,7 +63,7 @@ class MatchedFieldConfig:
     """cells that are split in each round"""
     n_rounds: Annotated[int, Ge(0), Le(20)] = 3
     """rounds of splitting"""
-    n_calibration: PositiveInt = 200
+    n_calibration: PositiveInt = 120
     """held-out spectra that determine the weights of the likelihoods, at most"""
     seed: NonNegativeInt = 0
     """seed of everything random"""
@@ -92,14 +93,14 @@ class _Likelihoods:
     def __call__(self, position: Tensor, observed: SpectrumFeatures) -> Tensor:
         """Return log-likelihoods (k, n, m) of n observations at candidates (n, m, 3) [m]."""
         n, m, _ = position.shape
-        owner = torch.arange(n).repeat_interleave(m)
-        found = []
-        for some, rows in zip(
-            position.reshape(-1, 3).split(BATCH_CANDIDATES), owner.split(BATCH_CANDIDATES), strict=True
-        ):
-            waves, target = PathWaves.at(self.room, some), observed.subset(rows)
-            found.append(torch.stack([part.log_likelihood(waves, target) for part in self.parts]))
-        return torch.cat(found, dim=1).reshape(len(self.parts), n, m)
+        at, owner = position.reshape(-1, 3), torch.arange(n).repeat_interleave(m)
+
+        def of_batch(rows: Tensor) -> Tensor:
+            waves, target = PathWaves.at(self.room, at[rows]), observed.subset(owner[rows])
+            return torch.stack([part.log_likelihood(waves, target) for part in self.parts])
+
+        batches = torch.arange(n * m).split(BATCH_CANDIDATES)
+        return torch.cat(side_by_side(of_batch, batches), dim=1).reshape(len(self.parts), n, m)
 
 
 class MatchedField(Configured, Saved):
@@ -165,15 +166,15 @@ class MatchedField(Configured, Saved):
         kernel = prior(scene.moving)
 
         def fitted(kept: Tensor) -> _Fit:
-            some = train.subset(kept.nonzero()[:, 0])
-            part = GeometryModel(seed=self.config.seed).fit(some, like=own)
-            gains = fit_path_gains(part, scene.subset(kept[rows].nonzero()[:, 0]), kernel)
-            return _Fit(part, gains, PathStatistics.fit(part, some.position, features.subset(kept)))
+            phases = scene.subset(kept[rows].nonzero()[:, 0])
+            part = own.refined_on(phases)
+            statistics = PathStatistics.fit(part, train.position[kept], features.subset(kept))
+            return _Fit(part, fit_path_gains(part, phases, kernel), statistics)
 
         fold = torch.arange(len(train)) % FOLDS
-        parts = [fitted(fold != number) for number in range(FOLDS)]
+        everything = torch.ones_like(fold, dtype=torch.bool)
+        *parts, self._fit = side_by_side(fitted, [*(fold != number for number in range(FOLDS)), everything])
         self._set_residuals(train.position, features, fold, parts)
-        self._fit = fitted(torch.ones_like(fold, dtype=torch.bool))
         held_out = [train.position[fold == number] for number in range(FOLDS)]
         others = [Region(train.position[fold != number]) for number in range(FOLDS)]
         self.region = region or Region(train.position, outside=outside_mass(others, held_out))
@@ -201,7 +202,7 @@ class MatchedField(Configured, Saved):
         self.likelihoods = self._likelihoods(self._fit)
         screen = self.likelihoods.parts[0]
         batches = self.cells.position.split(BATCH_CANDIDATES)
-        self._whitened = torch.cat([screen.whitened(PathWaves.at(self.room, some)) for some in batches])
+        self._whitened = torch.cat(side_by_side(lambda some: screen.whitened(PathWaves.at(self.room, some)), batches))
 
     def _likelihoods(self, fit: _Fit, kept: Tensor | None = None) -> _Likelihoods:
         residual = self.residual if kept is None else self.residual[:, kept]

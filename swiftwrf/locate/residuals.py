@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 
@@ -37,20 +36,13 @@ class ResidualDistribution:
         """
         residual = residual.double()
         fold = torch.arange(len(residual)) % FOLDS
-
-        def score(setting: tuple[float, float]) -> float:
-            total = 0.0
-            for number in range(FOLDS):
-                root = _root(residual[fold != number], size, *setting)
-                distance = (
-                    torch.linalg.solve_triangular(root, residual[fold == number].T, upper=False).square().sum(dim=0)
-                )
-                density = _log_density(distance, len(root), setting[1]) - root.diagonal().log().sum()
-                total += float(density.sum())
-            return total
-
-        best = max(itertools.product(SHRINKAGES, DEGREES), key=score)
-        return cls(torch.linalg.inv(_root(residual, size, *best)).T.float(), best[1])
+        kept = (fold != torch.arange(FOLDS)[:, None]).double()
+        density = torch.stack([_held_out_density(residual, kept, size, degrees) for degrees in DEGREES])
+        degrees, shrinkage = divmod(int(density.argmax()), len(SHRINKAGES))
+        everything = torch.ones(1, len(residual), dtype=torch.float64)
+        chosen = torch.tensor(SHRINKAGES[shrinkage : shrinkage + 1], dtype=torch.float64)
+        root = _roots(residual, everything, size, chosen, DEGREES[degrees])[0]
+        return cls(torch.linalg.inv(root).T.float(), DEGREES[degrees])
 
     def log_density(self, distance: Tensor) -> Tensor:
         """Return the log-density of squared whitened distances, up to a constant."""
@@ -64,16 +56,42 @@ def _log_density(distance: Tensor, f: int, degrees: float) -> Tensor:
     return constant - (degrees + f) / 2 * torch.log1p(distance / degrees)
 
 
-def _root(residual: Tensor, size: float, shrinkage: float, degrees: float) -> Tensor:
-    """Return the Cholesky factor of the scale matrix (F, F) of residuals (n, F), shrunk to a multiple of the identity."""
-    n, f = residual.shape
-    weight = torch.ones(n, dtype=residual.dtype)
+def _held_out_density(residual: Tensor, kept: Tensor, size: float, degrees: float) -> Tensor:
+    """Return the log-density of the rows outside each fold, for each shrinkage (S,), with folds as 0/1 weights (B, n)."""
+    shrinkage = torch.tensor(SHRINKAGES, dtype=torch.float64).repeat_interleave(len(kept))
+    weight = kept.repeat(len(SHRINKAGES), 1)
+    root = _roots(residual, weight, size, shrinkage, degrees)
+    volume = root.diagonal(dim1=1, dim2=2).log().sum(dim=1, keepdim=True)
+    density = _log_density(_squared_distance(root, residual), residual.shape[1], degrees) - volume
+    return ((1 - weight) * density).sum(dim=1).reshape(len(SHRINKAGES), -1).sum(dim=1)
+
+
+def _roots(residual: Tensor, kept: Tensor, size: float, shrinkage: Tensor, degrees: float) -> Tensor:
+    """Return Cholesky factors of scale matrices, shrunk to multiples of the identity.
+
+    Args:
+        residual: Residuals (n, F).
+        kept: 1 for the rows that each matrix is fitted to, 0 for the others, (B, n).
+        size: Mean square of the features.
+        shrinkage: Shrinkage of each matrix, (B,).
+        degrees: Degrees of freedom.
+
+    Returns:
+        Lower triangular matrices (B, F, F).
+    """
+    f = residual.shape[1]
+    weight, identity = kept, torch.eye(f, dtype=residual.dtype)
     for _ in range(1 if math.isinf(degrees) else EM_STEPS):  # expectation maximisation
-        scatter = (weight[:, None] * residual).T @ residual / n
-        mean = scatter.diagonal().mean()
-        scatter = (1 - shrinkage) * scatter + (shrinkage * mean + FLOOR * size) * torch.eye(f, dtype=scatter.dtype)
-        root: Tensor = torch.linalg.cholesky(scatter)
+        scatter = (residual.T * weight[:, None]) @ residual / kept.sum(dim=1)[:, None, None]
+        mean = scatter.diagonal(dim1=1, dim2=2).mean(dim=1)
+        scatter = (1 - shrinkage)[:, None, None] * scatter
+        root: Tensor = torch.linalg.cholesky(scatter + (shrinkage * mean + FLOOR * size)[:, None, None] * identity)
         if not math.isinf(degrees):
-            distance = torch.linalg.solve_triangular(root, residual.T, upper=False).square().sum(dim=0)
-            weight = (degrees + f) / (degrees + distance)
+            weight = kept * (degrees + f) / (degrees + _squared_distance(root, residual))
     return root
+
+
+def _squared_distance(root: Tensor, residual: Tensor) -> Tensor:
+    """Return squared Mahalanobis distances (B, n) of residuals (n, F) for Cholesky factors (B, F, F)."""
+    white: Tensor = torch.linalg.solve_triangular(root, residual.T, upper=False)
+    return white.square().sum(dim=1)

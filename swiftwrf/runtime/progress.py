@@ -50,6 +50,16 @@ def forwarding(listener: Callable[[float], None]) -> Iterator[None]:
         _listener = outer
 
 
+def silent() -> None:
+    """Show no progress bar in this process from now on."""
+    global _listener
+    _listener = _ignored
+
+
+def _ignored(fraction: float) -> None:
+    """Receive a fraction that nobody wants."""
+
+
 def progress_bar(shown: bool = True) -> Progress:
     """Return a bar with steps, rate and remaining time, which disappears at the end."""
     if _listener is not None and shown:

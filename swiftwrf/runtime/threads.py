@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TypeVar
 
 import torch
@@ -23,6 +24,7 @@ class _Users:
 
 
 _users = _Users()
+_workers: ContextVar[int | None] = ContextVar("workers", default=None)  # of `side_by_side` inside `single_thread`
 
 
 def set_threads(number: int) -> None:
@@ -69,14 +71,18 @@ def threads_kept() -> Iterator[None]:
 
 @contextmanager
 def single_thread() -> Iterator[None]:
-    """Use one thread for many small tensor operations; also a decorator.
+    """Use one thread for many small tensor operations; also a decorator. `side_by_side` inside still uses all threads.
 
     Threads synchronise after every operation. If an operation takes microseconds and other work shares the machine, most
     of the time is spent waiting: up to ten times the time of one thread.
     """
-    with threads_kept():
-        torch.set_num_threads(1)
-        yield
+    token = _workers.set(_workers.get() or torch.get_num_threads())
+    try:
+        with threads_kept():
+            torch.set_num_threads(1)
+            yield
+    finally:
+        _workers.reset(token)
 
 
 def side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
@@ -88,6 +94,6 @@ def side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) -> l
         >>> side_by_side(abs, [-1, 2])
         [1, 2]
     """
-    workers = torch.get_num_threads()
+    workers = _workers.get() or torch.get_num_threads()
     with single_thread(), threadpool_limits(1), ThreadPoolExecutor(workers) as threads:
         return list(threads.map(function, items))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from augment import SyntheticPositions, withhold
+from augment.choose import candidates
 from swiftwrf import Spectra
 from swiftwrf.models import FIELD_MODELS, FieldModel, make_model
 from tasks.aoa.condition import EVERYTHING, LOCATOR, Condition, MeasuredSubset
@@ -47,6 +48,11 @@ class Experiment:
         """Return a field model that is not fitted."""
         # validation at random: withheld positions lie among the measured ones, whatever the split of the test
         return make_model(name, preset, seed=self.seed(subset), validation="random", scene=self.config.scene)
+
+    @property
+    def candidates(self) -> list[str]:
+        """Names of the field models that are compared."""
+        return candidates(self.train)
 
     def finds_room(self, name: str) -> bool:
         """Return True if a field model is built on the room that the spectra show."""

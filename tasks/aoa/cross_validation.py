@@ -109,28 +109,30 @@ def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> Advice:
     return Advice(advice, alone, by_rule)
 
 
+def located_folds(folds: Sequence[Fold]) -> dict[int, Fold]:
+    """Return the folds by number on which matched-field processing is compared: one of each structure search."""
+    return {number: folds[number] for number in range(0, len(folds), len(BLIND_FOLDS[0]))[: len(BLIND_FOLDS)]}
+
+
 def choose_estimator(
-    errors: Mapping[str, Sequence[Errors]], folds: Sequence[Fold], seed: int
+    errors: Mapping[str, Sequence[Errors]], folds: Mapping[int, Fold], seed: int
 ) -> EstimatorChoiceMetrics:
     """Return the estimator with the smallest median error on held-out measured spectra.
 
-    Matched-field processing is compared on one fold of each structure search, because its fits take seconds. It is a
-    candidate only if planes were found without the spectra of each of these folds. All estimators are then compared on the
-    spectra that it located.
+    Matched-field processing is compared on few folds, because its fits take seconds. It is a candidate only if planes were
+    found without the spectra of each of these folds. All estimators are then compared on the spectra that it located.
 
     Args:
         errors: Angular errors [deg] on the held-out spectra of each fold, by name of the method.
-        folds: The same folds with a field model that has a room. Empty without such a model.
+        folds: `located_folds` of a field model that has a room. Empty without such a model.
         seed: Seed of the locators.
     """
     compared = {name: np.concatenate(parts) for name, parts in errors.items()}
-    scored = range(0, len(folds), len(BLIND_FOLDS[0]))[: len(BLIND_FOLDS)]
-    rows = [thinned(torch.arange(len(folds[fold].test)), rows=MAX_LOCATED)[0] for fold in scored]
-    compared_folds = [(folds[fold], some) for fold, some in zip(scored, rows, strict=True)]
-    located = side_by_side(lambda item: _located_errors(*item, seed), compared_folds)
+    rows = {number: thinned(torch.arange(len(fold.test)), rows=MAX_LOCATED)[0] for number, fold in folds.items()}
+    located = side_by_side(lambda number: _located_errors(folds[number], rows[number], seed), folds)
     if located and all(found is not None for found in located):
         compared = {
-            name: np.concatenate([parts[fold][some.numpy()] for fold, some in zip(scored, rows, strict=True)])
+            name: np.concatenate([parts[number][some.numpy()] for number, some in rows.items()])
             for name, parts in errors.items()
         }
         compared[LOCATOR] = np.concatenate([found for found in located if found is not None])

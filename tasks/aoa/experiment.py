@@ -21,6 +21,7 @@ from tasks.cluster import connected
 from tasks.metrics import AoaMetrics
 from tasks.page.page import reporting
 from tasks.page.records import Records
+from tasks.processes import number_of_processes
 from tasks.run import Run, choose_device
 from tasks.source import reading
 from tasks.steps import Step, computed
@@ -61,7 +62,8 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
     ):
         results = Results(experiment, directory)
         with terminal.progress():
-            for step, value in computed(directory, steps, experiment, cluster):
+            processes = number_of_processes(device)
+            for step, value in computed(directory, steps, experiment, cluster, processes, results.show):
                 results.add(step, value)
         results.write()
         metrics: AoaMetrics = {

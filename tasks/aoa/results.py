@@ -13,11 +13,22 @@ from swiftwrf.metrics import angle_errors, covered, l1, psnr, ssim
 from swiftwrf.models import FIELD_MODELS
 from tasks.aoa.condition import EVERYTHING, LOCATOR, Condition, MeasuredSubset, pooled, reference_of
 from tasks.aoa.context import ROOM_MODEL, Experiment
+from tasks.aoa.evaluation import Evaluation
 from tasks.aoa.locating import LEVEL, NO_PLANE, Locating
 from tasks.aoa.options import AUTO, fraction_key
-from tasks.aoa.steps import CrossValidation, Evaluation, RoomSearch, Synthesis, as_bytes
+from tasks.aoa.steps import CrossValidation, EstimatorChoice
 from tasks.aoa.suggestion import Suggestion
-from tasks.metrics import ANGLES, SCORES, ChangeMetrics, LocatingMetrics, MethodMetrics, MixMetrics, SynthesisMetrics
+from tasks.aoa.synthesis import RoomSearch, Synthesis, as_bytes
+from tasks.metrics import (
+    ANGLES,
+    SCORES,
+    ChangeMetrics,
+    EstimatorChoiceMetrics,
+    LocatingMetrics,
+    MethodMetrics,
+    MixMetrics,
+    SynthesisMetrics,
+)
 from tasks.run import Row, Run
 from tasks.steps import Step
 from tasks.summarise import averaged, paired_change, repeats_averaged
@@ -49,6 +60,7 @@ class Results:
         self.synthesis_seconds: list[Row] = []
         self.history: list[Row] = []
         self.chosen: dict[str, Row] = {}  # by measured fraction, of the first repeat
+        self.estimator_choice: dict[str, EstimatorChoiceMetrics] = {}  # by measured fraction, of the first repeat
         self.left_out: dict[Condition, str] = {}  # conditions of matched-field processing, and why
         self._examples: set[str] = set()
         self._sentences: set[str] = set()
@@ -63,6 +75,8 @@ class Results:
         match step:
             case CrossValidation():
                 self.chosen.setdefault(step.subset.key, value)
+            case EstimatorChoice() if step.compared.subset.repeat == 0:
+                self.estimator_choice[step.compared.subset.key] = value["estimator_choice"]
             case Synthesis() if "refused" in value:
                 console.print(f"{step.synthesizer} is left out of the comparison: {value['refused']}")
             case Synthesis():
@@ -73,10 +87,20 @@ class Results:
                 self._leave_out((step.condition,), value["refused"])
             case Evaluation() | Locating():
                 self.evaluated.append((step.condition, value))
-                self._show(step.condition, value)
                 self.history += [step.condition.columns | row for row in value["history"]]
             case Suggestion():
                 self._add_suggestion(step, value)
+
+    def show(self, step: Step[Experiment], value: Row) -> None:
+        """Show the median angular error of a condition on the terminal."""
+        if not isinstance(step, Evaluation | Locating) or "refused" in value:
+            return
+        condition = step.condition
+        error = angle_errors(torch.tensor(value["estimate"], dtype=torch.float64), self.test.label)["great_circle"]
+        name = f"{condition.estimator}, {condition.meaning}"
+        if condition.training != "all" and len(self.experiment.config.mix) > 1:
+            name = f"{condition.measured_fraction:.0%}: {name}"
+        terminal.result(name, f"{float(error.nanmedian().rad2deg()):.2f} deg")
 
     @property
     def pooled(self) -> list[tuple[Condition, Row]]:
@@ -130,14 +154,6 @@ class Results:
             }
             rows += _rows(condition.columns, columns)
         return rows
-
-    def _show(self, condition: Condition, value: Row) -> None:
-        """Show the median angular error of a condition."""
-        error = angle_errors(torch.tensor(value["estimate"], dtype=torch.float64), self.test.label)["great_circle"]
-        name = f"{condition.estimator}, {condition.meaning}"
-        if condition.training != "all" and len(self.experiment.config.mix) > 1:
-            name = f"{condition.measured_fraction:.0%}: {name}"
-        terminal.result(name, f"{float(error.nanmedian().rad2deg()):.2f} deg")
 
     def _leave_out(self, conditions: Iterable[Condition], reason: str) -> None:
         """Record and print why conditions are not in the results, each sentence once."""
@@ -211,7 +227,7 @@ class Results:
             "counts": {condition.training_set: value["counts"] for condition, value in evaluated},
             "choice": chosen.get("choice"),
             "advice": chosen.get("advice"),
-            "estimator_choice": chosen.get("estimator_choice"),
+            "estimator_choice": self.estimator_choice.get(fraction_key(fraction)),
             "synthesis": _synthesis_metrics(synthesis, fits),
             "methods": methods,
             "reference": reference,

@@ -1,31 +1,26 @@
-"""Steps of the experiment: a field model is chosen, spectra are synthesized, an estimator is trained and tested."""
+"""First steps of the experiment: reference conditions, and the comparison of field models and estimators."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
+import numpy as np
 import torch
-from torch import Tensor
 
-from augment import Mixed, SyntheticPositions, choose_model, mix, synthetic_positions
-from augment.choose import candidates
-from swiftwrf import FitError, InputError, Spectra, load
-from swiftwrf.data.store import Store
-from swiftwrf.models import FIELD_MODELS, FieldModel
-from swiftwrf.runtime.checkpoint import read, write
-from tasks.aoa.artifacts import save_artifacts
-from tasks.aoa.condition import EVERYTHING, NETWORKS, Condition, MeasuredSubset, Training, estimators, trainable
+from augment import Fold, choose_model
+from swiftwrf import GeometryModel, InputError, Spectra, load
+from swiftwrf.models import FIELD_MODELS
+from tasks.aoa.condition import EVERYTHING, Condition, MeasuredSubset, Training, estimators, trainable
 from tasks.aoa.context import ROOM_MODEL, Experiment
-from tasks.aoa.cross_validation import STAND_IN, advise, choose_estimator
-from tasks.aoa.estimators import SavedEstimator, make_estimator
-from tasks.aoa.locating import Locating
+from tasks.aoa.cross_validation import STAND_IN, advise, choose_estimator, located_folds
+from tasks.aoa.evaluation import Evaluation
 from tasks.aoa.options import AUTO
+from tasks.aoa.synthesis import RoomSearch, syntheses
 from tasks.claim import STEPS
 from tasks.metrics import AdviceMetrics
+from tasks.records import read_json
 from tasks.run import Row
 from tasks.steps import Step
 
@@ -44,31 +39,14 @@ def first_steps(experiment: Experiment, subset: MeasuredSubset) -> list[Step[Exp
 
     steps: list[Step[Experiment]] = [
         *(reference(estimator, "measured") for estimator in estimators(experiment.config.preset)),
-        *(_syntheses(experiment, subset, named, {}) if named and not compared else [CrossValidation(subset, compared)]),
-        # independent of the measured fraction, so all fractions share these steps
-        *(reference(estimator, "all") for estimator in trainable(experiment.config.preset)),
+        *(syntheses(experiment, subset, named, {}) if named and not compared else [CrossValidation(subset, compared)]),
     ]
-    config = experiment.config
-    if subset == MeasuredSubset(config.mix[0]) and 1.0 not in config.mix and ROOM_MODEL in candidates(experiment.train):
-        steps.append(RoomSearch(EVERYTHING, (), experiment.located_by(EVERYTHING)))
-    return steps
-
-
-def _syntheses(
-    experiment: Experiment, subset: MeasuredSubset, names: Sequence[str], advice: Mapping[str, AdviceMetrics]
-) -> list[Step[Experiment]]:
-    """Return the syntheses whose spectra are trained on, and those for comparison; models with a room follow its search."""
-    direct: list[Step[Experiment]] = []
-    with_room: list[Synthesis] = []
-    for name in dict.fromkeys((*names, *candidates(experiment.train))):
-        trains, own = name in names, advice.get(name)
-        n_synthetic = experiment.n_extra(own) if trains else 0
-        synthesis = Synthesis(subset, name, trains, n_synthetic, bool(own and own["sampled"]))
-        (with_room if experiment.finds_room(name) else direct).append(synthesis)
-    search: list[Step[Experiment]] = []
-    if with_room:
-        search.append(RoomSearch(subset, tuple(with_room), experiment.located_by(subset)))
-    return search + direct if with_room and with_room[0].trains else direct + search
+    config, has_room = experiment.config, ROOM_MODEL in experiment.candidates
+    if has_room:
+        shared = subset == MeasuredSubset(config.mix[0]) and 1.0 not in config.mix
+        steps.append(RoomSearch(subset, (), experiment.located_by(subset), EVERYTHING if shared else None))
+    # independent of the measured fraction, so all fractions share these steps
+    return [*steps, *(reference(estimator, "all") for estimator in trainable(experiment.config.preset))]
 
 
 @dataclass(frozen=True)
@@ -100,7 +78,7 @@ class CrossValidation(Step[Experiment]):
             if not self.compared:
                 raise
             # field models asked for by name need no comparison
-            return {"choice": None, "advice": {}, "estimator_choice": None}
+            return {"choice": None, "advice": {}}
         trained = [name for name in self.compared if name in choice.folds] or [choice.name]
         advice = {name: advise(choice.folds[name], experiment.n_synthetic, seed) for name in trained}
         first = advice[trained[0]]
@@ -111,8 +89,16 @@ class CrossValidation(Step[Experiment]):
         return {
             "choice": {"name": choice.name, "psnr_db": choice.psnr_db, "seconds": choice.seconds},
             "advice": {name: entry.metrics for name, entry in advice.items()},
-            "estimator_choice": choose_estimator(errors, with_room, seed),
+            "errors": errors,
+            "folds": {number: self._keep(fold, number, folder) for number, fold in located_folds(with_room).items()},
         }
+
+    def _keep(self, fold: Fold, number: int, folder: Path) -> Row:
+        """Keep the room of a fold. Return its file, and the numbers of the spectra in the data set."""
+        file = f"{STEPS}/{self.name}-room{number}.safetensors"
+        assert fold.model.room is not None
+        fold.model.room.save(folder / file)
+        return {"file": file, "train": fold.train.index, "test": fold.test.index}
 
     def _turbo(self, experiment: Experiment, synthesizer: str, advice: AdviceMetrics) -> Condition:
         """Return the condition of the stand-in with all spectra of a field model."""
@@ -121,262 +107,52 @@ class CrossValidation(Step[Experiment]):
 
     def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
         named = [name for name in experiment.config.synthesizer if name != AUTO]
-        return _syntheses(experiment, self.subset, named or [value["choice"]["name"]], value["advice"])
+        followed = syntheses(experiment, self.subset, named or [value["choice"]["name"]], value["advice"])
+        if value["choice"] is None:
+            return followed
+        return [*followed, EstimatorChoice(self, tuple(entry["file"] for entry in value["folds"].values()))]
 
 
 @dataclass(frozen=True)
-class RoomSearch(Step[Experiment]):
-    """Find the room in the measured spectra, once for all field models that are built on it and for the locator.
+class EstimatorChoice(Step[Experiment]):
+    """Choose the estimator by the errors on held-out measured spectra.
 
     Args:
-        subset: Measured spectra.
-        syntheses: Steps of these models.
-        located: Conditions of matched-field processing.
+        compared: Comparison of field models whose folds are used.
+        rooms: Files of the folds' rooms.
     """
 
-    subset: MeasuredSubset
-    syntheses: tuple[Synthesis, ...]
-    located: tuple[Condition, ...] = ()
+    compared: CrossValidation
+    rooms: tuple[str, ...]
 
     @property
     def name(self) -> str:
-        return f"room-{self.subset}"
+        return f"estimator-{self.compared.subset}"
 
     @property
     def title(self) -> str:
-        return "finding the room"
+        return "comparing estimators"
 
     @property
-    def file(self) -> str:
-        """File of the fitted model in the run's directory."""
-        return f"{STEPS}/{self.name}.safetensors"
-
-    def compute(self, experiment: Experiment, folder: Path) -> Row:
-        measured, _ = experiment.withhold(self.subset)
-        began = time.perf_counter()
-        try:
-            model = experiment.make_model(ROOM_MODEL, self.subset).fit(
-                measured, device=experiment.device, progress=True
-            )
-        except (InputError, FitError) as error:
-            return {"refused": str(error)}
-        model.save(folder / self.file)
-        return {"seconds": time.perf_counter() - began, "planes": len(model.room.planes) if model.room else 0}
-
-    def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
-        found = None if "refused" in value else self  # without a room the models refuse the spectra themselves
-        seconds = value.get("seconds", 0.0)
-        steps: list[Step[Experiment]] = [replace(one, room=found, room_seconds=seconds) for one in self.syntheses]
-        return steps + [Locating(condition, self.file, seconds) for condition in self.located if value.get("planes")]
-
-
-@dataclass(frozen=True)
-class Synthesis(Step[Experiment]):
-    """Predict spectra by one field model at test, withheld and further positions.
-
-    Args:
-        subset: Measured spectra.
-        synthesizer: Name of the field model.
-        trains: Whether its spectra train estimators. Otherwise it predicts at the test positions alone, for comparison.
-        n_synthetic: Number of further synthetic positions.
-        sampled: Train with samples in place of means.
-        room: Search for the room that the model reuses, if any.
-        room_seconds: Time of that search [s], which counts as part of the fit.
-    """
-
-    subset: MeasuredSubset
-    synthesizer: str
-    trains: bool
-    n_synthetic: int
-    sampled: bool
-    room: RoomSearch | None = None
-    room_seconds: float = 0.0
-
-    @property
-    def name(self) -> str:
-        return f"synthesis_{self.synthesizer}-{self.subset}"
-
-    @property
-    def title(self) -> str:
-        return f"synthesizing spectra by {self.synthesizer}"
-
-    @property
-    def file(self) -> str:
-        """File of the spectra in the run's directory."""
-        return f"{STEPS}/{self.name}.safetensors"
+    def result(self) -> str:
+        """File of the kept comparison."""
+        return f"{STEPS}/{self.compared.name}.json"
 
     @property
     def reads(self) -> tuple[str, ...]:
-        return (self.room.file,) if self.room else ()
-
-    def test_spectra(self, folder: Path) -> dict[str, Store]:
-        """Return the spectra at the test positions: `test`, and `test_std` and `test_sample` if the model has them."""
-        tensors = read(folder / self.file, KIND)[1]
-        return {name: Store(tensor) for name, tensor in tensors.items() if name.startswith("test")}
-
-    def training_spectra(self, folder: Path, part: str) -> tuple[SyntheticPositions, Tensor]:
-        """Return positions and spectra of a part, `withheld` or `extra`, as they were synthesized together."""
-        tensors = read(folder / self.file, KIND)[1]
-        positions = (tensors[f"{part}_{name}"] for name in ("position", "label", "index"))
-        return SyntheticPositions(*positions), tensors[part]
+        return (self.result, *self.rooms)
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
-        try:
-            return self._synthesize(experiment, folder)
-        except (InputError, FitError) as error:
-            if self.trains:
-                raise
-            return {"refused": str(error)}
+        measured, _ = experiment.withhold(self.compared.subset)
+        found = read_json(folder / self.result)["value"]
 
-    def _synthesize(self, experiment: Experiment, folder: Path) -> Row:
-        measured, withheld = experiment.withhold(self.subset)
-        history = _FitHistory()
-        model = self._fitted(experiment, measured, history, folder)
-        fitted = time.perf_counter()
-        generator = torch.Generator().manual_seed(experiment.seed(self.subset))
+        def part(index: list[int]) -> Spectra:
+            return measured.subset(torch.isin(measured.index, torch.tensor(index)).nonzero()[:, 0])
 
-        def sample(position: Tensor) -> Tensor:
-            return model.sample(position, generator=generator)
-
-        def std(position: Tensor) -> Tensor:
-            return cast(Tensor, model.predict(position).std)
-
-        test = experiment.test.position
-        tensors = {"test": _as_bytes_at(test, model.synthesize)}
-        tested = time.perf_counter()
-        if model.predict(test[:1]).std is not None:
-            tensors["test_std"] = _as_bytes_at(test, std)
-        if model.samples:
-            tensors["test_sample"] = _as_bytes_at(test, sample)
-        parts = {"withheld": withheld} if self.trains else {}
-        if self.n_synthetic:
-            parts["extra"] = synthetic_positions(measured, self.n_synthetic, experiment.seed(self.subset))
-        for part, positions in parts.items():
-            predict = sample if self.sampled and model.samples else model.synthesize
-            tensors[part] = _as_bytes_at(positions.position, predict)
-            tensors |= {f"{part}_{name}": tensor for name, tensor in vars(positions).items()}
-        seconds = {
-            "fit": fitted - history.began + history.earlier + self.room_seconds,
-            "synthesize": tested - fitted,
-            "draw": time.perf_counter() - fitted,
-        }
-        write(folder / self.file, KIND, tensors, {})
-        if self.trains and self.subset.repeat == 0:
-            save_artifacts(model, self.subset.key, measured, experiment.test, folder)
-        return {"history": history.records, "seconds": seconds}
-
-    def _fitted(self, experiment: Experiment, measured: Spectra, history: _FitHistory, folder: Path) -> FieldModel:
-        # models that are only compared are as small as in the choice
-        preset = experiment.config.preset if self.trains else "quick"
-        room = load(folder / self.room.file) if self.room else None
-        assert room is None or isinstance(room, FieldModel)
-        history.begin()
-        return experiment.make_model(self.synthesizer, self.subset, preset).fit(
-            measured,
-            like=room,
-            device=experiment.device,
-            checkpoint=folder / STEPS / f"{self.name}-fit.safetensors",
-            on_record=history.add,
-            progress=True,
-        )
-
-    def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
-        trainings: list[tuple[Training, int]] = [("turbo", 0)] if self.trains else []
-        if self.n_synthetic:
-            trainings.append(("turbo_extra", self.n_synthetic))
-        fraction, repeat = self.subset.measured_fraction, self.subset.repeat
-        return [
-            Evaluation(Condition(estimator, training, self.synthesizer, number, fraction, repeat), self)
-            for training, number in trainings
-            for estimator in trainable(experiment.config.preset)
-            # a training of the network takes most of the time
-            if training == trainings[-1][0] or estimator not in NETWORKS.values()
-        ]
-
-
-@dataclass(frozen=True)
-class Evaluation(Step[Experiment]):
-    """Train and test one condition.
-
-    Args:
-        condition: Estimator and training set.
-        synthesis: Step of the synthetic spectra, if there are any.
-    """
-
-    condition: Condition
-    synthesis: Synthesis | None = None
-
-    @property
-    def subset(self) -> MeasuredSubset:
-        """Measured spectra of the condition."""
-        return self.condition.subset
-
-    @property
-    def name(self) -> str:
-        return self.condition.result_name
-
-    @property
-    def title(self) -> str:
-        return f"training {self.condition.estimator}, {self.condition.meaning}"
-
-    @property
-    def reads(self) -> tuple[str, ...]:
-        return (self.synthesis.file,) if self.synthesis else ()
-
-    def compute(self, experiment: Experiment, folder: Path) -> Row:
-        train = self._training_set(experiment, folder)
-        config, name = experiment.config, self.condition.estimator
-        estimator = make_estimator(name, len(experiment.train), config.preset, seed=experiment.seed(self.subset))
-        began = time.perf_counter()
-        estimator.fit(train, device=experiment.device)
-        fitted = time.perf_counter()
-        estimate = torch.cat([estimator.predict(part) for part in experiment.test.store.batches()])
-        if isinstance(estimator, SavedEstimator) and self._is_saved(experiment):
-            estimator.save(folder / f"{name}-mix{self.subset.key}.safetensors")
-        seconds = {"train": fitted - began, "estimate": time.perf_counter() - fitted}
-        return {"estimate": estimate, "seconds": seconds, "history": estimator.history, "counts": train.counts}
-
-    def _is_saved(self, experiment: Experiment) -> bool:
-        """Return True for the condition that a user would choose: with all spectra of the first field model."""
-        if self.synthesis is None or self.subset.repeat:
-            return False
-        first = experiment.config.synthesizer[0] in (AUTO, self.synthesis.synthesizer)
-        return first and self.condition.n_synthetic == self.synthesis.n_synthetic
-
-    def _training_set(self, experiment: Experiment, folder: Path) -> Mixed:
-        if self.condition.training == "all":
-            return Mixed.measured(experiment.train)
-        measured, _ = experiment.withhold(self.subset)
-        if self.synthesis is None:
-            return Mixed.measured(measured)
-        train = mix(measured, *self.synthesis.training_spectra(folder, "withheld"))
-        if self.condition.training == "turbo_extra":
-            train = train.add(*self.synthesis.training_spectra(folder, "extra"))
-        return train
-
-
-class _FitHistory:
-    """Records of a fit, and the seconds that earlier sessions of the run spent on it."""
-
-    def __init__(self) -> None:
-        self.records: list[Row] = []
-        self.began = self.earlier = 0.0
-
-    def begin(self) -> None:
-        """Start the clock."""
-        self.began = time.perf_counter()
-
-    def add(self, record: Row) -> None:
-        """Append a record; those of earlier sessions come first."""
-        self.records.append(record)
-        self.earlier = max(self.earlier, record.get("elapsed", 0.0) - (time.perf_counter() - self.began))
-
-
-def _as_bytes_at(position: Tensor, predict: Callable[[Tensor], Tensor]) -> Tensor:
-    """Return predicted spectra at positions (n, 3), rounded in batches."""
-    return torch.cat([as_bytes(predict(some).cpu()) for some in position.split(BATCH_POSITIONS)])
-
-
-def as_bytes(spectrum: Tensor) -> Tensor:
-    """Return magnitudes in 256 steps, the resolution of spectra stored as images."""
-    return (spectrum.clamp(0, 1) * 255).round().to(torch.uint8)
+        folds = {}
+        for number, entry in found["folds"].items():
+            room = load(folder / entry["file"])
+            assert isinstance(room, GeometryModel)
+            folds[int(number)] = Fold(room, part(entry["train"]), part(entry["test"]))
+        errors = {name: [np.array(fold) for fold in entry] for name, entry in found["errors"].items()}
+        return {"estimator_choice": choose_estimator(errors, folds, experiment.seed(self.compared.subset))}

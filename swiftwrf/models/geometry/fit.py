@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import torch
@@ -25,12 +25,21 @@ from swiftwrf.models.geometry.planes import (
     RoomEstimate,
     advantage,
     correlation_score,
+    log_explained,
     refined,
     robust_advantage,
     sign_alternatives,
 )
 from swiftwrf.models.geometry.refine import offset_covariance
-from swiftwrf.models.geometry.search import N_STARTS, PERFECT_SCORE, WEAK_GAIN, Search, find_room
+from swiftwrf.models.geometry.search import (
+    MAX_SCORE_RATIO,
+    N_STARTS,
+    PERFECT_SCORE,
+    SIGNS,
+    WEAK_GAIN,
+    Search,
+    find_room,
+)
 from swiftwrf.models.geometry.uncertainty import assess
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
@@ -39,8 +48,11 @@ from swiftwrf.runtime.validation import NonNegativeFloat, NonNegativeInt, Positi
 MAX_PHASE_ERROR = 0.1  # relative error of a spectrum's autocorrelation up to which its phases are used
 MAX_ALIAS_STEPS = 3  # times that planes move to other phase aliases
 FURTHER_SIGNIFICANCE = 4.0  # standard errors for a plane of any orientation, of which far more are tried
+PROMISING_SIGNIFICANCE = 1.0  # standard errors by which one must be better after a few steps to be refined further
 MAX_FURTHER_TRIED = 8  # candidates of any orientation that are refined
 MAX_ORDER = 4  # reflections of an image source
+MIN_SEARCHED = 50  # spectra of a search whose room is extended; searches in fewer end at phase aliases more often
+MAX_MISSING_RATIO = 1.4  # of the missing coherence of new spectra and of those of a search, geometric means
 MIN_HELD_OUT = 300  # positions to decide by: folds are held out in turn until their number is reached
 
 
@@ -83,46 +95,121 @@ def search_room(train: Spectra, config: GeometryConfig, progress: bool = False) 
     Raises:
         InputError: Fewer than 10 different positions, or spectra that the array cannot have produced.
     """
-    train, _ = _evenly(train, config.max_spectra)
-    assert train.array is not None
-    assert train.fixed_position is not None
-    observed, _ = observe(train, config)
-    scene = observed.around(train.fixed_position)
-    fold = folds(scene.moving, config.validation, config.seed)
-    kept, held = scene.subset((fold != 0).nonzero()[:, 0]), scene.subset((fold == 0).nonzero()[:, 0])
+    evidence = _Evidence.of(train, config)
     with progress_bar(progress) as bar:
         task = bar.add_task("finding the room", total=N_STARTS)
-        signs, found = find_room(
-            _some(kept, config.positions, config.seed), config.reach, config.width, tick=lambda: bar.advance(task)
-        )
-    score = correlation_score(held, PlaneSet.of(found).refined(kept), train.array)
-    some = _some(scene, config.positions, config.seed)
-    found = Search(some, config.reach, signs).improve(found)
-    room = PlaneSet.of(found).refined(scene)
-    splits = split(scene, fold)
+        some = _some(evidence.kept, config.positions, config.seed)
+        signs, found = find_room(some, config.reach, config.width, tick=lambda: bar.advance(task))
+    score = evidence.held_out_score(PlaneSet.of(found))
+    found = Search(evidence.some, config.reach, signs).improve(found)
+    return _completed(PlaneSet.of(found).refined(evidence.scene), signs, score, evidence, config)
+
+
+@single_thread()
+def extend_room(room: PlaneSet, train: Spectra, is_new: Tensor, config: GeometryConfig) -> RoomEstimate | None:
+    """Estimate a room from more spectra than its search had, without another search if the room explains the new ones.
+
+    A wrong room explains the spectra of its search better than others, because its planes are fitted to them.
+
+    Args:
+        room: Planes that the search found.
+        train: All spectra.
+        is_new: Whether the search did not use a spectrum, (n,).
+        config: Options of the search.
+
+    Returns:
+        The room, with the planes that all spectra together resolve, or None if it does not explain the new spectra or its
+        search had fewer than 50.
+
+    Raises:
+        InputError: As `search_room`.
+    """
+    evidence = _Evidence.of(train, config)
+    room, scene = room.shifted(-evidence.origin), evidence.scene
+    new = is_new[evidence.rows]
+    explained = log_explained(scene.coherence(room.field(scene)))
+    excess = explained[~new].mean() - explained[new].mean()
+    if int((~new).sum()) < MIN_SEARCHED or not room.normal.shape[1] or not float(excess) < math.log(MAX_MISSING_RATIO):
+        return None
+    gains = room.by_side().gain
+    signs = max(SIGNS, key=lambda row: sum(float(row[side]) * gain > 0 for side, gain in gains.items()))
+    score, room = evidence.held_out_score(room), room.refined(scene)
+    improved = PlaneSet.of(Search(evidence.some, config.reach, signs).improve(room.by_side())).refined(scene)
+    # a phase alias explains new spectra nearly as well as others, but all positions together less than the right room
+    if scene.score(improved.field(scene)) < MAX_SCORE_RATIO * scene.score(room.field(scene)):
+        room = improved
+    return _completed(room, signs, score, evidence, config)
+
+
+@dataclass(frozen=True, eq=False)
+class _Evidence:
+    """Observed phases of training spectra, and the parts of them that the stages of a search use.
+
+    Args:
+        train: Training spectra, at most `max_spectra`.
+        observed: Phases in world coordinates.
+        scene: Phases in coordinates around the fixed end.
+        rows: Number of each position's spectrum among all training spectra.
+        fold: Fold of each position.
+        some: Positions of the search.
+    """
+
+    train: Spectra
+    observed: PhaseObservations
+    scene: PhaseObservations
+    rows: Tensor
+    fold: Tensor
+    some: PhaseObservations
+
+    @classmethod
+    def of(cls, train: Spectra, config: GeometryConfig) -> _Evidence:
+        observed, rows = observe(train, config)
+        assert train.fixed_position is not None
+        scene = observed.around(train.fixed_position)
+        fold = folds(scene.moving, config.validation, config.seed)
+        used, _ = _evenly(train, config.max_spectra)
+        return cls(used, observed, scene, rows, fold, _some(scene, config.positions, config.seed))
+
+    @property
+    def origin(self) -> Tensor:
+        """Origin of the scene's coordinates (3,) [m]."""
+        assert self.train.fixed_position is not None
+        return self.train.fixed_position
+
+    @property
+    def kept(self) -> PhaseObservations:
+        """Positions outside the first fold."""
+        return self.scene.subset((self.fold != 0).nonzero()[:, 0])
+
+    def held_out_score(self, room: PlaneSet) -> float:
+        """Return the score of a room at the positions of the first fold, refined on the others."""
+        assert self.train.array is not None
+        held = self.scene.subset((self.fold == 0).nonzero()[:, 0])
+        return correlation_score(held, room.refined(self.kept), self.train.array)
+
+
+def _completed(
+    room: PlaneSet, signs: Tensor, score: float, evidence: _Evidence, config: GeometryConfig
+) -> RoomEstimate:
+    """Return the estimate that follows from planes that were found: weak and further planes, order and uncertainty."""
+    scene, some, splits = evidence.scene, evidence.some, split(evidence.scene, evidence.fold)
     room = _pruned(_without_aliases(room, scene, config), scene, splits, config)
     room = _with_weak_planes(room, scene, some, splits, signs, config)
     room = _with_further_planes(room, scene, some, splits, config)
     room = _with_order(room, splits, config)
-    return assess(
-        train, observed, room.shifted(train.fixed_position).refined(observed), score, config.reach, config.certainty
-    )
+    final = room.shifted(evidence.origin).refined(evidence.observed)
+    return assess(evidence.train, evidence.observed, final, score, config.reach, config.certainty)
 
 
 @single_thread()
-def refine_room(room: RoomEstimate, planes: PlaneSet, train: Spectra, config: GeometryConfig) -> RoomEstimate:
+def refine_room(room: RoomEstimate, planes: PlaneSet, scene: PhaseObservations) -> RoomEstimate:
     """Refine offsets and gains of a room on other spectra of the scene, without a search, in under a second.
 
     Args:
         room: Estimate from other spectra.
         planes: Its planes as tensors.
-        train: Spectra to refine on.
-        config: Options, of which the seed and the number of spectra count.
-
-    Raises:
-        InputError: As `search_room`.
+        scene: Observed phases of the spectra to refine on.
     """
-    scene, _ = observe(train, config)
     new = planes.refined(scene)
     found = zip(room.planes, new.normal[0].tolist(), new.offset[0].tolist(), new.gain[0].tolist(), strict=True)
     return replace(room, planes=[replace(p, normal=tuple(n), offset_m=o, gain=g) for p, n, o, g in found])
@@ -278,6 +365,8 @@ def _with_further_planes(
             gains = torch.cat([room.gain, torch.full((1, 1), FURTHER_GAIN * sign)], dim=1)
             wider.append(PlaneSet(normals, offsets, gains, room.order))
         wider = sorted(refined(wider, some, 8, tilt=True), key=lambda r: float(some.score(r.field(some))))
+        if advantage(some.coherence(wider[0].field(some)), some.coherence(room.field(some))) < PROMISING_SIGNIFICANCE:
+            break
         wider = [r for other in wider[:2] for r in (other, *sign_alternatives(scene, other))]
         wider = refined(wider, some, 20, tilt=True)
         best = min(wider, key=lambda r: float(some.score(r.field(some)))).refined(scene, 15, tilt=True)

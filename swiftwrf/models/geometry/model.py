@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import asdict
 from typing import Any, Self
 
@@ -11,11 +12,19 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.choices import Moving
-from swiftwrf.data.spectra import Spectra, fingerprint
+from swiftwrf.data.spectra import Spectra, check_training, fingerprint
 from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext, bounding_box
-from swiftwrf.models.geometry.fit import MAX_ORDER, GeometryConfig, refine_room, search_room, update_room
+from swiftwrf.models.geometry.fit import (
+    MAX_ORDER,
+    GeometryConfig,
+    extend_room,
+    observe,
+    refine_room,
+    search_room,
+    update_room,
+)
 from swiftwrf.models.geometry.images import PhaseObservations, image_gain, images
 from swiftwrf.models.geometry.planes import Plane, PlaneSet, RoomEstimate
 from swiftwrf.models.geometry.sample import Residual, sample_field
@@ -110,12 +119,50 @@ class GeometryModel(FieldModel):
         elif known.fingerprint == owner:
             self.estimate = known.estimate
         else:
-            self.estimate = refine_room(known.estimate, known.tensors(), train, self.config)
+            self.estimate = known.refined_on(observe(train, self.config)[0]).estimate
         self.fingerprint = owner
 
     def _update(self, new: Spectra) -> None:
         if self.planes:
             self.estimate, self.fingerprint = update_room(self.estimate, self.tensors(), new, self.config), ""
+
+    def extended(self, train: Spectra, is_new: Tensor) -> Self | None:
+        """Return the room fitted to more spectra than its search had, without another search.
+
+        Args:
+            train: Training spectra.
+            is_new: Whether the search did not use a spectrum, (n,).
+
+        Returns:
+            The fitted model. None if the search had fewer than 50 spectra, or if the room does not explain the new ones as
+            well as those of its search: then only another search helps.
+
+        Raises:
+            InputError: As `fit`.
+
+        Example:
+            >>> import swiftwrf
+            >>> data = swiftwrf.simulated_room(n=60)
+            >>> floor = Plane((0.0, 0.0, -1.0), offset_m=0.0, gain=-0.6)
+            >>> found_in_few = GeometryModel.of_planes(data.subset(torch.arange(20)), [floor])
+            >>> found_in_few.extended(data, is_new=torch.arange(60) >= 20) is None
+            True
+        """
+        check_training(train)
+        estimate = extend_room(self.tensors(), train, is_new, self.config)
+        if estimate is None:
+            return None
+        model = copy(self)
+        model.grid, model.bounds = train.grid, bounding_box(train.position)
+        model._set_link(train)
+        model.estimate, model.fingerprint = estimate, fingerprint(train)
+        return model
+
+    def refined_on(self, scene: PhaseObservations) -> Self:
+        """Return the room with offsets and gains refined on the observed phases of some spectra, without a search."""
+        model = copy(self)
+        model.estimate = refine_room(self.estimate, self.tensors(), scene)
+        return model
 
     @property
     def room(self) -> GeometryModel:

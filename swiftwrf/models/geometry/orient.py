@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from swiftwrf.models.geometry.batched import batched, batched_field, batched_score
 from swiftwrf.models.geometry.images import PhaseObservations
+from swiftwrf.runtime.threads import side_by_side
 
 N_HORIZONTAL_NORMALS = 90  # of upright walls
 N_SPHERE_NORMALS = 1200  # in all directions
@@ -40,12 +42,13 @@ def candidates(scene: PhaseObservations, base: Tensor, reach: float, top: int) -
     both = torch.cat([scene.transmitter, scene.receiver])
     rows = (scene.moving - scene.moving.mean(0)).norm(dim=1).argsort()[:N_NEAR]
     near, base = scene.subset(rows), batched(base[rows])
-    found: list[tuple[float, Tensor, float, float]] = []
     distance = (
         torch.arange(MIN_DISTANCE_RAD, reach * scene.wavenumber, DISTANCE_STEP_RAD, dtype=torch.float64)
         / scene.wavenumber
     )
-    for normal in directions().split(BATCH_SIZE):
+
+    def of_normals(normal: Tensor) -> list[tuple[float, Tensor, float, float]]:
+        found = []
         offset = (both @ normal.T).amax(0)[:, None] + distance
         planes = normal.repeat_interleave(len(distance), dim=0)[:, None], offset.reshape(-1, 1)
         wave = FURTHER_GAIN * batched_field(near, *planes, torch.ones(offset.numel(), 1), [(0,)])
@@ -53,4 +56,7 @@ def candidates(scene: PhaseObservations, base: Tensor, reach: float, top: int) -
             best = batched_score(near, base + sign * wave).view_as(offset).min(1)
             at = offset.gather(1, best.indices[:, None])[:, 0].tolist()
             found += [(v, n, o, sign) for v, n, o in zip(best.values.tolist(), normal, at, strict=True)]
+        return found
+
+    found = itertools.chain.from_iterable(side_by_side(of_normals, directions().split(BATCH_SIZE)))
     return [f[1:] for f in sorted(found, key=lambda f: f[0])[:top]]

@@ -13,7 +13,6 @@ from collections.abc import Iterable
 
 import torch
 from torch import Tensor
-from torch.nn.functional import one_hot
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray, basis, pairs
@@ -26,13 +25,11 @@ MAX_ERROR = 5e-3  # relative error of the autocorrelation of a solution
 
 def autocorrelation(channel: Tensor, array: PlanarArray) -> Tensor:
     """Return r(l) = sum of h_a conj(h_b) over the pairs with difference l, divided by K^2, (..., K) to (..., P)."""
-    k, (a, b, lag) = channel.shape[-1], pairs(array)
-    real, imag = channel.real.contiguous(), channel.imag.contiguous()
-    # products with matrices of zeros and ones are faster than indexing
-    first, second = one_hot(a, k).to(real).T, one_hot(b, k).to(real).T
-    total = one_hot(lag).to(real) / k**2
-    real_a, real_b, imag_a, imag_b = real @ first, real @ second, imag @ first, imag @ second
-    return torch.complex((real_a * real_b + imag_a * imag_b) @ total, (imag_a * real_b - real_a * imag_b) @ total)
+    a, b, lag = pairs(array)
+    element = channel.movedim(-1, 0).contiguous()
+    same = [lag == number for number in range(int(lag.max()) + 1)]
+    products = [torch.linalg.vecdot(element[b[some]], element[a[some]], dim=0) for some in same]
+    return torch.stack(products, dim=-1) / channel.shape[-1] ** 2
 
 
 def correlations(spectra: Spectra) -> Tensor:

@@ -22,6 +22,7 @@ from swiftwrf.models.geometry.batched import batched, batched_field, batched_sco
 from swiftwrf.models.geometry.images import PhaseObservations, phase_period_m, sequences
 from swiftwrf.models.geometry.refine import refine
 from swiftwrf.models.geometry.responses import SteeringResponses
+from swiftwrf.runtime.threads import side_by_side
 
 SIDES = torch.tensor(
     [[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], dtype=torch.float64
@@ -163,17 +164,17 @@ class Search:
 
         These are the present plane, no plane (gain 0), and the minima of scans with and without second-order images.
         """
-        found = []
-        for side in range(6):
+
+        def of_side(side: int) -> list[tuple[float, float]]:
             gain = room.gain[side] if side in room.offset else self.usual[side]
             own = [(room.offset[side], gain), (room.offset[side], 0.0)] if side in room.offset else [(0.0, 0.0)]
-            offsets = [o for order in (1, SEARCH_ORDER) for _, o in self.minima(room, side, order, top)]
             far: list[float] = []
-            for o in offsets:
+            for o in (o for order in (1, SEARCH_ORDER) for _, o in self.minima(room, side, order, top)):
                 if all(abs(o - p) > 2 * self.step for p in far):
                     far.append(o)
-            found.append(own + [(o, gain) for o in far])
-        return found
+            return own + [(o, gain) for o in far]
+
+        return side_by_side(of_side, range(6))
 
     def responses(self, alternatives: Alternatives) -> SteeringResponses:
         """Return the steering responses of all alternatives."""
@@ -251,13 +252,13 @@ def find_room(
         width: Width of the beam search.
         tick: Called after each of the N_STARTS starts.
     """
-    starts = []
     nothing = CandidateRoom(float(scene.score(scene.wave(scene.transmitter))))
     if nothing.score < PERFECT_SCORE:
         return SIGNS[0], nothing
-    for signs in SIGNS:
-        search = Search(scene, reach, signs)
-        starts += [(search.beam(width, order)[0], search) for order in (SEARCH_ORDER, 1)]
+    searches = [Search(scene, reach, signs) for signs in SIGNS]
+    searched = list(itertools.product((SEARCH_ORDER, 1), searches))
+    rooms = side_by_side(lambda item: item[1].beam(width, item[0])[0], searched)
+    starts = [(room, search) for room, (_, search) in zip(rooms, searched, strict=True)]
     best: tuple[Tensor, CandidateRoom] | None = None
     for start, search in sorted(starts, key=lambda s: s[0].score):
         if best is None or PERFECT_SCORE < start.score < MAX_START_RATIO * best[1].score:

@@ -24,6 +24,7 @@ from swiftwrf.models.geometry.planes import (
 )
 from swiftwrf.models.geometry.refine import offset_covariance
 from swiftwrf.models.geometry.sample import Residual, residual_statistics
+from swiftwrf.runtime.threads import side_by_side
 
 MAX_STD_RAD = 0.5  # of phase, beyond which a plane is not certain
 MIN_SPREAD_RAD = 0.8  # of phase: positions with less spread in any direction count as flat
@@ -59,7 +60,7 @@ def assess(
     alternatives = [
         (room_, log_explained(scene.coherence(room_.field(scene)))) for room_ in phase_alternatives(scene, room)
     ]
-    nearest = [_nearest_alternative(scene, room, i, alternatives) for i in range(len(std))]
+    nearest = side_by_side(lambda plane: _nearest_alternative(scene, room, plane, alternatives), range(len(std)))
     lost = [lead <= certainty or s * scene.wavenumber > MAX_STD_RAD for s, (lead, _) in zip(std, nearest, strict=True)]
     # a room most of whose planes have alternatives may be wrong as a whole, because each plane holds the others
     all_lost = bool(doubt) or sum(lost) > len(lost) / 2
@@ -120,9 +121,13 @@ def _flat(scene: PhaseObservations) -> str:
 
 def _other_carrier(scene: PhaseObservations, room: PlaneSet, certainty: float) -> str:
     """Return the reason if another carrier explains the spectra significantly better, else nothing."""
-    for scale in CARRIER_SCALES:
+    here = scene.coherence(room.field(scene))
+
+    def lead(scale: float) -> float:
         other = replace(scene, wavenumber=scale * scene.wavenumber)
-        explained = other.coherence(room.refined(other, 6).field(other))
-        if advantage(explained, scene.coherence(room.field(scene))) > certainty:
+        return advantage(other.coherence(room.refined(other, 6).field(other)), here)
+
+    for scale, found in zip(CARRIER_SCALES, side_by_side(lead, CARRIER_SCALES), strict=True):
+        if found > certainty:
             return f"; a carrier {100 * (scale - 1):+.0f} % from the given one explains the spectra better"
     return ""

@@ -32,7 +32,7 @@ HALF_TRUST_SPECTRA = 1000  # training spectra after which squared distances of f
 class AANNKernelConfig(AANNConfig):
     """Options of the network and its short training."""
 
-    steps: PositiveInt = 30
+    steps: PositiveInt = 15
     """optimisation steps, the same for every training set"""
 
     @classmethod

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.linalg import solve
+from scipy.linalg import cho_factor, cho_solve
 from scipy.special import softmax
 from sklearn.metrics.pairwise import euclidean_distances
 from sklearn.model_selection import KFold
@@ -122,6 +122,8 @@ def choose(distance: NDArray[Any], target: NDArray[Any], seed: int) -> tuple[flo
         seed: Seed of the folds.
     """
     width = 1 / max(float(np.median(distance[~np.eye(len(distance), dtype=bool)])), 1e-9)
+    # single precision: the penalty, relative to the row sums, is a thousand times its rounding
+    distance, target = distance.astype(np.float32), target.astype(np.float32)
     folds = KFold(min(5, len(distance)), shuffle=True, random_state=seed)
     errors: dict[tuple[float, float], float] = {}
     with threadpool_limits(1):  # many small problems: several threads would mostly wait for each other
@@ -149,5 +151,6 @@ def _dual_coefficients(kernel: NDArray[Any], target: NDArray[Any], alpha: float)
     interpolates the targets, a large one gives the targets themselves, and constant targets are reproduced exactly.
     """
     sums = kernel.sum(axis=1)
-    dual: NDArray[Any] = solve(kernel + np.diag(alpha * sums), sums[:, None] * target, assume_a="pos")
+    factor = cho_factor(kernel + np.diag(alpha * sums), lower=True, overwrite_a=True, check_finite=False)
+    dual: NDArray[Any] = cho_solve(factor, sums[:, None] * target, check_finite=False)
     return (1 + alpha) * dual

@@ -6,7 +6,6 @@ import copy
 from typing import Any, cast
 
 import torch
-import torchvision
 from torch import Tensor, nn
 from torch import distributed as dist
 from torch.nn import functional
@@ -116,7 +115,9 @@ def backbone(circular: bool, products: bool) -> nn.Module:
         circular: pads the azimuth circularly.
         products: computes its pointwise convolutions, two thirds of all, as matrix products, and those over few pixels.
     """
-    network: nn.Module = torchvision.models.resnet50(weights=None)
+    from torchvision.models import resnet50  # takes two seconds, which only a training needs
+
+    network: nn.Module = resnet50(weights=None)
     network.conv1 = nn.Conv2d(1, 64, kernel_size=7, stride=2, padding=3, bias=False)
     last = nn.Linear(256, 3)
     network.fc = nn.Sequential(nn.Linear(FEATURES, 256), nn.ReLU(), last)

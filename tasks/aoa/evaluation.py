@@ -1,0 +1,89 @@
+"""Step of the experiment: an estimator is trained on one training set and tested."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from augment import Mixed, mix
+from tasks.aoa.condition import Condition, MeasuredSubset
+from tasks.aoa.context import Experiment
+from tasks.aoa.estimators import SavedEstimator, make_estimator
+from tasks.aoa.options import AUTO
+from tasks.run import Row
+from tasks.steps import Step
+
+if TYPE_CHECKING:
+    from tasks.aoa.synthesis import Synthesis
+
+KIND = "synthetic spectra"
+BATCH_POSITIONS = 4096  # spectra predicted before they are rounded: half a gigabyte of 90 x 360 pixels
+
+
+@dataclass(frozen=True)
+class Evaluation(Step[Experiment]):
+    """Train and test one condition.
+
+    Args:
+        condition: Estimator and training set.
+        synthesis: Step of the synthetic spectra, if there are any.
+    """
+
+    condition: Condition
+    synthesis: Synthesis | None = None
+
+    @property
+    def subset(self) -> MeasuredSubset:
+        """Measured spectra of the condition."""
+        return self.condition.subset
+
+    @property
+    def name(self) -> str:
+        return self.condition.result_name
+
+    @property
+    def title(self) -> str:
+        return f"training {self.condition.estimator}, {self.condition.meaning}"
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return (self.synthesis.file,) if self.synthesis else ()
+
+    @property
+    def priority(self) -> int:
+        return int(self.condition.is_network)
+
+    def compute(self, experiment: Experiment, folder: Path) -> Row:
+        train = self._training_set(experiment, folder)
+        config, name = experiment.config, self.condition.estimator
+        estimator = make_estimator(name, len(experiment.train), config.preset, seed=experiment.seed(self.subset))
+        began = time.perf_counter()
+        estimator.fit(train, device=experiment.device)
+        fitted = time.perf_counter()
+        estimate = torch.cat([estimator.predict(part) for part in experiment.test.store.batches()])
+        if isinstance(estimator, SavedEstimator) and self._is_saved(experiment):
+            estimator.save(folder / f"{name}-mix{self.subset.key}.safetensors")
+        seconds = {"train": fitted - began, "estimate": time.perf_counter() - fitted}
+        return {"estimate": estimate, "seconds": seconds, "history": estimator.history, "counts": train.counts}
+
+    def _is_saved(self, experiment: Experiment) -> bool:
+        """Return True for the condition that a user would choose: with all spectra of the first field model."""
+        if self.synthesis is None or self.subset.repeat:
+            return False
+        first = experiment.config.synthesizer[0] in (AUTO, self.synthesis.synthesizer)
+        return first and self.condition.n_synthetic == self.synthesis.n_synthetic
+
+    def _training_set(self, experiment: Experiment, folder: Path) -> Mixed:
+        if self.condition.training == "all":
+            return Mixed.measured(experiment.train)
+        measured, _ = experiment.withhold(self.subset)
+        if self.synthesis is None:
+            return Mixed.measured(measured)
+        train = mix(measured, *self.synthesis.training_spectra(folder, "withheld"))
+        if self.condition.training == "turbo_extra":
+            train = train.add(*self.synthesis.training_spectra(folder, "extra"))
+        return train

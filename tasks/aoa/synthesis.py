@@ -1,0 +1,263 @@
+"""Steps of the experiment: the room is found, and field models predict spectra."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from augment import SyntheticPositions, synthetic_positions
+from swiftwrf import FitError, GeometryModel, InputError, Spectra, load
+from swiftwrf.data.store import Store
+from swiftwrf.models import FieldModel
+from swiftwrf.runtime.checkpoint import read, write
+from tasks.aoa.artifacts import save_artifacts
+from tasks.aoa.condition import NETWORKS, Condition, MeasuredSubset, Training, trainable
+from tasks.aoa.context import ROOM_MODEL, Experiment
+from tasks.aoa.evaluation import Evaluation
+from tasks.aoa.locating import Locating
+from tasks.claim import STEPS
+from tasks.metrics import AdviceMetrics
+from tasks.run import Row
+from tasks.steps import Step
+
+KIND = "synthetic spectra"
+BATCH_POSITIONS = 4096  # spectra predicted before they are rounded: half a gigabyte of 90 x 360 pixels
+
+
+def syntheses(
+    experiment: Experiment, subset: MeasuredSubset, names: Sequence[str], advice: Mapping[str, AdviceMetrics]
+) -> list[Step[Experiment]]:
+    """Return the syntheses whose spectra are trained on, and those for comparison; models with a room follow its search."""
+    direct: list[Step[Experiment]] = []
+    with_room: list[Synthesis] = []
+    for name in dict.fromkeys((*names, *experiment.candidates)):
+        trains, own = name in names, advice.get(name)
+        n_synthetic = experiment.n_extra(own) if trains else 0
+        synthesis = Synthesis(subset, name, trains, n_synthetic, bool(own and own["sampled"]))
+        (with_room if experiment.finds_room(name) else direct).append(synthesis)
+    search: list[Step[Experiment]] = []
+    if with_room:
+        search.append(RoomSearch(subset, tuple(with_room)))
+    return search + direct if with_room and with_room[0].trains else direct + search
+
+
+@dataclass(frozen=True)
+class RoomSearch(Step[Experiment]):
+    """Find the room in the measured spectra, once for all field models that are built on it and for the locator.
+
+    Args:
+        subset: Measured spectra.
+        syntheses: Steps of these models.
+        located: Conditions of matched-field processing.
+        larger: Larger subset whose room is estimated next, from this one.
+        start: Search in a smaller subset. If its room explains the other spectra, no other room is searched.
+    """
+
+    subset: MeasuredSubset
+    syntheses: tuple[Synthesis, ...]
+    located: tuple[Condition, ...] = ()
+    larger: MeasuredSubset | None = None
+    start: RoomSearch | None = None
+
+    @property
+    def name(self) -> str:
+        return f"room-{self.subset}"
+
+    @property
+    def title(self) -> str:
+        return "finding the room"
+
+    @property
+    def file(self) -> str:
+        """File of the fitted model in the run's directory."""
+        return f"{STEPS}/{self.name}.safetensors"
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return (self.start.file,) if self.start else ()
+
+    def compute(self, experiment: Experiment, folder: Path) -> Row:
+        measured, _ = experiment.withhold(self.subset)
+        began = time.perf_counter()
+        try:
+            model = self._extended(experiment, measured, folder) or experiment.make_model(ROOM_MODEL, self.subset).fit(
+                measured, device=experiment.device, progress=True
+            )
+        except (InputError, FitError) as error:
+            return {"refused": str(error)}
+        model.save(folder / self.file)
+        return {"seconds": time.perf_counter() - began, "planes": len(model.room.planes) if model.room else 0}
+
+    def _extended(self, experiment: Experiment, measured: Spectra, folder: Path) -> FieldModel | None:
+        """Return the room of the start, fitted to all measured spectra of the subset if it explains them."""
+        if self.start is None:
+            return None
+        room, known = load(folder / self.start.file), experiment.withhold(self.start.subset)[0]
+        assert isinstance(room, GeometryModel)
+        return room.extended(measured, ~torch.isin(measured.index, known.index))
+
+    def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
+        found = None if "refused" in value else self  # without a room the models refuse the spectra themselves
+        seconds = value.get("seconds", 0.0)
+        steps: list[Step[Experiment]] = [replace(one, room=found, room_seconds=seconds) for one in self.syntheses]
+        if self.larger:
+            start = replace(self, larger=None) if found else None
+            steps.append(RoomSearch(self.larger, (), experiment.located_by(self.larger), start=start))
+        return steps + [Locating(condition, self.file, seconds) for condition in self.located if value.get("planes")]
+
+
+@dataclass(frozen=True)
+class Synthesis(Step[Experiment]):
+    """Predict spectra by one field model at test, withheld and further positions.
+
+    Args:
+        subset: Measured spectra.
+        synthesizer: Name of the field model.
+        trains: Whether its spectra train estimators. Otherwise it predicts at the test positions alone, for comparison.
+        n_synthetic: Number of further synthetic positions.
+        sampled: Train with samples in place of means.
+        room: Search for the room that the model reuses, if any.
+        room_seconds: Time of that search [s], which counts as part of the fit.
+    """
+
+    subset: MeasuredSubset
+    synthesizer: str
+    trains: bool
+    n_synthetic: int
+    sampled: bool
+    room: RoomSearch | None = None
+    room_seconds: float = 0.0
+
+    @property
+    def name(self) -> str:
+        return f"synthesis_{self.synthesizer}-{self.subset}"
+
+    @property
+    def title(self) -> str:
+        return f"synthesizing spectra by {self.synthesizer}"
+
+    @property
+    def file(self) -> str:
+        """File of the spectra in the run's directory."""
+        return f"{STEPS}/{self.name}.safetensors"
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return (self.room.file,) if self.room else ()
+
+    def test_spectra(self, folder: Path) -> dict[str, Store]:
+        """Return the spectra at the test positions: `test`, and `test_std` and `test_sample` if the model has them."""
+        tensors = read(folder / self.file, KIND)[1]
+        return {name: Store(tensor) for name, tensor in tensors.items() if name.startswith("test")}
+
+    def training_spectra(self, folder: Path, part: str) -> tuple[SyntheticPositions, Tensor]:
+        """Return positions and spectra of a part, `withheld` or `extra`, as they were synthesized together."""
+        tensors = read(folder / self.file, KIND)[1]
+        positions = (tensors[f"{part}_{name}"] for name in ("position", "label", "index"))
+        return SyntheticPositions(*positions), tensors[part]
+
+    def compute(self, experiment: Experiment, folder: Path) -> Row:
+        try:
+            return self._synthesize(experiment, folder)
+        except (InputError, FitError) as error:
+            if self.trains:
+                raise
+            return {"refused": str(error)}
+
+    def _synthesize(self, experiment: Experiment, folder: Path) -> Row:
+        measured, withheld = experiment.withhold(self.subset)
+        history = _FitHistory()
+        model = self._fitted(experiment, measured, history, folder)
+        fitted = time.perf_counter()
+        generator = torch.Generator().manual_seed(experiment.seed(self.subset))
+
+        def sample(position: Tensor) -> Tensor:
+            return model.sample(position, generator=generator)
+
+        def std(position: Tensor) -> Tensor:
+            return cast(Tensor, model.predict(position).std)
+
+        test = experiment.test.position
+        tensors = {"test": _as_bytes_at(test, model.synthesize)}
+        tested = time.perf_counter()
+        if model.predict(test[:1]).std is not None:
+            tensors["test_std"] = _as_bytes_at(test, std)
+        if model.samples:
+            tensors["test_sample"] = _as_bytes_at(test, sample)
+        parts = {"withheld": withheld} if self.trains else {}
+        if self.n_synthetic:
+            parts["extra"] = synthetic_positions(measured, self.n_synthetic, experiment.seed(self.subset))
+        for part, positions in parts.items():
+            predict = sample if self.sampled and model.samples else model.synthesize
+            tensors[part] = _as_bytes_at(positions.position, predict)
+            tensors |= {f"{part}_{name}": tensor for name, tensor in vars(positions).items()}
+        seconds = {
+            "fit": fitted - history.began + history.earlier + self.room_seconds,
+            "synthesize": tested - fitted,
+            "draw": time.perf_counter() - fitted,
+        }
+        write(folder / self.file, KIND, tensors, {})
+        if self.trains and self.subset.repeat == 0:
+            save_artifacts(model, self.subset.key, measured, experiment.test, folder)
+        return {"history": history.records, "seconds": seconds}
+
+    def _fitted(self, experiment: Experiment, measured: Spectra, history: _FitHistory, folder: Path) -> FieldModel:
+        # models that are only compared are as small as in the choice
+        preset = experiment.config.preset if self.trains else "quick"
+        room = load(folder / self.room.file) if self.room else None
+        assert room is None or isinstance(room, FieldModel)
+        history.begin()
+        return experiment.make_model(self.synthesizer, self.subset, preset).fit(
+            measured,
+            like=room,
+            device=experiment.device,
+            checkpoint=folder / STEPS / f"{self.name}-fit.safetensors",
+            on_record=history.add,
+            progress=True,
+        )
+
+    def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
+        trainings: list[tuple[Training, int]] = [("turbo", 0)] if self.trains else []
+        if self.n_synthetic:
+            trainings.append(("turbo_extra", self.n_synthetic))
+        fraction, repeat = self.subset.measured_fraction, self.subset.repeat
+        return [
+            Evaluation(Condition(estimator, training, self.synthesizer, number, fraction, repeat), self)
+            for training, number in trainings
+            for estimator in trainable(experiment.config.preset)
+            # a training of the network takes most of the time
+            if training == trainings[-1][0] or estimator not in NETWORKS.values()
+        ]
+
+
+class _FitHistory:
+    """Records of a fit, and the seconds that earlier sessions of the run spent on it."""
+
+    def __init__(self) -> None:
+        self.records: list[Row] = []
+        self.began = self.earlier = 0.0
+
+    def begin(self) -> None:
+        """Start the clock."""
+        self.began = time.perf_counter()
+
+    def add(self, record: Row) -> None:
+        """Append a record; those of earlier sessions come first."""
+        self.records.append(record)
+        self.earlier = max(self.earlier, record.get("elapsed", 0.0) - (time.perf_counter() - self.began))
+
+
+def _as_bytes_at(position: Tensor, predict: Callable[[Tensor], Tensor]) -> Tensor:
+    """Return predicted spectra at positions (n, 3), rounded in batches."""
+    return torch.cat([as_bytes(predict(some).cpu()) for some in position.split(BATCH_POSITIONS)])
+
+
+def as_bytes(spectrum: Tensor) -> Tensor:
+    """Return magnitudes in 256 steps, the resolution of spectra stored as images."""
+    return (spectrum.clamp(0, 1) * 255).round().to(torch.uint8)
