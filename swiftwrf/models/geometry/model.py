@@ -15,7 +15,7 @@ from swiftwrf.choices import Moving
 from swiftwrf.data.spectra import Spectra, check_training, fingerprint
 from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
-from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext, bounding_box
+from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext
 from swiftwrf.models.geometry.fit import (
     MAX_ORDER,
     GeometryConfig,
@@ -28,6 +28,7 @@ from swiftwrf.models.geometry.fit import (
 from swiftwrf.models.geometry.images import PhaseObservations, image_gain, images
 from swiftwrf.models.geometry.planes import Plane, PlaneSet, RoomEstimate
 from swiftwrf.models.geometry.sample import Residual, sample_field
+from swiftwrf.models.updatable import bounding_box
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.validation import check_value
 
