@@ -25,7 +25,7 @@ def alarm_threshold(rate: float, n_series: int = 1) -> float:
         n_series: Number of series that are tested together.
 
     Example:
-        >>> round(alarm_threshold(1 / 465), 1)  # Page's chart with allowance 0.5 and threshold 5
+        >>> round(alarm_threshold(1 / 930), 1)  # the run length of a threshold of 5 is 930
         5.0
     """
     length = max(n_series / rate, 2.0)
