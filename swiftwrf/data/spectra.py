@@ -295,6 +295,15 @@ def check_training(train: Spectra) -> None:
     """
     if len(train) < MIN_TRAINING:
         raise InputError(f"a fit needs at least {MIN_TRAINING} spectra, got {len(train)}")
+    check_spectra(train)
+
+
+def check_spectra(train: Spectra) -> None:
+    """Refuse spectra with values that are not finite.
+
+    Raises:
+        InputError: The first such spectrum.
+    """
     if train.store.values.is_floating_point():
         for rows in train.store.parts():
             bad = (~train.store[rows].isfinite()).flatten(1).any(dim=1).nonzero()

@@ -18,6 +18,7 @@ from swiftwrf.data.spectra import Spectra, check_training
 from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
 from swiftwrf.models.prediction import Prediction
+from swiftwrf.models.updatable import Updatable, bounding_box
 from swiftwrf.positions import check_positions
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.options import Configured, Preset, from_plain
@@ -57,7 +58,7 @@ class FitContext:
     progress: bool = False
 
 
-class FieldModel(Configured, Saved):
+class FieldModel(Configured, Saved, Updatable):
     """Base class of all field models.
 
     A subclass sets `name`, `kind` and `config_type`, and implements `_fit`, `_predict`, `state` and `_restore`. Options are
@@ -307,12 +308,6 @@ class FieldModel(Configured, Saved):
             f"fitted, {self.grid.shape[0]} x {self.grid.shape[1]} directions" if hasattr(self, "grid") else "not fitted"
         )
         return f"{type(self).__name__}({fitted})"
-
-
-def bounding_box(position: Tensor) -> Tensor:
-    """Return the lower and upper corner (2, 3) of the box around positions (n, 3) [m]."""
-    position = check_positions(position)
-    return torch.stack([position.amin(dim=0), position.amax(dim=0)])
 
 
 def check_finite(spectrum: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
+from copy import copy
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -16,7 +17,7 @@ from torch import Tensor
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
-from swiftwrf.errors import InputError
+from swiftwrf.errors import InputError, listed
 from swiftwrf.models.base import FieldConfig, FitContext
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import check_positions
@@ -139,6 +140,39 @@ class RssiPredictor(Configured, ABC):
         self._fit(train, context)
         self.receiver_names = tuple(map(str, train.receiver_names))
         return self
+
+    def update(self, new: Rssi) -> Self:
+        """Return the predictor with more training rows, by an update of its factorisation. This one stays as it is.
+
+        The result equals a fit to all rows with the same kernel, noise, mixing weights and weights of the earlier rows.
+
+        Args:
+            new: Rows at the receivers of the training rows, in the same frame, any number.
+
+        Raises:
+            InputError: A predictor that must be fitted again, or rows at other receivers.
+
+        Example:
+            >>> import swiftwrf
+            >>> data = swiftwrf.rssi_room(n=60)
+            >>> model = swiftwrf.RssiModel().fit(data.subset(torch.arange(50)))
+            >>> len(model.update(data.subset(torch.arange(50, 60))).anchor)
+            60
+        """
+        self.check_fitted()
+        if tuple(map(str, new.receiver_names)) != self.receiver_names:
+            raise InputError(
+                f"{new.name} has the receivers {listed(new.receiver_names)}, but the predictor was fitted to "
+                f"{listed(self.receiver_names)}; give the same ones in this order"
+            )
+        predictor = copy(self)
+        if len(new):
+            predictor._update(new)
+        return predictor
+
+    def _update(self, new: Rssi) -> None:
+        """Add checked rows to this copy."""
+        raise InputError(f"a predictor {self.name} cannot be updated; fit it again to all rows")
 
     @abstractmethod
     def _fit(self, train: Rssi, context: RssiFitContext) -> None:

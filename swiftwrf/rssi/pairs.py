@@ -23,7 +23,8 @@ from swiftwrf.data.splits import folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, candidates
 from swiftwrf.gp.process import N_NEIGHBOURS, local_weights
-from swiftwrf.models.base import FieldConfig, Prediction
+from swiftwrf.models.base import FieldConfig
+from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import Neighbours, check_positions, distance
 from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiFitContext, RssiPredictor
 from swiftwrf.rssi.floors import FloorAttenuation
