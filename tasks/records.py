@@ -32,7 +32,7 @@ NAMES = (  # columns of text, even if a cell reads NA, 1 or 12:34
     "mix",
 )
 DECIMALS = {"m": 3, "db": 2, "dbm": 2, "deg": 4}  # of numbers, by the unit at the end of a column's name
-DEGREE_DECIMALS = 7  # of latitude and longitude: 1 cm
+DEGREE_DECIMALS = 8  # of latitude and longitude: 1 mm
 SIGNIFICANT_DIGITS = 4  # of magnitudes
 FORMULA = re.compile(r"^'*[=+\-@\t\r]")
 

@@ -377,7 +377,8 @@ def test_outputs_of_a_table_in_degrees(tmp_path):
     truth = data.origin.to_metres(degrees[40:])
     np.testing.assert_allclose(positions[["truth_x_m", "truth_y_m"]], truth, atol=1e-3)
     estimate = data.origin.to_metres(positions[["latitude_deg", "longitude_deg"]].to_numpy())
-    np.testing.assert_allclose(estimate, positions[["x_m", "y_m"]], atol=1e-3)
+    # both are rounded to a millimetre
+    np.testing.assert_allclose(estimate, positions[["x_m", "y_m"]], atol=2e-3)
 
 
 def grouped_tables(floor, kind, tmp_path):

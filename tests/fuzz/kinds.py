@@ -55,6 +55,7 @@ from swiftwrf.models.geometry import fit_geometry, fit_hybrid
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.path_gains import fit_path_gains
 from swiftwrf.models.swiftwrf import SwiftWRF
+from swiftwrf.rssi import PairModel
 from tasks.aoa.estimators.kernel_regression import KernelRegression
 
 N = 12
@@ -141,6 +142,10 @@ def model_nerf2_rssi(folder: Path) -> None:
 
 def model_rssi(folder: Path) -> None:
     fit_rssi(rssi_room(n=40).receivers(["1", "2"])).save(folder / "model")
+
+
+def model_pairs(folder: Path) -> None:
+    PairModel(new_places=False).fit(rssi_room(n=30).receivers(["1", "2"])).save(folder / "model")
 
 
 def model_kernel_regression(folder: Path) -> None:
@@ -253,6 +258,7 @@ KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "vae model": (functools.partial(model_published, "vae"), read_model),
     "dcgan model": (functools.partial(model_published, "dcgan"), read_model),
     "kernel regression": (model_kernel_regression, read_estimator),
+    "rssi pair model": (model_pairs, read_model),
     "RSSI locator": (model_rssi_locator, read_locator),
     "matched-field locator": (model_matched_field, read_locator),
     "fit state": (state_of_a_fit, go_on),
