@@ -92,7 +92,7 @@ def command(folder, threads, *more):
     return subprocess.Popen([sys.executable, "-m", "tasks.aoa", *arguments], cwd=folder, env=environment)
 
 
-@pytest.mark.long
+@pytest.mark.fuzz
 def test_the_command_gives_the_same_numbers_with_one_thread_and_with_two_processes(tmp_path):
     prepare(tmp_path)
     for threads in (1, 2):
