@@ -47,6 +47,7 @@ class Spectra(PositionedData):
         fixed_position: Position of the end that does not move, (3,) [m], if it does not follow from `pose`.
         rotation: Matrix that rotates array into world coordinates, (3, 3), in place of `pose`.
         store: Spectra as a `Store`, in place of `spectra`; readers of files give one.
+        channel: Snapshots that the spectra are computed from, complex (n, S, K), if they are kept.
         details: index, named_splits, source and notes of `PositionedData`.
 
     Raises:
@@ -68,8 +69,9 @@ class Spectra(PositionedData):
     array: PlanarArray | None
     fixed_position: Tensor | None
     rotation: Tensor | None
+    channel: Tensor | None
 
-    row_fields: ClassVar[tuple[str, ...]] = ("position", "store", "label", "line_of_sight", "index")
+    row_fields: ClassVar[tuple[str, ...]] = ("position", "store", "label", "line_of_sight", "index", "channel")
 
     @checked
     def __init__(
@@ -87,6 +89,7 @@ class Spectra(PositionedData):
         fixed_position: Numbers | None = None,
         rotation: Numbers | None = None,
         store: Store | None = None,
+        channel: Numbers | None = None,
         **details: Any,
     ) -> None:
         if position is None or (spectra is None) == (store is None):
@@ -130,6 +133,7 @@ class Spectra(PositionedData):
             array=array,
             fixed_position=fixed_position,
             rotation=rotation,
+            channel=None if channel is None else to_tensor("channel", channel, torch.complex64, (None, None, None)),
         )
 
     @property
