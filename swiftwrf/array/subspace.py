@@ -60,9 +60,9 @@ def music(array: PlanarArray, channel: Tensor, sources: Sources = 1, *, forward_
 
     Example:
         >>> array = PlanarArray.grid(4, 4, spacing=0.06, frequency_hz=2.4e9)
-        >>> towards = torch.tensor([[0.6, 0.0, 0.8]], dtype=torch.float64)
+        >>> towards = torch.tensor([[0.6, 0.64, 0.48]], dtype=torch.float64)
         >>> music(array, torch.exp(1j * array.phase(towards))[:, None]).round(decimals=6).tolist()
-        [[[0.6, 0.0, 0.8]]]
+        [[[0.6, 0.64, 0.48]]]
     """
     return _directions(_music, array, channel, sources, forward_backward)
 
@@ -74,9 +74,9 @@ def esprit(array: PlanarArray, channel: Tensor, sources: Sources = 1, *, forward
 
     Example:
         >>> array = PlanarArray.grid(4, 4, spacing=0.06, frequency_hz=2.4e9)
-        >>> towards = torch.tensor([[0.6, 0.0, 0.8]], dtype=torch.float64)
+        >>> towards = torch.tensor([[0.6, 0.64, 0.48]], dtype=torch.float64)
         >>> esprit(array, torch.exp(1j * array.phase(towards))[:, None]).round(decimals=6).tolist()
-        [[[0.6, 0.0, 0.8]]]
+        [[[0.6, 0.64, 0.48]]]
     """
     return _directions(_esprit, array, channel, sources, forward_backward)
 
@@ -90,9 +90,9 @@ def maximum_likelihood(
 
     Example:
         >>> array = PlanarArray.grid(4, 4, spacing=0.06, frequency_hz=2.4e9)
-        >>> towards = torch.tensor([[0.6, 0.0, 0.8]], dtype=torch.float64)
+        >>> towards = torch.tensor([[0.6, 0.64, 0.48]], dtype=torch.float64)
         >>> maximum_likelihood(array, torch.exp(1j * array.phase(towards))[:, None]).round(decimals=6).tolist()
-        [[[0.6, 0.0, 0.8]]]
+        [[[0.6, 0.64, 0.48]]]
     """
     return _directions(_maximum_likelihood, array, channel, sources, forward_backward)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -16,7 +16,11 @@ from swiftwrf.data.dataset import Numbers, PositionedData, to_positions
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.data.survey import SurveyOptions, read_survey
 from swiftwrf.errors import InputError, listed
+from swiftwrf.plotting import MARK, plan
 from swiftwrf.runtime.validation import checked
+
+if TYPE_CHECKING:
+    import matplotlib.axes
 
 UNKNOWN = (float("nan"),) * 3  # position of a receiver
 
@@ -106,7 +110,8 @@ class Rssi(PositionedData):
     Example:
         >>> data = Rssi([[-60.0, float("nan")]] * 20, torch.rand(20, 3), receiver_names=["hall", "office"])
         >>> data
-        <Rssi 'rssi': 20 rows at 2 receivers, 50% detected, positions over ... m>
+        <Rssi 'rssi': 20 rows at 2 receivers, 50% detected,
+         positions over ... m>
     """
 
     rssi_dbm: Tensor
@@ -299,6 +304,30 @@ class Rssi(PositionedData):
             return int(asked) - 1
         known = ", ".join(f"{i} {name}" for i, name in enumerate(self.receiver_names, start=1))
         raise InputError(f"{self.name} has no receiver {asked!r}; there are {known}")
+
+    def plot(self, receiver: str | None = None, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+        """Draw the RSSI where it was detected, seen from above, and the known positions of the receivers.
+
+        Args:
+            receiver: Name or number of a receiver as in `receivers`. Defaults to the strongest RSSI at each position.
+            ax: Axes to draw into. Defaults to those of a new figure.
+
+        Raises:
+            InputError: An unknown receiver.
+
+        Example:
+            >>> import swiftwrf
+            >>> swiftwrf.rssi_room(n=40).plot("2").get_title()
+            'simulated-floor, receiver02'
+        """
+        shown = self if receiver is None else self.columns([self._column(receiver)])
+        strongest = shown.rssi_dbm.nan_to_num(-torch.inf).amax(dim=1)
+        detected = strongest.isfinite()
+        ax = plan(self.transmitter_position[detected], strongest[detected], "RSSI [dBm]", ax)
+        x, y, _ = shown.receiver_position[shown.receiver_located].T.numpy()
+        ax.plot(x, y, "^", color=MARK)
+        ax.set_title(f"{self.name}, {'strongest receiver' if receiver is None else shown.receiver_names[0]}")
+        return ax
 
     def _columns(self) -> dict[str, Any]:
         return dict(zip(self.receiver_names, self.rssi_dbm.numpy().T, strict=True))

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -22,7 +22,11 @@ from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.data.store import BATCH_PIXELS, MAX_MEMORY_PIXELS, Store, stored, too_many
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
+from swiftwrf.plotting import mark_direction, polar_spectrum
 from swiftwrf.runtime.validation import checked
+
+if TYPE_CHECKING:
+    import matplotlib.axes
 
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
 MAGNITUDE_TOLERANCE = 1e-6  # beyond [0, 1], from rounding
@@ -186,6 +190,26 @@ class Spectra(PositionedData):
     def at_most(self, azimuths: int) -> Spectra:
         """Return the spectra averaged to at most that many columns, with enough rows for SSIM; 0 keeps all pixels."""
         return self.coarsen(coarsening(self.grid.shape, azimuths, least_rows=WINDOW))
+
+    def plot(self, row: int = 0, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+        """Draw a spectrum and the direction of the line of sight, seen along the normal of the array.
+
+        Args:
+            row: Number of the spectrum.
+            ax: Polar axes to draw into. Defaults to those of a new figure.
+
+        Example:
+            >>> import swiftwrf
+            >>> swiftwrf.simulated_room(n=20).plot(3).get_title()
+            'simulated-room 3 at ... m'
+        """
+        one = self.subset(torch.arange(len(self))[[row]])
+        ax = polar_spectrum(one.spectrum[0], self.grid, ax)
+        if bool(one.label.isfinite().all()):
+            mark_direction(ax, *one.label[0].tolist(), label="line of sight")
+        at = ", ".join(f"{coordinate:.2f}" for coordinate in one.position[0].tolist())
+        ax.set_title(f"{self.name} {int(one.index[0])} at ({at}) m")
+        return ax
 
     def _columns(self) -> dict[str, Any]:
         azimuth, elevation = self.label.rad2deg().numpy().T

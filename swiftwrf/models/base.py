@@ -17,6 +17,7 @@ from swiftwrf.choices import FIELD_MODELS, Moving
 from swiftwrf.data.spectra import Spectra, check_training
 from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
+from swiftwrf.plotting import Displayed, extent, plan, polar_spectrum
 from swiftwrf.positions import check_positions
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.options import Configured, Preset, from_plain
@@ -24,6 +25,8 @@ from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.validation import NonNegativeInt, checked, configuration
 
 if TYPE_CHECKING:
+    import matplotlib.axes
+
     import swiftwrf.models.geometry.model
 
 ARRAY, FIXED_END = "array", "fixed end"  # requirements that a model can declare
@@ -31,12 +34,14 @@ CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class Prediction(Displayed):
     """A predicted quantity with its uncertainty.
 
     Args:
         mean: Predictive mean, e.g. magnitudes (n, n_elevation, n_azimuth) or RSSI (n, R) [dBm].
         std: Predictive standard deviation of one measurement, of the same shape. None if the model has none.
+        position: Positions of the moving end, (n, 3) [m], for `plot`.
+        grid: Directions of predicted spectra, for `plot`.
 
     Example:
         >>> prediction = Prediction(torch.zeros(2), torch.ones(2))
@@ -47,6 +52,42 @@ class Prediction:
 
     mean: Tensor
     std: Tensor | None = None
+    position: Tensor | None = None
+    grid: AngularGrid | None = None
+
+    def plot(self, number: int = 0, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+        """Draw a predicted spectrum seen along the normal of the array, or the RSSI at a receiver seen from above.
+
+        Args:
+            number: Row of the spectrum, or column of the receiver.
+            ax: Axes to draw into, polar for a spectrum. Defaults to those of a new figure.
+
+        Raises:
+            InputError: A prediction without directions or positions.
+
+        Example:
+            >>> at = torch.tensor([[0.0, 0.0, 1.0], [1.0, 2.0, 1.0]])
+            >>> Prediction(torch.tensor([[-50.0], [-60.0]]), position=at).plot().get_ylabel()
+            'y [m]'
+        """
+        if self.grid is not None:
+            return polar_spectrum(self.mean[number], self.grid, ax)
+        if self.position is None or self.mean.dim() != 2:
+            raise InputError("this prediction contains neither directions nor positions; use that of a model's predict")
+        return plan(self.position, self.mean[:, number], "predicted RSSI [dBm]", ax)
+
+    def __repr__(self) -> str:
+        facts = self._facts()
+        return f"<Prediction of shape {facts['shape']}: mean {facts['mean']},\n standard deviation {facts['std']}>"
+
+    def _facts(self) -> dict[str, str]:
+        def span(values: Tensor | None) -> str:
+            if values is None or not values.numel():
+                return "none"
+            low, high = (float(end) for end in values.detach().aminmax())
+            return f"{low:.4g} to {high:.4g}"
+
+        return {"shape": f"{tuple(self.mean.shape)}", "mean": span(self.mean), "std": span(self.std)}
 
     def interval(self, level: float = 0.8) -> tuple[Tensor, Tensor]:
         """Return the lower and upper end of the central interval that contains a measurement with probability `level`.
@@ -88,7 +129,7 @@ class FitContext:
     progress: bool = False
 
 
-class FieldModel(Configured, Saved):
+class FieldModel(Configured, Saved, Displayed):
     """Base class of all field models.
 
     A subclass sets `name`, `kind` and `config_type`, and implements `_fit`, `_predict`, `state` and `_restore`. Options are
@@ -219,7 +260,7 @@ class FieldModel(Configured, Saved):
             return mean.clamp(0, 1), std
 
         mean, std = self._in_batches(evaluate, self._checked(position), grid)
-        return Prediction(mean, std)
+        return Prediction(mean, std, position, grid)
 
     def sample(self, position: Tensor, *, generator: torch.Generator, grid: AngularGrid | None = None) -> Tensor:
         """Return one sample of the predictive distribution at each position.
@@ -331,6 +372,37 @@ class FieldModel(Configured, Saved):
     @abstractmethod
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         """Take the fitted state over from `_state`, checking every shape first."""
+
+    def plot(self, position: Tensor, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+        """Draw the predicted spectrum at one position, seen along the normal of the array.
+
+        Args:
+            position: Position of the moving end, (3,) [m].
+            ax: Polar axes to draw into. Defaults to those of a new figure.
+
+        Raises:
+            InputError: As `predict`.
+
+        Example:
+            >>> import swiftwrf
+            >>> room = swiftwrf.simulated_room(n=20)
+            >>> make_model("nearest").fit(room).plot(room.position[0]).get_title()
+            'nearest at ... m'
+        """
+        prediction = self.predict(torch.as_tensor(position)[None])
+        at = ", ".join(f"{float(coordinate):.2f}" for coordinate in position)
+        ax = prediction.plot(ax=ax)
+        ax.set_title(f"{self.name} at ({at}) m")
+        return ax
+
+    def _facts(self) -> dict[str, str]:
+        facts = {"model": self.kind}
+        if not hasattr(self, "grid"):
+            return facts | {"fitted": "no"}
+        return facts | {
+            "directions": f"{self.grid.shape[0]} x {self.grid.shape[1]}",
+            "fitted over": extent(self.bounds),
+        }
 
     def __repr__(self) -> str:
         fitted = (

@@ -15,8 +15,9 @@ from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
-from swiftwrf.errors import InputError
+from swiftwrf.errors import InputError, listed
 from swiftwrf.models.base import FieldConfig, FitContext, Prediction
+from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_positions
 from swiftwrf.runtime.options import Configured
 from swiftwrf.runtime.session import Record
@@ -42,7 +43,7 @@ class RssiFitContext(FitContext):
     parallel: Map | None = None
 
 
-class RssiPredictor(Configured, ABC):
+class RssiPredictor(Configured, Displayed, ABC):
     """Base class of all predictors of RSSI at fixed receivers from the position of the transmitter.
 
     A subclass sets `name` and `config_type`, and implements `_fit` and `_predict`. Options are keyword arguments of the
@@ -150,12 +151,15 @@ class RssiPredictor(Configured, ABC):
         with torch.set_grad_enabled(torch.is_grad_enabled() and position.requires_grad):
             parts = [self._predict(some) for some in position.split(self.batch_size)]
         stds = [std for _, std in parts if std is not None]
-        return Prediction(torch.cat([mean for mean, _ in parts]), torch.cat(stds) if stds else None)
+        return Prediction(torch.cat([mean for mean, _ in parts]), torch.cat(stds) if stds else None, position)
 
     def check_fitted(self) -> None:
         """Raise InputError if the predictor is not fitted."""
         if not hasattr(self, "receiver_names"):
             raise InputError(f"this {type(self).__name__} is not fitted; call fit first")
+
+    def _facts(self) -> dict[str, str]:
+        return {"model": self.name, "receivers": listed(getattr(self, "receiver_names", ())) or "not fitted"}
 
     def __repr__(self) -> str:
         fitted = f"fitted, {len(self.receiver_names)} receivers" if hasattr(self, "receiver_names") else "not fitted"

@@ -15,15 +15,16 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from statistics import NormalDist
-from typing import ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.rssi import Offsets, Rssi
-from swiftwrf.errors import InputError
+from swiftwrf.errors import InputError, listed
 from swiftwrf.gp import GaussianProcess, Kernel, thinned
+from swiftwrf.plotting import MAP_CELLS, plan_map
 from swiftwrf.rssi.base import Map, RssiFitContext, RssiPredictor, fingerprint, map_threads
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
@@ -38,6 +39,9 @@ from swiftwrf.runtime.options import from_plain
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.session import Record, Session
 from swiftwrf.runtime.threads import single_thread
+
+if TYPE_CHECKING:
+    import matplotlib.axes
 
 LEVEL = 0.8  # nominal coverage of the interval that the standard deviation is calibrated for
 MAX_DISTANCE_M = 1e9  # from the measurements: float32 ends beyond, and so does any receiver's range
@@ -185,6 +189,38 @@ class RssiModel(RssiPredictor, Saved):
         mean = mean + self.mixing_weight[0].float() * head
         variance = self._process.variance(offset).float()
         return mean, (self.noise_db.square() + self.field_db.square() * variance[:, None]).sqrt()
+
+    def plot(
+        self, receiver: str | None = None, height_m: float | None = None, ax: matplotlib.axes.Axes | None = None
+    ) -> matplotlib.axes.Axes:
+        """Draw the map of the predicted RSSI over the measured region, seen from above.
+
+        Args:
+            receiver: Name of a receiver. Defaults to the strongest RSSI at each position.
+            height_m: Height of the transmitter. Defaults to the mean of the measurements.
+            ax: Axes to draw into. Defaults to those of a new figure.
+
+        Raises:
+            InputError: An unknown receiver, or a model that is not fitted.
+
+        Example:
+            >>> import swiftwrf
+            >>> fit_rssi(swiftwrf.rssi_room(n=60)).plot("receiver03").get_title()
+            'predicted RSSI of receiver03'
+        """
+        self.check_fitted()
+        if receiver is not None and receiver not in self.receiver_names:
+            raise InputError(f"there is no receiver {receiver!a}; choose from {listed(self.receiver_names)}")
+        measured = self.anchor.double() + self.centre
+        low, high = measured.amin(dim=0), measured.amax(dim=0)
+        height = float(self.centre[2]) if height_m is None else height_m
+        centre = (torch.arange(MAP_CELLS) + 0.5) / MAP_CELLS
+        cell = low[:2] + (high - low)[:2] * torch.cartesian_prod(centre, centre).flip(1)
+        mean = self.predict(torch.nn.functional.pad(cell, (0, 1), value=height)).mean
+        value = mean.amax(dim=1) if receiver is None else mean[:, self.receiver_names.index(receiver)]
+        ax = plan_map(low[:2], high[:2], value.reshape(MAP_CELLS, MAP_CELLS), "predicted RSSI [dBm]", ax)
+        ax.set_title(f"predicted RSSI of {receiver or 'the strongest receiver'}")
+        return ax
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         self.check_fitted()
