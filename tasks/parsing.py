@@ -74,8 +74,9 @@ def _grouped(config_type: type[Options]) -> type[Any]:
     groups: dict[str, list[Any]] = {}
     for source in (config_type, Resumable if config_type.resumable else General):
         hints = get_type_hints(source, include_extras=True)
+        bases = [base for base in source.__mro__ if issubclass(base, Options)]
         for option in fields(source):
-            owner = next(base for base in source.__mro__ if option.name in inspect.get_annotations(base))
+            owner = next(base for base in bases if option.name in inspect.get_annotations(base))
             group = "command" if owner is config_type else owner.group
             if option.default is MISSING and tyro.conf.Positional not in get_args(hints[option.name])[1:]:
                 group = "required"

@@ -128,7 +128,8 @@ def count_sources(channel: Tensor, criterion: Literal["mdl", "aic"] = "mdl") -> 
     number = elements - smallest
     parameters = number * (2 * elements - number)
     penalty = parameters / 2 * math.log(snapshots) if criterion == "mdl" else parameters
-    return (misfit + penalty).argmin(dim=1).clamp_min(1)
+    found: Tensor = (misfit + penalty).argmin(dim=1).clamp_min(1)
+    return found
 
 
 def _directions(
@@ -201,10 +202,10 @@ def _esprit(array: PlanarArray, matrix: Tensor, count: int) -> Tensor:
     signal = torch.linalg.eigh(matrix).eigenvectors[..., -count:]
     shift, groups = _shifts(array, count)
     rotations = [torch.linalg.pinv(signal[:, b]) @ signal[:, a] for a, b in groups]
-    # one eigenbasis for all shifts pairs their eigenvalues; a generic sum of them has no double eigenvalue
-    basis = torch.linalg.eig(sum((0.6**n * rotation for n, rotation in enumerate(rotations)), 0 * rotations[0]))[1]
+    # one eigenbasis for both shifts pairs their eigenvalues; a sum of unequal parts has no double eigenvalue in general
+    basis = torch.linalg.eig(rotations[0] + 0.6 * rotations[-1]).eigenvectors
     values = [(torch.linalg.inv(basis) @ rotation @ basis).diagonal(dim1=1, dim2=2) for rotation in rotations]
-    cosine = torch.stack([value.angle() for value in values], dim=-1) / math.tau @ torch.linalg.inv(shift).T
+    cosine: Tensor = torch.stack([value.angle() for value in values], dim=-1) / math.tau @ torch.linalg.inv(shift).T
     return cosine / cosine.norm(dim=-1, keepdim=True).clamp_min(1)
 
 

@@ -206,7 +206,8 @@ class Spectra(PositionedData):
         one = self.subset(torch.arange(len(self))[[row]])
         ax = polar_spectrum(one.spectrum[0], self.grid, ax)
         if bool(one.label.isfinite().all()):
-            mark_direction(ax, *one.label[0].tolist(), label="line of sight")
+            azimuth, elevation = one.label[0].tolist()
+            mark_direction(ax, azimuth, elevation, "line of sight")
         at = ", ".join(f"{coordinate:.2f}" for coordinate in one.position[0].tolist())
         ax.set_title(f"{self.name} {int(one.index[0])} at ({at}) m")
         return ax

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -52,8 +52,8 @@ class Prediction(Displayed):
 
     mean: Tensor
     std: Tensor | None = None
-    position: Tensor | None = None
-    grid: AngularGrid | None = None
+    position: Tensor | None = field(default=None, kw_only=True)
+    grid: AngularGrid | None = field(default=None, kw_only=True)
 
     def plot(self, number: int = 0, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
         """Draw a predicted spectrum seen along the normal of the array, or the RSSI at a receiver seen from above.
@@ -260,7 +260,7 @@ class FieldModel(Configured, Saved, Displayed):
             return mean.clamp(0, 1), std
 
         mean, std = self._in_batches(evaluate, self._checked(position), grid)
-        return Prediction(mean, std, position, grid)
+        return Prediction(mean, std, position=position, grid=grid)
 
     def sample(self, position: Tensor, *, generator: torch.Generator, grid: AngularGrid | None = None) -> Tensor:
         """Return one sample of the predictive distribution at each position.

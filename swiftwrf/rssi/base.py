@@ -151,7 +151,7 @@ class RssiPredictor(Configured, Displayed, ABC):
         with torch.set_grad_enabled(torch.is_grad_enabled() and position.requires_grad):
             parts = [self._predict(some) for some in position.split(self.batch_size)]
         stds = [std for _, std in parts if std is not None]
-        return Prediction(torch.cat([mean for mean, _ in parts]), torch.cat(stds) if stds else None, position)
+        return Prediction(torch.cat([mean for mean, _ in parts]), torch.cat(stds) if stds else None, position=position)
 
     def check_fitted(self) -> None:
         """Raise InputError if the predictor is not fitted."""

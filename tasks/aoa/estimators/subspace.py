@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import ClassVar
+from abc import abstractmethod
 
 import torch
 from torch import Tensor
@@ -19,11 +18,14 @@ MIN_SNAPSHOTS = 2  # of one position: with one snapshot all methods are the peak
 
 
 class SnapshotEstimator(Estimator):
-    """Base class of estimators from array snapshots. A subclass sets `method`."""
+    """Base class of estimators from array snapshots. A subclass implements `directions`."""
 
     trainable = False
-    method: ClassVar[Callable[[PlanarArray, Tensor], Tensor]]
-    """function of the array and snapshots (n, S, K) that returns unit vectors (n, 1, 3)"""
+
+    @staticmethod
+    @abstractmethod
+    def directions(array: PlanarArray, channel: Tensor) -> Tensor:
+        """Return unit vectors (n, 1, 3) from snapshots (n, S, K)."""
 
     def _fit(self, train: Mixed, device: torch.device) -> None:
         """Learn nothing."""
@@ -38,7 +40,7 @@ class SnapshotEstimator(Estimator):
             raise InputError(f"{type(self).__name__} is not possible: {lacking}")
         assert data.array is not None
         assert data.channel is not None
-        return torch.stack(to_angles(type(self).method(data.array, data.channel)[:, 0]), dim=-1)
+        return torch.stack(to_angles(self.directions(data.array, data.channel)[:, 0]), dim=-1)
 
     @classmethod
     def lacking(cls, data: Spectra) -> str:
@@ -48,7 +50,7 @@ class SnapshotEstimator(Estimator):
         if data.channel.shape[1] < MIN_SNAPSHOTS:
             return f"{needed}, and {data.name} contains one"
         try:
-            cls.method(data.array, data.channel[:1])
+            cls.directions(data.array, data.channel[:1])
         except InputError as error:
             return str(error)
         return ""
@@ -64,18 +66,24 @@ class Music(SnapshotEstimator):
         swiftwrf.errors.InputError: Music estimates directions from array snapshots; spectra do not contain them
     """
 
-    method = staticmethod(music)
+    @staticmethod
+    def directions(array: PlanarArray, channel: Tensor) -> Tensor:
+        return music(array, channel)
 
 
 @ESTIMATORS.register("esprit")
 class Esprit(SnapshotEstimator):
     """The direction of one source by ESPRIT."""
 
-    method = staticmethod(esprit)
+    @staticmethod
+    def directions(array: PlanarArray, channel: Tensor) -> Tensor:
+        return esprit(array, channel)
 
 
 @ESTIMATORS.register("maximum_likelihood")
 class MaximumLikelihood(SnapshotEstimator):
     """The direction of one source by maximum likelihood."""
 
-    method = staticmethod(maximum_likelihood)
+    @staticmethod
+    def directions(array: PlanarArray, channel: Tensor) -> Tensor:
+        return maximum_likelihood(array, channel)
