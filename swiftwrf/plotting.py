@@ -7,6 +7,7 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     import matplotlib.axes
 
 MARK = "#cc3311"  # of a true or estimated value in a figure, distinct from all colours of viridis
-MAP_CELLS = 60  # of a map, along each side
 
 
 class Displayed:
@@ -108,20 +108,22 @@ def plan(
 
 
 def plan_map(
-    low: Tensor, high: Tensor, value: Tensor, label: str, ax: matplotlib.axes.Axes | None = None
+    corners: NDArray[Any], value: NDArray[Any], label: str, ax: matplotlib.axes.Axes | None = None
 ) -> matplotlib.axes.Axes:
     """Draw a map seen from above and to scale, and return the axes.
 
     Args:
-        low: Lower left corner, (2,) [m].
-        high: Upper right corner, (2,) [m].
-        value: Values at evenly spaced positions, (rows along y, columns along x).
+        corners: Lower left and upper right corner, (2, 2) [m].
+        value: Values of the cells, (rows along y, columns along x).
         label: Quantity and unit of the values.
         ax: Axes to draw into. Defaults to those of a new figure.
+
+    Example:
+        >>> plan_map(np.array([[0, 0], [4, 2]]), np.zeros((2, 4)), "RSSI [dBm]").get_ylabel()
+        'y [m]'
     """
     ax = _plan_axes(ax)
-    (left, bottom), (right, top) = low.tolist(), high.tolist()
-    image = ax.imshow(_array(value), origin="lower", extent=(left, right, bottom, top))
+    image = ax.imshow(value, origin="lower", extent=tuple(corners.T.ravel().tolist()))
     ax.figure.colorbar(image, ax=ax, label=label)
     return ax
 
@@ -135,5 +137,5 @@ def _plan_axes(ax: matplotlib.axes.Axes | None) -> matplotlib.axes.Axes:
     return ax
 
 
-def _array(tensor: Tensor) -> np.ndarray[Any, np.dtype[Any]]:
+def _array(tensor: Tensor) -> NDArray[Any]:
     return np.asarray(tensor.detach().cpu())

@@ -77,6 +77,10 @@ PREDICTORS = {
     "mri_residual": Label("mri_receiver, its residual interpolated from the nearest measurements", "#ccbb44"),
     "knn": Label("inverse-distance mean of the nearest measurements", "#66ccee"),
     "mean": Label("the mean of the receiver's training values", "#bbbbbb"),
+    "pairs": Label(
+        "a log-distance path-loss model and a Gaussian process over the positions of both ends of the link", "#332288"
+    ),
+    "knn_pairs": Label("inverse-distance mean of the nearest pairs of positions", "#999933"),
     "nerf2": Label("a neural field for all receivers, its rays averaged (NeRF2)", "#44aa99"),
     "blend": Label("a weighted mean of other predictors, weights by cross-validation", "#aa3377"),
 }

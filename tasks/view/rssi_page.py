@@ -8,7 +8,8 @@ from matplotlib.colors import to_hex
 from nicegui import events, run, ui
 from PIL import Image
 
-from tasks.view.drawing import colour_image, text
+from tasks.page.raster import colour_image
+from tasks.view.drawing import text
 from tasks.view.page import NewestOnly, colour_bar, header, located_marks, plan_picture, slider
 from tasks.view.rssi import (
     LOCATING,

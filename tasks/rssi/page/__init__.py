@@ -17,11 +17,12 @@ from tasks.page import figures
 from tasks.page.page import Page, Plot, Section, Table
 from tasks.page.palette import Palette
 from tasks.page.provenance import number, provenance
-from tasks.rssi.page.summary import OWN, RssiRecords, by_method, summary, varies
+from tasks.rssi.page.summary import RssiRecords, by_method, model_of, summary, title, varies
 from tasks.rssi.predictors import PREDICTORS
 from tasks.summarise import SHORTEST, paired_difference, running_median
 
 MAX_MAPS = 24  # receivers with a map in the report; all are in the tables
+MAX_BARS = 60  # receivers beside each other in a figure
 MAX_VECTOR_DOTS = 300  # more dots become an image: their white edges hide the colours, and the page grows to megabytes
 _FIELDS = {"predicted": "predicted_dbm", "width": "width_db"}
 
@@ -45,15 +46,15 @@ def _run(run: RssiRecords, several: bool) -> list[Section]:
     errors, cells = run.table("errors"), _cells(run)
     heights = _heights(run)
     pairs = errors[["receiver", "index", "method", "abs_error_db"]]
-    plots = [
-        Plot(
+    plots = [Plot(f"cdf-{name}", _cdf(errors), "Distribution of the absolute errors over all receivers.", pairs)]
+    if len(_receivers(run)) <= MAX_BARS:
+        bars = Plot(
             f"bars-{name}",
             _bars(run, heights),
             "Median absolute error; whiskers: its 95 % interval.",
             figures.bars_data("receiver", _receivers(run), heights, "db"),
-        ),
-        Plot(f"cdf-{name}", _cdf(errors), "Distribution of the absolute errors over all receivers.", pairs),
-    ]
+        )
+        plots.insert(0, bars)
     maps = [
         Plot(
             f"width-{name}",
@@ -86,7 +87,7 @@ _WIDER = "Wider away from measurements."
 _EVEN = "Equally wide everywhere: a field does not improve the predictions of held-out measurements at these receivers."
 _WHERE_CAPTION = (
     "Predicted against measured RSSI, and the absolute error (dots; line: running median) against the distance from the "
-    "receiver, if its position is known, and from the nearest training position. SwiftWRF, all receivers."
+    "receiver, if its position is known, and from the nearest training position. All receivers."
 )
 _SPEED_CAPTION = (
     "Seconds to fit and to predict the test rows against the median error, both logarithmic. The line is the Pareto front: "
@@ -106,19 +107,19 @@ def _table(run: RssiRecords) -> Table:
         columns,
         rows,
         "Absolute error over all detected test pairs; median with its 95 % interval.",
-        frozenset([OWN]),
+        frozenset([model_of(run)]),
     )
 
 
 def _paired(run: RssiRecords) -> Table:
-    errors, rows = by_method(run), []
+    errors, rows, own = by_method(run), [], model_of(run)
     for name in run.metrics["overall"]:
-        if name != OWN:
-            mean, low, high = paired_difference(errors, OWN, name)
+        if name != own:
+            mean, low, high = paired_difference(errors, own, name)
             interval = "" if math.isnan(low) else f" [{low:+.2f}, {high:+.2f}]"
             rows.append([name, f"{mean:+.2f}{interval}"])
     caption = (
-        "Mean of SwiftWRF's absolute error minus that of the method on the same pairs; 95 % bootstrap over test rows."
+        f"Mean absolute error of {title(run)} minus that of the method on the same pairs; 95 % bootstrap of test rows."
     )
     return Table(["against", "difference [dB]"], rows, caption)
 
@@ -211,8 +212,8 @@ def _maps(run: RssiRecords, field: str, label: str, n_maps: int = MAX_MAPS) -> F
 
 def _where(run: RssiRecords) -> Plot:
     errors = run.table("errors")
-    own = errors[errors["method"] == OWN]
-    colour = palette().colour(OWN)
+    own = errors[errors["method"] == model_of(run)]
+    colour = palette().colour(model_of(run))
     columns = {
         "from_receiver_m": "distance from the receiver [m]",
         "from_training_m": "distance from training positions [m]",
@@ -241,7 +242,7 @@ def _speed(run: RssiRecords) -> Plot:
     figure, axes = figures.new_figure(1, 2, 12, 4)
     for ax, stage, seconds in zip(axes, ("fit", "predict"), (fit, predict), strict=True):
         points = {name: (seconds[name], error[name]) for name in overall}
-        figures.speed(ax, palette(), points, f"seconds to {stage}", "median absolute error [dB]", also=[OWN])
+        figures.speed(ax, palette(), points, f"seconds to {stage}", "median absolute error [dB]", also=[model_of(run)])
     figures.legend_of(figure, palette(), list(overall))
     columns = {"fit_s": fit, "predict_s": predict, "median_abs_error_db": error}
     data = DataFrame(columns).rename_axis("method").reset_index()

@@ -13,7 +13,6 @@ from tasks.summarise import verdict_of_difference
 from tasks.terminal import Answer
 
 RssiRecords = Records[RssiMetrics]
-OWN = "swiftwrf"  # the predictor that all others are compared with
 MAX_EVEN_DB = 0.01  # difference of widths up to which an interval counts as equally wide everywhere
 MAX_COVERAGE_ERROR = 0.05  # difference from the nominal coverage above which the report warns
 
@@ -21,15 +20,15 @@ MAX_COVERAGE_ERROR = 0.05  # difference from the nominal coverage above which th
 def summary(run: RssiRecords, picture: Plot) -> Summary:
     """Return the summary of one run."""
     error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
-    own, best = error[OWN], best_baseline(run)
+    own, best = error[model_of(run)], best_baseline(run)
     interval = run.metrics["interval"]
     shared = error.get("mri_pooled")
     also = f"; one path-loss model for all receivers: {shared['median']:.2f} dB" if shared else ""
     numbers = [
         Number(
             f"{own['median']:.2f} dB",
-            f"SwiftWRF's median absolute error, 95 % interval [{own['low']:.2f}, {own['high']:.2f}]; 90 % of the errors "
-            f"are below {own['p90']:.1f} dB",
+            f"median absolute error of {title(run)}, 95 % interval [{own['low']:.2f}, {own['high']:.2f}]; 90 % of the "
+            f"errors are below {own['p90']:.1f} dB",
         ),
         Number(f"{error[best]['median']:.2f} dB", f"the best baseline, {best}{also}"),
         Number(
@@ -53,9 +52,20 @@ def answer(run: RssiRecords) -> Answer:
     return Answer("dB", rows, verdict(run), _next_steps(run))
 
 
+def model_of(run: RssiRecords) -> str:
+    """Return the predictor that all others are compared with, whose maps and intervals the run contains."""
+    return run.metrics.get("model", "swiftwrf")
+
+
+def title(run: RssiRecords) -> str:
+    """Return the name of that predictor in sentences."""
+    return {"swiftwrf": "SwiftWRF"}.get(model_of(run), model_of(run))
+
+
 def best_baseline(run: RssiRecords) -> str:
     """Return the name of the baseline with the lowest median error."""
-    error = {name: entry["abs_error_db"]["median"] for name, entry in run.metrics["overall"].items() if name != OWN}
+    own = model_of(run)
+    error = {name: entry["abs_error_db"]["median"] for name, entry in run.metrics["overall"].items() if name != own}
     return min(error, key=lambda name: error[name])
 
 
@@ -63,7 +73,8 @@ def verdict(run: RssiRecords) -> str:
     """Return a sentence that compares the model with the best baseline."""
     best = best_baseline(run)
     n_test = run.metrics["n_test"]
-    return verdict_of_difference(by_method(run), OWN, best, name="SwiftWRF", unit="dB", rows="pairs", n_test=n_test)
+    own, name = model_of(run), title(run)
+    return verdict_of_difference(by_method(run), own, best, name=name, unit="dB", rows="pairs", n_test=n_test)
 
 
 def _next_steps(run: RssiRecords) -> list[str]:
@@ -83,7 +94,9 @@ def _next_steps(run: RssiRecords) -> list[str]:
     if abs(interval["coverage"] - interval["nominal"]) > MAX_COVERAGE_ERROR:
         ranking = "take their widths as a ranking, not as a promise" if uneven else "do not rely on them"
         steps.append(f"The intervals are not calibrated on these rows; {ranking}.")
-    if run.metrics["split"] == "random":
+    if model_of(run) == "pairs" and run.metrics["split"] != "place":
+        steps.append("Run --split place: it shows the error of a receiver at positions where it measured nothing.")
+    elif run.metrics["split"] == "random":
         steps.append("Run --split block: it shows the error in a region where nothing was measured.")
     return steps
 
