@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import inspect
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -11,15 +10,15 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-import tyro
-
 from swiftwrf.errors import FitError, InputError, one_line
 from tasks.options import OUTPUT, Options
+from tasks.parsing import parse
 from tasks.records import Row
 from tasks.resume import saved_config
 from tasks.terminal import terminal
 
 Config = TypeVar("Config", bound=Options)
+VERBOSE = "--verbose"
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -98,7 +97,8 @@ def execute(
     Raises:
         InputError: Wrong options, or the error of the task.
     """
-    folder = None
+    folder, verbose = None, VERBOSE in arguments
+    arguments = [option for option in arguments if option != VERBOSE]
     match arguments:
         case ["--resume", *_] if not config_type.resumable:
             raise InputError(f"a run of {name} cannot be resumed; start it again")
@@ -106,16 +106,13 @@ def execute(
             folder, changed = _resumed(options)
             config = configured(config_type, saved_config(folder, name.removeprefix("tasks.")) | changed, folder)
         case _:
-            description = inspect.cleandoc(config_type.__doc__ or "")
-            config = tyro.cli(
-                config_type,
-                prog=program or f"python -m {name}",
-                description=description,
-                args=arguments,
-                config=(tyro.conf.FlagCreatePairsOff,),
-            )
+            if any(option.partition("=")[0] == "--resume" for option in arguments):
+                raise InputError(
+                    "--resume DIR.partial comes first, because it takes the options of the run that it continues"
+                )
+            config = parse(config_type, arguments, program or f"python -m {name}")
     config.check()
-    with terminal.of(config):
+    with terminal.of(config, verbose):
         task(*((config, folder) if config_type.resumable else (config,)))
 
 

@@ -57,6 +57,9 @@ ESTIMATORS = {
     "nearest_spectrum": Label("the label of the most similar training spectrum", "#666666"),
     "constant": Label("the mean direction of the training labels", "#999999"),
     "peak": Label("the strongest direction", "#bbbbbb"),
+    "music": Label("MUSIC on the array snapshots, for one source", "#aa4499"),
+    "esprit": Label("ESPRIT on the array snapshots, for one source", "#88ccee"),
+    "maximum_likelihood": Label("maximum likelihood on the array snapshots, for one source", "#117733"),
 }
 
 PREDICTORS = {

@@ -41,6 +41,8 @@ class Options:
     `check` runs before the modules of the command are imported, so a wrong value is refused at once.
     """
 
+    group: ClassVar[str] = "command"
+    """group of the options in the help of a command that inherits them"""
     resumable: ClassVar[bool] = False
     """whether an interrupted run of the command can be continued"""
 
@@ -69,6 +71,8 @@ class Options:
 class Output(Options):
     """Options of what a command shows. They are no part of a run's configuration."""
 
+    group: ClassVar[str] = "output"
+
     open: bool = False
     """open the report in the browser at the end"""
     quiet: bool = False
@@ -85,16 +89,17 @@ def plain(config: Any) -> dict[str, Any]:
     return {name: value for name, value in asdict(config).items() if name not in OUTPUT}
 
 
-def choice(meaning: str, registry: Registry[Any], known: Mapping[str, labels.Label]) -> Any:
+def choice(meaning: str, registry: Registry[Any], known: Mapping[str, labels.Label], default: str) -> Any:
     """Return the annotation of an option that takes names of a registry. Its help lists the names.
 
     Args:
         meaning: Meaning of the option.
         registry: Registry of the names.
         known: Labels by name. Names of other packages have the first line of their docstring.
+        default: Default that the help shows.
     """
 
-    def entries(default: str) -> str:
+    def entries(_: str) -> str:
         found = labels.labels(registry, dict(known))
         return f"{'; '.join(f'{name}: {label.meaning}' for name, label in found.items())} (default: {default})"
 
@@ -105,11 +110,13 @@ def choice(meaning: str, registry: Registry[Any], known: Mapping[str, labels.Lab
 class SpectraSource(Options):
     """Options of reading spectra."""
 
+    group: ClassVar[str] = "spectra"
+
     array: tuple[int, float, float] | tuple[int, int, float, float] | None = None
     """array of the spectra if the data do not describe it, or for which spectra of ray paths are computed: elements a side,
     spacing [m], carrier [Hz] of a square array, or rows, columns, spacing [m], carrier [Hz]"""
     beamformer: Annotated[
-        str | None, choice("beamformer for array snapshots (default: phase)", BEAMFORMERS, labels.BEAMFORMERS)
+        str | None, choice("beamformer for array snapshots", BEAMFORMERS, labels.BEAMFORMERS, "phase")
     ] = None
     grid: tuple[int, int] | None = None
     """elevations and azimuths of computed spectra (default: 90 360)"""
@@ -148,6 +155,8 @@ class SpectraSource(Options):
 @dataclass(frozen=True, kw_only=True)
 class TableSource(Options):
     """Options of reading RSSI."""
+
+    group: ClassVar[str] = "table"
 
     columns: tuple[str, ...] = ()
     """names of columns of a survey table that are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME

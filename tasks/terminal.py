@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import logging
 import sys
+import time
 import webbrowser
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
+from rich.logging import RichHandler
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -22,8 +25,10 @@ from tasks.records import strict
 if TYPE_CHECKING:
     from tasks.metrics import ErrorSummary
 
+LOGGERS = ("swiftwrf", "augment", "tasks")  # whose messages --verbose shows
 PLAIN_WIDTH = 140  # characters of a table that is not shown on a terminal
 SPEED_PERIOD_S = 120  # over which the speed is averaged for the time left
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -82,16 +87,24 @@ class Terminal:
         self._output = Output()
         self._progress: Progress | None = None
         self._done = self._expected = 0
+        self._began = 0.0  # of the current step [s]
 
     @contextmanager
-    def of(self, config: object) -> Iterator[None]:
-        """Show what a configuration asks for, during the context."""
+    def of(self, config: object, verbose: bool = False) -> Iterator[None]:
+        """Show what a configuration asks for, during the context; with `verbose` also the messages of `logging`."""
         self._output = config if isinstance(config, Output) else Output()
         self.console.quiet = self._output.quiet or self._output.json
+        handler, loggers = RichHandler(console=self.console, show_path=False), [logging.getLogger(n) for n in LOGGERS]
+        for logger in loggers if verbose else ():
+            logger.addHandler(handler)
+            logger.setLevel(logging.DEBUG)
         try:
             yield
         finally:
             self._output, self.console.quiet = Output(), False
+            for logger in loggers if verbose else ():
+                logger.removeHandler(handler)
+                logger.setLevel(logging.NOTSET)
 
     @contextmanager
     def progress(self) -> Iterator[None]:
@@ -116,10 +129,13 @@ class Terminal:
 
     def begin(self, title: str) -> None:
         """Show what is computed now."""
+        logger.debug("%s", title)
+        self._began = time.perf_counter()
         self._update(description=title)
 
     def end(self) -> None:
         """Count a step as done."""
+        logger.debug("done after %.1f s", time.perf_counter() - self._began)
         self._done += 1
         self._update(completed=self._done)
 

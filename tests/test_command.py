@@ -37,6 +37,11 @@ def started(folder: Path, *arguments: str, **variables: str) -> subprocess.Compl
     )
 
 
+def test_python_m_tasks_lists_the_commands():
+    done = subprocess.run([sys.executable, "-m", "tasks"], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert re.findall(r"^  (\w+) +\S", done.stdout, flags=re.MULTILINE) == [*COMMANDS, "resume"]
+
+
 def test_the_package_declares_the_script():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["scripts"] == {"swiftwrf": "tasks.command:main"}

@@ -80,7 +80,7 @@ def test_snapshots_from_arrays():
     torch.testing.assert_close(spectra.label, spectra.direction_at(data.position))
     assert data.subset(torch.tensor([3, 1])).time.tolist() == [3, 1]
     assert repr(data).startswith(
-        "<Snapshots 'snapshots': 20 channels of 1 snapshots, 4 elements at 2.4 GHz, positions over"
+        "<Snapshots 'snapshots': 20 channels of 1 snapshots, 4 elements at 2.4 GHz,\n positions over"
     )
 
 
@@ -174,7 +174,7 @@ def test_tables_and_one_line_of_a_data_set():
     assert list(frame) == ["x_m", "y_m", "z_m", "azimuth_deg", "elevation_deg", "line_of_sight"]
     assert frame.loc[2, "azimuth_deg"] == pytest.approx(math.degrees(ROOM.label[2, 0]))
     assert repr(ROOM) == (
-        "<Spectra 'simulated-room': 24 spectra of 9 x 36 directions, 16 elements at 0.915 GHz, moving transmitter, "
+        "<Spectra 'simulated-room': 24 spectra of 9 x 36 directions, 16 elements at 0.915 GHz, moving transmitter,\n "
         f"positions over {' x '.join(f'{s:.2f}' for s in np.ptp(ROOM.position.numpy(), axis=0))} m>"
     )
     assert "30 rows at 12 receivers" in repr(rssi_room(n=30))

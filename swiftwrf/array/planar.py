@@ -163,12 +163,12 @@ class PlanarArray:
             max(1, min(BATCH_SPECTRA, MAX_ELEMENT_PAIRS // len(self.element) ** 2))
         ):
             squared = make(
-                snapshots[rows], lambda matrix: (self._coefficients(matrix) @ functions).reshape(-1, *grid.shape)
+                snapshots[rows], lambda matrix: (self.coefficients(matrix) @ functions).reshape(-1, *grid.shape)
             )
             spectrum[rows] = squared.clamp(0, 1).sqrt().float()
         return spectrum
 
-    def _coefficients(self, matrix: Tensor) -> Tensor:
+    def coefficients(self, matrix: Tensor) -> Tensor:
         """Return the coefficients (n, 1 + 2 P) of a^H M a in the co-array basis: sums of entries with one difference."""
         a, b, lag = pairs(self)
         half = torch.zeros(len(matrix), len(differences(self)), dtype=torch.complex128)

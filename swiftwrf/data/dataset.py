@@ -15,13 +15,14 @@ from torch import Tensor
 from swiftwrf.data.labelled import Labelled, Variable, position_coordinates
 from swiftwrf.data.splits import choose_split
 from swiftwrf.errors import InputError
+from swiftwrf.plotting import Displayed, extent
 
 Numbers = Any  # a tensor, array, list or table of numbers
 Data = TypeVar("Data", bound="PositionedData")
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
-class PositionedData(Labelled):
+class PositionedData(Labelled, Displayed):
     """Measurements at n known positions; the base class of `Spectra`, `Snapshots` and `Rssi`.
 
     Attributes:
@@ -123,10 +124,12 @@ class PositionedData(Labelled):
         raise NotImplementedError
 
     def __repr__(self) -> str:
-        position = self._position
-        extent = (position.amax(dim=0) - position.amin(dim=0)).tolist() if len(self) else [0.0] * 3
-        size = " x ".join(f"{side:.2f}" for side in extent)
-        return f"<{type(self).__name__} {self.name!r}: {self._summary()}, positions over {size} m>"
+        head = f"<{type(self).__name__} {self.name!r}: {self._summary()},"
+        return f"{head}\n positions over {extent(self._position)}>"
+
+    def _facts(self) -> dict[str, str]:
+        found = {"name": self.name, "measurements": self._summary(), "positions over": extent(self._position)}
+        return found | {f"note {number}": note for number, note in enumerate(self.notes, start=1)}
 
     def _summary(self) -> str:
         """Return number and kind of the measurements."""

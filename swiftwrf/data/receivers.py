@@ -1,7 +1,8 @@
-"""Tables with the positions of receivers."""
+"""Receivers by name, and tables with their positions."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -100,3 +101,26 @@ def _in_metres(file: Path, xy: NDArray[np.float64], named: bool, origin: Geodeti
             f"{origin}"
         )
     return origin.to_metres(xy[:, ::-1])
+
+
+def receiver_row(names: Sequence[str], asked: str, owner: str) -> int:
+    """Return the index of a receiver.
+
+    Args:
+        names: Names of all receivers.
+        asked: Name, or number counted from 1.
+        owner: What has these receivers, for the message.
+
+    Raises:
+        InputError: An unknown receiver.
+
+    Example:
+        >>> receiver_row(["hall", "office"], "office", "floor"), receiver_row(["hall", "office"], "1", "floor")
+        (1, 0)
+    """
+    if asked in names:
+        return list(names).index(asked)
+    if asked.isdecimal() and 1 <= int(asked) <= len(names):
+        return int(asked) - 1
+    known = ", ".join(f"{number} {name}" for number, name in enumerate(names, start=1))
+    raise InputError(f"{owner} has no receiver {asked!r}; there are {known}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -15,12 +15,17 @@ from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin
 from swiftwrf.data.dataset import Numbers, PositionedData, to_positions
 from swiftwrf.data.floors import Floors
 from swiftwrf.data.labelled import Variable, position_coordinates, receiver_coordinates
+from swiftwrf.data.receivers import receiver_row
 from swiftwrf.data.splits import MIN_TRAINING, random_split
 from swiftwrf.data.survey import SurveyOptions, read_survey
 from swiftwrf.errors import InputError, listed
+from swiftwrf.plotting import MARK, plan
 from swiftwrf.runtime.validation import checked
 
 PLACE, MIN_PLACES = "place", 5  # split by receiver, a fifth of which is held out
+if TYPE_CHECKING:
+    import matplotlib.axes
+
 UNKNOWN = (float("nan"),) * 3  # position of a receiver
 
 
@@ -111,7 +116,8 @@ class Rssi(PositionedData):
     Example:
         >>> data = Rssi([[-60.0, float("nan")]] * 20, torch.rand(20, 3), receiver_names=["hall", "office"])
         >>> data
-        <Rssi 'rssi': 20 rows at 2 receivers, 50% detected, positions over ... m>
+        <Rssi 'rssi': 20 rows at 2 receivers, 50% detected,
+         positions over ... m>
     """
 
     rssi_dbm: Tensor
@@ -345,6 +351,30 @@ class Rssi(PositionedData):
             rssi_dbm=self.rssi_dbm[:, columns],
         )
 
+    def plot(self, receiver: str | None = None, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+        """Draw the RSSI where it was detected, seen from above, and the known positions of the receivers.
+
+        Args:
+            receiver: Name or number of a receiver as in `receivers`. Defaults to the strongest RSSI at each position.
+            ax: Axes to draw into. Defaults to those of a new figure.
+
+        Raises:
+            InputError: An unknown receiver.
+
+        Example:
+            >>> import swiftwrf
+            >>> swiftwrf.rssi_room(n=40).plot("2").get_title()
+            'simulated-floor, receiver02'
+        """
+        shown = self if receiver is None else self.columns([receiver_row(self.receiver_names, receiver, self.name)])
+        strongest = shown.rssi_dbm.nan_to_num(-torch.inf).amax(dim=1)
+        detected = strongest.isfinite()
+        ax = plan(self.transmitter_position[detected], strongest[detected], "RSSI [dBm]", ax)
+        x, y, _ = shown.receiver_position[shown.receiver_located].T.numpy()
+        ax.plot(x, y, "^", color=MARK)
+        ax.set_title(f"{self.name}, {'strongest receiver' if receiver is None else shown.receiver_names[0]}")
+        return ax
+
     def _columns(self) -> dict[str, Any]:
         return dict(zip(self.receiver_names, self.rssi_dbm.numpy().T, strict=True))
 
@@ -365,26 +395,3 @@ class Rssi(PositionedData):
     def _summary(self) -> str:
         share = float(self.detected.double().mean()) if len(self) else 0.0
         return f"{len(self)} rows at {len(self.receiver_names)} receivers, {share:.0%} detected"
-
-
-def receiver_row(names: Sequence[str], asked: str, owner: str) -> int:
-    """Return the index of a receiver.
-
-    Args:
-        names: Names of all receivers.
-        asked: Name, or number counted from 1.
-        owner: What has these receivers, for the message.
-
-    Raises:
-        InputError: An unknown receiver.
-
-    Example:
-        >>> receiver_row(["hall", "office"], "office", "floor"), receiver_row(["hall", "office"], "1", "floor")
-        (1, 0)
-    """
-    if asked in names:
-        return list(names).index(asked)
-    if asked.isdecimal() and 1 <= int(asked) <= len(names):
-        return int(asked) - 1
-    known = ", ".join(f"{number} {name}" for number, name in enumerate(names, start=1))
-    raise InputError(f"{owner} has no receiver {asked!r}; there are {known}")

@@ -113,7 +113,17 @@ class Snapshots(PositionedData):
         """
         grid = AngularGrid.of(grid or GRID)
         check_pixels(self.name, len(self), grid)
-        same = ("position", "line_of_sight", "index", "named_splits", "array", "source", "fixed_position", "rotation")
+        same = (
+            "position",
+            "line_of_sight",
+            "index",
+            "named_splits",
+            "array",
+            "source",
+            "fixed_position",
+            "rotation",
+            "channel",
+        )
         return Spectra(
             store=array_spectra(self.array, self.channel, grid, beamformer),
             grid=grid,

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -23,7 +23,11 @@ from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.data.store import BATCH_PIXELS, MAX_MEMORY_PIXELS, Store, stored, too_many
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
+from swiftwrf.plotting import mark_direction, polar_spectrum
 from swiftwrf.runtime.validation import checked
+
+if TYPE_CHECKING:
+    import matplotlib.axes
 
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
 DIRECTION = ("elevation", "azimuth")  # names of the dimensions of a spectrum
@@ -49,6 +53,7 @@ class Spectra(PositionedData):
         fixed_position: Position of the end that does not move, (3,) [m], if it does not follow from `pose`.
         rotation: Matrix that rotates array into world coordinates, (3, 3), in place of `pose`.
         store: Spectra as a `Store`, in place of `spectra`; readers of files give one.
+        channel: Snapshots that the spectra are computed from, complex (n, S, K), if they are kept.
         details: index, named_splits, source and notes of `PositionedData`.
 
     Raises:
@@ -70,8 +75,9 @@ class Spectra(PositionedData):
     array: PlanarArray | None
     fixed_position: Tensor | None
     rotation: Tensor | None
+    channel: Tensor | None
 
-    row_fields: ClassVar[tuple[str, ...]] = ("position", "store", "label", "line_of_sight", "index")
+    row_fields: ClassVar[tuple[str, ...]] = ("position", "store", "label", "line_of_sight", "index", "channel")
 
     @checked
     def __init__(
@@ -89,6 +95,7 @@ class Spectra(PositionedData):
         fixed_position: Numbers | None = None,
         rotation: Numbers | None = None,
         store: Store | None = None,
+        channel: Numbers | None = None,
         **details: Any,
     ) -> None:
         if position is None or (spectra is None) == (store is None):
@@ -132,6 +139,7 @@ class Spectra(PositionedData):
             array=array,
             fixed_position=fixed_position,
             rotation=rotation,
+            channel=None if channel is None else to_tensor("channel", channel, torch.complex64, (None, None, None)),
         )
 
     @property
@@ -185,6 +193,27 @@ class Spectra(PositionedData):
     def at_most(self, azimuths: int) -> Spectra:
         """Return the spectra averaged to at most that many columns, with enough rows for SSIM; 0 keeps all pixels."""
         return self.coarsen(coarsening(self.grid.shape, azimuths, least_rows=WINDOW))
+
+    def plot(self, row: int = 0, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+        """Draw a spectrum and the direction of the line of sight, seen along the normal of the array.
+
+        Args:
+            row: Number of the spectrum.
+            ax: Polar axes to draw into. Defaults to those of a new figure.
+
+        Example:
+            >>> import swiftwrf
+            >>> swiftwrf.simulated_room(n=20).plot(3).get_title()
+            'simulated-room 3 at ... m'
+        """
+        one = self.subset(torch.arange(len(self))[[row]])
+        ax = polar_spectrum(one.spectrum[0], self.grid, ax)
+        if bool(one.label.isfinite().all()):
+            azimuth, elevation = one.label[0].tolist()
+            mark_direction(ax, azimuth, elevation, "line of sight")
+        at = ", ".join(f"{coordinate:.2f}" for coordinate in one.position[0].tolist())
+        ax.set_title(f"{self.name} {int(one.index[0])} at ({at}) m")
+        return ax
 
     def _columns(self) -> dict[str, Any]:
         azimuth, elevation = self.label.rad2deg().numpy().T

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from swiftwrf.errors import InputError
+from swiftwrf.plotting import MARK, Displayed, plan
+
+if TYPE_CHECKING:
+    import matplotlib.axes
 
 WEISZFELD_STEPS = 30
 MODE_MASS = 0.1  # mass of a second mode from which on a posterior is ambiguous
@@ -15,7 +21,7 @@ MODE_LEVEL, MODE_WIDTH = 0.3, 5.0  # of the first mode, see `Posterior.ambiguous
 
 
 @dataclass(frozen=True, eq=False)
-class Posterior:
+class Posterior(Displayed):
     """Posterior over the position of the moving end for each of n observations.
 
     Args:
@@ -37,6 +43,44 @@ class Posterior:
     resolution_m: float = 0.0
     inflation: float = 1.0
     mode_width_m: float = 0.0
+
+    def __repr__(self) -> str:
+        head = f"<Posterior of {len(self)} observations on {self.log_weight.shape[1]} candidates,"
+        return f"{head}\n median 80 % credible radius {self._median_radius}>"
+
+    def _facts(self) -> dict[str, str]:
+        return {
+            "observations": str(len(self)),
+            "candidates": str(self.log_weight.shape[1]),
+            "median 80 % credible radius": self._median_radius,
+        }
+
+    @property
+    def _median_radius(self) -> str:
+        return f"{float(self.credible_radius().median()):.2f} m"
+
+    def plot(self, row: int = 0, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+        """Draw the mass of the candidates, the median and the 80 % credible circle of an observation, seen from above.
+
+        Args:
+            row: Number of the observation.
+            ax: Axes to draw into. Defaults to those of a new figure.
+
+        Example:
+            >>> at = torch.tensor([[[0.0, 0, 0], [1.0, 0, 0]]], dtype=torch.float64)
+            >>> Posterior(at, torch.tensor([[0.25, 0.75]], dtype=torch.float64).log(), 0.1).plot().get_xlabel()
+            'x [m]'
+        """
+        position = self.position.expand(len(self), -1, -1)
+        one = replace(self, position=position[[row]], log_weight=self.log_weight[[row]])
+        order = one.log_weight[0].argsort()  # the largest mass on top
+        ax = plan(one.position[0, order], one.weight[0, order], "posterior mass", ax)
+        angle = torch.linspace(0, math.tau, 100)
+        (x, y, _), radius = one.median[0].tolist(), float(one.credible_radius())
+        ax.plot(x, y, "+", color=MARK, markersize=10, label="median")
+        ax.plot(x + radius * angle.cos().numpy(), y + radius * angle.sin().numpy(), color=MARK, label="80 % circle")
+        ax.legend()
+        return ax
 
     def __len__(self) -> int:
         return len(self.log_weight)

@@ -19,6 +19,7 @@ from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.models.updatable import Updatable, bounding_box
+from swiftwrf.plotting import Displayed, extent
 from swiftwrf.positions import check_positions
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.options import Configured, Preset, from_plain
@@ -26,6 +27,8 @@ from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.validation import NonNegativeInt, checked, configuration
 
 if TYPE_CHECKING:
+    import matplotlib.axes
+
     import swiftwrf.models.geometry.model
 
 ARRAY, FIXED_END = "array", "fixed end"  # requirements that a model can declare
@@ -58,7 +61,7 @@ class FitContext:
     progress: bool = False
 
 
-class FieldModel(Configured, Saved, Updatable):
+class FieldModel(Configured, Saved, Updatable, Displayed):
     """Base class of all field models.
 
     A subclass sets `name`, `kind` and `config_type`, and implements `_fit`, `_predict`, `state` and `_restore`. Options are
@@ -302,6 +305,37 @@ class FieldModel(Configured, Saved, Updatable):
     @abstractmethod
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         """Take the fitted state over from `_state`, checking every shape first."""
+
+    def plot(self, position: Tensor, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+        """Draw the predicted spectrum at one position, seen along the normal of the array.
+
+        Args:
+            position: Position of the moving end, (3,) [m].
+            ax: Polar axes to draw into. Defaults to those of a new figure.
+
+        Raises:
+            InputError: As `predict`.
+
+        Example:
+            >>> import swiftwrf
+            >>> room = swiftwrf.simulated_room(n=20)
+            >>> make_model("nearest").fit(room).plot(room.position[0]).get_title()
+            'nearest at ... m'
+        """
+        prediction = self.predict(torch.as_tensor(position)[None])
+        at = ", ".join(f"{float(coordinate):.2f}" for coordinate in position)
+        ax = prediction.plot(ax=ax)
+        ax.set_title(f"{self.name} at ({at}) m")
+        return ax
+
+    def _facts(self) -> dict[str, str]:
+        facts = {"model": self.kind}
+        if not hasattr(self, "grid"):
+            return facts | {"fitted": "no"}
+        return facts | {
+            "directions": f"{self.grid.shape[0]} x {self.grid.shape[1]}",
+            "fitted over": extent(self.bounds),
+        }
 
     def __repr__(self) -> str:
         fitted = (

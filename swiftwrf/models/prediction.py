@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from statistics import NormalDist
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -14,10 +15,14 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.labelled import Labelled, Variable, position_coordinates, receiver_coordinates
 from swiftwrf.data.spectra import DIRECTION, direction_coordinates
 from swiftwrf.errors import InputError
+from swiftwrf.plotting import Displayed, plan, polar_spectrum
+
+if TYPE_CHECKING:
+    import matplotlib.axes
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction(Labelled):
+class Prediction(Labelled, Displayed):
     """A predicted quantity with its uncertainty.
 
     Args:
@@ -40,6 +45,43 @@ class Prediction(Labelled):
     position: Tensor | None = None
     grid: AngularGrid | None = None
     receiver_names: tuple[str, ...] = ()
+
+    def plot(self, number: int = 0, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+        """Draw a predicted spectrum seen along the normal of the array, or the RSSI at a receiver seen from above.
+
+        Args:
+            number: Row of the spectrum, or column of the receiver.
+            ax: Axes to draw into, polar for a spectrum. Defaults to those of a new figure.
+
+        Raises:
+            InputError: A prediction without directions or positions.
+
+        Example:
+            >>> import torch
+            >>> at = torch.tensor([[0.0, 0.0, 1.0], [1.0, 2.0, 1.0]])
+            >>> Prediction(torch.tensor([[-50.0], [-60.0]]), position=at).plot().get_ylabel()
+            'y [m]'
+        """
+        if self.grid is not None:
+            return polar_spectrum(self.mean[number], self.grid, ax)
+        if self.position is None or self.mean.dim() != 2:
+            raise InputError("this prediction contains neither directions nor positions; use that of a model's predict")
+        ax = plan(self.position, self.mean[:, number], "predicted RSSI [dBm]", ax)
+        ax.set_title(self.receiver_names[number] if self.receiver_names else "")
+        return ax
+
+    def __repr__(self) -> str:
+        facts = self._facts()
+        return f"<Prediction of shape {facts['shape']}: mean {facts['mean']},\n standard deviation {facts['std']}>"
+
+    def _facts(self) -> dict[str, str]:
+        def span(values: Tensor | None) -> str:
+            if values is None or not values.numel():
+                return "none"
+            low, high = (float(end) for end in values.detach().aminmax())
+            return f"{low:.4g} to {high:.4g}"
+
+        return {"shape": f"{tuple(self.mean.shape)}", "mean": span(self.mean), "std": span(self.std)}
 
     def interval(self, level: float = 0.8) -> tuple[Tensor, Tensor]:
         """Return the lower and upper end of the central interval that contains a measurement with probability `level`.

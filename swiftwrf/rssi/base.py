@@ -20,6 +20,7 @@ from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError, listed
 from swiftwrf.models.base import FieldConfig, FitContext
 from swiftwrf.models.prediction import Prediction
+from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_positions
 from swiftwrf.rssi.floors import FloorAttenuation, estimate_floor_attenuation, receiver_floors
 from swiftwrf.runtime.options import Configured
@@ -46,7 +47,7 @@ class RssiFitContext(FitContext):
     parallel: Map | None = None
 
 
-class RssiPredictor(Configured, ABC):
+class RssiPredictor(Configured, Displayed, ABC):
     """Base class of all predictors of RSSI at fixed receivers from the position of the transmitter.
 
     If the data have floors, `fit` removes the attenuation of those between transmitter and receiver, and `predict` adds it.
@@ -215,6 +216,9 @@ class RssiPredictor(Configured, ABC):
         """Raise InputError if the predictor is not fitted."""
         if not hasattr(self, "receiver_names"):
             raise InputError(f"this {type(self).__name__} is not fitted; call fit first")
+
+    def _facts(self) -> dict[str, str]:
+        return {"model": self.name, "receivers": listed(getattr(self, "receiver_names", ())) or "not fitted"}
 
     def __repr__(self) -> str:
         fitted = f"fitted, {len(self.receiver_names)} receivers" if hasattr(self, "receiver_names") else "not fitted"

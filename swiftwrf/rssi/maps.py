@@ -13,10 +13,13 @@ from numpy.typing import NDArray
 
 from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
 from swiftwrf.data.labelled import Labelled, Variable, receiver_coordinates
-from swiftwrf.data.rssi import receiver_row
-from swiftwrf.errors import InputError
+from swiftwrf.data.receivers import receiver_row
+from swiftwrf.errors import InputError, listed
+from swiftwrf.plotting import Displayed, plan_map
 
 if TYPE_CHECKING:
+    import matplotlib.axes
+
     from swiftwrf.rssi.model import RssiModel
 
 CELLS = 120  # of a map, along its longer side
@@ -25,7 +28,7 @@ Values = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class RssiMap(Labelled):
+class RssiMap(Labelled, Displayed):
     """RSSI that R receivers detect from a transmitter at the centres of square cells of one height.
 
     Args:
@@ -96,6 +99,30 @@ class RssiMap(Labelled):
         rows = [receiver_row(self.receiver_names, name, "the map") for name in asked]
         names = tuple(self.receiver_names[row] for row in rows)
         return replace(self, mean=self.mean[rows], std=self.std[rows], receiver_names=names)
+
+    def plot(self, receiver: str | None = None, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+        """Draw the map of the predictive mean, seen from above.
+
+        Args:
+            receiver: Name of a receiver, or its number from 1. Defaults to the strongest RSSI at each position.
+            ax: Axes to draw into. Defaults to those of a new figure.
+
+        Raises:
+            InputError: An unknown receiver.
+        """
+        shown = self if receiver is None else self.receivers([receiver])
+        corners = np.array([[self.x[0], self.y[0]], [self.x[-1], self.y[-1]]]) + self.cell / 2 * np.array([[-1], [1]])
+        ax = plan_map(corners, shown.mean.max(axis=0), "predicted RSSI [dBm]", ax)
+        ax.set_title(f"predicted RSSI of {'the strongest receiver' if receiver is None else shown.receiver_names[0]}")
+        return ax
+
+    def __repr__(self) -> str:
+        facts = self._facts()
+        return f"<RssiMap of {facts['receivers']}:\n {facts['cells']}, height {self.height:g} m>"
+
+    def _facts(self) -> dict[str, str]:
+        cells = f"{len(self.y)} x {len(self.x)} cells of {self.cell:.3g} m"
+        return {"receivers": listed(self.receiver_names), "cells": cells, "height": f"{self.height:g} m"}
 
     def to_frame(self) -> pd.DataFrame:
         """Return a table with one row for each cell and receiver."""

@@ -15,7 +15,7 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from statistics import NormalDist
-from typing import ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -28,6 +28,7 @@ from swiftwrf.rssi.base import Map, RssiFitContext, RssiPredictor, fingerprint, 
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.floors import FloorAttenuation
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
+from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.paper_head import HELD_OUT_FOLD, learn_receivers
 from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
 from swiftwrf.rssi.posterior import FitState, RssiPosterior
@@ -40,6 +41,9 @@ from swiftwrf.runtime.options import from_plain
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.session import Record, Session
 from swiftwrf.runtime.threads import single_thread
+
+if TYPE_CHECKING:
+    import matplotlib.axes
 
 LEVEL = 0.8  # nominal coverage of the interval that the standard deviation is calibrated for
 MAX_DISTANCE_M = 1e9  # from the measurements: float32 ends beyond, and so does any receiver's range
@@ -233,6 +237,26 @@ class RssiModel(RssiPredictor, Saved):
         mean = mean + self.mixing_weight[0].float() * head
         variance = self._process.variance(offset).float()
         return mean, (self.noise_db.square() + self.field_db.square() * variance[:, None]).sqrt()
+
+    def plot(
+        self, receiver: str | None = None, height_m: float | None = None, ax: matplotlib.axes.Axes | None = None
+    ) -> matplotlib.axes.Axes:
+        """Draw the map of the predicted RSSI over the measured region, seen from above.
+
+        Args:
+            receiver: Name of a receiver, or its number from 1. Defaults to the strongest RSSI at each position.
+            height_m: Height of the transmitter. Defaults to the median of the measurements.
+            ax: Axes to draw into. Defaults to those of a new figure.
+
+        Raises:
+            InputError: An unknown receiver, or a model that is not fitted.
+
+        Example:
+            >>> import swiftwrf
+            >>> fit_rssi(swiftwrf.rssi_room(n=60)).plot("receiver03").get_title()
+            'predicted RSSI of receiver03'
+        """
+        return RssiMap.predict(self, height=height_m).plot(receiver, ax)
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         self.check_fitted()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 
@@ -10,7 +11,8 @@ from augment import SyntheticPositions, withhold
 from augment.choose import candidates
 from swiftwrf import Spectra
 from swiftwrf.models import FIELD_MODELS, FieldModel, make_model
-from tasks.aoa.condition import EVERYTHING, LOCATOR, Condition, MeasuredSubset
+from tasks.aoa.condition import EVERYTHING, LOCATOR, Condition, MeasuredSubset, estimators
+from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.options import RAYTRACE, AoaConfig
 from tasks.metrics import AdviceMetrics
 from tasks.run import Preset
@@ -64,6 +66,12 @@ class Experiment:
         # by default only where held-out measured spectra gain from further positions
         wanted = self.config.extra is not None or bool(advice and advice["recommended_extra"])
         return self.n_synthetic if wanted else 0
+
+    @cached_property
+    def lacking(self) -> dict[str, str]:
+        """Reason for each estimator that the test spectra do not suffice for."""
+        names = estimators(self.config.preset)
+        return {name: reason for name in names if (reason := ESTIMATORS[name].lacking(self.test))}
 
     def located_by(self, subset: MeasuredSubset) -> tuple[Condition, ...]:
         """Return the conditions of matched-field processing that use the room found in these measured spectra."""

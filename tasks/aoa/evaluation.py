@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import torch
-
 from augment import Mixed, mix
 from tasks.aoa.condition import Condition, MeasuredSubset
 from tasks.aoa.context import Experiment
@@ -64,7 +62,7 @@ class Evaluation(Step[Experiment]):
         began = time.perf_counter()
         estimator.fit(train, device=experiment.device)
         fitted = time.perf_counter()
-        estimate = torch.cat([estimator.predict(part) for part in experiment.test.store.batches()])
+        estimate = estimator.estimate(experiment.test)
         if isinstance(estimator, SavedEstimator) and self._is_saved(experiment):
             estimator.save(folder / f"{name}-mix{self.subset.key}.safetensors")
         seconds = {"train": fitted - began, "estimate": time.perf_counter() - fitted}

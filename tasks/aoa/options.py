@@ -45,6 +45,7 @@ class AoaConfig(SpectraSource, Output):
             f"field models of the synthetic spectra; {AUTO} chooses the one that predicts held-out measured spectra best",
             FIELD_MODELS,
             labels.FIELD_MODELS,
+            AUTO,
         ),
     ] = (AUTO,)
     scene: str | None = None

@@ -64,11 +64,17 @@ class Results:
         self.left_out: dict[Condition, str] = {}  # conditions of matched-field processing, and why
         self._examples: set[str] = set()
         self._sentences: set[str] = set()
+        fractions = [MeasuredSubset(fraction) for fraction in experiment.config.mix]
+        for name, reason in experiment.lacking.items():
+            self.left_out |= {Condition(name, "measured", **subset.columns): reason for subset in fractions}
+        for reason in dict.fromkeys(experiment.lacking.values()):
+            names = ", ".join(name for name, own in experiment.lacking.items() if own == reason)
+            console.print(f"left out: {names}, because {reason}")
         if missing := FIELD_MODELS[ROOM_MODEL].lacking(self.test):
             reason = f"it needs the {missing[0]}, which {self.test.name} does not describe"
             console.print(f"{LOCATOR} is left out: {reason}")
-            subsets = (*map(MeasuredSubset, experiment.config.mix), EVERYTHING)
-            self.left_out = dict.fromkeys((c for subset in subsets for c in experiment.located_by(subset)), reason)
+            located = (c for subset in (*fractions, EVERYTHING) for c in experiment.located_by(subset))
+            self.left_out |= dict.fromkeys(located, reason)
 
     def add(self, step: Step[Experiment], value: Row) -> None:
         """Add the result of one step."""

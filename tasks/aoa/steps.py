@@ -38,7 +38,11 @@ def first_steps(experiment: Experiment, subset: MeasuredSubset) -> list[Step[Exp
         return Evaluation(Condition(estimator, training, measured_fraction=fraction, repeat=repeat))
 
     steps: list[Step[Experiment]] = [
-        *(reference(estimator, "measured") for estimator in estimators(experiment.config.preset)),
+        *(
+            reference(name, "measured")
+            for name in estimators(experiment.config.preset)
+            if name not in experiment.lacking
+        ),
         *(syntheses(experiment, subset, named, {}) if named and not compared else [CrossValidation(subset, compared)]),
     ]
     config, has_room = experiment.config, ROOM_MODEL in experiment.candidates

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -23,6 +24,7 @@ LINEAR_ARRAY = (
     "the elements lie on a line, so the array receives the angle to its axis only; directions are folded to the half-plane "
     "of axis and normal"
 )
+logger = logging.getLogger(__name__)
 Data = TypeVar("Data", bound=Spectra | Snapshots | Rssi)
 
 
@@ -122,6 +124,7 @@ def read(path: str | Path, options: ReadOptions, *registries: Registry[Format[An
         raise InputError(f"{source} is not a folder or file; expected measurements (formats: {known})")
     try:
         name, reader = _find(source, known, registries)
+        logger.info("%s is read as %s", source, name)
         for option in options.given:
             if option not in reader.takes:
                 raise InputError(f"{source} is read as {name}, which takes no {option}; leave it out")

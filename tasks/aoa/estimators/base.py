@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from augment import Mixed
-from swiftwrf import AngularGrid, InputError
+from swiftwrf import AngularGrid, InputError, Spectra
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.validation import NonNegativeInt, configuration
@@ -79,6 +79,15 @@ class Estimator(ABC):
     @abstractmethod
     def predict(self, spectra: Tensor) -> Tensor:
         """Return azimuth and elevation (n, 2) [rad] of spectra (n, H, W)."""
+
+    def estimate(self, data: Spectra) -> Tensor:
+        """Return azimuth and elevation (n, 2) [rad] of measurements."""
+        return torch.cat([self.predict(part) for part in data.store.batches()])
+
+    @classmethod
+    def lacking(cls, data: Spectra) -> str:
+        """Return a sentence about what the data lack for this estimator, or an empty text if they have it."""
+        return ""
 
 
 class SavedEstimator(Estimator, Saved):

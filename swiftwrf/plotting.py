@@ -1,0 +1,141 @@
+"""Figures and tables of objects in notebooks. matplotlib is imported when a figure is made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from swiftwrf.array.angles import AngularGrid
+
+if TYPE_CHECKING:
+    import matplotlib.axes
+
+MARK = "#cc3311"  # of a true or estimated value in a figure, distinct from all colours of viridis
+
+
+class Displayed:
+    """Base class of objects that notebooks show as a table. A subclass implements `_facts`.
+
+    Example:
+        >>> class Room(Displayed):
+        ...     def _facts(self):
+        ...         return {"walls": "4"}
+        >>> Room()._repr_html_()
+        '<table><caption>Room</caption><tr><th>walls</th><td>4</td></tr></table>'
+    """
+
+    def _facts(self) -> Mapping[str, str]:
+        """Return what the table contains, by name."""
+        raise NotImplementedError
+
+    def _repr_html_(self) -> str:
+        rows = (f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in self._facts().items())
+        return f"<table><caption>{escape(type(self).__name__)}</caption>{''.join(rows)}</table>"
+
+
+def extent(position: Tensor) -> str:
+    """Return the sides of the box around positions (n, 3) [m] in words.
+
+    Example:
+        >>> import torch
+        >>> extent(torch.tensor([[0.0, 0.0, 1.0], [5.0, 4.0, 1.0]]))
+        '5.00 x 4.00 x 0.00 m'
+    """
+    sides = (position.amax(dim=0) - position.amin(dim=0)).tolist() if len(position) else [0.0] * 3
+    return f"{' x '.join(f'{side:.2f}' for side in sides)} m"
+
+
+def polar_spectrum(spectrum: Tensor, grid: AngularGrid, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+    """Draw a spectrum as seen along the normal of the array, which is the centre, and return the axes.
+
+    Args:
+        spectrum: Magnitudes in [0, 1], (n_elevation, n_azimuth).
+        grid: Directions of the pixels.
+        ax: Polar axes to draw into. Defaults to those of a new figure.
+
+    Example:
+        >>> import torch
+        >>> polar_spectrum(torch.rand(9, 36), AngularGrid.hemisphere(9, 36)).name
+        'polar'
+    """
+    if ax is None:
+        from matplotlib import pyplot
+
+        ax = pyplot.figure().add_subplot(projection="polar")
+    azimuth = np.degrees(grid.azimuth_start + grid.azimuth_step * (np.arange(grid.n_azimuth + 1) - 0.5))
+    elevation = np.degrees(grid.elevation_start + grid.elevation_step * (np.arange(grid.n_elevation + 1) - 0.5))
+    zenith = (90 - elevation).clip(0, 90)
+    mesh = ax.pcolormesh(np.radians(azimuth), zenith, _array(spectrum), vmin=0, vmax=1, rasterized=True)
+    ax.set(ylim=(0, 90), yticks=(30, 60, 90), yticklabels=("60°", "30°", "0°"))  # elevations
+    ax.grid(alpha=0.4)
+    ax.figure.colorbar(mesh, ax=ax, label="magnitude", pad=0.1)
+    return ax
+
+
+def mark_direction(ax: matplotlib.axes.Axes, azimuth: float, elevation: float, label: str) -> None:
+    """Mark a direction [rad] in the figure of `polar_spectrum`."""
+    ax.plot(azimuth, 90 - np.degrees(elevation), "o", markersize=11, fillstyle="none", color=MARK, label=label)
+    ax.legend(loc="lower left", bbox_to_anchor=(-0.15, -0.12))
+
+
+def plan(
+    position: Tensor, value: Tensor, label: str, ax: matplotlib.axes.Axes | None = None, **style: Any
+) -> matplotlib.axes.Axes:
+    """Draw values at positions, seen from above and to scale, and return the axes. Values that are nan are left out.
+
+    Args:
+        position: (n, 3) [m].
+        value: (n,).
+        label: Quantity and unit of the values.
+        ax: Axes to draw into. Defaults to those of a new figure.
+        style: Arguments of `Axes.scatter`.
+
+    Example:
+        >>> import torch
+        >>> plan(torch.rand(5, 3), torch.rand(5), "RSSI [dBm]").get_xlabel()
+        'x [m]'
+    """
+    ax = _plan_axes(ax)
+    x, y, _ = _array(position).T
+    points = ax.scatter(x, y, c=_array(value), **({"s": 14} | style))
+    ax.figure.colorbar(points, ax=ax, label=label)
+    return ax
+
+
+def plan_map(
+    corners: NDArray[Any], value: NDArray[Any], label: str, ax: matplotlib.axes.Axes | None = None
+) -> matplotlib.axes.Axes:
+    """Draw a map seen from above and to scale, and return the axes.
+
+    Args:
+        corners: Lower left and upper right corner, (2, 2) [m].
+        value: Values of the cells, (rows along y, columns along x).
+        label: Quantity and unit of the values.
+        ax: Axes to draw into. Defaults to those of a new figure.
+
+    Example:
+        >>> plan_map(np.array([[0, 0], [4, 2]]), np.zeros((2, 4)), "RSSI [dBm]").get_ylabel()
+        'y [m]'
+    """
+    ax = _plan_axes(ax)
+    image = ax.imshow(value, origin="lower", extent=tuple(corners.T.ravel().tolist()))
+    ax.figure.colorbar(image, ax=ax, label=label)
+    return ax
+
+
+def _plan_axes(ax: matplotlib.axes.Axes | None) -> matplotlib.axes.Axes:
+    if ax is None:
+        from matplotlib import pyplot
+
+        ax = pyplot.figure().add_subplot()
+    ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    return ax
+
+
+def _array(tensor: Tensor) -> NDArray[Any]:
+    return np.asarray(tensor.detach().cpu())

@@ -1,0 +1,89 @@
+"""Estimators from array snapshots, without training: MUSIC, ESPRIT and maximum likelihood for one source."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import torch
+from torch import Tensor
+
+from augment import Mixed
+from swiftwrf import InputError, Spectra
+from swiftwrf.array.angles import to_angles
+from swiftwrf.array.planar import PlanarArray
+from swiftwrf.array.subspace import esprit, maximum_likelihood, music
+from tasks.aoa.estimators.base import ESTIMATORS, Estimator
+
+MIN_SNAPSHOTS = 2  # of one position: with one snapshot all methods are the peak of its spectrum
+
+
+class SnapshotEstimator(Estimator):
+    """Base class of estimators from array snapshots. A subclass implements `directions`."""
+
+    trainable = False
+
+    @staticmethod
+    @abstractmethod
+    def directions(array: PlanarArray, channel: Tensor) -> Tensor:
+        """Return unit vectors (n, 1, 3) from snapshots (n, S, K)."""
+
+    def _fit(self, train: Mixed, device: torch.device) -> None:
+        """Learn nothing."""
+
+    def predict(self, spectra: Tensor) -> Tensor:
+        raise InputError(
+            f"{type(self).__name__} estimates directions from array snapshots; spectra do not contain them"
+        )
+
+    def estimate(self, data: Spectra) -> Tensor:
+        if lacking := self.lacking(data):
+            raise InputError(f"{type(self).__name__} is not possible: {lacking}")
+        assert data.array is not None
+        assert data.channel is not None
+        return torch.stack(to_angles(self.directions(data.array, data.channel)[:, 0]), dim=-1)
+
+    @classmethod
+    def lacking(cls, data: Spectra) -> str:
+        needed = "several snapshots (subcarriers or packets) of each position are needed"
+        if data.array is None or data.channel is None:
+            return f"{needed}, and {data.name} contains spectra alone"
+        if data.channel.shape[1] < MIN_SNAPSHOTS:
+            return f"{needed}, and {data.name} contains one"
+        try:
+            cls.directions(data.array, data.channel[:1])
+        except InputError as error:
+            return str(error)
+        return ""
+
+
+@ESTIMATORS.register("music")
+class Music(SnapshotEstimator):
+    """The direction of one source by MUSIC.
+
+    Example:
+        >>> Music().predict(torch.zeros(1, 9, 36))
+        Traceback (most recent call last):
+        swiftwrf.errors.InputError: Music estimates directions from array snapshots; spectra do not contain them
+    """
+
+    @staticmethod
+    def directions(array: PlanarArray, channel: Tensor) -> Tensor:
+        return music(array, channel)
+
+
+@ESTIMATORS.register("esprit")
+class Esprit(SnapshotEstimator):
+    """The direction of one source by ESPRIT."""
+
+    @staticmethod
+    def directions(array: PlanarArray, channel: Tensor) -> Tensor:
+        return esprit(array, channel)
+
+
+@ESTIMATORS.register("maximum_likelihood")
+class MaximumLikelihood(SnapshotEstimator):
+    """The direction of one source by maximum likelihood."""
+
+    @staticmethod
+    def directions(array: PlanarArray, channel: Tensor) -> Tensor:
+        return maximum_likelihood(array, channel)

@@ -1,0 +1,191 @@
+"""MUSIC, ESPRIT and maximum likelihood on simulated snapshots: against the Cramér-Rao bound and another implementation."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from samples import snapshots, write_snapshots
+
+from augment import Mixed
+from swiftwrf import InputError, load_spectra
+from swiftwrf.array.angles import angular_distance
+from swiftwrf.array.planar import PlanarArray
+from swiftwrf.array.subspace import count_sources, esprit, maximum_likelihood, music
+from swiftwrf.metrics import angle_errors
+from tasks.aoa.condition import MeasuredSubset
+from tasks.aoa.context import Experiment
+from tasks.aoa.estimators import make_estimator
+from tasks.aoa.options import AoaConfig
+from tasks.aoa.steps import first_steps
+
+SQUARE = PlanarArray.square(4, 2.4e9)
+ROW = PlanarArray(torch.arange(8, dtype=torch.float64)[:, None] * torch.tensor([[0.03, 0.04]]), SQUARE.wavelength)
+ON_SNAPSHOTS = ("music", "esprit", "maximum_likelihood")
+METHODS = [music, esprit, maximum_likelihood]
+
+
+def unit(*cosine: float) -> torch.Tensor:
+    """Unit vector of the first two direction cosines, in front of the array."""
+    return torch.tensor([*cosine, math.sqrt(1 - sum(c * c for c in cosine))], dtype=torch.float64)
+
+
+def received(array, direction, n=1, snapshots=20, noise=0.3, coherent=False, seed=0):
+    """Channels (n, S, K) of Gaussian sources of unit power from directions (q, 3), and the sources (n, S, q)."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def gaussian(*shape):
+        return torch.randn(shape, dtype=torch.complex128, generator=generator)
+
+    source = gaussian(n, snapshots, len(direction))
+    if coherent:
+        source = source[..., :1] * torch.polar(torch.ones(2), torch.tensor([0.0, 1.0])).to(source)
+    steering = torch.exp(1j * array.phase(direction))
+    return source @ steering + noise * gaussian(n, snapshots, len(array.element)), source
+
+
+def bound(array, direction, source, noise):
+    """Cramér-Rao bound of the direction cosines, (2 q, 2 q): P. Stoica and A. Nehorai, IEEE Trans. ASSP 37, 1989."""
+    steering = torch.exp(1j * array.phase(direction)).T
+    wave = 2j * math.pi * array.element / array.wavelength
+    slope = torch.cat([wave * column[:, None] for column in steering.T], dim=1)
+    outside = torch.eye(len(steering)) - steering @ torch.linalg.pinv(steering)
+    power = (source.mT @ source.conj()).mean(dim=0)
+    power = torch.kron(power.T.resolve_conj().contiguous(), torch.ones(2, 2, dtype=power.dtype))
+    return noise**2 / 2 * torch.linalg.inv((slope.mH @ outside @ slope * power).real)
+
+
+@pytest.mark.parametrize(("method", "worst"), [(music, 1.08), (maximum_likelihood, 1.08), (esprit, 1.2)])
+def test_errors_of_one_source_reach_the_cramer_rao_bound(method, worst):
+    direction = unit(0.35, -0.5)[None]
+    channel, source = received(SQUARE, direction, n=500)
+    error = method(SQUARE, channel)[:, 0, :2] - direction[0, :2]
+    ratio = math.sqrt(float(error.square().sum(1).mean() / bound(SQUARE, direction, source, 0.3).trace()))
+    assert 0.92 < ratio < worst
+
+
+@pytest.mark.parametrize(("method", "worst"), [(music, 1.1), (maximum_likelihood, 1.1), (esprit, 1.2)])
+def test_errors_of_two_sources_are_near_the_cramer_rao_bound(method, worst):
+    direction = torch.stack([unit(0.35, -0.5), unit(0.0, 0.0)])
+    channel, source = received(SQUARE, direction, n=300, snapshots=40)
+    found = method(SQUARE, channel, sources=2)[..., :2]
+    nearest = torch.cdist(direction[None, :, :2], found).argmin(dim=2)
+    error = found.take_along_dim(nearest[..., None], dim=1) - direction[:, :2]
+    ratio = math.sqrt(float(error.square().sum((1, 2)).mean() / bound(SQUARE, direction, source, 0.3).trace()))
+    assert 0.92 < ratio < worst
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_directions_from_everywhere_and_of_a_linear_array(method):
+    generator = torch.Generator().manual_seed(1)
+    away = torch.randn(500, 3, dtype=torch.float64, generator=generator)
+    away = away / away.norm(dim=1, keepdim=True)
+    for array in (SQUARE, ROW):
+        folded = array.folded(away)
+        folded = folded[folded[:, 2] > 0.3]  # nearer to the plane or the axis both of its ends are alike
+        channel = torch.exp(1j * array.phase(folded))[:, None]
+        torch.testing.assert_close(method(array, channel)[:, 0], folded, rtol=0, atol=1e-6)
+
+
+def test_the_strongest_source_comes_first_and_missing_ones_are_nan():
+    weak, strong = unit(0.5, 0.3), unit(-0.4, -0.2)
+    both = received(SQUARE, torch.stack([weak, strong]), n=1, snapshots=200, noise=0.1)[1]
+    steering = torch.exp(1j * SQUARE.phase(torch.stack([weak, strong])))
+    noise = (
+        received(SQUARE, weak[None], snapshots=200, noise=0.1)[0]
+        - received(SQUARE, weak[None], snapshots=200, noise=0.0)[0]
+    )
+    channel = torch.cat([both * torch.tensor([1.0, 3.0]) @ steering, both[..., :1] @ steering[:1]]) + noise
+    assert count_sources(channel).tolist() == [2, 1]
+    found = music(SQUARE, channel, sources="mdl")
+    assert angular_distance(found[0], torch.stack([strong, weak])).rad2deg().max() < 1
+    assert angular_distance(found[1, 0], weak).rad2deg() < 1
+    assert found[1, 1].isnan().all()
+
+
+def test_coherent_paths_need_forward_backward_averaging_or_maximum_likelihood():
+    direction = torch.stack([unit(0.3, -0.2), unit(-0.1, 0.1)])
+    channel, _ = received(SQUARE, direction, n=20, snapshots=30, noise=0.05, coherent=True)
+
+    def error(found):
+        """Largest distance of a source from the nearest direction found, median over the trials [deg]."""
+        apart = angular_distance(direction[None, :, None], found[:, None]).amin(dim=2).amax(dim=1)
+        return float(apart.median().rad2deg())
+
+    assert error(maximum_likelihood(SQUARE, channel, 2)) < 1
+    assert error(music(SQUARE, channel, 2, forward_backward=True)) < 1
+    assert error(esprit(SQUARE, channel, 2, forward_backward=True)) < 1
+    assert error(music(SQUARE, channel, 2)) > 3
+    assert count_sources(channel).tolist() == [1] * 20
+
+
+def test_what_cannot_be_separated_is_refused_with_one_sentence():
+    channel = torch.ones(1, 3, 16, dtype=torch.complex128)
+    with pytest.raises(InputError, match="separates 1 to 15 sources, got 16"):
+        music(SQUARE, channel, 16)
+    with pytest.raises(InputError, match="mdl needs more snapshots than elements, got 3 of 16"):
+        music(SQUARE, channel, "mdl")
+    wide = PlanarArray.grid(2, 2, spacing=0.1, frequency_hz=2.4e9)
+    with pytest.raises(InputError, match="at most half a wavelength, along two directions; use MUSIC"):
+        esprit(wide, channel[..., :4])
+    triangle = PlanarArray(torch.tensor([[0.0, 0.0], [0.06, 0.0], [0.0, 0.06]]).double(), 0.125)
+    with pytest.raises(InputError, match="point symmetry"):
+        music(triangle, channel[..., :3], forward_backward=True)
+
+
+def test_music_agrees_with_pyroomacoustics():
+    doa = pytest.importorskip("pyroomacoustics").doa
+    direction = unit(0.35, -0.5)[None]
+    channel, _ = received(SQUARE, direction, snapshots=50)
+    sound, size = 343.0, 64
+    rate = size * sound / SQUARE.wavelength / 8  # bin 8 has the wavelength of the array
+    azimuth, colatitude = np.radians(np.arange(0, 360, 1.0)), np.radians(np.arange(0, 90.5, 1.0))
+    place = torch.nn.functional.pad(SQUARE.element, (0, 1)).T.numpy()
+    reference = doa.MUSIC(place, rate, size, c=sound, num_src=1, dim=3, azimuth=azimuth, colatitude=colatitude)
+    spectra = np.zeros((16, size // 2 + 1, 50), dtype=complex)
+    spectra[:, 8] = channel[0].T.numpy()
+    reference.locate_sources(spectra, num_src=1, freq_bins=[8])
+    (phi,), (theta,) = reference.azimuth_recon, reference.colatitude_recon
+    theirs = torch.tensor([math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)])
+    assert float(angular_distance(music(SQUARE, channel)[0, 0], theirs.double()).rad2deg()) < 1.5  # their grid
+
+
+def test_estimators_use_the_snapshots_of_measured_spectra(tmp_path):
+    made = snapshots(n=60, count=5, noise=0.3)
+    data = load_spectra(write_snapshots(tmp_path / "walk", data=made), grid=(16, 64))
+    assert torch.equal(data.subset(torch.tensor([3])).channel, data.channel[3:4])
+    errors = {}
+    for name in ("peak", *ON_SNAPSHOTS):
+        estimate = make_estimator(name).fit(Mixed.measured(data)).estimate(data)
+        errors[name] = float(angle_errors(estimate, data.label)["great_circle"].rad2deg().median())
+    assert all(errors[name] < errors["peak"] for name in ON_SNAPSHOTS)
+    train, test = data.split()
+    experiment = Experiment(AoaConfig((0.5,)), train, test, 0, torch.device("cpu"))
+    steps = {step.name: step for step in first_steps(experiment, MeasuredSubset(0.5))}
+    for name in ON_SNAPSHOTS:
+        step = steps[f"{name}-mix0.5-r0"]
+        assert f"{name}-r0" not in steps  # there is no training that more spectra improve
+        assert step.compute(experiment, tmp_path)["estimate"].shape == (len(test), 2)
+    spectra = replace(experiment, test=replace(test, channel=None))
+    assert not {*ON_SNAPSHOTS} & {step.name.split("-")[0] for step in first_steps(spectra, MeasuredSubset(0.5))}
+
+
+@pytest.mark.parametrize(
+    ("data", "sentence"),
+    [
+        (snapshots(n=20, count=1).spectra((8, 32)), "are needed, and made contains one"),
+        (replace(snapshots(n=20).spectra((8, 32)), channel=None), "are needed, and made contains spectra alone"),
+    ],
+    ids=["one snapshot", "spectra"],
+)
+def test_estimators_say_why_they_are_not_possible(data, sentence):
+    for name in ON_SNAPSHOTS:
+        estimator = make_estimator(name).fit(Mixed.measured(data))
+        assert estimator.lacking(data).endswith(sentence)
+        with pytest.raises(InputError, match=sentence):
+            estimator.estimate(data)
+        with pytest.raises(InputError, match="spectra do not contain them"):
+            estimator.predict(data.spectrum)
