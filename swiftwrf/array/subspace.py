@@ -206,7 +206,8 @@ def _esprit(array: PlanarArray, matrix: Tensor, count: int) -> Tensor:
     basis = torch.linalg.eig(rotations[0] + 0.6 * rotations[-1]).eigenvectors
     values = [(torch.linalg.inv(basis) @ rotation @ basis).diagonal(dim1=1, dim2=2) for rotation in rotations]
     cosine: Tensor = torch.stack([value.angle() for value in values], dim=-1) / math.tau @ torch.linalg.inv(shift).T
-    return cosine / cosine.norm(dim=-1, keepdim=True).clamp_min(1)
+    inside: Tensor = cosine / cosine.norm(dim=-1, keepdim=True).clamp_min(1)
+    return inside
 
 
 def _shifts(array: PlanarArray, count: int) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
