@@ -83,7 +83,8 @@ def _grouped(config_type: type[Options]) -> type[Any]:
             default = {} if option.default is MISSING else {"default": option.default}
             entry = (option.name, _with_help(hints[option.name], owner, option), field(**default))
             groups.setdefault(group, []).append(entry)
-    nested = [(group, make_dataclass(group, options, kw_only=True)) for group, options in groups.items()]
+    order = sorted(groups, key=lambda group: group != "required")  # an option of a base class may be required
+    nested = [(group, make_dataclass(group, groups[group], kw_only=True)) for group in order]
     return make_dataclass("Command", nested, kw_only=True)
 
 

@@ -54,7 +54,7 @@ class LocateConfig(SpectraSource, OffsetSource, Output):
     seed: int = 0
     """seed of everything random"""
     out: str | None = None
-    """directory of the run (default: a new one under runs/locate), or table (default: positions.csv); must not exist"""
+    """directory of the run or table (default: a new directory under runs/locate, or positions.csv); must not exist"""
 
     def check(self) -> None:
         super().check()
