@@ -120,9 +120,7 @@ def _with_file(config_type: type[Options], arguments: list[str]) -> list[str]:
     values = _file_options(file)
     known = {option.name: option for option in fields(config_type)}
     if unknown := [name for name in values if name not in known]:
-        raise InputError(
-            f"{file} names {unknown[0]!a}, which is no option of this command; choose from {', '.join(known)}"
-        )
+        raise InputError(f"{file} names {unknown[0]!a}, which is no option of this command; --help lists them")
     hints = get_type_hints(config_type, include_extras=True)
     positional: list[str] = []
     options: list[str] = []
