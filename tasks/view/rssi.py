@@ -18,14 +18,15 @@ from torch import Tensor
 from swiftwrf import Prediction, Rssi, RssiModel
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.rssi import LEVEL
-from tasks.page import figures
+from tasks.page import figures, maps
 from tasks.records import as_table
+from tasks.rssi.page.maps import MAX_WIDTH_DB
 from tasks.view.drawing import PlanProjection
 from tasks.view.locating import Corners, RssiLocating
 
 CELLS = 120  # of a map, along its longer side
 RECEIVER_COLOURS, N_RECEIVER_COLOURS = "tab20", 20
-RECEIVER_MARK = "#ee6677"
+RECEIVER_MARK = "#cf4a4a"
 MIN_STD_DB = 1e-6
 MapKind = Literal["RSSI", "interval", "coverage", "best receiver", "posterior", "expected error"]
 LOCATING: tuple[MapKind, ...] = ("posterior", "expected error")
@@ -81,6 +82,7 @@ class MapSelection:
         threshold: Threshold of the coverage [dBm].
         certainty: Required probability that a measurement exceeds the threshold, in (0, 1).
         row: Row whose posterior is shown, counted from 0.
+        at_least: Number of receivers of the coverage; 0 for that of the selected receiver.
     """
 
     kind: MapKind
@@ -89,6 +91,7 @@ class MapSelection:
     threshold: float = -75.0
     certainty: float = 0.9
     row: int = 0
+    at_least: int = 0
 
 
 @dataclass(frozen=True)
@@ -202,8 +205,9 @@ class RssiView:
                 return ColouredMap(mean[receiver], "viridis", low, high, "predicted RSSI [dBm]")
             case "interval":
                 width = self._width(selection.height)
-                high = float(np.percentile(width, 99))
-                return ColouredMap(width[receiver], "magma", 0.0, high, f"width of the {LEVEL:.0%} interval [dB]")
+                return ColouredMap(
+                    width[receiver], "magma", 0.0, MAX_WIDTH_DB, f"width of the {LEVEL:.0%} interval [dB]"
+                )
             case "coverage":
                 return ColouredMap(np.where(self._covered(selection), 0.7, np.nan), "GnBu", 0.0, 1.0, "")
             case "best receiver":
@@ -220,8 +224,15 @@ class RssiView:
         return ColouredMap(found.values, "viridis", 0.0, high, "expected position error [m]", found.corners)
 
     def _covered(self, selection: MapSelection) -> NDArray[np.bool_]:
-        rssi = self.map(selection.height)
-        return (probability_above(rssi, selection)[selection.receiver] >= selection.certainty).numpy()
+        probability = probability_above(self.map(selection.height), selection)
+        if selection.at_least == 0:
+            return (probability[selection.receiver] >= selection.certainty).numpy()
+        return (at_least(probability, selection.at_least) >= selection.certainty).numpy()
+
+    @cached_property
+    def inside(self) -> NDArray[np.bool_]:
+        """Whether each cell lies inside the measured positions, in plan (rows, columns)."""
+        return maps.inside(np.stack(np.meshgrid(*self.cells), axis=-1), self.floor.position)
 
     def sentence(self, selection: MapSelection) -> str:
         """Describe the selected map in a few sentences."""
@@ -235,8 +246,12 @@ class RssiView:
             case "interval":
                 return f"Width of the {LEVEL:.0%} interval of a measurement at {name}."
             case "coverage":
+                number = selection.at_least
+                who = {0: name, 1: "at least one receiver"}.get(number, f"at least {number} receivers")
+                covered, known = self._covered(selection), self.inside
+                area = f", {covered[known].mean():.0%} of the measured area" if known.any() else ""
                 return (
-                    f"{self._covered(selection).mean():.0%} of the map is coloured: there a measurement at {name} is above "
+                    f"{covered.mean():.0%} of the map{area} is coloured: there a measurement at {who} is above "
                     f"{selection.threshold:g} dBm with {selection.certainty:.0%} certainty, if it is detected at all."
                 )
             case "best receiver":
@@ -340,3 +355,21 @@ def probability_above(rssi: Prediction, selection: MapSelection) -> Tensor:
     assert rssi.std is not None
     probability: Tensor = torch.special.ndtr((rssi.mean - selection.threshold) / rssi.std.clamp_min(MIN_STD_DB))
     return probability
+
+
+def at_least(probability: Tensor, number: int) -> Tensor:
+    """Return the probability that at least a number of receivers exceed the threshold, independent of each other.
+
+    Args:
+        probability: Probability of each receiver, (R, ...).
+        number: Number of receivers, at least 1.
+
+    Example:
+        >>> at_least(torch.tensor([0.5, 0.5]), 1)
+        tensor(0.7500)
+    """
+    counts = [torch.ones_like(probability[0]), *(torch.zeros_like(probability[0]) for _ in range(number - 1))]
+    for own in probability:  # probabilities of 0 to number - 1 receivers
+        fewer = [torch.zeros_like(own), *counts[:-1]]
+        counts = [count * (1 - own) + less * own for count, less in zip(counts, fewer, strict=True)]
+    return 1 - torch.stack(counts).sum(dim=0)

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 from nicegui import events, run, ui
+from numpy.typing import NDArray
 from PIL import Image
 
 from tasks.view.drawing import colour_image, text
@@ -36,12 +37,14 @@ class RssiPage:
         with header(view.title, view.notes):
             kinds = {kind: KIND_LABELS.get(kind, kind) for kind in view.kinds}
             self._kind = ui.toggle(kinds, value="RSSI", on_change=self._update).props("no-caps padding='2px 12px'")
-        with ui.row().classes("w-full no-wrap items-start gap-8"):
-            with ui.column().classes("gap-1").style("flex: none"):
+        with ui.row().classes("w-full items-start gap-8 lg:flex-nowrap"):
+            with ui.column().classes("gap-1").style("flex: none; max-width: 100%"):
                 self._picture = plan_picture(self._plan, "map")
                 self._picture.on_mouse(self._on_pointer)
-                self._bar = ui.html("", sanitize=False).style("min-height: 34px; margin-left: 48px")
-            with ui.column().classes("gap-3 grow").style("max-width: 420px"):
+                self._bar = ui.html("", sanitize=False).style(
+                    "min-height: 34px; margin-left: 48px; max-width: calc(100% - 48px)"
+                )
+            with ui.column().classes("gap-3 grow").style("max-width: 420px; min-width: min(100%, 18rem)"):
                 self._build_controls()
         self._update()
 
@@ -56,6 +59,10 @@ class RssiPage:
         with ui.column().classes("w-full gap-0") as self._limits:
             self._threshold = slider("above", -110, -30, -75, "dBm", self._update)
             self._certainty = slider("certainty", 50, 99, 90, "%", self._update)
+            numbers = {0: "at this receiver", 1: "at any receiver"}
+            numbers |= {number: f"at {number} receivers or more" for number in range(2, len(names) + 1)}
+            self._at_least = ui.select(numbers if len(names) > 1 else {0: numbers[0]}, value=0, on_change=self._update)
+            self._at_least.props("outlined dense options-dense").classes("w-full").set_visibility(len(names) > 1)
         with ui.column().classes("w-full gap-0") as self._choice:
             self._row = ui.number("row", format="%d", on_change=self._update).props("outlined dense")
             ui.label("Click the map: the measured row nearest to it.").classes("quiet")
@@ -74,7 +81,9 @@ class RssiPage:
         height, certainty = round(self._height.value, 3), self._certainty.value / 100
         locating, number = self._view.locating, self._row.value
         row = 0 if locating is None or number is None else locating.numbered(number)
-        return MapSelection(self._kind.value, self._receiver.value, height, self._threshold.value, certainty, row)
+        return MapSelection(
+            self._kind.value, self._receiver.value, height, self._threshold.value, certainty, row, self._at_least.value
+        )
 
     def _update(self) -> None:
         if self._kind.value == "expected error":
@@ -99,6 +108,8 @@ class RssiPage:
         parts = [plan.picture(Image.fromarray(floor.plan[0]), floor.plan[1])] if floor.plan else []
         image = colour_image(coloured.values[::-1], coloured.colours, coloured.low, coloured.high)
         parts.append(plan.picture(image, coloured.corners or self._view.corners, 0.7 if floor.plan else 1.0))
+        if selection.kind not in LOCATING:
+            parts.append(plan.picture(colour_image(self._outside, "gray"), self._view.corners, 0.55))
         if selection.kind == "RSSI":
             parts.append(self._measured_svg(selection.receiver, coloured))
         if selection.kind == "posterior":
@@ -114,6 +125,11 @@ class RssiPage:
                     parts.append(plan.cross(position, RECEIVER_MARK))
                 parts.append(text(x + 11, y + 5, self._view.receivers[number], haloed=True))
         return "".join([*parts, plan.axes()])
+
+    @property
+    def _outside(self) -> NDArray[np.floating]:
+        """Grey where the map is extrapolated, transparent elsewhere, the first row on top."""
+        return np.where(self._view.inside, np.nan, 0.5)[::-1]
 
     def _measured_svg(self, receiver: int, coloured: ColouredMap) -> str:
         """Return the measurements as dots in the colours of the map, with a white rim."""
