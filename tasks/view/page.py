@@ -109,7 +109,8 @@ def colour_bar(colours: str, low: float, high: float, label: str) -> str:
     ends = ((0, "start", low), (130, "middle", (low + high) / 2), (260, "end", high))
     numbers = "".join(text(x, 30, f"{value:.3g}", anchor) for x, anchor, value in ends)
     return (
-        f'<svg viewBox="0 0 520 34" style="width: 520px; max-width: 100%"><defs><linearGradient id="bar-{colours}">{stops}</linearGradient></defs>'
+        '<svg viewBox="0 0 520 34" style="width: 520px; max-width: 100%">'
+        f'<defs><linearGradient id="bar-{colours}">{stops}</linearGradient></defs>'
         f'<rect width="260" height="14" fill="url(#bar-{colours})"/>{numbers}{text(272, 12, label, size=13)}</svg>'
     )
 

@@ -43,7 +43,10 @@ def overview(fraction: FractionRecords) -> Plot:
     caption += "Median angular error with its 95 % interval; `peak` and `constant` need no training."
     if fraction.run.holds(f"located-mix{fraction.key}"):
         panels.insert(0, located_plan(fraction))
-        caption = f"The room that was found (dashed walls are not identifiable), and test positions with the errors of their location. {caption}"
+        caption = (
+            "The room that was found (dashed walls are not identifiable), and test positions with the errors of their "
+            f"location. {caption}"
+        )
     data = figures.dots_data("method", names, {"error": values}, "deg")
     return Plot("summary", [*panels, dots], caption, data)
 
