@@ -12,7 +12,7 @@ Gaussian Splatting for Efficient Wireless Radiance Field Rendering", 2025.
 from swiftwrf.runtime.lazy import lazy_imports
 
 with lazy_imports(globals()):
-    from swiftwrf import comparison
+    from swiftwrf import comparison, datasets
     from swiftwrf.array.angles import AngularGrid, ArrayPose
     from swiftwrf.choices import FIELD_MODELS
     from swiftwrf.data import Rssi, Snapshots, Spectra, load_rssi, load_snapshots, load_spectra
@@ -20,12 +20,13 @@ with lazy_imports(globals()):
     from swiftwrf.diagnostics.calibration import Calibration, calibrate
     from swiftwrf.errors import FitError, InputError
     from swiftwrf.locate import MatchedField, Posterior, RssiLocator
-    from swiftwrf.models.base import FieldModel, Prediction, make_model
+    from swiftwrf.models.base import FieldModel, make_model
     from swiftwrf.models.coarray import CoarrayModel, fit_coarray, project
     from swiftwrf.models.geometry import GeometryModel, HybridModel, fit_geometry, fit_hybrid
+    from swiftwrf.models.prediction import Prediction
     from swiftwrf.models.swiftwrf import FitConfig, ModelConfig, SwiftWRF, fit
     from swiftwrf.rasterize import rasterize, rasterize_magnitude
-    from swiftwrf.rssi import RssiConfig, RssiModel, fit_rssi
+    from swiftwrf.rssi import PairModel, RssiConfig, RssiModel, fit_rssi
     from swiftwrf.runtime.checkpoint import load
 
 __all__ = [
@@ -42,6 +43,7 @@ __all__ = [
     "InputError",
     "MatchedField",
     "ModelConfig",
+    "PairModel",
     "Posterior",
     "Prediction",
     "Rssi",
@@ -53,6 +55,7 @@ __all__ = [
     "SwiftWRF",
     "calibrate",
     "comparison",
+    "datasets",
     "fit",
     "fit_coarray",
     "fit_geometry",

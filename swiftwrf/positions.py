@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -10,21 +13,29 @@ from swiftwrf.errors import InputError
 
 FARTHEST = 1e15
 FAR = 1e6  # normalised: beyond, all is equally far, and float32 must not overflow
+BISECTIONS = 20  # of the edge of cells, which find it to a millionth of the extent
 MANY = 2000  # known positions from which on a tree finds the nearest ones faster than all distances do
 
 
-def check_positions(position: Tensor) -> Tensor:
-    """Positions [m] as float64 (n, 3).
+def check_positions(position: Any) -> Tensor:
+    """Return positions (tensor, array or list) as float64 (n, 3) [m].
 
     Raises:
         InputError: another shape, or not finite.
+
+    Example:
+        >>> check_positions([[0, 1, 2]])
+        tensor([[0., 1., 2.]], dtype=torch.float64)
     """
-    position = torch.as_tensor(position, dtype=torch.float64)
-    if position.dim() != 2 or position.shape[1] != 3:
-        raise InputError(f"positions must have shape (n, 3), got {tuple(position.shape)}")
-    if not position.isfinite().all():
+    try:
+        tensor = position if isinstance(position, Tensor) else torch.from_numpy(np.array(position))
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(f"positions must be numbers of shape (n, 3), got {type(position).__name__}") from None
+    if tensor.dim() != 2 or tensor.shape[1] != 3:
+        raise InputError(f"positions must have shape (n, 3), got {tuple(tensor.shape)}")
+    if not tensor.isfinite().all():
         raise InputError("positions must be finite numbers [m]")
-    return position
+    return tensor.double()
 
 
 def frame(position: Tensor) -> tuple[Tensor, Tensor]:
@@ -47,6 +58,26 @@ def distance(a: Tensor, b: Tensor) -> Tensor:
     would give weights of inf / inf.
     """
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist").clamp(max=FARTHEST)
+
+
+def cells(position: Tensor, n: int) -> tuple[Tensor, float]:
+    """Return the number of the cell of each position (m, 3), int64 (m,), with at most n cells, and the edge of the cells.
+
+    Each distinct position is a cell, with edge 0, unless there are more than n. Then cells are the cubes of a grid.
+    """
+    spot = torch.unique(position, dim=0, return_inverse=True)[1]
+    if int(spot.max()) < n:
+        return spot, 0.0
+    local = position - position.min(dim=0).values
+    fine, coarse, found = 0.0, float(local.max()), torch.zeros(len(position), dtype=torch.int64)
+    for _ in range(BISECTIONS):
+        edge = (fine + coarse) / 2
+        number = torch.unique((local / edge).floor().long(), dim=0, return_inverse=True)[1]
+        if int(number.max()) < n:
+            coarse, found = edge, number
+        else:
+            fine = edge
+    return found, coarse
 
 
 class Neighbours:

@@ -12,6 +12,7 @@ from swiftwrf import InputError
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # errors of file systems without locks
 LOCK, STEPS, CONFIG, ENVIRONMENT = "lock", "steps", "config.json", "environment.json"
+MODEL, LOCATOR = "model.safetensors", "locator.safetensors"  # fitted RSSI models of runs
 
 
 def begun(folder: Path) -> bool:

@@ -41,6 +41,7 @@ COMMANDS = {
     "inspect": Command("check measurements before a run: counts, frames, calibration", "InspectConfig"),
     "convert": Command("write measurements of any known format in the toolkit's layout", "ConvertConfig"),
     "estimate": Command("estimate directions of new spectra with a trained estimator", "EstimateConfig"),
+    "update": Command("update a fitted model with new measurements, and detect changes", "UpdateConfig"),
     "scenes": Command("trace ray paths in a room (extra: raytrace)", "ScenesConfig"),
     "view": Command("show a fitted field in the browser (extra: view)", "ViewConfig"),
 }

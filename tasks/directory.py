@@ -58,15 +58,20 @@ def new_directory(out: Path, what: str) -> Iterator[Path]:
 
 
 def check_new_table(out: Path) -> None:
-    """Refuse the place of a table that a command is to write.
+    """Refuse the place of a table that a command is to write, as `check_new_file`."""
+    check_new_file(out, "--out ")
+
+
+def check_new_file(out: Path, option: str = "") -> None:
+    """Refuse the place of a file that a command is to write.
 
     Raises:
         InputError: `out` exists already, or its folder does not exist.
     """
     if out.exists():
-        raise InputError(f"--out {out} exists already and is never overwritten; choose another")
+        raise InputError(f"{option}{out} exists already and is never overwritten; choose another")
     if not out.parent.is_dir():
-        raise InputError(f"--out {out} lies in {out.parent}, which is no directory")
+        raise InputError(f"{option}{out} lies in {out.parent}, which is no directory")
 
 
 class Run:

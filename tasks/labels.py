@@ -74,6 +74,10 @@ PREDICTORS = {
     "mri_residual": Label("mri_receiver, its residual interpolated from the nearest measurements", "#8f7d12"),
     "knn": Label("inverse-distance mean of the nearest measurements", "#1b8fa6"),
     "mean": Label("the mean of the receiver's training values", "#7f8794"),
+    "pairs": Label(
+        "a log-distance path-loss model and a Gaussian process over the positions of both ends of the link", "#8b6fd0"
+    ),
+    "knn_pairs": Label("inverse-distance mean of the nearest pairs of positions", "#a0623a"),
     "nerf2": Label("a neural field for all receivers, its rays averaged (NeRF2)", "#4f8f2f"),
     "blend": Label("a weighted mean of other predictors, weights by cross-validation", "#c04f9d"),
 }

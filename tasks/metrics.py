@@ -5,7 +5,7 @@ Units are degrees, dB and seconds. A number that does not exist is nan here and 
 
 from __future__ import annotations
 
-from typing import Literal, TypedDict, get_args
+from typing import Literal, NotRequired, TypedDict, get_args
 
 Angle = Literal["azimuth_deg", "elevation_deg", "great_circle_deg"]
 Score = Literal["psnr_db", "ssim", "l1"]
@@ -185,17 +185,20 @@ class ChosenMetrics(TypedDict):
     """What the fit of SwiftWRF chose."""
 
     n_primitives: int
+    floor_attenuation_db: NotRequired[float | None]
 
 
 class RssiMetrics(RunMetrics):
     """Metrics of a run of tasks.rssi.
 
-    `notes` are those of the reader. `receivers` by receiver and method; `left_out` says why a method is not there.
+    `notes` are those of the reader. `receivers` by receiver and method; `left_out` says why a method is not there. `model`
+    is the method whose maps and intervals the run contains; results of earlier versions lack it.
     """
 
     notes: list[str]
 
     preset: str
+    model: NotRequired[str]
     overall: dict[str, PredictorMetrics]
     left_out: dict[str, str]
     receivers: dict[str, dict[str, ReceiverMetrics]]

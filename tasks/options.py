@@ -150,14 +150,20 @@ class TableSource(Options):
     """Options of reading RSSI."""
 
     columns: tuple[str, ...] = ()
-    """names of columns of a survey table that are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME ... (several with
-    rssi='WAP*')"""
+    """names of columns of a survey table that are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME
+    floor=NAME ... (several with rssi='WAP*')"""
     filler: tuple[float, ...] = ()
     """values of RSSI that stand for not detected (default: those that are recognised)"""
     keep_filler: bool = False
     """count all values of RSSI as measured"""
     coordinates: Literal["degrees", "metres"] | None = None
     """unit of the positions in a survey table (default: the one that is recognised)"""
+    transmitter: tuple[str, ...] = ()
+    """columns of a survey table with the position of the transmitter, where both ends move: x y [z]; or the one column with
+    names of its positions, which receivers.csv contains (default: those that are recognised, e.g. tx_x tx_y)"""
+    pool_by: str | None = None
+    """pool radios of one access point into one receiver, by the mean of their powers: mac (the first five bytes of their
+    addresses), a regular expression whose group is the access point, or the column of a long table that contains it"""
 
     @property
     def column_names(self) -> dict[str, str] | None:
@@ -172,6 +178,8 @@ class TableSource(Options):
                 raise InputError(f"--columns takes what a column holds and its name, e.g. x=NAME, got {text!r}")
         if len(self.column_names or {}) < len(self.columns):
             raise InputError(f"--columns names something twice: {' '.join(self.columns)}")
+        if len(self.transmitter) > 3:
+            raise InputError(f"--transmitter takes 1 to 3 columns, got {' '.join(self.transmitter)}")
         if self.filler and self.keep_filler:
             raise InputError("--filler and --keep-filler exclude each other")
 

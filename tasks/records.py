@@ -31,6 +31,9 @@ NAMES = (  # columns of text, even if a cell reads NA, 1 or 12:34
     "measured_fraction",  # a key, whose last digit counts
     "mix",
 )
+DECIMALS = {"m": 3, "db": 2, "dbm": 2, "deg": 4}  # of numbers, by the unit at the end of a column's name
+DEGREE_DECIMALS = 7  # of latitude and longitude: 1 cm
+SIGNIFICANT_DIGITS = 4  # of magnitudes
 FORMULA = re.compile(r"^'*[=+\-@\t\r]")
 
 
@@ -97,6 +100,29 @@ def as_table(rows: Iterable[Row]) -> str:
 
 def _escaped(value: Any) -> Any:
     return f"'{value}" if isinstance(value, str) and FORMULA.match(value) else value
+
+
+def rounded(rows: Iterable[Row]) -> list[Row]:
+    """Return the rows of a table for people, with numbers rounded by the units at the end of the columns' names.
+
+    Metres have 3 decimals, dB and dBm 2, degrees 4, latitudes and longitudes 7. Magnitudes have 4 significant digits.
+
+    Example:
+        >>> rounded([{"rssi_dbm": -200 / 3, "x_m": 1 / 3, "magnitude": 2 / 3000}])
+        [{'rssi_dbm': -66.67, 'x_m': 0.333, 'magnitude': 0.0006667}]
+    """
+    return [{name: _rounded(name, value) for name, value in row.items()} for row in rows]
+
+
+def _rounded(name: str, value: Any) -> Any:
+    if not isinstance(value, float):
+        return value
+    if name in ("latitude_deg", "longitude_deg"):
+        return round(value, DEGREE_DECIMALS)
+    if name == "magnitude":
+        return float(f"{value:.{SIGNIFICANT_DIGITS}g}")
+    decimals = DECIMALS.get(name.rpartition("_")[2])
+    return value if decimals is None else round(value, decimals)
 
 
 def read_table(file: Path) -> pd.DataFrame:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,25 +16,39 @@ from swiftwrf.data import ReadOptions, read_rssi, read_spectra
 from swiftwrf.data.rssi import Offsets
 from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
+from swiftwrf.datasets import fetch
+from swiftwrf.datasets.sources import DATA_SETS
 from swiftwrf.rssi import estimate_offsets
 from tasks.options import OffsetSource, SpectraSource, TableSource
+from tasks.terminal import console
 
 
 def reading(config: SpectraSource | TableSource) -> ReadOptions:
     """Return the options of a command line for reading."""
-    array = beamformer = grid = every = station = columns = filler = coordinates = offset_by = None
-    drop_null = round_trip = False
+    options = ReadOptions()
     if isinstance(config, SpectraSource):
-        array, beamformer, every, station = _array(config), config.beamformer, config.every, config.station
-        grid = AngularGrid.hemisphere(*config.grid) if config.grid else None
-        drop_null, round_trip = config.drop_null, config.round_trip
+        options = replace(
+            options,
+            array=_array(config),
+            beamformer=config.beamformer,
+            grid=AngularGrid.hemisphere(*config.grid) if config.grid else None,
+            every=config.every,
+            station=config.station,
+            drop_null=config.drop_null,
+            round_trip=config.round_trip,
+        )
     if isinstance(config, TableSource):
-        columns, filler, coordinates = config.column_names, config.fillers, config.coordinates
+        options = replace(
+            options,
+            columns=config.column_names,
+            filler=config.fillers,
+            coordinates=config.coordinates,
+            transmitter=config.transmitter,
+            pool_by=config.pool_by,
+        )
     if isinstance(config, OffsetSource) and config.offset_by is not None:
-        offset_by = config.offset_by.partition("=")[0]
-    return ReadOptions(
-        array, beamformer, grid, every, station, columns, filler, coordinates, offset_by, drop_null, round_trip
-    )
+        options = replace(options, offset_by=config.offset_by.partition("=")[0])
+    return options
 
 
 def _array(config: SpectraSource) -> PlanarArray | None:
@@ -45,13 +61,26 @@ def _array(config: SpectraSource) -> PlanarArray | None:
     return PlanarArray.grid(rows, columns, spacing, frequency)
 
 
+def located(source: str) -> str:
+    """Return the folder or file of measurements; a name of a public data set becomes its folder, if there is no such file.
+
+    Raises:
+        InputError: A data set that cannot be downloaded.
+    """
+    if os.path.exists(source) or source not in DATA_SETS:
+        return source
+    found = DATA_SETS[source]
+    console.print(f"{source}: licence {found.licence}; {found.citation}")
+    return str(fetch(source))
+
+
 def measured_rssi(data: str | None, config: TableSource) -> Rssi | None:
     """Return the RSSI of an experiment in a folder or file, None without one.
 
     Raises:
         InputError: RSSI that cannot be read.
     """
-    return None if data is None else read_rssi(data, reading(config))
+    return None if data is None else read_rssi(located(data), reading(config))
 
 
 def asked_offsets(train: Rssi, config: OffsetSource) -> Offsets | None:
@@ -91,7 +120,7 @@ def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model
     """
     known = None
     if not source.endswith(".npy"):
-        known = read_spectra(source, options)
+        known = read_spectra(located(source), options)
     elif options.given:
         raise InputError(f"{source} holds spectra as they are; --{options.given[0]} does not apply")
     store = Store(_read_array(Path(source))) if known is None else known.store

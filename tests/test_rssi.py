@@ -85,7 +85,7 @@ def test_predictors_ignore_missing_values(name):
     prediction = predictor.predict(test.transmitter_position)
     assert prediction.mean.shape == (12, 2)
     assert prediction.mean.isfinite().all()
-    assert (prediction.std is not None) == (name == "swiftwrf")
+    assert (prediction.std is not None) == (name in ("swiftwrf", "pairs"))
     assert (prediction.mean - test.rssi_dbm).abs().nanmedian() < 9
     assert predictor.predict(test.transmitter_position[:0]).mean.shape == (0, 2)
 
@@ -109,7 +109,7 @@ def test_predictors_describe_themselves():
         assert PREDICTORS.summary(name)
         assert LABELS[name].colour
     baselines = ["mean", "mri_pooled", "mri_receiver", "knn", "mri_residual", "gp"]
-    assert list(PREDICTORS) == ["swiftwrf", *baselines, "blend", "nerf2"]
+    assert list(PREDICTORS) == ["swiftwrf", *baselines, "pairs", "knn_pairs", "blend", "nerf2"]
 
 
 def test_unknown_predictor():
@@ -163,7 +163,7 @@ def test_whole_run(small, tmp_path, monkeypatch):
     out = tmp_path / "run"
     metrics = json.loads((out / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(name))
     assert (metrics["task"], metrics["data"], metrics["split"]) == ("rssi", "simulated-floor", "random")
-    assert set(metrics["overall"]) == set(PREDICTORS)
+    assert set(metrics["overall"]) == set(PREDICTORS) - {"pairs", "knn_pairs"}  # which are for two moving ends
     assert set(metrics["receivers"]) == {"receiver01", "receiver06"}
     assert set(metrics["seconds"]) == {"fit", "predict"}
     errors = pd.read_csv(out / "errors.csv")

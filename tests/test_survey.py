@@ -124,7 +124,9 @@ def test_columns_named_by_the_user(tmp_path):
     assert load_rssi(named, columns={"rssi": "a[1]"}).receiver_names == ("a[1]",)  # before it is taken for a pattern
     with pytest.raises(InputError, match="no column 'nowhere' for y"):
         load_rssi(file, columns={"x": "easting_of_robot", "y": "nowhere"})
-    with pytest.raises(InputError, match="columns takes x, y, z, longitude, latitude, time, receiver, rssi, got 'w'"):
+    with pytest.raises(
+        InputError, match="columns takes x, y, z, longitude, latitude, floor, time, receiver, rssi, got 'w'"
+    ):
         load_rssi(file, columns={"w": "y"})
 
 

@@ -27,8 +27,9 @@ from swiftwrf.locate import MatchedField, RssiLocator
 from swiftwrf.models.geometry import Plane, fit_hybrid
 from tasks.command_line import command_line
 from tasks.locate.options import LocateConfig
+from tasks.page.raster import colour_image
 from tasks.view import spectra
-from tasks.view.drawing import HemisphereProjection, PlanProjection, colour_image, data_url, text
+from tasks.view.drawing import HemisphereProjection, PlanProjection, data_url, text
 from tasks.view.locating import N_POSITIONS, RssiLocating
 from tasks.view.options import ViewConfig
 from tasks.view.rssi import MapSelection, probability_above

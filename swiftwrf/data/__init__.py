@@ -92,22 +92,35 @@ def load_rssi(
     filler: Sequence[float] | None = None,
     coordinates: Coordinates | None = None,
     offset_by: str | None = None,
+    transmitter: Sequence[str] = (),
+    pool_by: str | None = None,
 ) -> Rssi:
     """Read RSSI in any format of docs/formats.md: the NeRF2 layout, or a survey table (CSV, Parquet).
 
     Args:
         path: Folder or file.
-        columns: Names of columns of a table that are not recognised, by role: x, y, z, longitude, latitude, time, receiver,
-            rssi.
+        columns: Names of columns of a table that are not recognised, by role: x, y, z, longitude, latitude, floor, time,
+            receiver, rssi.
         filler: Values that stand for not detected, [] for none. Defaults to those that are recognised.
         coordinates: "degrees" or "metres", of the positions in a table. Defaults to the unit that is recognised.
         offset_by: Column of a table with groups of rows, e.g. devices, between which RSSI has constant offsets.
+        transmitter: Columns of a table with the position of the transmitter where both ends move: x, y and optionally z, or
+            the one column with names of its positions, which receivers.csv contains. Defaults to those recognised.
+        pool_by: Radios of one access point to pool by the mean of their powers: "mac" for the first five bytes of MAC
+            addresses, a regular expression whose group is the access point, or the column of a long table that contains it.
 
     Raises:
         InputError: A part that is missing or invalid, parts that do not match, or an argument that does not apply.
     """
     values = None if filler is None else tuple(map(float, filler))
-    options = ReadOptions(columns=columns, filler=values, coordinates=coordinates, offset_by=offset_by)
+    options = ReadOptions(
+        columns=columns,
+        filler=values,
+        coordinates=coordinates,
+        offset_by=offset_by,
+        transmitter=tuple(transmitter),
+        pool_by=pool_by,
+    )
     return read_rssi(path, options)
 
 

@@ -9,8 +9,10 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import pandas as pd
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from swiftwrf.data.labelled import Labelled, Variable, position_coordinates
 from swiftwrf.data.splits import choose_split
 from swiftwrf.errors import InputError
 
@@ -19,7 +21,7 @@ Data = TypeVar("Data", bound="PositionedData")
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
-class PositionedData:
+class PositionedData(Labelled):
     """Measurements at n known positions; the base class of `Spectra`, `Snapshots` and `Rssi`.
 
     Attributes:
@@ -105,6 +107,19 @@ class PositionedData:
 
     def _columns(self) -> dict[str, Any]:
         """Return the columns of `to_frame` beside the position."""
+        raise NotImplementedError
+
+    def coordinates(self) -> dict[str, Variable]:
+        """Return number and position of each row."""
+        index = Variable(("position",), self.index.numpy())
+        return {"index": index} | position_coordinates(self._position.numpy())
+
+    def to_numpy(self) -> tuple[NDArray[np.float64], NDArray[Any]]:
+        """Return positions X (n, 3) [m] and measurements y, as scikit-learn takes them; no copies where possible."""
+        return self._position.numpy(), self._measured().numpy()
+
+    def _measured(self) -> Tensor:
+        """Return what is measured at each position."""
         raise NotImplementedError
 
     def __repr__(self) -> str:

@@ -5,13 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from swiftwrf.data.columns import GEODETIC, column_of, column_of_numbers
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.files import MAX_COORDINATE_M
-from swiftwrf.data.survey import GEODETIC, column_of, column_of_numbers, read_frame
+from swiftwrf.data.survey import read_frame
 from swiftwrf.errors import InputError, listed
 
 MAX_FROM_ORIGIN_DEG = 2.0  # of receivers in degrees
@@ -35,23 +37,46 @@ def read_receivers(file: Path, names: list[str], origin: GeodeticOrigin | None =
     listed_names = names if label is None else table[label].astype(str).str.strip().tolist()
     if len(set(listed_names)) < len(listed_names):
         raise InputError(f"{file} must have each receiver once, got {listed(listed_names)}")
-    columns = [column_of(table, axis, {}) or column_of(table, GEODETIC[axis], {}) for axis in "xy"]
-    if None in columns:
-        raise InputError(f"{file} must start with the header receiver,x,y,z, got {','.join(map(str, table.columns))}")
-    height = column_of(table, "z", {})
-    values = [column_of_numbers(file, table, str(name)) for name in columns]
-    position = np.column_stack([*values, column_of_numbers(file, table, height) if height else np.zeros(len(table))])
-    given = np.flatnonzero(~(np.isnan(values[0]) & np.isnan(values[1])))
+    position = _positions(file, table, origin, "receiver,x,y,z")
+    given = np.flatnonzero(~np.isnan(position[:, :2]).all(axis=1))
     position, listed_names = position[given], [listed_names[row] for row in given]
     if not (np.abs(position) <= MAX_COORDINATE_M).all():
         raise InputError(f"{file} needs 3 finite numbers [m], at most {MAX_COORDINATE_M:g}, for each receiver")
-    position[:, :2] = _in_metres(file, position[:, :2], column_of(table, "longitude", {}) in columns, origin)
     place = dict(zip(listed_names, position.tolist(), strict=True))
     unknown = [name for name in names if name not in place]
     if len(unknown) == len(names):
         raise InputError(f"{file} has none of the receivers ({listed(names)}); there are {listed(listed_names)}")
     found = torch.tensor([place.get(name, [float("nan")] * 3) for name in names], dtype=torch.float64)
     return found, unknown_positions(unknown)
+
+
+def read_places(file: Path, origin: GeodeticOrigin | None = None) -> Tensor:
+    """Return the positions in a table with columns x, y, z or longitude, latitude, altitude, float64 (n, 3) [m].
+
+    Args:
+        file: CSV or Parquet file. Without a column of heights, z is 0.
+        origin: Origin of the metres, if positions are in degrees.
+
+    Raises:
+        InputError: A column that is missing, or a position that is not usable.
+    """
+    position = _positions(file, read_frame(file), origin, "x,y,z")
+    if not (np.abs(position) <= MAX_COORDINATE_M).all():
+        raise InputError(f"{file} needs 3 finite numbers [m], at most {MAX_COORDINATE_M:g}, for each position")
+    return torch.from_numpy(position)
+
+
+def _positions(file: Path, table: pd.DataFrame, origin: GeodeticOrigin | None, header: str) -> NDArray[np.float64]:
+    """Return the positions (n, 3) [m] in a table, nan where a cell is empty."""
+    columns = [column_of(table, axis, {}) or column_of(table, GEODETIC[axis], {}) for axis in "xy"]
+    if None in columns:
+        raise InputError(f"{file} must start with the header {header}, got {','.join(map(str, table.columns))}")
+    height = column_of(table, "z", {})
+    values = [column_of_numbers(file, table, str(name)) for name in columns]
+    position = np.column_stack([*values, column_of_numbers(file, table, height) if height else np.zeros(len(table))])
+    known = ~np.isnan(position[:, :2]).all(axis=1)
+    position[known, :2] = _in_metres(file, position[known, :2], column_of(table, "longitude", {}) in columns, origin)
+    return position
 
 
 def unknown_positions(names: list[str]) -> list[str]:

@@ -13,11 +13,14 @@ from torch import Tensor
 
 from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin
 from swiftwrf.data.dataset import Numbers, PositionedData, to_positions
-from swiftwrf.data.splits import MIN_TRAINING
+from swiftwrf.data.floors import Floors
+from swiftwrf.data.labelled import Variable, position_coordinates, receiver_coordinates
+from swiftwrf.data.splits import MIN_TRAINING, random_split
 from swiftwrf.data.survey import SurveyOptions, read_survey
 from swiftwrf.errors import InputError, listed
 from swiftwrf.runtime.validation import checked
 
+PLACE, MIN_PLACES = "place", 5  # split by receiver, a fifth of which is held out
 UNKNOWN = (float("nan"),) * 3  # position of a receiver
 
 
@@ -97,6 +100,8 @@ class Rssi(PositionedData):
         groups: Groups of rows between which RSSI has constant offsets.
         offsets: Offsets that were removed from the RSSI.
         labels: Names of columns of the table that distinguish groups of rows.
+        floors: Floors of the building, by height.
+        receiver_moves: Whether the receivers are positions of one receiver that moves, too.
         name: Name of the data set.
         details: index, named_splits, source and notes of `PositionedData`.
 
@@ -117,6 +122,8 @@ class Rssi(PositionedData):
     groups: Groups | None
     offsets: Offsets | None
     labels: tuple[str, ...]
+    floors: Floors | None
+    receiver_moves: bool
 
     row_fields: ClassVar[tuple[str, ...]] = ("transmitter_position", "rssi_dbm", "index", "groups")
 
@@ -132,6 +139,8 @@ class Rssi(PositionedData):
         groups: Groups | None = None,
         offsets: Offsets | None = None,
         labels: tuple[str, ...] = (),
+        floors: Floors | None = None,
+        receiver_moves: bool = False,
         name: str = "rssi",
         **details: Any,
     ) -> None:
@@ -166,6 +175,8 @@ class Rssi(PositionedData):
             groups=groups,
             offsets=offsets,
             labels=labels,
+            floors=floors,
+            receiver_moves=receiver_moves,
         )
 
     @classmethod
@@ -177,6 +188,8 @@ class Rssi(PositionedData):
         filler: Sequence[float] | None = None,
         coordinates: Coordinates | None = None,
         offset_by: str | None = None,
+        transmitter: Sequence[str] = (),
+        pool_by: str | None = None,
         receiver_position: Mapping[str, Sequence[float]] | None = None,
         name: str = "rssi",
     ) -> Rssi:
@@ -184,10 +197,14 @@ class Rssi(PositionedData):
 
         Args:
             frame: Columns of positions [m] and RSSI [dBm], recognised by their names as in docs/formats.md.
-            columns: Names of columns that are not recognised, by role: x, y, z, longitude, latitude, time, receiver, rssi.
+            columns: Names of columns that are not recognised, by role: x, y, z, longitude, latitude, floor,
+                time, receiver, rssi.
             filler: Values that stand for not detected, [] for none. Defaults to those that are recognised.
             coordinates: "degrees" or "metres". Defaults to the unit that is recognised.
             offset_by: Column with the groups of rows between which RSSI has constant offsets.
+            transmitter: Columns with the position of the second end of the link where both ends move: x, y and optionally z,
+                or the one column with names of its positions. Defaults to those recognised.
+            pool_by: Radios of one access point to pool, as in `load_rssi`.
             receiver_position: Positions [m] by name of the receiver; those of others are unknown.
             name: Name of the data set.
 
@@ -198,9 +215,10 @@ class Rssi(PositionedData):
             >>> Rssi.from_frame(pd.DataFrame({"x": [0, 1], "y": [0, 1], "z": [1, 1], "hall": [-50, -60]})).receiver_names
             ('hall',)
         """
-        options = SurveyOptions(columns, None if filler is None else tuple(filler), coordinates, offset_by)
+        values = None if filler is None else tuple(filler)
+        options = SurveyOptions(columns, values, coordinates, offset_by, tuple(transmitter), pool_by)
         survey = read_survey("the table", frame, options)
-        known = receiver_position or {}
+        known = receiver_position or survey.receiver_position or {}
         return cls(
             survey.rssi_dbm,
             survey.position,
@@ -209,6 +227,8 @@ class Rssi(PositionedData):
             origin=survey.origin,
             groups=Groups.of(offset_by, survey.group) if offset_by else None,
             labels=survey.labels,
+            floors=survey.floors,
+            receiver_moves=survey.receiver_moves,
             name=name,
             index=survey.row,
             notes=survey.notes,
@@ -248,19 +268,52 @@ class Rssi(PositionedData):
         position = moved(self.transmitter_position)
         return replace(self, transmitter_position=position, receiver_position=places, origin=origin)
 
+    def split(self, name: str = "random", seed: int = 0) -> tuple[Rssi, Rssi]:
+        """Return the training and the test part.
+
+        Args:
+            name: A split that came with the data, or else "random", "block", or "place", which holds out all measurements of
+                a fifth of the receivers.
+            seed: Seed of the random, block and place splits.
+
+        Raises:
+            InputError: An unknown name, fewer than 10 training rows, or fewer than 5 receivers of known position.
+        """
+        if name != PLACE or name in self.named_splits:
+            return super().split(name, seed)
+        located = self.receiver_located.nonzero()[:, 0]
+        if len(located) < MIN_PLACES:
+            raise InputError(
+                f"split {PLACE!r} needs at least {MIN_PLACES} receivers of known position; {self.name} has {len(located)}"
+            )
+        places = self.receiver_position[located]
+        is_test = torch.zeros(len(self.receiver_names), dtype=torch.bool)
+        is_test[located[random_split(places, seed)[1]]] = True
+        parts = []
+        for kept in (~is_test, is_test):
+            rssi = self.rssi_dbm.where(kept, torch.nan)
+            parts.append(replace(self, rssi_dbm=rssi).subset((~rssi.isnan()).any(dim=1)))
+        if len(parts[0]) < MIN_TRAINING:
+            raise InputError(
+                f"split {PLACE!r} of {self.name} has {len(parts[0])} training rows, too few to fit anything"
+            )
+        return parts[0], parts[1]
+
     def receivers(self, asked: Sequence[str]) -> Rssi:
         """Return the data of some receivers.
 
         Args:
             asked: Names, numbers counted from 1 in file order, or "all", which omits receivers that detected the transmitter
-                in fewer than 10 rows and adds a note.
+                in fewer than 10 rows and adds a note. Positions of one receiver that moves are all kept.
 
         Raises:
             InputError: An unknown receiver, one asked for twice, or one that detected the transmitter in fewer than 10 rows.
         """
+        if list(asked) == ["all"] and self.receiver_moves:
+            return self
         if list(asked) == ["all"]:
             return self._detected_enough()
-        columns = [self._column(a) for a in asked]
+        columns = [receiver_row(self.receiver_names, name, self.name) for name in asked]
         if not columns or len(set(columns)) < len(columns):
             raise InputError(f"ask for each receiver once, got {' '.join(asked) or 'none'}")
         for column in columns:
@@ -292,17 +345,46 @@ class Rssi(PositionedData):
             rssi_dbm=self.rssi_dbm[:, columns],
         )
 
-    def _column(self, asked: str) -> int:
-        if asked in self.receiver_names:
-            return self.receiver_names.index(asked)
-        if asked.isdecimal() and 1 <= int(asked) <= len(self.receiver_names):
-            return int(asked) - 1
-        known = ", ".join(f"{i} {name}" for i, name in enumerate(self.receiver_names, start=1))
-        raise InputError(f"{self.name} has no receiver {asked!r}; there are {known}")
-
     def _columns(self) -> dict[str, Any]:
         return dict(zip(self.receiver_names, self.rssi_dbm.numpy().T, strict=True))
+
+    def coordinates(self) -> dict[str, Variable]:
+        position = position_coordinates(self.transmitter_position.numpy(), self.origin)
+        return super().coordinates() | position | receiver_coordinates(self.receiver_names)
+
+    def variables(self) -> dict[str, Variable]:
+        places = Variable(("receiver", "axis"), self.receiver_position.numpy(), "m")
+        return {
+            "rssi": Variable(("position", "receiver"), self.rssi_dbm.numpy(), "dBm"),
+            "receiver_position": places,
+        }
+
+    def _measured(self) -> Tensor:
+        return self.rssi_dbm
 
     def _summary(self) -> str:
         share = float(self.detected.double().mean()) if len(self) else 0.0
         return f"{len(self)} rows at {len(self.receiver_names)} receivers, {share:.0%} detected"
+
+
+def receiver_row(names: Sequence[str], asked: str, owner: str) -> int:
+    """Return the index of a receiver.
+
+    Args:
+        names: Names of all receivers.
+        asked: Name, or number counted from 1.
+        owner: What has these receivers, for the message.
+
+    Raises:
+        InputError: An unknown receiver.
+
+    Example:
+        >>> receiver_row(["hall", "office"], "office", "floor"), receiver_row(["hall", "office"], "1", "floor")
+        (1, 0)
+    """
+    if asked in names:
+        return list(names).index(asked)
+    if asked.isdecimal() and 1 <= int(asked) <= len(names):
+        return int(asked) - 1
+    known = ", ".join(f"{number} {name}" for number, name in enumerate(names, start=1))
+    raise InputError(f"{owner} has no receiver {asked!r}; there are {known}")

@@ -13,6 +13,7 @@ from swiftwrf.array.angles import AngularGrid, ArrayPose
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.dataset import Numbers, PositionedData, to_positions, to_tensor
+from swiftwrf.data.labelled import Variable
 from swiftwrf.data.spectra import GRID, Spectra, array_spectra, check_pixels
 from swiftwrf.errors import InputError, ranges
 from swiftwrf.runtime.validation import checked
@@ -125,6 +126,12 @@ class Snapshots(PositionedData):
     def _columns(self) -> dict[str, Any]:
         time = {} if self.time is None else {"time_s": self.time.numpy()}
         return time | {"line_of_sight": self.line_of_sight.numpy()}
+
+    def variables(self) -> dict[str, Variable]:
+        return {"channel": Variable(("position", "snapshot", "element"), self.channel.numpy())}
+
+    def _measured(self) -> Tensor:
+        return self.channel
 
     def _summary(self) -> str:
         return f"{len(self)} channels of {self.channel.shape[1]} snapshots, {self.array.summary}"

@@ -18,6 +18,7 @@ from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray, folded_angles
 from swiftwrf.choices import Moving
 from swiftwrf.data.dataset import Numbers, PositionedData, to_positions, to_tensor
+from swiftwrf.data.labelled import Variable
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.data.store import BATCH_PIXELS, MAX_MEMORY_PIXELS, Store, stored, too_many
 from swiftwrf.errors import InputError
@@ -25,6 +26,7 @@ from swiftwrf.metrics import WINDOW
 from swiftwrf.runtime.validation import checked
 
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
+DIRECTION = ("elevation", "azimuth")  # names of the dimensions of a spectrum
 MAGNITUDE_TOLERANCE = 1e-6  # beyond [0, 1], from rounding
 
 
@@ -150,7 +152,7 @@ class Spectra(PositionedData):
         """Return the data with the spectra as float32 in memory, for repeated access."""
         return replace(self, store=Store(self.spectrum))
 
-    def direction_at(self, position: Tensor) -> Tensor:
+    def direction_at(self, position: Numbers) -> Tensor:
         """Return azimuth and elevation (n, 2) [rad] of the line of sight with the moving end at positions (n, 3) [m].
 
         Raises:
@@ -161,6 +163,7 @@ class Spectra(PositionedData):
                 f"{self.name} does not describe the position of the fixed end and the orientation of the array, so the "
                 "direction at synthetic positions is unknown"
             )
+        position = to_positions("position", position)
         return direction_of_link(position, self.fixed_position, self.rotation, self.moving, self.array)
 
     def peak_direction(self, rows: Tensor) -> Tensor:
@@ -187,10 +190,35 @@ class Spectra(PositionedData):
         azimuth, elevation = self.label.rad2deg().numpy().T
         return {"azimuth_deg": azimuth, "elevation_deg": elevation, "line_of_sight": self.line_of_sight.numpy()}
 
+    def coordinates(self) -> dict[str, Variable]:
+        return super().coordinates() | direction_coordinates(self.grid)
+
+    def variables(self) -> dict[str, Variable]:
+        label = self.label.rad2deg().numpy()
+        return {
+            "spectrum": Variable(("position", *DIRECTION), self.spectrum.numpy(), "1"),
+            "label": Variable(("position", "angle"), label, "degree"),
+            "line_of_sight": Variable(("position",), self.line_of_sight.numpy()),
+        }
+
+    def _measured(self) -> Tensor:
+        return self.spectrum
+
     def _summary(self) -> str:
         rows, columns = self.grid.shape
         array = f", {self.array.summary}" if self.array else ""
         return f"{len(self)} spectra of {rows} x {columns} directions{array}, moving {self.moving}"
+
+
+def direction_coordinates(grid: AngularGrid) -> dict[str, Variable]:
+    """Return elevation and azimuth [deg] of the rows and columns of spectra.
+
+    Example:
+        >>> direction_coordinates(AngularGrid.hemisphere(3, 4))["azimuth"].values.tolist()
+        [0.0, 90.0, 180.0, 270.0]
+    """
+    angles = zip(DIRECTION, (grid.elevation, grid.azimuth), strict=True)
+    return {name: Variable((name,), angle.rad2deg().numpy(), "degree") for name, angle in angles}
 
 
 def _checked_store(spectra: Numbers) -> Store:
@@ -267,6 +295,15 @@ def check_training(train: Spectra) -> None:
     """
     if len(train) < MIN_TRAINING:
         raise InputError(f"a fit needs at least {MIN_TRAINING} spectra, got {len(train)}")
+    check_spectra(train)
+
+
+def check_spectra(train: Spectra) -> None:
+    """Refuse spectra with values that are not finite.
+
+    Raises:
+        InputError: The first such spectrum.
+    """
     if train.store.values.is_floating_point():
         for rows in train.store.parts():
             bad = (~train.store[rows].isfinite()).flatten(1).any(dim=1).nonzero()

@@ -84,6 +84,12 @@ class Store:
             rows = rows.nonzero()[:, 0]
         return Store(self.values, rows if self.rows is None else self.rows[rows], self.factor)
 
+    def joined(self, other: Store) -> Store:
+        """Return the spectra of both stores in memory, in the type of this one if the other has it, too."""
+        if self.factor == other.factor == 1 and self.values.dtype == other.values.dtype:
+            return Store(torch.cat([self.measured(slice(None)), other.measured(slice(None))]))
+        return Store(torch.cat([self[:], other[:]]))
+
     def coarsen(self, factor: int) -> Store:
         """Return the spectra averaged over squares of factor x factor pixels."""
         return Store(self.values, self.rows, self.factor * factor)

@@ -6,7 +6,6 @@ A wide table has one column a receiver, a long one has one row a packet.
 from __future__ import annotations
 
 import fnmatch
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -16,32 +15,29 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES, refusing_broken
+from swiftwrf.data.columns import (
+    GEODETIC,
+    column_of,
+    column_of_numbers,
+    find_roles,
+    is_coordinate,
+    is_rssi,
+    parsed,
+    text_of,
+)
 from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin, degrees_in, without_fix
+from swiftwrf.data.ends import as_receivers, transmitter_columns
 from swiftwrf.data.files import MAX_COORDINATE_M, lines_before_header, read_cells
-from swiftwrf.data.fillers import KNOWN_FILLERS, MIN_RSSI_DBM, check_powers, find_fillers, without_fillers
+from swiftwrf.data.fillers import check_powers, find_fillers, without_fillers
+from swiftwrf.data.floors import STOREY_M, Floors, floors_of, height_of_floors
+from swiftwrf.data.pooling import pool_names, pooled
 from swiftwrf.errors import InputError, listed
 
 Floats = NDArray[np.float64]
 SUFFIXES = (".csv", ".parquet")
 SEPARATORS = ",;\t"
-EMPTY_CELLS = {"", "nan", "na", "n/a", "null", "none", "-"}
-STOREY_M = 4.0  # height of a floor, in a table with numbers of floors and no heights
 MAX_VALUES = 2**27  # rows x receivers
 MAX_GROUPS, MIN_GROUP_ROWS = 30, 10  # of a column that may distinguish devices or channels
-AXIS = "(?:(?:pos|position|coord|tx|rx)_)?{0}(?:_(?:pos|position|coord))?(?:_m)?"
-ROLES = {  # names of columns, in lower case with underscores
-    "x": re.compile(AXIS.format("x") + "|east(?:ing)?|e_?coord"),
-    "y": re.compile(AXIS.format("y") + "|north(?:ing)?|n_?coord"),
-    "z": re.compile(AXIS.format("z") + "|(?:height|alt|altitude|elevation)_?(?:m|meters|metres)?"),
-    "longitude": re.compile("(?:gps_?|current_?)?(?:lon|lng|long|longitude)(?:_deg(?:rees)?)?"),
-    "latitude": re.compile("(?:gps_?|current_?)?(?:lat|latitude)(?:_deg(?:rees)?)?"),
-    "floor": re.compile("floor(?:_?id)?"),
-    "time": re.compile("time(?:_s)?|timestamp|t|date(?:_?time)?|first_?seen"),
-    "receiver": re.compile("receiver(?:_(?:name|id))?|rx|gateway|ap|bssid|mac|sensor|anchor"),
-    "rssi": re.compile("(?:rssi?|rsrp|signal|power)(?:_dbm)?|rss_dbm|dbm"),
-}
-NAMED_ROLES = tuple(role for role in ROLES if role != "floor")  # roles that a user can assign
-GEODETIC = {"x": "longitude", "y": "latitude"}  # that take the place of x and y
 
 
 class SurveyOptions(NamedTuple):
@@ -52,12 +48,16 @@ class SurveyOptions(NamedTuple):
         filler: Values that stand for not detected. Defaults to those that are recognised; none if it is empty.
         coordinates: Unit of the positions. Defaults to the one that is recognised.
         offset_by: Column with the group of each row. Packets of a row of RSSI are of one group.
+        transmitter: Columns of the second end where both ends move: x, y and z, or one with names of its positions.
+        pool_by: Radios to pool, as in `pool_names`, or the column with the access point of each packet.
     """
 
     columns: Mapping[str, str] | None = None
     filler: tuple[float, ...] | None = None
     coordinates: Coordinates | None = None
     offset_by: str | None = None
+    transmitter: tuple[str, ...] = ()
+    pool_by: str | None = None
 
 
 class Survey(NamedTuple):
@@ -71,6 +71,9 @@ class Survey(NamedTuple):
     origin: GeodeticOrigin | None  # of positions in degrees
     group: list[str]  # of each row; empty if it was not asked for
     labels: tuple[str, ...]  # columns that distinguish groups of rows
+    floors: Floors | None  # if the table contains them
+    receiver_moves: bool  # receivers are positions of one that moves
+    receiver_position: dict[str, list[float]] | None  # by name, if the table contains them [m]
     notes: tuple[str, ...]
 
 
@@ -102,17 +105,6 @@ def has_positions(table: pd.DataFrame, columns: Mapping[str, str]) -> bool:
     return any(column_of(table, role, columns) is not None for role in ("x", "y", *GEODETIC.values()))
 
 
-def column_of(table: pd.DataFrame, role: str, columns: Mapping[str, str]) -> str | None:
-    """Return the first column of a role, by the names of columns given by role or by its own name. None without one."""
-    return columns[role] if role in columns else next(iter(_candidates(table, role)), None)
-
-
-def _candidates(table: pd.DataFrame, role: str) -> list[str]:
-    """Return the columns whose names are of a role. A column of powers does not hold names of receivers."""
-    found = [name for name in map(str, table.columns) if ROLES[role].fullmatch(_plain(name))]
-    return [name for name in found if role != "receiver" or not _is_rssi(table[name])]
-
-
 def first_rows(table: pd.DataFrame, columns: Mapping[str, str], offset_by: str | None = None) -> NDArray[np.int64]:
     """Return the first row in the table of each row of RSSI: packets of a long table share rows of RSSI.
 
@@ -128,8 +120,8 @@ def first_rows(table: pd.DataFrame, columns: Mapping[str, str], offset_by: str |
     keys = {role: name for role in roles if (name := column_of(table, role, columns)) is not None}
     coordinate = pd.DataFrame({role: column_of_numbers("the table", table, name) for role, name in keys.items()})
     if offset_by is not None:
-        coordinate["group"] = _text(table[offset_by])
-    row = _row_of_packet(coordinate, _text(table[receiver]), None if time is None else _text(table[time]))
+        coordinate["group"] = text_of(table[offset_by])
+    row = _row_of_packet(coordinate, text_of(table[receiver]), None if time is None else text_of(table[time]))
     return np.unique(row, return_index=True)[1]
 
 
@@ -147,12 +139,16 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
     table = table.set_axis([str(name).strip() for name in table.columns], axis=1)
     if not len(table) or not table.columns.is_unique:
         raise InputError(f"{label} must have rows, and a name of its own for each column")
-    asked = options.columns or {}
-    roles = _roles(label, table, asked)
+    asked, end = _second_end(label, table, options)
+    roles = find_roles(label, table, asked, end.values())
     coordinate, notes = _coordinates(label, table, roles)
+    if end:
+        coordinate = np.hstack([coordinate, _coordinates(label, table, end)[0]])
+        coordinate[np.isnan(coordinate).any(axis=1)] = np.nan
+        roles |= {f"transmitter {axis}": name for axis, name in end.items()}
     if options.offset_by is not None and options.offset_by not in table.columns:
         raise InputError(f"{label} has no column {options.offset_by!r} for offsets; there are {listed(table.columns)}")
-    group = _text(table[options.offset_by]) if options.offset_by else pd.Series([""] * len(table))
+    group = text_of(table[options.offset_by]) if options.offset_by else pd.Series([""] * len(table))
     if "receiver" in roles:
         names, rssi, source, coordinate = _long(label, table, roles, coordinate, group)
         unused = [name for name in table.columns if name not in roles.values()]
@@ -160,18 +156,29 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
         names, rssi = _wide(label, table, roles, asked)
         source = np.arange(len(table))[:, None]
         unused = [name for name in table.columns if name not in roles.values() and name not in names]
-    unused = [name for name in unused if name != options.offset_by]
+    unused = [name for name in unused if name not in (options.offset_by, options.pool_by)]
     if unused:
         notes.append(f"columns that are not used: {listed(unused)}")
     fillers = find_fillers(rssi) if options.filler is None else list(options.filler)
     check_powers(label, rssi, names, fillers, source)
     rssi, found = without_fillers(rssi, fillers)
-    omitted, missing = without_fix(coordinate)
+    if options.pool_by is not None:
+        n_radios, pools = len(names), _pools(label, table, roles, names, options.pool_by)
+        names, rssi = pooled(rssi, pools)
+        found.append(
+            f"{n_radios} radios are pooled into {len(names)} receivers by {options.pool_by}: mean of their powers"
+        )
+    omitted, missing = without_fix(coordinate[:, :3])
     notes += found + missing
     if omitted.all():
         raise InputError(f"{label} has no row with a position; {missing[0]}")
     row = np.flatnonzero(~omitted)
-    position, origin = _in_metres(label, roles, coordinate[row], options.coordinates)
+    position, origin = _in_metres(label, roles, coordinate[row].reshape(-1, 3), options.coordinates)
+    position = position.reshape(len(row), -1)
+    floors = None
+    if "floor" in roles:
+        name = text_of(table[roles["floor"]]).to_numpy()[source.max(axis=1)[row]]
+        floors = floors_of(name.tolist(), position[:, 2])
     if origin is not None:
         x, y = (roles.get(role) or roles[GEODETIC[role]] for role in "xy")
         if np.abs(coordinate[row, 1]).max() > 90:  # only a longitude does
@@ -182,61 +189,41 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
         raise InputError(f"{label} holds no RSSI that a receiver detected")
     if not kept.all():
         notes.append(f"receivers that never detected the transmitter are left out: {int((~kept).sum())}")
-    names = [names[i] for i in np.flatnonzero(kept)]
+    names, rssi, places = [names[i] for i in np.flatnonzero(kept)], rssi[row][:, kept], None
+    if end:
+        names, rssi, position, where, found = as_receivers(label, rssi, position)
+        places, notes = dict(zip(names, where.tolist(), strict=True)), notes + found
     groups = group.to_numpy()[source.max(axis=1)[row]].tolist() if options.offset_by else []
     labels = tuple(name for name in unused if _distinguishes(table[name]))
-    return Survey(names, rssi[row][:, kept], position, row, len(rssi), origin, groups, labels, tuple(notes))
+    moves = bool(end or options.transmitter)
+    if moves and not end:
+        notes.append(f"both ends move; {len(names)} positions of column {options.transmitter[0]} count as receivers")
+    return Survey(names, rssi, position, row, len(omitted), origin, groups, labels, floors, moves, places, tuple(notes))
 
 
-def column_of_numbers(label: object, table: pd.DataFrame, name: str) -> Floats:
-    """Return a column as numbers, nan where a cell is empty.
-
-    Raises:
-        InputError: A cell holds text.
-    """
-    values, text = _parsed(table[name])
-    if text.any():
-        row = int(text.argmax())
-        raise InputError(f"{label} row {row + 1}, column {name}: {table[name].iloc[row]!r} is not a number")
-    return values
-
-
-def _roles(label: object, table: pd.DataFrame, asked: Mapping[str, str]) -> dict[str, str]:
-    """Return the column of each role: the one asked for, or else the one with a known name."""
-    for role in asked:
-        if role not in NAMED_ROLES:
-            raise InputError(f"columns takes {', '.join(NAMED_ROLES)}, got {role!r}")
-    roles = {role: name for role, name in asked.items() if name in table.columns}
-    for role, name in asked.items():
-        pattern = role == "rssi" and fnmatch.filter(table.columns, name)
-        if role not in roles and not pattern:
-            raise InputError(f"{label} has no column {name!r} for {role}; there are {listed(table.columns)}")
-    for role in ROLES:
-        found = [name for name in _candidates(table, role) if name not in roles.values()]
-        if role in asked or not found:
-            continue
-        if len(found) > 1:
-            raise InputError(
-                f"{label} has {len(found)} columns that may be {role} ({listed(found)}); say which: columns {role}=NAME"
-            )
-        roles[role] = found[0]
-    for role, other in GEODETIC.items():
-        if other in roles and role in roles:
-            del roles[other]
-        if role not in roles and other not in roles:
-            raise InputError(
-                f"{label} has no column for {role}; there are {listed(table.columns)}; say which: columns {role}=NAME"
-            )
-    if "receiver" in roles and "rssi" not in roles:
+def _pools(label: object, table: pd.DataFrame, roles: dict[str, str], names: list[str], by: str) -> list[str]:
+    """Return the access point of each radio, by a column of a long table or by the radio's name."""
+    if by not in table.columns:
+        return pool_names(names, by)
+    if "receiver" not in roles:
+        raise InputError(f"{label} has a column for each receiver; pool by their names: mac or a regular expression")
+    pairs = pd.DataFrame({"radio": text_of(table[roles["receiver"]]), "pool": text_of(table[by])}).drop_duplicates()
+    if len(several := pairs["radio"][pairs["radio"].duplicated()]):
         raise InputError(
-            f"{label} has receivers in column {roles['receiver']!r}, but no RSSI beside; say where: columns rssi=NAME"
+            f"{label}: receiver {several.iloc[0]!r} has several values in column {by!r}, so it is no access point"
         )
-    return roles
+    pool = dict(zip(pairs["radio"], pairs["pool"], strict=True))
+    return [pool[name] or name for name in names]
 
 
-def _plain(name: str) -> str:
-    """Return the name in lower case with underscores: `Position X [m]` becomes position_x_m."""
-    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+def _second_end(label: object, table: pd.DataFrame, options: SurveyOptions) -> tuple[Mapping[str, str], dict[str, str]]:
+    """Return the columns that the user names, by role, and those of the second end by x, y and z, if both ends move."""
+    asked = options.columns or {}
+    if len(options.transmitter) == 1:
+        return {**asked, "receiver": options.transmitter[0]}, {}
+    if not options.transmitter and {"x", "y"} & asked.keys():
+        return asked, {}
+    return asked, transmitter_columns(label, table, options.transmitter)
 
 
 def _coordinates(label: object, table: pd.DataFrame, roles: dict[str, str]) -> tuple[Floats, list[str]]:
@@ -245,6 +232,12 @@ def _coordinates(label: object, table: pd.DataFrame, roles: dict[str, str]) -> t
     notes = []
     if "z" in roles:
         z = column_of_numbers(label, table, roles["z"])
+        if "floor" in roles and not (numbers := parsed(table[roles["floor"]]))[1].any():
+            own, z = z, height_of_floors(z, numbers[0])
+            if z is not own:
+                notes.append(
+                    f"heights count from the floor, so each floor of column {roles['floor']} adds {STOREY_M:g} m"
+                )
     elif "floor" in roles:
         z = STOREY_M * column_of_numbers(label, table, roles["floor"])
         notes.append(f"there is no height, so each floor of column {roles['floor']} counts as {STOREY_M:g} m")
@@ -281,12 +274,12 @@ def _long(
 
     Repeated packets have a row each.
     """
-    receiver = _text(table[roles["receiver"]])
+    receiver = text_of(table[roles["receiver"]])
     nameless = (receiver == "").to_numpy().nonzero()[0]
     if len(nameless):
         raise InputError(f"{label} row {nameless[0] + 1} has no receiver in column {roles['receiver']}")
     power = column_of_numbers(label, table, roles["rssi"])
-    time = _text(table[roles["time"]]) if "time" in roles else None
+    time = text_of(table[roles["time"]]) if "time" in roles else None
     row = _row_of_packet(pd.DataFrame(coordinate).assign(group=group.to_numpy()), receiver, time)
     column, names = pd.factorize(receiver)
     _, first = np.unique(row, return_index=True)
@@ -306,11 +299,6 @@ def _row_of_packet(coordinate: pd.DataFrame, receiver: pd.Series, time: pd.Serie
     return row
 
 
-def _text(column: pd.Series) -> pd.Series:
-    """Return the cells as text, empty for missing ones."""
-    return column.astype(object).where(column.notna(), "").astype(str).str.strip()
-
-
 def _wide(
     label: object, table: pd.DataFrame, roles: dict[str, str], asked: Mapping[str, str]
 ) -> tuple[list[str], Floats]:
@@ -319,7 +307,7 @@ def _wide(
     if "rssi" in asked:
         names = [asked["rssi"]] if asked["rssi"] in others else fnmatch.filter(others, asked["rssi"])
     else:
-        names = [name for name in others if _is_rssi(table[name]) and not _is_coordinate(name)]
+        names = [name for name in others if is_rssi(table[name]) and not is_coordinate(name)]
     if not names:
         raise InputError(
             f"{label} has no column of RSSI in dBm (numbers below 0) besides positions; there are {listed(table.columns)}; "
@@ -329,38 +317,10 @@ def _wide(
     return names, np.stack([column_of_numbers(label, table, name) for name in names], axis=1)
 
 
-def _parsed(column: pd.Series) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return numbers, nan elsewhere, and a mask of cells that hold text."""
-    if column.dtype.kind in "biuf":
-        return column.to_numpy(np.float64), np.zeros(len(column), dtype=bool)
-    cells = column.astype(str).str.strip()
-    values = pd.to_numeric(cells, errors="coerce").to_numpy(np.float64)
-    empty = column.isna().to_numpy() | cells.str.lower().isin(EMPTY_CELLS).to_numpy()
-    return np.where(empty, np.nan, values), np.isnan(values) & ~empty
-
-
-def _is_rssi(column: pd.Series) -> bool:
-    """Return True if most cells are received powers or fillers, whatever the number of these."""
-    values, text = _parsed(column)
-    known = np.unique(values[~np.isnan(values)])
-    if not len(known) or text.sum() > np.isfinite(values).sum():
-        return False
-    power = known[~np.isin(known, KNOWN_FILLERS) & np.isfinite(known)]
-    if not len(power):
-        return bool((known != 0).any())
-    below = power[power < 0]
-    mostly_below = len(power) - len(below) <= 1 or np.median(power) < 0
-    return bool(mostly_below and len(below) and np.median(below) >= MIN_RSSI_DBM)
-
-
 def _distinguishes(column: pd.Series) -> bool:
     """Return True if a column has few different values, each of them in several rows."""
-    times = _text(column).value_counts()
+    times = text_of(column).value_counts()
     return 2 <= len(times) <= MAX_GROUPS and int(times.min()) >= MIN_GROUP_ROWS
-
-
-def _is_coordinate(name: str) -> bool:
-    return any(ROLES[role].fullmatch(_plain(name)) for role in ("x", "y", "z", "longitude", "latitude"))
 
 
 def _check_size(label: object, rows: int, receivers: int) -> None:

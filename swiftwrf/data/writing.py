@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import io
+import json
 import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import yaml
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from swiftwrf.array.angles import AngularGrid
+from swiftwrf.array.angles import AngularGrid, to_angles
+from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.data.fillers import NOT_DETECTED_DBM
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.rssi import Rssi
@@ -20,6 +23,9 @@ from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.store import write_npy
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.durable import replacing, write_bytes, write_text
+
+DEEPMIMO_PAIR = "t000_tx000_r001"  # transmitter and receivers, as file names contain them
+DIRECT_TOLERANCE = 1e-6  # relative difference between the length of a direct path and the distance
 
 
 def write_spectra(data: Spectra, folder: Path) -> None:
@@ -81,8 +87,10 @@ def write_paths(paths: PropagationPaths, folder: Path) -> None:
         folder: Existing folder.
     """
     stream = io.BytesIO()
+    length: dict[str, Any] = {} if paths.length is None else {"length": paths.length.numpy()}
     np.savez_compressed(
         stream,
+        **length,
         transmitter_position=paths.transmitter.numpy(),
         receiver_position=paths.receiver.numpy(),
         path_count=paths.count.numpy(),
@@ -92,6 +100,47 @@ def write_paths(paths: PropagationPaths, folder: Path) -> None:
         frequency_hz=np.float64(paths.frequency_hz),
     )
     write_bytes(folder / "paths.npz", stream.getvalue())
+
+
+def write_deepmimo(paths: PropagationPaths, folder: Path) -> None:
+    """Write the folder of a DeepMIMO v4 scenario, which `load_spectra` reads.
+
+    Interactions (`inter`) are 0 for direct paths and nan for others, whose kinds the paths do not contain.
+
+    Args:
+        paths: Paths of known length from one transmitter.
+        folder: Existing folder.
+
+    Raises:
+        InputError: Unknown lengths, or several transmitters.
+    """
+    if paths.length is None:
+        raise InputError("DeepMIMO contains delays, but the lengths of these paths are unknown (length in paths.npz)")
+    if len(transmitter := paths.transmitter.unique(dim=0)) > 1:
+        raise InputError(
+            f"DeepMIMO has one transmitter and many receivers, but these paths have {len(transmitter)} transmitters"
+        )
+    distance = (paths.transmitter - paths.receiver).norm(dim=1)
+    away = (paths.length / distance[paths.owner] - 1).abs()
+    direct = paths.line_of_sight[paths.owner] & (away < DIRECT_TOLERANCE)
+    azimuth, elevation = to_angles(paths.direction)
+    columns = {
+        "power": 20 * paths.gain.abs().log10(),
+        "phase": paths.gain.angle().rad2deg(),
+        "delay": paths.length / LIGHT_SPEED,
+        "aoa_az": azimuth.rad2deg(),
+        "aoa_el": 90 - elevation.rad2deg(),
+        "inter": torch.where(direct, 0.0, torch.nan),
+    }
+    first = paths.count.cumsum(0) - paths.count
+    place = paths.owner, torch.arange(len(paths.gain)) - first[paths.owner]
+    empty = torch.full((len(paths.count), int(paths.count.max())), torch.nan, dtype=torch.float64)
+    arrays = {name: empty.index_put(place, values.double()) for name, values in columns.items()}
+    for name, values in (arrays | {"rx_pos": paths.receiver, "tx_pos": transmitter}).items():
+        with replacing(folder / f"{name}_{DEEPMIMO_PAIR}.npz") as temporary, temporary.open("wb") as stream:
+            np.savez_compressed(stream, **{name: values.numpy()})
+    params = {"rt_params": {"frequency": paths.frequency_hz, "raytracer_name": "SwiftWRF"}}
+    write_text(folder / "params.json", json.dumps(params, indent=1) + "\n")
 
 
 def _csv(header: str, values: Tensor) -> str:

@@ -27,6 +27,7 @@ class Kernel:
         short: Correlation length of the smooth part.
         share: Variance of the rough part, in [0, 1].
         noise: Variance that does not depend on position, relative to k(0) = 1.
+        vertical: Factor of differences in z, e.g. between floors.
 
     Raises:
         InputError: A value outside its range.
@@ -40,6 +41,7 @@ class Kernel:
     short: float = 0.1
     share: float = 0.6
     noise: float = 1e-2
+    vertical: float = 1.0
 
     def __post_init__(self) -> None:
         finite = all(map(math.isfinite, (self.long, self.short, self.share, self.noise)))
@@ -52,7 +54,13 @@ class Kernel:
 
     def __call__(self, a: Tensor, b: Tensor) -> Tensor:
         """Return k between positions (n, 3) and (m, 3), (n, m)."""
-        r = distance(a, b)
+        if self.vertical != 1:
+            scale = a.new_tensor([1.0, 1.0, self.vertical])
+            a, b = a * scale, b * scale
+        return self.at(distance(a, b))
+
+    def at(self, r: Tensor) -> Tensor:
+        """Return k at distances of any shape."""
         if self.share == 1:
             return torch.exp(-r / self.long)
         near = math.sqrt(3) * r / self.short

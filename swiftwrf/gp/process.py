@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import asdict
 from functools import cached_property
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from swiftwrf.errors import InputError
 from swiftwrf.gp.kernel import Kernel
 from swiftwrf.positions import Neighbours
 from swiftwrf.runtime.checkpoint import Header, expect
@@ -29,6 +31,8 @@ class GaussianProcess:
         coefficient: Dual coefficients of an exact process, values of a local one, (n, K); needed by `mean` only. See
             `regress`.
         exact: Whether every prediction conditions on all positions. Defaults to n <= 2000.
+        correlation: Correlation of the field at the time of each value with the present field, (n,), from above 0 to 1,
+            ascending. Defaults to 1. Between two values of correlations a <= b it is a / b (autoregressive in time).
 
     Example:
         >>> position = torch.rand(20, 3, dtype=torch.float64)
@@ -38,10 +42,16 @@ class GaussianProcess:
     """
 
     def __init__(
-        self, kernel: Kernel, known: Tensor, coefficient: Tensor | None = None, exact: bool | None = None
+        self,
+        kernel: Kernel,
+        known: Tensor,
+        coefficient: Tensor | None = None,
+        exact: bool | None = None,
+        correlation: Tensor | None = None,
     ) -> None:
         self.kernel, self.known, self.coefficient = kernel, known.double(), coefficient
-        self.exact = len(known) <= MAX_EXACT if exact is None else exact
+        self._asked_exact, self.exact = exact, len(known) <= MAX_EXACT if exact is None else exact
+        self.correlation = self.known.new_ones(len(known)) if correlation is None else correlation.double()
 
     @classmethod
     def regress(
@@ -51,21 +61,80 @@ class GaussianProcess:
         value: Tensor,
         exact: bool | None = None,
         dtype: torch.dtype = torch.float64,
+        correlation: Tensor | None = None,
     ) -> GaussianProcess:
         """Return the process of values (n, K) at known positions (n, 3), with coefficients of the given type."""
-        process = cls(kernel, known, value.to(dtype), exact)
+        process = cls(kernel, known, value.to(dtype), exact, correlation)
         if process.exact:
-            process.coefficient = torch.linalg.solve(kernel.covariance(known), value.double()).to(dtype)
+            process.value = value.to(dtype)
+            process.coefficient = torch.cholesky_solve(value.double(), process._factor).to(dtype)
+        return process
+
+    @cached_property
+    def value(self) -> Tensor:
+        """Values (n, K) that the process was regressed on, in the precision of the coefficients."""
+        assert self.coefficient is not None
+        if not self.exact:
+            return self.coefficient
+        return (self._factor @ (self._factor.T @ self.coefficient.double())).to(self.coefficient)
+
+    def updated(self, position: Tensor, value: Tensor) -> GaussianProcess:
+        """Return the process with more values (k, K) at positions (k, 3), equal to `regress` on all values.
+
+        The Cholesky factor grows by k rows, in a time proportional to n^2 k (G. H. Golub and C. F. Van Loan, "Matrix
+        Computations", 4th ed., 2013, section 6.5.4).
+        """
+        assert self.coefficient is not None
+        known = torch.cat([self.known, position.double()])
+        correlation = torch.cat([self.correlation, self.correlation.new_ones(len(position))])
+        options = self._asked_exact, self.coefficient.dtype, correlation
+        if not self.exact or not (self._asked_exact or len(known) <= MAX_EXACT):
+            return self.regress(self.kernel, known, torch.cat([self.value, value.to(self.coefficient)]), *options)
+        n, coefficient = len(self.known), self.coefficient.double()
+        cross = self._cross(position)
+        root = torch.linalg.solve_triangular(self._factor, cross.T, upper=False)  # (n, k)
+        corner = torch.linalg.cholesky(self.kernel.covariance(position) - root.T @ root)
+        new = torch.cholesky_solve(value.double() - cross @ coefficient, corner)
+        weight = torch.linalg.solve_triangular(self._factor.T, root, upper=True)
+        coefficient = torch.cat([coefficient - weight @ new, new]).to(self.coefficient)
+        process = GaussianProcess(self.kernel, known, coefficient, self._asked_exact, correlation)
+        factor = corner.new_zeros(len(known), len(known))
+        factor[:n, :n], factor[n:, :n], factor[n:, n:] = self._factor, root.T, corner
+        process._factor, process.value = factor, torch.cat([self.value, value.to(coefficient)])
+        return process
+
+    def without(self, rows: Tensor) -> GaussianProcess:
+        """Return the process without the values of some rows, by regression on the remaining ones."""
+        assert self.coefficient is not None
+        kept = torch.ones(len(self.known), dtype=torch.bool)
+        kept[rows] = False
+        options = self._asked_exact, self.coefficient.dtype, self.correlation[kept]
+        return self.regress(self.kernel, self.known[kept], self.value[kept], *options)
+
+    def widened(self, count: int) -> GaussianProcess:
+        """Return the process with some more columns of values, all 0."""
+        process = copy(self)
+        process.coefficient, process.value = (
+            nn.functional.pad(torch.as_tensor(x), (0, count)) for x in (self.coefficient, self.value)
+        )
+        return process
+
+    def aged(self, correlation: float) -> GaussianProcess:
+        """Return the process after a change of the field, whose values before and after have the given correlation.
+
+        Covariances of the values stay as they are, and the posterior mean is multiplied by the correlation.
+        """
+        process = copy(self)
+        process.correlation = correlation * self.correlation
         return process
 
     def mean(self, position: Tensor) -> Tensor:
         """Return the posterior mean at positions (m, 3), (m, K), in the precision of the coefficients."""
         assert self.coefficient is not None
         if self.exact:
-            mean: Tensor = self.kernel(position.double(), self.known).to(self.coefficient) @ self.coefficient
+            mean: Tensor = self._cross(position).to(self.coefficient) @ self.coefficient
             return mean
-        number, weight, _ = self._local(position)
-        return torch.einsum("mk,mkc->mc", weight, self.coefficient[number].double())
+        return self.local(position)[0]
 
     def weights(self, position: Tensor) -> tuple[Tensor, Tensor]:
         """Return the posterior mean at positions (m, 3) as a linear function of the values.
@@ -74,8 +143,8 @@ class GaussianProcess:
             Row numbers (r,) of the values that count, and their weights, float64 (m, r).
         """
         if self.exact:
-            cross = self.kernel(position.double(), self.known)
-            return torch.arange(len(self.known)), cross @ self._inverse
+            weight = torch.cholesky_solve(self._cross(position).T, self._factor).T
+            return torch.arange(len(self.known)), weight
         number, weight, _ = self._local(position)
         return dense_weights(number, weight)
 
@@ -83,14 +152,16 @@ class GaussianProcess:
         """Return the posterior variance, without noise, at positions (m, 3), relative to k(0) = 1, float64 (m,)."""
         if not self.exact:
             return self._local(position)[2]
-        cross = self.kernel(position.double(), self.known)
-        variance: Tensor = 1 - (cross @ self._inverse * cross).sum(dim=1)
+        root = torch.linalg.solve_triangular(self._factor, self._cross(position).T, upper=False)
+        variance: Tensor = 1 - root.square().sum(dim=0)
         return variance.clamp(0, 1)
 
     def state(self, prefix: str = "") -> tuple[dict[str, Tensor], Header]:
         """Return positions and coefficients, and the kernel as plain values, with names that begin with `prefix`."""
         assert self.coefficient is not None
         tensors = {f"{prefix}position": self.known, f"{prefix}coefficient": self.coefficient}
+        if bool((self.correlation < 1).any()):
+            tensors[f"{prefix}correlation"] = self.correlation
         return tensors, {f"{prefix}kernel": asdict(self.kernel)}
 
     @classmethod
@@ -105,27 +176,58 @@ class GaussianProcess:
         known, coefficient = tensors[f"{prefix}position"], tensors[f"{prefix}coefficient"]
         n = len(known)
         expect(tensors, {f"{prefix}position": (n, 3), f"{prefix}coefficient": (n, *coefficient.shape[1:2])})
-        return cls(Kernel(**header[f"{prefix}kernel"]), known, coefficient.to(dtype), exact)
+        correlation = tensors.get(f"{prefix}correlation", known.new_ones(n))
+        expect({"correlation": correlation}, {"correlation": (n,)})
+        if not bool(((correlation > 0) & (correlation <= 1)).all()):
+            raise InputError("correlation in time must be above 0 and at most 1")
+        return cls(Kernel(**header[f"{prefix}kernel"]), known, coefficient.to(dtype), exact, correlation)
+
+    def _cross(self, position: Tensor) -> Tensor:
+        """Return the covariances of the present field at positions (m, 3) with the values, float64 (m, n)."""
+        cross: Tensor = self.kernel(position.double(), self.known)
+        return cross * self.correlation
 
     @cached_property
     @torch.inference_mode(False)
-    def _inverse(self) -> Tensor:
-        inverse: Tensor = torch.linalg.inv(self.kernel.covariance(self.known))
-        return inverse
+    def _factor(self) -> Tensor:
+        """Cholesky factor of the covariance of the values, float64 (n, n)."""
+        ratio = self.correlation[:, None] / self.correlation
+        covariance = self.kernel.covariance(self.known) * torch.minimum(ratio, ratio.T)
+        factor: Tensor = torch.linalg.cholesky(covariance)
+        return factor
 
     @cached_property
     def _neighbours(self) -> Neighbours:
         return Neighbours(self.known)
+
+    def local(self, position: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean (m, K) and variance (m,) at positions from the nearest known ones, whatever their number."""
+        assert self.coefficient is not None
+        number, weight, variance = self._local(position)
+        return torch.einsum("mk,mkc->mc", weight, self.coefficient[number].double()), variance
 
     def _local(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return row numbers (m, k), weights (m, k) and posterior variance (m,) from the nearest positions."""
         position = position.to(self.known)
         number = self._neighbours(position, min(N_NEIGHBOURS, len(self.known)))[1].to(self.known.device)
         near = self.known[number]
-        noisy = self.kernel(near, near) + self.kernel.noise * torch.eye(number.shape[1]).to(near)
-        cross = self.kernel(position[:, None], near)[:, 0]
-        weight = torch.linalg.solve(noisy, cross)
-        return number, weight, (1 - (weight * cross).sum(dim=1)).clamp(0, 1)
+        correlation = self.correlation[number]
+        ratio = correlation[:, :, None] / correlation[:, None]
+        covariance = self.kernel(near, near) * torch.minimum(ratio, ratio.mT)
+        cross = self.kernel(position[:, None], near)[:, 0] * correlation
+        return number, *local_weights(covariance, cross, self.kernel.noise)
+
+
+def local_weights(covariance: Tensor, cross: Tensor, noise: float) -> tuple[Tensor, Tensor]:
+    """Return weights (m, k) and posterior variance (m,) from the k values near each of m positions.
+
+    Args:
+        covariance: Covariance of the values without noise, (m, k, k).
+        cross: Covariance of the values and the field at the positions, (m, k).
+        noise: Variance of the noise.
+    """
+    weight = torch.linalg.solve(covariance + noise * torch.eye(cross.shape[1]).to(cross), cross)
+    return weight, (1 - (weight * cross).sum(dim=1)).clamp(0, 1)
 
 
 def dense_weights(number: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:

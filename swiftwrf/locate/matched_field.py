@@ -13,6 +13,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import to_angles, to_direction
 from swiftwrf.array.planar import differences
+from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.spectra import Spectra, check_training, direction_of_link
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, thinned
@@ -254,15 +255,16 @@ class MatchedField(Configured, Saved):
         return normalised(torch.einsum("k,knm->nm", self.weight, values.double()) + cells.log_volume)
 
     @torch.no_grad()
-    def locate(self, spectrum: Tensor) -> Posterior:
+    def locate(self, spectrum: Numbers) -> Posterior:
         """Return the posterior over the position of the moving end for each spectrum.
 
         Args:
-            spectrum: Magnitudes in [0, 1], (n, n_elevation, n_azimuth) on the grid of the training spectra.
+            spectrum: Magnitudes in [0, 1], tensor or array (n, n_elevation, n_azimuth) on the grid of the training spectra.
 
         Raises:
             InputError: Spectra on another grid, or not finite.
         """
+        spectrum = torch.as_tensor(spectrum, dtype=torch.float32)
         if spectrum.dim() != 3 or tuple(spectrum.shape[1:]) != self.grid.shape:
             raise InputError(
                 f"expected spectra of shape (n, {self.grid.shape[0]}, {self.grid.shape[1]}), got {tuple(spectrum.shape)}"
@@ -282,7 +284,7 @@ class MatchedField(Configured, Saved):
         """Edge of the smallest cells [m]."""
         return float(self.cells.edge_m / 2**self.config.n_rounds)
 
-    def predict(self, spectrum: Tensor) -> Tensor:
+    def predict(self, spectrum: Numbers) -> Tensor:
         """Return azimuth and elevation (n, 2) [rad] of the transmitter that minimise the expected angular error."""
         return self.direction(self.locate(spectrum))
 

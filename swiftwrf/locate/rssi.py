@@ -10,6 +10,7 @@ import torch
 from annotated_types import Ge, Le
 from torch import Tensor
 
+from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
@@ -195,11 +196,11 @@ class RssiLocator(Configured, Saved):
         self.inflation = inflation(held_out, position[rows])
 
     @torch.no_grad()
-    def locate(self, rssi: Tensor) -> Posterior:
+    def locate(self, rssi: Numbers) -> Posterior:
         """Return the posterior over the transmitter's position for each row.
 
         Args:
-            rssi: RSSI at the receivers of the training rows, (n, R) [dBm], NaN if not detected.
+            rssi: RSSI at the receivers of the training rows, tensor or array (n, R) [dBm], NaN if not detected.
 
         Raises:
             InputError: Another number of receivers, infinite values, or a row that no receiver detected.
@@ -222,7 +223,7 @@ class RssiLocator(Configured, Saved):
         return Posterior(at[None], normalised(log_mass + self.cells.log_volume), self.cells.edge_m, self.inflation)
 
     @torch.no_grad()
-    def sample(self, position: Tensor, n: int, generator: torch.Generator) -> Tensor:
+    def sample(self, position: Numbers, n: int, generator: torch.Generator) -> Tensor:
         """Sample rows of RSSI from the fitted distributions: values with correlated errors, and lost packets.
 
         Args:

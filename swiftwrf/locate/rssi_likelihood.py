@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from swiftwrf.locate.residuals import DEGREES
-from swiftwrf.models.base import Prediction
+from swiftwrf.models.prediction import Prediction
 
 MIN_STD_DB = 0.5
 SHRINKAGES = (0.0, 0.1, 0.3, 0.6, 1.0)  # of a correlation matrix towards the identity, that are compared

@@ -2,6 +2,7 @@
 
 from swiftwrf.choices import FIELD_MODELS
 from swiftwrf.models import coarray, geometry, gp, idw, nearest, raytrace, swiftwrf  # noqa: F401 (each defines a saved kind)
-from swiftwrf.models.base import ARRAY, FIXED_END, FieldConfig, FieldModel, Prediction, make_model
+from swiftwrf.models.base import ARRAY, FIXED_END, FieldConfig, FieldModel, make_model
+from swiftwrf.models.prediction import Prediction
 
 __all__ = ["ARRAY", "FIELD_MODELS", "FIXED_END", "FieldConfig", "FieldModel", "Prediction", "make_model"]

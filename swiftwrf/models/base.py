@@ -6,7 +6,6 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
@@ -14,9 +13,12 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.choices import FIELD_MODELS, Moving
+from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.spectra import Spectra, check_training
 from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
+from swiftwrf.models.prediction import Prediction
+from swiftwrf.models.updatable import Updatable, bounding_box
 from swiftwrf.positions import check_positions
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.options import Configured, Preset, from_plain
@@ -28,38 +30,6 @@ if TYPE_CHECKING:
 
 ARRAY, FIXED_END = "array", "fixed end"  # requirements that a model can declare
 CPU = torch.device("cpu")
-
-
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """A predicted quantity with its uncertainty.
-
-    Args:
-        mean: Predictive mean, e.g. magnitudes (n, n_elevation, n_azimuth) or RSSI (n, R) [dBm].
-        std: Predictive standard deviation of one measurement, of the same shape. None if the model has none.
-
-    Example:
-        >>> prediction = Prediction(torch.zeros(2), torch.ones(2))
-        >>> low, high = prediction.interval(0.8)
-        >>> round(float(high[0]), 2)
-        1.28
-    """
-
-    mean: Tensor
-    std: Tensor | None = None
-
-    def interval(self, level: float = 0.8) -> tuple[Tensor, Tensor]:
-        """Return the lower and upper end of the central interval that contains a measurement with probability `level`.
-
-        Raises:
-            InputError: The model has no standard deviation, or the level is outside (0, 1).
-        """
-        if self.std is None:
-            raise InputError("this model predicts no standard deviation, so there is no interval")
-        if not 0 < level < 1:
-            raise InputError(f"level must be between 0 and 1, got {level}")
-        half = NormalDist().inv_cdf((1 + level) / 2) * self.std
-        return self.mean - half, self.mean + half
 
 
 @configuration
@@ -88,7 +58,7 @@ class FitContext:
     progress: bool = False
 
 
-class FieldModel(Configured, Saved):
+class FieldModel(Configured, Saved, Updatable):
     """Base class of all field models.
 
     A subclass sets `name`, `kind` and `config_type`, and implements `_fit`, `_predict`, `state` and `_restore`. Options are
@@ -189,13 +159,13 @@ class FieldModel(Configured, Saved):
         """Return one posterior sample (b, H, W) for each of a batch of positions."""
         raise NotImplementedError
 
-    def predict(self, position: Tensor, grid: AngularGrid | None = None) -> Prediction:
+    def predict(self, position: Numbers, grid: AngularGrid | None = None) -> Prediction:
         """Predict spectra.
 
         Gradients flow to the positions, and to parameters of the model that require them, unless torch.no_grad is active.
 
         Args:
-            position: Positions of the moving end, (n, 3) [m].
+            position: Positions of the moving end, tensor or array (n, 3) [m].
             grid: Directions. Defaults to the grid of the training spectra.
 
         Returns:
@@ -207,21 +177,22 @@ class FieldModel(Configured, Saved):
         """
         return self._predicted(position, grid, with_std=True)
 
-    def synthesize(self, position: Tensor, grid: AngularGrid | None = None) -> Tensor:
+    def synthesize(self, position: Numbers, grid: AngularGrid | None = None) -> Tensor:
         """Return the mean of `predict` alone, without the cost of the standard deviation."""
         return self._predicted(position, grid, with_std=False).mean
 
-    def _predicted(self, position: Tensor, grid: AngularGrid | None, with_std: bool) -> Prediction:
+    def _predicted(self, position: Numbers, grid: AngularGrid | None, with_std: bool) -> Prediction:
         grid = self._checked_grid(grid)
 
         def evaluate(some: Tensor) -> tuple[Tensor, Tensor | None]:
             mean, std = self._predict(some, grid, with_std)
             return mean.clamp(0, 1), std
 
-        mean, std = self._in_batches(evaluate, self._checked(position), grid)
-        return Prediction(mean, std)
+        position = self._checked(position)
+        mean, std = self._in_batches(evaluate, position, grid)
+        return Prediction(mean, std, position, grid)
 
-    def sample(self, position: Tensor, *, generator: torch.Generator, grid: AngularGrid | None = None) -> Tensor:
+    def sample(self, position: Numbers, *, generator: torch.Generator, grid: AngularGrid | None = None) -> Tensor:
         """Return one sample of the predictive distribution at each position.
 
         Args:
@@ -272,7 +243,7 @@ class FieldModel(Configured, Saved):
         """Device of the fitted tensors."""
         return next((tensor.device for tensor in self.parameters()), torch.device("cpu"))
 
-    def _checked(self, position: Tensor) -> Tensor:
+    def _checked(self, position: Numbers) -> Tensor:
         return check_positions(position).to(self.device)
 
     def _checked_grid(self, grid: AngularGrid | None) -> AngularGrid:
@@ -337,12 +308,6 @@ class FieldModel(Configured, Saved):
             f"fitted, {self.grid.shape[0]} x {self.grid.shape[1]} directions" if hasattr(self, "grid") else "not fitted"
         )
         return f"{type(self).__name__}({fitted})"
-
-
-def bounding_box(position: Tensor) -> Tensor:
-    """Return the lower and upper corner (2, 3) of the box around positions (n, 3) [m]."""
-    position = check_positions(position)
-    return torch.stack([position.amin(dim=0), position.amax(dim=0)])
 
 
 def check_finite(spectrum: Tensor) -> Tensor:

@@ -18,17 +18,20 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray, basis, differences
-from swiftwrf.data.spectra import Spectra, fingerprint
+from swiftwrf.data.spectra import Spectra, coarsening, fingerprint
 from swiftwrf.data.splits import Validation, folds
+from swiftwrf.data.store import Store
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, choose_kernel, principal_components
-from swiftwrf.models.base import ARRAY, FieldModel, FitContext
+from swiftwrf.models.base import ARRAY, FitContext
+from swiftwrf.models.process import ProcessModel
 from swiftwrf.runtime.checkpoint import Header, expect, refusing, restore
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.threads import single_thread
 
 MAX_COMPONENTS = 64  # principal components of the training magnitudes
+VALUE_AZIMUTHS = 90  # columns of the components that new spectra are projected on; the beams of an array are far wider
 MAX_EXACT_ROWS = 2000  # spectra whose principal components are computed in memory
 
 
@@ -84,7 +87,7 @@ def _offset(flat: Tensor, functions: Tensor, inverse: Tensor) -> Tensor:
     return least.clamp_min(0)[:, None]
 
 
-class CoarrayModel(FieldModel):
+class CoarrayModel(ProcessModel):
     """A Gaussian process in the linear space of the squared spectra that the array can produce.
 
     The process predicts the mean magnitude between the positions; its square, projected, gives the co-array coefficients. A
@@ -112,6 +115,8 @@ class CoarrayModel(FieldModel):
     """mean offset that stretching removed from a spectrum, float32 (1,)"""
     form: Tensor
     """quadratic form from scores, after a 1, to coefficients, float32 (1 + 2 P, K + 1, K + 1)"""
+    component: Tensor | None
+    """mean magnitude and its components, averaged to few pixels, float32 (1 + K, h, w); None in files of earlier versions"""
 
     @property
     def n_parameters(self) -> int:
@@ -157,12 +162,25 @@ class CoarrayModel(FieldModel):
 
         few = len(train) <= MAX_EXACT_ROWS
         mean, score, component = principal_components(torch.cat(list(batches())) if few else batches, MAX_COMPONENTS)
-        self.form = _quadratic_form(torch.cat([mean[None], component]), inverse)
+        basis_magnitude = torch.cat([mean[None], component])
+        self.form = _quadratic_form(basis_magnitude, inverse)
+        self.component = _coarse(Store(basis_magnitude.unflatten(1, train.grid.shape)))
         fold = folds(train.position, self.config.validation, self.config.seed)
         kernel = choose_kernel(train.position, train.store, fold)
         target = torch.cat([score, (offset - offset.mean()).double()], dim=1)
         self.process = GaussianProcess.regress(kernel, train.position, target)
         self.array, self.offset = array, offset.mean()[None]
+
+    def _values(self, new: Spectra) -> Tensor:
+        if self.component is None:
+            raise InputError(f"this {self.kind} is of an earlier version, which cannot be updated; fit it again")
+        functions, inverse = basis(self.array, self.grid, torch.float32), _inverse(self.array, self.grid).float()
+        spectrum = new.store[:]
+        offset = _offset(spectrum.flatten(1), functions, inverse)
+        component = self.component[1:].flatten(1).double()
+        change = (_coarse(Store(spectrum + offset[..., None])) - self.component[0]).flatten(1).double()
+        score = torch.linalg.solve(component @ component.T, component @ change.T).T
+        return torch.cat([score, (offset - self.offset).double()], dim=1)
 
     def _spectra(self, score: Tensor, grid: AngularGrid) -> Tensor:
         """Return the spectra (b, H, W) of component scores with an offset (b, K + 1)."""
@@ -186,6 +204,8 @@ class CoarrayModel(FieldModel):
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         tensors, header = self.process.state()
         tensors |= {"offset": self.offset, "form": self.form, "element": self.array.element}
+        if self.component is not None:
+            tensors["component"] = self.component
         return tensors, header | {"wavelength": self.array.wavelength}
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
@@ -195,6 +215,9 @@ class CoarrayModel(FieldModel):
         form = (1 + 2 * len(differences(self.array)), n_scores, n_scores)
         expect(tensors, {"offset": (1,), "form": form})
         self.offset, self.form = tensors["offset"].float(), tensors["form"].float()
+        self.component = tensors.get("component")
+        if self.component is not None:
+            expect(tensors, {"component": (n_scores, *_coarse(Store(torch.zeros(1, *self.grid.shape))).shape[1:])})
 
 
 def fit_coarray(
@@ -226,6 +249,12 @@ def fit_coarray(
     """
     model = CoarrayModel(validation=validation, seed=seed)
     return model.fit(train, checkpoint=checkpoint, on_record=on_record, progress=progress)
+
+
+def _coarse(spectra: Store) -> Tensor:
+    """Return spectra averaged to few pixels, (n, h, w)."""
+    factor = coarsening(spectra.shape[1:], VALUE_AZIMUTHS)
+    return spectra.coarsen(factor)[:]
 
 
 def _quadratic_form(component: Tensor, inverse: Tensor) -> Tensor:

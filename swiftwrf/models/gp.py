@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
 
 import torch
 from torch import Tensor
@@ -14,10 +13,11 @@ from swiftwrf.data.splits import folds
 from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, thinned
 from swiftwrf.models.base import FitContext
 from swiftwrf.models.nearest import MemoryModel
+from swiftwrf.models.process import ProcessModel
 from swiftwrf.runtime.checkpoint import Header
 
 
-class GPModel(MemoryModel):
+class GPModel(ProcessModel, MemoryModel):
     """Gaussian process regression of every pixel with one kernel, chosen by cross-validation.
 
     A prediction among more than 2000 training spectra uses the nearest 64. A sample is drawn from the marginal posterior of
@@ -34,41 +34,63 @@ class GPModel(MemoryModel):
     kind = "pixel Gaussian process"
     samples = True
 
-    kernel: Kernel
-
     def _fit(self, train: Spectra, context: FitContext) -> None:
         super()._fit(train, context)
         fold = folds(train.position, self.config.validation, self.config.seed)
-        self.kernel = choose_kernel(train.position, train.store, fold)
-        self._prepare()
+        self._prepare(_without_values(choose_kernel(train.position, train.store, fold), train.position))
 
-    def _prepare(self) -> None:
-        """Precompute what predictions share: mean, process, and differences from the mean, if they are few."""
-        self._mean = self.store.mean()
-        self._process = GaussianProcess(self.kernel, self.position)
-        some = self.store[:] if self._process.exact else thinned(self.store)[0]
+    @property
+    def kernel(self) -> Kernel:
+        """Kernel of the process."""
+        return self.process.kernel
+
+    def _prepare(self, process: GaussianProcess) -> None:
+        """Precompute what predictions share: mean, and differences from the mean, if they are few."""
+        self._mean, self.process = self.store.mean(), process
+        some = self.store[:] if process.exact else thinned(self.store)[0]
         self._change = (some - self._mean).flatten(1)
+
+    def _values(self, new: Spectra) -> Tensor:
+        return torch.zeros(len(new), 0)  # the values are the spectra of the store
+
+    def _update(self, new: Spectra) -> None:
+        super()._update(new)
+        self.position, self.store = self.process.known, self.store.joined(new.store)
+        self._prepare(self.process)
+
+    def _forget(self, rows: Tensor) -> None:
+        super()._forget(rows)
+        kept = torch.ones(len(self.store), dtype=torch.bool)
+        kept[rows] = False
+        self.position, self.store = self.process.known, self.store.subset(kept)
+        self._prepare(self.process)
 
     def _mean_change(self, position: Tensor) -> Tensor:
         """Return predicted differences from the mean spectrum (b, pixels)."""
-        rows, weight = self._process.weights(position)
-        change = self._change if self._process.exact else (self.store[rows] - self._mean).flatten(1)
+        rows, weight = self.process.weights(position)
+        change = self._change if self.process.exact else (self.store[rows] - self._mean).flatten(1)
         return weight.float() @ change
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         return self._mean + self._mean_change(position).reshape(-1, *grid.shape), None
 
     def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
-        variance, n = self._process.variance(position), len(self._change)
+        variance, n = self.process.variance(position), len(self._change)
         # the covariance of the training spectra between pixels, scaled by the posterior variance of each position
         scale = variance.sqrt().float()[:, None] / math.sqrt(n)
         noise = scale * torch.randn(len(position), n, generator=generator)
         return self._mean + (self._mean_change(position) + noise @ self._change).reshape(-1, *grid.shape)
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
-        return super()._state()[0], {"kernel": asdict(self.kernel)}
+        tensors, header = self.process.state()
+        return super()._state()[0] | {name: tensors[name] for name in tensors if name == "correlation"}, header
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         super()._restore(tensors, header)
-        self.kernel = Kernel(**header["kernel"])
-        self._prepare()
+        none = {"coefficient": torch.zeros(len(self.position), 0)}
+        self._prepare(GaussianProcess.from_state(tensors | none, header, torch.float64))
+
+
+def _without_values(kernel: Kernel, position: Tensor) -> GaussianProcess:
+    """Return a process for weights and variances alone."""
+    return GaussianProcess(kernel, position, torch.zeros(len(position), 0, dtype=torch.float64))

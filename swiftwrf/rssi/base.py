@@ -6,18 +6,22 @@ import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
+from copy import copy
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
+from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
-from swiftwrf.errors import InputError
-from swiftwrf.models.base import FieldConfig, FitContext, Prediction
+from swiftwrf.errors import InputError, listed
+from swiftwrf.models.base import FieldConfig, FitContext
+from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import check_positions
+from swiftwrf.rssi.floors import FloorAttenuation, estimate_floor_attenuation, receiver_floors
 from swiftwrf.runtime.options import Configured
 from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.threads import side_by_side
@@ -44,6 +48,8 @@ class RssiFitContext(FitContext):
 
 class RssiPredictor(Configured, ABC):
     """Base class of all predictors of RSSI at fixed receivers from the position of the transmitter.
+
+    If the data have floors, `fit` removes the attenuation of those between transmitter and receiver, and `predict` adds it.
 
     A subclass sets `name` and `config_type`, and implements `_fit` and `_predict`. Options are keyword arguments of the
     constructor; `config_type` declares their ranges.
@@ -76,6 +82,13 @@ class RssiPredictor(Configured, ABC):
 
     receiver_names: tuple[str, ...]
     """names of the receivers, set by `fit`"""
+    attenuation: FloorAttenuation | None = None
+    """attenuation of the floors between transmitter and receiver, set by `fit` if the data have floors"""
+
+    @classmethod
+    def compared(cls, data: Rssi) -> bool:
+        """Return whether the predictor is compared on these data without a request."""
+        return not cls.slow
 
     @classmethod
     def lacking(cls, data: Rssi) -> str:
@@ -117,11 +130,49 @@ class RssiPredictor(Configured, ABC):
         check_training(train, pool)
         if lacking := self.lacking(train):
             raise InputError(lacking)
+        self.attenuation = None
+        if train.floors is not None:
+            self.attenuation = estimate_floor_attenuation(train, pool)
+            pool = replace(self.attenuation, receiver_floor=tuple(receiver_floors(pool).tolist())).removed(pool)
+            train = self.attenuation.removed(train)
         where = torch.device(device)
         context = RssiFitContext(None, where, checkpoint, on_record, progress, pool=pool, parallel=parallel)
         self._fit(train, context)
         self.receiver_names = tuple(map(str, train.receiver_names))
         return self
+
+    def update(self, new: Rssi) -> Self:
+        """Return the predictor with more training rows, by an update of its factorisation. This one stays as it is.
+
+        The result equals a fit to all rows with the same kernel, noise, mixing weights and weights of the earlier rows.
+
+        Args:
+            new: Rows at the receivers of the training rows, in the same frame, any number.
+
+        Raises:
+            InputError: A predictor that must be fitted again, or rows at other receivers.
+
+        Example:
+            >>> import swiftwrf
+            >>> data = swiftwrf.rssi_room(n=60)
+            >>> model = swiftwrf.RssiModel().fit(data.subset(torch.arange(50)))
+            >>> len(model.update(data.subset(torch.arange(50, 60))).anchor)
+            60
+        """
+        self.check_fitted()
+        if tuple(map(str, new.receiver_names)) != self.receiver_names:
+            raise InputError(
+                f"{new.name} has the receivers {listed(new.receiver_names)}, but the predictor was fitted to "
+                f"{listed(self.receiver_names)}; give the same ones in this order"
+            )
+        predictor = copy(self)
+        if len(new):
+            predictor._update(new)
+        return predictor
+
+    def _update(self, new: Rssi) -> None:
+        """Add checked rows to this copy."""
+        raise InputError(f"a predictor {self.name} cannot be updated; fit it again to all rows")
 
     @abstractmethod
     def _fit(self, train: Rssi, context: RssiFitContext) -> None:
@@ -131,13 +182,13 @@ class RssiPredictor(Configured, ABC):
     def _predict(self, position: Tensor) -> tuple[Tensor, Tensor | None]:
         """Return RSSI (b, R) [dBm] and its standard deviation, or None, for a batch of positions (b, 3), float64 [m]."""
 
-    def predict(self, position: Tensor) -> Prediction:
+    def predict(self, position: Numbers) -> Prediction:
         """Predict the RSSI at every receiver.
 
         Gradients flow to the positions where the mathematics is differentiable, unless torch.no_grad is active.
 
         Args:
-            position: Positions of the transmitter, (n, 3) [m].
+            position: Positions of the transmitter, tensor or array (n, 3) [m].
 
         Returns:
             Mean (n, R) [dBm], and the standard deviation of a measurement (n, R) [dB] if the predictor has one.
@@ -150,7 +201,15 @@ class RssiPredictor(Configured, ABC):
         with torch.set_grad_enabled(torch.is_grad_enabled() and position.requires_grad):
             parts = [self._predict(some) for some in position.split(self.batch_size)]
         stds = [std for _, std in parts if std is not None]
-        return Prediction(torch.cat([mean for mean, _ in parts]), torch.cat(stds) if stds else None)
+        mean = torch.cat([mean for mean, _ in parts])
+        if self.attenuation is not None:
+            mean = mean + self.attenuation.of(position).to(mean)
+        std = torch.cat(stds) if stds else None
+        return Prediction(mean, std, position, receiver_names=self.receiver_names)
+
+    def predict_detected(self, data: Rssi) -> Prediction:
+        """Predict the RSSI at least where it is measured, with shapes of `predict` at the positions of the data."""
+        return self.predict(data.transmitter_position)
 
     def check_fitted(self) -> None:
         """Raise InputError if the predictor is not fitted."""

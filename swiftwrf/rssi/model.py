@@ -26,9 +26,11 @@ from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, thinned
 from swiftwrf.rssi.base import Map, RssiFitContext, RssiPredictor, fingerprint, map_threads
 from swiftwrf.rssi.config import RssiConfig
+from swiftwrf.rssi.floors import FloorAttenuation
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.paper_head import HELD_OUT_FOLD, learn_receivers
 from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
+from swiftwrf.rssi.posterior import FitState, RssiPosterior
 from swiftwrf.rssi.regression import fit_receiver
 from swiftwrf.rssi.stacking import MIN_STACKING_ROWS, comparable, receiver_weights
 from swiftwrf.rssi.training import RssiTraining, prepare
@@ -101,6 +103,8 @@ class RssiModel(RssiPredictor, Saved):
     """calibrated standard deviation of the field far from all measurements, (R,) [dB]"""
     noise_db: Tensor
     """calibrated standard deviation of a measurement about the field, (R,) [dB]"""
+    _posterior: RssiPosterior | None
+    """least squares of the fit, which `update` continues; None for the paper's head and for files of earlier versions"""
 
     def _fit(self, train: Rssi, context: RssiFitContext) -> None:
         began = time.perf_counter()
@@ -160,15 +164,59 @@ class RssiModel(RssiPredictor, Saved):
         self.directivity = (weight[0][:, None] * found["directivity"]).float()
         self.anchor, self.coefficient = training.position.float(), found["coefficient"].T.float().contiguous()
         self.rendered = found["rendered"]
+        self._posterior = None
+        if not self.config.paper_head:
+            state = FitState(
+                dual=found["dual"].T,
+                tangent=found["tangent"].T,
+                variance=found["variance"].T,
+                prior_level=training.prior_mean.level,
+                prior_slope=training.prior_mean.slope,
+                field_variance=training.field_db.square(),
+                noise_variance=training.noise_db.square(),
+                located=train.receiver_located.double(),
+            )
+            self._posterior = self._posterior_of(state)
         self.field_db, self.noise_db = (scale * training.field_db).float(), (scale * training.noise_db).float()
         self._precompute()
+
+    def region(self) -> Tensor:
+        """Return the positions (n, 3) [m] of the location bins."""
+        return self.anchor.double() + self.centre
 
     def _precompute(self) -> None:
         """Compute what all predictions share."""
         self._table = HeadTable(self.rendered)
         at_zero = self._table(torch.zeros(1, len(self.level)))[0]
         self._offset = torch.zeros_like(at_zero) if self.config.paper_head else at_zero
-        self._process = GaussianProcess(self.kernel, thinned(self.anchor.double(), rows=MAX_VARIANCE_POSITIONS)[0])
+        self._process = self._variance_process()
+
+    def _variance_process(self) -> GaussianProcess:
+        """Return the process of few of the measured positions, which determine the standard deviation."""
+        return GaussianProcess(self.kernel, thinned(self.anchor.double(), rows=MAX_VARIANCE_POSITIONS)[0])
+
+    def _posterior_of(self, state: FitState) -> RssiPosterior:
+        table, receiver = HeadTable(self.rendered), self.receiver - self.centre
+        return RssiPosterior(state, self.anchor, receiver, self.kernel, table, self.config.huber)
+
+    @single_thread()
+    def _update(self, new: Rssi) -> None:
+        if self._posterior is None:
+            raise InputError(
+                f"this {self.kind} has the paper's head or is of an earlier version; fit it again to all rows"
+            )
+        if self.offsets is not None:
+            new = self.offsets.removed(new)
+        new, before = new.about(self.origin), self._posterior.linear
+        self._posterior = self._posterior.updated(new.transmitter_position - self.centre, new.rssi_dbm)
+        change = self.mixing_weight[0] * (self._posterior.linear - before).T  # (10, R)
+        self.level, self.slope = self.level + change[0], self.slope + change[1]
+        self.directivity = self.directivity + change[2:].T.float()
+        self._take_rows(self._posterior.folded())
+
+    def _take_rows(self, folded: RssiPosterior) -> None:
+        self.anchor, self.coefficient = folded.anchor.float(), folded.coefficient.float()
+        self._process = self._variance_process()
 
     @single_thread()
     def _predict(self, position: Tensor) -> tuple[Tensor, Tensor]:
@@ -189,10 +237,13 @@ class RssiModel(RssiPredictor, Saved):
     def state(self) -> tuple[dict[str, Tensor], Header]:
         self.check_fitted()
         tensors = {name: getattr(self, name) for name in _shapes(0, 0)}
+        if self._posterior is not None:
+            tensors |= self._posterior.folded().state.tensors()
         header = {
             "options": asdict(self.config),
             "origin": self.origin,
             "offsets": self.offsets and asdict(self.offsets),
+            "attenuation": self.attenuation and asdict(self.attenuation),
             "receiver_names": self.receiver_names,
             "n_primitives": self.n_primitives,
             "kernel": asdict(self.kernel),
@@ -204,12 +255,17 @@ class RssiModel(RssiPredictor, Saved):
         model = cls(from_plain(RssiConfig, header["options"]))
         model.receiver_names = tuple(map(str, header["receiver_names"]))
         model.origin = GeodeticOrigin(*map(float, header["origin"])) if header.get("origin") else None
+        model.attenuation = FloorAttenuation.from_plain(header.get("attenuation"))
         model.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
         model.n_primitives, model.kernel = int(header["n_primitives"]), Kernel(**header["kernel"])
         shapes = _shapes(len(model.receiver_names), len(tensors["anchor"]))
         files.expect(tensors, shapes)
         for name in shapes:
             setattr(model, name, tensors[name])
+        model._posterior = None
+        if "fit.dual" in tensors:
+            files.expect(tensors, FitState.shapes(len(model.receiver_names), len(tensors["anchor"])))
+            model._posterior = model._posterior_of(FitState.of(tensors))
         model._precompute()
         return model
 

@@ -22,6 +22,8 @@ from swiftwrf.runtime.threads import single_thread
 
 PATH_LOSS_STD_DB = 30.0  # prior of level and slope about their least squares: as good as none
 DIRECTIVITY_STD_DB = 2.0  # prior of each harmonic of a receiver's antenna and surroundings
+# prior standard deviation of each coefficient that the regressors of level, slope and directivity are scaled by
+FEATURE_SCALE_DB = torch.tensor([PATH_LOSS_STD_DB] * 2 + [DIRECTIVITY_STD_DB] * N_HARMONICS, dtype=torch.float64)
 MAX_ITERATIONS, WEIGHT_TOLERANCE = 30, 3e-3  # each weight is in (0, 1]
 MIN_CONTRACTION = 0.9  # a change of the field above this share of the last one is an oscillation
 FIELD_TOLERANCE_DB = 0.1  # mean change of the latent field that counts as converged
@@ -39,7 +41,8 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
 
     Returns:
         With R = 1: level (R,) [dBm], slope (R,) [dB a decade] and directivity (R, 8) [dB]; coefficient (R, n) of the kernel
-        to the bins, whose sum is the latent field [dB]; rendered fields of the heads (R, 2, 2, directions); held_out (R, n),
+        to the bins, whose sum is the latent field [dB]; dual, tangent and variance (R, n), see `posterior.FitState`;
+        rendered fields of the heads (R, 2, 2, directions); held_out (R, n),
         predictions of detected bins by all other folds [dBm].
 
     Raises:
@@ -49,15 +52,15 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
     prior_mean = PathLoss(data.prior_mean.level[some], data.prior_mean.slope[some])
     distance, bearing = log_distance(data.position, receiver), harmonics(data.position, receiver)[:, 0]
     detected = (~rssi.isnan()).nonzero()[:, 0]
-    scale = torch.tensor([PATH_LOSS_STD_DB] * 2 + [DIRECTIVITY_STD_DB] * N_HARMONICS, dtype=torch.float64)
-    feature = torch.cat([torch.ones_like(distance), distance, bearing], dim=1) * scale
+    feature = torch.cat([torch.ones_like(distance), distance, bearing], dim=1) * FEATURE_SCALE_DB
     residual = rssi - prior_mean(distance)[:, 0]
-    coefficient, error, linear = torch.zeros_like(rssi), torch.zeros_like(rssi), torch.zeros_like(scale)
+    error, linear = torch.zeros_like(rssi), torch.zeros_like(FEATURE_SCALE_DB)
+    dual, tangent, noise = (torch.zeros_like(rssi) for _ in range(3))
+    variance = float(data.field_db[some]) ** 2
     if len(detected):
         position = data.position[detected].to(device)
-        variance = float(data.field_db[some]) ** 2
         try:
-            dual, slope, factor = solve(
+            *found, factor = solve(
                 residual[detected].to(device),
                 feature[detected].to(device),
                 variance * data.kernel(position, position),
@@ -65,18 +68,21 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
                 HeadTable(data.rendered[some].to(device)),
                 config.huber,
             )
-            error[detected] = fold_errors(factor, dual, data.fold[detected].to(device)).cpu()
+            error[detected] = fold_errors(factor, found[0], data.fold[detected].to(device)).cpu()
         except torch.linalg.LinAlgError as reason:  # type: ignore[attr-defined]
             raise FitError(
                 f"the RSSI fit of receiver {data.receiver_names[some][0]!r} broke ({reason}); are its values sane?"
             ) from None
-        coefficient[detected] = variance * (slope * dual).cpu()
-        linear = scale * (dual.cpu() @ feature[detected])
+        dual[detected], tangent[detected], noise[detected] = (x.cpu() for x in found)
+        linear = FEATURE_SCALE_DB * (dual @ feature)
     return {
         "level": prior_mean.level + linear[0],
         "slope": prior_mean.slope + linear[1],
         "directivity": linear[None, 2:],
-        "coefficient": coefficient[None],
+        "coefficient": variance * (tangent * dual)[None],
+        "dual": dual[None],
+        "tangent": tangent[None],
+        "variance": noise[None],
         "rendered": data.rendered[some],
         "held_out": (rssi.nan_to_num() - error)[None],
     }
@@ -84,7 +90,7 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
 
 def solve(
     residual: Tensor, feature: Tensor, covariance: Tensor, noise_db: Tensor, table: HeadTable, huber: float
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Fit residual = feature b + head(c) + noise in n bins, with b standard normal and c of a given covariance.
 
     Args:
@@ -97,7 +103,7 @@ def solve(
 
     Returns:
         Dual coefficients (n,), i.e. the inverse covariance of the data times the data; the slope of the tangent (n,); the
-        Cholesky factor of the covariance of the data (n, n).
+        variance of the noise over the weights (n,) [dB^2]; the Cholesky factor of the covariance of the data (n, n).
     """
     zero = table(torch.zeros(1, 1, dtype=torch.float64, device=residual.device))[0][0, 0]
     weight, latent = torch.ones_like(residual), torch.zeros_like(residual)
@@ -120,7 +126,7 @@ def solve(
         settled = float((weight - previous).abs().max()) < WEIGHT_TOLERANCE
         if settled and (step == 1 or mean_change < FIELD_TOLERANCE_DB):
             break
-    return dual, slope, factor
+    return dual, slope, variance, factor
 
 
 def fold_errors(factor: Tensor, dual: Tensor, fold: Tensor) -> Tensor:

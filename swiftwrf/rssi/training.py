@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -10,6 +11,7 @@ from torch import Tensor
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.gp import Kernel, LeaveGroupOut, candidates, thinned
+from swiftwrf.positions import cells
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import Head, render
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, fit_shared_path_loss, log_distance
@@ -18,8 +20,8 @@ from swiftwrf.runtime.threads import single_thread
 PAPER_LEVEL_DBM = -100.0  # of the paper's head where nothing is received
 # variance of a packet relative to the variance of the field: fading is as large as shadowing
 RELATIVE_NOISE_VARIANCES = (0.3, 1.0, 2.0, 3.0)
+VERTICALS = (1.0, 5.0)  # factors of the heights of floors: floors alike, or nearly independent beyond their attenuation
 MAX_KERNEL_ROWS, MAX_KERNEL_RECEIVERS = 300, 12  # more do not change the choice of the kernel
-BISECTIONS = 20  # of the bins' edge, which find it to a millionth of the extent
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ def prepare(train: Rssi, pool: Rssi, config: RssiConfig) -> RssiTraining:
     else:
         pool_residual = pool_rssi - fit_path_loss(pool_distance, pool_rssi)(pool_distance)
         prior_mean, residual = own, rssi - own(distance)
-    kernel, helps = choose_residual_kernel(local, pool_residual, fold)
+    kernel, helps = choose_residual_kernel(local, pool_residual, fold, (1.0,) if train.floors is None else VERTICALS)
     n_primitives = config.n_primitives if helps or config.paper_head else 0
     common = float(pool_residual.square().nanmean())  # of a receiver without measurements
     variance = residual.square().nanmean(dim=0).nan_to_num(common).clamp_min(1e-6)
@@ -136,15 +138,7 @@ def bin_locations(rows: Rssi, max_locations: int) -> tuple[Tensor, Tensor, Tenso
     position = rows.transmitter_position
     bin_of_row = torch.arange(len(position))
     if len(position) > max_locations:
-        local = position - position.min(dim=0).values
-        fine, coarse = 0.0, float(local.max()) or 1.0
-        for _ in range(BISECTIONS):
-            edge = (fine + coarse) / 2
-            number = torch.unique((local / edge).floor().long(), dim=0, return_inverse=True)[1]
-            if int(number.max()) < max_locations:
-                coarse, bin_of_row = edge, number
-            else:
-                fine = edge
+        bin_of_row = cells(position, max_locations)[0]
     n = int(bin_of_row.max()) + 1
 
     def mean(values: Tensor) -> tuple[Tensor, Tensor]:
@@ -157,13 +151,16 @@ def bin_locations(rows: Rssi, max_locations: int) -> tuple[Tensor, Tensor, Tenso
     return mean(position)[0], *mean(rows.rssi_dbm), bin_of_row
 
 
-def choose_residual_kernel(position: Tensor, residual: Tensor, fold: Tensor) -> tuple[Kernel, bool]:
+def choose_residual_kernel(
+    position: Tensor, residual: Tensor, fold: Tensor, verticals: Sequence[float] = (1.0,)
+) -> tuple[Kernel, bool]:
     """Choose the kernel with the lowest mean absolute error on held-out residuals of the path-loss model.
 
     Args:
         position: Positions of the bins (n, 3) [m].
         residual: Residuals (n, R) [dB], nan where not detected.
         fold: Cross-validation fold of each bin, (n,).
+        verticals: Factors of differences in height.
 
     Returns:
         The kernel, and whether its error is lower than that of no field at all.
@@ -187,6 +184,7 @@ def choose_residual_kernel(position: Tensor, residual: Tensor, fold: Tensor) -> 
         return float(torch.cat(errors).abs().mean())
 
     # rough fields only: a choice among mixtures with a smooth part follows chance, and its errors are no lower
-    rough = (kernel for kernel in candidates(position, RELATIVE_NOISE_VARIANCES) if kernel.share == 1)
-    score, best = min(((error(kernel), kernel) for kernel in rough), key=lambda pair: pair[0])
+    rough = [kernel for kernel in candidates(position, RELATIVE_NOISE_VARIANCES) if kernel.share == 1]
+    stretched = (replace(kernel, vertical=vertical) for vertical in verticals for kernel in rough)
+    score, best = min(((error(kernel), kernel) for kernel in stretched), key=lambda pair: pair[0])
     return best, score < float(residual.abs().nanmean())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -10,6 +11,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.choices import Moving
+from swiftwrf.data.simulated.room import ShoeboxRoom
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.store import Store
 from swiftwrf.models.geometry.images import PhaseObservations, field, sequences
@@ -71,3 +73,16 @@ def mirror_room(
         fixed_position=fixed,
         rotation=rotation,
     )
+
+
+def room_with_box(centre: tuple[float, float], side_m: float = 0.6, height_m: float = 1.8) -> ShoeboxRoom:
+    """Return the built-in room after a box was put on its floor.
+
+    Args:
+        centre: x and y of the centre [m].
+        side_m: Side of the square that the box covers [m].
+        height_m: Height [m].
+    """
+    room, (x, y), half = ShoeboxRoom(), centre, side_m / 2
+    box = ((x - half, y - half, 0.0), (x + half, y + half, height_m))
+    return replace(room, boxes=(*room.boxes, box))

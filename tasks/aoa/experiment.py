@@ -23,7 +23,7 @@ from tasks.page.page import reporting
 from tasks.page.records import Records
 from tasks.processes import number_of_processes
 from tasks.run import Run, choose_device
-from tasks.source import reading
+from tasks.source import located, reading
 from tasks.steps import Step, computed
 from tasks.terminal import console, terminal
 
@@ -94,4 +94,4 @@ def measurements(config: AoaConfig) -> Spectra:
     """
     if config.data is None:
         return simulated_room(seed=config.seed, moving=config.moving or "transmitter")
-    return read_spectra(config.data, reading(config))
+    return read_spectra(located(config.data), reading(config))

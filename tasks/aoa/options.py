@@ -36,7 +36,7 @@ class AoaConfig(SpectraSource, Output):
     """measured fractions in (0, 1]: 0.3 keeps 30 % of the training spectra and synthesizes the others. Required, except with
     --preset paper"""
     data: str | None = None
-    """folder or file of spectra, ray paths or array snapshots, see docs/formats.md"""
+    """folder or file of spectra, ray paths or array snapshots, or name of a public data set, see docs/formats.md"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
     synthesizer: Annotated[

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import PurePath
 from typing import Annotated
 
 import tyro
@@ -9,18 +10,27 @@ import tyro
 from swiftwrf.errors import InputError
 from tasks.options import SpectraSource, TableSource, command_options
 
+FILES = (".csv", ".mat", ".tif", ".geojson", ".png")  # suffixes of files; other names are directories
+MAPS = (".tif", ".geojson", ".png")  # suffixes of files that hold a map only
+
 
 @command_options
 class ConvertConfig(SpectraSource, TableSource):
-    """Convert measurements of any known format to the toolkit's own layout (see docs/formats.md).
+    """Convert measurements, predictions and RSSI maps: OUT is a directory in the toolkit's own layout, or a file.
+
+    SOURCE is measurements of any known format (see docs/formats.md), the directory of a run of tasks.rssi or tasks.locate,
+    or a saved model.
 
     Example: python -m tasks.convert DIR converted --calibrate
+
+    Example: python -m tasks.convert runs/rssi/first map.tif
     """
 
     source: Annotated[str, tyro.conf.Positional]
-    """folder or file of measurements"""
+    """folder or file of measurements, name of a public data set, directory of a run, or saved model"""
     out: Annotated[str, tyro.conf.Positional]
-    """directory to write; must not exist"""
+    """directory to write, or file: .csv, .mat, and of RSSI maps .tif (GeoTIFF), .geojson, .png (with a world file); must
+    not exist"""
     calibrate: bool = False
     """whether to estimate the elements' phases and the array's orientation from the training positions of array snapshots,
     and to correct them"""
@@ -28,8 +38,34 @@ class ConvertConfig(SpectraSource, TableSource):
     """with --calibrate: split whose training part is used (default: random); it is written beside the spectra"""
     seed: int = 0
     """seed of that split"""
+    deepmimo: bool = False
+    """write ray paths (paths.npz) as a folder of DeepMIMO v4"""
+    at: str | None = None
+    """table of positions (x, y, z) at which a model predicts, for .csv and .mat (default: the map of an RSSI model)"""
+    rx: tuple[str, ...] = ()
+    """receivers of the map, names or numbers counted from 1 (default: all); a .png shows the strongest of them"""
+    cell: float | None = None
+    """edge of the map's cells [m] (default: 1/120 of the longer side)"""
+    height: float | None = None
+    """height of the transmitter on the map [m] (default: the median of the training positions)"""
+
+    @property
+    def suffix(self) -> str:
+        """Suffix of the file to write, empty for a directory."""
+        suffix = PurePath(self.out).suffix.lower()
+        return suffix if suffix in FILES else ""
 
     def check(self) -> None:
         super().check()
         if (self.split is not None or self.seed) and not self.calibrate:
             raise InputError("--split and --seed are of the calibration; give --calibrate, too")
+        if self.deepmimo and self.suffix:
+            raise InputError(f"--deepmimo writes a folder; give a directory instead of {self.out}")
+        if self.calibrate and (self.suffix or self.deepmimo):
+            raise InputError("--calibrate writes a directory in the toolkit's own layout; give another OUT")
+        if self.at is not None and self.suffix not in (".csv", ".mat"):
+            raise InputError("--at gives predictions at single positions; write them to a .csv or .mat file")
+        if self.at is not None and (self.rx or self.cell is not None or self.height is not None):
+            raise InputError("--rx, --cell and --height are for maps; leave them or --at out")
+        if self.cell is not None and self.cell <= 0:
+            raise InputError(f"--cell must be above 0 m, got {self.cell:g}")

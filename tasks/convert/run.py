@@ -1,4 +1,4 @@
-"""Convert measurements of any known format to the toolkit's own layout."""
+"""Convert measurements to the toolkit's own layout or to files, and models to maps and predictions."""
 
 from __future__ import annotations
 
@@ -7,29 +7,70 @@ from pathlib import Path
 
 import torch
 
-from swiftwrf import InputError
+from swiftwrf import FieldModel, InputError, RssiModel
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.data import ReadOptions, Rssi, Snapshots, Spectra
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
-from swiftwrf.data.writing import write_rssi, write_spectra
+from swiftwrf.data.formats.paths import read_paths
+from swiftwrf.data.writing import write_deepmimo, write_rssi, write_spectra
 from swiftwrf.diagnostics.calibration import Calibration, calibrate
-from tasks.convert.options import ConvertConfig
-from tasks.directory import new_directory
+from tasks.convert.options import FILES, ConvertConfig
+from tasks.convert.outputs import predicted, saved_model, write_file
+from tasks.directory import check_new_file, new_directory
 from tasks.environment import invocation
 from tasks.records import write_json
-from tasks.source import reading
+from tasks.source import located, reading
 from tasks.terminal import console
 
 
 def run(config: ConvertConfig) -> None:
-    """Read measurements, calibrate them on request, and write them.
+    """Read measurements or a model, and write a directory or a file.
 
     Raises:
-        InputError: Measurements that cannot be read, calibrated or written in the layout.
+        InputError: A source that cannot be read, calibrated or written as OUT asks.
     """
+    source = Path(config.source)
+    if config.deepmimo:
+        with new_directory(Path(config.out), "a directory") as folder:
+            paths = read_paths(source)
+            write_deepmimo(paths, folder)
+        print(f"{len(paths.count)} receivers with {len(paths.gain)} paths: {config.out}")
+    elif (model := saved_model(source)) is not None or config.suffix:
+        _write_new_file(config, model)
+    else:
+        _write_directory(config)
+
+
+def _write_new_file(config: ConvertConfig, model: FieldModel | RssiModel | None) -> None:
+    out = Path(config.out)
+    if not config.suffix:
+        raise InputError(
+            f"{config.source} is a model, of which files are written: {', '.join(FILES)}; got {config.out}"
+        )
+    if model is None and (config.at is not None or config.rx or config.cell is not None or config.height is not None):
+        raise InputError(f"--at, --rx, --cell and --height are for models, but {config.source} holds measurements")
+    if model is not None and (options := reading(config).given):
+        raise InputError(f"{config.source} is a model; --{options[0].replace('_', '-')} is for measurements")
+    check_new_file(out)
+    data = _spectra_or_rssi(_read(config), reading(config)) if model is None else predicted(model, config)
+    print(f"{write_file(data, out)}: {out}")
+
+
+def _read(config: ConvertConfig) -> Spectra | Snapshots | Rssi:
+    data: Spectra | Snapshots | Rssi = read(
+        located(config.source), reading(config), SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS
+    )
+    return data
+
+
+def _spectra_or_rssi(data: Spectra | Snapshots | Rssi, options: ReadOptions) -> Spectra | Rssi:
+    return data.spectra(options.grid, options.beamformer or PHASE) if isinstance(data, Snapshots) else data
+
+
+def _write_directory(config: ConvertConfig) -> None:
     options = reading(config)
     with new_directory(Path(config.out), "a directory") as folder:
-        data = read(config.source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
+        data = _read(config)
         found = None
         if config.calibrate:
             data, found = _calibrated(data, config)
@@ -64,9 +105,9 @@ def _calibrated(data: Spectra | Snapshots | Rssi, config: ConvertConfig) -> tupl
 
 
 def _write(data: Spectra | Snapshots | Rssi, options: ReadOptions, folder: Path) -> str:
-    if isinstance(data, Rssi):
-        write_rssi(data, folder)
-        return f"{len(data)} rows of RSSI at {len(data.receiver_names)} receivers"
-    spectra = data.spectra(options.grid, options.beamformer or PHASE) if isinstance(data, Snapshots) else data
+    spectra = _spectra_or_rssi(data, options)
+    if isinstance(spectra, Rssi):
+        write_rssi(spectra, folder)
+        return f"{len(spectra)} rows of RSSI at {len(spectra.receiver_names)} receivers"
     write_spectra(spectra, folder)
     return f"{len(spectra)} spectra of {spectra.grid.shape[0]} x {spectra.grid.shape[1]} pixels"

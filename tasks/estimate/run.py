@@ -12,7 +12,7 @@ from swiftwrf.metrics import angle_errors
 from tasks.aoa.estimators import SavedEstimator
 from tasks.directory import check_new_table
 from tasks.estimate.options import EstimateConfig
-from tasks.records import write_table
+from tasks.records import rounded, write_table
 from tasks.source import observed_spectra, reading
 
 
@@ -36,6 +36,6 @@ def run(config: EstimateConfig) -> None:
         columns["great_circle_deg"] = angle_errors(estimate, known.label)["great_circle"].rad2deg()
     index = torch.arange(len(store)) if known is None else known.index
     rows = zip(index.tolist(), *(column.tolist() for column in columns.values()), strict=True)
-    write_table(out, [dict(zip(("index", *columns), row, strict=True)) for row in rows])
+    write_table(out, rounded(dict(zip(("index", *columns), row, strict=True)) for row in rows))
     error = f", median error {columns['great_circle_deg'].median():.2f} degrees" if known is not None else ""
     print(f"{len(store)} directions{error}: {out}")

@@ -17,6 +17,6 @@ class InspectConfig(SpectraSource, TableSource, Output):
     """
 
     source: Annotated[str, tyro.conf.Positional]
-    """folder or file of measurements"""
+    """folder or file of measurements, or name of a public data set"""
     out: str | None = None
     """directory of the page; must not exist (default: a new one under runs/inspect)"""

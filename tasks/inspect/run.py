@@ -15,7 +15,7 @@ from tasks.inspect.options import InspectConfig
 from tasks.inspect.page import page
 from tasks.page.page import write_page
 from tasks.records import write_json
-from tasks.source import reading
+from tasks.source import located, reading
 from tasks.terminal import terminal
 
 
@@ -25,14 +25,14 @@ def run(config: InspectConfig) -> None:
     Raises:
         InputError: Measurements that cannot be read.
     """
-    options = reading(config)
+    source, options = located(config.source), reading(config)
     out = Path(config.out) if config.out else Path("runs") / "inspect" / f"{datetime.now():%Y%m%d-%H%M%S}"
     with new_directory(out, "an inspection") as folder:
-        data = read(config.source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
+        data = read(source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
         kind = "RSSI" if isinstance(data, Rssi) else "array snapshots" if isinstance(data, Snapshots) else "spectra"
         findings, shown = inspect(data, options)
         for column in data.labels if isinstance(data, Rssi) else ():
-            propose_offsets(read(config.source, replace(options, offset_by=column), RSSI_FORMATS), findings)
+            propose_offsets(read(source, replace(options, offset_by=column), RSSI_FORMATS), findings)
         content = {
             "source": config.source,
             "kind": kind,

@@ -70,6 +70,10 @@ def measurements(config: LocateConfig) -> Rssi:
         InputError: The data cannot be read, or have no such receiver.
     """
     measured = measured_rssi(config.data, config)
+    if measured is not None and measured.receiver_moves:
+        raise InputError(
+            f"both ends of {measured.name} move; positions are found by receivers that stay where they are"
+        )
     return (rssi_room(seed=config.seed) if measured is None else measured).receivers(config.rx)
 
 

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from swiftwrf import InputError, Rssi, Spectra, load
 from swiftwrf.data import ReadOptions
+from swiftwrf.data.columns import column_of
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.formats import RSSI_FORMATS, read
 from swiftwrf.data.store import Store
-from swiftwrf.data.survey import SUFFIXES, column_of, first_rows, has_positions, read_frame
+from swiftwrf.data.survey import SUFFIXES, first_rows, has_positions, read_frame
 from swiftwrf.errors import listed
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
 from swiftwrf.locate.track import joined
@@ -23,8 +24,8 @@ from swiftwrf.metrics import angle_errors
 from tasks.directory import check_new_table
 from tasks.locate.localizers import BATCH_ROWS
 from tasks.locate.options import SPECTRA, TABLE, LocateConfig
-from tasks.records import Row, write_table
-from tasks.source import observed_spectra, reading
+from tasks.records import Row, rounded, write_table
+from tasks.source import located, observed_spectra, reading
 from tasks.terminal import console, terminal
 
 Columns = dict[str, Tensor]
@@ -51,7 +52,7 @@ def write_positions(config: LocateConfig) -> None:
             f"{config.model} holds a {model.kind}, which locates nothing; give {RssiLocator.kind!r} or {MatchedField.kind!r}"
         )
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-    write_table(out, [dict(zip(columns, row, strict=True)) for row in rows])
+    write_table(out, rounded(dict(zip(columns, row, strict=True)) for row in rows))
     values: Row = {"n_positions": len(columns["index"]), "table": str(out)}
     error = ""
     if "position_error_m" in columns:
@@ -104,9 +105,11 @@ def read_rssi(source: str, options: ReadOptions) -> tuple[Rssi, bool]:
         if not has_positions(frame, options.columns or {}):
             somewhere = frame.assign(x=0.0, y=0.0, z=0.0)
             columns, filler, offset_by = options.columns, options.filler, options.offset_by
-            data = Rssi.from_frame(somewhere, columns=columns, filler=filler, offset_by=offset_by, name=file.stem)
+            data = Rssi.from_frame(
+                somewhere, columns=columns, filler=filler, offset_by=offset_by, pool_by=options.pool_by, name=file.stem
+            )
             return data, False
-    return read(source, options, RSSI_FORMATS), True
+    return read(located(source), options, RSSI_FORMATS), True
 
 
 def has_column(source: str, name: str) -> bool:

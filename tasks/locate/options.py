@@ -38,7 +38,7 @@ class LocateConfig(SpectraSource, OffsetSource, Output):
     """RSSI of any format that tasks.rssi takes, a table without positions included; or spectra of any format that tasks.aoa
     takes, or a .npy file (n, elevations, azimuths) of magnitudes in [0, 1]"""
     data: str | None = None
-    """survey table (CSV or Parquet), or folder in NeRF2 layout, of the experiment"""
+    """survey table (CSV or Parquet), folder in NeRF2 layout, or name of a public data set, of the experiment"""
     rx: tuple[str, ...] = ("all",)
     """receivers: names, numbers counted from 1, or all"""
     track: float | None = None

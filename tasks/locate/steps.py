@@ -17,11 +17,11 @@ from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.splits import validation_for
 from swiftwrf.locate import Posterior, RssiLocator
 from swiftwrf.positions import nearest
+from tasks.claim import LOCATOR
 from tasks.locate.localizers import LOCALIZERS, PosteriorLocalizer
 from tasks.records import Row, write_npz, write_table
 from tasks.steps import Step
 
-MODEL = "locator.safetensors"
 MAPS = "maps.npz"
 SUGGESTED = "suggested"
 MIN_ROWS = 20  # training rows that a receiver detected: five folds, of which four hold at least 10 rows
@@ -130,7 +130,7 @@ class Localization(Step[Experiment]):
         if isinstance(localizer, PosteriorLocalizer) and self.is_whole:
             locator = localizer.locator
             value["weights"] = dict(zip(("values", "detections", "fingerprints"), locator.weight.tolist(), strict=True))
-            locator.save(folder / MODEL)
+            locator.save(folder / LOCATOR)
             error = (located.position - test.transmitter_position).norm(dim=1)
             write_npz(folder / MAPS, posterior_maps(locator, train, test, error))
             if context.suggest:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,10 +16,12 @@ from PIL import Image, UnidentifiedImageError
 from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.files import sha256
+from swiftwrf.data.rssi import PLACE
 from swiftwrf.data.splits import validation_for
-from swiftwrf.models.base import Prediction
+from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance
-from swiftwrf.rssi import LEVEL, RssiModel
+from swiftwrf.rssi import LEVEL, PairModel, RssiModel
+from tasks.claim import MODEL
 from tasks.cluster import connected
 from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
 from tasks.page.page import reporting
@@ -32,8 +35,8 @@ from tasks.source import asked_offsets, measured_rssi, split_notes
 from tasks.summarise import error_summary, grouped
 from tasks.terminal import console, terminal
 
-MODEL = "model.safetensors"
 MAP_CELLS = 80  # along the longer side of the floor
+MAX_PAIR_CELLS = 60_000  # of all maps together: each needs a system of 64 equations
 MAX_PLAN_PIXELS = 2**24
 
 
@@ -65,7 +68,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     ):
         options = {"pool": pool, "device": device, "parallel": cluster.map if cluster else None}
         tables = _Tables(config, train, test, plan, directory, options)
-        compared = [name for name in PREDICTORS if not PREDICTORS[name].slow or name in config.also]
+        compared = [name for name in PREDICTORS if PREDICTORS[name].compared(data) or name in config.also]
         left_out = {name: reason for name in compared if (reason := PREDICTORS[name].lacking(data))}
         for reason in left_out.values():
             console.print(f"left out: {reason}")
@@ -77,7 +80,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         metrics: RssiMetrics = {
             "task": "rssi",
             "data": data.name,
-            "notes": notes,
+            "notes": [*notes, *tables.notes()],
             "split": config.split,
             "preset": config.preset,
             "seed": config.seed,
@@ -86,9 +89,10 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             "overall": tables.overall(),
             "left_out": left_out,
             "receivers": tables.receivers(),
-            "seconds": tables.seconds["swiftwrf"],
+            "model": tables.model,
+            "seconds": tables.seconds[tables.model],
             "interval": {"nominal": LEVEL, "coverage": tables.coverage},
-            "chosen": {"n_primitives": tables.n_primitives},
+            "chosen": {"n_primitives": tables.n_primitives, "floor_attenuation_db": tables.floor_attenuation_db},
         }
         final = directory.finish(metrics, reporting(page))
     terminal.answer(answer(Records(final)), final / "report.html")
@@ -143,6 +147,8 @@ class _Tables:
         self.seconds: dict[str, PredictorSeconds] = {}
         self.coverage = float("nan")
         self.n_primitives = 0
+        self.floor_attenuation_db: float | None = None
+        self.model = PairModel.name if train.receiver_moves else RssiModel.name
         self.detected = ~test.rssi_dbm.isnan()
         self.row, column = self.detected.nonzero(as_tuple=True)
         self.receiver = [test.receiver_names[number] for number in column.tolist()]
@@ -163,21 +169,26 @@ class _Tables:
         def compute() -> Row:
             config = self.config
             options = {"validation": validation_for(config.split), "seed": config.seed}
+            options["new_places"] = config.split == PLACE
             predictor = make_predictor(name, config.preset, **options)
             began = time.perf_counter()
             predictor.fit(self.train, progress=True, **self.options)
             fitted = time.perf_counter()
-            prediction = predictor.predict(self.test.transmitter_position)
+            prediction = predictor.predict_detected(self.test)
             result: Row = {"fit": fitted - began, "predict": time.perf_counter() - fitted}
             if isinstance(predictor, RssiModel):
                 result["n_primitives"] = predictor.n_primitives
+            if name == self.model:
+                assert isinstance(predictor, RssiModel | PairModel)
                 predictor.save(self.directory.path(MODEL))
                 self._write_maps(predictor)
-            return result | {"predicted": prediction.mean, "std": prediction.std}
+                result["floor_attenuation_db"] = predictor.attenuation and predictor.attenuation.db
+            std = None if prediction.std is None else prediction.std[self.detected]
+            return result | {"predicted": prediction.mean[self.detected], "std": std}
 
         value = self.directory.step(name, f"fitting {name}", compute)
         self.seconds[name] = {"fit": value["fit"], "predict": value["predict"]}
-        predicted, measured = torch.tensor(value["predicted"], dtype=torch.float64) + self.offset, self.test.rssi_dbm
+        predicted, measured = self._spread(value["predicted"]) + self.offset, self.test.rssi_dbm
         self.errors += _rows(
             method=[name] * len(self.row),
             receiver=self.receiver,
@@ -188,9 +199,16 @@ class _Tables:
             from_receiver_m=self.from_receiver[self.detected],
             from_training_m=self.from_training[self.row],
         )
-        if name == "swiftwrf":
-            self.n_primitives = value["n_primitives"]
-            self._add_predictions(Prediction(predicted, torch.tensor(value["std"], dtype=torch.float64)))
+        self.n_primitives = value.get("n_primitives", self.n_primitives)
+        if name == self.model:
+            self.floor_attenuation_db = value.get("floor_attenuation_db")
+            self._add_predictions(Prediction(predicted, self._spread(value["std"])))
+
+    def _spread(self, values: list[float]) -> torch.Tensor:
+        """Return values of the detected test pairs as a matrix (rows, R), nan elsewhere."""
+        matrix = torch.full(self.detected.shape, torch.nan, dtype=torch.float64)
+        matrix[self.detected] = torch.tensor(values, dtype=torch.float64)
+        return matrix
 
     def _add_predictions(self, prediction: Prediction) -> None:
         measured, detected = self.test.rssi_dbm, self.detected
@@ -198,25 +216,32 @@ class _Tables:
         self.coverage = float(((measured >= low) & (measured <= high))[detected].double().mean())
         x, y, z = self.test.transmitter_position[self.row].unbind(dim=1)
         values = {"measured": measured, "predicted": prediction.mean, "low": low, "high": high}
-        columns = {name: value[detected] for name, value in values.items()}
+        columns = {name: value[detected].round(decimals=2) for name, value in values.items()}
         degrees = degree_columns(self.test.origin, self.test.transmitter_position[self.row].numpy())
         columns |= {name: torch.from_numpy(value) for name, value in degrees.items()}
         group = {"group": self.test.groups.subset(self.row).labels()} if self.test.groups else {}
-        self.predictions += _rows(x=x, y=y, z=z, receiver=self.receiver, **group, **columns)
+        metres = {name: axis.round(decimals=3) for name, axis in (("x", x), ("y", y), ("z", z))}
+        self.predictions += _rows(**metres, receiver=self.receiver, **group, **columns)
 
-    def _write_maps(self, model: RssiModel) -> None:
+    def _write_maps(self, model: RssiModel | PairModel) -> None:
         """Write the prediction and the width of its interval over the floor, at the median height of the measurements."""
         position = self.train.transmitter_position
         shown = torch.cat([position, self.test.transmitter_position])
         shown = torch.cat([shown, self.train.receiver_position[self.train.receiver_located]])
         low, high = shown.min(dim=0).values, shown.max(dim=0).values
-        cell = float((high - low)[:2].max()) / MAP_CELLS or 1.0
+        n_cells = MAP_CELLS
+        if isinstance(model, PairModel):
+            n_cells = min(n_cells, math.isqrt(MAX_PAIR_CELLS // len(self.train.receiver_names)))
+        cell = float((high - low)[:2].max()) / n_cells or 1.0
         xs, ys = (
             torch.arange(float(a), float(b) + cell, cell, dtype=torch.float64)
             for a, b in zip(low[:2], high[:2], strict=True)
         )
         grid = torch.stack([*torch.meshgrid(xs, ys, indexing="xy")], dim=-1).reshape(-1, 2)
-        prediction = model.predict(torch.cat([grid, position[:, 2].median().expand(len(grid), 1)], dim=1))
+        height = position[:, 2].median()
+        if self.train.floors is not None:  # the floor with most measurements, since the median may be between two
+            height = torch.tensor(self.train.floors.height_m)[self.train.floors.number(position).mode().values]
+        prediction = model.predict(torch.cat([grid, height.double().expand(len(grid), 1)], dim=1))
         lower, upper = prediction.interval(LEVEL)
         predicted, width = (x.T.reshape(-1, len(ys), len(xs)).numpy() for x in (prediction.mean, upper - lower))
         maps = {
@@ -232,6 +257,11 @@ class _Tables:
         if self.train.origin is not None:
             maps["origin"] = np.array(self.train.origin)
         self.directory.write_npz("maps.npz", maps | self.plan)
+
+    def notes(self) -> list[str]:
+        """Return a note on the attenuation of floors, if there are any."""
+        db, floors = self.floor_attenuation_db, self.train.floors
+        return [] if db is None or floors is None else [f"each of the {len(floors.names)} floors takes {db:.1f} dB"]
 
     def overall(self) -> dict[str, PredictorMetrics]:
         """Return the entries of each method for metrics.json."""

@@ -25,11 +25,13 @@ class RssiTaskConfig(OffsetSource, Output):
     rx: tuple[str, ...]
     """receivers: names, numbers counted from 1, or all"""
     data: str | None = None
-    """survey table (CSV or Parquet), or folder with tx_pos.csv, gateway_rssi.csv and gateway_position.yml (NeRF2 layout)"""
+    """survey table (CSV or Parquet), folder with tx_pos.csv, gateway_rssi.csv and gateway_position.yml (NeRF2 layout), or
+    name of a public data set, see docs/formats.md"""
     split: str = "random"
-    """a split that comes with the data, or a seeded one: random or block"""
+    """a split that comes with the data, or a seeded one: random, block, or place (a fifth of the receivers is held out)"""
     also: tuple[str, ...] = ()
-    """predictors that take minutes and are compared only when named: nerf2, blend"""
+    """predictors that are compared only when named: nerf2 and blend take minutes; pairs and knn_pairs are for data with both
+    ends moving, where they are compared anyway"""
     preset: Preset = "quick"
     """of SwiftWRF and NeRF2: quick, or paper for the published head and field"""
     floor_plan: str | None = None

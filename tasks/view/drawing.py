@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from markupsafe import escape
-from matplotlib import colormaps
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
@@ -18,30 +17,10 @@ from PIL import Image
 from swiftwrf import AngularGrid
 
 Values = NDArray[np.floating]
-TRANSPARENT = 255  # palette index of pixels without a value
 DISC_PX = 240
 MIN_RECTANGLE_PX = 240
 PLAN_MARGIN = 0.04  # of the longer side
 MIN_PLAN_ASPECT = 0.4  # a path along one axis needs room to drag across it
-
-
-def colour_image(values: Values, colours: str, low: float = 0.0, high: float = 1.0) -> Image.Image:
-    """Return an image of values (rows, columns), the first row on top; nan is transparent.
-
-    Args:
-        values: Values of the pixels.
-        colours: Name of a matplotlib colour map.
-        low: Value of its first colour.
-        high: Value of its last colour.
-    """
-    scaled = (values - low) * (TRANSPARENT - 1) / (high - low)
-    image = Image.fromarray(
-        np.where(np.isnan(values), TRANSPARENT, np.clip(scaled, 0, TRANSPARENT - 1)).astype(np.uint8)
-    )
-    rgb = colormaps[colours](np.linspace(0, 1, TRANSPARENT), bytes=True)[:, :3]
-    image.putpalette(rgb.tobytes() + b"\0\0\0")
-    image.info["transparency"] = TRANSPARENT
-    return image
 
 
 def data_url(image: Image.Image) -> str:

@@ -19,7 +19,7 @@ from swiftwrf.locate.rssi import UNDETECTED_BELOW_DB
 from swiftwrf.positions import nearest
 from tasks.locate.localizers import BATCH_ROWS
 from tasks.locate.steps import MAP_PIXELS, in_plan
-from tasks.records import as_table
+from tasks.records import as_table, rounded
 
 LEVELS = (0.5, 0.8)  # probabilities of the credible regions that are shown
 N_POSITIONS = 300  # of the map of expected errors
@@ -59,9 +59,9 @@ class PlanMap:
 
     def table(self, name: str) -> str:
         """Return the cells with values as comma-separated values, under this name."""
-        x, y = np.meshgrid(self.x.round(4), self.y.round(4))
+        x, y = np.meshgrid(self.x, self.y)
         table = pd.DataFrame({"x_m": x.ravel(), "y_m": y.ravel(), name: self.values.ravel().round(4)})
-        return as_table(table.dropna().to_dict("records"))
+        return as_table(rounded(table.dropna().to_dict("records")))
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from swiftwrf import Prediction, Rssi, RssiModel
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.rssi import LEVEL
 from tasks.page import figures, maps
-from tasks.records import as_table
+from tasks.records import as_table, rounded
 from tasks.rssi.page.maps import MAX_WIDTH_DB
 from tasks.view.drawing import PlanProjection
 from tasks.view.locating import Corners, RssiLocating
@@ -179,7 +179,8 @@ class RssiView:
             x, y = self.cells
             position = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), height)], axis=-1).reshape(-1, 3)
             found = self._predict(position)
-            self._last = height, Prediction(*(values.T.reshape(-1, len(y), len(x)) for values in found))
+            mean, std = (values.T.reshape(-1, len(y), len(x)) for values in found)
+            self._last = height, Prediction(mean, std)
         return self._last[1]
 
     def _predict(self, position: Values) -> tuple[Tensor, Tensor]:
@@ -299,7 +300,7 @@ class RssiView:
             return self.locating.map(None if is_error else selection.row).table(name)
         rssi, r = self.map(selection.height), selection.receiver
         low, high = rssi.interval(LEVEL)
-        x, y = np.meshgrid(*(centres.round(4) for centres in self.cells))
+        x, y = np.meshgrid(*self.cells)
         columns = {"predicted_dbm": rssi.mean[r], "low_dbm": low[r], "high_dbm": high[r]}
         table = pd.DataFrame(
             {
@@ -308,14 +309,14 @@ class RssiView:
                 "z_m": selection.height,
                 **degree_columns(self.model.origin, np.stack([x.ravel(), y.ravel()], axis=1)),
                 "receiver": self.receivers[r],
-                **{name: values.double().numpy().ravel().round(2) for name, values in columns.items()},
+                **{name: values.double().numpy().ravel() for name, values in columns.items()},
                 f"above_{selection.threshold:g}_dbm_with_{selection.certainty:.0%}": self._covered(selection)
                 .ravel()
                 .astype(int),
                 "best_receiver": np.array(self.receivers)[rssi.mean.argmax(dim=0).flatten()],
             }
         )
-        return as_table(table.to_dict("records"))
+        return as_table(rounded(table.to_dict("records")))
 
     def picture(self, selection: MapSelection) -> bytes:
         """Return the selected map as PNG with axes and legend."""

@@ -9,7 +9,8 @@ from nicegui import events, run, ui
 from numpy.typing import NDArray
 from PIL import Image
 
-from tasks.view.drawing import colour_image, text
+from tasks.page.raster import colour_image
+from tasks.view.drawing import text
 from tasks.view.page import NewestOnly, colour_bar, header, located_marks, plan_picture, slider
 from tasks.view.rssi import (
     LOCATING,

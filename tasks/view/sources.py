@@ -16,13 +16,11 @@ from tasks.aoa.artifacts import model_file
 from tasks.aoa.condition import LOCATOR as MATCHED_FIELD
 from tasks.aoa.experiment import measurements as spectra_of
 from tasks.aoa.options import AoaConfig, fraction_key
-from tasks.claim import CONFIG, ENVIRONMENT
+from tasks.claim import CONFIG, ENVIRONMENT, LOCATOR, MODEL
 from tasks.command_line import configured
 from tasks.locate.experiment import measurements as rssi_of
 from tasks.locate.options import LocateConfig
-from tasks.locate.steps import MODEL as LOCATOR
 from tasks.records import Row, read_json
-from tasks.rssi.experiment import MODEL
 from tasks.view.locating import RssiLocating, SpectrumLocating
 from tasks.view.rssi import MeasuredFloor, RssiView
 from tasks.view.spectra import LoadedModel, SpectraView

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from swiftwrf import AngularGrid, Spectra
 from tasks.aoa.page.room import FIXED, MEASURED, in_plan
 from tasks.page.polar import MAX_DIFFERENCE
-from tasks.view.drawing import HemisphereProjection, PlanProjection, colour_image, cross, data_url, ring, text
+from tasks.page.raster import colour_image
+from tasks.view.drawing import HemisphereProjection, PlanProjection, cross, data_url, ring, text
 from tasks.view.page import NewestOnly, colour_bar, header, located_marks, plan_picture, slider
 from tasks.view.spectra import Direction, LoadedModel, PredictedSpectrum, SpectraView, angle_between, peak
 

@@ -53,6 +53,10 @@ class ReadOptions:
     """unit of the positions in a table (default: the one that is recognised)"""
     offset_by: str | None = None
     """column of a table with groups of rows, e.g. devices, between which RSSI has constant offsets"""
+    transmitter: tuple[str, ...] = ()
+    """columns of a table with the position of the transmitter where both ends move: x, y and z, or one of names"""
+    pool_by: str | None = None
+    """radios of a table to pool into one receiver: "mac", a regular expression, or a column with access points"""
     drop_null: bool = False
     """leaves out null subcarriers, which are the same at every position and element"""
     round_trip: bool = False

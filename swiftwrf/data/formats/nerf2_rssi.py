@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from swiftwrf.data.columns import column_of_numbers
 from swiftwrf.data.coordinates import without_fix
 from swiftwrf.data.files import MAX_COORDINATE_M, digests, numbers, read_yaml
 from swiftwrf.data.fillers import NOT_DETECTED_DBM, check_powers, find_fillers, without_fillers
@@ -19,7 +20,7 @@ from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
 from swiftwrf.data.receivers import read_receivers, unknown_positions
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
-from swiftwrf.data.survey import column_of_numbers, read_frame
+from swiftwrf.data.survey import read_frame
 from swiftwrf.errors import InputError, listed
 
 TABLES = ("gateway_rssi.csv", "rssi.csv")

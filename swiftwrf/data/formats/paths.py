@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.archives import array_names, read_arrays
 from swiftwrf.data.files import MAX_COORDINATE_M, check_carrier, digests
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
@@ -25,6 +26,7 @@ SHAPES = {  # of n receivers and P paths
     "line_of_sight": ("n",),
     "frequency_hz": (),
 }
+LENGTH = "length"  # of each path [m], optional
 TYPES = {"gain": np.complex128, "path_count": np.int64, "line_of_sight": np.bool_}  # others: float64
 MIN_DISTANCE_M = 1e-9  # between two points
 MAX_GAIN = 1e100  # sums of larger ones overflow
@@ -41,30 +43,46 @@ class PathArchive(Format[Spectra]):
 
     def read(self, path: Path, options: ReadOptions) -> Spectra:
         file = path if path.is_file() else path / "paths.npz"
-        arrays = _read(file, options)
-        receiver, count = arrays["receiver_position"], arrays["path_count"]
-        offset = arrays["last_point"] - receiver.repeat_interleave(count, dim=0)
-        paths = PropagationPaths(
-            transmitter=arrays["transmitter_position"],
-            receiver=receiver,
-            count=count,
-            direction=offset / offset.norm(dim=1, keepdim=True),
-            gain=arrays["gain"],
-            line_of_sight=arrays["line_of_sight"],
-            frequency_hz=float(arrays["frequency_hz"]),
-        )
+        paths = read_paths(file, options.grid or GRID)
         return paths.spectra(
             file.parent.resolve().name,
             options.array,
             options.grid,
-            named_splits=read_splits(file.parent, len(count), first=1),
+            named_splits=read_splits(file.parent, len(paths.count), first=1),
             source=digests([file], file.parent),
         )
 
 
-def _read(file: Path, options: ReadOptions) -> dict[str, Tensor]:
+def read_paths(source: Path, grid: AngularGrid = GRID) -> PropagationPaths:
+    """Return the paths in a paths.npz, or in a folder with one.
+
+    Args:
+        source: File or folder.
+        grid: Directions of the spectra that are computed from them, for a check of the size.
+
+    Raises:
+        InputError: No paths, arrays that do not match, or values that are not usable.
+    """
+    arrays = _read(source / "paths.npz" if source.is_dir() else source, grid)
+    receiver, count = arrays["receiver_position"], arrays["path_count"]
+    offset = arrays["last_point"] - receiver.repeat_interleave(count, dim=0)
+    return PropagationPaths(
+        transmitter=arrays["transmitter_position"],
+        receiver=receiver,
+        count=count,
+        direction=offset / offset.norm(dim=1, keepdim=True),
+        gain=arrays["gain"],
+        line_of_sight=arrays["line_of_sight"],
+        frequency_hz=float(arrays["frequency_hz"]),
+        length=arrays.get(LENGTH),
+    )
+
+
+def _read(file: Path, grid: AngularGrid) -> dict[str, Tensor]:
     """Return the checked arrays by name."""
-    arrays = read_arrays(file, list(SHAPES))
+    if not file.is_file():
+        raise InputError(f"{file} is not there; expected ray paths")
+    arrays = read_arrays(file, list(SHAPES), [LENGTH])
     count = arrays["path_count"]
     if count.ndim != 1 or count.dtype.kind not in "iu":
         raise InputError(
@@ -73,10 +91,10 @@ def _read(file: Path, options: ReadOptions) -> dict[str, Tensor]:
     n = len(count)
     if n == 0 or int(count.min()) < 1:
         raise InputError(f"{file}: every receiver needs at least one path; leave out those without")
-    check_pixels(str(file), n, options.grid or GRID)
+    check_pixels(str(file), n, grid)
     sizes = {"n": n, "P": sum(count.tolist())}
     tensors = {}
-    for name, symbols in SHAPES.items():
+    for name, symbols in (SHAPES | dict.fromkeys({LENGTH} & {*arrays}, ("P",))).items():
         array, shape = arrays[name], tuple(sizes.get(str(symbol), symbol) for symbol in symbols)
         if array.shape != shape:
             raise InputError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from swiftwrf.data.files import digests, lines_before_header
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
@@ -22,7 +23,7 @@ RECEIVERS = "receivers.csv"  # beside the table: receiver,x,y,z
 class SurveyTable(Format[Rssi]):
     """Table of a walk test; positions of receivers are unknown unless receivers.csv beside it contains them."""
 
-    takes = frozenset({"columns", "filler", "coordinates", "offset_by"})
+    takes = frozenset({"columns", "filler", "coordinates", "offset_by", "transmitter", "pool_by"})
 
     def recognises(self, path: Path) -> bool:
         return bool(_tables(path))
@@ -34,14 +35,27 @@ class SurveyTable(Format[Rssi]):
                 f"{path} holds {len(tables)} tables ({', '.join(file.name for file in tables)}); name the one to read"
             )
         file, receivers = tables[0], tables[0].with_name(RECEIVERS)
-        survey = read_survey(
-            file,
-            read_frame(file),
-            SurveyOptions(options.columns, options.filler, options.coordinates, options.offset_by),
+        stated = SurveyOptions(
+            options.columns,
+            options.filler,
+            options.coordinates,
+            options.offset_by,
+            options.transmitter,
+            options.pool_by,
         )
-        known, unknown = (
-            read_receivers(receivers, survey.receiver_names, survey.origin) if receivers.is_file() else (None, [])
-        )
+        survey = read_survey(file, read_frame(file), stated)
+        known: Tensor | None = None
+        unknown: list[str] = []
+        if survey.receiver_position is not None:
+            places = [survey.receiver_position[name] for name in survey.receiver_names]
+            known = torch.tensor(places, dtype=torch.float64)
+        elif receivers.is_file():
+            known, unknown = read_receivers(receivers, survey.receiver_names, survey.origin)
+        if survey.receiver_moves and (known is None or unknown):
+            raise InputError(
+                f"{file}: column {options.transmitter[0]} has names of positions, so {RECEIVERS} beside it must contain "
+                "each of them"
+            )
         skipped = file.suffix.lower() == ".csv" and lines_before_header(file, SEPARATORS)
         notes = [f"lines before the header are skipped: {skipped}"] * bool(skipped)
         splits = read_splits(file.parent, survey.n_rows, first=0)
@@ -54,6 +68,8 @@ class SurveyTable(Format[Rssi]):
             origin=survey.origin,
             groups=Groups.of(options.offset_by, survey.group) if options.offset_by else None,
             labels=survey.labels,
+            floors=survey.floors,
+            receiver_moves=survey.receiver_moves,
             index=survey.row,
             named_splits=kept_splits(splits, torch.from_numpy(survey.row), survey.n_rows),
             source=digests([file, *([receivers] if receivers.is_file() else [])], file.parent),

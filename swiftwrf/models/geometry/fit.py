@@ -30,6 +30,7 @@ from swiftwrf.models.geometry.planes import (
     robust_advantage,
     sign_alternatives,
 )
+from swiftwrf.models.geometry.refine import offset_covariance
 from swiftwrf.models.geometry.search import (
     MAX_SCORE_RATIO,
     N_STARTS,
@@ -212,6 +213,32 @@ def refine_room(room: RoomEstimate, planes: PlaneSet, scene: PhaseObservations) 
     new = planes.refined(scene)
     found = zip(room.planes, new.normal[0].tolist(), new.offset[0].tolist(), new.gain[0].tolist(), strict=True)
     return replace(room, planes=[replace(p, normal=tuple(n), offset_m=o, gain=g) for p, n, o, g in found])
+
+
+@single_thread()
+def update_room(room: RoomEstimate, planes: PlaneSet, new: Spectra, config: GeometryConfig) -> RoomEstimate:
+    """Refine a room on more spectra, each estimate weighed by its covariance (R. E. Kalman, 1960), without a search.
+
+    Args:
+        room: Estimate from earlier spectra.
+        planes: Its planes as tensors.
+        new: More spectra of the scene, which replace none of the earlier ones.
+        config: Options, of which the seed and the number of spectra count.
+
+    Raises:
+        InputError: As `search_room`.
+    """
+    scene, _ = observe(new, config)
+    found = planes.refined(scene)
+    covariance = offset_covariance(scene, found.normal, found.offset, found.gain, found.sequence)
+    weight = room.covariance @ torch.linalg.pinv(room.covariance + covariance, hermitian=True)
+    offset = planes.offset[0] + weight @ (found.offset - planes.offset)[0]
+    gain = planes.gain[0] + weight.diagonal().float() * (found.gain - planes.gain)[0]
+    remaining = room.covariance - weight @ room.covariance
+    scale = (remaining.diagonal() / room.covariance.diagonal()).clamp(0, 1).sqrt()
+    values = zip(room.planes, offset.tolist(), gain.tolist(), scale.tolist(), strict=True)
+    refined = [replace(p, offset_m=o, gain=g, std_mm=s * p.std_mm) for p, o, g, s in values]
+    return replace(room, planes=refined, covariance=remaining)
 
 
 def _evenly(train: Spectra, most: int) -> tuple[Spectra, Tensor]:

@@ -10,7 +10,7 @@ alone.
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
@@ -23,21 +23,24 @@ from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.path_gains import PathGains, fit_path_gains, prior
 from swiftwrf.models.geometry.planes import advantage
+from swiftwrf.models.process import ProcessModel
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import Fraction, check_value
 
 MAX_COMPONENTS = 64  # principal components of the residual spectra
+MIN_RESIDUAL = 1e-3  # relative norm below which an update adds no component
 MAX_PIXELS = 4000  # of a spectrum, to choose kernel and mixing weight
 MAX_SPECTRA = 10_000  # the fit computes all their inner products
 CONSTANT_GAINS_MARGIN = 1.0  # standard errors by which constant path gains must be ahead to be taken
 FIRST_WEIGHT = 0.7  # mixing weight with which the kernel is chosen
 
 
-class HybridModel(FieldModel):
+class HybridModel(ProcessModel):
     """Geometry with position-dependent path gains, and a Gaussian process on the residual.
 
-    Only the geometric part of a sample is random.
+    An update adds to the residual, and components to it while there are fewer than 64. Room, path gains and mixing weight
+    stay as fitted. Only the geometric part of a sample is random.
 
     Example:
         >>> import swiftwrf
@@ -122,6 +125,28 @@ class HybridModel(FieldModel):
                 return constant
         self.path_gains = fit_path_gains(self.room, scene, kernel)
         return known
+
+    def _update(self, new: Spectra) -> None:
+        self._extend(self._residual(new))
+        super()._update(new)
+
+    def _values(self, new: Spectra) -> Tensor:
+        component = self.component[1:]
+        return self._residual(new) @ component.T / component.square().sum(1)
+
+    def _residual(self, new: Spectra) -> Tensor:
+        """Return the residuals (k, pixels) of the paths and of the mean residual."""
+        paths = torch.cat([self._paths(part) for part in new.position.split(self.batch)])
+        return (new.store[:] - self.mixing_weight * paths).flatten(1) - self.component[0]
+
+    def _extend(self, residual: Tensor) -> None:
+        """Add orthogonal components that residuals (k, pixels) need; they are 0 at all earlier training positions."""
+        unit = nn.functional.normalize(self.component[1:], dim=1)
+        rest = residual - (residual @ unit.T) @ unit
+        n = min(MAX_COMPONENTS - len(unit), len(rest))
+        _, size, direction = torch.linalg.svd(rest, full_matrices=False)
+        added = direction[:n][size[:n] > MIN_RESIDUAL * residual.norm()]
+        self.process, self.component = self.process.widened(len(added)), torch.cat([self.component, added])
 
     def _paths(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Return the spectra (b, H, W) that the paths predict at a batch of positions (b, 3) [m]."""

@@ -15,11 +15,20 @@ from swiftwrf.choices import Moving
 from swiftwrf.data.spectra import Spectra, check_training, fingerprint
 from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
-from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext, bounding_box
-from swiftwrf.models.geometry.fit import MAX_ORDER, GeometryConfig, extend_room, observe, refine_room, search_room
+from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext
+from swiftwrf.models.geometry.fit import (
+    MAX_ORDER,
+    GeometryConfig,
+    extend_room,
+    observe,
+    refine_room,
+    search_room,
+    update_room,
+)
 from swiftwrf.models.geometry.images import PhaseObservations, image_gain, images
 from swiftwrf.models.geometry.planes import Plane, PlaneSet, RoomEstimate
 from swiftwrf.models.geometry.sample import Residual, sample_field
+from swiftwrf.models.updatable import bounding_box
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.validation import check_value
 
@@ -46,6 +55,7 @@ class GeometryModel(FieldModel):
     config_type = GeometryConfig
     requires = (ARRAY, FIXED_END)
     samples = True
+    updates = True
     any_grid = True
     batch = 256
 
@@ -112,6 +122,10 @@ class GeometryModel(FieldModel):
         else:
             self.estimate = known.refined_on(observe(train, self.config)[0]).estimate
         self.fingerprint = owner
+
+    def _update(self, new: Spectra) -> None:
+        if self.planes:
+            self.estimate, self.fingerprint = update_room(self.estimate, self.tensors(), new, self.config), ""
 
     def extended(self, train: Spectra, is_new: Tensor) -> Self | None:
         """Return the room fitted to more spectra than its search had, without another search.

@@ -142,11 +142,24 @@ class DeformableGaussians(nn.Module):
 
     def spread(self, grid: AngularGrid) -> Tensor:
         """Return the prior standard deviation (H, W) of the real part that the deformed responses give each direction."""
-        canonical = self.primitives()
-        response = Offsets.of(torch.as_tensor(self.deformation.basis), self.config.components).response
-        assert response is not None  # a regression, the only fit with standard deviations, deforms responses
         kernel = self.kernels(grid)
         variance = torch.zeros(grid.shape, device=kernel.device)
-        for weight in (canonical.attenuation * response[..., 0]).split(64):
+        for weight in self._component_weight().split(64):
             variance = variance + torch.tensordot(weight, kernel, dims=1).square().sum(dim=0)
         return variance.sqrt()
+
+    def projection(self, grid: AngularGrid) -> Tensor:
+        """Return the mean spectrum, then the spectra whose inner products with a change are the scores, (1 + K, H, W)."""
+        kernel, canonical = self.kernels(grid).flatten(1), self.primitives()
+        component = (self._component_weight() @ kernel).double()
+        dual = torch.linalg.pinv(component @ component.T, hermitian=True) @ component
+        projection = torch.cat([(canonical.weight[:, 0] @ kernel)[None], dual.float()])
+        whole: Tensor = projection.unflatten(1, grid.shape)
+        return whole
+
+    def _component_weight(self) -> Tensor:
+        """Return the weights (K, N) of the primitives in each component of a regression."""
+        response = Offsets.of(torch.as_tensor(self.deformation.basis), self.config.components).response
+        assert response is not None  # a regression deforms responses
+        weight: Tensor = self.primitives().attenuation * response[..., 0]
+        return weight

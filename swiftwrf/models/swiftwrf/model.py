@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from copy import copy
 from dataclasses import asdict
 from pathlib import Path
 
@@ -12,8 +13,12 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.models.base import FieldModel, FitContext
+from swiftwrf.errors import InputError
+from swiftwrf.gp import GaussianProcess, SmoothField
+from swiftwrf.models.base import FitContext
+from swiftwrf.models.process import ProcessModel
 from swiftwrf.models.swiftwrf.config import FitConfig, ModelConfig
+from swiftwrf.models.swiftwrf.deformation.low_rank import LowRankDeformation
 from swiftwrf.models.swiftwrf.field import DeformableGaussians
 from swiftwrf.models.swiftwrf.fit import MAX_PRIMITIVES, fit_field
 from swiftwrf.rasterize.magnitude import magnitude
@@ -23,7 +28,7 @@ from swiftwrf.runtime.session import Record
 MAX_CACHED_VALUES = 2**26  # float32 values that one model caches: 256 MiB
 
 
-class SwiftWRF(FieldModel):
+class SwiftWRF(ProcessModel):
     """2D Gaussians whose parameters deform with the position (M. Liu et al., 2025).
 
     By default a fit is a regression: the Gaussians stay in place, their responses are least squares, and a Gaussian process
@@ -63,6 +68,36 @@ class SwiftWRF(FieldModel):
     def parameters(self) -> Iterable[Tensor]:
         return self.field.parameters()
 
+    @property
+    def process(self) -> GaussianProcess:
+        """Process of the component scores, at normalised positions.
+
+        Raises:
+            InputError: A model that was not fitted by regression, or by an earlier version.
+        """
+        deformation = self.field.deformation
+        if not isinstance(deformation, LowRankDeformation) or deformation.field.value is None:
+            raise InputError("only a regression can be updated, by the version that saved it; fit the model again")
+        return deformation.field.process
+
+    @process.setter
+    def process(self, process: GaussianProcess) -> None:
+        old = self.field.deformation
+        assert isinstance(old, LowRankDeformation)
+        scores = SmoothField.regress(process.known.float(), process.kernel, process.value, process)
+        deformation = copy(old)
+        deformation._modules = {"field": scores}
+        self.field = copy(self.field)
+        self.field._modules = self.field._modules | {"deformation": deformation}
+
+    def _process_position(self, position: Tensor) -> Tensor:
+        return self.field.normalise(position)
+
+    def _values(self, new: Spectra) -> Tensor:
+        work = new.at_most(self.config.max_azimuths)
+        projection = self._cached("projection", work.grid, self.field.projection)
+        return (work.store[:] - projection[0]).flatten(1) @ projection[1:].flatten(1).T
+
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         field, x = self.field, self.field.normalise(position)
         gaussians = field.gaussians(x)
@@ -75,9 +110,15 @@ class SwiftWRF(FieldModel):
         scale = field.deformation.unscaled_std(x) if with_std else None
         return mean, None if scale is None else scale[:, None, None] * self._cached("spread", grid, field.spread)
 
+    def region(self) -> Tensor:
+        if not isinstance(self.field.deformation, LowRankDeformation):
+            return super().region()
+        return self.field.deformation.field.anchor.double() * self.field.scale + self.field.centre
+
     def _cached(self, quantity: str, grid: AngularGrid, compute: Callable[[AngularGrid], Tensor]) -> Tensor:
-        """Return a quantity that depends on the grid and the parameters only, from the cache if both are unchanged."""
-        tensors = [*self.field.parameters(), *self.field.buffers()]
+        """Return a quantity of grid, primitives and their basis, from the cache if all are unchanged."""
+        named = [*self.field.named_parameters(), *self.field.named_buffers()]
+        tensors = [tensor for name, tensor in named if not name.startswith("deformation.field.")]
         if any(tensor.requires_grad for tensor in tensors):
             return compute(grid)
         state = tuple((tensor.data_ptr(), tensor._version, tensor.device) for tensor in tensors)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pandas import DataFrame
 
-from tasks.locate.steps import MODEL
+from tasks.claim import LOCATOR
 from tasks.metrics import LocateMetrics
 from tasks.page.page import Number, Plot, Summary
 from tasks.page.records import Records, notes
@@ -65,7 +65,7 @@ def verdict(run: LocateRecords) -> str:
 def _next_steps(run: LocateRecords) -> list[str]:
     steps = [
         f"Explore posteriors and maps: `python -m tasks.view {run.path}`.",
-        f"Locate new observations: `python -m tasks.locate {run.path}/{MODEL} SOURCE`.",
+        f"Locate new observations: `python -m tasks.locate {run.path}/{LOCATOR} SOURCE`.",
     ]
     coverage = run.metrics["calibration"][str(LEVEL)]
     if abs(coverage - LEVEL) > MAX_COVERAGE_ERROR:

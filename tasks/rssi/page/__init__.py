@@ -10,7 +10,7 @@ from tasks.page.provenance import provenance
 from tasks.page.records import notes
 from tasks.rssi.page import errors
 from tasks.rssi.page.maps import CERTAINTY, COVERED_DBM, Maps
-from tasks.rssi.page.summary import OWN, RssiRecords, best_baseline, next_steps, verdict
+from tasks.rssi.page.summary import RssiRecords, best_baseline, model_of, next_steps, title, verdict
 from tasks.rssi.predictors import PREDICTORS
 
 
@@ -33,13 +33,13 @@ def page(runs: list[RssiRecords]) -> Page:
 def _summary(run: RssiRecords) -> Summary:
     """Return the first screen of one run."""
     error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
-    own, best, interval, maps = error[OWN], best_baseline(run), run.metrics["interval"], Maps(run)
+    own, best, interval, maps = error[model_of(run)], best_baseline(run), run.metrics["interval"], Maps(run)
     who = "a receiver" if len(maps.names) > 1 else "the receiver"
     numbers = [
         Number(
             f"{own['median']:.2f} dB",
-            f"SwiftWRF's median absolute error, 95 % interval [{own['low']:.2f}, {own['high']:.2f}]; 90 % of the errors "
-            f"are below {own['p90']:.1f} dB",
+            f"median absolute error of {title(run)}, 95 % interval [{own['low']:.2f}, {own['high']:.2f}]; 90 % of the "
+            f"errors are below {own['p90']:.1f} dB",
         ),
         Number(f"{error[best]['median']:.2f} dB", f"median absolute error of the best baseline, {best}"),
         Number(
@@ -68,7 +68,7 @@ def _comparison(runs: list[RssiRecords]) -> Summary:
         compared.append(Compared(f"{run.number}: {run.place}", found, further))
         every.update(found)
     baselines = dict.fromkeys([*(best_baseline(run) for run in runs), "mean"])
-    shown = [OWN, *(name for name in baselines if name in every)]
+    shown = [*dict.fromkeys(map(model_of, runs)), *(name for name in baselines if name in every)]
     table, plot = comparison(compared, errors.palette(), shown, "dB", "absolute error")
     meaning = [f"Run {run.number}, {run.place}: {verdict(run)}" for run in runs]
     steps = [f"Explore run {run.number}: `python -m tasks.view {run.path}`." for run in runs]

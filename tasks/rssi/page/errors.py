@@ -15,7 +15,7 @@ from tasks.page.page import Plot, Table
 from tasks.page.palette import Palette
 from tasks.page.provenance import number
 from tasks.rssi.page.maps import MAX_VECTOR_DOTS
-from tasks.rssi.page.summary import OWN, RssiRecords, best_baseline, by_method
+from tasks.rssi.page.summary import RssiRecords, best_baseline, by_method, model_of, title
 from tasks.rssi.predictors import PREDICTORS
 from tasks.summarise import SHORTEST, paired_difference, running_median
 
@@ -28,46 +28,48 @@ def palette() -> Palette:
 
 
 def table(run: RssiRecords) -> Table:
-    """Return the errors of all methods, and their differences from SwiftWRF."""
-    errors, rows = by_method(run), []
+    """Return the errors of all methods, and the differences of the run's model from them."""
+    errors, rows, own = by_method(run), [], model_of(run)
     for name, entry in sorted(run.metrics["overall"].items(), key=lambda item: item[1]["abs_error_db"]["median"]):
         error, difference = entry["abs_error_db"], ""
-        if name != OWN:
-            mean, low, high = paired_difference(errors, OWN, name)
+        if name != own:
+            mean, low, high = paired_difference(errors, own, name)
             difference = f"{mean:+.2f}" + ("" if math.isnan(low) else f" [{low:+.2f}, {high:+.2f}]")
         rows.append([name, with_interval(error), number(error["mean"]), number(error["p90"]), difference])
-    columns = ["method", "median [dB]", "mean [dB]", "90 % [dB]", "SwiftWRF minus method [dB]"]
+    columns = ["method", "median [dB]", "mean [dB]", "90 % [dB]", f"{title(run)} minus method [dB]"]
     caption = (
         "Absolute error over all detected test pairs; median with its 95 % interval. Last column: mean difference of the "
         "absolute errors on the same pairs; 95 % bootstrap over test rows."
     )
-    return Table(columns, rows, caption, frozenset([OWN]))
+    return Table(columns, rows, caption, frozenset([own]))
 
 
 def differences(run: RssiRecords) -> Plot:
-    """Return the difference of SwiftWRF's error from the best baseline's at each receiver, sorted."""
-    best, errors = best_baseline(run), by_method(run)
+    """Return the difference of the model's error from the best baseline's at each receiver, sorted."""
+    own, best, errors = model_of(run), best_baseline(run), by_method(run)
     found = {}
     for name in run.metrics["receivers"]:
-        own = errors[errors.index.get_level_values("receiver") == name]
-        if len(own):
-            found[name] = paired_difference(own, OWN, best)
+        at_receiver = errors[errors.index.get_level_values("receiver") == name].dropna(subset=[own, best])
+        if len(at_receiver):
+            found[name] = paired_difference(at_receiver, own, best)
     names = sorted(found, key=lambda name: found[name][0])
-    shown, values = names[:MAX_RECEIVERS], {OWN: [found[name] for name in names]}
-    label = f"SwiftWRF minus {best}, mean absolute error [dB]"
-    figure = figures.dots(shown, {OWN: values[OWN][: len(shown)]}, palette(), label, zero=True)
+    shown, values = names[:MAX_RECEIVERS], {own: [found[name] for name in names]}
+    label = f"{title(run)} minus {best}, mean absolute error [dB]"
+    figure = figures.dots(shown, {own: values[own][: len(shown)]}, palette(), label, zero=True)
     caption = (
-        f"Difference of SwiftWRF's mean absolute error from that of {best}, the best baseline, at each receiver on the same "
-        "pairs; whiskers: 95 % intervals. Left of zero SwiftWRF is better."
+        f"Difference of the mean absolute error of {title(run)} from that of {best}, the best baseline, at each receiver on "
+        f"the same pairs; whiskers: 95 % intervals. Left of zero {title(run)} is better."
     )
     return Plot(f"difference-{run.file_name}", [figure], caption, figures.dots_data("receiver", names, values, "db"))
 
 
 def distribution(run: RssiRecords) -> Plot:
-    """Return the distribution of the errors of SwiftWRF, the best baseline, one path-loss model, and the mean."""
+    """Return the distribution of the errors of the model, the best baseline, one path-loss model, and the mean."""
     table = run.table("errors")
     shown = [
-        name for name in dict.fromkeys((OWN, best_baseline(run), "mri_pooled", "mean")) if name in set(table["method"])
+        name
+        for name in dict.fromkeys((model_of(run), best_baseline(run), "mri_pooled", "mean"))
+        if name in set(table["method"])
     ]
     figure, axes = figures.panel(5.8, 3.4)
     groups = {name: table[table["method"] == name]["abs_error_db"] for name in shown}
@@ -80,8 +82,8 @@ def distribution(run: RssiRecords) -> Plot:
 def where(run: RssiRecords) -> Plot:
     """Return predicted against measured RSSI, and the error against distances."""
     errors = run.table("errors")
-    own = errors[errors["method"] == OWN]
-    colour, many = palette().colour(OWN), len(own) >= MAX_VECTOR_DOTS
+    own = errors[errors["method"] == model_of(run)]
+    colour, many = palette().colour(model_of(run)), len(own) >= MAX_VECTOR_DOTS
     columns = {
         "from_receiver_m": "distance from the receiver [m]",
         "from_training_m": "distance from training positions [m]",
@@ -102,7 +104,7 @@ def where(run: RssiRecords) -> Plot:
         panels.append(panel)
     caption = (
         "Predicted against measured RSSI, and the absolute error (dots; line: running median) against the distance from the "
-        "receiver, if its position is known, and from the nearest training position. SwiftWRF, all receivers."
+        "receiver, if its position is known, and from the nearest training position. All receivers."
     )
     data = own[["receiver", "index", "measured_dbm", "predicted_dbm", "abs_error_db", *columns]]
     return Plot(f"where-{run.file_name}", panels, caption, data)

@@ -127,7 +127,7 @@ class Maps:
                 for size, colour in ((4.5, "#fffffd"), (2.0, RECEIVER)):
                     ax.plot(*at[:2], "x", color=colour, markersize=8, markeredgewidth=size, zorder=4)
         ax.set_title(figures.short(title), fontsize=9)
-        label = f"width of the {LEVEL:.0%} interval [dB]" if kind == "width" else "predicted RSSI [dBm]"
+        label = "interval width [dB]" if kind == "width" else "predicted RSSI [dBm]"
         extend = "max" if kind == "width" else "both"
         figures.colour_bar(ax, drawn, label, extend)
         return figure

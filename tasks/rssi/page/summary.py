@@ -12,7 +12,6 @@ from tasks.summarise import verdict_of_difference
 from tasks.terminal import Answer
 
 RssiRecords = Records[RssiMetrics]
-OWN = "swiftwrf"  # the predictor that all others are compared with
 MIN_RATIO = 1.2  # of the widest interval inside to the median one, for which more positions are proposed
 MAX_COVERAGE_ERROR = 0.05  # difference from the nominal coverage above which the report warns
 
@@ -24,9 +23,20 @@ def answer(run: RssiRecords) -> Answer:
     return Answer("dB", rows, verdict(run), next_steps(run))
 
 
+def model_of(run: RssiRecords) -> str:
+    """Return the predictor that all others are compared with, whose maps and intervals the run contains."""
+    return run.metrics.get("model", "swiftwrf")
+
+
+def title(run: RssiRecords) -> str:
+    """Return the name of that predictor in sentences."""
+    return {"swiftwrf": "SwiftWRF"}.get(model_of(run), model_of(run))
+
+
 def best_baseline(run: RssiRecords) -> str:
     """Return the name of the baseline with the lowest median error."""
-    error = {name: entry["abs_error_db"]["median"] for name, entry in run.metrics["overall"].items() if name != OWN}
+    own = model_of(run)
+    error = {name: entry["abs_error_db"]["median"] for name, entry in run.metrics["overall"].items() if name != own}
     return min(error, key=lambda name: error[name])
 
 
@@ -34,19 +44,26 @@ def verdict(run: RssiRecords) -> str:
     """Return a sentence that compares the model with the best baseline."""
     best = best_baseline(run)
     n_test = run.metrics["n_test"]
-    return verdict_of_difference(by_method(run), OWN, best, name="SwiftWRF", unit="dB", rows="pairs", n_test=n_test)
+    own, name = model_of(run), title(run)
+    return verdict_of_difference(by_method(run), own, best, name=name, unit="dB", rows="pairs", n_test=n_test)
 
 
 def next_steps(run: RssiRecords) -> list[str]:
     """Return what to do next, a sentence each."""
     interval = run.metrics["interval"]
-    steps = [f"Explore maps and coverage: `python -m tasks.view {run.path}`.", where_next(run)]
-    steps.append("Predict anywhere: `swiftwrf.load('model.safetensors').predict(positions)`, with intervals.")
+    pairs = model_of(run) == "pairs"  # its maps depend on both ends, and the page shows one
+    steps = [] if pairs else [f"Explore maps and coverage: `python -m tasks.view {run.path}`."]
+    steps.append(where_next(run))
+    steps.append(
+        f"Predict anywhere: `swiftwrf.load('{run.path}/model.safetensors').predict(positions)`, with intervals."
+    )
     if abs(interval["coverage"] - interval["nominal"]) > MAX_COVERAGE_ERROR:
         steps.append(
             "The intervals are not calibrated on these rows; take their widths as a ranking, not as a promise."
         )
-    if run.metrics["split"] == "random":
+    if pairs and run.metrics["split"] != "place":
+        steps.append("Run `--split place`: it shows the error of a receiver at positions where it measured nothing.")
+    elif run.metrics["split"] == "random":
         steps.append("Run `--split block`: it shows the error in a region where nothing was measured.")
     return steps
 

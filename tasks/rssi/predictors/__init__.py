@@ -24,6 +24,8 @@ PREDICTORS: Registry[RssiPredictor] = Registry(
         "knn": "tasks.rssi.predictors.regressors:KNNPredictor",
         "mri_residual": "tasks.rssi.predictors.regressors:ResidualKNNPredictor",
         "gp": "tasks.rssi.predictors.regressors:GPPredictor",
+        "pairs": "swiftwrf.rssi:PairModel",
+        "knn_pairs": "tasks.rssi.predictors.pairs:PairKNN",
         "blend": "tasks.rssi.predictors.blend:Blend",
         "nerf2": "swiftwrf.comparison:NeRF2Rssi",
     },

@@ -25,6 +25,7 @@ from tasks.rssi.predictors.path_loss import Mean, ReceiverPathLoss
 # scikit-learn's own choice for many neighbours computes distances from squares and a product, which cancel map coordinates
 NEIGHBOUR_SEARCH = "kd_tree"
 NEIGHBOUR_COUNTS = (1, 3, 5, 8, 12, 20, 40, 80, 120)
+FLOOR_STRETCH = 5.0  # of heights where there are floors, so that neighbours are on one floor
 MAX_TUNING_ROWS, MAX_GP_ROWS = 500, 1500  # the cost of the Gaussian process grows with their cube
 
 
@@ -50,7 +51,8 @@ class ReceiverRegressors(RssiPredictor):
         if self._simpler is not None:
             residual = residual - self._simpler.predict(train.transmitter_position).mean
         fold = folds(train.transmitter_position, self.config.validation, self.config.seed).numpy()
-        position = train.transmitter_position.numpy()
+        self._scale = torch.tensor([1.0, 1.0, FLOOR_STRETCH if train.floors else 1.0], dtype=torch.float64)
+        position = (train.transmitter_position * self._scale).numpy()
         mean = float(residual.nanmean())
 
         def fit(values: NDArray[Any]) -> Any:
@@ -70,7 +72,7 @@ class ReceiverRegressors(RssiPredictor):
     def _predict(self, position: Tensor) -> tuple[Tensor, None]:
         if not len(position):  # scikit-learn refuses it
             return torch.zeros(0, len(self._regressors), dtype=torch.float64), None
-        x = position.detach().numpy()
+        x = (position.detach() * self._scale).numpy()
         predicted = torch.from_numpy(np.stack([regressor.predict(x) for regressor in self._regressors], axis=1))
         return predicted if self._simpler is None else predicted + self._simpler.predict(position.detach()).mean, None
 
@@ -81,23 +83,7 @@ class KNNPredictor(ReceiverRegressors):
     name = "knn"
 
     def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
-        numbers = np.unique(fold)
-        fewest = len(y) - int(np.bincount(fold).max())
-        errors = {(k, weights): 0.0 for k in NEIGHBOUR_COUNTS if k <= fewest for weights in ("uniform", "distance")}
-        for number in numbers:  # one search for neighbours serves all settings; GridSearchCV repeats it
-            out, kept = fold == number, fold != number
-            search = NearestNeighbors(n_neighbors=max(errors)[0], algorithm=NEIGHBOUR_SEARCH)
-            distance, row = search.fit(x[kept]).kneighbors(x[out])
-            near = y[kept][row]
-            with np.errstate(divide="ignore"):
-                inverse = 1 / distance
-            inverse = np.where(np.isinf(inverse).any(axis=1, keepdims=True), np.isinf(inverse), inverse)
-            for k, weights in errors:
-                weight = inverse[:, :k] if weights == "distance" else np.ones_like(inverse[:, :k])
-                predicted = (weight * near[:, :k]).sum(axis=1) / weight.sum(axis=1)
-                errors[k, weights] += float(np.abs(predicted - y[out]).mean()) / len(numbers)
-        k, weights = min(errors, key=lambda setting: errors[setting])
-        return KNeighborsRegressor(k, weights=weights, algorithm=NEIGHBOUR_SEARCH).fit(x, y)
+        return choose_neighbours(x, y, fold)
 
 
 class ResidualKNNPredictor(KNNPredictor):
@@ -135,3 +121,24 @@ class GPPredictor(ReceiverRegressors):
         tuned, kept = order[:MAX_TUNING_ROWS], order[:MAX_GP_ROWS]
         fitted = GaussianProcessRegressor(kernel, random_state=self.config.seed).fit(x[tuned], y[tuned])
         return GaussianProcessRegressor(fitted.kernel_, optimizer=None).fit(x[kept], y[kept])
+
+
+def choose_neighbours(x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> KNeighborsRegressor:
+    """Return a regressor fitted to coordinates (n, d) and values (n,) whose settings predict held-out folds (n,) best."""
+    numbers = np.unique(fold)
+    fewest = len(y) - int(np.bincount(fold).max())
+    errors = {(k, weights): 0.0 for k in NEIGHBOUR_COUNTS if k <= fewest for weights in ("uniform", "distance")}
+    for number in numbers:  # one search for neighbours serves all settings; GridSearchCV repeats it
+        out, kept = fold == number, fold != number
+        search = NearestNeighbors(n_neighbors=max(errors)[0], algorithm=NEIGHBOUR_SEARCH)
+        distance, row = search.fit(x[kept]).kneighbors(x[out])
+        near = y[kept][row]
+        with np.errstate(divide="ignore"):
+            inverse = 1 / distance
+        inverse = np.where(np.isinf(inverse).any(axis=1, keepdims=True), np.isinf(inverse), inverse)
+        for k, weights in errors:
+            weight = inverse[:, :k] if weights == "distance" else np.ones_like(inverse[:, :k])
+            predicted = (weight * near[:, :k]).sum(axis=1) / weight.sum(axis=1)
+            errors[k, weights] += float(np.abs(predicted - y[out]).mean()) / len(numbers)
+    k, weights = min(errors, key=lambda setting: errors[setting])
+    return KNeighborsRegressor(k, weights=weights, algorithm=NEIGHBOUR_SEARCH).fit(x, y)

@@ -25,7 +25,7 @@ class LowRankDeformation(Deformation):
     product, for any number of primitives.
 
     Args:
-        field: The smooth functions. A local field cannot be fitted by gradient descent.
+        field: The smooth functions. A regression cannot be fitted by gradient descent.
         basis: Offsets of the primitives, (K, N, sum of component sizes).
         components: Parameters that deform.
         deviation: Calibration factor between the prior's standard deviation of a spectrum and the measured one; 0 if
@@ -55,16 +55,19 @@ class LowRankDeformation(Deformation):
     @classmethod
     def restore(cls, components: tuple[str, ...], header: Header, tensors: Mapping[str, Tensor]) -> LowRankDeformation:
         rank, n, m = header["config"]["rank"], header["config"]["n_primitives"], len(tensors["field.anchor"])
-        kernel, exact = gp.Kernel(**header["kernel"]), "field.whiten" in tensors
-        own = {"whiten": (m, m), "coefficient": (m, rank)} if exact else {"value": (m, rank)}
+        kernel, regressed = gp.Kernel(**header["kernel"]), "field.value" in tensors
+        own: dict[str, tuple[int, ...]] = (
+            {"value": (m, rank)} if regressed else {"whiten": (m, m), "coefficient": (m, rank)}
+        )
+        own |= {"correlation": (m,)} if "field.correlation" in tensors else {}
         field_shapes = {f"field.{name}": shape for name, shape in ({"anchor": (m, 3)} | own).items()}
         basis_shape = (rank, n, sum(COMPONENTS[c] for c in components))
         expect(dict(tensors), field_shapes | {"basis": basis_shape, "deviation": ()})
         if not float(tensors["deviation"]) >= 0:
             raise InputError(f"deviation is {float(tensors['deviation'])}, expected 0 or more")
         anchor, basis = tensors["field.anchor"], tensors["basis"].clone()
-        whiten, value = tensors.get("field.whiten"), tensors.get("field.value")
-        return cls(gp.SmoothField(anchor, kernel, rank, whiten, value if not exact else None), basis, components)
+        known = (tensors.get(f"field.{name}") for name in ("whiten", "value", "correlation"))
+        return cls(gp.SmoothField(anchor, kernel, rank, *known), basis, components)
 
     def header(self) -> Header:
         return {"kernel": asdict(self.field.kernel)}

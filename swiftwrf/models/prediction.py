@@ -1,0 +1,104 @@
+"""Predicted quantities with their uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from torch import Tensor
+
+from swiftwrf.array.angles import AngularGrid
+from swiftwrf.data.labelled import Labelled, Variable, position_coordinates, receiver_coordinates
+from swiftwrf.data.spectra import DIRECTION, direction_coordinates
+from swiftwrf.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction(Labelled):
+    """A predicted quantity with its uncertainty.
+
+    Args:
+        mean: Predictive mean, e.g. magnitudes (n, n_elevation, n_azimuth) or RSSI (n, R) [dBm].
+        std: Predictive standard deviation of one measurement, of the same shape. None if the model has none.
+        position: Positions of the predictions, (n, 3) [m]. `predict` of every model sets it.
+        grid: Directions of predicted spectra.
+        receiver_names: Names of the receivers of predicted RSSI.
+
+    Example:
+        >>> import torch
+        >>> prediction = Prediction(torch.zeros(2), torch.ones(2))
+        >>> low, high = prediction.interval(0.8)
+        >>> round(float(high[0]), 2)
+        1.28
+    """
+
+    mean: Tensor
+    std: Tensor | None = None
+    position: Tensor | None = None
+    grid: AngularGrid | None = None
+    receiver_names: tuple[str, ...] = ()
+
+    def interval(self, level: float = 0.8) -> tuple[Tensor, Tensor]:
+        """Return the lower and upper end of the central interval that contains a measurement with probability `level`.
+
+        Raises:
+            InputError: The model has no standard deviation, or the level is outside (0, 1).
+        """
+        if self.std is None:
+            raise InputError("this model predicts no standard deviation, so there is no interval")
+        if not 0 < level < 1:
+            raise InputError(f"level must be between 0 and 1, got {level}")
+        half = NormalDist().inv_cdf((1 + level) / 2) * self.std
+        return self.mean - half, self.mean + half
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return a table: a row for each position and receiver, or for each spectrum with its largest magnitude.
+
+        Raises:
+            InputError: Values without position.
+
+        Example:
+            >>> import torch
+            >>> at = torch.zeros(1, 3)
+            >>> Prediction(torch.tensor([[-60.0]]), torch.tensor([[2.0]]), at, receiver_names=("hall",)).to_frame()
+               x_m  y_m  z_m receiver  predicted_dbm  std_db
+            0  0.0  0.0  0.0     hall          -60.0     2.0
+        """
+        position, mean = self._place(), self.mean.detach().cpu()
+        if self.grid is not None:
+            azimuth, elevation = self.grid.peak_direction(mean).rad2deg().T.numpy()
+            peak = {
+                "azimuth_deg": azimuth,
+                "elevation_deg": elevation,
+                "magnitude": mean.flatten(1).amax(dim=1).numpy(),
+            }
+            return _positions(position).assign(**peak)
+        table = _positions(position.repeat(len(self.receiver_names), axis=0))
+        values = {"receiver": np.tile(self.receiver_names, len(position)), "predicted_dbm": mean.flatten().numpy()}
+        std = {} if self.std is None else {"std_db": self.std.detach().cpu().flatten().numpy()}
+        return table.assign(**values, **std)
+
+    def coordinates(self) -> dict[str, Variable]:
+        own = receiver_coordinates(self.receiver_names) if self.grid is None else direction_coordinates(self.grid)
+        return position_coordinates(self._place()) | own
+
+    def variables(self) -> dict[str, Variable]:
+        name, dimensions, unit = ("spectrum", DIRECTION, "1") if self.grid else ("rssi", ("receiver",), "dBm")
+        found = {name: Variable(("position", *dimensions), self.mean.detach().cpu().numpy(), unit)}
+        if self.std is not None:
+            std = self.std.detach().cpu().numpy()
+            found["std"] = Variable(("position", *dimensions), std, "1" if self.grid else "dB")
+        return found
+
+    def _place(self) -> NDArray[np.float64]:
+        if self.position is None or (self.grid is None and not self.receiver_names):
+            raise InputError("this prediction has no positions; take the one that predict returns")
+        place: NDArray[np.float64] = self.position.detach().cpu().double().numpy()
+        return place
+
+
+def _positions(position: NDArray[np.float64]) -> pd.DataFrame:
+    return pd.DataFrame(position, columns=["x_m", "y_m", "z_m"])

@@ -1,0 +1,114 @@
+"""A model that follows its scene: each measurement is scored, tested for a change, and learnt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from swiftwrf.data.rssi import Rssi
+from swiftwrf.data.spectra import Spectra
+from swiftwrf.models.base import FieldModel
+from swiftwrf.models.process import ProcessModel
+from swiftwrf.online.adaptation import adapted
+from swiftwrf.online.change import Alarm
+from swiftwrf.online.monitor import Monitor, MonitorConfig
+from swiftwrf.online.prequential import Scores, learnt, score
+from swiftwrf.rssi.model import RssiModel
+
+MAX_RECENT = 500  # spectra that are kept to adapt the model to a change
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One followed measurement.
+
+    Args:
+        scores: Its scores before it was learnt, of length 1.
+        alarms: Changes that it revealed, in words.
+        correlation: Correlation of the fields before and after a change to which the model was adapted; None without one.
+    """
+
+    scores: Scores
+    alarms: tuple[str, ...]
+    correlation: float | None = None
+
+
+class Follower:
+    """A fitted model that learns measurements one by one.
+
+    An alarm adapts models of spectra to the change, if these can forget spectra, and starts the test again.
+
+    Args:
+        model: Fitted model with `update`.
+        train: Training data of the model in their order, which calibrate the test for spectra.
+        config: Options of the test.
+
+    Raises:
+        InputError: A model without `update`.
+
+    Example:
+        >>> import swiftwrf
+        >>> data = swiftwrf.rssi_room(n=80)
+        >>> follower = Follower(swiftwrf.RssiModel().fit(data.subset(torch.arange(79))))
+        >>> follower.step(data.subset(torch.tensor([79]))).alarms
+        ()
+        >>> follower.count
+        1
+    """
+
+    def __init__(
+        self, model: FieldModel | RssiModel, train: Spectra | Rssi | None = None, config: MonitorConfig | None = None
+    ) -> None:
+        self.model, self.count = model, 0
+        self.monitor = Monitor.of(model, train, config)
+        self._recent: list[Spectra] = []
+
+    def step(self, new: Spectra | Rssi) -> Step:
+        """Score one measurement, test it for a change, and learn it.
+
+        Raises:
+            InputError: As `update`.
+        """
+        scores = score(self.model, new)
+        alarms = self.monitor.observe(scores.position[0], scores.innovation[0])
+        words, correlation = tuple(map(self.monitor.describe, alarms)), None
+        self.model = learnt(self.model, new)
+        self.count += 1
+        if isinstance(new, Spectra) and isinstance(self.model, ProcessModel):
+            self._recent = [*self._recent, new][-MAX_RECENT:]
+            if alarms:
+                correlation = self._adapt(self.model, alarms[0])
+        return Step(scores, words, correlation)
+
+    def _adapt(self, model: ProcessModel, alarm: Alarm) -> float:
+        """Adapt the model to a change, and calibrate the test with the next measurements."""
+        n, learnt = min(alarm.at - alarm.since + 1, len(self._recent)), len(model.process.known)
+        after = joined(self._recent[-n:])
+        self.model, correlation = adapted(model.forget(torch.arange(learnt - n, learnt)), after)
+        self.monitor = Monitor.of(self.model, None, self.monitor.config)
+        return correlation
+
+    def state(self) -> dict[str, Any]:
+        """Return the count of measurements and the state of the test as plain values."""
+        return {"count": self.count, "monitor": self.monitor.state()}
+
+    def resume(self, state: dict[str, Any]) -> None:
+        """Continue from a `state`; the model is that of the same moment."""
+        self.count, self.monitor = int(state["count"]), self.monitor.continued(state["monitor"])
+
+
+def joined(parts: list[Spectra]) -> Spectra:
+    """Return the spectra of all parts, of one scene, in memory."""
+    first = parts[0]
+    return Spectra(
+        torch.cat([part.store[:] for part in parts]),
+        torch.cat([part.position for part in parts]),
+        array=first.array,
+        moving=first.moving,
+        grid=first.grid,
+        name=first.name,
+        fixed_position=first.fixed_position,
+        rotation=first.rotation,
+    )

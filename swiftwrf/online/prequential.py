@@ -1,0 +1,133 @@
+"""Prequential scores: each measurement is predicted before the model learns it (A. P. Dawid, JRSS A 147, 1984)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from swiftwrf.data.rssi import Rssi
+from swiftwrf.data.spectra import Spectra
+from swiftwrf.models.base import FieldModel
+from swiftwrf.models.process import ProcessModel
+from swiftwrf.rssi.base import RssiPredictor
+
+LEVEL = 0.8  # nominal coverage of the intervals
+Model = TypeVar("Model", bound=FieldModel | RssiPredictor)
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Scores of n measurements by a model that had not learnt them.
+
+    Args:
+        position: Positions of the moving end, (n, 3) [m].
+        error: Root mean square error of each spectrum, or mean absolute error of each row of RSSI [dB], (n,).
+        innovation: Standardized innovations: error over expected error of each spectrum up to a constant factor, (n, 1), or
+            measured minus predicted RSSI over its standard deviation, (n, R), nan where not detected.
+        covered: Fraction of pixels or receivers inside their 80 % interval, (n,), nan without intervals.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.simulated_room(n=50).split()
+        >>> score(swiftwrf.make_model("coarray").fit(train), test).error.shape
+        torch.Size([10])
+    """
+
+    position: Tensor
+    error: Tensor
+    innovation: Tensor
+    covered: Tensor
+
+    def __len__(self) -> int:
+        return len(self.error)
+
+    @classmethod
+    def joined(cls, parts: list[Scores]) -> Scores:
+        """Return the scores of all parts in order."""
+        return cls(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+
+    def running_error(self, window: int = 50) -> Tensor:
+        """Return the mean error of the last `window` measurements after each of them, (n,)."""
+        total = torch.nn.functional.pad(self.error.nan_to_num().cumsum(0), (1, 0))
+        count = torch.nn.functional.pad((~self.error.isnan()).double().cumsum(0), (1, 0))
+        end = torch.arange(1, len(self) + 1)
+        begin = (end - window).clamp_min(0)
+        return (total[end] - total[begin]) / (count[end] - count[begin])
+
+
+def score(model: FieldModel | RssiPredictor, new: Spectra | Rssi) -> Scores:
+    """Return the scores of measurements that a model has not learnt.
+
+    Raises:
+        InputError: As `predict`.
+    """
+    with torch.no_grad():
+        if isinstance(model, RssiPredictor):
+            assert isinstance(new, Rssi)
+            return _of_rssi(model, new)
+        assert isinstance(new, Spectra)
+        return _of_spectra(model, new)
+
+
+def _of_spectra(model: FieldModel, new: Spectra) -> Scores:
+    predicted, measured = model.predict(new.position), new.store[:]
+    error = (measured - predicted.mean).square().mean(dim=(1, 2)).sqrt().double()
+    expected = torch.ones_like(error)
+    if isinstance(model, ProcessModel):
+        expected = model.expected_error(new.position)
+    covered = torch.full_like(error, torch.nan)
+    if predicted.std is not None:
+        low, high = predicted.interval(LEVEL)
+        covered = ((low <= measured) & (measured <= high)).double().mean(dim=(1, 2))
+    return Scores(new.position, error, (error / expected)[:, None], covered)
+
+
+def _of_rssi(model: RssiPredictor, new: Rssi) -> Scores:
+    predicted, measured = model.predict(new.transmitter_position), new.rssi_dbm
+    miss = measured - predicted.mean
+    innovation, covered = torch.full_like(miss, torch.nan), torch.full_like(miss, torch.nan)
+    if predicted.std is not None:
+        innovation = miss / predicted.std
+        low, high = predicted.interval(LEVEL)
+        covered = ((low <= measured) & (measured <= high)).double().where(~miss.isnan(), torch.nan)
+    return Scores(new.transmitter_position, miss.abs().nanmean(dim=1), innovation, covered.nanmean(dim=1))
+
+
+def learnt(model: Model, new: Spectra | Rssi) -> Model:
+    """Return the model after an update with measurements of its kind."""
+    update: Any = model.update
+    found: Model = update(new)
+    return found
+
+
+def prequential(model: Model, new: Spectra | Rssi, batch: int = 1) -> tuple[Scores, Model]:
+    """Score measurements in order, each before the model learns it.
+
+    Args:
+        model: Fitted model with `update`.
+        new: Measurements in the order in which they were taken.
+        batch: Number of measurements that are predicted and then learnt together.
+
+    Returns:
+        Scores, and the model that has learnt all measurements.
+
+    Raises:
+        InputError: As `update`.
+
+    Example:
+        >>> import swiftwrf
+        >>> data = swiftwrf.rssi_room(n=80)
+        >>> model = swiftwrf.RssiModel().fit(data.subset(torch.arange(60)))
+        >>> scores, model = prequential(model, data.subset(torch.arange(60, 80)), batch=5)
+        >>> len(scores), len(model.anchor)
+        (20, 80)
+    """
+    parts = []
+    for rows in torch.arange(len(new)).split(batch):
+        some = new.subset(rows)
+        parts.append(score(model, some))
+        model = learnt(model, some)
+    return Scores.joined(parts), model

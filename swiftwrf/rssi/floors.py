@@ -1,0 +1,108 @@
+"""Attenuation of RSSI by the floors between both ends of a link, estimated with path loss.
+
+    rssi = T - 10 gamma log10 d - F |floor(s) - floor(receiver)|       [dBm]
+
+F is the floor attenuation factor (S. Y. Seidel and T. S. Rappaport, IEEE Transactions on Antennas and Propagation 40, 1992),
+linear in the number of floors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from swiftwrf.data.floors import Floors
+from swiftwrf.data.rssi import Rssi
+from swiftwrf.positions import distance
+from swiftwrf.rssi.path_loss import MIN_DISTANCE_M
+
+MIN_FLOOR_ROWS = 3  # on a floor, before its mean tells where a receiver is
+
+
+@dataclass(frozen=True)
+class FloorAttenuation:
+    """Attenuation of each floor between transmitter and receiver.
+
+    Args:
+        floors: Floors of the building.
+        receiver_floor: Number of each receiver's floor.
+        db: Attenuation of a floor [dB].
+    """
+
+    floors: Floors
+    receiver_floor: tuple[int, ...]
+    db: float
+
+    @classmethod
+    def from_plain(cls, values: Mapping[str, Any] | None) -> Self | None:
+        """Return the attenuation of plain values, None without any."""
+        if not values:
+            return None
+        names, heights = (tuple(values["floors"][field]) for field in ("names", "height_m"))
+        floors = Floors(tuple(map(str, names)), tuple(map(float, heights)))
+        return cls(floors, tuple(map(int, values["receiver_floor"])), float(values["db"]))
+
+    def of(self, position: Tensor) -> Tensor:
+        """Return the RSSI that the floors take from transmitters (n, 3) at each receiver, float64 (n, R) [dB]."""
+        receiver = torch.tensor(self.receiver_floor)
+        return -self.db * (self.floors.number(position.detach())[:, None] - receiver).abs().double()
+
+    def between(self, a: Tensor, b: Tensor) -> Tensor:
+        """Return the RSSI that the floors between positions a and b (m, 3) take, float64 (m,) [dB]."""
+        return -self.db * (self.floors.number(a.detach()) - self.floors.number(b.detach())).abs().double()
+
+    def removed(self, data: Rssi) -> Rssi:
+        """Return the data as if all links were within a floor."""
+        return replace(data, rssi_dbm=data.rssi_dbm - self.of(data.transmitter_position))
+
+
+def estimate_floor_attenuation(train: Rssi, pool: Rssi | None = None) -> FloorAttenuation:
+    """Estimate the attenuation of a floor by least squares, jointly with the path-loss model of each receiver.
+
+    Distances are horizontal. The floor of a receiver of unknown position is the one with its strongest mean RSSI.
+
+    Args:
+        train: Training rows with floors.
+        pool: The same rows at more receivers, which determine the attenuation. Defaults to `train`.
+
+    Example:
+        >>> import pandas as pd
+        >>> table = pd.DataFrame({"x": [0.0, 5, 9] * 4, "y": 0.0, "floor": [0] * 6 + [1] * 6})
+        >>> table["hall"] = [-50.0, -60, -64] * 2 + [-65.0, -75, -79] * 2
+        >>> round(estimate_floor_attenuation(Rssi.from_frame(table)).db, 1)
+        15.0
+    """
+    pool = pool or train
+    assert train.floors is not None
+    floor = train.floors.number(train.transmitter_position)
+    where = receiver_floors(pool)
+    flat = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
+    apart = distance(pool.transmitter_position * flat, pool.receiver_position * flat).clamp_min(MIN_DISTANCE_M)
+    log_apart, top, bottom = apart.log10().nan_to_num(0.0), 0.0, 0.0
+    for r, rssi in enumerate(pool.rssi_dbm.T):
+        rows = ~rssi.isnan()
+        crossed = (floor[rows] - where[r]).abs().double()
+        free = torch.stack([torch.ones_like(crossed), log_apart[rows, r]], dim=1)
+        both = torch.stack([rssi[rows], crossed], dim=1)
+        left = both - free @ torch.linalg.lstsq(free, both, driver="gelsd").solution
+        top += float(left[:, 0] @ left[:, 1])
+        bottom += float(left[:, 1] @ left[:, 1])
+    db = max(-top / bottom, 0.0) if bottom > 0 else 0.0
+    number = dict(zip(pool.receiver_names, where.tolist(), strict=True))
+    return FloorAttenuation(train.floors, tuple(number[name] for name in train.receiver_names), db)
+
+
+def receiver_floors(data: Rssi) -> Tensor:
+    """Return the floor of each receiver by its position, or by where its mean RSSI is strongest, int64 (R,)."""
+    assert data.floors is not None
+    floor, mean = data.floors.number(data.transmitter_position), []
+    for number in range(len(data.floors.names)):
+        rssi = data.rssi_dbm[floor == number]
+        enough = (~rssi.isnan()).sum(dim=0) >= MIN_FLOOR_ROWS
+        mean.append(rssi.nanmean(dim=0).where(enough, -torch.inf))
+    strongest = torch.stack(mean).argmax(dim=0)
+    return data.floors.number(data.receiver_position.nan_to_num(0.0)).where(data.receiver_located, strongest)

@@ -1,0 +1,125 @@
+"""Maps of predicted RSSI on square cells, as tables and data sets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+
+from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
+from swiftwrf.data.labelled import Labelled, Variable, receiver_coordinates
+from swiftwrf.data.rssi import receiver_row
+from swiftwrf.errors import InputError
+
+if TYPE_CHECKING:
+    from swiftwrf.rssi.model import RssiModel
+
+CELLS = 120  # of a map, along its longer side
+MAX_CELLS = 2**22
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RssiMap(Labelled):
+    """RSSI that R receivers detect from a transmitter at the centres of square cells of one height.
+
+    Args:
+        x: Centres of the columns, ascending, (columns,) [m].
+        y: Centres of the rows, ascending, (rows,) [m].
+        height: Height of the transmitter [m].
+        cell: Edge of a cell [m].
+        mean: Predictive mean (R, rows, columns) [dBm].
+        std: Predictive standard deviation of a measurement (R, rows, columns) [dB].
+        receiver_names: Names of the receivers.
+        origin: Latitude and longitude of x = y = 0, if they are known.
+    """
+
+    x: Values
+    y: Values
+    height: float
+    cell: float
+    mean: NDArray[np.float32]
+    std: NDArray[np.float32]
+    receiver_names: tuple[str, ...]
+    origin: GeodeticOrigin | None = None
+
+    @classmethod
+    def predict(cls, model: RssiModel, cell: float | None = None, height: float | None = None) -> RssiMap:
+        """Return the map of a fitted model over the box of its training positions.
+
+        Args:
+            model: Fitted model.
+            cell: Edge of a cell [m]. Defaults to 1/120 of the longer side.
+            height: Height of the transmitter [m]. Defaults to the median of the training positions.
+
+        Raises:
+            InputError: A cell that is not positive, or a map of more than 2^22 cells.
+
+        Example:
+            >>> import swiftwrf
+            >>> model = swiftwrf.RssiModel().fit(swiftwrf.rssi_room(n=60))
+            >>> RssiMap.predict(model, cell=1.0).mean.shape
+            (12, 15, 19)
+        """
+        position = (model.anchor + model.centre).double()
+        low, high = (end[:2].numpy() for end in (position.amin(dim=0), position.amax(dim=0)))
+        cell = float((high - low).max()) / CELLS or 1.0 if cell is None else cell
+        if not cell > 0:
+            raise InputError(f"a cell needs an edge above 0 m, got {cell:g}")
+        sizes = np.maximum(np.ceil((high - low) / cell), 1)
+        if sizes.prod() > MAX_CELLS:
+            raise InputError(f"a map of cells of {cell:g} m would have {sizes.prod():.3g} of them; take larger cells")
+        first = (low + high - sizes * cell) / 2 + cell / 2
+        x, y = (start + cell * np.arange(int(size)) for start, size in zip(first, sizes, strict=True))
+        z = float(position[:, 2].median()) if height is None else height
+        grid = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), z)], axis=-1).reshape(-1, 3)
+        with torch.no_grad():
+            found = model.predict(grid)
+        assert found.std is not None
+        mean, std = (values.T.reshape(-1, len(y), len(x)).float().numpy() for values in (found.mean, found.std))
+        return cls(x, y, z, cell, mean, std, model.receiver_names, model.origin)
+
+    def receivers(self, asked: Sequence[str]) -> RssiMap:
+        """Return the map of some receivers.
+
+        Args:
+            asked: Names, or numbers counted from 1.
+
+        Raises:
+            InputError: An unknown receiver.
+        """
+        rows = [receiver_row(self.receiver_names, name, "the map") for name in asked]
+        names = tuple(self.receiver_names[row] for row in rows)
+        return replace(self, mean=self.mean[rows], std=self.std[rows], receiver_names=names)
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return a table with one row for each cell and receiver."""
+        x, y = (values.ravel() for values in np.meshgrid(self.x, self.y))
+        cells = {"x_m": x, "y_m": y, "z_m": np.full(len(x), self.height)}
+        cells |= degree_columns(self.origin, np.stack([x, y], axis=1))
+        n_receivers = len(self.receiver_names)
+        return pd.DataFrame({name: np.tile(values, n_receivers) for name, values in cells.items()}).assign(
+            receiver=np.repeat(self.receiver_names, len(x)),
+            predicted_dbm=self.mean.ravel(),
+            std_db=self.std.ravel(),
+        )
+
+    def coordinates(self) -> dict[str, Variable]:
+        axes = {"x": Variable(("x",), self.x, "m"), "y": Variable(("y",), self.y, "m")}
+        height = {"z": Variable((), np.array(self.height), "m")}
+        cells = np.stack(np.meshgrid(self.x, self.y), axis=-1)
+        degrees = degree_columns(self.origin, cells.reshape(-1, 2)).values()
+        names = (("latitude", "degrees_north"), ("longitude", "degrees_east"))
+        places = zip(names, degrees, strict=False)
+        shape = cells.shape[:2]
+        in_degrees = {name: Variable(("y", "x"), values.reshape(shape), unit) for (name, unit), values in places}
+        return axes | height | in_degrees | receiver_coordinates(self.receiver_names)
+
+    def variables(self) -> dict[str, Variable]:
+        dimensions = ("receiver", "y", "x")
+        return {"rssi": Variable(dimensions, self.mean, "dBm"), "std": Variable(dimensions, self.std, "dB")}

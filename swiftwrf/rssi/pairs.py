@@ -1,0 +1,307 @@
+"""RSSI where both ends of the link move: one model over pairs of positions.
+
+    rssi(p, q) = T - 10 gamma log10 |p - q| + c(p, r q)       [dBm]
+
+p and q are the positions of both ends, c is a Gaussian process over the six coordinates, and r is a ratio of lengths. So the
+model predicts ends at positions where none was measured.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import asdict
+from itertools import groupby
+from statistics import NormalDist
+from typing import ClassVar, NamedTuple, Self
+
+import torch
+from torch import Tensor
+
+from swiftwrf.data.coordinates import GeodeticOrigin
+from swiftwrf.data.rssi import Offsets, Rssi
+from swiftwrf.data.splits import folds
+from swiftwrf.errors import InputError
+from swiftwrf.gp import GaussianProcess, Kernel, candidates
+from swiftwrf.gp.process import N_NEIGHBOURS, local_weights
+from swiftwrf.models.base import FieldConfig
+from swiftwrf.models.prediction import Prediction
+from swiftwrf.positions import Neighbours, check_positions, distance
+from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiFitContext, RssiPredictor
+from swiftwrf.rssi.floors import FloorAttenuation
+from swiftwrf.rssi.model import LEVEL
+from swiftwrf.rssi.path_loss import MIN_DISTANCE_M, fit_path_loss
+from swiftwrf.runtime import checkpoint as files
+from swiftwrf.runtime.checkpoint import Header, Saved
+from swiftwrf.runtime.options import from_plain
+from swiftwrf.runtime.threads import single_thread
+from swiftwrf.runtime.validation import configuration
+
+RATIOS = (0.5, 1.0, 2.0)  # distance that the receiver moves, relative to an equivalent one of the transmitter
+RELATIVE_NOISE_VARIANCES = (0.03, 0.1, 0.3, 1.0, 3.0)  # variance of a measurement relative to that of the field
+MAX_HELD_OUT = 500  # pairs that choose the kernel; more do not change it
+PAIRS_AT_ONCE = 2048  # each needs a matrix of 64 x 64
+
+
+@configuration
+class PairConfig(FieldConfig):
+    """Options of models over pairs of positions."""
+
+    new_places: bool = True
+    """choose settings for receivers at positions without a measurement; otherwise for new positions of the transmitter, as
+    `validation` states"""
+
+
+class PairPredictor(RssiPredictor):
+    """Base class of predictors over pairs of positions of transmitter and receiver; all receivers are alike.
+
+    A subclass implements `_fit_pairs` and `_at_pairs` instead of `_fit` and `_predict`.
+    """
+
+    config_type = PairConfig
+    requires_receiver_position = True
+
+    receiver: Tensor
+    """positions of the receivers, float64 (R, 3) [m]"""
+
+    @classmethod
+    def lacking(cls, data: Rssi) -> str:
+        """Return a sentence if the position of a receiver is unknown, or an empty text."""
+        known = bool(data.receiver_located.all())
+        return "" if known else f"{cls.name} needs the {RECEIVER_POSITIONS}, which {data.name} does not describe"
+
+    @classmethod
+    def compared(cls, data: Rssi) -> bool:
+        """Return True if both ends move."""
+        return data.receiver_moves
+
+    @abstractmethod
+    def _fit_pairs(self, pair: Tensor, rssi: Tensor, fold: Tensor) -> None:
+        """Fit to RSSI (m,) [dBm] at pairs (m, 6) [m], with numbers of the groups to hold out (m,)."""
+
+    @abstractmethod
+    def _at_pairs(self, pair: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Return RSSI (m,) [dBm] and its standard deviation, or None, at pairs (m, 6) [m]."""
+
+    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+        row, column = train.detected.nonzero(as_tuple=True)
+        self.receiver = train.receiver_position
+        pair = torch.cat([train.transmitter_position[row], self.receiver[column]], dim=1)
+        fold = folds(pair[:, :3], self.config.validation, self.config.seed)
+        if self.config.new_places and len(self.receiver[column].unique(dim=0)) > 1:
+            fold = folds(pair[:, 3:], "random", self.config.seed)
+        self._fit_pairs(pair, train.rssi_dbm[row, column], fold)
+
+    def _predict(self, position: Tensor) -> tuple[Tensor, Tensor | None]:
+        n, r = len(position), len(self.receiver)
+        pair = torch.cat([position.repeat_interleave(r, dim=0), self.receiver.repeat(n, 1)], dim=1)
+        mean, std = self._batches(pair)
+        return mean.reshape(n, r), None if std is None else std.reshape(n, r)
+
+    def _batches(self, pair: Tensor) -> tuple[Tensor, Tensor | None]:
+        parts = [self._at_pairs(some) for some in pair.split(PAIRS_AT_ONCE)]
+        stds = [std for _, std in parts if std is not None]
+        return torch.cat([mean for mean, _ in parts]), torch.cat(stds) if stds else None
+
+    def predict_detected(self, data: Rssi) -> Prediction:
+        """Predict the RSSI where it is measured; nan elsewhere, which saves time where a row has few receivers."""
+        self.check_fitted()
+        row, column = data.detected.nonzero(as_tuple=True)
+        found = self.predict_pairs(data.transmitter_position[row], self.receiver[column])
+
+        def spread(values: Tensor) -> Tensor:
+            return torch.full(data.rssi_dbm.shape, torch.nan).double().index_put((row, column), values.double())
+
+        return Prediction(spread(found.mean), None if found.std is None else spread(found.std))
+
+    def predict_pairs(self, transmitter_position: Tensor, receiver_position: Tensor) -> Prediction:
+        """Predict the RSSI of pairs of positions, measured or not.
+
+        Args:
+            transmitter_position: Positions of the transmitter, (m, 3) [m].
+            receiver_position: Position of the receiver in each pair, (m, 3) [m].
+
+        Returns:
+            Mean (m,) [dBm], and the standard deviation of a measurement (m,) [dB] if the predictor has one.
+
+        Raises:
+            InputError: Positions of another shape or not finite, or a predictor that is not fitted.
+
+        Example:
+            >>> import swiftwrf
+            >>> train = swiftwrf.rssi_room(n=60)
+            >>> model = swiftwrf.PairModel().fit(train)
+            >>> model.predict_pairs(train.transmitter_position, train.transmitter_position.flip(0)).mean.shape
+            torch.Size([60])
+        """
+        self.check_fitted()
+        ends = [check_positions(end) for end in (transmitter_position, receiver_position)]
+        if len(ends[0]) != len(ends[1]):
+            raise InputError(f"each pair needs two positions, got {len(ends[0])} and {len(ends[1])}")
+        with torch.set_grad_enabled(torch.is_grad_enabled() and any(end.requires_grad for end in ends)):
+            mean, std = self._batches(torch.cat(ends, dim=1))
+        return Prediction(mean if self.attenuation is None else mean + self.attenuation.between(*ends).to(mean), std)
+
+
+class Metric(NamedTuple):
+    """Coordinates in which pairs are near to each other.
+
+    Args:
+        ratio: Factor of the receiver's coordinates.
+        reciprocal: Whether both ends are alike, so that exchanging them changes nothing.
+    """
+
+    ratio: float = 1.0
+    reciprocal: bool = False
+
+    def coordinates(self, pair: Tensor) -> Tensor:
+        """Return the coordinates of pairs (m, 6)."""
+        return pair * pair.new_tensor([1.0] * 3 + [self.ratio] * 3)
+
+    def known(self, pair: Tensor) -> Tensor:
+        """Return the coordinates of measured pairs (m, 6), and of the exchanged ones after them if they are reciprocal."""
+        own = self.coordinates(pair)
+        return torch.cat([own, own.roll(3, dims=1)]) if self.reciprocal else own
+
+    def values(self, value: Tensor) -> Tensor:
+        """Return the values (m,) of `known`."""
+        return value.repeat(1 + self.reciprocal)
+
+
+METRICS = (*(Metric(ratio) for ratio in RATIOS), Metric(reciprocal=True))
+
+
+class PairModel(PairPredictor, Saved):
+    """A path-loss model in the distance of both ends, and a Gaussian process over both positions.
+
+    A prediction conditions on the nearest 64 pairs (local Gaussian process). Lengths, noise, the ratio of the ends' lengths
+    and reciprocity are those with the lowest error at held-out pairs, which also calibrate the standard deviation.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.rssi_room(n=60).split()
+        >>> PairModel(new_places=False).fit(train).predict(test.transmitter_position).mean.shape
+        torch.Size([12, 12])
+    """
+
+    kind: ClassVar[str] = "rssi pair model"
+    name = "pairs"
+
+    origin: GeodeticOrigin | None
+    """latitude and longitude of x = y = 0, if the positions were projected from degrees"""
+    offsets: Offsets | None
+    """offsets that were removed from the training rows; predictions are of their reference"""
+    metric: Metric
+    """how distances of both ends count"""
+    kernel: Kernel
+    """kernel of the field, lengths in [m]"""
+    path_loss: Tensor
+    """RSSI at 1 m [dBm] and slope [dB a decade], float64 (2,)"""
+    pair: Tensor
+    """measured pairs, float64 (m, 6) [m]"""
+    residual: Tensor
+    """residuals of the path-loss model, float64 (m,) [dB]"""
+    scale_db: Tensor
+    """calibrated standard deviation of the field far from all measurements, float64 (1,) [dB]"""
+
+    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+        self.origin, self.offsets = train.origin, train.offsets
+        super()._fit(train, context)
+
+    @single_thread()
+    def _fit_pairs(self, pair: Tensor, rssi: Tensor, fold: Tensor) -> None:
+        level, slope = fit_path_loss(_log_distance(pair)[:, None], rssi[:, None])
+        self.path_loss = torch.cat([level, slope])
+        self.pair, self.residual = pair, rssi - self._path_loss(pair)
+        order = torch.randperm(len(pair), generator=torch.Generator().manual_seed(self.config.seed))
+        sample = order[:MAX_HELD_OUT]
+        # one region only: none is left to predict it from
+        fold = fold if len(fold.unique()) > 1 else torch.arange(len(fold)) % 2
+        choices = [choice for metric in METRICS for choice in self._judged(metric, fold, sample)]
+        _, self.metric, self.kernel, score = min(choices, key=lambda choice: choice[0])
+        self.scale_db = score.quantile(LEVEL)[None] / NormalDist().inv_cdf((1 + LEVEL) / 2)
+        self._precompute()
+
+    def _judged(self, metric: Metric, fold: Tensor, sample: Tensor) -> list[tuple[float, Metric, Kernel, Tensor]]:
+        """Return kernels with their mean absolute error at held-out pairs, and the errors by their relative deviations."""
+        n_near = min(N_NEIGHBOURS, int((fold[:, None] != fold.unique()).sum(dim=0).min()))
+        between, across, value, residual = [], [], [], []
+        for number in fold[sample].unique():
+            out, kept = sample[fold[sample] == number], fold != number
+            known, query = metric.known(self.pair[kept]), metric.coordinates(self.pair[out])
+            near = Neighbours(known)(query, n_near)[1]
+            between.append(distance(known[near], known[near]))
+            across.append(distance(query[:, None], known[near])[:, 0])
+            value.append(metric.values(self.residual[kept])[near])
+            residual.append(self.residual[out])
+        r_between, r_across, values, truth = (torch.cat(parts) for parts in (between, across, value, residual))
+        # rough fields only, as in the model of each receiver
+        kernels = [k for k in candidates(metric.coordinates(self.pair), RELATIVE_NOISE_VARIANCES) if k.share == 1]
+        judged = []
+        for long, alike in groupby(sorted(kernels, key=lambda kernel: kernel.long), key=lambda kernel: kernel.long):
+            shape = Kernel(long=long, share=1.0)
+            covariance, cross = shape.at(r_between), shape.at(r_across)
+            for kernel in alike:
+                weight, variance = local_weights(covariance, cross, kernel.noise)
+                error = (truth - (weight * values).sum(dim=1)).abs()
+                score = error / (variance + kernel.noise).sqrt()
+                judged.append((float(error.mean()), metric, kernel, score))
+        return judged
+
+    def _path_loss(self, pair: Tensor) -> Tensor:
+        return self.path_loss[0] + self.path_loss[1] * _log_distance(pair)
+
+    def _precompute(self) -> None:
+        known, value = self.metric.known(self.pair), self.metric.values(self.residual)
+        self._process = GaussianProcess(self.kernel, known, value[:, None], exact=False)
+
+    @single_thread()
+    def _at_pairs(self, pair: Tensor) -> tuple[Tensor, Tensor]:
+        field, variance = self._process.local(self.metric.coordinates(pair))
+        return self._path_loss(pair) + field[:, 0], self.scale_db * (variance + self.kernel.noise).sqrt()
+
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        self.check_fitted()
+        tensors = {name: getattr(self, name) for name in _shapes(0, 0)}
+        header = {
+            "options": asdict(self.config),
+            "origin": self.origin,
+            "offsets": self.offsets and asdict(self.offsets),
+            "attenuation": self.attenuation and asdict(self.attenuation),
+            "receiver_names": self.receiver_names,
+            "metric": self.metric,
+            "kernel": asdict(self.kernel),
+        }
+        return tensors, header
+
+    @classmethod
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
+        model = cls(from_plain(PairConfig, header["options"]))
+        model.receiver_names = tuple(map(str, header["receiver_names"]))
+        model.origin = GeodeticOrigin(*map(float, header["origin"])) if header.get("origin") else None
+        model.attenuation = FloorAttenuation.from_plain(header.get("attenuation"))
+        model.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
+        ratio, reciprocal = header["metric"]
+        model.metric, model.kernel = Metric(float(ratio), bool(reciprocal)), Kernel(**header["kernel"])
+        shapes = _shapes(len(model.receiver_names), len(tensors["pair"]))
+        files.expect(tensors, shapes)
+        for name in shapes:
+            setattr(model, name, tensors[name])
+        model._precompute()
+        return model
+
+
+def _shapes(n_receivers: int, n_pairs: int) -> dict[str, tuple[int, ...]]:
+    """Return the shape of every saved tensor."""
+    return {
+        "receiver": (n_receivers, 3),
+        "path_loss": (2,),
+        "pair": (n_pairs, 6),
+        "residual": (n_pairs,),
+        "scale_db": (1,),
+    }
+
+
+def _log_distance(pair: Tensor) -> Tensor:
+    """Return the log10 of the distances [m] between the ends of pairs (m, 6), float64 (m,)."""
+    squared = (pair[:, :3] - pair[:, 3:]).square().sum(dim=1)
+    return squared.clamp_min(MIN_DISTANCE_M**2).log10() / 2

@@ -1,0 +1,235 @@
+"""Update of an RSSI fit with more rows: the weighted least squares that the fit ended in, bordered by the new rows.
+
+At the end of `swiftwrf.rssi.regression.solve` the rows of one receiver have the covariance C + F F^T with
+
+    C = (slope slope^T) * covariance of the latent field + diag(noise / weight),    F = scaled regressors of the path loss.
+
+The inverse of C, and the posterior covariance B of the regressors' coefficients, are computed once. A new row then costs
+one product with inv(C). Slopes and weights of the rows of the fit stay. Those of new rows are found with all new rows
+together, so their order has no effect.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.linalg.blas import ssymv
+from torch import Tensor
+from torch.nn import functional
+
+from swiftwrf.gp import Kernel
+from swiftwrf.rssi.head import HeadTable
+from swiftwrf.rssi.path_loss import harmonics, log_distance
+from swiftwrf.rssi.regression import FEATURE_SCALE_DB, WEIGHT_TOLERANCE
+
+MAX_NEW_ROWS = 256  # beyond, the weights of new rows are fixed and the inverses are computed again
+MAX_ITERATIONS = 100  # of the weights of new rows
+TOLERANCE = WEIGHT_TOLERANCE / 100  # of these weights, so that the order of the rows does not matter
+
+
+@dataclass(frozen=True, eq=False)
+class FitState:
+    """Weighted least squares of R receivers in n location bins at the end of a fit.
+
+    Args:
+        dual: Dual coefficients (n, R); 0 where not detected.
+        tangent: Slope of each head at the latent field, (n, R); 0 where not detected.
+        variance: Variance of the noise over the weight, (n, R) [dB^2]; 0 where not detected.
+        prior_level: Path-loss model that the fit started from, RSSI at 1 m, (R,) [dBm].
+        prior_slope: Its slope, (R,) [dB a decade].
+        field_variance: Prior variance of the latent field, (R,) [dB^2].
+        noise_variance: Variance of one measurement, (R,) [dB^2].
+        located: 1 where the position of the receiver is known, else 0, (R,).
+    """
+
+    dual: Tensor
+    tangent: Tensor
+    variance: Tensor
+    prior_level: Tensor
+    prior_slope: Tensor
+    field_variance: Tensor
+    noise_variance: Tensor
+    located: Tensor
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the tensors by their names in files."""
+        return {f"fit.{field.name}": getattr(self, field.name) for field in fields(self)}
+
+    @classmethod
+    def of(cls, tensors: dict[str, Tensor]) -> FitState:
+        """Return the state in a file."""
+        return cls(**{field.name: tensors[f"fit.{field.name}"].double() for field in fields(cls)})
+
+    @classmethod
+    def shapes(cls, n_receivers: int, n_bins: int) -> dict[str, tuple[int, ...]]:
+        """Return the shape of each tensor in a file."""
+        rows = ("dual", "tangent", "variance")
+        sizes = {field.name: (n_bins, n_receivers) if field.name in rows else (n_receivers,) for field in fields(cls)}
+        return {f"fit.{name}": size for name, size in sizes.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class NewRows:
+    """m rows beside those of a fit, for R receivers, float64.
+
+    Args:
+        position: Positions less the centre, (m, 3) [m].
+        error: Errors of the fit, (R, m) [dB]; 0 where not detected.
+        tangent: Slopes of the heads (R, m); 0 where not detected.
+        variance: Variance of the noise (R, m) [dB^2]; 0 where not detected.
+        influence: Effect of each new dual coefficient on those of the fit, float32 (R, m, n).
+        gain: Its effect on the coefficients of the regressors, (R, m, k).
+        covariance: Covariance of the errors without noise, (R, m, m).
+        weight: Robust weights (R, m).
+        dual: Dual coefficients (R, m).
+    """
+
+    position: Tensor
+    error: Tensor
+    tangent: Tensor
+    variance: Tensor
+    influence: Tensor
+    gain: Tensor
+    covariance: Tensor
+    weight: Tensor
+    dual: Tensor
+
+    @classmethod
+    def none(cls, n_receivers: int, n_bins: int) -> NewRows:
+        """Return no rows."""
+        row = torch.zeros(n_receivers, 0, dtype=torch.float64)
+        square, influence = row[..., None].expand(-1, 0, 0), torch.zeros(n_receivers, 0, n_bins)
+        gain = row.new_zeros(n_receivers, 0, len(FEATURE_SCALE_DB))
+        return cls(row.new_zeros(0, 3), row, row, row, influence, gain, square, row, row)
+
+    def solved(self, huber: float) -> NewRows:
+        """Return the rows with weights and dual coefficients by iteratively reweighted least squares."""
+        weight, noise = self.weight, self.variance.where(self.variance > 0, 1.0)
+        for _ in range(MAX_ITERATIONS):
+            dual = torch.linalg.solve(self.covariance + torch.diag_embed(noise / weight), self.error)
+            used, missed = weight, (noise / weight * dual).abs()
+            weight = (huber * noise.sqrt() / missed.clamp_min(1e-12)).clamp_max(1)
+            if bool(((weight - used).abs() < TOLERANCE).all()):
+                break
+        return replace(self, weight=used, dual=dual)
+
+
+class RssiPosterior:
+    """A fit of R receivers, with more rows.
+
+    Args:
+        state: State of the fit.
+        anchor: Positions of its bins less the centre, (n, 3) [m].
+        receiver: Positions of the receivers less the centre, (R, 3) [m].
+        kernel: Kernel of the latent field.
+        table: Heads of the receivers.
+        huber: See `RssiConfig`.
+    """
+
+    def __init__(
+        self, state: FitState, anchor: Tensor, receiver: Tensor, kernel: Kernel, table: HeadTable, huber: float
+    ) -> None:
+        self.state, self.anchor, self.kernel = state, anchor.double(), kernel
+        self.receiver = receiver.where(state.located[:, None] > 0, torch.nan)
+        self.table, self.huber = table, huber
+        self.new = NewRows.none(len(receiver), len(anchor))
+
+    @cached_property
+    def _feature(self) -> Tensor:
+        """Scaled regressors of the bins (R, n, k); 0 where not detected."""
+        return self._regressors(self.anchor) * (self.state.variance > 0).T[..., None]
+
+    @cached_property
+    def _base(self) -> tuple[list[Any], Tensor, Tensor]:
+        """Inverses of C, float32 (n, n) for each receiver; inv(C) F (R, n, k); and B (R, k, k)."""
+        covariance = self.kernel(self.anchor, self.anchor)
+        inverses, products, posteriors = [], [], []
+        for r, feature in enumerate(self._feature):
+            variance, slope = self.state.variance[:, r], self.state.tangent[:, r]
+            whole = self.state.field_variance[r] * slope[:, None] * covariance * slope
+            whole.diagonal().add_(variance.where(variance > 0, 1.0))
+            factor = torch.linalg.cholesky(whole)
+            inverses.append(np.asfortranarray(torch.cholesky_inverse(factor).float().numpy()))  # as BLAS reads it
+            products.append(torch.cholesky_solve(feature, factor))
+            posteriors.append(torch.linalg.inv(torch.eye(feature.shape[1]).double() + feature.T @ products[-1]))
+        return inverses, torch.stack(products), torch.stack(posteriors)
+
+    def _regressors(self, position: Tensor) -> Tensor:
+        """Return the scaled regressors of level, slope and directivity at positions (m, 3), float64 (R, m, k)."""
+        distance, bearing = log_distance(position, self.receiver), harmonics(position, self.receiver)
+        feature = torch.cat([torch.ones_like(distance)[..., None], distance[..., None], bearing], dim=-1)
+        return (feature * FEATURE_SCALE_DB).transpose(0, 1)
+
+    @property
+    def linear(self) -> Tensor:
+        """Change of level, slope and directivity from the prior path-loss model, float64 (R, k) [dB]."""
+        coefficient = self._feature.mT @ self.state.dual.T[..., None] + self.new.gain.mT @ self.new.dual[..., None]
+        return coefficient[..., 0] * FEATURE_SCALE_DB
+
+    def folded(self) -> RssiPosterior:
+        """Return the fit with the new rows as rows of the fit, their weights fixed."""
+        old, new = self.state, self.new
+        dual = old.dual - torch.einsum("rmn,rm->nr", new.influence, new.dual.float()).double()
+        state = replace(
+            old,
+            dual=torch.cat([dual, new.dual.T]),
+            tangent=torch.cat([old.tangent, new.tangent.T]),
+            variance=torch.cat([old.variance, (new.variance / new.weight).T]),
+        )
+        anchor = torch.cat([self.anchor, new.position])
+        return RssiPosterior(state, anchor, self.receiver, self.kernel, self.table, self.huber)
+
+    @property
+    def coefficient(self) -> Tensor:
+        """Coefficients of the kernel to the bins whose sum is the latent field, float64 (n, R) [dB]."""
+        return self.state.field_variance * self.state.tangent * self.state.dual
+
+    def updated(self, position: Tensor, rssi: Tensor) -> RssiPosterior:
+        """Return the posterior with more rows, RSSI (m, R) [dBm], nan where not detected, at positions (m, 3) [m]."""
+        if len(self.new.position) and len(self.new.position) + len(position) > MAX_NEW_ROWS:
+            return self.folded().updated(position, rssi)
+        state, detected = self.state, ~rssi.isnan().T  # (R, m)
+        cross = self.kernel(position, self.anchor)  # (m, n)
+        latent = cross @ self.coefficient  # (m, R)
+        head, tangent = self.table(latent)
+        feature = self._regressors(position)
+        coefficient = self._feature.mT @ state.dual.T[..., None]  # of the fit, (R, k, 1)
+        predicted = state.prior_level + state.prior_slope * log_distance(position, self.receiver)
+        predicted = predicted + (feature @ coefficient)[..., 0].T + head - self.table(torch.zeros_like(latent))[0]
+        tangent = tangent.T * detected
+        inverses, product, posterior = self._base
+        scaled = (state.field_variance[:, None] * tangent)[..., None]  # (R, m, 1)
+        own = scaled * cross * state.tangent.T[:, None]  # covariances with the bins by the latent field, (R, m, n)
+        # half of each inverse is read, because its time in memory is most of the time of a row
+        white = [
+            np.stack([ssymv(1.0, p, x, lower=1) for x in c]) for p, c in zip(inverses, own.float().numpy(), strict=True)
+        ]
+        left = feature * detected[..., None] - own @ product  # regressors that the bins do not explain, (R, m, k)
+        gain = left @ posterior
+        influence = torch.from_numpy(np.stack(white)) + (gain @ product.mT).float()
+        new = NewRows(
+            position=torch.cat([self.new.position, position]),
+            error=torch.cat([self.new.error, (rssi - predicted).T.where(detected, 0.0)], dim=1),
+            tangent=torch.cat([self.new.tangent, tangent], dim=1),
+            variance=torch.cat([self.new.variance, state.noise_variance[:, None] * detected], dim=1),
+            influence=torch.cat([self.new.influence, influence], dim=1),
+            gain=torch.cat([self.new.gain, gain], dim=1),
+            covariance=self.new.covariance,
+            weight=functional.pad(self.new.weight, (0, len(position)), value=1.0),
+            dual=self.new.dual,
+        )
+        # c_i inv(C) c_j = c_i influence_j - (c_i inv(C) F) gain_j
+        prior = scaled * self.kernel(position, new.position) * new.tangent[:, None]
+        explained = (own.float() @ new.influence.mT).double() - own @ product @ new.gain.mT
+        border = prior - explained + left @ new.gain.mT  # (R, m, all new)
+        covariance = functional.pad(self.new.covariance, (0, len(position), 0, len(position)))
+        covariance[:, -len(position) :] = border
+        covariance[..., -len(position) :] = border.mT
+        result = copy(self)
+        result.new = replace(new, covariance=covariance).solved(self.huber)
+        return result

@@ -1,0 +1,94 @@
+"""Files of measurements, predictions and maps, written by their suffix."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from swiftwrf import FieldModel, InputError, Prediction, RssiModel, load
+from swiftwrf.data.labelled import Labelled, write_mat
+from swiftwrf.data.rasters import Cells, write_geojson, write_geotiff, write_world_file
+from swiftwrf.data.receivers import read_places
+from swiftwrf.locate import RssiLocator
+from swiftwrf.rssi.maps import RssiMap
+from swiftwrf.runtime.checkpoint import Saved
+from swiftwrf.runtime.durable import replacing
+from tasks.claim import CONFIG, LOCATOR, MODEL
+from tasks.convert.options import MAPS, ConvertConfig
+from tasks.page.raster import colour_image
+from tasks.records import rounded, write_table
+
+WORLD_FILE = ".pgw"  # suffix beside a .png
+
+
+def saved_model(source: Path) -> FieldModel | RssiModel | None:
+    """Return the model in a file or in the directory of a run; None if the source is no model.
+
+    Raises:
+        InputError: A run without an RSSI model, or a model that predicts neither spectra nor RSSI.
+    """
+    file = next((file for name in (MODEL, LOCATOR) if (file := source / name).is_file()), source)
+    if file == source and (source / CONFIG).is_file():
+        raise InputError(f"{source} is a run without an RSSI model; name one of its models, {source}/....safetensors")
+    if file.suffix != ".safetensors":
+        return None
+    model: Saved = load(file)
+    model = model.model if isinstance(model, RssiLocator) else model
+    if not isinstance(model, FieldModel | RssiModel):
+        raise InputError(f"{file} holds a {model.kind}, which predicts neither spectra nor RSSI")
+    return model
+
+
+def predicted(model: FieldModel | RssiModel, config: ConvertConfig) -> Prediction | RssiMap:
+    """Return the map of an RSSI model, or what a model predicts at given positions.
+
+    Raises:
+        InputError: Positions that cannot be read, a field model without positions, or an unknown receiver.
+    """
+    if config.at is not None:
+        origin = model.origin if isinstance(model, RssiModel) else None
+        return model.predict(read_places(Path(config.at), origin))
+    if isinstance(model, FieldModel):
+        raise InputError("a model of spectra predicts at positions; give a table of them (x, y, z) with --at")
+    found = RssiMap.predict(model, config.cell, config.height)
+    return found.receivers(config.rx) if config.rx else found
+
+
+def write_file(data: Labelled, file: Path) -> str:
+    """Write a file by its suffix, and return a description of it.
+
+    Raises:
+        InputError: A suffix of maps for other data, or a map in local metres as GeoJSON.
+    """
+    if file.suffix.lower() in MAPS:
+        if not isinstance(data, RssiMap):
+            raise InputError(f"{file.name} holds a map of RSSI, but the source is none; write .csv or .mat")
+        return _write_map(data, file)
+    if file.suffix.lower() == ".mat":
+        write_mat(data, file)
+        return f"{' and '.join(data.variables())}, with coordinates"
+    table = data.to_frame()
+    if table.index.name:
+        table = table.reset_index()
+    write_table(file, rounded(table.to_dict("records")))
+    return f"{len(table)} rows"
+
+
+def _write_map(data: RssiMap, file: Path) -> str:
+    cells = Cells(data.x, data.y, data.cell, data.origin)
+    bands = dict(zip(data.receiver_names, data.mean, strict=True))
+    described = f"map of {len(cells.y)} x {len(cells.x)} cells of {data.cell:.3g} m"
+    match file.suffix.lower():
+        case ".tif":
+            write_geotiff(file, bands, cells)
+            return f"{described}, a band a receiver"
+        case ".geojson":
+            write_geojson(file, bands, cells)
+            return described
+    strongest = data.mean.max(axis=0)
+    low, high = np.percentile(strongest, (1, 99)).tolist()
+    with replacing(file) as temporary:
+        colour_image(strongest[::-1], "viridis", low, max(high, low + 1)).save(temporary, "PNG")
+    write_world_file(file.with_suffix(WORLD_FILE), cells)
+    return f"{described}, strongest RSSI from {low:.0f} dBm (dark) to {high:.0f} dBm (bright)"

@@ -1,0 +1,1 @@
+"""Update of a fitted model with new measurements, and detection of changes."""

@@ -1,0 +1,8 @@
+"""python -m tasks.update MODEL SOURCE --out NEW"""
+
+import sys
+
+from tasks.command import run_command
+
+if __name__ == "__main__":
+    sys.exit(run_command("update", sys.argv[1:]))

@@ -1,0 +1,48 @@
+"""Options of python -m tasks.update, and their checks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from swiftwrf.errors import InputError
+from tasks.options import Output, SpectraSource, TableSource, command_options
+
+FOLLOWED = (".ndjson", ".jsonl")
+
+
+@command_options
+class UpdateConfig(SpectraSource, TableSource, Output):
+    """Update a fitted model with new measurements. Each is predicted before the model learns it, and tested for a change.
+
+    With --follow the measurements come one by one, a JSON object a line: {"position": [x, y, z], "rssi_dbm": {"NAME": -60}}
+    or {"position": [x, y, z], "spectrum": [[...], ...]}. The model in --out is replaced after each line.
+
+    Example: python -m tasks.update model.safetensors DIR --out updated
+    """
+
+    model: Annotated[str, tyro.conf.Positional]
+    """file of a fitted model of spectra or RSSI"""
+    source: Annotated[str, tyro.conf.Positional]
+    """measurements of any known format in the order in which they were taken; with --follow a .ndjson file that grows, or -
+    for standard input"""
+    out: str
+    """directory to write; must not exist. With --follow, one that exists is continued"""
+    data: str | None = None
+    """training measurements of the model in their order, which calibrate the test for changes of spectra, and show what
+    stands in a room"""
+    false_alarm_rate: float = 1e-4
+    """false alarms a measurement"""
+    follow: bool = False
+    """take measurements line by line as they come, and print a line for each"""
+
+    def check(self) -> None:
+        super().check()
+        if not 0 < self.false_alarm_rate < 1:
+            raise InputError(f"--false-alarm-rate must be between 0 and 1, got {self.false_alarm_rate}")
+        if self.follow and self.source != "-" and Path(self.source).suffix.lower() not in FOLLOWED:
+            raise InputError(f"--follow takes {' or '.join(FOLLOWED)} files or -, got {self.source}")
+        if self.follow and (self.open or self.json):
+            raise InputError("--follow prints JSON lines and writes no page; leave out --open and --json")

@@ -1,0 +1,93 @@
+"""Floors: read as a dimension of their own, and the attenuation of each floor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+import swiftwrf
+from swiftwrf import PairModel, Rssi, RssiModel
+from swiftwrf.rssi import estimate_floor_attenuation
+from tasks.rssi.predictors import PREDICTORS
+
+FLOOR_DB, STOREY_M, SIDE_M = 15.0, 3.5, 30.0
+RECEIVERS = {
+    f"ap{i}": (x, y, STOREY_M * floor + 2.5) for i, (x, y, floor) in enumerate([(3, 3, 0), (25, 6, 1), (9, 24, 2)])
+}
+
+
+def building(n=240, seed=0, noise_db=2.0, floor_db=FLOOR_DB):
+    """A table of three floors, three access points, and 15 dB a floor between them."""
+    draw = np.random.default_rng(seed)
+    floor = draw.integers(0, 3, n)
+    table = pd.DataFrame({"x": draw.uniform(0, SIDE_M, n), "y": draw.uniform(0, SIDE_M, n)})
+    table["z"], table["floor"] = STOREY_M * floor + 1.2, floor
+    for name, (x, y, z) in RECEIVERS.items():
+        distance = np.hypot(table.x - x, table.y - y).clip(1)
+        crossed = np.abs(floor - z // STOREY_M)
+        table[name] = -35 - 25 * np.log10(distance) - floor_db * crossed + noise_db * draw.normal(size=n)
+    return table
+
+
+def rssi(table, located=True):
+    return Rssi.from_frame(table, receiver_position=RECEIVERS if located else None)
+
+
+@pytest.mark.parametrize("located", [True, False])
+@pytest.mark.parametrize("true_db", [5.0, 15.0])
+def test_attenuation_of_a_floor_is_recovered(located, true_db):
+    found = estimate_floor_attenuation(rssi(building(floor_db=true_db), located))
+    assert found.receiver_floor == (0, 1, 2)
+    assert found.db == pytest.approx(true_db, abs=1.0 if located else 2.0)  # chance of the rows, without distances
+
+
+def test_floors_by_number_without_heights_and_with_heights_above_the_floor():
+    table = building()
+    for changed in (table.drop(columns="z"), table.assign(z=1.2)):
+        data = Rssi.from_frame(changed)
+        assert data.floors.names == ("0", "1", "2")
+        assert np.diff(data.floors.height_m) == pytest.approx([4.0, 4.0])
+        assert any("each floor of column floor" in note for note in data.notes)
+    assert np.diff(rssi(table).floors.height_m) == pytest.approx([STOREY_M, STOREY_M])
+
+
+def test_floors_by_name():
+    table = building()
+    table["floor"] = np.array(["UG", "EG", "OG"])[table["floor"]]
+    assert Rssi.from_frame(table).floors.names == ("UG", "EG", "OG")
+    table["level"] = np.where(table.x < 15, "west ", "east ") + table.pop("floor")
+    data = Rssi.from_frame(table, columns={"floor": "level"})
+    assert data.floors.names == ("east UG, west UG", "east EG, west EG", "east OG, west OG")
+    assert Rssi.from_frame(table.assign(floor=1)).floors is None
+
+
+@pytest.mark.parametrize(
+    "name", ["swiftwrf", "gp", "knn", "mri_pooled", "mri_receiver", "mri_residual", "mean", "pairs"]
+)
+def test_predictors_take_the_floor_into_account(name):
+    train, test = rssi(building()).split()
+    error = []
+    for floors in (train.floors, None):
+        predictor = PREDICTORS[name]().fit(replace(train, floors=floors))
+        error.append(float((predictor.predict(test.transmitter_position).mean - test.rssi_dbm).abs().mean()))
+    assert error[0] < error[1]
+    assert name in ("mean", "knn") or error[0] < 3.0
+
+
+@pytest.mark.parametrize("model", [RssiModel, PairModel])
+def test_the_attenuation_is_saved(model, tmp_path):
+    data = rssi(building(n=90))
+    fitted = model().fit(data)
+    assert fitted.attenuation.db == pytest.approx(FLOOR_DB, abs=1.5)
+    fitted.save(tmp_path / "model.safetensors")
+    loaded = swiftwrf.load(tmp_path / "model.safetensors")
+    assert loaded.attenuation == fitted.attenuation
+    torch.testing.assert_close(
+        loaded.predict(data.transmitter_position).mean, fitted.predict(data.transmitter_position).mean
+    )
+    again = model().fit(replace(data, floors=None))
+    assert again.attenuation is None

@@ -1,0 +1,345 @@
+"""Tables, data sets, MATLAB files, maps and DeepMIMO folders are read back by the programs that they are for."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+import zlib
+from dataclasses import replace
+from xml.etree import ElementTree
+from xml.sax.saxutils import unescape
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from PIL import Image
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
+from quick import said
+from samples import FREQUENCY, snapshots
+from scipy.io import loadmat
+from sklearn.neighbors import KNeighborsRegressor
+
+from swiftwrf import AngularGrid, InputError, RssiModel, Spectra, load_spectra, make_model, rssi_room, simulated_room
+from swiftwrf.data.coordinates import GeodeticOrigin
+from swiftwrf.data.labelled import write_mat
+from swiftwrf.data.rasters import Cells, write_geojson, write_geotiff, write_world_file
+from swiftwrf.data.simulated.room import ShoeboxRoom
+from swiftwrf.data.writing import write_deepmimo, write_paths, write_rssi, write_spectra
+from swiftwrf.rssi.maps import RssiMap
+from tasks.command_line import command_line
+from tasks.convert.options import ConvertConfig
+from tasks.convert.run import run as convert
+
+GRID = AngularGrid.hemisphere(8, 32)
+ORIGIN = GeodeticOrigin(48.1, 11.6)
+
+
+def run(*arguments):
+    return command_line("tasks.convert", ConvertConfig, convert, [str(a) for a in arguments])
+
+
+@pytest.fixture(scope="module")
+def room():
+    return simulated_room(n=30, grid=GRID)
+
+
+@pytest.fixture(scope="module")
+def floor():
+    return rssi_room(n=60)
+
+
+@pytest.fixture(scope="module")
+def model(floor):
+    return RssiModel(n_primitives=0, steps=2).fit(floor.columns([0, 4]))
+
+
+@pytest.fixture(scope="module")
+def geodetic(floor, model):
+    """A model of positions that were projected from degrees."""
+    return RssiModel(n_primitives=0, steps=2).fit(replace(floor.columns([0, 4]), origin=ORIGIN))
+
+
+@pytest.fixture(scope="module")
+def field(room):
+    return make_model("idw").fit(room)
+
+
+@pytest.mark.parametrize("container", [np.asarray, pd.DataFrame, lambda x: x.tolist(), lambda x: x[::-1][::-1]])
+def test_positions_may_be_arrays(field, model, room, container):
+    position = room.position[:3]
+    given = container(position.numpy())
+    assert torch.equal(field.predict(given).mean, field.predict(position).mean)
+    assert torch.equal(field.synthesize(given), field.synthesize(position))
+    assert torch.equal(model.predict(given).mean, model.predict(position).mean)
+    assert torch.equal(room.direction_at(given), room.direction_at(position))
+
+
+def test_arrays_in_and_out_as_in_scikit_learn(floor, room):
+    x, y = floor.columns([0]).receivers(["1"]).to_numpy()
+    known = ~np.isnan(y[:, 0])
+    fitted = KNeighborsRegressor(1).fit(x[known], y[known])
+    np.testing.assert_allclose(fitted.predict(x[known]), y[known])
+    x, y = room.to_numpy()
+    again = Spectra(y, x)
+    assert torch.equal(again.spectrum, room.spectrum)
+    assert torch.equal(again.position, room.position)
+    assert snapshots(n=12).to_numpy()[1].shape == (12, 3, 16)
+
+
+def test_predictions_become_tables(field, model, room):
+    position = room.position[:3]
+    table, found = model.predict(position).to_frame(), model.predict(position)
+    assert list(table) == ["x_m", "y_m", "z_m", "receiver", "predicted_dbm", "std_db"]
+    second = table[table["receiver"] == model.receiver_names[1]]
+    np.testing.assert_array_equal(second["predicted_dbm"], found.mean[:, 1].numpy())
+    np.testing.assert_array_equal(second[["x_m", "y_m", "z_m"]], position.numpy())
+    spectra = field.predict(position)
+    peak = GRID.peak_direction(spectra.mean).rad2deg().numpy()
+    np.testing.assert_array_equal(spectra.to_frame()[["azimuth_deg", "elevation_deg"]], peak)
+    with pytest.raises(InputError, match="no positions"):
+        type(spectra)(spectra.mean).to_frame()
+
+
+def test_data_sets_have_coordinates_and_units(field, model, geodetic, room, floor):
+    pytest.importorskip("xarray", reason="needs the extra xarray")
+    measured = room.to_xarray()
+    assert measured.spectrum.dims == ("position", "elevation", "azimuth")
+    near = measured.spectrum.isel(position=4).sel(azimuth=90, elevation=45, method="nearest")
+    assert float(near) == float(room.spectrum[4, 3, 8])
+    assert (measured.x.attrs["units"], measured.azimuth.attrs["units"]) == ("m", "degree")
+    rssi = floor.to_xarray()
+    name = floor.receiver_names[2]
+    np.testing.assert_array_equal(rssi.rssi.sel(receiver=name), floor.rssi_dbm[:, 2].numpy())
+    assert rssi.rssi.attrs["units"] == "dBm"
+    predicted = field.predict(room.position[:2]).to_xarray()
+    np.testing.assert_array_equal(predicted.y, room.position[:2, 1].numpy())
+    assert set(model.predict(room.position[:2]).to_xarray()) == {"rssi", "std"}
+    chart = RssiMap.predict(geodetic, cell=1.0).to_xarray()
+    assert chart.rssi.dims == ("receiver", "y", "x")
+    back = ORIGIN.to_metres(np.stack([chart.latitude, chart.longitude], axis=-1).reshape(-1, 2))
+    np.testing.assert_allclose(back[:, 0], np.broadcast_to(chart.x, chart.latitude.shape).ravel(), atol=1e-6)
+    assert snapshots(n=12).to_xarray().channel.dims == ("position", "snapshot", "element")
+
+
+def test_without_xarray_a_sentence_says_what_to_install(room, monkeypatch):
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(InputError, match=r"pip install 'swiftwrf-tasks\[xarray\]'"):
+        room.to_xarray()
+
+
+def test_matlab_files_hold_spectra_and_predictions(field, room, tmp_path):
+    write_mat(room, tmp_path / "spectra.mat")
+    stored = loadmat(tmp_path / "spectra.mat")
+    np.testing.assert_array_equal(stored["spectrum"], room.spectrum.numpy())
+    np.testing.assert_array_equal(stored["x"][:, 0], room.position[:, 0].numpy())
+    np.testing.assert_allclose(stored["azimuth"][:, 0], 11.25 * np.arange(32))
+    prediction = field.predict(room.position[:2])
+    write_mat(prediction, tmp_path / "prediction.mat")
+    np.testing.assert_array_equal(loadmat(tmp_path / "prediction.mat")["spectrum"], prediction.mean.numpy())
+
+
+def test_a_model_predicts_at_the_positions_of_a_table(field, model, room, tmp_path):
+    pd.DataFrame(room.position[:5].numpy(), columns=["x", "y", "z"]).to_csv(tmp_path / "at.csv", index=False)
+    field.save(tmp_path / "field.safetensors")
+    assert run(tmp_path / "field.safetensors", tmp_path / "a.mat", "--at", tmp_path / "at.csv") == 0
+    stored = loadmat(tmp_path / "a.mat")["spectrum"]
+    np.testing.assert_allclose(stored, field.predict(room.position[:5]).mean.numpy(), atol=1e-6)
+    model.save(tmp_path / "model.safetensors")
+    assert run(tmp_path / "model.safetensors", tmp_path / "a.csv", "--at", tmp_path / "at.csv") == 0
+    table = pd.read_csv(tmp_path / "a.csv")
+    mean = model.predict(room.position[:5]).mean.numpy().ravel()
+    np.testing.assert_allclose(table["predicted_dbm"], mean, atol=0.00501)
+    assert all(len(text.rpartition(".")[2]) <= 2 for text in table["predicted_dbm"].astype(str))
+
+
+def test_measurements_become_tables(room, floor, tmp_path):
+    for data, write in ((room, write_spectra), (floor, write_rssi)):
+        (tmp_path / data.name).mkdir()
+        write(data, tmp_path / data.name)
+        out = tmp_path / f"{data.name}.csv"
+        assert run(tmp_path / data.name, out) == 0
+        table = pd.read_csv(out, index_col="index")
+        assert list(table) == list(data.to_frame())
+        np.testing.assert_allclose(table["x_m"], data.to_frame()["x_m"], atol=0.000501)
+
+
+def geokeys(tags):
+    """The keys of a GeoTIFF by number, doubles looked up."""
+    directory = np.array(tags[34735]).reshape(-1, 4)[1:]
+    return {key: tags[34736][value] if place else value for key, place, _, value in directory.tolist()}
+
+
+def test_a_geotiff_has_values_place_and_projection(geodetic, tmp_path):
+    one = RssiMap.predict(geodetic, cell=1.5).receivers(geodetic.receiver_names[:1])
+    write_geotiff(tmp_path / "a.tif", {"hall & <stairs>": one.mean[0]}, Cells(one.x, one.y, one.cell, ORIGIN))
+    with Image.open(tmp_path / "a.tif") as image:
+        tags = dict(image.tag_v2)
+        np.testing.assert_array_equal(np.asarray(image), one.mean[0, ::-1])
+    assert tags[33550][:2] == (1.5, 1.5)
+    assert tags[33922][3:5] == pytest.approx((one.x[0] - 0.75, one.y[-1] + 0.75))
+    keys = geokeys(tags)
+    assert (keys[3075], keys[3089], keys[3088]) == (12, ORIGIN.latitude, ORIGIN.longitude)
+    (description,) = ElementTree.fromstring(tags[42112])
+    assert unescape(description.text) == "hall & <stairs>"
+
+
+def test_a_geotiff_of_several_receivers_has_a_band_each(model, tmp_path):
+    rasterio = pytest.importorskip("rasterio", reason="reads bands of GeoTIFF")
+    model.save(tmp_path / "model.safetensors")
+    assert run(tmp_path / "model.safetensors", tmp_path / "map.tif", "--cell", 1, "--height", 1.2) == 0
+    expected = RssiMap.predict(model, cell=1.0, height=1.2)
+    with rasterio.open(tmp_path / "map.tif") as found:
+        np.testing.assert_array_equal(found.read(), expected.mean[:, ::-1])
+        assert found.descriptions == model.receiver_names
+        assert found.xy(0, 0) == pytest.approx((expected.x[0], expected.y[-1]))
+
+
+def test_strips_of_several_bands_hold_their_values(model, tmp_path):
+    """Pillow reads the tags of planar files, not their pixels."""
+    chart = RssiMap.predict(model, cell=1.0)
+    bands = dict(zip(chart.receiver_names, chart.mean, strict=True))
+    write_geotiff(tmp_path / "a.tif", bands, Cells(chart.x, chart.y, chart.cell))
+    content = (tmp_path / "a.tif").read_bytes()
+    tags = ImageFileDirectory_v2(content[:8])
+    stream = io.BytesIO(content)
+    stream.seek(tags.next)
+    tags.load(stream)
+    assert (tags[277], tags[284]) == (2, 2)
+    for offset, size, band in zip(tags[273], tags[279], chart.mean, strict=True):
+        values = np.frombuffer(zlib.decompress(content[offset : offset + size]), "<f4").reshape(band.shape)
+        np.testing.assert_array_equal(values, band[::-1])
+
+
+def test_geojson_has_a_square_a_cell_in_degrees(geodetic, tmp_path):
+    geodetic.save(tmp_path / "model.safetensors")
+    assert run(tmp_path / "model.safetensors", tmp_path / "map.geojson", "--cell", 2) == 0
+    found, chart = json.loads((tmp_path / "map.geojson").read_text()), RssiMap.predict(geodetic, cell=2.0)
+    rows, columns = len(chart.y), len(chart.x)
+    assert (found["type"], len(found["features"])) == ("FeatureCollection", rows * columns)
+    cell = found["features"][columns + 3]
+    (ring,) = cell["geometry"]["coordinates"]
+    assert ring[0] == ring[-1]
+    xy = ORIGIN.to_metres(np.array(ring)[:4, ::-1])
+    np.testing.assert_allclose(xy.mean(axis=0), (chart.x[3], chart.y[1]), atol=0.005)
+    east, north = xy[1] - xy[0], xy[2] - xy[1]
+    assert east[0] * north[1] > 0  # counter-clockwise
+    assert cell["properties"][chart.receiver_names[1]] == pytest.approx(chart.mean[1, 1, 3], abs=0.00501)
+
+
+def test_geojson_of_local_metres_is_refused(model, tmp_path, capsys):
+    model.save(tmp_path / "model.safetensors")
+    assert run(tmp_path / "model.safetensors", tmp_path / "map.geojson") == 2
+    assert "needs latitude and longitude" in said(capsys)
+    assert not (tmp_path / "map.geojson").exists()
+
+
+@pytest.mark.parametrize("with_origin", [True, False])
+def test_an_image_has_a_world_file(geodetic, model, with_origin, tmp_path):
+    chosen = geodetic if with_origin else model
+    chosen.save(tmp_path / "model.safetensors")
+    assert run(tmp_path, tmp_path / "map.png", "--cell", 0.5) == 0
+    chart = RssiMap.predict(chosen, cell=0.5)
+    x_column, y_column, x_row, y_row, x, y = map(float, (tmp_path / "map.pgw").read_text().split())
+    with Image.open(tmp_path / "map.png") as image:
+        assert image.size == (len(chart.x), len(chart.y))
+        luminance = np.asarray(image.convert("L"), dtype=float)
+    column, row = len(chart.x) - 1, len(chart.y) - 2
+    place = np.array([[x + column * x_column + row * x_row, y + column * y_column + row * y_row]])
+    if with_origin:
+        place = ORIGIN.to_metres(place[:, ::-1])
+    np.testing.assert_allclose(place[0], (chart.x[-1], chart.y[1]), atol=0.01)
+    strongest = chart.mean.max(axis=0)[::-1]
+    assert np.corrcoef(luminance.ravel(), strongest.ravel())[0, 1] > 0.95
+
+
+def test_a_world_file_of_one_cell_has_its_size(tmp_path):
+    write_world_file(tmp_path / "a.pgw", Cells(np.array([3.0]), np.array([4.0]), 2.0))
+    assert list(map(float, (tmp_path / "a.pgw").read_text().split())) == [2, 0, 0, -2, 3, 4]
+
+
+def test_cells_without_a_value_are_null_in_geojson(tmp_path):
+    cells = Cells(np.array([0.0, 1.0]), np.array([0.0]), 1.0, ORIGIN)
+    write_geojson(tmp_path / "a.geojson", {"hall": np.array([[np.nan, -50.126]])}, cells)
+    values = [f["properties"]["hall"] for f in json.loads((tmp_path / "a.geojson").read_text())["features"]]
+    assert values == [None, -50.13]
+
+
+@pytest.fixture(scope="module")
+def paths():
+    generator = torch.Generator().manual_seed(0)
+    receiver = torch.tensor([0.5, 0.5, 0.6]) + torch.tensor([5.0, 4.0, 1.0]) * torch.rand(30, 3, generator=generator)
+    return ShoeboxRoom(frequency_hz=FREQUENCY).paths(torch.tensor([[3.0, 2.5, 2.7]]), receiver)
+
+
+def test_deepmimo_folders_come_back(paths, tmp_path):
+    write_deepmimo(paths, tmp_path)
+    found, expected = load_spectra(tmp_path, grid=GRID), paths.spectra("made", grid=GRID)
+    torch.testing.assert_close(found.spectrum, expected.spectrum, atol=1e-6, rtol=0)
+    torch.testing.assert_close(found.label, expected.label, atol=1e-9, rtol=0)
+    torch.testing.assert_close(found.position, expected.position)
+    assert torch.equal(found.line_of_sight, expected.line_of_sight)
+    assert 0 < int(found.line_of_sight.sum()) < len(found)
+    assert (found.moving, found.notes) == ("receiver", ())
+
+
+def test_deepmimo_folders_are_made_of_ray_paths(paths, tmp_path, capsys):
+    corner = paths.receiver[paths.owner] + paths.direction
+    made = replace(paths, corner=corner[:, None])
+    for name, some in (("known", made), ("unknown", replace(made, length=None))):
+        (tmp_path / name).mkdir()
+        write_paths(some, tmp_path / name)
+    assert run(tmp_path / "known", tmp_path / "town", "--deepmimo") == 0
+    torch.testing.assert_close(
+        load_spectra(tmp_path / "town", grid=GRID).spectrum,
+        load_spectra(tmp_path / "known", grid=GRID).spectrum,
+        atol=1e-6,
+        rtol=0,
+    )
+    capsys.readouterr()
+    assert run(tmp_path / "unknown", tmp_path / "other", "--deepmimo") == 2
+    assert "lengths of these paths are unknown" in said(capsys)
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (("out.tif",), "holds a map of RSSI"),
+        (("out.csv", "--cell", "1"), "are for models"),
+        (("out", "--at", "x.csv"), "to a .csv or .mat file"),
+        (("out.mat", "--deepmimo"), "give a directory"),
+        (("out.mat", "--calibrate"), "writes a directory"),
+        (("out.png", "--cell", "0"), "above 0 m"),
+        (("nowhere/out.csv",), "no directory"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(room, arguments, reason, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "room").mkdir()
+    write_spectra(room, tmp_path / "room")
+    assert run("room", *arguments) == 2
+    assert reason in said(capsys)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (("out",), "is a model"),
+        (("out.csv",), "with --at"),
+        (("out.mat", "--at", "at.csv", "--grid", "4", "8"), "is for measurements"),
+    ],
+)
+def test_models_of_spectra_need_positions(field, arguments, reason, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    field.save(tmp_path / "field.safetensors")
+    (tmp_path / "at.csv").write_text("x,y,z\n1,2,1\n")
+    assert run("field.safetensors", *arguments) == 2
+    assert reason in said(capsys)
+
+
+def test_an_unknown_receiver_of_a_map_is_refused(model, tmp_path, capsys):
+    model.save(tmp_path / "model.safetensors")
+    assert run(tmp_path, tmp_path / "a.tif", "--rx", "nobody") == 2
+    assert "no receiver 'nobody'" in said(capsys)

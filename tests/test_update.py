@@ -1,0 +1,204 @@
+"""Updates equal a fit to all data with the same kernel; what is forgotten, aged, saved and refused."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+import small
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from swiftwrf import FIELD_MODELS, AngularGrid, InputError, ModelConfig, RssiConfig, RssiModel, load, make_model
+from swiftwrf.data.simulated import rssi_room, simulated_room
+from swiftwrf.gp import GaussianProcess, Kernel
+
+SIGNAL = 1e-5  # of the signal: magnitudes up to 1, RSSI over 60 dB
+OPTIONS = {"swiftwrf": {"model": ModelConfig(n_primitives=24)}}
+PROCESSES = ("gp", "coarray", "swiftwrf", "hybrid")
+N, M = 30, 12  # spectra of the fit and of the updates
+GRID = AngularGrid.hemisphere(15, 60)
+
+
+@cache
+def data(n=N + M):
+    return simulated_room(n=n, grid=GRID)
+
+
+@cache
+def fitted(name):
+    with small.glances():
+        return make_model(name, **OPTIONS.get(name, {})).fit(data().subset(torch.arange(N)))
+
+
+@cache
+def floor():
+    return rssi_room(n=90)
+
+
+@cache
+def fitted_rssi():
+    return RssiModel().fit(floor().subset(torch.arange(60)))
+
+
+def parts(rows, sizes):
+    """Split rows into batches of the sizes, the last one with the remaining rows."""
+    start = 0
+    for size in sizes:
+        yield rows[start : start + size]
+        start += size
+    yield rows[start:]
+
+
+orders = st.permutations(range(M)), st.lists(st.integers(1, 5), max_size=5)
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+@settings(max_examples=8, deadline=None)
+@given(order=orders[0], sizes=orders[1])
+def test_an_update_in_any_order_is_a_regression_on_all_spectra(name, order, sizes):
+    model, rows = fitted(name), N + torch.tensor(order)
+    updated = model
+    for some in parts(rows, sizes):
+        updated = updated.update(data().subset(some))
+    process = updated.process
+    refitted = GaussianProcess.regress(process.kernel, process.known, process.value, exact=True)
+    torch.testing.assert_close(process.coefficient, refitted.coefficient.to(process.coefficient), rtol=1e-4, atol=1e-4)
+    at = data().position[:5] + 0.03
+    once = model.update(data().subset(torch.arange(N, N + M)))
+    torch.testing.assert_close(updated.synthesize(at), once.synthesize(at), rtol=0, atol=SIGNAL)
+    torch.testing.assert_close(process.variance(process.known), refitted.variance(process.known), rtol=1e-6, atol=1e-9)
+
+
+def test_an_update_of_pixels_is_a_fit_with_the_same_kernel():
+    model = fitted("gp").update(data().subset(torch.arange(N, N + M)))
+    change = data().spectrum - data().spectrum.mean(dim=0)
+    kernel, at = model.kernel, data().position[:4] + 0.05
+    weight = torch.linalg.solve(kernel.covariance(data().position), kernel(data().position, at))
+    expected = data().spectrum.mean(dim=0) + torch.einsum("nm,nhw->mhw", weight.float(), change)
+    torch.testing.assert_close(model.synthesize(at), expected.clamp(0, 1), rtol=0, atol=SIGNAL)
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+def test_an_update_predicts_what_it_learnt_better_and_leaves_the_model(name):
+    model, new = fitted(name), data().subset(torch.arange(N, N + M))
+    before = model.synthesize(new.position)
+    after = model.update(new).synthesize(new.position)
+    assert (after - new.spectrum).square().mean() < 0.5 * (before - new.spectrum).square().mean()
+    assert torch.equal(model.synthesize(new.position), before)
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+def test_forgetting_what_was_learnt_restores_the_model(name):
+    model, at = fitted(name), data().position[:5] + 0.03
+    forgot = model.update(data().subset(torch.arange(N, N + M))).forget(torch.arange(N, N + M))
+    if name == "gp":  # the mean is that of the remaining spectra
+        assert len(forgot.store) == N
+    torch.testing.assert_close(forgot.synthesize(at), model.synthesize(at), rtol=0, atol=SIGNAL)
+    with pytest.raises(InputError, match="training rows 0 to 29"):
+        model.forget(torch.tensor([N]))
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+def test_a_saved_model_is_updated_as_the_one_in_memory(name, tmp_path):
+    first, second = (data().subset(rows) for rows in (torch.arange(N, N + 5), torch.arange(N + 5, N + M)))
+    model = fitted(name).aged(0.5).update(first)
+    model.save(tmp_path / "model.safetensors")
+    at = data().position[:5] + 0.03
+    expected = model.update(second).synthesize(at)
+    found = load(tmp_path / "model.safetensors").update(second).synthesize(at)
+    torch.testing.assert_close(found, expected, rtol=0, atol=SIGNAL)
+
+
+def test_ageing_weighs_earlier_values_less(generator):
+    kernel, position = Kernel(noise=1e-2), torch.rand(20, 3, generator=generator, dtype=torch.float64)
+    value = torch.randn(20, 2, generator=generator, dtype=torch.float64)
+    aged = GaussianProcess.regress(kernel, position, value).aged(0.5)
+    new, more = torch.rand(3, 3, generator=generator, dtype=torch.float64), torch.ones(3, 2, dtype=torch.float64)
+    found = aged.updated(new, more)
+    time = torch.cat([torch.full((20,), 0.5), torch.ones(3)]).double()
+    ratio = torch.where(time[:, None] == time, 1.0, 0.5)
+    every = torch.cat([position, new])
+    covariance = kernel(every, every) * ratio + kernel.noise * torch.eye(23)
+    at = torch.rand(4, 3, generator=generator, dtype=torch.float64)
+    cross = kernel(at, every) * time
+    expected = cross @ torch.linalg.solve(covariance, torch.cat([value, more]))
+    torch.testing.assert_close(found.mean(at), expected)
+
+
+def test_an_update_beyond_the_exact_size_is_local(monkeypatch, generator):
+    monkeypatch.setattr("swiftwrf.gp.process.MAX_EXACT", 25)
+    position = torch.rand(30, 3, generator=generator, dtype=torch.float64)
+    value = torch.randn(30, 2, generator=generator, dtype=torch.float64)
+    process = GaussianProcess.regress(Kernel(), position[:24], value[:24]).updated(position[24:], value[24:])
+    assert not process.exact
+    torch.testing.assert_close(process.value, value)
+
+
+def test_a_room_is_refined_by_its_covariance():
+    room = fitted("geometry")
+    new = simulated_room(n=20, seed=3, grid=GRID)
+    updated = room.update(new)
+    assert len(updated.planes) == len(room.planes) > 0
+    before, after = (model.estimate.covariance.diagonal() for model in (room, updated))
+    assert (after <= before).all()
+    with pytest.raises(InputError, match="fewer than 10"):
+        room.update(new.subset(torch.arange(3)))
+
+
+@pytest.mark.parametrize("name", [name for name in ("nearest", "idw") if not FIELD_MODELS[name].updates])
+def test_other_models_must_be_fitted_again(name):
+    with pytest.raises(InputError, match="fit it again"):
+        fitted(name).update(data())
+
+
+def test_wrong_spectra_are_refused():
+    with pytest.raises(InputError, match="another grid"):
+        fitted("coarray").update(simulated_room(n=2, grid=AngularGrid.hemisphere(7, 30)))
+    with pytest.raises(InputError, match="correlation"):
+        fitted("coarray").aged(0.0)
+
+
+@settings(max_examples=6, deadline=None)
+@given(order=st.permutations(range(30)), sizes=orders[1])
+def test_rssi_in_any_order_solves_the_least_squares_of_all_rows(order, sizes):
+    model = fitted_rssi()
+    updated = model
+    for some in parts(60 + torch.tensor(order), sizes):
+        updated = updated.update(floor().subset(some))
+    once = model.update(floor().subset(torch.arange(60, 90)))
+    at = floor().transmitter_position[:10] + 0.5
+    tolerance = SIGNAL * 60
+    torch.testing.assert_close(updated.predict(at).mean, once.predict(at).mean, rtol=0, atol=tolerance)
+    posterior, before = updated._posterior.folded(), model._posterior.state
+    state = posterior.state
+    for r in range(12):  # dense covariance of all rows times the dual coefficients is the data
+        seen = state.variance[:, r] > 0
+        anchor, slope, feature = posterior.anchor[seen], state.tangent[seen, r], posterior._feature[r][seen]
+        field = state.field_variance[r] * slope[:, None] * posterior.kernel(anchor, anchor) * slope
+        whole = field + feature @ feature.T + torch.diag(state.variance[seen, r])
+        old = int((before.variance[:, r] > 0).sum())
+        target = whole[:old, :old] @ before.dual[before.variance[:, r] > 0, r]
+        torch.testing.assert_close((whole @ state.dual[seen, r])[:old], target, rtol=0, atol=1e-2)
+    assert set(updated.anchor.tolist()[0]) == set(once.anchor.tolist()[0])
+
+
+def test_rssi_is_updated_after_loading_and_beyond_its_rows_in_memory(tmp_path, monkeypatch):
+    model = fitted_rssi().update(floor().subset(torch.arange(60, 70)))
+    model.save(tmp_path / "model.safetensors")
+    rest, at = floor().subset(torch.arange(70, 90)), floor().transmitter_position[:10] + 0.5
+    expected = model.update(rest).predict(at).mean
+    loaded = load(tmp_path / "model.safetensors").update(rest)  # the robust weights of the first rows are fixed
+    torch.testing.assert_close(loaded.predict(at).mean, expected, atol=0.2, rtol=0)
+    monkeypatch.setattr("swiftwrf.rssi.posterior.MAX_NEW_ROWS", 12)
+    torch.testing.assert_close(model.update(rest).predict(at).mean, expected, atol=0.2, rtol=0)
+
+
+def test_rssi_refuses_other_receivers_and_the_papers_head():
+    with pytest.raises(InputError, match="receivers"):
+        fitted_rssi().update(floor().columns([0, 1]))
+    few = floor().columns([0])
+    paper = RssiModel(RssiConfig.paper(steps=2)).fit(few)
+    with pytest.raises(InputError, match="fit it again"):
+        paper.update(few)
