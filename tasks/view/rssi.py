@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import textwrap
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -19,6 +20,7 @@ from swiftwrf import Prediction, Rssi, RssiModel
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.rssi import LEVEL
 from tasks.page import figures, maps
+from tasks.page.floor_plan import FloorPlan
 from tasks.records import as_table, rounded
 from tasks.rssi.page.maps import MAX_WIDTH_DB
 from tasks.view.drawing import PlanProjection
@@ -41,13 +43,13 @@ class MeasuredFloor:
         position: Positions of the transmitter [m], (n, 3).
         rssi_dbm: Measured RSSI [dBm], (n, R), nan where a receiver detected nothing.
         receiver: Positions of the receivers [m], (R, 3), nan where they are unknown.
-        plan: Image of the floor (height, width, 3) and its corners. None if there is none.
+        plan: Image of the floor. None if there is none.
     """
 
     position: Values
     rssi_dbm: Values
     receiver: Values
-    plan: tuple[NDArray[np.uint8], Corners] | None = None
+    plan: FloorPlan | None = None
 
     @classmethod
     def from_run(cls, maps: Mapping[str, NDArray[Any]]) -> MeasuredFloor:
@@ -55,7 +57,7 @@ class MeasuredFloor:
         plan = None
         if "plan" in maps:
             x0, x1, y0, y1 = maps["plan_extent"].tolist()
-            plan = maps["plan"], (x0, x1, y0, y1)
+            plan = FloorPlan(maps["plan"], (x0, x1, y0, y1))
         return cls(maps["measured_position"], maps["measured"], maps["receiver"], plan)
 
     @classmethod
@@ -125,6 +127,7 @@ class RssiView:
         floor: Measurements on the floor.
         locating: Locator and the rows that it locates. None if there is no locator.
         notes: Remarks on the data, a sentence each.
+        folder: Directory of the run, where a floor plan is saved. None for a saved model.
     """
 
     title: str
@@ -132,6 +135,7 @@ class RssiView:
     floor: MeasuredFloor
     locating: RssiLocating | None = None
     notes: list[str] = field(default_factory=list)
+    folder: Path | None = None
     _last: tuple[float, Prediction] | None = field(default=None, init=False, repr=False)
 
     @property
@@ -152,9 +156,21 @@ class RssiView:
         low, middle, high = np.quantile(self.floor.position[:, 2], (0, 0.5, 1)).tolist()
         return low, middle, high
 
+    def __post_init__(self) -> None:
+        if self.folder is not None and (stored := FloorPlan.load(self.folder)) is not None:
+            self.floor = replace(self.floor, plan=stored)
+
+    def place(self, plan: FloorPlan) -> None:
+        """Show a floor plan below the maps, and save it in the directory of the run."""
+        if self.folder is not None:
+            plan.save(self.folder)
+        self.floor, self._last = replace(self.floor, plan=plan), None
+        for name in ("cells", "inside"):  # they cover the plan, too
+            self.__dict__.pop(name, None)
+
     def plan(self, max_px: tuple[int, int] = (CELLS, CELLS)) -> PlanProjection:
         """Return the plan that contains measurements, receivers and floor plan, at most of this size in pixels."""
-        corners = np.array(self.floor.plan[1]).reshape(2, 2).T if self.floor.plan else self.floor.position
+        corners = np.array(self.floor.plan.corners).reshape(2, 2).T if self.floor.plan else self.floor.position
         return PlanProjection.around(self.floor.position, self.floor.receiver, corners, max_px=max_px)
 
     @cached_property
@@ -324,7 +340,7 @@ class RssiView:
         width, height = self.plan().size
         figure, (ax,) = figures.new_figure(1, 1, 8, 1 + 7 * height / width)
         if self.floor.plan:
-            ax.imshow(self.floor.plan[0], extent=self.floor.plan[1], zorder=0)
+            ax.imshow(self.floor.plan.pixels, extent=self.floor.plan.corners, zorder=0)
         drawn = ax.imshow(
             coloured.values,
             origin="lower",

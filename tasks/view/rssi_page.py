@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
@@ -9,6 +11,8 @@ from nicegui import events, run, ui
 from numpy.typing import NDArray
 from PIL import Image
 
+from swiftwrf import InputError
+from tasks.page.floor_plan import FloorPlan, read_pixels
 from tasks.page.raster import colour_image
 from tasks.view.drawing import text
 from tasks.view.page import NewestOnly, colour_bar, header, located_marks, plan_picture, slider
@@ -24,6 +28,7 @@ from tasks.view.rssi import (
 
 N_DOT_COLOURS = 33
 MAX_MAP_PX = (880, 700)
+MAX_UPLOAD_BYTES = 2**25
 KIND_LABELS = {"interval": "uncertainty"}  # of the kinds that the page calls by another word
 HINT = "Hover over the map."
 ROW = "#999999"  # of the measured rows under a posterior
@@ -34,6 +39,7 @@ class RssiPage:
 
     def __init__(self, view: RssiView) -> None:
         self._view, self._plan = view, view.plan(MAX_MAP_PX)
+        self._placing: dict[str, ui.number] = {}
         self._maps, self._points = NewestOnly(self._show_map), NewestOnly(self._show_point)
         with header(view.title, view.notes):
             kinds = {kind: KIND_LABELS.get(kind, kind) for kind in view.kinds}
@@ -76,6 +82,29 @@ class RssiPage:
         with ui.row():
             ui.button("PNG", icon="download", on_click=self._save_picture).props("outline no-caps")
             ui.button("CSV", icon="download", on_click=self._save_table).props("outline no-caps")
+        self._build_floor_plan()
+
+    def _build_floor_plan(self) -> None:
+        with ui.expansion("Floor plan").classes("w-full").props('id="floor-plan" dense'):
+            ui.label("Give scale and origin, then drop an image (PNG, JPEG). It is saved with the run.").classes(
+                "quiet"
+            )
+            with ui.row().classes("w-full gap-2"):
+                for name, value in (("scale", 0.05), ("right", 0.0), ("down", 0.0)):
+                    label = {"scale": "metres a pixel", "right": "origin, pixels right", "down": "origin, pixels down"}
+                    self._placing[name] = ui.number(label[name], value=value).props("outlined dense")
+            upload = ui.upload(on_upload=self._place, auto_upload=True, max_file_size=MAX_UPLOAD_BYTES, max_files=1)
+            upload.props('accept=".png,.jpg,.jpeg" flat bordered').classes("w-full")
+
+    async def _place(self, event: events.UploadEventArguments) -> None:
+        scale, right, down = (float("nan") if box.value is None else box.value for box in self._placing.values())
+        try:
+            pixels = read_pixels(io.BytesIO(await event.file.read()), event.file.name)
+            await run.io_bound(self._view.place, FloorPlan.scaled(pixels, scale, (right, down)))
+        except InputError as error:
+            ui.notify(str(error), type="negative")
+        else:
+            ui.navigate.reload()
 
     @property
     def _selection(self) -> MapSelection:
@@ -106,7 +135,7 @@ class RssiPage:
 
     def _map_svg(self, selection: MapSelection, coloured: ColouredMap) -> str:
         plan, floor = self._plan, self._view.floor
-        parts = [plan.picture(Image.fromarray(floor.plan[0]), floor.plan[1])] if floor.plan else []
+        parts = [plan.picture(Image.fromarray(floor.plan.pixels), floor.plan.corners)] if floor.plan else []
         image = colour_image(coloured.values[::-1], coloured.colours, coloured.low, coloured.high)
         parts.append(plan.picture(image, coloured.corners or self._view.corners, 0.7 if floor.plan else 1.0))
         if selection.kind not in LOCATING:
