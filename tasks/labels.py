@@ -8,8 +8,8 @@ from typing import Any
 
 from swiftwrf.runtime.registry import Registry
 
-# colour-blind safe (P. Tol, "bright"), for methods of other packages
-OTHER_COLOURS = ("#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")
+# Each colour has a contrast of at least 3 to 1 with the light page and with the dark one. Lines also differ by dashes.
+OTHER_COLOURS = ("#cf4a4a", "#2a9165", "#8f7d12", "#1b8fa6", "#c04f9d", "#7f8794")  # of methods of other packages
 
 
 @dataclass(frozen=True)
@@ -26,18 +26,18 @@ class Label:
 
 
 FIELD_MODELS = {
-    "swiftwrf": Label("2D Gaussians that deform with the position", "#4477aa"),
-    "gp": Label("a Gaussian process on the pixels", "#ee8866"),
-    "coarray": Label("a Gaussian process in the space that the array's spectra can lie in", "#aa3377"),
-    "geometry": Label("image sources of the room's walls, found from the spectra", "#3366ff"),
-    "hybrid": Label("geometry with position-dependent path gains, and a Gaussian process on the residual", "#332288"),
-    "raytrace": Label("rays traced by Sionna RT, in --scene or in the room found (extra: raytrace)", "#994455"),
-    "idw": Label("inverse-distance mean of the nearest spectra", "#66ccee"),
-    "nearest": Label("the spectrum of the nearest measured position", "#ccbb44"),
-    "nerf2": Label("a neural field summed along rays (NeRF2)", "#44aa99"),
-    "wrfgs": Label("3D Gaussians drawn on the array's sphere (WRF-GS)", "#882255"),
-    "vae": Label("a convolutional decoder of position and latent variables (VAE)", "#999933"),
-    "dcgan": Label("a convolutional generator trained against a discriminator (DCGAN)", "#661100"),
+    "swiftwrf": Label("2D Gaussians that deform with the position", "#0072b2"),
+    "gp": Label("a Gaussian process on the pixels", "#d1620f"),
+    "coarray": Label("a Gaussian process in the space that the array's spectra can lie in", "#c04f9d"),
+    "geometry": Label("image sources of the room's walls, found from the spectra", "#8b6fd0"),
+    "hybrid": Label("geometry with position-dependent path gains, and a Gaussian process on the residual", "#3a7fd5"),
+    "raytrace": Label("rays traced by Sionna RT, in --scene or in the room found (extra: raytrace)", "#a0623a"),
+    "idw": Label("inverse-distance mean of the nearest spectra", "#1b8fa6"),
+    "nearest": Label("the spectrum of the nearest measured position", "#8f7d12"),
+    "nerf2": Label("a neural field summed along rays (NeRF2)", "#2a9165"),
+    "wrfgs": Label("3D Gaussians drawn on the array's sphere (WRF-GS)", "#cf4a4a"),
+    "vae": Label("a convolutional decoder of position and latent variables (VAE)", "#4f8f2f"),
+    "dcgan": Label("a convolutional generator trained against a discriminator (DCGAN)", "#b8560f"),
 }
 
 BEAMFORMERS = {
@@ -49,51 +49,51 @@ BEAMFORMERS = {
 ESTIMATORS = {
     "aann": Label("the paper's angular neural network: ResNet-50 and a multilayer perceptron"),
     "aann_kernel": Label("kernel regression on the features of a briefly trained ResNet-50 and on coarse pixels"),
-    "kernel_regression": Label("kernel regression from the spectrum to the direction", "#44aa99"),
+    "kernel_regression": Label("kernel regression from the spectrum to the direction", "#2a9165"),
     "matched_field": Label(
         "the position whose spectrum, predicted by the room, matches, and its direction (matched-field processing)",
-        "#ddaa33",
+        "#d1620f",
     ),
-    "nearest_spectrum": Label("the label of the most similar training spectrum", "#666666"),
-    "constant": Label("the mean direction of the training labels", "#999999"),
-    "peak": Label("the strongest direction", "#bbbbbb"),
-    "music": Label("MUSIC on the array snapshots, for one source", "#aa4499"),
-    "esprit": Label("ESPRIT on the array snapshots, for one source", "#88ccee"),
-    "maximum_likelihood": Label("maximum likelihood on the array snapshots, for one source", "#117733"),
+    "nearest_spectrum": Label("the label of the most similar training spectrum", "#8f7d12"),
+    "constant": Label("the mean direction of the training labels", "#7f8794"),
+    "peak": Label("the strongest direction", "#a0623a"),
+    "music": Label("MUSIC on the array snapshots, for one source", "#b5539f"),
+    "esprit": Label("ESPRIT on the array snapshots, for one source", "#3a8fb7"),
+    "maximum_likelihood": Label("maximum likelihood on the array snapshots, for one source", "#5f8f3a"),
 }
 
 PREDICTORS = {
     "swiftwrf": Label(
         "50 primitives a receiver on a 16 x 16 grid, averaged, on a log-distance path-loss model; mixed with simpler "
         "predictors by cross-validation",
-        "#4477aa",
+        "#3a7fd5",
     ),
     "gp": Label(
         "a Gaussian process on the residual of the path-loss model (or of the mean)",
-        "#228833",
+        "#2a9165",
     ),
-    "mri_pooled": Label("one log-distance path-loss model for all receivers of the data", "#ee6677"),
-    "mri_receiver": Label("a log-distance path-loss model for each receiver", "#ee8866"),
-    "mri_residual": Label("mri_receiver, its residual interpolated from the nearest measurements", "#ccbb44"),
-    "knn": Label("inverse-distance mean of the nearest measurements", "#66ccee"),
-    "mean": Label("the mean of the receiver's training values", "#bbbbbb"),
+    "mri_pooled": Label("one log-distance path-loss model for all receivers of the data", "#cf4a4a"),
+    "mri_receiver": Label("a log-distance path-loss model for each receiver", "#d1620f"),
+    "mri_residual": Label("mri_receiver, its residual interpolated from the nearest measurements", "#8f7d12"),
+    "knn": Label("inverse-distance mean of the nearest measurements", "#1b8fa6"),
+    "mean": Label("the mean of the receiver's training values", "#7f8794"),
     "pairs": Label(
-        "a log-distance path-loss model and a Gaussian process over the positions of both ends of the link", "#332288"
+        "a log-distance path-loss model and a Gaussian process over the positions of both ends of the link", "#8b6fd0"
     ),
-    "knn_pairs": Label("inverse-distance mean of the nearest pairs of positions", "#999933"),
-    "nerf2": Label("a neural field for all receivers, its rays averaged (NeRF2)", "#44aa99"),
-    "blend": Label("a weighted mean of other predictors, weights by cross-validation", "#aa3377"),
+    "knn_pairs": Label("inverse-distance mean of the nearest pairs of positions", "#a0623a"),
+    "nerf2": Label("a neural field for all receivers, its rays averaged (NeRF2)", "#4f8f2f"),
+    "blend": Label("a weighted mean of other predictors, weights by cross-validation", "#c04f9d"),
 }
 
 LOCALIZERS = {
     "posterior": Label(
         "the median of the posterior over positions: radio maps with their uncertainty, detections, similar training rows",
-        "#4477aa",
+        "#3a7fd5",
     ),
-    "knn": Label("the inverse-distance mean position of the k training rows with the most similar RSSI", "#66ccee"),
-    "knn_difference": Label("knn on differences to the row's strongest value, without the device's offset", "#ee8866"),
-    "gp": Label("Gaussian-process regression from RSSI to coordinates", "#228833"),
-    "mean": Label("the mean training position", "#bbbbbb"),
+    "knn": Label("the inverse-distance mean position of the k training rows with the most similar RSSI", "#1b8fa6"),
+    "knn_difference": Label("knn on differences to the row's strongest value, without the device's offset", "#d1620f"),
+    "gp": Label("Gaussian-process regression from RSSI to coordinates", "#2a9165"),
+    "mean": Label("the mean training position", "#7f8794"),
 }
 
 

@@ -15,6 +15,8 @@ from tasks.metrics import ChangeMetrics, ErrorSummary
 
 LEAST_ROWS = 10  # of a test, for an interval of differences
 N_BOOTSTRAP = 2000
+MIN_RELEVANT = 0.02  # difference of mean errors, relative to them, below which methods are equal in practice
+MAX_SPREAD = 0.5  # of labels about their mean direction, relative to the error of the peaks, for a warning
 SMALLEST_ERROR = 1e-9  # degrees: a change is relative to at least this median
 SHORTEST = 1e-5  # seconds: what took less is drawn here, for logarithmic axes have no zero
 
@@ -83,6 +85,8 @@ def verdict_of_difference(
     if math.isnan(low):
         return f"{n_test} test rows are too few to compare {name} with {other}."
     interval = f"{mean:+.2f} {unit} [{low:+.2f}, {high:+.2f}]"
+    if max(abs(low), abs(high)) < MIN_RELEVANT * float(errors[other].mean()):
+        return f"On the same {rows} {name} and {other} are equal in practice: mean errors differ by {interval}."
     if high < 0:
         return f"On the same {rows} {name}'s mean error is lower than that of {other}: {interval}."
     if low > 0:
@@ -90,6 +94,25 @@ def verdict_of_difference(
             f"On the same {rows} {other} has the lower mean error: {name}'s differs by {interval}. Take {other} here."
         )
     return f"On the same {rows} the errors of {name} and {other} do not differ significantly: {interval}."
+
+
+def fingerprinting(constant_deg: float, peak_deg: float) -> str:
+    """Return a warning if spectra are labels of positions rather than of directions, else nothing.
+
+    Args:
+        constant_deg: Median error of the mean direction of the labels [deg], their spread.
+        peak_deg: Median error of the strongest direction [deg].
+
+    Example:
+        >>> fingerprinting(26.0, 2.4)
+        ''
+    """
+    if not constant_deg < MAX_SPREAD * peak_deg:
+        return ""
+    return (
+        f"This is fingerprinting along a path rather than estimation of angles: directions lie within {constant_deg:.1f} "
+        f"degrees of their mean (median), and peaks are {peak_deg:.0f} degrees off."
+    )
 
 
 def paired_change(before: ArrayLike, after: ArrayLike) -> ChangeMetrics:

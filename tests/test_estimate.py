@@ -108,7 +108,7 @@ def test_a_run_keeps_the_estimator_that_saw_most(finished):
     assert files == [
         "kernel_regression-mix0.5.safetensors"
     ]  # the network of these runs is a stand-in that cannot be saved
-    assert "tasks.estimate kernel_regression-mix0.5.safetensors" in (finished / "report.html").read_text()
+    assert "kernel_regression-mix0.5.safetensors" in (finished / "report.html").read_text()
     estimator = load(finished / "kernel_regression-mix0.5.safetensors")
     errors = pd.read_csv(finished / "errors.csv")
     own = errors[errors.method == "kernel_regression_turbo_nearest_extra"]

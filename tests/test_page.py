@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 from pandas import DataFrame
 
+from tasks import labels
+from tasks.aoa.page.records import CHOSEN, LOWER_REFERENCE, UPPER_REFERENCE
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, write_page
 from tasks.page.palette import Palette
@@ -18,12 +22,12 @@ def plot(name: str = "line", width: float = 6.0) -> Plot:
     figure, axes = figures.new_figure(1, 1, width, 2)
     axes[0].plot([0, 1], [1, 2], color=figures.RULE)
     axes[0].set(xlabel="x <m>")
-    return Plot(name, figure, "A line.", DataFrame({"x": [0, 1], "method": ["=a", "b"]}))
+    return Plot(name, [figure], "A line.", DataFrame({"x": [0, 1], "method": ["=a", "b"]}))
 
 
 def page(*sections: Section, first: Plot | None = None) -> Page:
     numbers = [Number("1 dB", "of <something>")]
-    return Page("A & B", Summary(numbers, first or plot("first"), ["What."], ["Next."]), list(sections))
+    return Page("A & B", Summary(numbers, [first or plot("first")], ["What."], ["Next."]), list(sections))
 
 
 def test_every_figure_lies_in_the_page_and_as_a_file_with_its_numbers(tmp_path):
@@ -70,12 +74,38 @@ def test_what_is_wide_takes_the_whole_page():
     assert Table(["a", "b"], [["x", "y"]], long=True).wide
 
 
-def test_no_curve_hides_another():
-    _, axes = figures.new_figure(1, 1, 3, 2)
+def test_curves_of_a_panel_differ_by_dashes_and_have_their_names_at_their_ends():
+    figure, axes = figures.panel(4, 3)
     values = np.linspace(0, 1, 50)
-    figures.cdf(axes[0], Palette(), {"a": values, "b": 0.5 * values, "c": values + 1e-4}, "error")
-    wide, apart, over = axes[0].get_lines()[:3]
-    assert wide.get_linewidth() > over.get_linewidth() == apart.get_linewidth()
+    figures.cdf(axes, Palette(), {name: factor * values for factor, name in enumerate("abcd", 1)}, "error", limit=4)
+    lines = axes.get_lines()[:4]
+    assert len({str(line._dash_pattern) + str(line.get_linestyle()) for line in lines}) == 4
+    figure.draw_without_rendering()
+    boxes = {text.get_text(): Text.get_window_extent(text) for text in axes.texts}  # without their arrows
+    assert set(boxes) == set("abcd")
+    assert not any(boxes[a].overlaps(boxes[b]) for a in boxes for b in boxes if a < b)
+    with pytest.raises(ValueError, match="at most 4 curves"):
+        figures.cdf(axes, Palette(), dict.fromkeys("abcde", values), "error")
+
+
+def luminance(colour):
+    """Relative luminance of a colour `#rrggbb` (WCAG 2)."""
+    channels = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    return float(linear @ (0.2126, 0.7152, 0.0722))
+
+
+def test_every_colour_of_a_curve_stands_out_in_light_and_dark():
+    template = (Path(figures.__file__).parent / "template.html").read_text()
+    papers = ["#ffffff" if paper == "#fff" else paper for paper in re.findall(r"--paper: (#\w+)", template)]
+    assert len(set(papers)) == 2
+    tables = (labels.FIELD_MODELS, labels.ESTIMATORS, labels.PREDICTORS, labels.LOCALIZERS)
+    colours = {label.colour for table in tables for label in table.values() if label.colour}
+    colours |= {*labels.OTHER_COLOURS, figures.RULE, LOWER_REFERENCE, UPPER_REFERENCE, CHOSEN}
+    for colour in colours:
+        for paper in papers:
+            high, low = sorted((luminance(colour), luminance(paper)), reverse=True)
+            assert (high + 0.05) / (low + 0.05) >= 3, (colour, paper)
 
 
 def test_two_figures_of_one_name_are_refused(tmp_path):

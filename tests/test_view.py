@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import copy
 import io
+import itertools
 import json
 import shutil
 import socket
@@ -27,12 +28,13 @@ from swiftwrf.locate import MatchedField, RssiLocator
 from swiftwrf.models.geometry import Plane, fit_hybrid
 from tasks.command_line import command_line
 from tasks.locate.options import LocateConfig
+from tasks.page.floor_plan import FloorPlan
 from tasks.page.raster import colour_image
 from tasks.view import spectra
 from tasks.view.drawing import HemisphereProjection, PlanProjection, data_url, text
 from tasks.view.locating import N_POSITIONS, RssiLocating
 from tasks.view.options import ViewConfig
-from tasks.view.rssi import MapSelection, probability_above
+from tasks.view.rssi import MapSelection, at_least, probability_above
 from tasks.view.run import run
 from tasks.view.sources import open_source
 from tasks.view.spectra import angle_between
@@ -206,7 +208,7 @@ def test_room_of_another_model_on_the_same_spectra(aoa_run, tmp_path):
 def test_maps_are_those_of_the_model(rssi_run):
     view = open_source(rssi_run)
     assert view.receivers == ("receiver01", "receiver06", "receiver12")
-    assert view.floor.plan[1] == (0, 20, 0, 15)
+    assert view.floor.plan.corners == (0, 20, 0, 15)
     i, j = 5, 17
     place = view.cells[0][j], view.cells[1][i]
     at = torch.tensor([[*place, 1.2]], dtype=torch.float64)
@@ -435,3 +437,51 @@ def test_records_that_are_damaged(aoa_run, tmp_path):
     (folder / "geometry-mix1.json").write_text("{}")
     with pytest.raises(InputError, match="not those of a run"):
         open_source(folder)
+
+
+def test_a_dropped_floor_plan_lies_at_its_scale_and_origin_and_stays(rssi_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(rssi_run, folder)
+    view = open_source(folder)
+    before = len(view.cells[0]), view.inside.shape
+    pixels = np.full((30, 80, 3), 9, dtype=np.uint8)
+    view.place(FloorPlan.scaled(pixels, 0.5, (4, 26)))  # y counts down from the upper edge
+    assert view.floor.plan.corners == (-2, 38, -2, 13)
+    assert view.corners[1] >= 38
+    assert (len(view.cells[0]), view.inside.shape) != before
+    again = open_source(folder).floor.plan
+    assert again.corners == (-2, 38, -2, 13)
+    np.testing.assert_array_equal(again.pixels, pixels)
+    for scale, origin in ((0.0, (0, 0)), (np.nan, (0, 0)), (1.0, (np.inf, 0))):
+        with pytest.raises(InputError, match="scale"):
+            FloorPlan.scaled(pixels, scale, origin)
+
+
+def test_total_coverage_counts_receivers(rssi_run):
+    view = open_source(rssi_run)
+    fraction = [
+        view._covered(MapSelection("coverage", 0, 1.2, threshold=-60, certainty=0.7, at_least=number)).mean()
+        for number in (1, 2, 3)
+    ]
+    single = [
+        view._covered(MapSelection("coverage", receiver, 1.2, threshold=-60, certainty=0.7)).mean()
+        for receiver in range(3)
+    ]
+    assert 0 < max(single) <= fraction[0]
+    assert fraction[0] > fraction[1] >= fraction[2]
+    generator = torch.Generator().manual_seed(0)
+    probability = torch.rand(3, 4, generator=generator, dtype=torch.float64)
+    every = torch.tensor(list(itertools.product((0.0, 1.0), repeat=3)), dtype=torch.float64)
+    weight = torch.stack(
+        [(row[:, None] * probability + (1 - row[:, None]) * (1 - probability)).prod(dim=0) for row in every]
+    )
+    for number in (1, 2, 3):
+        expected = weight[every.sum(dim=1) >= number].sum(dim=0)
+        torch.testing.assert_close(at_least(probability, number), expected)
+
+
+def test_positions_outside_of_the_measured_ones_are_extrapolated(aoa_run):
+    view = open_source(aoa_run)
+    middle = view.positions.mean(axis=0)
+    assert not view.extrapolates(middle)
+    assert view.extrapolates(view.positions.max(axis=0) + 1)

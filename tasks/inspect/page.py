@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+
 import numpy as np
 import torch
 from matplotlib.axes import Axes
@@ -16,9 +18,10 @@ from tasks.inspect.findings.base import Findings
 from tasks.inspect.findings.positions import nearest
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table
+from tasks.summarise import fingerprinting
 
-AXES = {"x": "#ee6677", "y": "#228833", "normal": "#4477aa"}
-DOTS, NONE = "#4477aa", "#bbbbbb"  # with line of sight, without
+AXES = {"x": "#cf4a4a", "y": "#2a9165", "normal": "#3a7fd5"}
+DOTS, NONE = "#3a7fd5", "#7f8794"  # with line of sight, without
 MOST_DOTS = 2000
 MOST_RECEIVERS = 30  # in a figure
 PLAN = (
@@ -31,8 +34,8 @@ DIRECTIONS = (
 )
 
 
-def page(data: Spectra | Rssi, kind: str, findings: Findings) -> Page:
-    """Return the page: findings and figures."""
+def page(data: Spectra | Rssi, kind: str, findings: Findings, source: str) -> Page:
+    """Return the page: findings and figures of what was read from a source."""
     rows = [[finding.level, finding.text] for finding in findings.sentences]
     warnings = [finding.text for finding in findings.sentences if finding.level == "warning"]
     table = Table(["", ""], rows, strong=frozenset(["warning"]), long=True)
@@ -45,16 +48,27 @@ def page(data: Spectra | Rssi, kind: str, findings: Findings) -> Page:
         Number(f"{extent} m", "extent of the positions, x by y by z"),
     ]
     task = "rssi --rx all" if isinstance(data, Rssi) else "aoa --mix 0.3"
-    mend = ["Mend what the warnings say, and inspect again."] if warnings else []
-    summary = Summary(
-        numbers,
-        plan,
-        warnings or ["Nothing looks wrong. What cannot be seen from the files alone is not excluded by that."],
-        [*mend, f"Go on with python -m tasks.{task} --data and this source."],
-    )
+    source = shlex.quote(source)
+    mend = [f"Fix what the warnings say, and inspect again: `python -m tasks.inspect {source}`."] if warnings else []
+    steps = [*mend, f"Go on with `python -m tasks.{task} --data {source}`."]
+    meaning = warnings or ["Nothing looks wrong. Errors that the files alone do not reveal remain possible."]
+    verdict = _fingerprinting(data) if isinstance(data, Spectra) else ""
     return Page(
-        f"Inspection: {data.name}", summary, [Section("Findings", tables=[table]), Section("Figures", plots=plots)]
+        f"Inspection: {data.name}",
+        Summary(numbers, [plan], meaning, steps, verdict),
+        [Section("Findings", tables=[table]), Section("Figures", plots=plots)],
     )
+
+
+def _fingerprinting(data: Spectra) -> str:
+    """Return the warning of `fingerprinting`, from the spread of the lines of sight and the errors of the peaks."""
+    rows = data.line_of_sight.nonzero()[:MOST_DOTS, 0]
+    if not len(rows):
+        return ""
+    line, peak = (to_direction(*angles.unbind(-1)) for angles in (data.label[rows], data.peak_direction(rows)))
+    mean = torch.nn.functional.normalize(line.mean(dim=0), dim=0)
+    spread, error = angular_distance(mean.expand_as(line), line), angular_distance(peak, line)
+    return fingerprinting(*(float(angle.nanmedian().rad2deg()) for angle in (spread, error)))
 
 
 def _spectra(data: Spectra) -> list[Plot]:
@@ -72,17 +86,20 @@ def _places(position: Tensor, **columns: Tensor) -> DataFrame:
 
 
 def _plan(data: Spectra) -> Plot:
-    figure, axes = figures.new_figure(1, 2, 7.4, 4)
-    marker = "^" if data.moving == "transmitter" else "*"
-    for ax, (a, b) in zip(axes, ((0, 1), (0, 2)), strict=True):
+    marker, panels = "^" if data.moving == "transmitter" else "*", []
+    for a, b in ((0, 1), (0, 2)):
+        span = (data.position.amax(dim=0) - data.position.amin(dim=0))[[a, b]].clamp_min(1e-3)
+        figure, ax = figures.panel(3.8, 0.6 + 3 * float((span[1] / span[0]).clamp(0.4, 1.2)))
         for free, colour in ((False, NONE), (True, DOTS)):
             place = data.position[data.line_of_sight == free]
             ax.plot(place[:, a], place[:, b], ".", markersize=3, color=colour)
-        ax.set(xlabel=f"{'xyz'[a]} [m]", ylabel=f"{'xyz'[b]} [m]", aspect="equal")
+        ax.set(xlabel=f"{'xyz'[a]} [m]", ylabel=f"{'xyz'[b]} [m]")
+        ax.set_aspect("equal", adjustable="datalim")
         if data.fixed_position is not None:
             ax.plot(*data.fixed_position[[a, b]].tolist(), marker, color="black", markersize=7)
         _draw_axes(ax, data, a, b)
-    return Plot("plan", figure, PLAN, _places(data.position, line_of_sight=data.line_of_sight))
+        panels.append(figure)
+    return Plot("plan", panels, PLAN, _places(data.position, line_of_sight=data.line_of_sight))
 
 
 def _draw_axes(ax: Axes, data: Spectra, a: int, b: int) -> None:
@@ -95,6 +112,8 @@ def _draw_axes(ax: Axes, data: Spectra, a: int, b: int) -> None:
     length = 0.25 * float((data.position.amax(dim=0) - data.position.amin(dim=0)).max() or 1.0)
     for (name, colour), axis in zip(AXES.items(), data.rotation.T, strict=True):
         dx, dy = (length * axis[[a, b]]).tolist()
+        if np.hypot(dx, dy) < 0.2 * length:  # towards the viewer
+            continue
         ax.annotate(
             name,
             xy=(float(origin[a]), float(origin[b])),
@@ -109,54 +128,59 @@ def _directions(data: Spectra) -> Plot:
     rows = data.line_of_sight.nonzero()[:MOST_DOTS, 0]
     peak = to_direction(*data.peak_direction(rows).unbind(-1))
     line = to_direction(*data.label[rows].unbind(-1))
-    figure, axes = figures.new_figure(1, 3, 11, 3.6)
-    for ax, (title, direction) in zip(axes, {"line of sight": line, "peak": peak}.items(), strict=False):
+    panels = []
+    for title, direction in {"line of sight": line, "peak": peak}.items():
+        figure, ax = figures.panel(3.6, 3.4)
         ax.scatter(direction[:, 0], direction[:, 1], s=6, c=data.label[rows, 0].rad2deg(), cmap="hsv", vmin=0, vmax=360)
         ax.add_patch(Circle((0, 0), 1, fill=False, color=figures.RULE))  # the array's horizon
         ax.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal", title=title, xlabel="array x", ylabel="array y")
+        panels.append(figure)
     apart = angular_distance(peak, line).rad2deg()
-    axes[2].hist(apart.numpy(), bins=45, range=(0, 90), color=DOTS)
-    axes[2].set(xlabel="peak to line of sight [deg]", ylabel="spectra")
+    figure, ax = figures.panel(3.8, 3.4)
+    ax.hist(apart.numpy(), bins=45, range=(0, 90), color=DOTS)
+    ax.set(xlabel="peak to line of sight [deg]", ylabel="spectra")
     azimuth, elevation = data.label[rows].rad2deg().unbind(-1)
     table = _places(data.position[rows], azimuth_deg=azimuth, elevation_deg=elevation, peak_from_line_deg=apart)
-    return Plot("directions", figure, DIRECTIONS, table)
+    return Plot("directions", [*panels, figure], DIRECTIONS, table)
 
 
 def _neighbours(data: Spectra) -> Plot:
-    figure, axes = figures.new_figure(1, 1, 6, 3)
+    figure, ax = figures.panel(6, 3)
     rows, apart = nearest(data.position)
-    axes[0].hist(apart.numpy(), bins=40, color=DOTS)
+    ax.hist(apart.numpy(), bins=40, color=DOTS)
     if data.array is not None:
-        axes[0].axvline(data.array.wavelength / 2, color="#ee6677")
-    axes[0].set(xlabel="nearest other position [m]", ylabel="positions")
-    caption = "Distance to the nearest other position; the line is half a wavelength."
-    return Plot("neighbours", figure, caption, _places(data.position[rows], nearest_m=apart))
+        ax.axvline(data.array.wavelength / 2, color="#cf4a4a")
+    ax.set(xlabel="nearest other position [m]", ylabel="positions")
+    caption = "Distance to the nearest other position."
+    if data.array is not None:
+        caption += " The line is half a wavelength."
+    return Plot("neighbours", [figure], caption, _places(data.position[rows], nearest_m=apart))
 
 
 def _floor(data: Rssi) -> Plot:
-    figure, axes = figures.new_figure(1, 1, 6.8, 4.8)
+    figure, ax = figures.panel(6.8, 4.8)
     place = data.transmitter_position
     strongest = data.rssi_dbm.nan_to_num(-torch.inf).amax(dim=1)
-    drawn = axes[0].scatter(
+    drawn = ax.scatter(
         place[:, 0], place[:, 1], s=8, c=strongest.where(strongest.isfinite(), torch.nan), cmap="viridis"
     )
-    figure.colorbar(drawn, ax=axes[0], label="strongest RSSI [dBm]")
+    figures.colour_bar(ax, drawn, "strongest RSSI [dBm]")
     places = zip(data.receiver_names, data.receiver_position.tolist(), data.receiver_located.tolist(), strict=True)
     for name, at, is_located in places:
         if is_located:
-            axes[0].plot(*at[:2], "x", color="#ee6677", markersize=8, markeredgewidth=2)
-            axes[0].annotate(figures.short(name), at[:2], fontsize=7, xytext=(3, 3), textcoords="offset points")
-    axes[0].set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+            ax.plot(*at[:2], "x", color="#cf4a4a", markersize=8, markeredgewidth=2)
+            ax.annotate(figures.short(name), at[:2], fontsize=7, xytext=(3, 3), textcoords="offset points")
+    ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     caption = "Positions, coloured by the strongest RSSI; crosses: receivers, where they are known."
-    return Plot("plan", figure, caption, _places(place, strongest_dbm=strongest))
+    return Plot("plan", [figure], caption, _places(place, strongest_dbm=strongest))
 
 
 def _against_distance(data: Rssi) -> Plot:
-    figure, axes = figures.new_figure(1, 1, 6, 3.6)
+    figure, ax = figures.panel(6, 3.6)
     apart = distance(data.transmitter_position, data.receiver_position)
     for c, name in enumerate(data.receiver_names[:MOST_RECEIVERS]):
-        axes[0].plot(apart[:, c], data.rssi_dbm[:, c], ".", markersize=2, label=figures.short(name))
-    axes[0].set(xlabel="distance from the receiver [m]", ylabel="RSSI [dBm]", xscale="log")
+        ax.plot(apart[:, c], data.rssi_dbm[:, c], ".", markersize=2, label=figures.short(name))
+    ax.set(xlabel="distance from the receiver [m]", ylabel="RSSI [dBm]", xscale="log")
     row, column = (~data.rssi_dbm.isnan()).nonzero(as_tuple=True)
     table = DataFrame(
         {
@@ -165,16 +189,16 @@ def _against_distance(data: Rssi) -> Plot:
             "rssi_dbm": data.rssi_dbm[row, column].numpy(),
         }
     )
-    return Plot("law", figure, "RSSI against the distance from the receiver.", table)
+    return Plot("law", [figure], "RSSI against the distance from the receiver.", table)
 
 
 def _heard(data: Rssi) -> Plot:
     share = (~data.rssi_dbm.isnan()).double().mean(dim=0)
     order = share.argsort(descending=True)[:MOST_RECEIVERS].tolist()
     names = [figures.short(data.receiver_names[i]) for i in order]
-    figure, axes = figures.new_figure(1, 1, max(4.0, 0.3 * len(order) + 2), 3)
-    axes[0].bar(np.arange(len(order)), share[order].numpy(), color=DOTS)
-    axes[0].set(xticks=range(len(order)), xticklabels=names, ylabel="share detected", ylim=(0, 1))
-    axes[0].tick_params(axis="x", labelrotation=60)
+    figure, ax = figures.panel(max(4.0, 0.3 * len(order) + 2), 3)
+    ax.bar(np.arange(len(order)), share[order].numpy(), color=DOTS)
+    ax.set(xticks=range(len(order)), xticklabels=names, ylabel="share detected", ylim=(0, 1))
+    ax.tick_params(axis="x", labelrotation=60)
     table = DataFrame({"receiver": data.receiver_names, "share_heard": share.numpy()})
-    return Plot("heard", figure, "Share of the rows in which each receiver detected the transmitter.", table)
+    return Plot("heard", [figure], "Share of the rows in which each receiver detected the transmitter.", table)

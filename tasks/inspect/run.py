@@ -40,6 +40,6 @@ def run(config: InspectConfig) -> None:
             "numbers": findings.numbers,
         }
         write_json(folder / "inspect.json", content)
-        write_page(folder, page(shown, kind, findings))
+        write_page(folder, page(shown, kind, findings, str(config.source)))
     marked = (f"{'! ' if finding.level == 'warning' else '  '}{finding.text}" for finding in findings.sentences)
     terminal.page(content, "\n".join([f"{config.source}: {kind}", *marked]), out / "report.html")

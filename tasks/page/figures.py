@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,14 +15,15 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.transforms import Bbox
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pandas import DataFrame
 
-from tasks.page.palette import Palette
+from tasks.page.palette import DASHES, MAX_CURVES, Palette
 from tasks.summarise import pareto
 
-RULE, LINES, PAPER = "#aeb7c6", "#e4e8ef", "#fffffe"  # marks of reference, grid, background
-THEMED = {"#000000": "currentColor", LINES: "var(--lines)", PAPER: "none"}  # what the page's own colours replace
+RULE, LINES, PAPER = "#7f8794", "#e4e8ef", "#fffffe"  # marks of reference, grid, background
+THEMED = {"#000000": "currentColor", LINES: "var(--lines)", PAPER: "var(--paper)"}  # colours that follow the page's
+MARKERS = "osD^"  # of the series of a dot plot
 LONGEST = 100  # characters of a line of text
 NAME = 24  # characters of a name among others
 LABEL = 7  # size of a point's name [pt]
@@ -49,12 +51,26 @@ def new_figure(rows: int, columns: int, width: float, height: float) -> tuple[Fi
     return figure, list(axes.flat)
 
 
+def panel(width: float, height: float) -> tuple[Figure, Axes]:
+    """Return a figure of width x height inches in the style of the reports, and its only axes."""
+    figure, (axes,) = new_figure(1, 1, width, height)
+    return figure, axes
+
+
 def in_space(figure: Figure, axes: Axes) -> Any:
     """Axes with three dimensions in the place of others."""
     place = axes.get_subplotspec()
     axes.remove()
     with matplotlib.style.context(STYLE):
         return figure.add_subplot(place, projection="3d")
+
+
+def colour_bar(axes: Axes, drawn: Any, label: str = "", extend: str = "neither", pad: float = 0.03) -> None:
+    """Draw a colour bar beside axes, in the style of the reports."""
+    figure = axes.get_figure(root=True)
+    assert figure is not None  # axes outside of a figure have no place beside them
+    with matplotlib.style.context(STYLE):
+        figure.colorbar(drawn, ax=axes, label=label, fraction=0.045, pad=pad, extend=extend)
 
 
 def plain(text: str, most: int = LONGEST) -> str:
@@ -68,15 +84,15 @@ def short(name: str) -> str:
     return plain(name, NAME)
 
 
-def as_svg(figure: Figure) -> str:
-    """The figure as SVG without date or random names."""
+def as_svg(figure: Figure, title: str | None = None) -> str:
+    """Return the figure as SVG without date or random names, with a title for readers who do not see it."""
     stream = io.StringIO()
     canvas = FigureCanvasSVG(figure)
     with matplotlib.style.context(STYLE):
         if (engine := figure.get_layout_engine()) is not None:  # savefig would draw the figure twice to place its parts
             engine.execute(figure)
             figure.set_layout_engine("none")
-        canvas.print_figure(stream, format="svg", metadata={"Date": None, "Creator": None})
+        canvas.print_figure(stream, format="svg", metadata={"Date": None, "Creator": None, "Title": title})
     return stream.getvalue()
 
 
@@ -85,6 +101,7 @@ def for_page(svg: str, name: str) -> str:
     element = svg[svg.index("<svg") :]
     for colour, themed in THEMED.items():
         element = element.replace(colour, themed)
+    element = element.replace("<svg", '<svg role="img"', 1)
     return re.sub(r'((?:id="|href="#|url\(#))', rf"\g<1>{name}-", element)
 
 
@@ -107,93 +124,113 @@ def _columns(figure: Figure, labels: Sequence[str]) -> int:
 
 
 def cdf(axes: Axes, palette: Palette, errors: Mapping[str, ArrayLike], label: str, limit: float | None = None) -> None:
-    """Empirical distribution of each method's errors, with the median marked by the line at 0.5; one that a later one would
-    cover is drawn wider."""
-    curves = [np.quantile(np.asarray(values), np.linspace(0, 1, 21)) for values in errors.values()]
-    near = 0.005 * (limit or max(curve[-1] for curve in curves))
-    for number, (name, values) in enumerate(errors.items()):
-        covered = any(np.allclose(curves[number], later, rtol=0, atol=near) for later in curves[number + 1 :])
-        style: dict[str, Any] = {"color": palette.colour(name), "linestyle": palette.line(name)}
-        axes.ecdf(np.asarray(values), label=name, linewidth=4 if covered else 1.4, **style)
+    """Draw the empirical distribution of the errors of at most `MAX_CURVES` methods; the thin line is at the median."""
+    _expect_few(errors)
+    for dashes, (name, values) in zip(DASHES, errors.items(), strict=False):
+        style: dict[str, Any] = {"color": palette.colour(name), "linestyle": dashes, "linewidth": 1.6}
+        axes.ecdf(np.asarray(values), label=name, **style)
     axes.axhline(0.5, color=RULE, linewidth=0.8)
-    axes.set(xlabel=label, ylabel="share of test spectra", ylim=(0, 1), xlim=(0, limit))
-
-
-def bars(
-    axes: Axes,
-    palette: Palette,
-    groups: Sequence[str],
-    heights: Mapping[str, Sequence[tuple[float, float, float]]],
-    label: str,
-) -> None:
-    """Bars with whiskers: for each method one (value, low, high) a group."""
-    width = 0.8 / max(len(heights), 1)
-    for i, (name, values) in enumerate(heights.items()):
-        value, low, high = np.array(values, dtype=float).reshape(-1, 3).T
-        at = np.arange(len(groups)) + (i - (len(heights) - 1) / 2) * width
-        error = np.clip([value - low, high - value], 0, None)
-        style: dict[str, Any] = {"color": palette.colour(name), "error_kw": {"elinewidth": 0.8}}
-        axes.bar(at, value, width * 0.92, yerr=error, label=name, **style)
-    axes.set(xticks=range(len(groups)), xticklabels=groups, ylabel=label)
-    axes.grid(axis="x", visible=False)
-
-
-def bars_data(
-    group: str, groups: Sequence[str], heights: Mapping[str, Sequence[tuple[float, float, float]]], unit: str
-) -> DataFrame:
-    """The numbers of such bars, a row each."""
-    rows = [(of, name, *value) for name, values in heights.items() for of, value in zip(groups, values, strict=True)]
-    return DataFrame(rows, columns=[group, "method", f"median_{unit}", f"low_{unit}", f"high_{unit}"])
-
-
-def spectra(
-    measured: NDArray[Any],
-    synthetic: NDArray[Any],
-    captions: Sequence[str],
-    deviation: NDArray[Any] | None = None,
-) -> Figure:
-    """Measured, synthesized, their difference and, where it is known, the deviation that was expected, one row a spectrum;
-    azimuth to the right, elevation upwards [deg]."""
-    missed = synthetic - measured
-    most = float(np.abs(missed).max()) or 1.0  # a scale from -1 to 1 would show a good spectrum's misses as nothing
-    columns = [
-        ("measured", measured, "viridis", (0.0, 1.0)),
-        ("synthesized", synthetic, "viridis", (0.0, 1.0)),
-        ("synthesized - measured", missed, "RdBu_r", (-most, most)),
-        *([("expected deviation", deviation, "magma", (0.0, float(deviation.max())))] if deviation is not None else []),
-    ]
-    n = len(columns)
-    figure, axes = new_figure(len(measured), n, 3 * n, 0.95 * len(measured) + 0.6)
-    for column, (title, images, colours, (low, high)) in enumerate(columns):
-        for row, image in enumerate(images):
-            ax = axes[n * row + column]
-            drawn = ax.imshow(
-                image,
-                origin="lower",
-                extent=(0, 360, 0, 90),
-                aspect="auto",
-                interpolation="nearest",
-                cmap=colours,
-                vmin=low,
-                vmax=high,
-            )
-            ax.set(yticks=(0, 90), xticks=(0, 180, 360) if row == len(captions) - 1 else ())
-            ax.grid(visible=False)
-        axes[column].set_title(title, fontsize=9)
-        if column:
-            figure.colorbar(drawn, ax=axes[column::n], fraction=0.04, pad=0.02)
-    for row, caption in enumerate(captions):
-        axes[n * row].set_ylabel(caption, rotation=0, ha="right", va="center")
-    axes[n * (len(captions) - 1) + 1].set_xlabel("azimuth [deg]")
-    return figure
+    axes.set(xlabel=label, ylabel="fraction of test spectra", ylim=(0, 1.02), xlim=(0, limit))
+    end_labels(axes)
 
 
 def curves(axes: Axes, palette: Palette, lines: Mapping[str, tuple[ArrayLike, ArrayLike]], x: str, y: str) -> None:
-    """One line a name, y logarithmic."""
-    for name, (xs, ys) in lines.items():
-        axes.plot(np.asarray(xs), np.asarray(ys), label=name, color=palette.colour(name), linewidth=1.2)
-    axes.set(xlabel=x, ylabel=y, yscale="log")
-    axes.legend(fontsize=7, frameon=False)
+    """Draw one line for each of at most `MAX_CURVES` names."""
+    _expect_few(lines)
+    for dashes, (name, (xs, ys)) in zip(DASHES, lines.items(), strict=False):
+        axes.plot(
+            np.asarray(xs), np.asarray(ys), label=name, color=palette.colour(name), linestyle=dashes, linewidth=1.6
+        )
+    axes.set(xlabel=x, ylabel=y)
+    end_labels(axes)
+
+
+def _expect_few(lines: Mapping[str, Any]) -> None:
+    if len(lines) > MAX_CURVES:
+        raise ValueError(f"a panel has at most {MAX_CURVES} curves, got {len(lines)}: {', '.join(lines)}")
+
+
+def end_labels(axes: Axes) -> None:
+    """Write the name of each labelled line at its right end, in its colour, such that no name covers another."""
+    figure = axes.get_figure(root=True)
+    assert figure is not None  # an axes outside of a figure has no size
+    lines = [line for line in axes.get_lines() if not str(line.get_label()).startswith("_")]
+    ends = []
+    for line in lines:
+        x, y = np.asarray(line.get_xdata(), dtype=float), np.asarray(line.get_ydata(), dtype=float)
+        inside = x <= axes.get_xlim()[1]
+        last = np.flatnonzero(inside)[-1] if inside.any() else 0
+        at = axes.transAxes.inverted().transform(axes.transData.transform((x[last], y[last])))
+        stays = line.get_drawstyle() == "steps-post"  # up to the right edge
+        ends.append((1.0 if stays else float(np.clip(at[0], 0, 1)), float(np.clip(at[1], 0, 1))))
+    order = np.argsort([y for _, y in ends], kind="stable")
+    spacing = 1.5 * LABEL / 72 / (0.75 * figure.get_figheight())
+    places = np.array([ends[i][1] for i in order])
+    for i in range(1, len(places)):
+        places[i] = max(places[i], places[i - 1] + spacing)
+    for i in reversed(range(len(places))):
+        places[i] = min(places[i], 1 - spacing * (len(places) - 1 - i))
+    for i, place in zip(order, places, strict=True):
+        colour = lines[i].get_color()
+        axes.annotate(
+            short(str(lines[i].get_label())),
+            ends[i],
+            xytext=(1.05, place),
+            xycoords="axes fraction",
+            color=colour,
+            fontsize=LABEL + 1,
+            verticalalignment="center",
+            annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.8, "shrinkA": 1, "shrinkB": 0},
+        )
+
+
+def dots(
+    rows: Sequence[str],
+    values: Mapping[str, Sequence[tuple[float, float, float]]],
+    palette: Palette,
+    label: str,
+    zero: bool = False,
+    log: bool = False,
+) -> Figure:
+    """Return a dot plot with whiskers, a row for each name, the first on top.
+
+    Args:
+        rows: Names of the rows.
+        values: Value, low and high of each row for at most `MAX_CURVES` series. nan is left out.
+        palette: Colours of the series. A single series has one colour and no legend.
+        label: Label of the values.
+        zero: Whether the line of zero is drawn.
+        log: Whether the axis is logarithmic.
+    """
+    _expect_few(values)
+    figure, axes = panel(5.6, 0.7 + 0.27 * len(rows) * max(1.0, 0.55 * len(values)) + (0.3 if len(values) > 1 else 0))
+    for number, (marker, (name, of_rows)) in enumerate(zip(MARKERS, values.items(), strict=False)):
+        value, low, high = np.array(of_rows, dtype=float).reshape(-1, 3).T
+        at = np.arange(len(rows)) + 0.2 * (number - (len(values) - 1) / 2)
+        error = np.clip(np.nan_to_num([value - low, high - value]), 0, None)
+        style: dict[str, Any] = {"color": palette.colour(name), "fmt": marker, "markersize": 5, "elinewidth": 1.4}
+        axes.errorbar(value, at, xerr=error, label=short(name), **style)
+    if zero:
+        axes.axvline(0, color=RULE, linewidth=1)
+    axes.set(yticks=range(len(rows)), yticklabels=[plain(textwrap.fill(name, NAME)) for name in rows], xlabel=label)
+    axes.set_ylim(len(rows) - 0.4, -0.6)
+    if log:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter("")
+    axes.grid(axis="y", visible=False)
+    if len(values) > 1:
+        figure.legend(loc="outside upper left", ncols=len(values), frameon=False, fontsize=LABEL + 1)
+    return figure
+
+
+def dots_data(
+    row: str, rows: Sequence[str], values: Mapping[str, Sequence[tuple[float, float, float]]], unit: str
+) -> DataFrame:
+    """Return the numbers of `dots`, a row for each value."""
+    cells = [(of, name, *value) for name, each in values.items() for of, value in zip(rows, each, strict=True)]
+    return DataFrame(cells, columns=[row, "series", f"value_{unit}", f"low_{unit}", f"high_{unit}"])
 
 
 def speed(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 from jinja2 import Environment, PackageLoader
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from pandas import DataFrame
 
@@ -19,6 +19,18 @@ from tasks.records import write_table
 
 HALF = 84  # letters of a table that fit into half of the page
 WIDE = 7.5  # [inches] figures that are wider take the whole width of the page, others half
+MAX_SECTIONS = 5  # of a page, whose navigation has the details, too
+
+
+class HasScene(Protocol):
+    """Records of a run, or of a part of it."""
+
+    @property
+    def scene(self) -> str:
+        """Name among those of a report."""
+
+
+Named = TypeVar("Named", bound=HasScene)
 
 
 @dataclass(frozen=True)
@@ -43,42 +55,57 @@ class Plot:
     """A figure and what it shows.
 
     Args:
-        name: of its files without suffix.
-        figure: drawn.
-        caption: in a sentence or two.
-        data: the numbers that it shows, for those who draw it anew.
+        name: Name of its files without suffix.
+        panels: Figures, which stand side by side where the page is wide enough, and below each other elsewhere.
+        caption: A sentence or two.
+        data: Numbers that it shows.
     """
 
     name: str
-    figure: Figure
+    panels: Sequence[Figure]
     caption: str
     data: DataFrame
 
     @property
-    def width(self) -> float:
-        """As it was drawn [inches]."""
-        return float(self.figure.get_figwidth())
+    def widths(self) -> list[float]:
+        """Widths of the panels [inches]."""
+        return [float(panel.get_figwidth()) for panel in self.panels]
 
     @property
     def wide(self) -> bool:
         """Whether it needs the whole width of the page."""
-        return self.width > WIDE
+        return sum(self.widths) > WIDE
+
+    @property
+    def files(self) -> list[str]:
+        """Names of the panels' files without suffix."""
+        several = len(self.panels) > 1
+        return [f"{self.name}-{n}" if several else self.name for n in range(1, len(self.panels) + 1)]
 
 
 @dataclass(frozen=True)
 class Section:
-    """A heading and what follows it, in this order: paragraphs, tables, plots, and what the names in them mean."""
+    """A heading and what follows it: paragraphs, tables, plots, meanings of names, and sections below it.
+
+    Text between backticks is shown as code.
+    """
 
     title: str
     paragraphs: list[str] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
     plots: list[Plot] = field(default_factory=list)
     terms: dict[str, str] = field(default_factory=dict)
+    parts: list[Section] = field(default_factory=list)
+
+    @property
+    def all_plots(self) -> list[Plot]:
+        """Plots of the section and of the sections below it."""
+        return [*self.plots, *(plot for part in self.parts for plot in part.all_plots)]
 
 
 @dataclass(frozen=True)
 class Number:
-    """One of the numbers that a reader should take away, and what it is of."""
+    """One of the numbers that a reader should take away, and its meaning."""
 
     value: str
     meaning: str
@@ -86,42 +113,77 @@ class Number:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a reader sees first: numbers, a picture, the verdict in one sentence, what they mean, what to do next."""
+    """The first screen: numbers, figures, the verdict in one sentence, its meaning, next steps, a table of runs, and
+    notes on the data."""
 
     numbers: list[Number]
-    plot: Plot
+    plots: list[Plot]
     meaning: list[str]
     next_steps: list[str]
     verdict: str = ""
+    table: Table | None = None
+    notes: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class Page:
+    """A report.
+
+    Args:
+        title: Title.
+        summary: First screen.
+        sections: Sections in the navigation, at most `MAX_SECTIONS`.
+        details: Sections of secondary interest, folded.
+    """
+
     title: str
     summary: Summary
     sections: list[Section]
+    details: list[Section] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if len(self.sections) > MAX_SECTIONS:
+            raise ValueError(f"a page has at most {MAX_SECTIONS} sections, got {len(self.sections)}")
 
     @property
     def plots(self) -> list[Plot]:
-        """All of them."""
-        return [self.summary.plot, *(plot for section in self.sections for plot in section.plots)]
+        """All plots."""
+        sections = [*self.sections, *self.details]
+        return [*self.summary.plots, *(plot for section in sections for plot in section.all_plots)]
+
+
+def rich(text: str) -> Markup:
+    """Return escaped text with code elements for what stands between backticks; a line of code breaks between words.
+
+    Example:
+        >>> str(rich("a < b: `python`"))
+        'a &lt; b: <code><span>python</span></code>'
+    """
+    parts = [escape(part) for part in text.split("`")]
+    for n, part in enumerate(text.split("`")):
+        if n % 2:
+            words = Markup(" ").join(Markup("<span>{}</span>").format(word) for word in part.split(" "))
+            parts[n] = Markup("<code>{}</code>").format(words)
+    return Markup("").join(parts)
 
 
 def write_page(folder: Path, page: Page) -> None:
-    """Writes `figures/NAME.svg` and `figures/NAME.csv` of each plot and `report.html` with the same figures inlined."""
+    """Write the panels of each plot and its numbers into `figures/`, and `report.html` with the same panels inlined."""
     figures = folder / "figures"
     figures.mkdir(parents=True, exist_ok=True)
     inlined: dict[str, Markup] = {}
     for plot in page.plots:
-        if plot.name in inlined:
-            raise ValueError(f"two figures are called {plot.name}; one would be shown in the other's place")
-        svg = as_svg(plot.figure)
-        write_text(figures / f"{plot.name}.svg", svg)
+        for file, panel in zip(plot.files, plot.panels, strict=True):
+            if file in inlined:
+                raise ValueError(f"two figures are called {file}; one would be shown in the other's place")
+            svg = as_svg(panel, plot.caption)
+            write_text(figures / f"{file}.svg", svg)
+            inlined[file] = Markup(for_page(svg, file))  # our own drawing; its texts are escaped in it
         write_table(figures / f"{plot.name}.csv", plot.data.to_dict("records"))
-        inlined[plot.name] = Markup(for_page(svg, plot.name))  # our own drawing; its texts are escaped in it
     environment = Environment(
         loader=PackageLoader("tasks.page", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
+    environment.filters["rich"] = rich
     html = environment.get_template("template.html").render(page=page, svg=inlined)
     write_text(folder / "report.html", html)
 
@@ -133,3 +195,23 @@ def reporting(page: Callable[[list[Records[Metrics]]], Page]) -> Callable[[Path,
         write_page(folder, page([Records(folder, metrics)]))
 
     return report
+
+
+def sections_of(
+    title: str,
+    runs: Sequence[Named],
+    section: Callable[[Named], Section | None],
+    terms: dict[str, str] | None = None,
+) -> Section:
+    """Return one section over all runs. Several runs have a part each, under the run's name.
+
+    Args:
+        title: Title of the section.
+        runs: Records, or parts of them, with a `scene`.
+        section: Content for one of them. None if there is nothing to show.
+        terms: Meanings of the names in the section.
+    """
+    found = [(run, part) for run in runs if (part := section(run)) is not None]
+    if len(runs) == 1:
+        return replace(found[0][1], title=title, terms=terms or {}) if found else Section(title, terms=terms or {})
+    return Section(title, parts=[replace(part, title=run.scene) for run, part in found], terms=terms or {})

@@ -94,3 +94,8 @@ class Records(Generic[Metrics]):
             with np.load(self.folder / f"{name}.npz") as file:
                 self._arrays[name] = dict(file)
         return self._arrays[name]
+
+    @property
+    def path(self) -> str:
+        """Directory of the run as commands take it, also while the run is not finished."""
+        return str(self.folder).removesuffix(".partial")

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 from pandas import DataFrame
-from PIL import Image, UnidentifiedImageError
 
 from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.data.coordinates import degree_columns
@@ -24,6 +23,7 @@ from swiftwrf.rssi import LEVEL, PairModel, RssiModel
 from tasks.claim import MODEL
 from tasks.cluster import connected
 from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
+from tasks.page.floor_plan import read_pixels
 from tasks.page.page import reporting
 from tasks.page.records import Records
 from tasks.rssi.options import RssiTaskConfig
@@ -37,7 +37,6 @@ from tasks.terminal import console, terminal
 
 MAP_CELLS = 80  # along the longer side of the floor
 MAX_PAIR_CELLS = 60_000  # of all maps together: each needs a system of 64 equations
-MAX_PLAN_PIXELS = 2**24
 
 
 def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
@@ -107,19 +106,8 @@ def _read_floor_plan(config: RssiTaskConfig) -> dict[str, Any]:
     """Return the floor plan and its corners as maps.npz stores them, or nothing if there is no plan."""
     if config.floor_plan is None or config.floor_extent is None:
         return {}
-    try:
-        # two formats only: Pillow starts other programs for some; the pixels are read here, since the file may be truncated
-        with Image.open(config.floor_plan, formats=("PNG", "JPEG")) as image:
-            if image.width * image.height > MAX_PLAN_PIXELS:
-                raise InputError(
-                    f"--floor-plan {config.floor_plan} has {image.width} x {image.height} pixels; give one of at most "
-                    f"{MAX_PLAN_PIXELS}"
-                )
-            return {"plan": np.asarray(image.convert("RGB")), "plan_extent": np.array(config.floor_extent)}
-    except InputError:
-        raise
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
-        raise InputError(f"--floor-plan {config.floor_plan} is not a readable image, PNG or JPEG ({error})") from None
+    pixels = read_pixels(config.floor_plan, f"--floor-plan {config.floor_plan}")
+    return {"plan": pixels, "plan_extent": np.array(config.floor_extent)}
 
 
 def _rows(**columns: torch.Tensor | list[str]) -> list[Row]:

@@ -59,9 +59,10 @@ def page(name: str, surfaces: list[Surface], moving: Moving, paths: PropagationP
         "vertically polarised; obstacles block without transmission."
     ]
     steps = [
-        "Go on with python -m tasks.aoa --mix 0.3 --data and this directory; the array lies level at the receiver."
+        "Go on with `python -m tasks.aoa --mix 0.3 --data DIR`, where DIR is this directory. The array lies level at the "
+        "receiver."
     ]
-    summary = Summary(numbers, _room(surfaces, fixed[0], position, moving, paths), meaning, steps)
+    summary = Summary(numbers, [_room(surfaces, fixed[0], position, moving, paths)], meaning, steps)
     materials = sorted({(s.material.name, s.material.thickness_m) for s in surfaces})
     rows = [[material, f"{1e3 * thickness:g}"] for material, thickness in materials]
     table = Table(["material", "thickness [mm]"], rows, "Materials of the surfaces.")
@@ -82,7 +83,7 @@ def _room(surfaces: list[Surface], fixed: Tensor, position: Tensor, moving: Movi
     table = DataFrame(position.numpy(), columns=["x_m", "y_m", "z_m"]).assign(
         line_of_sight=paths.line_of_sight.numpy(), paths=paths.count.numpy(), power_db=paths.power_db.numpy()
     )
-    return Plot("room", figure, "In plan and in space: surfaces, positions (blue), the fixed end (star).", table)
+    return Plot("room", [figure], "In plan and in space: surfaces, positions (blue), the fixed end (star).", table)
 
 
 def _rays(
@@ -123,7 +124,7 @@ def _rays(
             "elevation_deg": elevation.numpy() * paths.direction[own, 2].sign().numpy(),
         }
     )
-    return Plot("rays", figure, caption, table[::-1])
+    return Plot("rays", [figure], caption, table[::-1])
 
 
 def _mark(plan: Axes, space: Any, at: Tensor, marker: str, colour: str, label: str) -> None:

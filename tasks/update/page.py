@@ -126,7 +126,7 @@ def page(followed: Followed, obstacles: ObstacleMonitor | None) -> Page:
     ]
     if bool(scores.covered.isfinite().any()):
         numbers.append(Number(f"{float(scores.covered.nanmean()):.0%}", "of the values inside their 80 % interval"))
-    summary = Summary(numbers, _error(followed), followed.sentences(obstacles), ["Continue with model.safetensors."])
+    summary = Summary(numbers, [_error(followed)], followed.sentences(obstacles), ["Continue with model.safetensors."])
     rows = followed.rows()
     order = followed.surprise.nan_to_num().argsort(descending=True)[:MOST_SURPRISING].tolist()
     cells = [
@@ -154,7 +154,7 @@ def _error(followed: Followed) -> Plot:
         axes[0].axvline(number, color=RED, linewidth=1)
     axes[0].set(xlabel="measurement", ylabel=f"error{followed.unit}", ylim=(0, None))
     caption = f"Error of each measurement before it was learnt, mean of the last {WINDOW} (blue), and alarms (red)."
-    return Plot("error", figure, caption, DataFrame({"error": error, "running_error": running}))
+    return Plot("error", [figure], caption, DataFrame({"error": error, "running_error": running}))
 
 
 def _map(followed: Followed, obstacles: ObstacleMonitor | None) -> Plot:
@@ -178,4 +178,4 @@ def _map(followed: Followed, obstacles: ObstacleMonitor | None) -> Plot:
         axes[0].autoscale_view()
     axes[0].set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     table = DataFrame(position.numpy(), columns=["x_m", "y_m", "z_m"]).assign(innovation=surprise.numpy())
-    return Plot("changes", figure, caption, table)
+    return Plot("changes", [figure], caption, table)

@@ -27,6 +27,8 @@ class ViewConfig(Options):
     """port of the page; 0 takes any free port"""
     host: str = "127.0.0.1"
     """address to listen on; with any other address, other machines see the page without a password"""
+    open: bool = False
+    """open the page in the browser"""
 
     def check(self) -> None:
         super().check()

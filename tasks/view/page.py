@@ -26,7 +26,10 @@ STYLE = """
 .drag { touch-action: none; cursor: crosshair; user-select: none; }
 .pixels img { image-rendering: pixelated; }
 .numbers { font-variant-numeric: tabular-nums; }
-.quiet { opacity: 0.75; font-size: 0.85rem; }
+.quiet { opacity: 0.8; font-size: 0.85rem; overflow-wrap: anywhere; }
+.extrapolated img { filter: grayscale(0.9); opacity: 0.6; }
+.nicegui-content, .nicegui-content > * { min-width: 0; max-width: 100%; }
+@media (max-width: 700px) { .nicegui-content { padding: 8px 10px; } }
 """
 
 
@@ -62,9 +65,9 @@ def header(title: str, notes: list[str]) -> ui.row:
     """Build title, notes and the switch between light and dark; return the row for further controls."""
     ui.add_css(STYLE)
     dark = ui.dark_mode(None)
-    with ui.row().classes("w-full items-center no-wrap"):
-        ui.label(title).classes("text-h6 ellipsis").style("max-width: 40%")
-        row = ui.row().classes("items-center gap-6 grow no-wrap")
+    with ui.row().classes("w-full items-center"):
+        ui.label(title).classes("text-h6 ellipsis").style("max-width: 100%")
+        row = ui.row().classes("items-center gap-x-6 gap-y-1 grow")
         modes = ui.toggle({None: "auto", False: "light", True: "dark"}, value=None).props("dense no-caps flat")
         modes.bind_value_to(dark)
     for note in notes:
@@ -76,7 +79,7 @@ def plan_picture(plan: PlanProjection, name: str) -> ui.interactive_image:
     """Build a picture of the size of a plan that reports the position of the pointer."""
     events = ["pointerdown", "pointermove", "pointerup", "pointerleave"]
     picture = ui.interactive_image(size=plan.size, events=events, sanitize=False)
-    picture.style(f"width: {plan.size[0]}px; margin: 24px 10px 34px 48px")
+    picture.style(f"width: {plan.size[0]}px; max-width: calc(100% - 58px); margin: 24px 10px 34px 48px")
     return picture.classes("outside drag").props(f'id="{name}"')
 
 
@@ -106,7 +109,8 @@ def colour_bar(colours: str, low: float, high: float, label: str) -> str:
     ends = ((0, "start", low), (130, "middle", (low + high) / 2), (260, "end", high))
     numbers = "".join(text(x, 30, f"{value:.3g}", anchor) for x, anchor, value in ends)
     return (
-        f'<svg width="520" height="34"><defs><linearGradient id="bar-{colours}">{stops}</linearGradient></defs>'
+        '<svg viewBox="0 0 520 34" style="width: 520px; max-width: 100%">'
+        f'<defs><linearGradient id="bar-{colours}">{stops}</linearGradient></defs>'
         f'<rect width="260" height="14" fill="url(#bar-{colours})"/>{numbers}{text(272, 12, label, size=13)}</svg>'
     )
 
@@ -130,7 +134,7 @@ def free_port(host: str, port: int) -> int:
         raise InputError(f"cannot listen on {host}, port {port} ({error}); choose another --host or --port") from None
 
 
-def serve(title: str, build: Callable[[], object], host: str, port: int) -> None:
+def serve(title: str, build: Callable[[], object], host: str, port: int, show: bool = False) -> None:
     """Serve one page and nothing else of this machine, until the process is interrupted.
 
     Args:
@@ -138,6 +142,7 @@ def serve(title: str, build: Callable[[], object], host: str, port: int) -> None
         build: Builds the page for one visitor.
         host: Address to listen on.
         port: Port to listen on.
+        show: Whether the browser opens the page.
     """
 
     async def announce() -> None:
@@ -156,4 +161,4 @@ def serve(title: str, build: Callable[[], object], host: str, port: int) -> None
         app.add_middleware(TrustedHostMiddleware, allowed_hosts=LOCAL_HOSTS)
     app.on_startup(announce)
     # dark=None follows the browser's setting
-    ui.run(host=host, port=port, title=title, dark=None, show=False, reload=False, show_welcome_message=False)
+    ui.run(host=host, port=port, title=title, dark=None, show=show, reload=False, show_welcome_message=False)

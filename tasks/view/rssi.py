@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import textwrap
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -18,14 +19,16 @@ from torch import Tensor
 from swiftwrf import Prediction, Rssi, RssiModel
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.rssi import LEVEL
-from tasks.page import figures
+from tasks.page import figures, maps
+from tasks.page.floor_plan import FloorPlan
 from tasks.records import as_table, rounded
+from tasks.rssi.page.maps import MAX_WIDTH_DB
 from tasks.view.drawing import PlanProjection
 from tasks.view.locating import Corners, RssiLocating
 
 CELLS = 120  # of a map, along its longer side
 RECEIVER_COLOURS, N_RECEIVER_COLOURS = "tab20", 20
-RECEIVER_MARK = "#ee6677"
+RECEIVER_MARK = "#cf4a4a"
 MIN_STD_DB = 1e-6
 MapKind = Literal["RSSI", "interval", "coverage", "best receiver", "posterior", "expected error"]
 LOCATING: tuple[MapKind, ...] = ("posterior", "expected error")
@@ -40,13 +43,13 @@ class MeasuredFloor:
         position: Positions of the transmitter [m], (n, 3).
         rssi_dbm: Measured RSSI [dBm], (n, R), nan where a receiver detected nothing.
         receiver: Positions of the receivers [m], (R, 3), nan where they are unknown.
-        plan: Image of the floor (height, width, 3) and its corners. None if there is none.
+        plan: Image of the floor. None if there is none.
     """
 
     position: Values
     rssi_dbm: Values
     receiver: Values
-    plan: tuple[NDArray[np.uint8], Corners] | None = None
+    plan: FloorPlan | None = None
 
     @classmethod
     def from_run(cls, maps: Mapping[str, NDArray[Any]]) -> MeasuredFloor:
@@ -54,7 +57,7 @@ class MeasuredFloor:
         plan = None
         if "plan" in maps:
             x0, x1, y0, y1 = maps["plan_extent"].tolist()
-            plan = maps["plan"], (x0, x1, y0, y1)
+            plan = FloorPlan(maps["plan"], (x0, x1, y0, y1))
         return cls(maps["measured_position"], maps["measured"], maps["receiver"], plan)
 
     @classmethod
@@ -81,6 +84,7 @@ class MapSelection:
         threshold: Threshold of the coverage [dBm].
         certainty: Required probability that a measurement exceeds the threshold, in (0, 1).
         row: Row whose posterior is shown, counted from 0.
+        at_least: Number of receivers of the coverage; 0 for that of the selected receiver.
     """
 
     kind: MapKind
@@ -89,6 +93,7 @@ class MapSelection:
     threshold: float = -75.0
     certainty: float = 0.9
     row: int = 0
+    at_least: int = 0
 
 
 @dataclass(frozen=True)
@@ -122,6 +127,7 @@ class RssiView:
         floor: Measurements on the floor.
         locating: Locator and the rows that it locates. None if there is no locator.
         notes: Remarks on the data, a sentence each.
+        folder: Directory of the run, where a floor plan is saved. None for a saved model.
     """
 
     title: str
@@ -129,6 +135,7 @@ class RssiView:
     floor: MeasuredFloor
     locating: RssiLocating | None = None
     notes: list[str] = field(default_factory=list)
+    folder: Path | None = None
     _last: tuple[float, Prediction] | None = field(default=None, init=False, repr=False)
 
     @property
@@ -149,9 +156,21 @@ class RssiView:
         low, middle, high = np.quantile(self.floor.position[:, 2], (0, 0.5, 1)).tolist()
         return low, middle, high
 
+    def __post_init__(self) -> None:
+        if self.folder is not None and (stored := FloorPlan.load(self.folder)) is not None:
+            self.floor = replace(self.floor, plan=stored)
+
+    def place(self, plan: FloorPlan) -> None:
+        """Show a floor plan below the maps, and save it in the directory of the run."""
+        if self.folder is not None:
+            plan.save(self.folder)
+        self.floor, self._last = replace(self.floor, plan=plan), None
+        for name in ("cells", "inside"):  # they cover the plan, too
+            self.__dict__.pop(name, None)
+
     def plan(self, max_px: tuple[int, int] = (CELLS, CELLS)) -> PlanProjection:
         """Return the plan that contains measurements, receivers and floor plan, at most of this size in pixels."""
-        corners = np.array(self.floor.plan[1]).reshape(2, 2).T if self.floor.plan else self.floor.position
+        corners = np.array(self.floor.plan.corners).reshape(2, 2).T if self.floor.plan else self.floor.position
         return PlanProjection.around(self.floor.position, self.floor.receiver, corners, max_px=max_px)
 
     @cached_property
@@ -203,8 +222,9 @@ class RssiView:
                 return ColouredMap(mean[receiver], "viridis", low, high, "predicted RSSI [dBm]")
             case "interval":
                 width = self._width(selection.height)
-                high = float(np.percentile(width, 99))
-                return ColouredMap(width[receiver], "magma", 0.0, high, f"width of the {LEVEL:.0%} interval [dB]")
+                return ColouredMap(
+                    width[receiver], "magma", 0.0, MAX_WIDTH_DB, f"width of the {LEVEL:.0%} interval [dB]"
+                )
             case "coverage":
                 return ColouredMap(np.where(self._covered(selection), 0.7, np.nan), "GnBu", 0.0, 1.0, "")
             case "best receiver":
@@ -221,8 +241,15 @@ class RssiView:
         return ColouredMap(found.values, "viridis", 0.0, high, "expected position error [m]", found.corners)
 
     def _covered(self, selection: MapSelection) -> NDArray[np.bool_]:
-        rssi = self.map(selection.height)
-        return (probability_above(rssi, selection)[selection.receiver] >= selection.certainty).numpy()
+        probability = probability_above(self.map(selection.height), selection)
+        if selection.at_least == 0:
+            return (probability[selection.receiver] >= selection.certainty).numpy()
+        return (at_least(probability, selection.at_least) >= selection.certainty).numpy()
+
+    @cached_property
+    def inside(self) -> NDArray[np.bool_]:
+        """Whether each cell lies inside the measured positions, in plan (rows, columns)."""
+        return maps.inside(np.stack(np.meshgrid(*self.cells), axis=-1), self.floor.position)
 
     def sentence(self, selection: MapSelection) -> str:
         """Describe the selected map in a few sentences."""
@@ -236,8 +263,12 @@ class RssiView:
             case "interval":
                 return f"Width of the {LEVEL:.0%} interval of a measurement at {name}."
             case "coverage":
+                number = selection.at_least
+                who = {0: name, 1: "at least one receiver"}.get(number, f"at least {number} receivers")
+                covered, known = self._covered(selection), self.inside
+                area = f", {covered[known].mean():.0%} of the measured area" if known.any() else ""
                 return (
-                    f"{self._covered(selection).mean():.0%} of the map is coloured: there a measurement at {name} is above "
+                    f"{covered.mean():.0%} of the map{area} is coloured: there a measurement at {who} is above "
                     f"{selection.threshold:g} dBm with {selection.certainty:.0%} certainty, if it is detected at all."
                 )
             case "best receiver":
@@ -309,7 +340,7 @@ class RssiView:
         width, height = self.plan().size
         figure, (ax,) = figures.new_figure(1, 1, 8, 1 + 7 * height / width)
         if self.floor.plan:
-            ax.imshow(self.floor.plan[0], extent=self.floor.plan[1], zorder=0)
+            ax.imshow(self.floor.plan.pixels, extent=self.floor.plan.corners, zorder=0)
         drawn = ax.imshow(
             coloured.values,
             origin="lower",
@@ -341,3 +372,21 @@ def probability_above(rssi: Prediction, selection: MapSelection) -> Tensor:
     assert rssi.std is not None
     probability: Tensor = torch.special.ndtr((rssi.mean - selection.threshold) / rssi.std.clamp_min(MIN_STD_DB))
     return probability
+
+
+def at_least(probability: Tensor, number: int) -> Tensor:
+    """Return the probability that at least a number of receivers exceed the threshold, independent of each other.
+
+    Args:
+        probability: Probability of each receiver, (R, ...).
+        number: Number of receivers, at least 1.
+
+    Example:
+        >>> at_least(torch.tensor([0.5, 0.5]), 1)
+        tensor(0.7500)
+    """
+    counts = [torch.ones_like(probability[0]), *(torch.zeros_like(probability[0]) for _ in range(number - 1))]
+    for own in probability:  # probabilities of 0 to number - 1 receivers
+        fewer = [torch.zeros_like(own), *counts[:-1]]
+        counts = [count * (1 - own) + less * own for count, less in zip(counts, fewer, strict=True)]
+    return 1 - torch.stack(counts).sum(dim=0)

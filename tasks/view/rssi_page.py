@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 from nicegui import events, run, ui
+from numpy.typing import NDArray
 from PIL import Image
 
+from swiftwrf import InputError
+from tasks.page.floor_plan import FloorPlan, read_pixels
 from tasks.page.raster import colour_image
 from tasks.view.drawing import text
 from tasks.view.page import NewestOnly, colour_bar, header, located_marks, plan_picture, slider
@@ -23,6 +28,7 @@ from tasks.view.rssi import (
 
 N_DOT_COLOURS = 33
 MAX_MAP_PX = (880, 700)
+MAX_UPLOAD_BYTES = 2**25
 KIND_LABELS = {"interval": "uncertainty"}  # of the kinds that the page calls by another word
 HINT = "Hover over the map."
 ROW = "#999999"  # of the measured rows under a posterior
@@ -33,16 +39,19 @@ class RssiPage:
 
     def __init__(self, view: RssiView) -> None:
         self._view, self._plan = view, view.plan(MAX_MAP_PX)
+        self._placing: dict[str, ui.number] = {}
         self._maps, self._points = NewestOnly(self._show_map), NewestOnly(self._show_point)
         with header(view.title, view.notes):
             kinds = {kind: KIND_LABELS.get(kind, kind) for kind in view.kinds}
             self._kind = ui.toggle(kinds, value="RSSI", on_change=self._update).props("no-caps padding='2px 12px'")
-        with ui.row().classes("w-full no-wrap items-start gap-8"):
-            with ui.column().classes("gap-1").style("flex: none"):
+        with ui.row().classes("w-full items-start gap-8 lg:flex-nowrap"):
+            with ui.column().classes("gap-1").style("flex: none; max-width: 100%"):
                 self._picture = plan_picture(self._plan, "map")
                 self._picture.on_mouse(self._on_pointer)
-                self._bar = ui.html("", sanitize=False).style("min-height: 34px; margin-left: 48px")
-            with ui.column().classes("gap-3 grow").style("max-width: 420px"):
+                self._bar = ui.html("", sanitize=False).style(
+                    "min-height: 34px; margin-left: 48px; max-width: calc(100% - 48px)"
+                )
+            with ui.column().classes("gap-3 grow").style("max-width: 420px; min-width: min(100%, 18rem)"):
                 self._build_controls()
         self._update()
 
@@ -57,6 +66,10 @@ class RssiPage:
         with ui.column().classes("w-full gap-0") as self._limits:
             self._threshold = slider("above", -110, -30, -75, "dBm", self._update)
             self._certainty = slider("certainty", 50, 99, 90, "%", self._update)
+            numbers = {0: "at this receiver", 1: "at any receiver"}
+            numbers |= {number: f"at {number} receivers or more" for number in range(2, len(names) + 1)}
+            self._at_least = ui.select(numbers if len(names) > 1 else {0: numbers[0]}, value=0, on_change=self._update)
+            self._at_least.props("outlined dense options-dense").classes("w-full").set_visibility(len(names) > 1)
         with ui.column().classes("w-full gap-0") as self._choice:
             self._row = ui.number("row", format="%d", on_change=self._update).props("outlined dense")
             ui.label("Click the map: the measured row nearest to it.").classes("quiet")
@@ -69,13 +82,38 @@ class RssiPage:
         with ui.row():
             ui.button("PNG", icon="download", on_click=self._save_picture).props("outline no-caps")
             ui.button("CSV", icon="download", on_click=self._save_table).props("outline no-caps")
+        self._build_floor_plan()
+
+    def _build_floor_plan(self) -> None:
+        with ui.expansion("Floor plan").classes("w-full").props('id="floor-plan" dense'):
+            ui.label("Give scale and origin, then drop an image (PNG, JPEG). It is saved with the run.").classes(
+                "quiet"
+            )
+            with ui.row().classes("w-full gap-2"):
+                for name, value in (("scale", 0.05), ("right", 0.0), ("down", 0.0)):
+                    label = {"scale": "metres a pixel", "right": "origin, pixels right", "down": "origin, pixels down"}
+                    self._placing[name] = ui.number(label[name], value=value).props("outlined dense")
+            upload = ui.upload(on_upload=self._place, auto_upload=True, max_file_size=MAX_UPLOAD_BYTES, max_files=1)
+            upload.props('accept=".png,.jpg,.jpeg" flat bordered').classes("w-full")
+
+    async def _place(self, event: events.UploadEventArguments) -> None:
+        scale, right, down = (float("nan") if box.value is None else box.value for box in self._placing.values())
+        try:
+            pixels = read_pixels(io.BytesIO(await event.file.read()), event.file.name)
+            await run.io_bound(self._view.place, FloorPlan.scaled(pixels, scale, (right, down)))
+        except InputError as error:
+            ui.notify(str(error), type="negative")
+        else:
+            ui.navigate.reload()
 
     @property
     def _selection(self) -> MapSelection:
         height, certainty = round(self._height.value, 3), self._certainty.value / 100
         locating, number = self._view.locating, self._row.value
         row = 0 if locating is None or number is None else locating.numbered(number)
-        return MapSelection(self._kind.value, self._receiver.value, height, self._threshold.value, certainty, row)
+        return MapSelection(
+            self._kind.value, self._receiver.value, height, self._threshold.value, certainty, row, self._at_least.value
+        )
 
     def _update(self) -> None:
         if self._kind.value == "expected error":
@@ -97,9 +135,11 @@ class RssiPage:
 
     def _map_svg(self, selection: MapSelection, coloured: ColouredMap) -> str:
         plan, floor = self._plan, self._view.floor
-        parts = [plan.picture(Image.fromarray(floor.plan[0]), floor.plan[1])] if floor.plan else []
+        parts = [plan.picture(Image.fromarray(floor.plan.pixels), floor.plan.corners)] if floor.plan else []
         image = colour_image(coloured.values[::-1], coloured.colours, coloured.low, coloured.high)
         parts.append(plan.picture(image, coloured.corners or self._view.corners, 0.7 if floor.plan else 1.0))
+        if selection.kind not in LOCATING:
+            parts.append(plan.picture(colour_image(self._outside, "gray"), self._view.corners, 0.55))
         if selection.kind == "RSSI":
             parts.append(self._measured_svg(selection.receiver, coloured))
         if selection.kind == "posterior":
@@ -115,6 +155,11 @@ class RssiPage:
                     parts.append(plan.cross(position, RECEIVER_MARK))
                 parts.append(text(x + 11, y + 5, self._view.receivers[number], haloed=True))
         return "".join([*parts, plan.axes()])
+
+    @property
+    def _outside(self) -> NDArray[np.floating]:
+        """Grey where the map is extrapolated, transparent elsewhere, the first row on top."""
+        return np.where(self._view.inside, np.nan, 0.5)[::-1]
 
     def _measured_svg(self, receiver: int, coloured: ColouredMap) -> str:
         """Return the measurements as dots in the colours of the map, with a white rim."""

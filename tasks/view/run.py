@@ -27,4 +27,4 @@ def run(config: ViewConfig) -> None:
     port = free_port(config.host, config.port)
     view = open_source(Path(config.source))
     build = (lambda: SpectraPage(view)) if isinstance(view, SpectraView) else (lambda: RssiPage(view))
-    serve(view.title, build, config.host, port)
+    serve(view.title, build, config.host, port, config.open)

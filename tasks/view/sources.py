@@ -141,12 +141,15 @@ def _locate_run(folder: Path, content: Row) -> RssiView:
             locating = RssiLocating(locator, data, torch.isin(data.index, train.index))
         except InputError as error:
             note = f"The measured rows are not shown, but the training rows in the locator: {error}."
-            return _located(folder.name, RssiLocating.of_training(locator), [note])
-    return _located(folder.name, locating)
+            return _located(folder.name, RssiLocating.of_training(locator), [note], folder)
+    return _located(folder.name, locating, folder=folder)
 
 
-def _located(title: str, locating: RssiLocating, notes: list[str] | None = None) -> RssiView:
-    return RssiView(title, locating.locator.model, MeasuredFloor.from_rows(locating.rows), locating, notes or [])
+def _located(
+    title: str, locating: RssiLocating, notes: list[str] | None = None, folder: Path | None = None
+) -> RssiView:
+    floor = MeasuredFloor.from_rows(locating.rows)
+    return RssiView(title, locating.locator.model, floor, locating, notes or [], folder)
 
 
 def _rssi_run(folder: Path) -> RssiView:
@@ -157,4 +160,4 @@ def _rssi_run(folder: Path) -> RssiView:
     if not isinstance(model, RssiModel):
         raise InputError(f"{file} holds a {model.kind}, expected a {RssiModel.kind}")
     with refusing(f"the maps in {folder} are not those of a run"), np.load(folder / "maps.npz") as stored:
-        return RssiView(folder.name, model, MeasuredFloor.from_run(dict(stored)))
+        return RssiView(folder.name, model, MeasuredFloor.from_run(dict(stored)), folder=folder)

@@ -19,6 +19,7 @@ from swiftwrf.choices import Moving
 from swiftwrf.data.spectra import direction_of_link
 from swiftwrf.positions import distance
 from tasks.aoa.page.room import MARGIN, extent
+from tasks.page.maps import inside
 from tasks.view.locating import Located, SpectrumLocating
 
 MAX_DRAG_SECONDS = 0.02  # of one prediction while the moving end is dragged
@@ -168,6 +169,10 @@ class SpectraView:
             None if self.fixed_end is None else _degrees(direction_of_link(query, *self.fixed_end, self.array)[0]),
             seconds,
         )
+
+    def extrapolates(self, position: NDArray[np.floating]) -> bool:
+        """Return whether a position (3,) [m] lies outside of the positions that the page covers, in plan."""
+        return not bool(inside(position, self.positions))
 
     def nearest(self, position: NDArray[np.floating]) -> tuple[int, float]:
         """Return index and distance [m] of the measured spectrum nearest to a position (3,) [m]."""

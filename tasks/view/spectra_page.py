@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from swiftwrf import AngularGrid, Spectra
 from tasks.aoa.page.room import FIXED, MEASURED, in_plan
+from tasks.page.polar import MAX_DIFFERENCE
 from tasks.page.raster import colour_image
 from tasks.view.drawing import HemisphereProjection, PlanProjection, cross, data_url, ring, text
 from tasks.view.page import NewestOnly, colour_bar, header, located_marks, plan_picture, slider
 from tasks.view.spectra import Direction, LoadedModel, PredictedSpectrum, SpectraView, angle_between, peak
 
-UNSEEN, MOVING, PEAK, SIGHT = "#bb8833", "#ee6677", "#ffffff", "#ee6677"
+UNSEEN, MOVING, PEAK, SIGHT = "#d1620f", "#cf4a4a", "#ffffff", "#ee6677"
 KEY_STEP = 0.01  # of the plan; ten times as far with Shift
 MAX_PLAN_PX = (430, 480)
 MAX_LARGE_DOTS = 400
@@ -58,8 +59,10 @@ class SpectrumPicture:
         self._projection = projection
         width, margin = (290, "24px 50px 28px 50px") if projection.polar else (750, "6px 24px 24px 40px")
         self._unit = projection.width / width  # pixels of the picture in one of the page
-        self.column.style(f"width: {width + 100}px")
-        self._picture.style(f"width: {width}px; margin: {margin}")
+        self.column.style(f"width: {width + 100}px; max-width: 100%")
+        self._picture.style(
+            f"width: {width}px; max-width: calc(100% - {100 if projection.polar else 64}px); margin: {margin}"
+        )
         self._picture._props["size"] = (projection.width, projection.height)
 
     def show(
@@ -105,15 +108,14 @@ class SpectraPage:
         self._view, self._model = view, view.models[0]
         self._position, self._shown_measurement = view.start.copy(), -1
         self._frames: deque[float] = deque(maxlen=RATE_FRAMES)
-        self._highest_std = 1e-3
         self._requests = NewestOnly(self._predict)
         self._low, self._high = view.box
         self._plan = PlanProjection.around(self._low, self._high, max_px=MAX_PLAN_PX)
         with header(view.title, view.notes):
             self._build_controls()
-        with ui.row().classes("w-full no-wrap items-start gap-8"):
+        with ui.row().classes("w-full items-start gap-8 lg:flex-nowrap"):
             self._build_plan()
-            with ui.row().classes("gap-x-8 gap-y-0 grow").style("max-width: 900px"):
+            with ui.row().classes("gap-x-8 gap-y-0 grow").style("max-width: 900px; min-width: min(100%, 20rem)"):
                 self._predicted = SpectrumPicture("Predicted", "synthesized")
                 self._measured = SpectrumPicture("Nearest measured", "measured")
                 self._std = SpectrumPicture("Standard deviation of a measured spectrum", "deviation", "magma")
@@ -134,7 +136,7 @@ class SpectraPage:
         self._polar.props("no-caps padding='2px 12px'")
 
     def _build_plan(self) -> None:
-        with ui.column().classes("gap-1").style("width: 500px; flex: none"):
+        with ui.column().classes("gap-1").style("width: 500px; max-width: 100%; flex: none"):
             self._picture = plan_picture(self._plan, "plan")
             self._picture.on_mouse(self._on_pointer)
             self._picture.props("tabindex=0").on("keydown", self._on_key, js_handler=KEYS)
@@ -160,7 +162,7 @@ class SpectraPage:
         return "".join(f'<div style="display: inline-block; margin-right: 1em">{part}</div>' for part in parts)
 
     def _choose(self, number: int) -> None:
-        self._model, self._highest_std = self._view.models[number], 1e-3
+        self._model = self._view.models[number]
         self._lay_out()
 
     def _lay_out(self) -> None:
@@ -255,12 +257,17 @@ class SpectraPage:
     def _show(self, predicted: PredictedSpectrum) -> None:
         grid = predicted.grid
         self._predicted.show(predicted.mean, grid, 1.0, (predicted.peak, predicted.line_of_sight))
-        self._predicted.caption.set_text(f"peak {_described(predicted.peak)}")
+        outside = self._view.extrapolates(predicted.position)
+        self._predicted.column.classes(**{"add" if outside else "remove": "extrapolated"})
+        where = "outside the measured positions, extrapolated; " if outside else ""
+        self._predicted.caption.set_text(f"{where}peak {_described(predicted.peak)}")
         self._std.column.set_visibility(predicted.std is not None)
         if predicted.std is not None:
-            self._highest_std = max(self._highest_std, float(predicted.std.max()))
-            self._std.show(predicted.std, grid, self._highest_std)
-            self._std.caption.set_text(f"black 0, white {self._highest_std:.2f}; mean {predicted.std.mean():.3f}")
+            self._std.show(predicted.std, grid, MAX_DIFFERENCE)
+            self._std.caption.set_text(
+                f"black 0, white {MAX_DIFFERENCE:g} and more; mean {predicted.std.mean():.3f}, "
+                f"largest {predicted.std.max():.2f}"
+            )
         shapes = [self._plan.dots(predicted.position[None], MOVING, 8)]
         if self._view.data is not None:
             index, away_m = self._view.nearest(predicted.position)

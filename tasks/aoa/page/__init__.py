@@ -2,39 +2,68 @@
 
 from __future__ import annotations
 
+from tasks.aoa.condition import terms
 from tasks.aoa.page.cost import sizes, speed_section, time_section, trainings
 from tasks.aoa.page.field import field_section
 from tasks.aoa.page.locating import locating_section
+from tasks.aoa.page.overview import compared
 from tasks.aoa.page.records import AoaRecords, FractionRecords
-from tasks.aoa.page.results import estimator_section, over_estimators, over_fractions, results_section
+from tasks.aoa.page.results import results_section, turbo_distribution
 from tasks.aoa.page.room import choice_section, room_section
 from tasks.aoa.page.suggest import suggestion_section
-from tasks.aoa.page.summary import summary
-from tasks.aoa.page.synthesis import examples_section, synthesis_section
-from tasks.page.page import Page, Section
+from tasks.aoa.page.summary import next_steps, summary, verdict
+from tasks.aoa.page.synthesis import similarity, synthesis_section
+from tasks.page.page import Page, Plot, Section, Summary, sections_of
 from tasks.page.provenance import provenance
 
 
 def page(runs: list[AoaRecords]) -> Page:
     """Return the page of these runs."""
-    several = len(runs) > 1
     fractions = [fraction for run in runs for fraction in FractionRecords.of(run)]
-    sections = [results_section(fraction, several) for fraction in fractions]
-    if len(fractions) > 1:
-        sections.insert(0, Section("Error against the measured fraction", plots=[over_fractions(fractions, "shares")]))
-    for fraction in fractions:
-        makers = (locating_section, estimator_section, choice_section, room_section, suggestion_section)
-        sections += [section for make in makers if (section := make(fraction))]
-    sections += [synthesis_section(fractions, several), *(examples_section(fraction) for fraction in fractions)]
-    sections += [section for fraction in fractions if (section := field_section(fraction))]
-    sections += [
-        *(speed_section(fraction) for fraction in fractions),
-        Section("Training and size", plots=[*sizes(runs), *trainings(runs)]),
+    sections = [
+        sections_of("Errors", fractions, results_section, terms()),
+        sections_of("Spectra", fractions, synthesis_section),
+        sections_of("Positions and room", fractions, _positions),
+        sections_of("Measure or synthesize more?", fractions, _more),
+        _limits(runs[0]),
     ]
-    sections += [time_section(fractions, several), _limits(runs[0]), provenance(runs)]
+    sections = [section for section in sections if section.paragraphs or section.tables or section.parts]
+    details = [
+        sections_of("Field models", fractions, lambda fraction: Section("", plots=_field_models(fraction))),
+        sections_of("Speed against error", fractions, speed_section),
+        Section("Training and size", plots=[*sizes(runs), *trainings(runs)]),
+        sections_of("The field over the region", fractions, field_section),
+        time_section(fractions),
+        provenance(runs),
+    ]
     names = ", ".join(dict.fromkeys(run.place for run in runs))
-    picture = over_fractions(fractions, "summary") if len(fractions) > 1 else over_estimators(fractions[0])
-    return Page(f"Angle of arrival: {names}", summary(fractions[0], picture), sections)
+    first = summary(fractions[0]) if len(fractions) == 1 else _comparison(fractions)
+    return Page(f"Angle of arrival: {names}", first, sections, details)
+
+
+def _comparison(fractions: list[FractionRecords]) -> Summary:
+    """Return the first screen of several measured fractions or runs."""
+    table, plot = compared(fractions)
+    meaning = [f"{fraction.scene}: {verdict(fraction)}" for fraction in fractions]
+    runs = {fraction.run.path: fraction.run for fraction in fractions}
+    steps = [f"Explore{run.label.replace(',', '')}: `python -m tasks.view {path}`." for path, run in runs.items()]
+    if len(runs) == 1:
+        steps = list(dict.fromkeys(step for fraction in fractions for step in next_steps(fraction)))
+    return Summary([], [plot], meaning, steps, table=table)
+
+
+def _positions(fraction: FractionRecords) -> Section | None:
+    parts = [part for make in (locating_section, room_section) if (part := make(fraction))]
+    return Section("", parts=parts) if parts else None
+
+
+def _more(fraction: FractionRecords) -> Section | None:
+    parts = [part for make in (choice_section, suggestion_section) if (part := make(fraction))]
+    return Section("", parts=parts) if parts else None
+
+
+def _field_models(fraction: FractionRecords) -> list[Plot]:
+    return [similarity(fraction), *turbo_distribution(fraction)]
 
 
 def _limits(run: AoaRecords) -> Section:

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from pandas import DataFrame, concat
 
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.swiftwrf.fit import MIN_GAIN
+from tasks.aoa.page.overview import essential
 from tasks.aoa.page.records import AoaRecords, FractionRecords, first_history, fits
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
+from tasks.page.palette import MAX_CURVES
 from tasks.page.provenance import number
 from tasks.summarise import SHORTEST, rms_of_psnr
 
 
 def speed_section(fraction: FractionRecords) -> Section:
     """Return the time of each field model and of each estimator against its error."""
-    return Section(
-        f"Speed against error ({fraction.title})", plots=[_synthesizer_speed(fraction), _estimator_speed(fraction)]
-    )
+    return Section("", plots=[_synthesizer_speed(fraction), _estimator_speed(fraction)])
 
 
 def _synthesizer_speed(fraction: FractionRecords) -> Plot:
@@ -32,14 +30,12 @@ def _synthesizer_speed(fraction: FractionRecords) -> Plot:
         for stage in ("fit", "synthesize")
     }
     caption = "Synthesizers: seconds to fit and to predict the test spectra. The line is the Pareto front."
-    return _speed(
-        f"speed-{fraction.file_name}", fraction, points, "RMS error of a spectrum", caption, also=["swiftwrf"]
-    )
+    return _speed(f"speed-{fraction.file_name}", fraction, points, "RMS error of a spectrum", caption)
 
 
 def _estimator_speed(fraction: FractionRecords) -> Plot:
-    """Return the figure of the networks on all training sets, and of the other estimators on the measured spectra."""
-    methods = {name: fraction.mix["methods"][name] for name in fraction.in_overviews}
+    """Return the figure of the essential methods."""
+    methods = {name: fraction.mix["methods"][name] for name in essential(fraction)}
     count = {"train": 1, "estimate a spectrum": fraction.run.metrics["n_test"]}
     points = {
         stage: {
@@ -64,15 +60,15 @@ def _speed(
     points: dict[str, dict[str, tuple[float, float]]],
     error: str,
     caption: str,
-    also: Sequence[str] = (),
 ) -> Plot:
     """Return a figure of seconds against error, one panel for each stage."""
-    figure, axes = figures.new_figure(1, len(points), 10, 4.2)
-    for ax, (stage, of_stage) in zip(axes, points.items(), strict=True):
-        figures.speed(ax, fraction.palette, of_stage, f"seconds to {stage}", error, also=also)
-    figures.legend_of(figure, fraction.palette, list(next(iter(points.values()))))
+    panels = []
+    for stage, of_stage in points.items():
+        figure, ax = figures.panel(5, 3.6)
+        figures.speed(ax, fraction.palette, of_stage, f"seconds to {stage}", error, also=[*of_stage])
+        panels.append(figure)
     rows = [(method, stage, *point) for stage, of_stage in points.items() for method, point in of_stage.items()]
-    return Plot(name, figure, caption, DataFrame(rows, columns=["name", "stage", "seconds", "error"]))
+    return Plot(name, panels, caption, DataFrame(rows, columns=["name", "stage", "seconds", "error"]))
 
 
 def sizes(runs: list[AoaRecords]) -> list[Plot]:
@@ -82,20 +78,20 @@ def sizes(runs: list[AoaRecords]) -> list[Plot]:
         search, final = fits(run)
         if not len(search):
             continue
-        figure, axes = figures.new_figure(1, 1, 6, 3)
+        figure, ax = figures.panel(5, 3)
         by_size = search.sort_values("n_primitives")
-        axes[0].plot(by_size["n_primitives"], by_size["validation"], "o-", markersize=4)
+        ax.plot(by_size["n_primitives"], by_size["validation"], "o-", markersize=4)
         n = int(final["n_primitives"].iloc[0])
-        axes[0].axvline(n, color=figures.RULE, linewidth=1)
-        axes[0].set_xscale("log", base=2)
-        axes[0].xaxis.set_major_formatter("{x:g}")
-        axes[0].set(xlabel="primitives", ylabel="loss on held-out spectra")
+        ax.axvline(n, color=figures.RULE, linewidth=1)
+        ax.set_xscale("log", base=2)
+        ax.xaxis.set_major_formatter("{x:g}")
+        ax.set(xlabel="primitives", ylabel="loss on held-out spectra")
         caption = (
             f"First measured fraction of {run.scene}. Loss on held-out measured spectra at coarse resolution. The model has "
             f"the smallest number within {MIN_GAIN:.1%} of the best: {n} primitives (line)."
         )
         data = by_size[["n_primitives", "validation"]]
-        plots.append(Plot(f"size-{FractionRecords.of(run)[0].file_name}", figure, caption, data))
+        plots.append(Plot(f"size-{FractionRecords.of(run)[0].file_name}", [figure], caption, data))
     return plots
 
 
@@ -111,26 +107,31 @@ def trainings(runs: list[AoaRecords]) -> list[Plot]:
         descents = history[(history["stage"] == "final") & (history["steps"] > 0)] if "steps" in history else None
         by_fit = () if descents is None else descents.groupby("synthesizer", sort=False)
         fitted = {str(name): (part["step"], part["loss"] / part["loss"].iloc[0]) for name, part in by_fit}
-        panels = {"loss of the network": networks, "loss of the synthesizer, over its first": fitted}
-        panels = {label: lines for label, lines in panels.items() if lines}
-        figure, axes = figures.new_figure(1, max(len(panels), 1), 6 * max(len(panels), 1), 3.2)
-        for ax, (label, lines) in zip(axes, panels.items(), strict=False):
-            figures.curves(ax, palette, lines, "step", label)
+        panels = {"loss of the network": networks, "loss of the field model, over its first": fitted}
+        drawn = []
+        for label, lines in panels.items():
+            for start in range(0, len(lines), MAX_CURVES):
+                names = list(lines)[start : start + MAX_CURVES]
+                figure, ax = figures.panel(5.4, 3.2)
+                ax.set_yscale("log")
+                figures.curves(ax, palette, {name: lines[name] for name in names}, "step", label)
+                drawn.append(figure)
+        if not drawn:
+            continue
         caption = f"First measured fraction and repeat of {run.scene}: networks, and synthesizers fitted by gradient."
         curves = {f"network, {name}": line for name, line in networks.items()}
         curves |= {f"synthesizer, {name}": line for name, line in fitted.items()}
         parts = [DataFrame({"what": what, "step": steps, "loss": loss}) for what, (steps, loss) in curves.items()]
-        data = concat(parts) if parts else DataFrame(columns=["what", "step", "loss"])
-        plots.append(Plot(f"training-{FractionRecords.of(run)[0].file_name}", figure, caption, data))
+        plots.append(Plot(f"training-{FractionRecords.of(run)[0].file_name}", drawn, caption, concat(parts)))
     return plots
 
 
-def time_section(fractions: list[FractionRecords], several: bool) -> Section:
+def time_section(fractions: list[FractionRecords]) -> Section:
     """Return the seconds by measured fraction and stage."""
     rows = []
     for fraction in fractions:
         seconds = fraction.mix["seconds"]
         cells = (number(value, 1) for value in (seconds["fit"], seconds["synthesize"], seconds["train"]))
-        rows.append([fraction.percent + (f", {fraction.run.scene}" if several else ""), *cells])
+        rows.append([fraction.scene, *cells])
     caption = "Seconds on the machine named below; train: all networks together."
     return Section("Where the time went", tables=[Table(["fraction", "fit", "synthesize", "train"], rows, caption)])

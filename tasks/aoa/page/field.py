@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 from pandas import DataFrame
@@ -24,7 +23,7 @@ def field_section(fraction: FractionRecords) -> Section | None:
     plots = [_map(fraction, name, field) for name in names if (field := _stored(fraction, f"field-{name}")) is not None]
     if (motion := _stored(fraction, "motion")) is not None:
         plots.append(_motion(fraction, motion))
-    return Section(f"The field over the region ({fraction.title})", plots=plots) if plots else None
+    return Section("", plots=plots) if plots else None
 
 
 def _stored(fraction: FractionRecords, kind: str) -> dict[str, NDArray[Any]] | None:
@@ -44,37 +43,36 @@ def _map(fraction: FractionRecords, name: str, field: dict[str, NDArray[Any]]) -
             "magnitude": field["magnitude"],
         }
     )
-    figure, axes = figures.new_figure(1, 3, 12, 3.8)
-    for ax, (column, label, colours, low, high) in zip(
-        axes,
-        (
-            ("azimuth_deg", "azimuth [deg]", "twilight", 0, 360),
-            ("elevation_deg", "elevation [deg]", "viridis", 0, 90),
-            ("magnitude", "magnitude", "magma", 0, 1),
-        ),
-        strict=True,
-    ):
+    shown = (
+        ("azimuth_deg", "azimuth [deg]", "twilight", 0, 360),
+        ("elevation_deg", "elevation [deg]", "viridis", 0, 90),
+        ("magnitude", "magnitude of the peak", "magma", 0, 1),
+    )
+    panels = []
+    for column, label, colours, low, high in shown:
+        figure, ax = figures.panel(4, 3.4)
         drawn = ax.scatter(x, y, c=data[column], s=24, cmap=colours, vmin=low, vmax=high, linewidths=0, rasterized=True)
-        ax.set(xlabel="x [m]", aspect="equal")
-        figure.colorbar(drawn, ax=ax, label=label, fraction=0.05, pad=0.03)
-    axes[0].set_ylabel("y [m]")
+        ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+        figures.colour_bar(ax, drawn, label)
+        panels.append(figure)
     caption = (
         f"Where the strongest signal comes from, as {name} predicts it, at {len(x)} places in the region of the "
         "measured positions, at their median height: azimuth, elevation, magnitude."
     )
-    return Plot(f"field-{name}-{fraction.file_name}", figure, caption, data)
+    return Plot(f"field-{name}-{fraction.file_name}", panels, caption, data)
 
 
 def _motion(fraction: FractionRecords, motion: dict[str, NDArray[Any]]) -> Plot:
     mean, strength = np.rad2deg(motion["mean"]), motion["strength"]
     walked = np.linalg.norm(motion["walk"] - motion["walk"][0], axis=1)
-    figure, axes = figures.new_figure(1, 2, 12, 3.6)
+    first, places = figures.panel(5.4, 3.4)
     moves = np.ptp(motion["mean"], axis=0).max() > MIN_SHIFT_RAD
-    _draw_primitives(axes[0], mean, np.rad2deg(1.0) ** 2 * motion["covariance"], strength.mean(axis=0))
+    _draw_primitives(places, mean, np.rad2deg(1.0) ** 2 * motion["covariance"], strength.mean(axis=0))
     if moves:
         for k in range(mean.shape[1]):
-            axes[0].plot(*mean[:, k].T, color="#cc3311", linewidth=0.8)
-    _draw_strengths(figure, axes[1], walked, strength)
+            places.plot(*mean[:, k].T, color="#cf4a4a", linewidth=0.8)
+    second, along = figures.panel(5.4, 3.4)
+    _draw_strengths(along, walked, strength)
     what = "red: the way of their means" if moves else "their means stay, their responses change"
     caption = (
         f"The {mean.shape[1]} strongest primitives. Left: where they lie (one standard deviation; darker is stronger; "
@@ -90,7 +88,7 @@ def _motion(fraction: FractionRecords, motion: dict[str, NDArray[Any]]) -> Plot:
             "strength": strength.ravel(),
         }
     )
-    return Plot(f"motion-{fraction.file_name}", figure, caption, data)
+    return Plot(f"motion-{fraction.file_name}", [first, second], caption, data)
 
 
 def _draw_primitives(ax: Axes, mean: NDArray[Any], covariance: NDArray[Any], strength: NDArray[Any]) -> None:
@@ -101,14 +99,14 @@ def _draw_primitives(ax: Axes, mean: NDArray[Any], covariance: NDArray[Any], str
         values, vectors = np.linalg.eigh(matrix)
         width, height = 2 * np.sqrt(values)
         angle = np.rad2deg(np.arctan2(vectors[1, 0], vectors[0, 0]))
-        style: dict[str, Any] = {"facecolor": "none", "edgecolor": "#4477aa", "alpha": float(0.15 + 0.85 * shade)}
+        style: dict[str, Any] = {"facecolor": "none", "edgecolor": "#3a7fd5", "alpha": float(0.15 + 0.85 * shade)}
         ax.add_patch(Ellipse((azimuth, elevation), width, height, angle=angle, linewidth=1.2, **style))
     ax.set(xlim=(0, 360), ylim=(0, 90), xlabel="azimuth [deg]", ylabel="elevation [deg]", xticks=range(0, 361, 90))
 
 
-def _draw_strengths(figure: Figure, ax: Axes, walked: NDArray[Any], strength: NDArray[Any]) -> None:
+def _draw_strengths(ax: Axes, walked: NDArray[Any], strength: NDArray[Any]) -> None:
     extent = (walked[0], walked[-1], strength.shape[1] - 0.5, -0.5)
     drawn = ax.imshow(strength.T, aspect="auto", extent=extent, cmap="magma", interpolation="nearest")
     ax.set(xlabel="walked [m]", ylabel="primitive, by strength")
     ax.grid(visible=False)
-    figure.colorbar(drawn, ax=ax, label="strength", fraction=0.05, pad=0.03)
+    figures.colour_bar(ax, drawn, "path gain")

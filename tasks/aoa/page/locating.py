@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from matplotlib.axes import Axes
-from numpy.typing import NDArray
 from pandas import DataFrame, concat
 
 from tasks.aoa.page.records import FractionRecords
-from tasks.aoa.page.room import FIXED, draw_in_plan, extent
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
 from tasks.page.provenance import number
 
 LEVELS = np.linspace(0, 1, 21)  # of credible regions
-TRUTH, ESTIMATE, MASS = "#228833", "#cc3311", "#4477aa"
+TRUTH, ESTIMATE, MASS = "#2a9165", "#cf4a4a", "#3a7fd5"
 MIN_WINDOW_M = 0.02  # half the side of the smallest map of a posterior
 MAX_MARK = 120  # area [pt^2] of the candidate with the largest mass
 
@@ -24,7 +19,7 @@ MAX_MARK = 120  # area [pt^2] of the candidate with the largest mass
 def locating_section(fraction: FractionRecords) -> Section | None:
     """Return the errors of located test positions; None if nothing was located and nothing was left out."""
     located, left_out = fraction.mix.get("locating") or {}, fraction.mix.get("left_out") or {}
-    title = f"Where was it? ({fraction.title})"
+    title = "Where was it?"
     notes = [f"{method} is left out: {reason}." for method, reason in left_out.items() if method not in located]
     if not located:
         return Section(title, notes) if notes else None
@@ -66,76 +61,54 @@ def locating_section(fraction: FractionRecords) -> Section | None:
 
 
 def _errors(fraction: FractionRecords) -> Plot:
-    """Return the distribution of the errors, their places, and the calibration of the credible regions."""
+    """Return the distribution of the position errors and the calibration of the credible regions."""
     table = fraction.table("positions")
-    figure, (distribution, plan, calibration) = figures.new_figure(1, 3, 12, 4.2)
     groups = {str(method): part for method, part in table.groupby("method", sort=False)}
-    errors = {method: part["error_m"] for method, part in groups.items()}
+    errors = {method: 100 * part["error_m"] for method, part in groups.items()}
+    first, distribution = figures.panel(5, 3.4)
     limit = max(*(float(part.quantile(0.95)) for part in errors.values()), 1e-3)
-    figures.cdf(distribution, fraction.palette, errors, "position error [m]", limit=limit)
+    figures.cdf(distribution, fraction.palette, errors, "position error [cm]", limit=limit)
+    second, calibration = figures.panel(5, 3.4)
     calibration.plot([0, 1], [0, 1], color=figures.RULE, linewidth=1)
-    for method, part in groups.items():
-        inside = [float((part["containing_level"] < level).mean()) for level in LEVELS]
-        calibration.plot(LEVELS, inside, label=method, color=fraction.palette.colour(method))
-    calibration.set(
-        xlabel="level of the credible region", ylabel="share of test positions inside", xlim=(0, 1), ylim=(0, 1)
-    )
-    first = next(iter(groups.values())).groupby("index")[["truth_x_m", "truth_y_m", "error_m"]].mean()
-    if fraction.run.holds(f"located-mix{fraction.key}"):
-        _draw_room(plan, fraction.run.arrays(f"located-mix{fraction.key}"))
-    highest = max(float(first["error_m"].quantile(0.95)), 1e-3)
-    drawn = plan.scatter(
-        first["truth_x_m"], first["truth_y_m"], c=first["error_m"], s=14, cmap="viridis", vmin=0, vmax=highest, zorder=3
-    )
-    plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    figure.colorbar(drawn, ax=plan, label="position error [m]", fraction=0.05, pad=0.03)
-    figures.legend_below(figure, distribution)
+    calibration.set(xlim=(0, 1), ylim=(0, 1.02))
+    inside = {
+        method: (LEVELS, [float((part["containing_level"] < level).mean()) for level in LEVELS])
+        for method, part in groups.items()
+    }
+    label = "fraction of test positions inside"
+    figures.curves(calibration, fraction.palette, inside, "level of the credible region", label)
     caption = (
-        f"Left: distribution of the position errors. Middle: error of {next(iter(groups))} at each test position in plan, "
-        "with the planes of the room (dashed: uncertain), measured positions (dots) and the fixed end (star). Right: share "
-        "of test positions inside the credible region of each level; on the diagonal the posterior is calibrated."
+        "Left: distribution of the position errors. Right: fraction of the test positions inside the credible region of "
+        "each level; on the diagonal the posterior is calibrated."
     )
     data = table[["method", "repeat", "index", "truth_x_m", "truth_y_m", "truth_z_m", "error_m", "containing_level"]]
-    return Plot(f"located-{fraction.file_name}", figure, caption, data)
-
-
-def _draw_room(plan: Axes, room: dict[str, NDArray[Any]]) -> None:
-    planes = [
-        {"normal": normal, "offset_m": offset, "certain": certain}
-        for normal, offset, certain in zip(room["normal"], room["offset"], room["certain"], strict=True)
-    ]
-    low, high = extent(planes, np.concatenate([room["measured"], room["fixed"][None]]))
-    for plane in planes:
-        draw_in_plan(plan, plane, low, high)
-    plan.plot(*room["measured"][:, :2].T, ".", color=figures.RULE, markersize=3)
-    plan.plot(*room["fixed"][:2], "*", color=FIXED, markersize=11)
+    return Plot(f"located-{fraction.file_name}", [first, second], caption, data)
 
 
 def _posteriors(fraction: FractionRecords) -> Plot:
     """Return maps of the posteriors of six test spectra, from the best to the worst."""
     example = fraction.run.arrays(f"located-mix{fraction.key}")
-    figure, axes = figures.new_figure(2, 3, 12, 7.2)
-    error = np.linalg.norm(example["estimate"] - example["truth"], axis=1)
-    for row, ax in enumerate(axes):
+    error, panels = np.linalg.norm(example["estimate"] - example["truth"], axis=1), []
+    for row in range(len(error)):
+        figure, ax = figures.panel(3.6, 3.6)
         at, weight = example["candidate"][row], example["weight"][row]
         truth, estimate = example["truth"][row], example["estimate"][row]
         half = 1.3 * max(error[row], 2 * example["radius"][row], MIN_WINDOW_M)
         ax.scatter(
             at[:, 0], at[:, 1], s=MAX_MARK * weight / weight.max(), color=MASS, alpha=0.4, linewidths=0, rasterized=True
         )
-        ax.plot(*truth[:2], "o", color=TRUTH, markersize=9, markerfacecolor="none", label="true position")
-        ax.plot(*estimate[:2], "x", color=ESTIMATE, markersize=8, label="estimate")
+        ax.plot(*truth[:2], "o", color=TRUTH, markersize=9, markerfacecolor="none")
+        ax.plot(*estimate[:2], "x", color=ESTIMATE, markersize=8)
         x, y = estimate[:2]
         ax.set(xlim=(x - half, x + half), ylim=(y - half, y + half), aspect="equal")
         ax.set_title(f"no. {example['index'][row] + 1}: {100 * error[row]:.1f} cm", fontsize=9)
-        if row >= 3:
-            ax.set_xlabel("x [m]")
-        if row % 3 == 0:
-            ax.set_ylabel("y [m]")
-    figures.legend_below(figure, axes[0])
+        ax.set(xlabel="x [m]", ylabel="y [m]")
+        ax.locator_params(nbins=5)
+        panels.append(figure)
     caption = (
         "Posteriors of six test spectra in plan, from the smallest to the largest position error (quantiles 0, 0.2, ..., "
-        "1), each around its estimate. The area of a dot is proportional to the posterior mass."
+        "1), each around its estimate. Circle: true position; cross: estimate. The area of a dot is proportional to the "
+        "posterior mass."
     )
     parts = [
         DataFrame(example["candidate"][row], columns=["x_m", "y_m", "z_m"]).assign(
@@ -143,4 +116,4 @@ def _posteriors(fraction: FractionRecords) -> Plot:
         )
         for row in range(len(error))
     ]
-    return Plot(f"posteriors-{fraction.file_name}", figure, caption, concat(parts))
+    return Plot(f"posteriors-{fraction.file_name}", panels, caption, concat(parts))

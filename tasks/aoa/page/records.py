@@ -18,11 +18,8 @@ from tasks.page.palette import Palette
 from tasks.page.records import Records
 
 AoaRecords = Records[AoaMetrics]
-LOWER_REFERENCE, UPPER_REFERENCE, CHOSEN = (
-    "#ee6677",
-    "#228833",
-    "#332288",
-)  # colours of conditions without a field model
+# colours of conditions without a field model
+LOWER_REFERENCE, UPPER_REFERENCE, CHOSEN = "#cf4a4a", "#2a9165", "#3a7fd5"
 
 
 @dataclass(frozen=True)
@@ -58,11 +55,6 @@ class FractionRecords:
         """Median angular error [deg] of each method."""
         return {name: method["great_circle_deg"]["median"] for name, method in self.mix["methods"].items()}
 
-    @property
-    def in_overviews(self) -> list[str]:
-        """Methods of overviews: networks, and other estimators on the measured spectra. More would hide each other."""
-        return [name for name, c in self.conditions.items() if c.is_network or c.training == "measured"]
-
     def table(self, name: str) -> DataFrame:
         """Return the rows of a table of the run, e.g. `errors`, with this measured fraction."""
         return table_with_present_names(of_fraction(self.run.table(name), self.key))
@@ -89,6 +81,11 @@ class FractionRecords:
         return f"{self.percent} measured{self.run.label}"
 
     @property
+    def scene(self) -> str:
+        """Name among the measured fractions of a report."""
+        return f"{self.percent} measured, {self.run.scene}"
+
+    @property
     def palette(self) -> Palette:
         """Colours of its field models and conditions."""
         return palette(self.conditions.values())
@@ -103,11 +100,11 @@ def of_fraction(table: DataFrame, key: str) -> DataFrame:
 def palette(conditions: Iterable[Condition]) -> Palette:
     """Return colours of all field models and of these conditions.
 
-    Conditions without the network are dashed, those with further positions are darker.
+    Conditions of one field model have its colour.
     """
     models = Palette.of(labels.labels(FIELD_MODELS, labels.FIELD_MODELS))
     estimators = Palette.of(labels.ESTIMATORS)
-    colours, dashed = dict(models.colours), set()
+    colours = dict(models.colours)
     for condition in conditions:
         match condition.training:
             case "measured" if condition.is_network:
@@ -118,14 +115,8 @@ def palette(conditions: Iterable[Condition]) -> Palette:
                 colour = UPPER_REFERENCE
             case _:
                 colour = CHOSEN if condition.synthesizer == AUTO else models.colour(condition.synthesizer)
-        colours[condition.method] = _darker(colour) if condition.training == "turbo_extra" else colour
-        if not condition.is_network:
-            dashed.add(condition.method)
-    return Palette(colours, frozenset(dashed))
-
-
-def _darker(colour: str) -> str:
-    return "#" + "".join(f"{int(int(colour[i : i + 2], 16) * 0.7):02x}" for i in (1, 3, 5))
+        colours[condition.method] = colour
+    return Palette(colours)
 
 
 def first_history(run: AoaRecords) -> DataFrame:

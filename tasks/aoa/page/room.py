@@ -17,10 +17,11 @@ from tasks.aoa.page.records import FractionRecords
 from tasks.metrics import AdviceMetrics, ChangeMetrics, GainMetrics
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
+from tasks.page.palette import DASHES
 from tasks.page.provenance import number
 
 MARGIN = 0.5  # [m] around the room in a plan
-FIXED, MEASURED, IMAGE = "#cc3311", "#4477aa", "#ee8866"
+FIXED, MEASURED, IMAGE = "#cf4a4a", "#3a7fd5", "#d1620f"
 
 
 def _advice_of(fraction: FractionRecords) -> dict[str, AdviceMetrics]:
@@ -75,7 +76,7 @@ def choice_section(fraction: FractionRecords) -> Section | None:
         for name, db in sorted(choice["psnr_db"].items(), key=lambda item: -item[1])
     ]
     table = Table(
-        ["synthesizer", "held-out PSNR [dB]", "seconds"],
+        ["field model", "held-out PSNR [dB]", "seconds"],
         rows,
         "Mean over held-out measured spectra, without the lowest and the highest tenth. Neither the fit nor the structure "
         "of the model depends on them.",
@@ -85,32 +86,29 @@ def choice_section(fraction: FractionRecords) -> Section | None:
     meaning = labels.labels(FIELD_MODELS, labels.FIELD_MODELS, [name])
     text = f"{name} predicts held-out measured spectra best" + (f": {meaning[name].meaning}." if meaning else ".")
     plots = [_gain(fraction, *item) for item in _advice_of(fraction).items()]
-    title = f"Which synthesizer, and does it help? ({fraction.percent} measured)"
-    return Section(title, [text, *advice_sentences(fraction)], [table], plots)
+    return Section("Which field model, and does it help?", [text, *advice_sentences(fraction)], [table], plots)
 
 
 def _gain(fraction: FractionRecords, name: str, advice: AdviceMetrics) -> Plot:
-    figure, axes = figures.new_figure(1, 1, 7, 3.2)
-    ax, colour = axes[0], fraction.palette.colour(name)
-    for sampled, line, label in ((False, "-", "predicted spectra"), (True, "--", "sampled spectra")):
-        own = [gain for gain in advice["gains"] if gain["sampled"] == sampled]
-        gains = sorted(own, key=lambda gain: gain["extra"])
+    figure, ax = figures.panel(5.8, 3.2)
+    colour, ends = fraction.palette.colour(name), []
+    for sampled, dashes, label in ((False, DASHES[0], "predicted"), (True, DASHES[1], "sampled")):
+        gains = sorted((gain for gain in advice["gains"] if gain["sampled"] == sampled), key=lambda gain: gain["extra"])
         if gains:
             at = [0, *(gain["extra"] for gain in gains)]
             change = [0, *(100 * gain["change"] for gain in gains)]
-            ax.plot(at, change, line, marker="o", markersize=4, color=colour, label=label)
-            ax.fill_between(at, *_band(gains), color=colour, alpha=0.12, linewidth=0)
+            ends.append(at[-1])
+            ax.plot(at, change, linestyle=dashes, marker="o", markersize=4, color=colour, label=label)
+            ax.fill_between(at, *_band(gains), color=colour, alpha=0.15, linewidth=0)
     ax.axhline(0, color=figures.RULE, linewidth=1)
-    ax.set_xscale("symlog", linthresh=100)
-    ax.set_xlim(left=0)
-    ax.xaxis.set_major_formatter("{x:g}")
+    ax.set_xlim(0, 1.02 * max(ends))
     ax.set(xlabel="further positions with synthetic spectra", ylabel="change of the median error [%]")
-    figures.legend_below(figure, ax)
+    figures.end_labels(ax)
     caption = (
         f"Held-out measured spectra, {advice['stand_in']} trained on the other measured spectra and on spectra by {name}. "
         "Bands: 95 % bootstrap intervals of the change. Turbo learning helps below zero."
     )
-    return Plot(f"gain-{name}-{fraction.file_name}", figure, caption, DataFrame(advice["gains"]))
+    return Plot(f"gain-{name}-{fraction.file_name}", [figure], caption, DataFrame(advice["gains"]))
 
 
 def _band(gains: list[GainMetrics]) -> tuple[list[float], list[float]]:
@@ -123,7 +121,7 @@ def room_section(fraction: FractionRecords) -> Section | None:
     if not file.is_file():
         return None
     room = json.loads(file.read_text())
-    title = f"The room that the spectra show ({fraction.percent} measured)"
+    title = "The room that was found"
     if not room["planes"]:
         return Section(title, ["No plane predicts held-out spectra: the direct path is all that was found."])
     rows = [
@@ -131,25 +129,25 @@ def room_section(fraction: FractionRecords) -> Section | None:
             _described(plane),
             f"{plane['gain']:+.2f}",
             number(plane["std_mm"], 1),
-            "certain" if plane["certain"] else "uncertain",
+            "yes" if plane["certain"] else "no",
         ]
         for plane in room["planes"]
     ]
     table = Table(
-        ["plane", "gain", "deviation [mm]", ""],
+        ["plane", "gain", "standard deviation [mm]", "identifiable"],
         rows,
-        f"Mirror planes; images up to order {room['order']}. Uncertain: another place explains the spectra nearly as "
+        f"Mirror planes; images up to order {room['order']}. Not identifiable: another place explains the spectra nearly as "
         "well, or held-out spectra hardly need the plane.",
     )
     text = (
-        f"1 - correlation with spectra held out from the search's first stage: {room['score_held_out']:.3f}; share of the "
-        f"spectra's power that the room leaves unexplained: {room['unexplained']:.0%}. The planes stand in "
-        f"geometry-mix{fraction.key}.json."
+        f"The room explains {1 - room['unexplained']:.0%} of the power of the spectra. Its spectra have a correlation of "
+        f"{1 - room['score_held_out']:.3f} with measured ones that the first stage of the search did not use. "
+        f"`geometry-mix{fraction.key}.json` contains the planes."
     )
     points = fraction.run.arrays(f"room-mix{fraction.key}")
     plot = Plot(
         f"room-{fraction.file_name}",
-        _room_figure(room["planes"], points),
+        _room_panels(room["planes"], points),
         "In plan and in space: the planes (dashed: uncertain), measured positions, the fixed end and its images of first "
         "order. The images of a moving transmitter are those of the array that sees it.",
         _places(points),
@@ -171,27 +169,27 @@ def _described(plane: dict[str, Any]) -> str:
     return f"({', '.join(f'{x:.3f}' for x in normal)}) . x = {plane['offset_m']:.3f} m"
 
 
-def _room_figure(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> Figure:
-    figure, axes = figures.new_figure(1, 2, 12, 5)
+def _room_panels(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> list[Figure]:
     low, high = extent(planes, np.concatenate([points["measured"], points["fixed"][None]]))
-    plan = axes[0]
+    first, plan = figures.panel(5.4, 4.6)
     for plane in planes:
         draw_in_plan(plan, plane, low, high)
-    first = points["order"] == 1
-    plan.plot(*points["measured"][:, :2].T, "o", color=MEASURED, markersize=2, label="measured positions")
+    own = points["order"] == 1
+    plan.plot(*points["measured"][:, :2].T, "o", color=MEASURED, markersize=2, label="measured")
     plan.plot(*points["fixed"][:2], "*", color=FIXED, markersize=11, label="fixed end")
-    plan.plot(*points["image"][first][:, :2].T, "o", color=IMAGE, markersize=4, label="its images, first order")
+    plan.plot(*points["image"][own][:, :2].T, "D", color=IMAGE, markersize=4, label="its images")
     plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    figures.legend_below(figure, plan)
-    space = figures.in_space(figure, axes[1])
+    figures.legend_below(first, plan)
+    second, axes = figures.panel(5.2, 4.6)
+    space = figures.in_space(second, axes)
     for plane in planes:
         _draw_in_space(space, plane, low, high)
     space.scatter(*points["measured"].T, s=2, color=MEASURED)
     space.scatter(*points["fixed"], s=60, marker="*", color=FIXED)
-    space.scatter(*points["image"][first].T, s=12, color=IMAGE)
+    space.scatter(*points["image"][own].T, s=12, marker="D", color=IMAGE)
     space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
-    space.set_box_aspect(np.ptp(np.concatenate([points["image"][first], [low, high]]), axis=0) + 0.5)
-    return figure
+    space.set_box_aspect(np.ptp(np.concatenate([points["image"][own], [low, high]]), axis=0) + 0.5)
+    return [first, second]
 
 
 def extent(planes: list[dict[str, Any]], inside: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tasks.aoa.page.records import FractionRecords
 from tasks.page.page import Section
-from tasks.page.suggestion import suggestion_plot
+from tasks.page.suggestion import suggestion_plot, worth
 
 
 def suggestion_section(fraction: FractionRecords) -> Section | None:
@@ -17,8 +17,8 @@ def suggestion_section(fraction: FractionRecords) -> Section | None:
     text = (
         f"Measuring at {len(suggested)} more positions (suggested-mix{fraction.key}.csv, the most informative first) would "
         f"reduce the predictive variance over the region from {left[0]:.0%} to {left[-1]:.0%} of the variance of the "
-        "spectra. The estimate is that of a Gaussian process on the measured spectra. If the variance hardly falls, spectra "
-        "change faster than this number of positions can resolve."
+        "spectra. The estimate is that of a Gaussian process on the measured spectra. "
+        f"{worth(left)}"
     )
     plot = suggestion_plot(f"suggested-{fraction.file_name}", arrays, "variance left in the region [%]")
-    return Section(f"Where to measure next ({fraction.title})", [text], plots=[plot])
+    return Section("Where to measure next", [text], plots=[plot])

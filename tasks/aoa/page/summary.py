@@ -6,14 +6,17 @@ from tasks.aoa.condition import LOCATOR
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.former import FORMER_NAMES
 from tasks.aoa.page.gains import change_text, changes_of, gain_sentence, judgement, reference, turbo_method
+from tasks.aoa.page.overview import overview
 from tasks.aoa.page.records import AoaRecords, FractionRecords
 from tasks.aoa.page.results import choice_sentence
 from tasks.aoa.page.room import advice_sentences
-from tasks.page.page import Number, Plot, Summary
+from tasks.page.page import Number, Summary
+from tasks.page.suggestion import worth
+from tasks.summarise import fingerprinting
 from tasks.terminal import Answer
 
 
-def summary(fraction: FractionRecords, picture: Plot) -> Summary:
+def summary(fraction: FractionRecords) -> Summary:
     """Return the summary of one measured fraction."""
     metrics, mix = fraction.run.metrics, fraction.mix
     meaning = [
@@ -23,11 +26,11 @@ def summary(fraction: FractionRecords, picture: Plot) -> Summary:
         *(text for text in (choice_sentence(fraction), gain_sentence(fraction)) if text),
         *advice_sentences(fraction),
     ]
-    return Summary(_numbers(fraction), picture, meaning, _next_steps(fraction), verdict(fraction))
+    return Summary(_numbers(fraction), [overview(fraction)], meaning, next_steps(fraction), verdict(fraction))
 
 
 def _numbers(fraction: FractionRecords) -> list[Number]:
-    """Return the error of the estimator that cross-validation chose, the gain of the network, the quality of the spectra."""
+    """Return errors of the chosen estimator, the network and the strongest peak, and the quality of the spectra."""
     turbo = turbo_method(fraction)
     choice = fraction.mix.get("estimator_choice")
     first = choice["name"] if choice else turbo
@@ -35,7 +38,7 @@ def _numbers(fraction: FractionRecords) -> list[Number]:
     quality = fraction.mix["synthesis"][synthesizer]["psnr_db"]
     return [
         *(_error(fraction, name) for name in dict.fromkeys((first, turbo)) if name in fraction.mix["methods"]),
-        _gain(fraction, turbo),
+        *_strongest_peak(fraction),
         Number(
             f"{quality['median']:.1f} dB",
             f"median PSNR of the spectra that {synthesizer} predicts at positions without a measurement",
@@ -52,77 +55,97 @@ def answer(run: AoaRecords) -> Answer:
         for method, condition in fraction.conditions.items():
             names = {"condition": condition.meaning, "estimator": condition.estimator}
             rows.append((share | names, fraction.mix["methods"][method]["great_circle_deg"]))
-    return Answer("deg", rows, verdict(fractions[0]), _next_steps(fractions[0]))
+    return Answer("deg", rows, verdict(fractions[0]), next_steps(fractions[0]))
 
 
 def verdict(fraction: FractionRecords) -> str:
-    """Return which estimator to take and what synthetic spectra change, in one or two short sentences."""
-    sentences = []
+    """Return which estimator to take and what synthetic spectra change, in short sentences."""
+    sentences, medians = [], fraction.medians
     if choice := fraction.mix.get("estimator_choice"):
-        sentences.append(f"Take {choice['name']}: median error {fraction.medians[choice['name']]:.2f} degrees.")
+        sentences.append(f"Take {choice['name']}: median error {medians[choice['name']]:.2f} degrees.")
     turbo = turbo_method(fraction)
-    own = "measured_only"
-    if change := changes_of(fraction, turbo).get(own):
+    best = reference(fraction)
+    if change := changes_of(fraction, turbo).get(best):
         sentences.append(
-            f"Synthetic spectra change the network's median error by {change_text(change)}: {judgement(change)}."
+            f"The network with synthetic spectra changes the median error by {change_text(change)} against {best}, the best "
+            f"estimator without them: {judgement(change)}."
         )
     else:
-        before, after = fraction.medians[own], fraction.medians[turbo]
         sentences.append(
-            f"Synthetic spectra change the network's median error from {before:.2f} to {after:.2f} degrees."
+            f"{best}, the best estimator without synthetic spectra, has a median error of {medians[best]:.2f} degrees, the "
+            f"network with them {medians[turbo]:.2f}."
         )
-    return " ".join(sentences)
+    if "peak" in medians and "constant" in medians:
+        sentences.append(fingerprinting(medians["constant"], medians["peak"]))
+    return " ".join(sentence for sentence in sentences if sentence)
 
 
 def _error(fraction: FractionRecords, method: str) -> Number:
     """Return the error of a method, with its position error if it locates."""
     error = fraction.mix["methods"][method]["great_circle_deg"]
     choice = fraction.mix.get("estimator_choice")
-    who = "the network with synthetic spectra" if fraction.conditions[method].is_network else "the estimator"
-    text = f"median angular error of {who}, {method}, 95 % interval [{error['low']:.2f}, {error['high']:.2f}]"
-    text += "; cross-validation on the measured spectra chose it" if choice and choice["name"] == method else ""
+    chosen = choice is not None and choice["name"] == method
+    who = "network with synthetic spectra" if fraction.conditions[method].is_network else "estimator"
+    text = f"median angular error of {method}, {'the chosen ' if chosen else 'the '}{who}, 95 % interval "
+    text += f"[{error['low']:.2f}, {error['high']:.2f}]"
     if located := (fraction.mix.get("locating") or {}).get(method):
         text += f"; median position error {100 * located['position_error_m']['median']:.1f} cm"
     return Number(f"{error['median']:.2f}\N{DEGREE SIGN}", text)
 
 
-def _gain(fraction: FractionRecords, turbo: str) -> Number:
-    """Return the change of the network's error against the best estimator without synthetic spectra."""
-    best, error = reference(fraction), fraction.medians
-    change, interval = error[turbo] / error[best] - 1, ""
-    if found := changes_of(fraction, turbo).get(best):
-        interval = f", 95 % interval [{found['low']:+.0%}, {found['high']:+.0%}]: {judgement(found)}"
-    return Number(
-        f"{change:+.0%}".replace("-", "\N{MINUS SIGN}"),
-        f"change by synthetic spectra of the network's error against {error[best]:.2f} degrees of {best}, the best without "
-        f"them{interval}; everything measured: {error['measured_all']:.2f}",
-    )
+def _strongest_peak(fraction: FractionRecords) -> list[Number]:
+    """Return the error of the strongest direction, which needs no training."""
+    if "peak" not in fraction.medians:
+        return []
+    without = "median angular error of the strongest peak, which needs no training"
+    if "constant" in fraction.medians:
+        without += f"; of the mean direction: {fraction.medians['constant']:.2f}\N{DEGREE SIGN}"
+    return [Number(f"{fraction.medians['peak']:.2f}\N{DEGREE SIGN}", without)]
 
 
-def _next_steps(fraction: FractionRecords) -> list[str]:
+def next_steps(fraction: FractionRecords) -> list[str]:
+    """Return what to do next, a sentence each."""
     metrics, key = fraction.run.metrics, fraction.key
-    steps = []
-    if choice := fraction.mix.get("estimator_choice"):
-        steps.append(f"Take {choice['name']} on this data: cross-validation chose it, without the test spectra.")
-    if metrics["repeats"] == 1:
-        steps.append(
-            "One draw of the measured fraction proves little: repeat with --repeats 3 before you rely on a difference."
-        )
-    if metrics["split"] == "random" and metrics["data"] != "simulated-room":
-        steps.append("Run --split block: it shows the error in a region where nothing was measured.")
-    if (fraction.run.folder / f"suggested-mix{key}.csv").is_file():
-        steps.append(f"Measure next at the positions in suggested-mix{key}.csv; the section below has their map.")
-    else:
-        steps.append("Ask where to measure next with --suggest 20.")
+    path = fraction.run.path
     files = {
         file.name.removesuffix(f"-mix{key}.safetensors") for file in fraction.run.folder.glob(f"*-mix{key}.safetensors")
     }
-    estimators = sorted(files & {*ESTIMATORS, *FORMER_NAMES, LOCATOR})
+    estimators = files & {*ESTIMATORS, *FORMER_NAMES, LOCATOR}
+    steps = []
+    if files - estimators:
+        steps.append(f"Explore the spectra: `python -m tasks.view {path}`.")
+    choice = fraction.mix.get("estimator_choice")
+    taken = _file_of(fraction, choice["name"], estimators) if choice else ""
+    if taken:
+        steps.append(
+            f"Take {taken} on this data: cross-validation chose it, without the test spectra. Estimate directions of new "
+            f"spectra: `python -m tasks.estimate {path}/{taken}-mix{key}.safetensors SOURCE`."
+        )
+    others = sorted(estimators - {taken})
+    if others:
+        kept = f"`python -m tasks.estimate {path}/{others[0]}-mix{key}.safetensors SOURCE`"
+        more = f" Also kept: {', '.join(others[1:])}." if len(others) > 1 else ""
+        steps.append(f"{'Or by' if taken else 'Estimate directions by'} {others[0]}: {kept}.{more}")
     steps += [
-        f"Estimate directions: python -m tasks.estimate {name}-mix{key}.safetensors SOURCE." for name in estimators
+        f"Predict spectra anywhere: `swiftwrf.load('{path}/{name}-mix{key}.safetensors').predict(positions)`."
+        for name in sorted(files - estimators)
     ]
-    steps += [
-        f"Draw spectra anywhere: swiftwrf.load('{name}-mix{key}.safetensors').synthesize(position)."
-        for name in sorted(files - set(estimators))
-    ]
+    if (fraction.run.folder / f"suggested-mix{key}.csv").is_file():
+        left = fraction.run.arrays(f"suggested-mix{key}")["left"]
+        steps.append(f"Where to measure next is in suggested-mix{key}.csv. {worth(left)}")
+    else:
+        steps.append("Ask where to measure next with `--suggest 20`.")
+    if metrics["repeats"] == 1:
+        steps.append("Repeat with `--repeats 3` before you rely on a difference: one random subset proves little.")
+    if metrics["split"] == "random" and metrics["data"] != "simulated-room":
+        steps.append("Run `--split block`: it shows the error in a region where nothing was measured.")
     return steps
+
+
+def _file_of(fraction: FractionRecords, method: str, kept: set[str]) -> str:
+    """Return the kept estimator of a method, empty if no file is of it: files are trained as the run recommends."""
+    condition = fraction.conditions.get(method)
+    if condition is None:
+        return ""
+    names = [condition.estimator, *(old for old, new in FORMER_NAMES.items() if new == condition.estimator)]
+    return next((name for name in names if name in kept), "")

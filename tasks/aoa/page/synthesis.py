@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,60 +10,89 @@ from numpy.typing import NDArray
 from pandas import DataFrame, concat
 
 from swiftwrf.models import FIELD_MODELS
-from tasks import labels
 from tasks.aoa.page.records import FractionRecords
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
+from tasks.page.palette import MAX_CURVES
+from tasks.page.polar import MAX_DIFFERENCE, Direction, spectra
 from tasks.page.provenance import number
 
 
-def synthesis_section(fractions: list[FractionRecords], several: bool) -> Section:
-    """Return the quality of the spectra of each field model at the test positions."""
+@dataclass(frozen=True)
+class Example:
+    """A test spectrum and its prediction.
+
+    Args:
+        title: Number and quality.
+        images: Values (n_elevation, n_azimuth) by kind, as `tasks.page.polar.spectra` takes them.
+        truth: True direction [deg]. None if it is unknown.
+    """
+
+    title: str
+    images: dict[str, NDArray[Any]]
+    truth: Direction | None
+
+
+def examples(fraction: FractionRecords) -> list[Example]:
+    """Return test spectra from the best to the worst prediction."""
+    stored = _stored(fraction)
+    labels = fraction.table("errors").drop_duplicates("index").set_index("index")
+    found = []
+    for row, index in enumerate(stored["index"].tolist()):
+        measured, predicted = (stored[kind][row] / 255.0 for kind in ("measured", "synthetic"))
+        images = {"measured": measured, "predicted": predicted, "difference": predicted - measured}
+        if "deviation" in stored:
+            images["standard deviation"] = stored["deviation"][row] / 255.0
+        truth = None
+        if index in labels.index:
+            label = labels.loc[index]
+            truth = (float(label["truth_azimuth_deg"]), float(label["truth_elevation_deg"]))
+        found.append(Example(f"no. {index + 1}, PSNR {stored['psnr_db'][row]:.1f} dB", images, truth))
+    return found
+
+
+def synthesis_section(fraction: FractionRecords) -> Section:
+    """Return the quality of the spectra of each field model at the test positions, and examples."""
     rows = []
-    for fraction in fractions:
-        for name, scores in fraction.mix["synthesis"].items():
-            what = f"{fraction.percent} {name}" + (f", {fraction.run.scene}" if several else "")
-            db = scores["psnr_db"]
-            interval = f"{number(db['median'], 1)} [{number(db['low'], 1)}, {number(db['high'], 1)}]"
-            rows.append([what, number(scores["ssim"]["median"], 3), interval, number(scores["l1"]["mean"], 4)])
+    for name, scores in fraction.mix["synthesis"].items():
+        db = scores["psnr_db"]
+        interval = f"{number(db['median'], 1)} [{number(db['low'], 1)}, {number(db['high'], 1)}]"
+        rows.append([name, interval, number(scores["ssim"]["median"], 3), number(scores["l1"]["mean"], 4)])
     caption = (
-        "SSIM: scikit-image's default (7 x 7 uniform window, data range 1), median; PSNR: 10 log10(1 / MSE), median with "
-        "its 95 % interval; L1: mean. Over the test spectra, which no synthesizer was fitted to."
+        "Median PSNR (10 log10(1 / MSE)) with its 95 % interval, median SSIM (7 x 7 uniform window, data range 1), mean L1 "
+        "over the test spectra, which no field model was fitted to."
     )
-    table = Table(["fraction and synthesizer", "SSIM", "PSNR [dB]", "L1"], rows, caption)
-    names = dict.fromkeys(name for fraction in fractions for name in fraction.mix["synthesis"])
-    plots = [_ssim_cdf(fraction) for fraction in fractions]
-    meanings = {name: label.meaning for name, label in labels.labels(FIELD_MODELS, labels.FIELD_MODELS, names).items()}
-    return Section("How good are the synthetic spectra?", [], [table], plots, meanings)
+    table = Table(["field model", "PSNR [dB]", "SSIM", "L1"], rows, caption)
+    return Section("", [], [table], [_examples(fraction)])
 
 
-def _ssim_cdf(fraction: FractionRecords) -> Plot:
+def _examples(fraction: FractionRecords) -> Plot:
+    stored = _stored(fraction)
+    text = (
+        f"Spectra at positions without a measurement, by {stored.get('synthesizer', 'swiftwrf')}, from the best to the "
+        "worst by PSNR (quantiles 1, 0.8, ..., 0). The zenith is in the middle; cross: true direction, ring: peak. "
+        f"Differences and standard deviations have a fixed scale up to {MAX_DIFFERENCE:g}."
+    )
+    if "deviation" in stored:
+        text += f" Intervals of 80 % cover {float(stored['coverage']):.0%} of the pixels of all test spectra."
+    panels = [spectra(one.images, one.title, one.truth) for one in examples(fraction)]
+    return Plot(f"spectra-{fraction.file_name}", panels, text, _pixels(stored))
+
+
+def similarity(fraction: FractionRecords) -> Plot:
+    """Return the distribution of the SSIM of the best field models."""
     table = fraction.table("synthesis")
     own = table[table["synthesizer"].isin(list(FIELD_MODELS))]
-    groups = {str(name): part["ssim"] for name, part in own.groupby("synthesizer", sort=False)}
-    figure, axes = figures.new_figure(1, 1, 6, 3.3)
-    figures.cdf(axes[0], fraction.palette, groups, "SSIM", limit=1)
-    figures.legend_below(figure, axes[0])
+    best = own.groupby("synthesizer")["ssim"].median().sort_values(ascending=False).index[:MAX_CURVES]
+    groups = {str(name): own[own["synthesizer"] == name]["ssim"] for name in best}
+    figure, axes = figures.panel(5.4, 3.3)
+    figures.cdf(axes, fraction.palette, groups, "SSIM", limit=1)
     caption = f"Distribution of the SSIM over the test spectra, {fraction.title}."
-    return Plot(f"ssim-{fraction.file_name}", figure, caption, own[["repeat", "index", "synthesizer", "ssim"]])
+    return Plot(f"ssim-{fraction.file_name}", [figure], caption, own[["repeat", "index", "synthesizer", "ssim"]])
 
 
-def examples_section(fraction: FractionRecords) -> Section:
-    """Return measured and synthetic spectra side by side, from the best to the worst."""
-    example = fraction.run.arrays(f"examples-mix{fraction.key}")
-    captions = [f"no. {i + 1}\n{db:.1f} dB" for i, db in zip(example["index"], example["psnr_db"], strict=True)]
-    deviation = example["deviation"] / 255.0 if "deviation" in example else None
-    figure = figures.spectra(example["measured"] / 255.0, example["synthetic"] / 255.0, captions, deviation)
-    text = "From the best to the worst of the test spectra by PSNR (quantiles 1, 0.8, ..., 0); angles in degrees."
-    if deviation is not None:
-        text += (
-            " Expected deviation: the predictive standard deviation of the model; intervals of 80 % cover "
-            f"{float(example['coverage']):.0%} of the pixels of all test spectra."
-        )
-    return Section(
-        f"Six spectra at positions nobody measured ({fraction.title}, {example.get('synthesizer', 'swiftwrf')})",
-        plots=[Plot(f"spectra-{fraction.file_name}", figure, text, _pixels(example))],
-    )
+def _stored(fraction: FractionRecords) -> dict[str, NDArray[Any]]:
+    return fraction.run.arrays(f"examples-mix{fraction.key}")
 
 
 def _pixels(example: dict[str, NDArray[Any]]) -> DataFrame:

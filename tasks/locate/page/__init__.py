@@ -10,50 +10,68 @@ from tasks.labels import LOCALIZERS as LABELS
 from tasks.labels import labels
 from tasks.locate.localizers import LOCALIZERS
 from tasks.locate.page import drawing
-from tasks.locate.page.summary import OWN, LocateRecords, by_method, summary
+from tasks.locate.page.summary import LEVEL, NEIGHBOURS, OWN, LocateRecords, by_method, summary, verdict
 from tasks.locate.steps import SUGGESTED
-from tasks.page.page import Page, Plot, Section, Table
+from tasks.page.comparison import Compared, comparison, with_interval
+from tasks.page.page import Page, Plot, Section, Summary, Table, sections_of
 from tasks.page.provenance import number, provenance
-from tasks.page.suggestion import suggestion_plot
+from tasks.page.suggestion import suggestion_plot, worth
 from tasks.summarise import paired_difference
 
 
 def page(runs: list[LocateRecords]) -> Page:
     """Return the page of these runs."""
-    sections = [section for n, run in enumerate(runs) for section in _run(run, several=len(runs) > 1, first=n == 0)]
+    terms = {name: label.meaning for name, label in labels(LOCALIZERS, LABELS).items()}
+    sections = [
+        sections_of("Position errors", runs, lambda run: _errors(run, several=len(runs) > 1), terms),
+        sections_of("Posterior maps", runs, lambda run: Section("", plots=[_posteriors(run)])),
+        sections_of("Calibration", runs, lambda run: Section("", _weights(run), plots=[_calibration(run)])),
+        _limits(runs[0]),
+    ]
+    if any(run.holds(SUGGESTED) for run in runs):
+        sections.insert(3, sections_of("Where to measure next", runs, _suggestion))
+    details = []
+    if any(run.metrics["by_rows"] or run.metrics["by_receivers"] for run in runs):
+        details.append(sections_of("Errors against training rows and receivers", runs, _studies))
     names = ", ".join(dict.fromkeys(run.place for run in runs))
-    first = summary(runs[0], _overview(runs[0], "summary"))
-    return Page(f"Localization: {names}", first, [*sections, _limits(runs[0]), provenance(runs)])
+    first = summary(runs[0], _overview(runs[0], "summary")) if len(runs) == 1 else _comparison(runs)
+    return Page(f"Localization: {names}", first, sections, [*details, provenance(runs)])
 
 
-def _run(run: LocateRecords, several: bool, first: bool) -> list[Section]:
-    suffix = f" - {run.scene}" if several else ""
+def _comparison(runs: list[LocateRecords]) -> Summary:
+    """Return the first screen of several runs."""
+    compared = []
+    for run in runs:
+        found = {name: entry["position_error_m"] for name, entry in run.metrics["overall"].items()}
+        further = {"in 80 % region": f"{run.metrics['calibration'][str(LEVEL)]:.0%}"}
+        compared.append(Compared(f"{run.number}: {run.place}", found, further))
+    shown = [name for name in (OWN, *NEIGHBOURS, "mean") if any(name in one.errors for one in compared)]
+    table, plot = comparison(compared, drawing.palette(), shown, "m", "position error")
+    meaning = [f"Run {run.number}, {run.place}: {verdict(run)}" for run in runs]
+    steps = [f"Explore run {run.number}: `python -m tasks.view {run.path}`." for run in runs]
+    return Summary([], [plot], meaning, steps, table=table)
+
+
+def _errors(run: LocateRecords, several: bool) -> Section:
     n_undetected = run.metrics["n_undetected"]
     notes = [f"Test rows that no receiver detected are left out: {n_undetected}."] if n_undetected else []
-    terms = {name: label.meaning for name, label in labels(LOCALIZERS, LABELS).items()}
-    overview = [] if first else [_overview(run, f"overview-{run.file_name}")]
-    sections = [
-        Section(f"Position errors{suffix}", notes, [_table(run), _paired(run)], overview, terms),
-        Section(f"Calibration{suffix}", _weights(run), plots=[_calibration(run)]),
-        Section(f"Posterior maps{suffix}", plots=[_posteriors(run)]),
-    ]
-    if run.metrics["by_rows"] or run.metrics["by_receivers"]:
-        sections.insert(2, Section(f"Errors against training rows and receivers{suffix}", plots=[_studies(run)]))
-    if run.holds(SUGGESTED):
-        sections.append(_suggestion(run, suffix))
-    return sections
+    overview = [_overview(run, f"overview-{run.file_name}")] if several else []
+    return Section("", notes, [_table(run), _paired(run)], overview)
 
 
-def _suggestion(run: LocateRecords, suffix: str) -> Section:
+def _suggestion(run: LocateRecords) -> Section | None:
+    if not run.holds(SUGGESTED):
+        return None
     arrays = run.arrays(SUGGESTED)
     left = arrays["left"]
     text = (
         f"Measuring at {len(arrays['suggested'])} more positions ({SUGGESTED}.csv, the most useful first) would reduce the "
         f"variance of the radio maps from {left[0]:.0%} to {left[-1]:.0%} of the field's variance. The mean over the region "
-        "is weighted by the expected squared position error. Errors are those of simulated rows under the fitted maps."
+        "is weighted by the expected squared position error. Errors are those of simulated rows under the fitted maps. "
+        f"{worth(left)}"
     )
     plot = suggestion_plot(f"suggested-{run.file_name}", arrays, "weighted variance left [%]")
-    return Section(f"Where to measure next{suffix}", [text], plots=[plot])
+    return Section("", [text], plots=[plot])
 
 
 def _overview(run: LocateRecords, name: str) -> Plot:
@@ -69,9 +87,17 @@ def _table(run: LocateRecords) -> Table:
     rows = []
     for name, entry in run.metrics["overall"].items():
         error, horizontal = entry["position_error_m"], entry["horizontal_error_m"]
-        median = f"{number(error['median'])} [{number(error['low'])}, {number(error['high'])}]"
         seconds = f"{number(entry['seconds']['fit'])} + {number(entry['seconds']['predict'])}"
-        rows.append([name, median, number(error["p90"]), number(error["mean"]), number(horizontal["median"]), seconds])
+        rows.append(
+            [
+                name,
+                with_interval(error),
+                number(error["p90"]),
+                number(error["mean"]),
+                number(horizontal["median"]),
+                seconds,
+            ]
+        )
     columns = ["localizer", "median [m]", "90 % [m]", "mean [m]", "median in plan [m]", "fit + locate [s]"]
     return Table(columns, rows, "Position error of the test rows; median with its 95 % interval.", frozenset([OWN]))
 
@@ -101,17 +127,20 @@ def _calibration(run: LocateRecords) -> Plot:
         "probability. On the line the posterior is calibrated, below it the regions are too small."
     )
     data = drawing.coverage(run.metrics["calibration"], run.metrics["n_test"])
-    return Plot(f"calibration-{run.file_name}", drawing.calibration(data), caption, data)
+    return Plot(f"calibration-{run.file_name}", [drawing.calibration(data)], caption, data)
 
 
-def _studies(run: LocateRecords) -> Plot:
+def _studies(run: LocateRecords) -> Section | None:
+    if not (run.metrics["by_rows"] or run.metrics["by_receivers"]):
+        return None
     caption = (
         "Median position error (bars: 95 % interval) of localizers fitted to a random part of the training rows, and with a "
         "random part of the receivers."
     )
     rows, receivers = drawing.study_table(run.metrics["by_rows"]), drawing.study_table(run.metrics["by_receivers"])
     data = concat([rows, receivers]).drop_duplicates()
-    return Plot(f"studies-{run.file_name}", drawing.studies(rows, receivers), caption, data)
+    plot = Plot(f"studies-{run.file_name}", drawing.studies(rows, receivers), caption, data)
+    return Section("", plots=[plot])
 
 
 def _posteriors(run: LocateRecords) -> Plot:

@@ -17,28 +17,28 @@ from scipy.stats import binomtest
 from tasks.labels import LOCALIZERS as LABELS
 from tasks.labels import labels
 from tasks.locate.localizers import LOCALIZERS
-from tasks.locate.page.summary import OWN
+from tasks.locate.page.summary import NEIGHBOURS, OWN
 from tasks.metrics import StudyMetrics
 from tasks.page import figures
-from tasks.page.palette import Palette
+from tasks.page.palette import DASHES, MAX_CURVES, Palette
 
 MAX_VECTOR_LINES = 300  # more lines become an image, so that the page stays small
-TRUTH, ESTIMATE = "#ee6677", "#ffffff"
+TRUTH, ESTIMATE = "#cf4a4a", "#ffffff"
 
 
 def palette() -> Palette:
-    """Return the colours of the localizers; the mean, which uses no RSSI, is dashed."""
-    return Palette.of(labels(LOCALIZERS, LABELS), dashed=["mean"])
+    """Return the colours of the localizers."""
+    return Palette.of(labels(LOCALIZERS, LABELS))
 
 
-def overview(errors: DataFrame) -> Figure:
-    """Draw the posterior's errors in plan, beside the distributions of all localizers' errors."""
-    figure, (plan, cdf) = figures.new_figure(1, 2, 12, 4.4)
+def overview(errors: DataFrame) -> list[Figure]:
+    """Draw the posterior's errors in plan, and the distributions of the errors of some localizers."""
+    first, plan = figures.panel(5.4, 4.2)
     own = errors[errors["method"] == OWN]
     truth, estimate = own[["truth_x_m", "truth_y_m"]].to_numpy(), own[["x_m", "y_m"]].to_numpy()
     value = own["position_error_m"].to_numpy()
     many = len(own) >= MAX_VECTOR_LINES
-    style: dict[str, Any] = {"cmap": "viridis_r", "clim": (0, float(np.quantile(value, 0.95)) or 1.0)}
+    style: dict[str, Any] = {"cmap": "viridis", "clim": (0, float(np.quantile(value, 0.95)) or 1.0)}
     lines = LineCollection(np.stack([truth, estimate], axis=1).tolist(), linewidths=1, rasterized=many, **style)
     lines.set_array(value)
     plan.add_collection(lines)
@@ -46,13 +46,14 @@ def overview(errors: DataFrame) -> Figure:
     dots.set_clim(*style["clim"])
     plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     plan.autoscale()
-    figure.colorbar(lines, ax=plan, label="position error [m]", fraction=0.03, pad=0.02, extend="max")
-    groups = {str(name): part["position_error_m"] for name, part in errors.groupby("method", sort=False)}
+    figures.colour_bar(plan, lines, "position error [m]", extend="max")
+    second, cdf = figures.panel(5.4, 3.4)
+    present = [name for name in (OWN, *NEIGHBOURS, "mean") if name in set(errors["method"])]
+    groups = {name: errors[errors["method"] == name]["position_error_m"] for name in present}
     without = errors[errors["method"] != "mean"]["position_error_m"]
     figures.cdf(cdf, palette(), groups, "position error [m]", float(without.quantile(0.98)) or 1.0)
     cdf.set_ylabel("fraction of test rows")
-    cdf.legend(frameon=False, fontsize=8, loc="lower right")
-    return figure
+    return [first, second]
 
 
 def coverage(measured: Mapping[str, float], n: int) -> DataFrame:
@@ -66,7 +67,7 @@ def coverage(measured: Mapping[str, float], n: int) -> DataFrame:
 
 def calibration(data: DataFrame) -> Figure:
     """Draw measured against nominal coverage."""
-    figure, (axes,) = figures.new_figure(1, 1, 5, 4)
+    figure, axes = figures.panel(5, 4)
     axes.plot([0, 1], [0, 1], color=figures.RULE, linewidth=1)
     _with_bars(axes, OWN, data, "nominal", "measured")
     axes.set(xlim=(0, 1), ylim=(0, 1))
@@ -80,7 +81,7 @@ def study_table(found: Sequence[StudyMetrics]) -> DataFrame:
     return DataFrame(rows).drop(columns="position_error_m", errors="ignore")
 
 
-def studies(by_rows: DataFrame, by_receivers: DataFrame) -> Figure:
+def studies(by_rows: DataFrame, by_receivers: DataFrame) -> list[Figure]:
     """Draw the median error against the numbers of training rows and of receivers, tables of `study_table`."""
     shown = [
         (table, x, label)
@@ -90,45 +91,45 @@ def studies(by_rows: DataFrame, by_receivers: DataFrame) -> Figure:
         )
         if len(table)
     ]
-    figure, axes = figures.new_figure(1, len(shown), 5 * len(shown), 3.6)
-    for ax, (table, x, label) in zip(axes, shown, strict=True):
-        for name, part in table.groupby("localizer", sort=False):
-            _with_bars(ax, str(name), part.sort_values(x), x, "median", line="-")
+    panels = []
+    for table, x, label in shown:
+        figure, ax = figures.panel(5, 3.4)
+        names = list(table["localizer"].unique())[:MAX_CURVES]
+        for dashes, name in zip(DASHES, names, strict=False):
+            _with_bars(ax, str(name), table[table["localizer"] == name].sort_values(x), x, "median", line=dashes)
         ax.set(xlabel=label, ylabel="median position error [m]", ylim=(0, None))
-    figures.legend_below(figure, axes[0])
-    return figure
+        figures.legend_below(figure, ax)
+        panels.append(figure)
+    return panels
 
 
-def _with_bars(axes: Axes, name: str, data: DataFrame, x: str, y: str, line: str = "") -> None:
+def _with_bars(axes: Axes, name: str, data: DataFrame, x: str, y: str, line: Any = "") -> None:
     """Draw a localizer's values with their intervals, columns low and high."""
     bars = np.clip([data[y] - data["low"], data["high"] - data[y]], 0, None)
     style: dict[str, Any] = {"color": palette().colour(name), "linestyle": line, "linewidth": 1.4, "elinewidth": 0.8}
     axes.errorbar(data[x], data[y], yerr=bars, marker="o", markersize=4, label=name, **style)
 
 
-def posteriors(maps: Mapping[str, NDArray[Any]]) -> Figure:
-    """Draw the posteriors of some test rows in plan."""
-    n = len(maps["density"])
-    columns = min(3, n)
-    rows = -(-n // columns)
-    shape = np.ptp(maps["y"]) / max(np.ptp(maps["x"]), 1e-9)
-    figure, axes = figures.new_figure(rows, columns, 12, rows * (0.5 + 3.7 * float(np.clip(shape, 0.4, 1.6))))
+def posteriors(maps: Mapping[str, NDArray[Any]]) -> list[Figure]:
+    """Draw the posteriors of some test rows in plan, a panel each."""
+    shape = float(np.clip(np.ptp(maps["y"]) / max(np.ptp(maps["x"]), 1e-9), 0.4, 1.6))
     extent = (maps["x"][0], maps["x"][-1], maps["y"][0], maps["y"][-1])
-    for ax in axes[n:]:
-        ax.set_visible(False)
-    for i, ax in enumerate(axes[:n]):
+    panels = []
+    for i in range(len(maps["density"])):
+        figure, ax = figures.panel(3.8, 0.6 + 2.8 * shape)
         truth, estimate = maps["truth"][i], maps["estimate"][i]
         drawn = ax.imshow(maps["density"][i], origin="lower", extent=extent, cmap="magma", vmin=0, vmax=1)
         ax.plot(*maps["training_position"].T[:2], ".", color="#888888", markersize=1, rasterized=True)
         ax.add_patch(Circle(estimate[:2], maps["radius_80_m"][i], fill=False, color=ESTIMATE, linewidth=1))
-        ax.plot(*estimate[:2], "o", color=ESTIMATE, markeredgecolor="#000000", markersize=5)
+        ax.plot(*estimate[:2], "o", color=ESTIMATE, markeredgecolor="#000001", markersize=5)
         ax.plot(*truth[:2], "x", color=TRUTH, markersize=8, markeredgewidth=2)
         error = float(np.linalg.norm(estimate - truth))
         ax.set_title(f"row {maps['index'][i]}: {error:.2f} m", fontsize=9)
         ax.set(xlabel="x [m]", ylabel="y [m]", xlim=extent[:2], ylim=extent[2:])
         ax.grid(visible=False)
-    figure.colorbar(drawn, ax=axes[:n], label="posterior relative to its maximum", fraction=0.03, pad=0.02)
-    return figure
+        figures.colour_bar(ax, drawn, "posterior over its maximum")
+        panels.append(figure)
+    return panels
 
 
 def posterior_cells(maps: Mapping[str, NDArray[Any]]) -> DataFrame:

@@ -43,9 +43,8 @@ def summary(run: LocateRecords, picture: Plot) -> Summary:
     meaning = [
         f"On {run.scene}: {run.metrics['n_train']} training rows and {run.metrics['n_test']} test rows at {receivers} "
         f"{'receiver' if receivers == 1 else 'receivers'}.",
-        *notes(run),
     ]
-    return Summary(numbers, picture, meaning, _next_steps(run), verdict(run))
+    return Summary(numbers, [picture], meaning, _next_steps(run), verdict(run), notes=notes(run))
 
 
 def answer(run: LocateRecords) -> Answer:
@@ -65,7 +64,8 @@ def verdict(run: LocateRecords) -> str:
 
 def _next_steps(run: LocateRecords) -> list[str]:
     steps = [
-        f"Locate new observations: python -m tasks.locate {run.folder.name.removesuffix('.partial')}/{LOCATOR} SOURCE."
+        f"Explore posteriors and maps: `python -m tasks.view {run.path}`.",
+        f"Locate new observations: `python -m tasks.locate {run.path}/{LOCATOR} SOURCE`.",
     ]
     coverage = run.metrics["calibration"][str(LEVEL)]
     if abs(coverage - LEVEL) > MAX_COVERAGE_ERROR:
@@ -73,7 +73,7 @@ def _next_steps(run: LocateRecords) -> list[str]:
             "The credible regions are not calibrated on these rows; take their radii as a ranking, not as a promise."
         )
     if run.metrics["split"] == "random":
-        steps.append("Run --split block: it shows the error in a region where nothing was measured.")
+        steps.append("Run `--split block`: it shows the error in a region where nothing was measured.")
     return steps
 
 
