@@ -39,7 +39,7 @@ def test_snapshots(tmp_path, capsys):
     assert "interpolators see no fringes" in text
     assert "needs no calibration" in text
     html = (tmp_path / "page" / "report.html").read_text()
-    assert html.count("<svg") == 3
+    assert html.count("<figcaption>") == 3
     assert all(finding["text"][:20] in html for finding in content["findings"])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from unittest import mock
 
@@ -147,7 +148,7 @@ def test_the_report_shows_errors_calibration_and_posteriors(finished):
     page = (finished / "report.html").read_text()
     assert "the best nearest-neighbour fingerprinting" in page
     assert "What this does not show" in page
-    assert f"tasks.locate run/{MODEL} SOURCE" in page
+    assert f"tasks.locate {finished}/{MODEL} SOURCE" in re.sub("</?span>", "", page)
     drawn = {file.stem.partition("-")[0] for file in (finished / "figures").glob("*.svg")}
     assert drawn == {"summary", "calibration", "studies", "posteriors"}
     with np.load(finished / "maps.npz") as maps:

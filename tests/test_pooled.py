@@ -81,7 +81,8 @@ def test_the_time_of_all_networks_counts():
     room = simulated_room(n=20)
     trained = results((GP,), (IDW, IDW_EXTRA))
     for synthesizer in (("auto",), ("gp", "idw")):
-        experiment = SimpleNamespace(test=room, train=room, config=AoaConfig((0.3,), synthesizer=synthesizer))
+        config = AoaConfig((0.3,), synthesizer=synthesizer)
+        experiment = SimpleNamespace(test=room, train=room, config=config, lacking={})
         found = Results(experiment, SimpleNamespace())
         for condition, _ in trained:
             value = {

@@ -14,6 +14,7 @@ from swiftwrf.data.splits import folds
 from swiftwrf.gp import choose_kernel, most_informative
 from swiftwrf.metrics import psnr
 from tasks.aoa.condition import MeasuredSubset
+from tasks.aoa.options import AoaConfig
 from tasks.aoa.results import Results
 from tasks.aoa.suggestion import Suggestion
 
@@ -37,7 +38,8 @@ def test_suggested_positions_keep_the_digits_of_maps(room):
     directory = SimpleNamespace(
         write_csv=lambda name, rows: kept.update({name: rows}), write_npz=lambda name, arrays: None
     )
-    results = Results(SimpleNamespace(test=measured), directory)
+    experiment = SimpleNamespace(test=measured, config=AoaConfig((0.5,)), lacking={})
+    results = Results(experiment, directory)
     positions = {"measured": measured.position.tolist(), "position": found.position.tolist()}
     results.add(Suggestion(MeasuredSubset(0.5)), positions | {"variance": found.variance.tolist()})
     rows = kept["suggested-mix0.5.csv"]

@@ -1,0 +1,124 @@
+"""Wording of docstrings, comments and documents: the field's words, imperative first lines, short sentences, examples."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import io
+import pkgutil
+import re
+import tokenize
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SOURCES = sorted(
+    file for folder in ("swiftwrf", "augment", "tasks", "benchmarks", "tests") for file in (ROOT / folder).rglob("*.py")
+)
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PENDING = (
+    "swiftwrf",
+    "augment",
+    "tasks",
+    "benchmarks",
+    "tests",
+    "docs",
+    "README.md",
+    "CONTRIBUTING.md",
+)  # not yet reworded
+
+FIRST_WORDS = "What|Of|The same|Whether|Where|Which|How|By|As|To"
+SPEECH = "says?|said|tells?|told|hears?|heard|teach(?:es)?|taught"
+PHRASES = (
+    "so many|by how much|unless given|unless told|what is left|where it had been|theirs|anew|great-circle error|"
+    "verdict|maker|the law|doubt|strengths|kernel ridge"
+)
+DENIED = re.compile(rf"\b(?:{SPEECH}|{PHRASES})\b", re.IGNORECASE)
+MAX_WORDS, MAX_MEAN_WORDS = 40, 18
+
+
+def _pending(file: Path) -> bool:
+    return str(file.relative_to(ROOT)).startswith(PENDING)
+
+
+def _docstrings(file: Path) -> list[tuple[int, str]]:
+    tree = ast.parse(file.read_text())
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    return [
+        (getattr(node, "lineno", 1), text)
+        for node in ast.walk(tree)
+        if isinstance(node, kinds) and (text := ast.get_docstring(node))
+    ]
+
+
+def _comments(file: Path) -> list[tuple[int, str]]:
+    tokens = tokenize.generate_tokens(io.StringIO(file.read_text()).readline)
+    return [(token.start[0], token.string) for token in tokens if token.type == tokenize.COMMENT]
+
+
+def _sentences(text: str) -> list[str]:
+    """Return the sentences of a Markdown text without code, tables and headings; a list item ends a sentence."""
+    text = re.sub(r"```.*?```|<!--.*?-->|^---.*?^---", "", text, flags=re.DOTALL | re.MULTILINE)
+    lines = [line for line in text.splitlines() if not re.match(r"\s*(?:\||#|!!!|!\[)", line)]
+    text = re.sub(r"^\s*(?:[-*]|\d+\.)\s+", "\n\n", "\n".join(lines), flags=re.MULTILINE)
+    text = re.sub(r"`[^`]*`", "code", re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text))
+    parts = (
+        part
+        for block in re.split(r"\n\s*\n", text)
+        for part in re.split(r"(?<=[.!?:])\s+(?=[A-Z*\d`(])", " ".join(block.split()))
+    )
+    return [part for part in parts if len(part.split()) > 2]
+
+
+@pytest.mark.parametrize("file", SOURCES, ids=lambda file: str(file.relative_to(ROOT)))
+def test_docstrings_use_the_fields_words(file):
+    if _pending(file):
+        pytest.skip("not yet reworded")
+    if file == Path(__file__):
+        pytest.skip("holds the list")
+    first = re.compile(rf"(?:{FIRST_WORDS})\b")
+    wrong = [f"{line}: begins with {text.split()[0]!r}" for line, text in _docstrings(file) if first.match(text)]
+    for line, text in _docstrings(file) + _comments(file):
+        wrong += [f"{line}: {match[0]!r} in {' '.join(text.split())[:90]!r}" for match in DENIED.finditer(text)]
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("file", DOCUMENTS, ids=lambda file: str(file.relative_to(ROOT)))
+def test_documents_have_short_sentences_in_the_fields_words(file):
+    if _pending(file):
+        pytest.skip("not yet reworded")
+    sentences = _sentences(file.read_text())
+    counts = [len(sentence.split()) for sentence in sentences]
+    wrong = [
+        sentence
+        for sentence, count in zip(sentences, counts, strict=True)
+        if count > MAX_WORDS or DENIED.search(sentence)
+    ]
+    assert not wrong, "\n".join(wrong)
+    assert not counts or sum(counts) / len(counts) <= MAX_MEAN_WORDS, (
+        f"{sum(counts) / len(counts):.1f} words a sentence"
+    )
+
+
+def _public() -> list[tuple[str, object]]:
+    """Return what swiftwrf, augment and their packages export by __all__, with its first name."""
+    found: dict[int, tuple[str, object]] = {}
+    for top in ("swiftwrf", "augment"):
+        package = importlib.import_module(top)
+        packages = [top] + [f"{top}.{info.name}" for info in pkgutil.iter_modules(package.__path__) if info.ispkg]
+        for name in packages:
+            module = importlib.import_module(name)
+            for export in getattr(module, "__all__", ()):
+                value = getattr(module, export)
+                if inspect.isclass(value) or inspect.isfunction(value):
+                    found.setdefault(id(value), (f"{name}.{export}", value))
+    return list(found.values())
+
+
+@pytest.mark.parametrize(("name", "value"), [pytest.param(*item, id=item[0]) for item in _public()])
+def test_public_objects_have_an_example(name, value):
+    if inspect.getmodule(value).__name__.replace(".", "/").startswith(PENDING):
+        pytest.skip("not yet reworded")
+    assert ">>>" in (inspect.getdoc(value) or ""), f"{name} has no example"
