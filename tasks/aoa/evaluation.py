@@ -55,6 +55,10 @@ class Evaluation(Step[Experiment]):
     def priority(self) -> int:
         return int(self.condition.is_network)
 
+    @property
+    def is_optional(self) -> bool:
+        return self.condition.is_network
+
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         train = self._training_set(experiment, folder)
         config, name = experiment.config, self.condition.estimator

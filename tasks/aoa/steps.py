@@ -12,9 +12,9 @@ import torch
 from augment import Fold, choose_model
 from swiftwrf import GeometryModel, InputError, Spectra, load
 from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.condition import EVERYTHING, Condition, MeasuredSubset, Training, estimators, trainable
+from tasks.aoa.condition import EVERYTHING, STAND_IN, Condition, MeasuredSubset, Training, estimators, trainable
 from tasks.aoa.context import ROOM_MODEL, Experiment
-from tasks.aoa.cross_validation import STAND_IN, advise, choose_estimator, located_folds
+from tasks.aoa.cross_validation import advise, choose_estimator, located_folds
 from tasks.aoa.evaluation import Evaluation
 from tasks.aoa.options import AUTO
 from tasks.aoa.synthesis import RoomSearch, syntheses
