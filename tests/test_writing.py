@@ -24,9 +24,6 @@ PENDING = (
     "tasks",
     "benchmarks",
     "tests",
-    "docs",
-    "README.md",
-    "CONTRIBUTING.md",
 )  # not yet reworded
 
 FIRST_WORDS = "What|Of|The same|Whether|Where|Which|How|By|As|To"

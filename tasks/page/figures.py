@@ -92,7 +92,8 @@ def as_svg(figure: Figure, title: str | None = None) -> str:
         if (engine := figure.get_layout_engine()) is not None:  # savefig would draw the figure twice to place its parts
             engine.execute(figure)
             figure.set_layout_engine("none")
-        canvas.print_figure(stream, format="svg", metadata={"Date": None, "Creator": None, "Title": title})
+        named = {} if title is None else {"Title": title}
+        canvas.print_figure(stream, format="svg", metadata={"Date": None, "Creator": None, **named})
     return stream.getvalue()
 
 
