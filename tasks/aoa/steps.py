@@ -24,9 +24,6 @@ from tasks.records import read_json
 from tasks.run import Row
 from tasks.steps import Step
 
-KIND = "synthetic spectra"
-BATCH_POSITIONS = 4096  # spectra predicted before they are rounded: half a gigabyte of 90 x 360 pixels
-
 
 def first_steps(experiment: Experiment, subset: MeasuredSubset) -> list[Step[Experiment]]:
     """Return the reference conditions of a measured subset, and the step that the turbo conditions follow from."""
