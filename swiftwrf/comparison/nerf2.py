@@ -37,7 +37,12 @@ MAX_SAMPLES_AT_ONCE = 2**19  # samples of the field evaluated at a time, which b
 
 @configuration
 class NeRF2Size:
-    """Size of the network and its rays."""
+    """Size of the network and its rays.
+
+    Example:
+        >>> NeRF2Size(width=32, samples=12).width
+        32
+    """
 
     width: Count = 64
     """width of the layers"""
@@ -53,7 +58,12 @@ class NeRF2Size:
 
 @configuration
 class NeRF2Config(Config):
-    """Options of `NeRF2`."""
+    """Options of `NeRF2`.
+
+    Example:
+        >>> NeRF2(NeRF2Config(size=NeRF2Size(width=32), rays=128)).config.rays
+        128
+    """
 
     size: NeRF2Size = NeRF2Size()
     steps: PositiveInt = 3000
@@ -142,7 +152,8 @@ class NeRF2Network(LinkNetwork):
         """Return magnitudes (P, D) at P positions of the moving end.
 
         Args:
-            transmitter, receiver: Positions (P or 1, 3), see `Link`.
+            transmitter: Positions (P or 1, 3), see `Link`.
+            receiver: Positions (P or 1, 3).
             direction: Directions of the rays in world coordinates, (P or 1, D, 3).
         """
         return torch.hypot(*received(self.field, self.size, transmitter[:, None], receiver[:, None], direction))
@@ -160,7 +171,9 @@ def received(field: Field, size: NeRF2Size, transmitter: Tensor, receiver: Tenso
     Args:
         field: Field that the rays cross.
         size: Number of samples and length of a ray.
-        transmitter, receiver, direction: Ends and direction of each ray, (..., 3); they broadcast.
+        transmitter: Position of the transmitter, (..., 3). All three broadcast.
+        receiver: Start of each ray, (..., 3).
+        direction: Direction of each ray, (..., 3).
     """
     distance = torch.linspace(0, size.reach, size.samples, device=direction.device)
     point = receiver[..., None, :] + distance[:, None] * direction[..., None, :]

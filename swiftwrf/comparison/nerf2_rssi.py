@@ -36,7 +36,12 @@ from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, Positiv
 
 @configuration
 class NeRF2RssiSize(NeRF2Size):
-    """Size of the network and its rays."""
+    """Size of the network and its rays.
+
+    Example:
+        >>> NeRF2RssiSize(azimuths=8).azimuths
+        8
+    """
 
     width: Count = 32
     bands: Count = 4
@@ -49,7 +54,12 @@ class NeRF2RssiSize(NeRF2Size):
 
 @configuration
 class NeRF2RssiConfig(Config):
-    """Options of `NeRF2Rssi`; a batch consists of transmitter positions."""
+    """Options of `NeRF2Rssi`; a batch consists of transmitter positions.
+
+    Example:
+        >>> NeRF2Rssi(NeRF2RssiConfig(weight_decay=1e-4)).config.weight_decay
+        0.0001
+    """
 
     size: NeRF2RssiSize = NeRF2RssiSize()
     steps: PositiveInt = 2400

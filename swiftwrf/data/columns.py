@@ -125,4 +125,5 @@ def is_rssi(column: pd.Series) -> bool:
 
 
 def is_coordinate(name: str) -> bool:
+    """Return True for the name of a column with a coordinate."""
     return any(ROLES[role].fullmatch(plain_name(name)) for role in ("x", "y", "z", "longitude", "latitude"))

@@ -23,7 +23,7 @@ from torch import Tensor
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.rssi import Offsets, Rssi
 from swiftwrf.errors import InputError
-from swiftwrf.gp import GaussianProcess, Kernel, thinned
+from swiftwrf.gp import GaussianProcess, Kernel, subsample
 from swiftwrf.rssi.base import Map, RssiFitContext, RssiPredictor, fingerprint, map_threads
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.floors import FloorAttenuation
@@ -197,7 +197,7 @@ class RssiModel(RssiPredictor, Saved):
 
     def _variance_process(self) -> GaussianProcess:
         """Return the process of few of the measured positions, which determine the standard deviation."""
-        return GaussianProcess(self.kernel, thinned(self.anchor.double(), rows=MAX_VARIANCE_POSITIONS)[0])
+        return GaussianProcess(self.kernel, subsample(self.anchor.double(), rows=MAX_VARIANCE_POSITIONS)[0])
 
     def _posterior_of(self, state: FitState) -> RssiPosterior:
         table, receiver = HeadTable(self.rendered), self.receiver - self.centre
@@ -360,6 +360,6 @@ def _held_out_std(training: RssiTraining) -> Tensor:
     variance = torch.empty(len(training.position), dtype=torch.float64)
     for number in training.fold.unique():
         out = training.fold == number
-        (known,) = thinned(training.position[~out], rows=MAX_VARIANCE_POSITIONS)
+        (known,) = subsample(training.position[~out], rows=MAX_VARIANCE_POSITIONS)
         variance[out] = GaussianProcess(training.kernel, known).variance(training.position[out])
     return (training.noise_db.square() + training.field_db.square() * variance[:, None]).sqrt()

@@ -203,8 +203,10 @@ def _from_horizon(
 
     Args:
         folder: Source, for the message.
-        azimuth, zenith: Angles of the paths, (n, paths) [deg].
-        direct, known: Whether a path is direct, and whether there is one, (n, paths).
+        azimuth: Azimuths of the paths, (n, paths) [deg].
+        zenith: Zenith angles of the paths, (n, paths) [deg].
+        direct: True for direct paths, (n, paths).
+        known: True for paths that exist, (n, paths).
         away: Vectors from the receivers to the transmitter, (n, 3).
 
     Raises:
