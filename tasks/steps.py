@@ -36,7 +36,7 @@ class Step(ABC, Generic[Context]):
 
     @property
     def title(self) -> str:
-        """What is computed, for the terminal."""
+        """Description of the step for the terminal."""
         return self.name
 
     @property
@@ -63,7 +63,7 @@ Arrived = Callable[[Step[Context], Row], None]
 
 
 class Workers(Protocol):
-    """Processes that compute steps, on this machine or on a cluster. The type of a future is theirs."""
+    """Processes that compute steps, on this machine or on a cluster. The type of a future depends on the implementation."""
 
     slots: float
     """number of steps that are computed at a time; infinite if the workers keep a queue"""

@@ -16,7 +16,7 @@ from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table
 
 WINDOW = 30  # measurements of the running error
-MOST_SURPRISING = 10
+MAX_SURPRISING = 10
 N_NEIGHBOURS = 5  # measurements whose mean innovation a map shows at each position
 BLUE, RED = "#4477aa", "#ee6677"
 
@@ -128,7 +128,7 @@ def page(followed: Followed, obstacles: ObstacleMonitor | None) -> Page:
         numbers.append(Number(f"{float(scores.covered.nanmean()):.0%}", "of the values inside their 80 % interval"))
     summary = Summary(numbers, [_error(followed)], followed.sentences(obstacles), ["Continue with model.safetensors."])
     rows = followed.rows()
-    order = followed.surprise.nan_to_num().argsort(descending=True)[:MOST_SURPRISING].tolist()
+    order = followed.surprise.nan_to_num().argsort(descending=True)[:MAX_SURPRISING].tolist()
     cells = [
         [str(rows[i]["index"]), *(f"{rows[i][name]:.3g}" for name in ("x_m", "y_m", "z_m", "error", "innovation"))]
         for i in order
