@@ -1,10 +1,10 @@
 """Choice of a field model by cross-validation on measured spectra.
 
 Some models search for a structure (walls, number of primitives) before they fit parameters. A search takes most of the time,
-so it is not repeated in every fold, but no fold is predicted with a structure that its spectra helped to find: one search
-leaves out folds 0 and 1, another leaves out folds 2 and 3. Each of these four folds is predicted by a model that reuses the
-structure of the search that left it out, with its parameters fitted to all other folds. Fold 4 takes part in both searches
-and is never predicted. If a search without two folds had too few spectra, each fold has a search of its own.
+so it is not repeated in every fold. No fold is predicted with a structure that its spectra helped to find. One search leaves
+out folds 0 and 1, another leaves out folds 2 and 3. A model reuses the structure of the search that left its fold out, and
+fits its parameters to all other folds. Fold 4 takes part in both searches and is never predicted. If a search without two
+folds had too few spectra, each fold has a separate search.
 """
 
 from __future__ import annotations

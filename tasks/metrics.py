@@ -131,14 +131,16 @@ class MixMetrics(TypedDict):
 
     `choice`, `cross_validation` (by field model) and `estimator_choice` are of the first repeat. `counts` are spectra by
     origin in each training set. Seconds are those to `fit` and `synthesize` of the trained field models and to `train` all
-    networks. `reference` is the method on measured spectra with the smallest test error, without matched-field processing.
-    `locating` is by method, `left_out` is the reason why a method is missing.
+    networks.
+
+    The method on measured spectra with the smallest test error, without matched-field processing, is the `reference`. Values
+    of `locating` are by method. Values of `left_out` are reasons why a method is missing.
     """
 
     n_measured: int
     counts: dict[str, dict[str, int]]
     choice: ChoiceMetrics | None
-    validation: dict[str, CrossValidationMetrics] | None
+    cross_validation: dict[str, CrossValidationMetrics] | None
     estimator_choice: EstimatorChoiceMetrics | None
     synthesis: dict[str, SynthesisMetrics]
     methods: dict[str, MethodMetrics]

@@ -294,7 +294,7 @@ def test_what_only_sionna_knows_is_refused(ray_tracer, tmp_path, capsys, argumen
         ((*OPTIONS, "--fixed", 2, 1, 0.4), "in furniture"),
         ((*OPTIONS, "--region", 1, 1, 1, 2, 2, 9), "is not inside the room"),
         ((*OPTIONS, "--region", 1.5, 0.5, 0.1, 2.5, 1.5, 0.4), "only 0 of 5 positions are free"),
-        (("--room", "{file}.xml", *OPTIONS[2:]), "does not say where the ends are"),
+        (("--room", "{file}.xml", *OPTIONS[2:]), "does not contain the positions of the ends"),
         (("--room", "{file}.xml", *OPTIONS[2:], "--walls", "wood"), "--walls is for the rooms"),
         (OPTIONS, "pip install 'swiftwrf-tasks[raytrace]'"),
     ],

@@ -44,6 +44,15 @@ def _docstrings(file: Path) -> list[tuple[int, str]]:
     ]
 
 
+def _docstring_sentences(text: str) -> list[str]:
+    """Return the sentences of a docstring without its example; an argument and a list item begin a new one."""
+    text = re.split(r"^\s*Example:", text, flags=re.MULTILINE)[0]
+    text = re.sub(r"^\s*\|.*$|^\s*(?:Args|Returns|Raises|Attributes|Yields):$", "", text, flags=re.MULTILINE)
+    text = re.sub(r"`[^`]*`", "Code", re.sub(r"^\s+[\w`, .*]+: |^\s*- ", "\n\n", text, flags=re.MULTILINE))
+    blocks = (" ".join(block.split()) for block in re.split(r"\n\s*\n", text))
+    return [part for block in blocks for part in re.split(r"(?<=[.!?:;])\s+", block)]
+
+
 def _comments(file: Path) -> list[tuple[int, str]]:
     tokens = tokenize.generate_tokens(io.StringIO(file.read_text()).readline)
     return [(token.start[0], token.string) for token in tokens if token.type == tokenize.COMMENT]
@@ -73,6 +82,12 @@ def test_docstrings_use_the_fields_words(file):
     wrong = [f"{line}: begins with {text.split()[0]!r}" for line, text in _docstrings(file) if first.match(text)]
     for line, text in _docstrings(file) + _comments(file):
         wrong += [f"{line}: {match[0]!r} in {' '.join(text.split())[:90]!r}" for match in DENIED.finditer(text)]
+    for line, text in _docstrings(file):
+        wrong += [
+            f"{line}: {words} words in {sentence[:90]!r}"
+            for sentence in _docstring_sentences(text)
+            if (words := len(sentence.split())) > MAX_WORDS
+        ]
     assert not wrong, "\n".join(wrong)
 
 

@@ -7,9 +7,12 @@ Changed everywhere: positions are relative to the centre of the training positio
 millimetres. The attenuation network is evaluated once for all transmitters (the same function). Transmittance is the
 exponential of a sum, without the 1e-10 that keeps a product from 0. Rays start at the moving array if the receiver moves.
 
-Changed in the quick preset, sized for two cores: width 64 (256), 24 samples (64), 7 frequency bands (10), a step of 16
-spectra that share 64 rays (8,192 of any spectra), 3,000 steps (30,000) at rate 3e-3 (8e-4) that decays once (three times),
-averaged parameters (the last), clipped gradients, no weight decay (5e-5).
+The quick preset is sized for two cores. The values of the publication are in parentheses.
+
+- Width 64 (256), 24 samples (64), 7 frequency bands (10).
+- 3,000 steps (30,000) of 16 spectra that share 64 rays (8,192 of any spectra).
+- Rate 3e-3 (8e-4), which decays once (three times), clipped gradients, no weight decay (5e-5).
+- Averaged parameters (the last).
 """
 
 from __future__ import annotations

@@ -54,10 +54,10 @@ MAX_VARIANCE_POSITIONS = 200  # measured positions that determine where the fiel
 class RssiModel(RssiPredictor, Saved):
     """RSSI at fixed receivers for any position of the transmitter; predictions are differentiable in the position.
 
-    Everything is chosen on five held-out folds of the training rows: the kernel and whether there is a field at all; the
-    mixing weights of the field beside simpler predictors (the path-loss model of the receiver, that of all receivers, the
-    mean of the receiver); and the scale of the standard deviation. A receiver detected in fewer than 10 rows falls back to
-    the path-loss model of all receivers. If the positions of the receivers are unknown, a path-loss model is a level.
+    Five held-out folds of the training rows determine the kernel, the presence of a field, the mixing weights and the scale
+    of the standard deviation. The field is mixed with simpler predictors: the path-loss model of the receiver, that of all
+    receivers, and the mean of the receiver. A receiver detected in fewer than 10 rows falls back to the path-loss model of
+    all receivers. If the positions of the receivers are unknown, a path-loss model is a level.
 
     Args:
         config: Options as one object. Defaults to `RssiConfig()`.

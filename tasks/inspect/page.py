@@ -49,7 +49,7 @@ def page(data: Spectra | Rssi, kind: str, findings: Findings, source: str) -> Pa
     ]
     task = "rssi --rx all" if isinstance(data, Rssi) else "aoa --mix 0.3"
     source = shlex.quote(source)
-    mend = [f"Fix what the warnings say, and inspect again: `python -m tasks.inspect {source}`."] if warnings else []
+    mend = [f"Correct the warnings and inspect again: `python -m tasks.inspect {source}`."] if warnings else []
     steps = [*mend, f"Go on with `python -m tasks.{task} --data {source}`."]
     meaning = warnings or ["Nothing looks wrong. Errors that the files alone do not reveal remain possible."]
     conclusion = _fingerprinting(data) if isinstance(data, Spectra) else ""

@@ -68,9 +68,9 @@ def _field_models(fraction: FractionRecords) -> list[Plot]:
 
 def _limits(run: AoaRecords) -> Section:
     texts = [
-        "The test positions lie in the region and time of one measurement campaign; nothing here says how the network does "
-        "in another room, after furniture moved, or with another array.",
-        "The label is the geometric direction of the transmitter, computed from positions; where the direct path is blocked "
+        "The test positions lie in the region and time of one measurement campaign. They do not predict errors in "
+        "another room, after furniture moved, or with another array.",
+        "The label is the geometric direction of the transmitter, computed from positions. If the direct path is blocked, "
         "the spectrum may not contain it.",
         "Intervals treat test spectra as independent draws. Along a measured path they are not, so on such data the "
         "intervals are too narrow.",
