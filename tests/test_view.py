@@ -1,4 +1,4 @@
-"""What the page shows, without the page: views, plans, spectra and maps as they are computed, and what is refused."""
+"""Content of the page without widgets: views, plans, spectra, maps and refusals."""
 
 from __future__ import annotations
 
@@ -401,7 +401,7 @@ def said(capsys, *arguments) -> str:
 
 @needs_the_extra
 def test_refusals(tmp_path, capsys, aoa_run, rssi_run):
-    assert "is not there" in said(capsys, tmp_path / "nowhere", "--port", 0)
+    assert "does not exist" in said(capsys, tmp_path / "nowhere", "--port", 0)
     assert "is no run" in said(capsys, tmp_path, "--port", 0)
     assert "cannot be read" in said(capsys, "x" * 300, "--port", 0)
     (tmp_path / "text").write_text("x")

@@ -45,7 +45,7 @@ image.addEventListener('load', () => window.frames_seen.push(performance.now()))
 
 @pytest.fixture
 def serve():
-    """Starts the page of a run or model, and says where it is."""
+    """Start the page of a run or model and return its address."""
     processes = []
 
     def start(source: Path) -> str:
@@ -111,7 +111,7 @@ def pointer(browser):
 
 
 def opened(browser, address, name, label):
-    """The page, once this label says something."""
+    """Return the page once this label has text."""
     browser.get(address)
     until(lambda: browser.find_elements("id", name) and said(browser, label))
     return find(browser, f"#{name}")

@@ -115,8 +115,10 @@ def read_yaml(file: Path) -> dict[str, Any]:
 
 
 def _plain(node: yaml.Node | None, done: dict[int, Any]) -> Any:
-    """Return the text, list or mapping of a node. Nodes referred to twice are built once, because nested references would
-    grow without bound."""
+    """Return the text, list or mapping of a node.
+
+    Nodes referred to twice are built once, because nested references would grow without bound.
+    """
     if node is None or id(node) in done:
         return done.get(id(node))
     if node.tag not in PLAIN_TAGS:

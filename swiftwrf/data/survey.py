@@ -317,7 +317,7 @@ def _wide(
     if not names:
         raise InputError(
             f"{label} has no column of RSSI in dBm (numbers below 0) besides positions; there are {listed(table.columns)}; "
-            "say which: columns rssi=NAME or rssi='PREFIX*'"
+            "choose with columns rssi=NAME or rssi='PREFIX*'"
         )
     _check_size(label, len(table), len(names))
     return names, np.stack([column_of_numbers(label, table, name) for name in names], axis=1)

@@ -29,6 +29,14 @@ class Step:
         scores: Its scores before it was learnt, of length 1.
         alarms: Changes that it revealed, in words.
         correlation: Correlation of the fields before and after a change to which the model was adapted; None without one.
+
+    Example:
+        >>> import swiftwrf
+        >>> data = swiftwrf.simulated_room(n=50, grid=swiftwrf.AngularGrid.hemisphere(6, 12))
+        >>> train, new = data.subset(torch.arange(49)), data.subset(torch.tensor([49]))
+        >>> step = Follower(swiftwrf.make_model("gp").fit(train), train).step(new)
+        >>> len(step.scores), step.correlation is None
+        (1, True)
     """
 
     scores: Scores

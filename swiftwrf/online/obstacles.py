@@ -44,6 +44,11 @@ class Boxes:
 
     Args:
         low, high: Opposite corners, float64 (M, 3) [m].
+
+    Example:
+        >>> corner = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
+        >>> len(Boxes(corner, corner + 0.5))
+        1
     """
 
     low: Tensor

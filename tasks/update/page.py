@@ -10,7 +10,7 @@ from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table
 from tasks.update.record import WINDOW, Record
 
-MOST_SURPRISING = 10
+MAX_SURPRISING = 10
 N_NEIGHBOURS = 5  # measurements whose mean innovation a map shows at each position
 BLUE, RED = "#4477aa", "#ee6677"
 
@@ -26,7 +26,7 @@ def page(record: Record, name: str) -> Page:
     if bool(covered.isfinite().any()):
         numbers.append(Number(f"{float(covered.nanmean()):.0%}", "of the values inside their 80 % interval"))
     summary = Summary(numbers, [error_plot(record)], record.sentences(), ["Continue with model.safetensors."])
-    order = record.column("innovation").nan_to_num().argsort(descending=True)[:MOST_SURPRISING].tolist()
+    order = record.column("innovation").nan_to_num().argsort(descending=True)[:MAX_SURPRISING].tolist()
     cells = [
         [
             str(record.rows[i]["index"]),

@@ -45,7 +45,7 @@ def open_source(source: Path) -> SpectraView | RssiView | FollowedView:
     if is_file:
         return _saved_model(source)
     if not is_folder:
-        raise InputError(f"{source} is not there; {EXPECTED}")
+        raise InputError(f"{source} does not exist; {EXPECTED}")
     if not (source / CONFIG).is_file():
         raise InputError(f"{source} is no run: it has no {CONFIG}; {EXPECTED}")
     content = read_json(source / CONFIG)
