@@ -37,7 +37,12 @@ CPU = torch.device("cpu")
 
 @configuration
 class FieldConfig:
-    """Options of every field model."""
+    """Options of every field model.
+
+    Example:
+        >>> FieldConfig(validation="block", seed=3).validation
+        'block'
+    """
 
     validation: Validation = "random"
     """training spectra held out to choose settings: single ones at random, or one region at a time"""
@@ -74,6 +79,13 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
 
     Raises:
         InputError: An unknown option, or a value outside its range.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.simulated_room(n=50).split()
+        >>> model = swiftwrf.make_model("idw").fit(train)
+        >>> isinstance(model, FieldModel), model.predict(test.position).mean.shape
+        (True, torch.Size([10, 30, 120]))
     """
 
     config_type: ClassVar[type[Any]] = FieldConfig
