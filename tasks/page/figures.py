@@ -91,8 +91,10 @@ def as_svg(figure: Figure, title: str | None = None) -> str:
         if (engine := figure.get_layout_engine()) is not None:  # savefig would draw the figure twice to place its parts
             engine.execute(figure)
             figure.set_layout_engine("none")
-        named = {} if title is None else {"Title": title}
-        canvas.print_figure(stream, format="svg", metadata={"Date": None, "Creator": None, **named})
+        metadata: dict[str, str | None] = {"Date": None, "Creator": None}
+        if title is not None:
+            metadata["Title"] = title
+        canvas.print_figure(stream, format="svg", metadata=metadata)
     return stream.getvalue()
 
 
