@@ -1,6 +1,6 @@
 """Measure hard cases: errors of every backend and of reduced precision, quality or refusal of fits.
 
-docs/stability.md gives the rules; its tables come from the result of this benchmark.
+docs/development/stability.md gives the rules; its tables come from the result of this benchmark.
 """
 
 from __future__ import annotations

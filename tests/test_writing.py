@@ -18,7 +18,6 @@ SOURCES = sorted(
     file for folder in ("swiftwrf", "augment", "tasks", "benchmarks", "tests") for file in (ROOT / folder).rglob("*.py")
 )
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-PENDING = ("docs", "README.md", "CONTRIBUTING.md")  # not yet reworded
 
 FIRST_WORDS = "What|Of|The same|Whether|Where|Which|How|By|As|To"
 SPEECH = "says?|said|tells?|told|hears?|heard|teach(?:es)?|taught"
@@ -28,10 +27,6 @@ PHRASES = (
 )
 DENIED = re.compile(rf"\b(?:{SPEECH}|{PHRASES})\b", re.IGNORECASE)
 MAX_WORDS, MAX_MEAN_WORDS = 40, 18
-
-
-def _pending(file: Path) -> bool:
-    return str(file.relative_to(ROOT)).startswith(PENDING)
 
 
 def _docstrings(file: Path) -> list[tuple[int, str]]:
@@ -74,8 +69,6 @@ def _sentences(text: str) -> list[str]:
 
 @pytest.mark.parametrize("file", SOURCES, ids=lambda file: str(file.relative_to(ROOT)))
 def test_docstrings_use_the_fields_words(file):
-    if _pending(file):
-        pytest.skip("not yet reworded")
     if file == Path(__file__):
         pytest.skip("holds the list")
     first = re.compile(rf"(?:{FIRST_WORDS})\b")
@@ -93,8 +86,6 @@ def test_docstrings_use_the_fields_words(file):
 
 @pytest.mark.parametrize("file", DOCUMENTS, ids=lambda file: str(file.relative_to(ROOT)))
 def test_documents_have_short_sentences_in_the_fields_words(file):
-    if _pending(file):
-        pytest.skip("not yet reworded")
     sentences = _sentences(file.read_text())
     counts = [len(sentence.split()) for sentence in sentences]
     wrong = [
@@ -125,6 +116,4 @@ def _public() -> list[tuple[str, object]]:
 
 @pytest.mark.parametrize(("name", "value"), [pytest.param(*item, id=item[0]) for item in _public()])
 def test_public_objects_have_an_example(name, value):
-    if inspect.getmodule(value).__name__.replace(".", "/").startswith(PENDING):
-        pytest.skip("not yet reworded")
     assert ">>>" in (inspect.getdoc(value) or ""), f"{name} has no example"

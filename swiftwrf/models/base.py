@@ -385,12 +385,3 @@ def make_model(name: str, preset: Preset = "quick", **options: Any) -> FieldMode
     """
     model_type: type[FieldModel] = FIELD_MODELS[name]
     return model_type.with_known(preset, options)
-
-
-def model_types(names: Iterable[str] | None = None) -> dict[str, type[FieldModel]]:
-    """Return the classes of the given field models, of all registered ones by default.
-
-    Raises:
-        InputError: An unknown name.
-    """
-    return {name: FIELD_MODELS[name] for name in (FIELD_MODELS if names is None else names)}

@@ -25,12 +25,11 @@ from swiftwrf.gp import subsample
 from swiftwrf.locate import MatchedField, MatchedFieldConfig
 from swiftwrf.metrics import angle_errors
 from swiftwrf.runtime.threads import parallel_map
-from tasks.aoa.condition import LOCATOR
+from tasks.aoa.condition import LOCATOR, STAND_IN
 from tasks.aoa.estimators import make_estimator
 from tasks.metrics import CrossValidationMetrics, EstimatorChoiceMetrics
 from tasks.summarise import paired_change
 
-STAND_IN = "kernel_regression"
 N_SYNTHETIC_CANDIDATES = (300, 1000, 3000)
 N_SYNTHETIC_COMPARED = 1000  # number of positions at which predicted means and samples are compared
 MAX_LOCATED = 60  # held-out spectra of a fold that are located

@@ -12,9 +12,9 @@ import torch
 from augment import Fold, choose_model
 from swiftwrf import GeometryModel, InputError, Spectra, load
 from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.condition import EVERYTHING, Condition, MeasuredSubset, Training, estimators, trainable
+from tasks.aoa.condition import EVERYTHING, STAND_IN, Condition, MeasuredSubset, Training, estimators, trainable
 from tasks.aoa.context import ROOM_MODEL, Experiment
-from tasks.aoa.cross_validation import STAND_IN, choose_estimator, cross_validate, located_folds
+from tasks.aoa.cross_validation import choose_estimator, cross_validate, located_folds
 from tasks.aoa.evaluation import Evaluation
 from tasks.aoa.options import AUTO
 from tasks.aoa.synthesis import RoomSearch, syntheses
@@ -23,9 +23,6 @@ from tasks.metrics import CrossValidationMetrics
 from tasks.records import read_json
 from tasks.run import Row
 from tasks.steps import Step
-
-KIND = "synthetic spectra"
-BATCH_POSITIONS = 4096  # spectra predicted before they are rounded: half a gigabyte of 90 x 360 pixels
 
 
 def first_steps(experiment: Experiment, subset: MeasuredSubset) -> list[Step[Experiment]]:

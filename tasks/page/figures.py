@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.transforms import Bbox
 from numpy.typing import ArrayLike
 from pandas import DataFrame
@@ -92,7 +91,8 @@ def as_svg(figure: Figure, title: str | None = None) -> str:
         if (engine := figure.get_layout_engine()) is not None:  # savefig would draw the figure twice to place its parts
             engine.execute(figure)
             figure.set_layout_engine("none")
-        canvas.print_figure(stream, format="svg", metadata={"Date": None, "Creator": None, "Title": title})
+        named = {} if title is None else {"Title": title}
+        canvas.print_figure(stream, format="svg", metadata={"Date": None, "Creator": None, **named})
     return stream.getvalue()
 
 
@@ -109,12 +109,6 @@ def legend_below(figure: Figure, axes: Axes) -> None:
     """One legend for all axes, from the entries of one of them."""
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=_columns(figure, labels), frameon=False)
-
-
-def legend_of(figure: Figure, palette: Palette, names: Sequence[str]) -> None:
-    """A legend of dots in the colours of methods."""
-    dots = [Line2D([], [], marker="o", linestyle="", color=palette.colour(name), label=name) for name in names]
-    figure.legend(handles=dots, loc="outside lower center", ncols=_columns(figure, names), frameon=False)
 
 
 def _columns(figure: Figure, labels: Sequence[str]) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from tasks.aoa.condition import LOCATOR
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.former import FORMER_NAMES
-from tasks.aoa.page.gains import change_text, changes_of, gain_sentence, judgement, reference, turbo_method
+from tasks.aoa.page.gains import change_text, changes_of, gain_sentence, judgement, learner, reference, turbo_method
 from tasks.aoa.page.overview import overview
 from tasks.aoa.page.records import AoaRecords, FractionRecords
 from tasks.aoa.page.results import choice_sentence
@@ -21,8 +21,8 @@ def summary(fraction: FractionRecords) -> Summary:
     metrics, mix = fraction.run.metrics, fraction.mix
     meaning = [
         f"On {fraction.run.scene}, {mix['n_measured']} of {metrics['n_train']} training spectra are measured "
-        f"({fraction.percent}); the spectra at the other positions are synthesized, and the network learns from both. "
-        f"It is tested on {metrics['n_test']} spectra that take no part in any fit.",
+        f"({fraction.percent}). The spectra at the other positions are synthesized, and {learner(fraction)} learns from "
+        f"both. It is tested on {metrics['n_test']} spectra that take no part in any fit.",
         *(text for text in (choice_sentence(fraction), gain_sentence(fraction)) if text),
         *cross_validation_sentences(fraction),
     ]
@@ -67,13 +67,13 @@ def conclusion(fraction: FractionRecords) -> str:
     best = reference(fraction)
     if change := changes_of(fraction, turbo).get(best):
         sentences.append(
-            f"The network with synthetic spectra changes the median error by {change_text(change)} against {best}, the best "
-            f"estimator without them: {judgement(change)}."
+            f"With synthetic spectra {learner(fraction)} changes the median error by {change_text(change)} against {best}, "
+            f"the best estimator without them: {judgement(change)}."
         )
     else:
         sentences.append(
-            f"{best}, the best estimator without synthetic spectra, has a median error of {medians[best]:.2f} degrees, the "
-            f"network with them {medians[turbo]:.2f}."
+            f"{best}, the best estimator without synthetic spectra, has a median error of {medians[best]:.2f} degrees, "
+            f"{learner(fraction)} with them {medians[turbo]:.2f}."
         )
     if "peak" in medians and "constant" in medians:
         sentences.append(fingerprinting(medians["constant"], medians["peak"]))
