@@ -33,7 +33,7 @@ missing = [name for name in LIBRARIES if find_spec(name) is None] + [
     name for name in PROGRAMS if not shutil.which(name)
 ]
 pytestmark = pytest.mark.skipif(bool(missing), reason=f"needs {' and '.join(missing)}")
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[3]
 PATIENCE = 60  # [s], for machines that are busy
 MOVES = 60  # of a drag, one in 16 ms as a pointer's are
 COUNT = """

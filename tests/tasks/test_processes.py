@@ -23,7 +23,7 @@ from tasks.directory import Run
 from tasks.processes import number_of_processes
 from tasks.steps import Budget, computed
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1]
 STEPS = [Sum(1, (3, 4)), Sum(2), Sum(1, (5,))]  # the third is the first one, and has another follower
 
 

@@ -208,7 +208,7 @@ def test_a_model_that_cannot_be_updated_is_refused(tmp_path, capsys):
 
 
 def follow(model_file, source, out, **options):
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent), "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3]), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "tasks.update", str(model_file), str(source), "--out", str(out), "--follow"]
     return subprocess.Popen(
         command,

@@ -199,7 +199,7 @@ def test_refusals_leave_nothing(tmp_path, capsys, arguments, says):
 
 
 def test_every_format_is_described():
-    text = (Path(__file__).parent.parent / "docs" / "formats.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "formats.md").read_text()
     for formats in (SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS):
         for name in formats:
             assert f"[{name}](#" in text, f"describe {name} in docs/formats.md"

@@ -30,7 +30,7 @@ from tasks.directory import Run
 
 distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1]
 CPU = torch.device("cpu")
 ENDS = ("client", "scheduler", "worker")
 AOA = ("aoa", "--mix", 0.5, "--synthesizer", "swiftwrf", "idw", "--extra", 20)

@@ -25,7 +25,7 @@ from swiftwrf import (
 )
 from swiftwrf.runtime.checkpoint import Saved, read, write
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[3]
 TINY = FitConfig(model=ModelConfig(n_primitives=4, rank=2), steps=10, check_every=5)
 
 

@@ -18,7 +18,7 @@ import pandas as pd
 import pytest
 
 pytestmark = pytest.mark.long
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1]
 AOA = ("aoa", "--mix", "0.5", "--extra", "20")
 RSSI = ("rssi", "--rx", "1")
 TABLES = {"aoa": ("errors.csv", "synthesis.csv"), "rssi": ("errors.csv", "predictions.csv")}

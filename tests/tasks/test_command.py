@@ -19,7 +19,7 @@ from quick import said
 from tasks.command import COMMANDS, main
 from tasks.command_line import BROKEN_PIPE
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 def started(folder: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:

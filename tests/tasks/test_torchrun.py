@@ -28,7 +28,7 @@ from tasks.aoa.estimators import aann
 from tasks.aoa.estimators.aann import AANN, AANNConfig
 from tasks.cluster import connected
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1]
 AOA = ("aoa", "--mix", 0.5, "--synthesizer", "swiftwrf", "idw", "--preset", "paper", "--extra", 0, "--device", "cpu")
 
 

@@ -23,7 +23,7 @@ from swiftwrf.testing.hard_cases import HARD_CASES, Case, degrees, field_errors,
 from swiftwrf.testing.scenes import random_scene
 from swiftwrf.testing.tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
 
-SHIM = Path(__file__).parent / "cuda_shim"
+SHIM = Path(__file__).parents[2] / "cuda_shim"
 rasterize_package = sys.modules[rasterize.__module__]
 KERNELS = {"find_reach", "rasterize", "rasterize_backward", "magnitude_backward"}
 SANITIZERS = os.environ.get("CUDA_SHIM_SANITIZERS", "")  # set by `test_sanitizers_find_nothing` in its child process
