@@ -16,10 +16,11 @@ from typing import Any
 
 import torch
 import tyro
-from record import write_result
+from committed import load
+from record import RESULTS, write_result
 from scipy.cluster.hierarchy import fclusterdata
 from sklearn.model_selection import GroupKFold
-from synthesis import load
+from synthesis import load as load_scene
 from torch import Tensor
 
 from augment import Mixed
@@ -49,19 +50,17 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Measure every set and write `results/measured_spectra.json`."""
-    rows = []
+    """Measure every set that `results/measured_spectra.json` does not contain, and write it after each."""
+    rows: list[Row] = load("measured_spectra")["sets"] if (RESULTS / "measured_spectra.json").is_file() else []
     for name in config.sets:
-        data = load(config.data / name)
         for split in PUBLISHED.get(name, ("places",)):
-            rows.append({"set": name, "split": split, "moving": data.moving} | measure(data, split, config.seed))
-            print(
-                name,
-                split,
-                {key: round(entry["median"], 2) for key, entry in rows[-1]["angle_deg"].items()},
-                flush=True,
-            )
-    write_result("measured_spectra", {"seed": config.seed, "sets": rows})
+            if any((row["set"], row["split"]) == (name, split) for row in rows):
+                continue
+            data = load_scene(config.data / name)
+            row = {"set": name, "split": split, "moving": data.moving} | measure(data, split, config.seed)
+            print(name, split, {key: round(entry["median"], 2) for key, entry in row["angle_deg"].items()}, flush=True)
+            rows.append(row)
+            write_result("measured_spectra", {"seed": config.seed, "sets": rows})
 
 
 def parts(data: Spectra, split: str, seed: int) -> Iterator[tuple[Spectra, Spectra]]:
