@@ -36,7 +36,7 @@ class Step(ABC, Generic[Context]):
 
     @property
     def title(self) -> str:
-        """What is computed, for the terminal."""
+        """Description of the step for the terminal."""
         return self.name
 
     @property
@@ -98,7 +98,7 @@ Arrived = Callable[[Step[Context], Row], None]
 
 
 class Workers(Protocol):
-    """Processes that compute steps, on this machine or on a cluster. The type of a future is theirs."""
+    """Processes that compute steps, on this machine or on a cluster. The type of a future depends on the implementation."""
 
     slots: float
     """number of steps that are computed at a time; infinite if the workers keep a queue"""
@@ -128,8 +128,8 @@ def computed(
         cluster: Cluster that computes the steps in parallel.
         processes: Number of processes of this machine that compute the steps. With 1 they are computed in this process.
         arrived: Called with each step and its result as soon as it arrives, in any order.
-        budget: Time within which optional steps must end. The others are yielded with a result that says why they are
-            left out, which is not kept.
+        budget: Time within which optional steps must end. Steps that are left out are yielded with the reason as their
+            result, which is not kept.
 
     Raises:
         FitError: The cluster or a process is lost.

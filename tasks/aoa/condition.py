@@ -125,7 +125,7 @@ class Condition:
 
     @property
     def is_turbo(self) -> bool:
-        """Whether synthetic spectra are part of the training set."""
+        """True if the training set contains synthetic spectra."""
         return bool(self.synthesizer)
 
     @property

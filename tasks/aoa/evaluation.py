@@ -18,9 +18,6 @@ from tasks.steps import Step
 if TYPE_CHECKING:
     from tasks.aoa.synthesis import Synthesis
 
-KIND = "synthetic spectra"
-BATCH_POSITIONS = 4096  # spectra predicted before they are rounded: half a gigabyte of 90 x 360 pixels
-
 
 @dataclass(frozen=True)
 class Evaluation(Step[Experiment]):

@@ -96,13 +96,13 @@ class AoaConfig(SpectraSource, Output):
         if not 0 <= self.suggest <= MAX_SUGGESTIONS:
             raise InputError(f"--suggest takes 0 to {MAX_SUGGESTIONS} positions, got {self.suggest}")
         if self.moving is not None and self.data is not None:
-            raise InputError("--moving is for the built-in room; with --data the data say which end moves")
+            raise InputError("--moving is for the built-in room; with --data the data determine which end moves")
         if not self.mix or not all(0 < fraction <= 1 for fraction in self.mix):
             raise InputError(f"--mix takes measured fractions in (0, 1], got {_listed(self.mix) or 'none'}")
         if len(set(self.mix)) < len(self.mix):
             raise InputError(f"--mix names a fraction twice: {_listed(self.mix)}")
         if given(self) and self.data is None:
-            raise InputError(f"--{given(self)[0]} says how --data is read; give it with --data")
+            raise InputError(f"--{given(self)[0]} is an option of the reader; give it with --data")
         if self.budget is not None and not self.budget > 0:
             raise InputError(f"--budget takes a time in seconds above 0, got {self.budget:g}")
         if self.repeats < 1:
@@ -148,7 +148,7 @@ def check_data(data: Spectra, config: AoaConfig) -> None:
     for name in config.synthesizer:
         missing = [] if name == AUTO else FIELD_MODELS[name].lacking(data)
         if missing:
-            hint = "give it with --array" if "array" in missing else "the data must say where it stands"
+            hint = "give it with --array" if "array" in missing else "the data must contain its position"
             raise InputError(f"synthesizer {name} needs the {missing[0]}, which {data.name} does not describe; {hint}")
 
 

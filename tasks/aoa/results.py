@@ -232,7 +232,7 @@ class Results:
             "n_measured": round(fraction * len(self.experiment.train)),
             "counts": {condition.training_set: value["counts"] for condition, value in evaluated},
             "choice": chosen.get("choice"),
-            "advice": chosen.get("advice"),
+            "cross_validation": chosen.get("cross_validation"),
             "estimator_choice": self.estimator_choice.get(fraction_key(fraction)),
             "synthesis": _synthesis_metrics(synthesis, fits),
             "methods": methods,

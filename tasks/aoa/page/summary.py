@@ -9,7 +9,7 @@ from tasks.aoa.page.gains import change_text, changes_of, gain_sentence, judgeme
 from tasks.aoa.page.overview import overview
 from tasks.aoa.page.records import AoaRecords, FractionRecords
 from tasks.aoa.page.results import choice_sentence
-from tasks.aoa.page.room import advice_sentences
+from tasks.aoa.page.room import cross_validation_sentences
 from tasks.page.page import Number, Summary
 from tasks.page.suggestion import worth
 from tasks.summarise import fingerprinting
@@ -24,9 +24,9 @@ def summary(fraction: FractionRecords) -> Summary:
         f"({fraction.percent}). The spectra at the other positions are synthesized, and {learner(fraction)} learns from "
         f"both. It is tested on {metrics['n_test']} spectra that take no part in any fit.",
         *(text for text in (choice_sentence(fraction), gain_sentence(fraction)) if text),
-        *advice_sentences(fraction),
+        *cross_validation_sentences(fraction),
     ]
-    return Summary(_numbers(fraction), [overview(fraction)], meaning, next_steps(fraction), verdict(fraction))
+    return Summary(_numbers(fraction), [overview(fraction)], meaning, next_steps(fraction), conclusion(fraction))
 
 
 def _numbers(fraction: FractionRecords) -> list[Number]:
@@ -55,10 +55,10 @@ def answer(run: AoaRecords) -> Answer:
         for method, condition in fraction.conditions.items():
             names = {"condition": condition.meaning, "estimator": condition.estimator}
             rows.append((share | names, fraction.mix["methods"][method]["great_circle_deg"]))
-    return Answer("deg", rows, verdict(fractions[0]), next_steps(fractions[0]))
+    return Answer("deg", rows, conclusion(fractions[0]), next_steps(fractions[0]))
 
 
-def verdict(fraction: FractionRecords) -> str:
+def conclusion(fraction: FractionRecords) -> str:
     """Return which estimator to take and what synthetic spectra change, in short sentences."""
     sentences, medians = [], fraction.medians
     if choice := fraction.mix.get("estimator_choice"):
