@@ -46,6 +46,17 @@ def rssi_methods() -> str:
     return markdown(["data, split", *(f"`{name}`" for name in names)], rows)
 
 
+def rssi_heads() -> str:
+    """Return the errors of the model with the head and with the identity in its place, and the change by the head."""
+    rows = []
+    for key, found in load("rssi")["sets"].items():
+        head, identity = (found["methods"][name]["abs_error_db"] for name in ("swiftwrf", "identity"))
+        cells = [f"{error['median']:.2f} / {error['mean']:.2f}" for error in (head, identity)]
+        change = " / ".join(f"{head[key] - identity[key]:+.3f}" for key in ("median", "mean"))
+        rows.append([key, *cells, change])
+    return markdown(["data, split", "with the head", "with the identity", "change by the head"], rows)
+
+
 def _outcome(difference_db: float) -> str:
     if abs(difference_db) <= RELEVANT_DB:
         return "level"

@@ -23,7 +23,7 @@ from committed import (
 from comparison_tables import comparison, comparison_counts, comparison_turbo
 from geometry import SIDES, WALLS, nearest
 from locating_tables import locating_rssi, locating_spectra
-from rssi_tables import rssi_glance, rssi_methods
+from rssi_tables import rssi_glance, rssi_heads, rssi_methods
 from speed_tables import busy, drawing, networks, scaling, scaling_quality, scaling_rssi, size, speed
 from targets import aoa_targets, rssi_targets, synthesis_targets
 
@@ -311,6 +311,7 @@ TABLES = {
     "aoa_targets": aoa_targets,
     "rssi_targets": rssi_targets,
     "rssi_glance": rssi_glance,
+    "rssi_heads": rssi_heads,
     "rssi_methods": rssi_methods,
 }
 FILES = (

@@ -49,7 +49,7 @@ LEVEL = 0.8  # nominal coverage of the interval that the standard deviation is c
 MAX_DISTANCE_M = 1e9  # from the measurements: float32 ends beyond, and so does any receiver's range
 PAPER_RECEIVERS = 4  # receivers that the paper's head is learnt for together, which saves time
 FIELD_ALONE = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)  # mixing weights
-SHRINKAGE = 0.05  # of the mixing weights towards the field; see docs/rssi_results.md
+SHRINKAGE = 0.05  # of the mixing weights towards the field, by nested cross-validation in the training rows
 MIN_SCORES = 30  # held-out rows of a receiver below which the scores of all receivers scale its standard deviation
 MAX_VARIANCE_POSITIONS = 200  # measured positions that determine where the field is known
 
@@ -59,7 +59,7 @@ class RssiModel(RssiPredictor, Saved):
 
     Everything is chosen on five held-out folds of the training rows: the kernel and whether there is a field at all; the
     mixing weights of the field beside simpler predictors (the path-loss model of the receiver, that of all receivers, the
-    mean of the receiver); and the scale of the standard deviation. A receiver detected in fewer than 10 rows falls back to
+    mean of the receiver), which all receivers share; and the scale of the standard deviation. A receiver detected in fewer than 10 rows falls back to
     the path-loss model of all receivers. If the positions of the receivers are unknown, a path-loss model is a level.
 
     Args:
@@ -89,7 +89,7 @@ class RssiModel(RssiPredictor, Saved):
     kernel: Kernel
     """kernel of the latent field, lengths in [m]"""
     mixing_weight: Tensor
-    """weights (4, R) of the field and the three simpler predictors, contained in the tensors below"""
+    """weights (4, R) of the field and the three simpler predictors, contained in the tensors below, equal in all columns"""
     receiver: Tensor
     """positions of the receivers, float64 (R, 3) [m]"""
     centre: Tensor
