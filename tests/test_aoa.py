@@ -114,7 +114,7 @@ def test_kernel_regression_reads_only_the_spectra_that_it_keeps(room, monkeypatc
 @pytest.mark.long
 @pytest.mark.parametrize("circular", [False, True])
 def test_aann_learns_a_toy(circular):
-    """Four directions, four patterns: a network that cannot tell them apart stays at the constant's error."""
+    """Four directions, four patterns: a network that cannot distinguish them keeps the error of a constant."""
     label = torch.tensor([[0.0, 30], [90, 30], [180, 30], [270, 60]]).deg2rad().repeat(4, 1).double()
     spectrum = torch.zeros(16, 16, 64)
     for i in range(16):
@@ -222,7 +222,7 @@ def test_kernel_regression_regression_is_what_its_definition_says():
 
 
 def test_what_all_distances_have_in_common_does_not_move_an_estimate():
-    """As noise does that a measured spectrum has and synthetic ones have not."""
+    """Noise adds a constant to all distances of a measured spectrum; synthetic ones have none."""
     generator = np.random.default_rng(0)
     feature, new = generator.normal(size=(40, 3)), generator.normal(size=(5, 3))
     regression = nadaraya_watson.NadarayaWatson.fit(np.c_[feature, np.zeros(40)], feature, seed=0)
@@ -233,7 +233,7 @@ def test_what_all_distances_have_in_common_does_not_move_an_estimate():
 
 @pytest.mark.parametrize("circular", [False, True])
 def test_pointwise_convolutions_are_matrix_products(circular):
-    """The same function with the same weights, in value and gradient."""
+    """Both agree in value and gradient for equal weights."""
     from tasks.aoa.estimators.resnet import Pointwise, backbone
 
     spectrum = torch.rand(4, 1, 9, 40, dtype=torch.float64)
@@ -352,17 +352,17 @@ def test_samples_train_only_if_they_are_significantly_better_than_means(room, ri
     for number in range(2):
         train, test = (room.subset(rows.nonzero()[:, 0]) for rows in (part != number, part == number))
         folds.append(Fold(Informed().fit(train), train, test))
-    given = cross_validation.advise(folds, n_synthetic=100, seed=0).metrics
+    given = cross_validation.cross_validate(folds, n_synthetic=100, seed=0).metrics
     assert given["sampled"] is sampled
     assert [gain["sampled"] for gain in given["gains"]] == [False, True]
 
 
 def pretended(monkeypatch, room, errors):
-    """Return the advice for four folds with these errors by fold and number of synthetic positions."""
+    """Return the cross-validation for four folds with these errors by fold and number of synthetic positions."""
     monkeypatch.setattr(cross_validation, "_errors", lambda fold, number, *_: errors(fold.test, number))
     model = make_model("idw").fit(room)
     folds = [SimpleNamespace(model=model, test=fold) for fold in range(4)]
-    return cross_validation.advise(folds, n_synthetic=3000, seed=0).metrics
+    return cross_validation.cross_validate(folds, n_synthetic=3000, seed=0).metrics
 
 
 @pytest.mark.parametrize(
@@ -373,11 +373,11 @@ def test_further_positions_are_recommended_if_each_number_of_them_gains(monkeypa
     """With few held-out spectra one number alone gains by chance."""
     factor = dict(zip((0, *cross_validation.N_SYNTHETIC_CANDIDATES), (1, *factors), strict=True))
     given = pretended(monkeypatch, room, lambda fold, number: factor[number] * np.linspace(1, 1.01, 20))
-    assert given["recommended_extra"] == recommended
+    assert given["recommended_n_synthetic"] == recommended
     assert given["helps"] == (recommended > 0)
 
 
-def test_the_interval_of_the_advice_is_that_of_the_rule(monkeypatch, room):
+def test_the_interval_of_cross_validation_is_that_of_the_rule(monkeypatch, room):
     """Errors without any gain on average: the best number of each fold is chance, and other folds do not confirm it."""
     generator = np.random.default_rng(1)
     drawn = {(fold, number): generator.uniform(0.5, 1.5, 4) for fold in range(4) for number in (0, 300, 1000, 3000)}
@@ -404,6 +404,18 @@ def test_a_training_is_as_long_as_the_scene_needs():
     assert make_estimator("aann", 780, "paper").config.steps == AANNConfig.paper().steps
 
 
+def test_a_budget_without_time_for_networks(small, tmp_path):
+    out = tmp_path / "run"
+    assert run("--mix", 0.5, "--extra", 10, "--budget", 1e-3, "--out", out) == 0
+    part = json.loads((out / "metrics.json").read_text())["mixes"]["0.5"]
+    assert {entry["estimator"] for entry in part["methods"].values()} >= {"peak", "kernel_regression"}
+    assert not any(entry["estimator"] == "aann_kernel" for entry in part["methods"].values())
+    assert "budget of 0.001 s" in part["left_out"]["measured_only"]
+    text = (out / "report.html").read_text()
+    assert "With synthetic spectra kernel_regression changes" in text
+    assert "its training does not fit" in text
+
+
 def test_whole_run(small, tmp_path):
     out = tmp_path / "run"
     more = ("--repeats", 2, "--extra", 20, "--suggest", 4)
@@ -425,7 +437,9 @@ def test_whole_run(small, tmp_path):
     drawn = {"swiftwrf", "idw", "gp", "gp sample", "coarray", "coarray sample"}
     assert set(metrics["mixes"]["0.5"]["synthesis"]) == drawn
     assert metrics["mixes"]["0.5"]["counts"]["turbo_idw_extra"] == {"measured": 20, "withheld": 20, "further": 20}
-    assert metrics["mixes"]["0.5"]["advice"]["swiftwrf"]["n_held_out"] == 16  # of 20: one fold is never scored
+    assert (
+        metrics["mixes"]["0.5"]["cross_validation"]["swiftwrf"]["n_held_out"] == 16
+    )  # of 20: one fold is never scored
     assert set(metrics["mixes"]["1"]["seconds"]) == {"fit", "synthesize", "train"}
 
     errors = pd.read_csv(out / "errors.csv")
@@ -634,13 +648,16 @@ def test_the_room_is_searched_once_for_all_models_with_one(room, glances, tmp_pa
     assert len(searched) == 1
 
 
-def test_advice_is_that_of_each_field_model(small):
+def test_cross_validation_is_that_of_each_field_model(small):
     """A model without cross-validation adds no further positions by default."""
     given = AoaConfig((0.5,), synthesizer=("idw", "gp", "vae"))
     train, test = small.split("random", 0)
     data = context.Experiment(given, train, test, 3000, torch.device("cpu"))
-    advice = {"idw": {"recommended_extra": 300, "sampled": False}, "gp": {"recommended_extra": 0, "sampled": True}}
-    found = {s.synthesizer: s for s in synthesizing.syntheses(data, MeasuredSubset(0.5), given.synthesizer, advice)}
+    validation = {
+        "idw": {"recommended_n_synthetic": 300, "sampled": False},
+        "gp": {"recommended_n_synthetic": 0, "sampled": True},
+    }
+    found = {s.synthesizer: s for s in synthesizing.syntheses(data, MeasuredSubset(0.5), given.synthesizer, validation)}
     assert {name: found[name].n_synthetic for name in given.synthesizer} == {"idw": 3000, "gp": 0, "vae": 0}
     assert {name: found[name].sampled for name in given.synthesizer} == {"idw": False, "gp": True, "vae": False}
 

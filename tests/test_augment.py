@@ -205,7 +205,7 @@ def rows_of(spectra):
 
 @settings(max_examples=15, deadline=None)
 @given(st.floats(0.3, 0.9), st.integers(0, 2**31))
-def test_choice_advice_and_synthetic_positions_use_the_measured_fraction_alone(fraction, seed):
+def test_choice_cross_validation_and_synthetic_positions_use_the_measured_fraction_alone(fraction, seed):
     """Every spectrum of every fit is measured; synthetic positions depend on measured positions alone."""
     measured, withheld = withhold(TRAIN, fraction, seed)
     with spied() as fits:

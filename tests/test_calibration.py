@@ -1,4 +1,4 @@
-"""Element phases and orientation: recovered where the data tell them, refused where they do not."""
+"""Element phases and orientation: recovered if the data determine them, refused otherwise."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def spoilt(data, degrees=20.0, seed=0):
 
 
 def errors(found, phase, turn):
-    """Of the turn and of the worst phase [deg]; all phases may be off by a common one."""
+    """Return the errors of the rotation and of the worst phase [deg], up to a common phase."""
     left = Rotation.from_rotvec(found.turn.numpy()).inv() * Rotation.from_rotvec(turn.numpy())
     beside = torch.polar(torch.ones_like(phase), found.phase - phase)
     return math.degrees(left.magnitude()), float((beside * beside.sum().conj()).angle().abs().max().rad2deg())

@@ -184,7 +184,7 @@ def test_workers_of_other_versions_are_refused(cluster, monkeypatch):
 
 
 class Foreign:
-    """What nobody but this process can open."""
+    """Class that no other process can unpickle."""
 
     def __reduce__(self):
         return __import__, ("no_such_package",)

@@ -17,7 +17,7 @@ GRID = AngularGrid.hemisphere(15, 60)
 
 
 def spectra(array, n=5, grid=GRID):
-    """Of random channels."""
+    """Return spectra of random channels."""
     generator = torch.Generator().manual_seed(0)
     channel = torch.randn(n, len(array.element), 2, dtype=torch.float64, generator=generator)
     return array.spectrum(torch.view_as_complex(channel), grid)

@@ -17,6 +17,7 @@ import pytest
 from quick import said
 
 from tasks.command import COMMANDS, main
+from tasks.command_line import BROKEN_PIPE
 
 ROOT = Path(__file__).parent.parent
 
@@ -54,6 +55,16 @@ def test_help_lists_every_command_at_once(tmp_path):
     assert done.returncode == 0
     listed = re.findall(r"^  (\w+) +\S", done.stdout, flags=re.MULTILINE)
     assert listed == [*COMMANDS, "resume"]
+
+
+@pytest.mark.parametrize("arguments", [("--help",), ("inspect", "--help")])
+def test_a_closed_output_ends_a_command_without_a_message(arguments):
+    """A case is `swiftwrf --help | head -1`, where `head` ends first."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tasks", *arguments], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    process.stdout.close()
+    assert (process.stderr.read(), process.wait()) == (b"", BROKEN_PIPE)
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -149,9 +149,9 @@ def test_the_field_shared_by_transmitters_is_the_field_of_each(generator):
     shared = field(point, direction, transmitter.transpose(0, 1))
     x, d, t = (encode(v.expand(7, 4, 3), 3, lowest=1.0) for v in (point, direction, transmitter.transpose(0, 1)))
     h = field.layers(x)
-    side_by_side = field.emission(field.mixing(torch.cat([field.feature(h), d, t], dim=-1)))
-    torch.testing.assert_close(shared.amplitude, functional.leaky_relu(side_by_side[..., 0]).abs())
-    torch.testing.assert_close(shared.phase, 2 * math.pi * side_by_side[..., 1].sigmoid())
+    parallel_map = field.emission(field.mixing(torch.cat([field.feature(h), d, t], dim=-1)))
+    torch.testing.assert_close(shared.amplitude, functional.leaky_relu(parallel_map[..., 0]).abs())
+    torch.testing.assert_close(shared.phase, 2 * math.pi * parallel_map[..., 1].sigmoid())
     assert shared.absorption.shape == (7, 1)
 
 
@@ -362,7 +362,7 @@ def test_what_is_not_finite_stops_the_fit(room, monkeypatch, name):
 
 
 def test_one_field_for_all_receivers(tmp_path):
-    """Averaged over rays, in dBm; where nothing was heard nothing is learnt."""
+    """RSSI is averaged over rays, in dBm; rows without detection do not train."""
     train = rssi_room(n=40).receivers(["1", "2", "3"])
     train.rssi_dbm[::3, 1] = torch.nan
     model = NeRF2Rssi(PUBLISHED_RSSI).fit(train)

@@ -241,7 +241,7 @@ def test_same_bits_twice_and_whatever_the_batch():
 
 
 def check_bits(device):
-    """The same bits twice, and for one position alone."""
+    """Check that results are bitwise reproducible, also for a single position."""
     grid = AngularGrid.hemisphere(17, 33)
     inputs = [x.detach().to(device) for x in random_scene(200, 5, per_position=True, grid=grid)]
     cotangent = torch.randn(5, 2, *grid.shape, generator=torch.Generator().manual_seed(1)).to(device)

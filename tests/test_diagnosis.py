@@ -1,4 +1,4 @@
-"""What an inspection states about measurements with a known error: the true cause, and never another one.
+"""Diagnoses of measurements with a known error name the true cause, and never another one.
 
 Scenes are random: size of the room, shape, place and orientation of the array, noise and an echo from the floor.
 """

@@ -109,7 +109,7 @@ def describe(record):
 
 
 def test_finds_a_size(room):
-    """What was chosen is among what was tried, and predicts held-out spectra as well as any."""
+    """The chosen size is among the candidates, and predicts held-out spectra as well as any."""
     records = []
     model = fit(room, on_record=records.append)
     tried = {r["n_primitives"]: r["validation"] for r in records if r["stage"] == "search"}
@@ -290,7 +290,7 @@ def test_recovers_a_scene_that_it_can_represent_exactly(generator):
         optimisation.advance()
     after = psnr(optimisation.result(optimisation.position).detach(), scene.spectrum).median()
     assert before < 35 < 50 < after
-    assert apart(optimisation.result) < 0.5 * began  # the spectra do not tell more at this length
+    assert apart(optimisation.result) < 0.5 * began  # the spectra determine no more at this length
 
 
 def test_a_fit_that_ended_worse_is_refused_again(room, tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""Rooms in closed form found again, verdicts on what cannot be known, draws, state."""
+"""Rooms in closed form found again, conclusions on what is not identifiable, samples, state."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def room(noisy):
 
 
 def test_elements_may_be_listed_in_any_order():
-    """Of phases that the spectra cannot tell apart, one fits the room, wherever each element's opposite one is listed."""
+    """One of two phase aliases fits the room, whatever the order of opposite elements."""
     order = torch.randperm(16, generator=torch.Generator().manual_seed(1))
     plain, shuffled = ARRAY, PlanarArray(ARRAY.element[order], ARRAY.wavelength)
     normal = torch.tensor([list(SIX)], dtype=torch.float64)
@@ -92,7 +92,7 @@ def test_phases_of_the_elements_follow_from_the_spectra():
 
 @pytest.mark.parametrize("moving", ["receiver", "transmitter"])
 def test_derivatives_of_the_phase_are_differences_of_the_field(moving):
-    """Of rooms with oblique planes, too, and of images that a plane makes twice."""
+    """Includes rooms with oblique planes, and images that a plane makes twice."""
     scene, _ = observe(mirror_room({}, moving=moving, n=10))
     normal = torch.tensor([[[1, 0, 0], [0, 0, -1], [0, 1, 0]], [[1, 0.1, 0], [0.1, 0, -1], [-0.2, 1, 0.1]]]).double()
     normal = torch.nn.functional.normalize(normal, dim=-1)
@@ -273,7 +273,7 @@ def test_a_tilted_plane_is_found_to_a_millimetre():
 
 
 def test_images_are_mirrored_in_one_plane_after_another():
-    """Of any sequences, also without those that they begin with."""
+    """Holds for any sequences, also without their prefixes."""
     generator = torch.Generator().manual_seed(0)
     normal = torch.nn.functional.normalize(torch.randn(2, 3, 3, generator=generator, dtype=torch.float64), dim=-1)
     offset, gain = torch.rand(2, 3, generator=generator, dtype=torch.float64), torch.rand(2, 3, generator=generator)
@@ -305,7 +305,7 @@ def test_the_field_is_the_sum_over_any_parts_of_its_images(moving):
 def test_nothing_to_find_is_no_plane():
     model = fit(mirror_room({}))
     assert model.planes == []
-    assert "no plane" in model.verdict
+    assert "no plane" in model.conclusion
     assert len(model.image_sources()[0]) == 1
 
 
@@ -402,7 +402,7 @@ def with_path_gains(hybrid, path_gains):
 
 
 def test_path_gains_follow_a_shadow():
-    """A wall that does not reflect to one half of the region: its amplitude is known where the phases say so."""
+    """A wall that does not reflect to one half of the region: its amplitude is known where the phases determine it."""
     whole, bare = mirror_room(SIX, n=140), mirror_room({n: o for n, o in SIX.items() if n != (0, 0, 1)}, n=140)
     hidden = whole.position[:, 0] > 2.5
     spectrum = torch.where(hidden[:, None, None], bare.spectrum, whole.spectrum)
@@ -431,7 +431,7 @@ def test_path_gains_follow_a_shadow():
 
 @pytest.mark.long
 def test_path_gains_are_held_out_from_spectra_without_observed_phases_too():
-    """What stands for predictions of one fold follows from the observed spectra of the other folds."""
+    """Predictions of one fold depend on the observed spectra of the other folds alone."""
     data, fold = mirror_room(SIX, n=80), torch.arange(80) % 3
     kernel = Kernel(long=0.5, short=1.0, share=1.0, noise=1e-3)
     few = GeometryConfig(max_spectra=40)

@@ -119,7 +119,7 @@ def test_local_predictions_condition_on_the_nearest_positions(generator):
 
 
 def test_smooth_fields_are_the_process(generator):
-    """Of all positions, and of the nearest, which here are all but a few far ones; and how they change with the position."""
+    """Values and derivatives agree, from all positions and from the nearest (here all but a few far ones)."""
     position = 2 * torch.rand(70, 3, generator=generator) - 1
     value = torch.sin(position @ torch.randn(3, 2, generator=generator))
     kernel = Kernel(long=8.0, short=0.4, share=0.05, noise=1e-2)

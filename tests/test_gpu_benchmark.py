@@ -1,4 +1,4 @@
-"""What is measured on a GPU, tried on the CPU: every part, and the script that survives parts that fail or take too long."""
+"""Every part of the GPU benchmark on the CPU, and its script, which survives failures and timeouts of parts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""tasks.inspect: what it says of sound measurements, and the page that it leaves. Wrong ones: test_wrong_conventions.py."""
+"""tasks.inspect on valid measurements: findings and page. Wrong ones are in test_wrong_conventions.py."""
 
 from __future__ import annotations
 

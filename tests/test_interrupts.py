@@ -46,7 +46,7 @@ def start(folder, *arguments, most_bytes=None):
 
 
 def finished(process):
-    """Its exit code, and what it said at last; a traceback is a wrong ending."""
+    """Return the exit code and the last line of stderr; a traceback fails the test."""
     _, said = process.communicate(timeout=300)
     assert "Traceback" not in said, said[-2000:]
     return process.returncode, said
@@ -124,7 +124,7 @@ def test_a_full_disk_ends_in_a_sentence_and_the_run_goes_on(tmp_path):
 
 
 def race(folder, asked, count):
-    """So many processes with one --out at once; all but one are refused."""
+    """Start `count` processes with one --out at the same time; all but one are refused."""
     folder.mkdir(exist_ok=True)
     started = [start(folder, *asked, "--out", folder / "same") for _ in range(count)]
     codes = sorted(finished(process)[0] for process in started)

@@ -19,14 +19,14 @@ from tasks.rssi.predictors import PREDICTORS
 
 
 def moved(spectra, shift):
-    """The same measurements in coordinates from another origin."""
+    """Return the measurements in coordinates from another origin."""
     fixed = None if spectra.fixed_position is None else spectra.fixed_position + shift
     return replace(spectra, position=spectra.position + shift, fixed_position=fixed)
 
 
 @pytest.mark.parametrize("name", [name for name in FIELD_MODELS if name != "swiftwrf"])
 def test_field_models_do_not_depend_on_the_origin(room, small_published, glances, name):
-    """Map coordinates lie thousands of kilometres from theirs."""
+    """The origin of map coordinates may be thousands of kilometres away."""
     train, test = room.split("random")
     predicted = [
         FIELD_MODELS[name]().fit(moved(train, shift)).predict(test.position + shift).mean for shift in (0.0, 1e7)

@@ -60,7 +60,7 @@ def test_summary_skips_what_is_not_finite():
 
 
 def test_a_first_ssim_under_inference_mode_leaves_later_gradients_alone(generator):
-    """What is kept between calls must serve both."""
+    """Cached tensors must work in inference mode and outside."""
     a = torch.rand(23, 41, generator=generator, requires_grad=True)  # sizes that no other test asks for
     with torch.inference_mode():
         ssim(a, a)

@@ -189,7 +189,7 @@ def test_models_of_every_kind_are_opened_with_swiftwrf_alone(room, tmp_path, sma
 
 
 def test_estimators_are_opened_with_swiftwrf_alone(tmp_path):
-    """By the entry points that pyproject.toml declares, as an installation has them."""
+    """The entry points of pyproject.toml suffice, as in an installation."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     points = project["entry-points"]["swiftwrf.estimators"]
     installed = tmp_path / "project-1.dist-info"

@@ -37,6 +37,7 @@ from swiftwrf.online import (
 from swiftwrf.online.obstacles import corners
 from swiftwrf.testing.rooms import room_with_box
 from tasks.command import main
+from tasks.update.record import Record, resumed
 
 GRID = AngularGrid.hemisphere(15, 60)
 WALLS = [
@@ -193,7 +194,7 @@ def test_an_update_from_files_writes_model_table_and_page(tmp_path, model_file, 
     assert main(["update", str(model_file), str(tmp_path / "data"), "--out", str(out)]) == 2
 
 
-@pytest.mark.parametrize("arguments", [("--follow", "--json"), ("--false-alarm-rate", "2"), ("--follow",)])
+@pytest.mark.parametrize("arguments", [("--follow", "--json"), ("--false-alarm-rate", "2"), ("--follow", "--open")])
 def test_wrong_options_are_refused(arguments, capsys):
     assert main(["update", "m", "table.csv", "--out", "x", *arguments]) == 2
     assert capsys.readouterr().err.startswith("error: ")
@@ -230,10 +231,75 @@ def test_lines_are_answered_and_a_bad_one_is_left_out(tmp_path, model_file):
     assert len(load(tmp_path / "out" / "model.safetensors").anchor) == 62
 
 
+def csv_rows(rows):
+    header = ",".join(["x", "y", "z", *floor().receiver_names])
+    cells = [[*floor().transmitter_position[i].tolist(), *floor().rssi_dbm[i].tolist()] for i in rows]
+    return [header + "\n", *(",".join("" if x != x else f"{x:g}" for x in row) + "\n" for row in cells)]
+
+
+def test_rows_of_a_table_wait_until_they_are_complete(tmp_path, model_file):
+    rows, source = csv_rows([60, 61, 62]), tmp_path / "rows.csv"
+    source.write_text(rows[0] + rows[1] + "\n" + rows[2][:20])
+    process = follow(model_file, source, tmp_path / "out")
+    try:
+        first = json.loads(process.stdout.readline())
+        assert first["measurement"] == 1
+        observed = dict(zip(floor().receiver_names, floor().rssi_dbm[60].tolist(), strict=True))
+        assert all(x is None or x == pytest.approx(observed[name], abs=0.01) for name, x in first["observed"].items())
+        time.sleep(1)
+        with source.open("a") as file:
+            file.write(rows[2][20:] + "no,number\n" + rows[3])
+        answers = [json.loads(process.stdout.readline()) for _ in range(2)]
+    finally:
+        process.kill()
+        process.communicate(timeout=60)
+    assert [answer["measurement"] for answer in answers] == [2, 3]
+    assert answers[0]["position"] == pytest.approx(floor().transmitter_position[61].tolist(), abs=1e-4)
+    record = Record.read(tmp_path / "out")
+    assert [row["index"] for row in record.rows][:2] == [0, 1]
+    assert record.rows[1]["running_error"] == pytest.approx((record.rows[0]["error"] + record.rows[1]["error"]) / 2)
+
+
+def test_a_record_is_cut_to_what_the_model_has_learnt(tmp_path):
+    record, model = Record("source", " [dB]"), RssiModel().fit(floor().subset(torch.arange(60)))
+    follower = Follower(model)
+    for i in range(60, 63):
+        record.append(tmp_path, record.add(i, follower.step(floor().subset(torch.tensor([i])))))
+    with (tmp_path / "measurements.csv").open("a") as file:
+        file.write("63,1.0")  # a kill while a row was written
+    assert [row["index"] for row in Record.read(tmp_path).rows] == [60, 61, 62]
+    kept = resumed(tmp_path, 2)
+    assert [row["index"] for row in kept.rows] == [row["index"] for row in Record.read(tmp_path).rows] == [60, 61]
+    assert kept.column("error").tolist() == pytest.approx(record.column("error")[:2].tolist())
+
+
+def test_a_follower_of_a_room_continues_its_test_for_obstacles():
+    changed = spectra(12, 2, PLACE)
+    follower = Follower(walls(), None)
+    follower.obstacles = ObstacleMonitor(walls(), spectra(72, 0))
+    follower.obstacles.observe(changed.subset(torch.arange(6)))
+    again = Follower(walls(), None)
+    again.resume(json.loads(json.dumps(follower.state())))
+    for one in (follower, again):
+        one.obstacles.observe(changed.subset(torch.arange(6, 12)))
+    torch.testing.assert_close(again.obstacles.value, follower.obstacles.value)
+    assert len(again.obstacles.standing) == len(follower.obstacles.standing)
+
+
+def test_a_box_that_the_training_spectra_do_not_exclude_raises_no_alarm():
+    monitor = ObstacleMonitor(walls(), spectra(72, 0))
+    assert 0 <= monitor.weight.min() < monitor.weight.max() <= 1
+    monitor.weight[:] = 0
+    assert not monitor.observe(spectra(30, 2, PLACE))
+    assert (ObstacleMonitor(walls()).weight == 1).all()
+
+
 @pytest.mark.long
-def test_kills_lose_nothing_and_repeat_at_most_the_last_line(tmp_path, model_file):
-    kills, source, out = int(os.environ.get("UPDATE_KILLS", "5")), tmp_path / "rows.ndjson", tmp_path / "out"
-    source.write_text("".join(rssi_lines()[60:]))
+@pytest.mark.parametrize("name", ["rows.ndjson", "rows.csv"])
+def test_kills_lose_nothing_and_repeat_at_most_the_last_line(tmp_path, model_file, name):
+    kills, source, out = int(os.environ.get("UPDATE_KILLS", "5")), tmp_path / name, tmp_path / "out"
+    rows = list(range(60, 100)) * max(1, kills // 5)  # that no run of the command reaches the end of them
+    source.write_text("".join([rssi_lines()[i] for i in rows] if name == "rows.ndjson" else csv_rows(rows)))
     wait, answered = random.Random(0), []
     for _ in range(kills):
         process = follow(model_file, source, out)
@@ -250,8 +316,10 @@ def test_kills_lose_nothing_and_repeat_at_most_the_last_line(tmp_path, model_fil
         )
         if (out / "model.safetensors").exists():
             assert len(load(out / "model.safetensors").anchor) - 60 in (answered[-1][-1] - 1, answered[-1][-1])
-        if answered[-1][-1] >= 38:
+        if answered[-1][-1] >= len(rows) - 2:
             break
     for before, after in pairwise(answered):
         assert after[0] - before[-1] in (0, 1)
         assert after == list(range(after[0], after[0] + len(after)))
+    learnt = len(load(out / "model.safetensors").anchor) - 60
+    assert learnt <= len(Record.read(out).rows) <= learnt + 1

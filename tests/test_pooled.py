@@ -54,7 +54,7 @@ def test_the_choices_of_all_repeats_are_one_condition():
     assert values(found, "measured_only") == [0, 10]
 
 
-def test_field_models_asked_for_by_name_add_no_positions_against_the_advice():
+def test_field_models_asked_for_by_name_add_no_positions_against_cross_validation():
     found = pooled(results((GP,), (GP, GP_EXTRA)), auto=False)
     assert values(found, "turbo_gp") == [1, 11]
     assert values(found, "turbo_gp_extra") == [1, 12]

@@ -14,23 +14,23 @@ from unittest import mock
 
 import pytest
 import torch
-from sums import Kill, Refusal, Sum
+from sums import Kill, Optional, Refusal, Sum
 
 from swiftwrf import AngularGrid, FitError, InputError, simulated_room
 from swiftwrf.data.writing import write_spectra
 from tasks.aoa.options import AoaConfig
 from tasks.directory import Run
 from tasks.processes import number_of_processes
-from tasks.steps import computed
+from tasks.steps import Budget, computed
 
 HERE = Path(__file__).parent
 STEPS = [Sum(1, (3, 4)), Sum(2), Sum(1, (5,))]  # the third is the first one, and has another follower
 
 
-def results(folder, steps, processes):
+def results(folder, steps, processes, budget=None):
     arrived = []
     with Run("aoa", str(folder), "", AoaConfig(mix=(0.5,)), torch.device("cpu"), {}) as run:
-        found = list(computed(run, steps, 10, None, processes, lambda step, value: arrived.append(step.name)))
+        found = list(computed(run, steps, 10, None, processes, lambda step, value: arrived.append(step.name), budget))
         run.finish({}, lambda folder, metrics: None)
     return found, arrived
 
@@ -43,6 +43,32 @@ def test_processes_give_the_results_of_one_process_in_the_same_order(tmp_path):
     assert all(value["process"] != os.getpid() and value["threads"] == 1 for _, value in there)
     assert (tmp_path / "2" / "sum-5.txt").read_text() == "5"
     assert not active_children()
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_a_budget_leaves_out_optional_steps_and_no_others(tmp_path, processes):
+    steps = [Optional(1), Sum(2), Sum(3, (4,))]
+    found, arrived = results(tmp_path / "none", steps, processes, Budget(1e-9))
+    assert {step.name: "refused" in value for step, value in found} == {
+        "sum-1": True,
+        "sum-2": False,
+        "sum-3": False,
+        "sum-4": False,
+    }
+    assert "sum-1" not in arrived
+    assert not (tmp_path / "none" / "sum-1.txt").exists()
+    found, _ = results(tmp_path / "all", steps, processes, Budget(600))
+    assert not any("refused" in value for _, value in found)
+
+
+def test_an_optional_step_is_expected_to_take_as_long_as_the_longest():
+    budget = Budget(100)
+    assert budget.refusal(Optional(1)) is None
+    budget.spent(Optional(1), 100)
+    assert budget.refusal(Optional(2))["refused"] == "its training does not fit into the budget of 100 s"
+    assert budget.refusal(Sum(2)) is None
+    assert budget.priority(Optional(2)) < budget.priority(Sum(2))
+    assert Budget().priority(Optional(2)) == Budget().priority(Sum(2))
 
 
 @pytest.mark.parametrize(("step", "error"), [(Refusal(1), InputError("no such number")), (Kill(1), FitError("killed"))])

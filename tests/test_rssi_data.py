@@ -12,7 +12,7 @@ N = 15
 
 @pytest.fixture
 def folder(tmp_path):
-    """A well-formed folder: three receivers, the third heard only in the last five rows."""
+    """A well-formed folder: three receivers, the third detected only in the last five rows."""
     (tmp_path / "gateway_position.yml").write_text("a: [0, 0, 1]\nb: [5, 0, 1]\nc: [0, 5, 1]\n")
     (tmp_path / "tx_pos.csv").write_text("x,y,z\n" + "".join(f"{i},1,1\n" for i in range(N)))
     rows = [f"{-50 - i},{-60 - i},{-70 if i >= N - 5 else -100}" for i in range(N)]

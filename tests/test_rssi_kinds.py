@@ -74,7 +74,7 @@ def floor(request):
 
 
 def noted(data, *words):
-    """Whether a note holds all of these words."""
+    """Return True if a note contains all of these words."""
     return any(all(word in note for word in words) for note in data.notes)
 
 

@@ -173,7 +173,7 @@ def test_shrinkage_keeps_the_first_of_equal_predictors():
     assert free[0] < shrunk[0] < 1
     assert mixing_weights(measured + noise, measured, shrinkage=1e4)[0] > 0.999
     better = torch.stack([measured + 5 * noise[0], measured + 0.1 * noise[1], measured + 5 * noise[2]])
-    assert mixing_weights(better, measured, shrinkage=0.05)[1] > 0.9
+    assert mixing_weights(better, measured, shrinkage=0.05)[1] > 0.8
 
 
 # --- the model -------------------------------------------------------------------------------------------------------

@@ -130,7 +130,7 @@ def test_a_metal_box_has_the_image_sources_of_the_simulated_room(ray_tracer, mov
 
 
 def passes_an_edge(receiver: torch.Tensor, source: torch.Tensor) -> bool:
-    """Whether the straight line to an image source leaves the room within a centimetre of an edge."""
+    """Return True if the straight line to an image source leaves the room within a centimetre of an edge."""
     crossing = sorted(
         ((wall - float(receiver[axis])) / float(source[axis]), axis)
         for axis in range(3)
@@ -191,7 +191,7 @@ def test_both_mobilities_see_the_same_paths(ray_tracer):
 
 
 def test_a_path_that_two_triangles_find_counts_once():
-    """The same image source: as long, from the same direction, at the same position."""
+    """Paths of equal length, direction and position have one image source."""
     arrival = np.array([[1.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 0, 0]])
     table = {"owner": np.array([0, 0, 0, 0, 1]), "length": np.array([2, 2 + 1e-5, 2, 3, 2]), "arrival": arrival}
     assert _first(table).tolist() == [0, 2, 3, 4]
@@ -284,7 +284,7 @@ def test_what_only_sionna_knows_is_refused(ray_tracer, tmp_path, capsys, argumen
     ("arguments", "says"),
     [
         (("--room", "kitchen", *OPTIONS[2:]), "unknown room 'kitchen'; choose from conference, office, bedroom"),
-        (("--room", "none.xml", *OPTIONS[2:]), "none.xml is not there"),
+        (("--room", "none.xml", *OPTIONS[2:]), "none.xml does not exist"),
         ((*OPTIONS[:4], "--positions", 1), "--positions takes 2 to"),
         ((*OPTIONS, "--frequency", 2.4), r"--frequency takes 1e+06 to 1e+13 [Hz]"),
         ((*OPTIONS, "--order", 9), "--order takes 0 to 8"),
@@ -294,7 +294,7 @@ def test_what_only_sionna_knows_is_refused(ray_tracer, tmp_path, capsys, argumen
         ((*OPTIONS, "--fixed", 2, 1, 0.4), "in furniture"),
         ((*OPTIONS, "--region", 1, 1, 1, 2, 2, 9), "is not inside the room"),
         ((*OPTIONS, "--region", 1.5, 0.5, 0.1, 2.5, 1.5, 0.4), "only 0 of 5 positions are free"),
-        (("--room", "{file}.xml", *OPTIONS[2:]), "does not say where the ends are"),
+        (("--room", "{file}.xml", *OPTIONS[2:]), "does not contain the positions of the ends"),
         (("--room", "{file}.xml", *OPTIONS[2:], "--walls", "wood"), "--walls is for the rooms"),
         (OPTIONS, "pip install 'swiftwrf-tasks[raytrace]'"),
     ],
@@ -330,7 +330,7 @@ def test_the_synthesizer_is_refused_before_anything_is_computed(tmp_path, capsys
     [
         ("office", "nearest", "--scene is for synthesizer raytrace"),
         ("kitchen", "raytrace", "unknown room 'kitchen'"),
-        ("none.xml", "raytrace", "--scene none.xml is not there"),
+        ("none.xml", "raytrace", "--scene none.xml does not exist"),
     ],
 )
 def test_a_scene_that_cannot_be(tmp_path, capsys, scene, synthesizer, says):

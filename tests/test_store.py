@@ -219,7 +219,7 @@ def test_sketched_components_are_the_exact_ones(generator):
 
 
 def test_the_tree_finds_the_nearest(generator):
-    known = torch.rand(positions.MANY + 1, 3, generator=generator, dtype=torch.float64)
+    known = torch.rand(positions.MIN_TREE_POSITIONS + 1, 3, generator=generator, dtype=torch.float64)
     asked = torch.rand(20, 3, generator=generator, dtype=torch.float64)
     apart, number = nearest(asked, known, 5)
     expected = distance(asked, known).topk(5, largest=False)
@@ -236,7 +236,7 @@ def exact(monkeypatch):
             (process, "MAX_EXACT"),
             (coarray, "MAX_EXACT_ROWS"),
             (idw, "MAX_CHOICE_SPECTRA"),
-            (positions, "MANY"),
+            (positions, "MIN_TREE_POSITIONS"),
         ):
             monkeypatch.setattr(module, name, n)
 

@@ -1,4 +1,4 @@
-"""Where to measure next."""
+"""Suggested positions to measure next."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where to measure next to locate better."""
+"""Suggested positions to measure next for locating."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ NOT_HEARD = WIDE[NAMES[3:]] == -100
 
 
 def same(data, table=WIDE, names=tuple(NAMES[3:])):
-    """Whether the data are those of the wide table, whatever the order of rows and receivers."""
+    """Return True if the data equal the wide table up to the order of rows and receivers."""
     columns = [data.receiver_names.index(name) for name in names]
     read = torch.cat([data.transmitter_position, data.rssi_dbm[:, columns]], dim=1).nan_to_num(-100)
     expected = torch.tensor(table[["x", "y", "z", *names]].to_numpy())

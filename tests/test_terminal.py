@@ -1,4 +1,4 @@
-"""What commands show: results as they come, the answer as a table or as JSON, the browser, and how to resume."""
+"""Output of commands: results while computing, the answer as a table or as JSON, the browser, and how to resume."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def found():
     return Answer("deg", [({"condition": "measured alone"}, ERROR)], "It helps.", ["Measure more."])
 
 
-def test_the_answer_is_a_table_a_verdict_next_steps_and_the_report(tmp_path, capsys, found):
+def test_the_answer_is_a_table_a_conclusion_next_steps_and_the_report(tmp_path, capsys, found):
     Terminal().answer(found, tmp_path / "report.html")
     head, row, *rest = capsys.readouterr().out.splitlines()
     assert " ".join(head.split()) == "condition median [deg] 95 % interval mean [deg] 90 % below [deg]"
@@ -38,7 +38,7 @@ def test_json_is_one_object_and_nothing_else(tmp_path, capsys, found):
     out, err = capsys.readouterr()
     content = json.loads(out)
     assert content["rows"][0]["median_deg"] == 2.36
-    assert (content["verdict"], content["report"]) == ("It helps.", str(tmp_path / "report.html"))
+    assert (content["conclusion"], content["report"]) == ("It helps.", str(tmp_path / "report.html"))
     assert err == ""
 
 
@@ -82,8 +82,8 @@ def test_a_run_shows_results_and_its_answer(tmp_path, capsys, arguments, first):
     out, err = capsys.readouterr()
     assert out.startswith(first)
     assert out.splitlines()[-1] == f"report: {tmp_path / 'run' / 'report.html'}"
-    verdict = next(line for line in out.split("\n\n")[1].splitlines())
-    assert verdict.replace("'", "&#39;") in (tmp_path / "run" / "report.html").read_text()
+    conclusion = next(line for line in out.split("\n\n")[1].splitlines())
+    assert conclusion.replace("'", "&#39;") in (tmp_path / "run" / "report.html").read_text()
     unit = {"rssi": "dB", "locate": "m", "aoa": "deg"}[arguments[0]]
     results = [line for line in err.splitlines() if line.endswith(f" {unit}")]
     assert len(results) >= 4

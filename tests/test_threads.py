@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from swiftwrf.runtime.threads import side_by_side, single_thread, threads_kept
+from swiftwrf.runtime.threads import parallel_map, single_thread, threads_kept
 
 
 @pytest.fixture(autouse=True)
@@ -66,5 +66,5 @@ def test_each_of_several_threads_uses_one():
             torch.set_num_threads(2)
         return torch.get_num_threads()
 
-    assert side_by_side(uses_threads, range(8)) == [1] * 8
+    assert parallel_map(uses_threads, range(8)) == [1] * 8
     assert torch.get_num_threads() == in_a_new_thread() == 4

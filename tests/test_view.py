@@ -1,4 +1,4 @@
-"""What the page shows, without the page: views, plans, spectra and maps as they are computed, and what is refused."""
+"""Content of the page without widgets: views, plans, spectra, maps and refusals."""
 
 from __future__ import annotations
 
@@ -23,13 +23,15 @@ import torch
 from fuzz import kinds
 from PIL import Image
 
-from swiftwrf import AngularGrid, GeometryModel, InputError, load, load_rssi, rssi_room
+from swiftwrf import AngularGrid, GeometryModel, InputError, RssiModel, load, load_rssi, rssi_room
 from swiftwrf.locate import MatchedField, RssiLocator
 from swiftwrf.models.geometry import Plane, fit_hybrid
+from swiftwrf.online import Follower
 from tasks.command_line import command_line
 from tasks.locate.options import LocateConfig
 from tasks.page.floor_plan import FloorPlan
 from tasks.page.raster import colour_image
+from tasks.update.record import Record
 from tasks.view import spectra
 from tasks.view.drawing import HemisphereProjection, PlanProjection, data_url, text
 from tasks.view.locating import N_POSITIONS, RssiLocating
@@ -399,7 +401,7 @@ def said(capsys, *arguments) -> str:
 
 @needs_the_extra
 def test_refusals(tmp_path, capsys, aoa_run, rssi_run):
-    assert "is not there" in said(capsys, tmp_path / "nowhere", "--port", 0)
+    assert "does not exist" in said(capsys, tmp_path / "nowhere", "--port", 0)
     assert "is no run" in said(capsys, tmp_path, "--port", 0)
     assert "cannot be read" in said(capsys, "x" * 300, "--port", 0)
     (tmp_path / "text").write_text("x")
@@ -455,6 +457,29 @@ def test_a_dropped_floor_plan_lies_at_its_scale_and_origin_and_stays(rssi_run, t
     for scale, origin in ((0.0, (0, 0)), (np.nan, (0, 0)), (1.0, (np.inf, 0))):
         with pytest.raises(InputError, match="scale"):
             FloorPlan.scaled(pixels, scale, origin)
+
+
+def test_a_followed_run_is_read_again_when_it_grows(tmp_path):
+    data = rssi_room(n=70)
+    follower, record = Follower(RssiModel().fit(data.subset(torch.arange(60)))), Record("source", " [dB]")
+    (tmp_path / "config.json").write_text(json.dumps({"task": "update"}))
+    with pytest.raises(InputError, match="no record"):
+        open_source(tmp_path)
+    record.write(tmp_path)
+    view = open_source(tmp_path)
+    assert view.snapshot().sentences == ["no measurement yet"]
+    for i in range(60, 63):
+        step = follower.step(data.subset(torch.tensor([i])))
+        record.append(tmp_path, record.add(i, replace(step, alarms=("hall weaker everywhere",)) if i == 62 else step))
+    shown = view.snapshot()
+    assert view.snapshot() is shown
+    assert [row["index"] for row in shown.rows] == [62, 61, 60]
+    assert shown.rows[0]["alarm"] == "hall weaker everywhere"
+    assert "change at measurement 2: hall weaker everywhere" in shown.sentences
+    assert all(figure.startswith("<svg") for figure in shown.figures.values())
+    record.append(tmp_path, record.add(63, step))
+    assert view.version != shown.version
+    assert "4 measurements" in view.snapshot().sentences[0]
 
 
 def test_total_coverage_counts_receivers(rssi_run):

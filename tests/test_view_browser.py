@@ -14,14 +14,18 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
 import pandas as pd
 import pytest
+import torch
 
-from swiftwrf import rssi_room
+from swiftwrf import RssiModel, rssi_room
 from swiftwrf.locate import RssiLocator
+from swiftwrf.online import Follower
+from tasks.update.record import Record
 
 LIBRARIES = ("nicegui", "selenium")
 PROGRAMS = ("chromium", "chromedriver")
@@ -41,7 +45,7 @@ image.addEventListener('load', () => window.frames_seen.push(performance.now()))
 
 @pytest.fixture
 def serve():
-    """Starts the page of a run or model, and says where it is."""
+    """Start the page of a run or model and return its address."""
     processes = []
 
     def start(source: Path) -> str:
@@ -107,7 +111,7 @@ def pointer(browser):
 
 
 def opened(browser, address, name, label):
-    """The page, once this label says something."""
+    """Return the page once this label has text."""
     browser.get(address)
     until(lambda: browser.find_elements("id", name) and said(browser, label))
     return find(browser, f"#{name}")
@@ -185,6 +189,37 @@ def test_page_of_rssi(browser, serve, rssi_run, tmp_path):
     file = until(lambda: next(tmp_path.glob("*.csv"), None))
     until(lambda: next(tmp_path.glob("*.png"), None))
     assert set(pd.read_csv(file)["receiver"]) == {"receiver01"}
+
+
+def test_page_of_a_followed_run_grows_without_reloading(browser, serve, tmp_path):
+    data, folder = rssi_room(n=70), tmp_path / "live"
+    folder.mkdir()
+    follower, record = Follower(RssiModel().fit(data.subset(torch.arange(60)))), Record("source", " [dB]")
+    (folder / "config.json").write_text('{"task": "update"}')
+    record.write(folder)
+
+    def learn(i, **changes):
+        step = replace(follower.step(data.subset(torch.tensor([i]))), **changes)
+        record.append(folder, record.add(i, step))
+
+    opened(browser, serve(folder), "rows", "sentence")
+    assert said(browser, "sentence") == "no measurement yet"
+    browser.execute_script("window.not_reloaded = true")
+    learn(60)
+    until(lambda: "1 measurements learnt" in said(browser, "sentence"))
+    before = find(browser, "#changes").get_attribute("innerHTML")
+    for i in range(61, 66):
+        learn(i, alarms=("hall weaker everywhere",) if i == 63 else ())
+    until(lambda: "6 measurements learnt" in said(browser, "sentence"))
+    assert "change at measurement 3: hall weaker everywhere" in said(browser, "sentence")
+    assert len(browser.find_elements("css selector", "#rows tbody tr")) == 6
+    assert find(browser, "#changes").get_attribute("innerHTML") != before
+    assert find(browser, "#error svg").is_displayed()
+    assert browser.execute_script("return window.not_reloaded")
+    for width in (360, 700, 1400):
+        browser.set_window_size(width, 900)
+        assert browser.execute_script("return document.querySelector('.q-layout').scrollWidth <= window.innerWidth")
+    browser.save_screenshot(str(tmp_path / "followed.png"))
 
 
 def test_page_of_a_locator(browser, serve, tmp_path):

@@ -132,7 +132,7 @@ REFUSED = {
     ),
     "angles of departure": (
         _deepmimo(aoa_el=lambda a: 180 - a["aoa_el"], aoa_az=lambda a: a["aoa_az"] + 180),
-        "say where a path goes",
+        "directions of propagation",
     ),
     "x and y swapped": (
         _deepmimo(rx_pos=lambda a: a["rx_pos"][:, [1, 0, 2]], tx_pos=lambda a: a["tx_pos"][:, [1, 0, 2]]),

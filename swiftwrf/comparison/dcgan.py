@@ -32,7 +32,12 @@ from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, Positiv
 
 @configuration
 class DcganSize(ConvolutionalSize):
-    """Size of the networks."""
+    """Size of the networks.
+
+    Example:
+        >>> DcganSize(noise=8).noise
+        8
+    """
 
     noise: Count = 16
     """number of noise variables"""
@@ -40,7 +45,12 @@ class DcganSize(ConvolutionalSize):
 
 @configuration
 class DcganConfig(Config):
-    """Options of `Dcgan`."""
+    """Options of `Dcgan`.
+
+    Example:
+        >>> Dcgan(DcganConfig(steps=200), l1_weight=10.0).config.l1_weight
+        10.0
+    """
 
     size: DcganSize = DcganSize()
     steps: PositiveInt = 1000
@@ -74,10 +84,10 @@ class Discriminator(nn.Module):
     def __init__(self, grid: AngularGrid, width: int, encoded: int) -> None:
         super().__init__()
         self.features, features = encoder(grid, width, inputs=1, norm=nn.BatchNorm2d)
-        self.verdict = nn.Linear(features + encoded, 1)
+        self.decision = nn.Linear(features + encoded, 1)
 
     def forward(self, spectrum: Tensor, encoded: Tensor) -> Tensor:
-        logit: Tensor = self.verdict(torch.cat([self.features(spectrum[:, None]), encoded], dim=-1))
+        logit: Tensor = self.decision(torch.cat([self.features(spectrum[:, None]), encoded], dim=-1))
         return logit[:, 0]
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
-from swiftwrf.gp import Kernel, LeaveGroupOut, candidates, thinned
+from swiftwrf.gp import Kernel, LeaveGroupOut, candidates, subsample
 from swiftwrf.positions import cells
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import Head, render
@@ -21,7 +21,7 @@ PAPER_LEVEL_DBM = -100.0  # of the paper's head where nothing is received
 # variance of a packet relative to the variance of the field: fading is as large as shadowing
 RELATIVE_NOISE_VARIANCES = (0.3, 1.0, 2.0, 3.0)
 VERTICALS = (1.0, 5.0)  # factors of the heights of floors: floors alike, or nearly independent beyond their attenuation
-MAX_KERNEL_ROWS, MAX_KERNEL_RECEIVERS = 300, 12  # more do not change the choice of the kernel or the mixing weights
+MAX_KERNEL_ROWS, MAX_KERNEL_RECEIVERS = 300, 12  # more do not change the chosen kernel or weights
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def prepare(train: Rssi, pool: Rssi, config: RssiConfig, like: RssiTraining | No
 def representative_receivers(pool: Rssi) -> Rssi:
     """Return the data of at most 12 receivers of the pool that detected the transmitter, evenly chosen."""
     detecting = pool.detected.any(dim=0).nonzero()[:, 0]
-    return pool.columns(thinned(detecting, rows=MAX_KERNEL_RECEIVERS)[0].tolist())
+    return pool.columns(subsample(detecting, rows=MAX_KERNEL_RECEIVERS)[0].tolist())
 
 
 def bin_locations(rows: Rssi, max_locations: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -183,9 +183,9 @@ def choose_residual_kernel(
         The kernel, and whether its error is lower than that of no field at all.
     """
     some = (~residual.isnan()).any(dim=1)
-    position, residual, fold = thinned(position[some], residual[some], fold[some], rows=MAX_KERNEL_ROWS)
+    position, residual, fold = subsample(position[some], residual[some], fold[some], rows=MAX_KERNEL_ROWS)
     residual = residual[:, (~residual.isnan()).any(dim=0)]
-    (columns,) = thinned(torch.arange(residual.shape[1]), rows=MAX_KERNEL_RECEIVERS)
+    (columns,) = subsample(torch.arange(residual.shape[1]), rows=MAX_KERNEL_RECEIVERS)
     residual = residual[:, columns]
     held_out = []  # (receiver, number of values, rows)
     for r, missing in enumerate(residual.isnan().T):
