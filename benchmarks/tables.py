@@ -11,6 +11,7 @@ from committed import RESULTS, ROOT, aoa_shares, interval, load, markdown, rssi_
 from comparison_tables import comparison, comparison_counts, comparison_methods, comparison_turbo
 from geometry import SIDES, WALLS, nearest
 from locating_tables import locating_rssi, locating_spectra
+from rssi_tables import rssi_glance, rssi_heads, rssi_methods
 from speed_tables import busy, drawing, networks, scaling, scaling_quality, scaling_rssi, size, speed
 from targets import aoa_targets, rssi_targets, synthesis_targets
 
@@ -311,6 +312,9 @@ TABLES = {
     "synthesis_targets": synthesis_targets,
     "aoa_targets": aoa_targets,
     "rssi_targets": rssi_targets,
+    "rssi_glance": rssi_glance,
+    "rssi_heads": rssi_heads,
+    "rssi_methods": rssi_methods,
 }
 DOCS = sorted(file.relative_to(ROOT).as_posix() for file in (ROOT / "docs").rglob("*.md"))
 FILES = ("README.md", *DOCS)
