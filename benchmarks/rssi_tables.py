@@ -1,4 +1,4 @@
-"""Tables of docs/rssi_results.md: all measured RSSI data sets, from the result of rssi.py."""
+"""Tables of all measured RSSI data sets, from the result of rssi.py."""
 
 from __future__ import annotations
 
