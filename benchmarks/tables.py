@@ -11,6 +11,7 @@ from committed import ROOT, aoa_shares, interval, load, markdown, turbo_conditio
 from comparison_tables import comparison, comparison_counts, comparison_methods, comparison_turbo
 from geometry import SIDES, WALLS, nearest
 from locating_tables import locating_rssi, locating_spectra
+from measured_tables import measured_spectra
 from rssi_tables import rssi_glance, rssi_heads, rssi_methods
 from speed_tables import busy, drawing, networks, scaling, scaling_quality, scaling_rssi, size, speed
 from targets import aoa_targets, rssi_targets, synthesis_targets
@@ -268,6 +269,7 @@ TABLES = {
     "locating_rssi": locating_rssi,
     "reliability": reliability,
     "synthesis": synthesis,
+    "measured_spectra": measured_spectra,
     "aoa": aoa,
     "room": room,
     "walls": walls,
