@@ -23,6 +23,13 @@ from committed import (
 from comparison_tables import comparison, comparison_counts, comparison_turbo
 from geometry import SIDES, WALLS, nearest
 from locating_tables import locating_rssi, locating_spectra
+from paper_scale_tables import (
+    paper_scale,
+    paper_scale_aoa,
+    paper_scale_counts,
+    paper_scale_density,
+    paper_scale_targets,
+)
 from speed_tables import busy, drawing, networks, scaling, scaling_quality, scaling_rssi, size, speed
 from targets import aoa_targets, rssi_targets, synthesis_targets
 
@@ -306,6 +313,11 @@ TABLES = {
     "raytracing": raytracing,
     "comparison_counts": comparison_counts,
     "comparison_turbo": comparison_turbo,
+    "paper_scale": paper_scale,
+    "paper_scale_aoa": paper_scale_aoa,
+    "paper_scale_counts": paper_scale_counts,
+    "paper_scale_density": paper_scale_density,
+    "paper_scale_targets": paper_scale_targets,
     "synthesis_targets": synthesis_targets,
     "aoa_targets": aoa_targets,
     "rssi_targets": rssi_targets,
@@ -321,6 +333,7 @@ FILES = (
     "docs/stability.md",
     "docs/ablation.md",
     "docs/comparison.md",
+    "docs/paper_scale.md",
     "docs/targets.md",
     "docs/raytracing.md",
     "docs/scale.md",
