@@ -78,8 +78,17 @@ def _best(rows: Rows) -> float:
 
 def paper_scale() -> str:
     """Return every method on every scene and split, the best PSNR of a split in bold."""
+    return _methods("paper_scale")
+
+
+def paper_scale_quick() -> str:
+    """Return the same table of the quick study."""
+    return _methods("paper_scale_quick")
+
+
+def _methods(result: str) -> str:
     table = []
-    for name, scene in load("paper_scale")["scenes"].items():
+    for name, scene in load(result)["scenes"].items():
         splits = {split: _with_all(scene, split) for split in ("random", "block")}
         for method in dict.fromkeys(method for rows in splits.values() for method in rows):
             own = [rows.get(method) for rows in splits.values()]
@@ -170,6 +179,23 @@ def paper_scale_targets() -> str:
     columns = ["scene, random split: PSNR [dB] / SSIM", "best of ours", "paper, other spectra", "swiftwrf"]
     columns += ["best of the published methods", "swiftwrf against gp [dB]", "size against gp", "fit of swiftwrf [s]"]
     return markdown(columns, table)
+
+
+def paper_scale_locating() -> str:
+    """Return the angular errors of the estimators without a network at each measured fraction."""
+    rows = [
+        [
+            f"{float(fraction):.0%} ({errors['n_measured']:,} spectra)",
+            method,
+            f"{errors['angle_deg']['median']:.2f}",
+            f"{errors['angle_deg']['p90']:.2f}",
+            f"{errors['seconds']:.0f}",
+        ]
+        for fraction, methods in sorted(load("paper_scale")["locating"].items())
+        for method, errors in methods.items()
+    ]
+    columns = ["measured", "estimator", "median angular error [deg]", "90th percentile [deg]", "fit and estimates [s]"]
+    return markdown(columns, rows)
 
 
 def paper_scale_aoa() -> str:

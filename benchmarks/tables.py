@@ -28,6 +28,8 @@ from paper_scale_tables import (
     paper_scale_aoa,
     paper_scale_counts,
     paper_scale_density,
+    paper_scale_locating,
+    paper_scale_quick,
     paper_scale_targets,
 )
 from speed_tables import busy, drawing, networks, scaling, scaling_quality, scaling_rssi, size, speed
@@ -317,6 +319,8 @@ TABLES = {
     "paper_scale_aoa": paper_scale_aoa,
     "paper_scale_counts": paper_scale_counts,
     "paper_scale_density": paper_scale_density,
+    "paper_scale_locating": paper_scale_locating,
+    "paper_scale_quick": paper_scale_quick,
     "paper_scale_targets": paper_scale_targets,
     "synthesis_targets": synthesis_targets,
     "aoa_targets": aoa_targets,

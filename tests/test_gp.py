@@ -17,7 +17,9 @@ from swiftwrf.gp import (
     choose_rank,
     held_out,
     most_informative,
+    thinned,
 )
+from swiftwrf.gp.choice import _held_out_errors, _local_errors
 
 KERNEL = Kernel(long=1.0, short=0.3, share=0.6, noise=1e-2)
 
@@ -63,6 +65,24 @@ def test_kernel_choice_finds_smooth_and_rough_fields(generator):
     smooth = torch.sin(position @ torch.rand(3, 64, generator=generator, dtype=torch.float64)).reshape(80, 8, 8)
     noise = torch.rand(80, 8, 8, generator=generator)
     assert choose_kernel(position, smooth, fold).noise < choose_kernel(position, noise, fold).noise
+
+
+def test_kernel_of_many_spectra_follows_their_density(generator):
+    """A sample of the spectra is too sparse for the fine part of the field, which is noise to its kernel."""
+    position = torch.rand(2500, 3, generator=generator, dtype=torch.float64) * torch.tensor([1.0, 1.0, 0.0])
+    wave = torch.nn.functional.normalize(torch.randn(2, 50, generator=generator, dtype=torch.float64), dim=0)
+    phase = position[:, :2] @ wave
+    spectrum = (torch.sin(2 * phase) + 0.2 * torch.sin(60 * phase))[:, None]
+    fold = torch.arange(2500) % 5
+    assert choose_kernel(position, spectrum, fold).noise < choose_kernel(*thinned(position, spectrum, fold)).noise
+
+
+def test_local_errors_of_all_neighbours_are_the_exact_ones(generator):
+    position, spectrum = (torch.rand(40, *shape, generator=generator, dtype=torch.float64) for shape in ((3,), (4, 5)))
+    exact, local = (
+        errors(position, spectrum, torch.arange(40))(KERNEL) for errors in (_held_out_errors, _local_errors)
+    )
+    torch.testing.assert_close(local, exact)
 
 
 def test_rank_counts_what_matters(generator):
