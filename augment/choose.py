@@ -1,10 +1,10 @@
 """Choice of a field model by cross-validation on measured spectra.
 
 Some models search for a structure (walls, number of primitives) before they fit parameters. A search takes most of the time,
-so it is not repeated in every fold, but no fold is predicted with a structure that its spectra helped to find: one search
-leaves out folds 0 and 1, another leaves out folds 2 and 3. Each of these four folds is predicted by a model that reuses the
-structure of the search that left it out, with its parameters fitted to all other folds. Fold 4 takes part in both searches
-and is never predicted. If a search without two folds had too few spectra, each fold has a search of its own.
+so it is not repeated in every fold. No fold is predicted with a structure that its spectra helped to find. One search leaves
+out folds 0 and 1, another leaves out folds 2 and 3. A model reuses the structure of the search that left its fold out, and
+fits its parameters to all other folds. Fold 4 takes part in both searches and is never predicted. If a search without two
+folds had too few spectra, each fold has a separate search.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from torch import Tensor
 from swiftwrf import FitError, InputError, Spectra
 from swiftwrf.data.spectra import check_training
 from swiftwrf.data.splits import FOLDS, MIN_TRAINING, Validation, folds
-from swiftwrf.gp import thinned
+from swiftwrf.gp import subsample
 from swiftwrf.metrics import psnr
 from swiftwrf.models import FIELD_MODELS, FieldModel, make_model
 
@@ -39,6 +39,13 @@ class Fold:
         model: Model fitted to `train`. Neither its parameters nor its structure depend on `test`.
         train: Measured spectra that the model was fitted to.
         test: Measured spectra that were held out.
+
+    Example:
+        >>> import swiftwrf
+        >>> measured = swiftwrf.simulated_room(n=40, grid=swiftwrf.AngularGrid.hemisphere(10, 40))
+        >>> fold = choose_model(measured, ("nearest",)).folds["nearest"][0]
+        >>> fold.model.predict(fold.test.position).mean.shape == fold.test.store.shape
+        True
     """
 
     model: FieldModel
@@ -55,6 +62,13 @@ class ModelChoice:
         psnr_db: Trimmed mean of the PSNR over held-out measured spectra [dB] of each candidate.
         seconds: Time of the cross-validation of each candidate [s]. A shared search counts for each model that uses it.
         folds: Scored folds of each candidate.
+
+    Example:
+        >>> import swiftwrf
+        >>> measured = swiftwrf.simulated_room(n=40, grid=swiftwrf.AngularGrid.hemisphere(10, 40))
+        >>> choice = choose_model(measured, ("nearest",))
+        >>> choice.name, len(choice.folds["nearest"]) > 1
+        ('nearest', True)
     """
 
     name: str
@@ -176,4 +190,4 @@ def _without(fold: Tensor, *numbers: int) -> Tensor:
 def _split(measured: Spectra, fold: Tensor, number: int) -> tuple[Spectra, Spectra]:
     """Return training and test spectra of one fold."""
     test = (fold == number).nonzero()[:, 0]
-    return measured.subset(_without(fold, number)), measured.subset(*thinned(test, rows=MAX_TEST_SPECTRA))
+    return measured.subset(_without(fold, number)), measured.subset(*subsample(test, rows=MAX_TEST_SPECTRA))

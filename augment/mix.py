@@ -26,6 +26,14 @@ class Mixed:
         synthetic: Origin of each spectrum, bool (n,).
         grid: Directions of the pixels.
         array: Antenna array, if it is known.
+
+    Example:
+        >>> import swiftwrf
+        >>> measured, withheld = withhold(swiftwrf.simulated_room(n=40), 0.5, seed=0)
+        >>> model = swiftwrf.make_model("nearest").fit(measured)
+        >>> train = mix(measured, withheld, model.synthesize(withheld.position))
+        >>> len(train), int(train.synthetic.sum())
+        (40, 20)
     """
 
     stores: tuple[Store, ...]
@@ -141,5 +149,12 @@ def mix(measured: Spectra, withheld: SyntheticPositions, synthetic: Tensor) -> M
 
     Raises:
         InputError: The number of synthetic spectra is not that of the positions.
+
+    Example:
+        >>> import swiftwrf
+        >>> measured, withheld = withhold(swiftwrf.simulated_room(n=40), 0.5, seed=0)
+        >>> model = swiftwrf.make_model("nearest").fit(measured)
+        >>> mix(measured, withheld, model.synthesize(withheld.position)).label.shape
+        torch.Size([40, 2])
     """
     return Mixed.measured(measured).add(withheld, synthetic)

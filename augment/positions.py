@@ -30,6 +30,12 @@ class SyntheticPositions:
         position: Positions of the moving end, (n, 3) [m].
         label: Direction of the transmitter from the positions of both ends, (n, 2) [rad].
         index: Number of each position in the data set, (n,). -1 for positions outside of it.
+
+    Example:
+        >>> import swiftwrf
+        >>> positions = synthetic_positions(swiftwrf.simulated_room(n=20), 5, seed=0)
+        >>> len(positions), positions.index.tolist()
+        (5, [-1, -1, -1, -1, -1])
     """
 
     position: Tensor

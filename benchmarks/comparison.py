@@ -27,7 +27,7 @@ from torch import Tensor
 
 from swiftwrf import FIELD_MODELS, FieldModel, Spectra, make_model, simulated_room
 from swiftwrf.data.splits import validation_for
-from swiftwrf.gp import thinned
+from swiftwrf.gp import subsample
 from swiftwrf.metrics import l1, psnr, ssim, summary
 from swiftwrf.models.nearest import MemoryModel
 from swiftwrf.runtime.durable import write_text
@@ -148,7 +148,7 @@ def jobs(config: Config, rows: Path) -> Iterator[tuple[Spectra, Spectra, list[Jo
         if config.only and not scene.startswith(config.only):
             continue
         train, test = data.split(split)
-        test = test.subset(*thinned(torch.arange(len(test)), rows=JUDGES))
+        test = test.subset(*subsample(torch.arange(len(test)), rows=JUDGES))
         methods = [
             method for method in (*BASELINES, *LEARNT) if method == MEAN or not FIELD_MODELS[method].lacking(data)
         ]

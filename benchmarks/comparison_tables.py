@@ -1,7 +1,8 @@
-"""Make the tables of docs/comparison.md, with the paper's numbers beside the measured ones."""
+"""Make the tables of both comparison pages, with the paper's numbers beside the measured ones."""
 
 from __future__ import annotations
 
+import statistics
 from typing import Any
 
 from committed import interval, load, markdown
@@ -37,6 +38,45 @@ PAPER_TURBO = {
     "0.5": {"swiftwrf": (0.410, 1.498), "nerf2": (0.704, 1.663), "wrfgs": (0.878, 1.854)},
     "0.7": {"swiftwrf": (0.370, 1.173), "nerf2": (0.674, 1.478), "wrfgs": (0.727, 1.629)},
 }
+
+
+# scenes of each column of the table of methods
+SCENES = {
+    "s23-200, random": ("s23-200 random",),
+    "s23-200, block": ("s23-200 block",),
+    "newrf (2 rooms)": ("newrf-bedroom random", "newrf-office random"),
+    "ray-traced (3 rooms, 2 moving ends)": tuple(
+        f"{room}-{moving} random"
+        for room in ("bedroom", "conference", "office")
+        for moving in ("receiver", "transmitter")
+    ),
+    "built-in room (2 moving ends)": ("simulated-room random", "simulated-room receiver random"),
+}
+
+
+def comparison_methods() -> str:
+    """Return one row for each method, the best PSNR of a column in bold."""
+    scenes = {scene: next(iter(by_count.values())) for scene, by_count in load("comparison")["scenes"].items()}
+    names = list(scenes["s23-200 random"])
+    psnr = {
+        name: [
+            statistics.mean(scenes[scene][name]["psnr_db"]["median"] for scene in group) for group in SCENES.values()
+        ]
+        for name in names
+    }
+    best = [f"{max(values):.1f}" for values in zip(*psnr.values(), strict=True)]
+    rows = []
+    for name in names:
+        texts = [f"{own:.1f}" for own in psnr[name]]
+        cells = [f"**{own}**" if own == top else own for own, top in zip(texts, best, strict=True)]
+        fit, ms = (
+            statistics.median(value(methods[name]) for methods in scenes.values())
+            for value in (lambda row: row["fit_seconds"], lambda row: row["ms"]["median"])
+        )
+        rows.append(
+            [f"`{name}`", *cells, f"{fit:.0f}", f"{ms:.2f}", f"{scenes['s23-200 random'][name]['parameters']:,}"]
+        )
+    return markdown(["method", *SCENES, "fit [s]", "ms a spectrum", "parameters"], rows)
 
 
 def comparison() -> str:

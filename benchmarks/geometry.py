@@ -66,7 +66,7 @@ def measure(data: Spectra, share: float, draw: int) -> dict[str, Any]:
         "planes": len(model.planes),
         "order": model.order,
         "score_held_out": model.estimate.score_held_out,
-        "verdict": model.verdict,
+        "conclusion": model.conclusion,
         "psnr_db": {
             "geometry": summary(psnr(model.synthesize(test.position), test.spectrum)),
             "sample": summary(

@@ -1,7 +1,7 @@
-"""What a GPU does beside `rasterize.py`: rates from positions to spectra, seconds of training, what limits drawing.
+"""Rates from positions to spectra, training seconds and limits of rendering on a GPU, in addition to `rasterize.py`.
 
-One part a call, so that a part that fails or takes too long costs no other; `gpu.sh` calls them all. Targets stand in the
-result with what was measured. Everything runs on a CPU, too, and quickly with --quick, to try it.
+Each call measures one part, so that a failure or timeout affects no other part. `gpu.sh` calls all parts. The result
+contains targets and measurements. For a trial, everything also runs on a CPU, quickly with --quick.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def rates(config: Config, device: torch.device) -> Row:
 
 
 def targets(rows: list[Row]) -> list[Row]:
-    """What was aimed at and what the best batch reaches."""
+    """Return the targets and the rates of the best batch size."""
 
     def best(n: int, name: str) -> float:
         return max(float(row[f"{name}_per_s"]["median"]) for row in rows if row["n"] == n)
@@ -146,7 +146,7 @@ def coarray(config: Config, device: torch.device) -> Row:
 
 
 def profiled(config: Config, device: torch.device) -> Row:
-    """Where the time of drawing goes, by kernel, and what share of the bound of exponentials and of memory is reached."""
+    """Return the rendering time by kernel, and the fraction of the exponential and memory bounds that is reached."""
     grid, numbers, batches = sizes(config)
     batch, rows = batches[-1], []
     machine = gpu_rates() if device.type == "cuda" else None
@@ -198,7 +198,7 @@ def kernels_of(call: Callable[[], Any], device: torch.device, calls: int = 5) ->
 
 
 def counters(config: Config, device: torch.device) -> Row | str:
-    """What Nsight Compute counts in the drawing kernel; or why it does not."""
+    """Return the counters of Nsight Compute for the rendering kernel, or the reason why there are none."""
     ncu = shutil.which("ncu")
     if device.type != "cuda" or ncu is None:
         return "no GPU" if device.type != "cuda" else "Nsight Compute (ncu) is not installed"

@@ -31,7 +31,7 @@ from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.choices import Moving
 from swiftwrf.data.raytraced import ROOMS
 from swiftwrf.data.splits import validation_for
-from swiftwrf.gp import thinned
+from swiftwrf.gp import subsample
 from swiftwrf.metrics import l1, psnr, ssim, summary
 from swiftwrf.models.base import FieldModel
 from swiftwrf.positions import Neighbours
@@ -146,7 +146,7 @@ def described(room: str, data: Spectra, folder: Path) -> Row:
 
 def measure(config: Config, prefix: Path, train: Spectra, test: Spectra, split: Split, first: bool) -> None:
     """Measure the missing rows of one split."""
-    test = test.subset(*thinned(torch.arange(len(test)), rows=JUDGES)).in_memory()
+    test = test.subset(*subsample(torch.arange(len(test)), rows=JUDGES)).in_memory()
     for method, n in wanted(config, len(train), split, first):
         file = Path(f"{prefix} {n} {method}")
         if not Path(f"{file}.json").exists():
@@ -223,7 +223,7 @@ def row(model: FieldModel | None, train: Spectra, test: Spectra, state: Path) ->
 
 def locate(work: Path, train: Spectra, test: Spectra, seed: int) -> None:
     """Measure the angular errors of the estimators without a network, unless they are measured."""
-    test = test.subset(*thinned(torch.arange(len(test)), rows=JUDGES)).in_memory()
+    test = test.subset(*subsample(torch.arange(len(test)), rows=JUDGES)).in_memory()
     for fraction in LOCATED_FRACTIONS:
         measured = withhold(train, fraction, seed)[0] if fraction < 1 else train
         for method in ("nearest_spectrum", KERNEL, *((MATCHED,) if fraction < 1 else ())):

@@ -40,7 +40,7 @@ def drawn(kind: str, generator: torch.Generator) -> tuple[tuple[float, ...], tup
 
 
 def measure(offset: tuple[float, ...], gain: tuple[float, ...], moving: Moving, noise: float) -> dict[str, Any]:
-    """What is found of one room."""
+    """Return the estimate of one room."""
     data = mirror_room(dict(zip(map(tuple, SIDES.tolist()), offset, strict=True)), gain, moving, POSITIONS, noise)
     began = time.process_time()
     model = fit_geometry(data, progress=False)

@@ -196,7 +196,7 @@ def rate(draw: Callable[[], Any], batch: int, device: torch.device, seconds: flo
 
 
 def gpu_rates() -> Rate:
-    """What the GPU can do: exponentials from its clock, bytes written (and as many read) from a copy of 1 GiB."""
+    """Return peak rates of the GPU: exponentials from its clock, bytes written (and read) from a copy of 1 GiB."""
     properties = torch.cuda.get_device_properties(0)
     source = torch.empty(2**28, device="cuda")
     target = torch.empty_like(source)

@@ -1,7 +1,7 @@
-"""Synthesizer `raytrace` beside others in the three furnished rooms, none of which it is told; needs the extra `raytrace`.
+"""Compare `raytrace` with other field models in the three furnished rooms. It needs the extra `raytrace`.
 
-Each room is traced anew by tasks.scenes, so this also says how long that takes. Spectra of 30 x 120 pixels, split at random;
-each row is kept in the folder `--work` once it is measured.
+No model receives the room's geometry. tasks.scenes traces each room again, so the result contains the tracing time, too.
+Spectra have 30 x 120 pixels and are split at random. Each finished row is saved in the folder `--work`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Measures what is not there yet and writes `results/raytracing.json`."""
+    """Measure missing rows and write `results/raytracing.json`."""
     scenes = {}
     for room in ROOMS:
         for moving in get_args(Moving):

@@ -1,4 +1,4 @@
-"""Attack readers, commands and runs and record how they end: the long version of tests/fuzz and tests/test_interrupts.
+"""Attack readers, commands and runs and record how they end: the long version of tests/fuzz and test_interrupts.py.
 
 python benchmarks/reliability.py [--mutations 10000 --commands 200 --right 20 --kills 50 --disks 10 --races 5]
 """

@@ -41,12 +41,12 @@ SIZES = (300, 1_000, 10_000, 100_000)
 MODELS = ("swiftwrf", "coarray", "gp")
 STEP = 0.01  # [m] between two spectra: a person who walks, a hundred spectra a second
 TURNS = (0.91, 0.37, 0.73)  # [rad / m] of the walk along x, y and z, which never comes back to its beginning
-AT_ONCE = 2048  # spectra that are simulated together
+BATCH_SIZE = 2048  # spectra that are simulated together
 DRAWN = 1_000  # positions between those of the walk that spectra are synthesized at
 TRAINING_STEPS = 5
 SAMPLED = 0.02  # [s] between two looks at the memory
 GIB = 2**20  # in kibibytes
-MOST_GIB = 6  # that any stage may take
+MAX_GIB = 6  # that any stage may take
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def draw(rows: list[dict[str, Any]]) -> None:
             )
             time_axis.plot(sizes, [values[part] for values in found], line, label=label, **style)
         memory_axis.plot(sizes, [values["rss_gib"] for values in found], **style)
-    memory_axis.axhline(MOST_GIB, color=figures.RULE)
+    memory_axis.axhline(MAX_GIB, color=figures.RULE)
     for axis, label in ((time_axis, "seconds of a processor"), (memory_axis, "peak resident memory [GiB]")):
         axis.set(xscale="log", xlabel="spectra of 90 x 360 pixels", ylabel=label)
     time_axis.set(yscale="log")
@@ -121,7 +121,7 @@ def walk(at: torch.Tensor) -> torch.Tensor:
 def simulated(at: torch.Tensor) -> Spectra:
     """Return spectra of the walk in the eight bits of images, simulated in batches directly into their store."""
     position = walk(at)
-    parts = position.split(AT_ONCE)
+    parts = position.split(BATCH_SIZE)
 
     def batches() -> Iterator[torch.Tensor]:
         for seed, some in enumerate(parts):

@@ -1,4 +1,4 @@
-"""Make the tables of docs/speed.md, docs/memory.md and docs/scale.md."""
+"""Make the tables of docs/development/speed.md and docs/large-data.md."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Measure hard cases: errors of every backend and of reduced precision, quality or refusal of fits.
 
-docs/stability.md gives the rules; its tables come from the result of this benchmark.
+docs/development/stability.md gives the rules; its tables come from the result of this benchmark.
 """
 
 from __future__ import annotations
@@ -190,7 +190,7 @@ FITS: dict[str, Callable[[int], Spectra]] = {
 
 
 def fit_case(name: str, many: int, config: FitConfig | None = None) -> dict[str, Any]:
-    """How well the training spectra are drawn, beside what their mean would reach; or the refusal."""
+    """Return the error of the fitted training spectra and of their mean, or the message of the refusal."""
     train, config = FITS[name](many), config or FitConfig()
     if name.startswith("learning rate"):
         gradient = replace(config.model, n_primitives=24, components=("mean", "response", "attenuation", "cholesky"))

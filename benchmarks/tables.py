@@ -7,20 +7,8 @@ import statistics
 from dataclasses import replace
 from typing import Any
 
-from committed import (
-    RESULTS,
-    ROOT,
-    aoa_shares,
-    change,
-    change_text,
-    interval,
-    load,
-    markdown,
-    reference,
-    rssi_runs,
-    turbo_condition,
-)
-from comparison_tables import comparison, comparison_counts, comparison_turbo
+from committed import RESULTS, ROOT, aoa_shares, interval, load, markdown, rssi_runs, turbo_condition
+from comparison_tables import comparison, comparison_counts, comparison_methods, comparison_turbo
 from geometry import SIDES, WALLS, nearest
 from locating_tables import locating_rssi, locating_spectra
 from paper_scale_tables import (
@@ -105,26 +93,38 @@ def headline() -> str:
         if share != "0.3":
             continue
         metrics, methods = result["metrics"], mix["methods"]
-        turbo, best = turbo_condition(mix), reference(mix)
-
-        def cell(name: str, methods: dict[str, Any] = methods) -> str:
-            return interval(methods[name]["great_circle_deg"]) if name in methods else ""
-
-        scene = f"{metrics['data']}, {metrics['split']}, {metrics['moving']} moves"
-        gain = change_text(change(mix, turbo.method, best))
-        shown = ("peak", "constant", best, turbo.method, LOCATOR, "measured_all")
-        rows.append([scene, *map(cell, shown[:4]), gain, *map(cell, shown[4:])])
+        shown = ("peak", "measured_only", turbo_condition(mix).method, LOCATOR, "measured_all")
+        cells = [interval(methods[name]["great_circle_deg"]) if name in methods else "" for name in shown]
+        rows.append([f"{metrics['data']}, {metrics['split']}, {metrics['moving']} moves", *cells])
     columns = [
-        "scene, split",
         "strongest peak",
-        "constant",
-        "best on measured spectra",
-        "network, with synthetic spectra",
-        "change",
+        "measured spectra only",
+        "with synthetic spectra",
         "matched field",
-        "everything measured",
+        "all spectra measured",
     ]
-    return markdown(columns, rows)
+    return markdown(["scene, split", *columns], rows)
+
+
+def headline_rssi() -> str:
+    """Return errors of RSSI and of positions on the measured sets of which both are known."""
+    sets, rows = load("locating_rssi")["sets"], []
+    for metrics in rssi_runs():
+        name = f"{metrics['data']}, {metrics['split']}"
+        errors = {method: entry["abs_error_db"] for method, entry in metrics["overall"].items()}
+        cells = [
+            f"{errors[method]['median']:.2f} / {errors[method]['p90']:.1f}" for method in ("mri_receiver", "swiftwrf")
+        ]
+        cells.append(f"{metrics['interval']['coverage']:.0%}")
+        located = sets.get(name.replace(",", ""))
+        if located is None:
+            continue
+        found = {method: entry["position_error_m"] for method, entry in located["localizers"].items()}
+        cells += [f"{found[method]['median']:.2f} / {found[method]['p90']:.2f}" for method in ("knn", "posterior")]
+        rows.append([name, *cells, f"{located['coverage']['0.8']:.0%}"])
+    columns = ["RSSI [dB]: path-loss model", "SwiftWRF", "80 % intervals cover"]
+    columns += ["position [m]: nearest fingerprints", "posterior", "80 % regions cover"]
+    return markdown(["data, split", *columns], rows)
 
 
 def room() -> str:
@@ -293,6 +293,7 @@ TABLES = {
     "scaling_rssi": scaling_rssi,
     "busy": busy,
     "headline": headline,
+    "headline_rssi": headline_rssi,
     "locating_spectra": locating_spectra,
     "locating_rssi": locating_rssi,
     "reliability": reliability,
@@ -312,6 +313,7 @@ TABLES = {
     "networks": networks,
     "ablation": ablation,
     "comparison": comparison,
+    "comparison_methods": comparison_methods,
     "raytracing": raytracing,
     "comparison_counts": comparison_counts,
     "comparison_turbo": comparison_turbo,
@@ -326,22 +328,8 @@ TABLES = {
     "aoa_targets": aoa_targets,
     "rssi_targets": rssi_targets,
 }
-FILES = (
-    "README.md",
-    "docs/results.md",
-    "docs/choosing.md",
-    "docs/tutorial.md",
-    "docs/speed.md",
-    "docs/memory.md",
-    "docs/reliability.md",
-    "docs/stability.md",
-    "docs/ablation.md",
-    "docs/comparison.md",
-    "docs/paper_scale.md",
-    "docs/targets.md",
-    "docs/raytracing.md",
-    "docs/scale.md",
-)
+DOCS = sorted(file.relative_to(ROOT).as_posix() for file in (ROOT / "docs").rglob("*.md"))
+FILES = ("README.md", *DOCS)
 
 
 def rewrite(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Make the tables of docs/targets.md: targets, committed results, and whether they are met.
+"""Make the tables of docs/development/targets.md: targets, committed results, and whether they are met.
 
 A result is rounded to the digits of its target before the comparison.
 """

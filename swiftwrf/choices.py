@@ -54,12 +54,12 @@ ROOMS = {  # what stands in the rooms of data/raytraced/rooms.yml
 }
 
 
-def check_scene(name: str, said: str = "") -> None:
+def check_scene(name: str, prefix: str = "") -> None:
     """Refuse a name that is neither a built-in room nor a scene file.
 
     Args:
         name: Name of a room, or a path that ends in `.xml`.
-        said: Text before the name in the message, e.g. the option.
+        prefix: Text before the name in the message, e.g. the option.
 
     Raises:
         InputError: No such room or file.
@@ -70,4 +70,4 @@ def check_scene(name: str, said: str = "") -> None:
     if not name.endswith(SCENE_FILE) and name not in ROOMS:
         raise InputError(f"unknown room {name!r}; choose from {', '.join(ROOMS)}")
     if name.endswith(SCENE_FILE) and not Path(name).is_file():
-        raise InputError(f"{said}{name} is not there; expected a Mitsuba scene, or one of {', '.join(ROOMS)}")
+        raise InputError(f"{prefix}{name} does not exist; expected a Mitsuba scene, or one of {', '.join(ROOMS)}")

@@ -1,27 +1,29 @@
-"""The two ways this package says no."""
+"""Exceptions of this package."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-LONGEST = 300  # characters of a message: what came may be a megabyte long
-MOST = 12  # names in a message
+MAX_LENGTH = 300  # characters of a message: what came may be a megabyte long
+MAX_NAMES = 12  # names in a message
 
 
 def one_line(message: str) -> str:
-    """The message without line breaks, its middle left out where it is too long: what is wrong stands at the beginning,
-    what to do at the end."""
+    """Return the message without line breaks. A long message loses its middle, because both ends are needed.
+
+    The beginning states the fault, the end the remedy.
+    """
     line = " ".join(message.split())
-    if len(line) <= LONGEST:
+    if len(line) <= MAX_LENGTH:
         return line
-    kept = LONGEST - len(" ... ")
+    kept = MAX_LENGTH - len(" ... ")
     return f"{line[: kept // 2]} ... {line[-(kept - kept // 2) :]}"
 
 
 def listed(names: Iterable[object]) -> str:
-    """The first names, and how many more there are."""
+    """Return the first names and the number of further ones."""
     found = [str(name) for name in names]
-    return ", ".join(found[:MOST]) + (f" and {len(found) - MOST} more" if found[MOST:] else "")
+    return ", ".join(found[:MAX_NAMES]) + (f" and {len(found) - MAX_NAMES} more" if found[MAX_NAMES:] else "")
 
 
 def ranges(numbers: Iterable[int]) -> str:
@@ -41,9 +43,15 @@ def ranges(numbers: Iterable[int]) -> str:
 
 
 class InputError(ValueError):
-    """Wrong input: one sentence saying what was expected, what came and what to do.
+    """Wrong input. The message is one sentence: what was expected, what came and what to do.
 
     Commands print the sentence and exit with code 2.
+
+    Example:
+        >>> import swiftwrf
+        >>> swiftwrf.simulated_room(n=0)
+        Traceback (most recent call last):
+        swiftwrf.errors.InputError: ...
     """
 
     def __init__(self, message: object) -> None:
@@ -51,7 +59,12 @@ class InputError(ValueError):
 
 
 class FitError(RuntimeError):
-    """A fit that cannot go on; the last good state is kept on disk where a checkpoint path was given."""
+    """A fit that cannot go on. The last good state remains on disk if a checkpoint path was given.
+
+    Example:
+        >>> str(FitError("the loss is not finite"))
+        'the loss is not finite'
+    """
 
     def __init__(self, message: object) -> None:
         super().__init__(one_line(str(message)))

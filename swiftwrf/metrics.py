@@ -1,4 +1,4 @@
-"""How wrong a spectrum, an angle or an RSSI is, as the papers of this field compute it, with intervals.
+"""Errors of spectra, angles and RSSI as the papers of this field define them, with intervals.
 
 SSIM is scikit-image's default (7 x 7 uniform window, sample covariance, borders cropped) with data_range 1; PSNR is
 10 log10(1 / MSE) per spectrum. Other conventions move SSIM by up to 0.07, so tables name this one.
@@ -65,16 +65,19 @@ def l1(a: Tensor, b: Tensor) -> Tensor:
 
 
 def covered(drawn: Tensor, deviation: Tensor, measured: Tensor) -> Tensor:
-    """Share of the pixels of each spectrum (..., H, W) that lie in their 80 % intervals, (...); 0.8 where the standard
-    deviations are right."""
+    """Return the fraction of the pixels of each spectrum (..., H, W) inside their 80 % intervals, (...).
+
+    It is 0.8 if the standard deviations are right.
+    """
     return ((drawn - measured).abs() <= NORMAL_80 * deviation).float().mean(dim=(-2, -1))
 
 
 def angle_errors(estimate: Tensor, truth: Tensor) -> dict[str, Tensor]:
-    """Absolute errors (n,) [rad] of azimuth (modulo a turn), elevation, and along the great circle.
+    """Return absolute errors (n,) [rad] of azimuth (modulo 2 pi) and elevation, and the angular error (great-circle).
 
     Args:
-        estimate, truth: azimuth and elevation [rad], (n, 2).
+        estimate: Estimated azimuth and elevation [rad], (n, 2).
+        truth: True azimuth and elevation [rad], (n, 2).
     """
     return {
         "azimuth": wrap(estimate[:, 0] - truth[:, 0]).abs(),

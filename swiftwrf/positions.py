@@ -11,10 +11,10 @@ from torch import Tensor
 
 from swiftwrf.errors import InputError
 
-FARTHEST = 1e15
-FAR = 1e6  # normalised: beyond, all is equally far, and float32 must not overflow
+MAX_COORDINATE = 1e15
+MAX_NORMALISED = 1e6  # normalised: beyond, all is equally far, and float32 must not overflow
 BISECTIONS = 20  # of the edge of cells, which find it to a millionth of the extent
-MANY = 2000  # known positions from which on a tree finds the nearest ones faster than all distances do
+MIN_TREE_POSITIONS = 2000  # known positions from which on a tree finds the nearest ones faster than all distances do
 
 
 def check_positions(position: Any) -> Tensor:
@@ -47,7 +47,7 @@ def frame(position: Tensor) -> tuple[Tensor, Tensor]:
 
 def normalise(position: Tensor, centre: Tensor, scale: Tensor | float) -> Tensor:
     """Positions (n, 3) [m] in a frame, float32."""
-    return ((position.double() - centre) / scale).clamp(-FAR, FAR).float()
+    return ((position.double() - centre) / scale).clamp(-MAX_NORMALISED, MAX_NORMALISED).float()
 
 
 def distance(a: Tensor, b: Tensor) -> Tensor:
@@ -57,7 +57,7 @@ def distance(a: Tensor, b: Tensor) -> Tensor:
     origin is (map coordinates lie thousands of kilometres from it). Farther than 1e15 counts as that: an infinite distance
     would give weights of inf / inf.
     """
-    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist").clamp(max=FARTHEST)
+    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist").clamp(max=MAX_COORDINATE)
 
 
 def cells(position: Tensor, n: int) -> tuple[Tensor, float]:
@@ -81,16 +81,18 @@ def cells(position: Tensor, n: int) -> tuple[Tensor, float]:
 
 
 class Neighbours:
-    """Finds the nearest of known positions: by all distances where these are few, else by a tree that is built once, so that
-    time grows with the logarithm of their number (k-d tree: J. L. Bentley, Communications of the ACM 18, 1975).
+    """Search for the nearest of known positions.
+
+    Among many positions a tree, built once, makes the time grow with the logarithm of their number (k-d tree: J. L. Bentley,
+    Communications of the ACM 18, 1975).
 
     Args:
-        known: positions (m, 3).
+        known: Positions (m, 3).
     """
 
     def __init__(self, known: Tensor) -> None:
         self._known = known.detach().double().cpu()
-        self._tree = cKDTree(self._known.numpy()) if len(known) > MANY else None
+        self._tree = cKDTree(self._known.numpy()) if len(known) > MIN_TREE_POSITIONS else None
 
     def __call__(self, position: Tensor, k: int) -> tuple[Tensor, Tensor]:
         """Distances from positions (n, 3) to the k nearest, ascending, float64, and the numbers of those, (n, k)."""

@@ -65,7 +65,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     name, *options = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):
-        print(_help())
+        try:
+            print(_help(), flush=True)
+        except BrokenPipeError:
+            from tasks.command_line import without_reader
+
+            return without_reader()
         return 0
     if name == "resume":
         return _resume(options)

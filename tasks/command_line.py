@@ -6,6 +6,7 @@ import errno
 import os
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -20,6 +21,7 @@ from tasks.terminal import terminal
 Config = TypeVar("Config", bound=Options)
 VERBOSE = "--verbose"
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+BROKEN_PIPE = 141  # exit code that shells show for a process ended by SIGPIPE
 
 
 def command_line(
@@ -37,7 +39,8 @@ def exit_code(action: Callable[[], None]) -> int:
     """Return the exit code of an action and print its error as one sentence. Under torchrun the first process acts.
 
     Returns:
-        0: done. 1: a fit failed. 2: wrong input, or a file that cannot be written. 130: interrupted.
+        0: done. 1: a fit failed. 2: wrong input, or a file that cannot be written. 130: interrupted. 141: the reader of the
+        output, e.g. `head`, is gone.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         return _exit_code(action)
@@ -49,6 +52,9 @@ def exit_code(action: Callable[[], None]) -> int:
 def _exit_code(action: Callable[[], None]) -> int:
     try:
         action()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        return without_reader()
     except InputError as error:
         return _report(str(error), 2)
     except FitError as error:
@@ -60,6 +66,19 @@ def _exit_code(action: Callable[[], None]) -> int:
     except KeyboardInterrupt:
         return 130
     return 0
+
+
+def without_reader() -> int:
+    """Redirect the remaining output to nowhere, so that the flush at exit does not fail, and return the exit code."""
+    with suppress(OSError, ValueError):  # a stream may have no file
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for stream in (sys.stdout, sys.stderr):
+            try:
+                stream.flush()
+            except BrokenPipeError:
+                os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
+    return BROKEN_PIPE
 
 
 def _report(sentence: str, code: int) -> int:

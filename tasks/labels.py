@@ -14,7 +14,7 @@ OTHER_COLOURS = ("#cf4a4a", "#2a9165", "#8f7d12", "#1b8fa6", "#c04f9d", "#7f8794
 
 @dataclass(frozen=True)
 class Label:
-    """How a method is shown.
+    """Appearance of a method in reports.
 
     Args:
         meaning: One line.

@@ -80,13 +80,13 @@ class ChoiceMetrics(TypedDict):
 
 
 class GainMetrics(ChangeMetrics):
-    """Change by a number of further synthetic spectra, samples or means."""
+    """Change by a number of synthetic spectra at synthetic positions, samples or means."""
 
-    extra: int
+    n_synthetic: int
     sampled: bool
 
 
-class AdviceMetrics(TypedDict):
+class CrossValidationMetrics(TypedDict):
     """Cross-validation of one field model: change of the error on held-out measured spectra by further synthetic spectra.
 
     `gains` has every number that was compared, `rule` the number chosen on the other folds. Further positions
@@ -99,7 +99,7 @@ class AdviceMetrics(TypedDict):
     gains: list[GainMetrics]
     rule: ChangeMetrics | None
     sampled: bool
-    recommended_extra: int
+    recommended_n_synthetic: int
     helps: bool
 
 
@@ -112,9 +112,12 @@ class EstimatorChoiceMetrics(TypedDict):
 
 
 class LocatingMetrics(TypedDict):
-    """Located test positions: position error [m], fraction of the test positions inside their 80 % credible region, fraction
-    of ambiguous spectra, weights of the likelihoods (first repeat), and seconds (means of the repeats) to find the `room`,
-    to `fit` the locator and to `locate` all test spectra."""
+    """Metrics of located test positions.
+
+    Position error [m], fraction of the test positions inside their 80 % credible region, fraction of ambiguous spectra, and
+    weights of the likelihoods (first repeat). Seconds, means of the repeats, are those to find the `room`, to `fit` the
+    locator and to `locate` all test spectra.
+    """
 
     position_error_m: ErrorSummary
     coverage_80: float
@@ -124,15 +127,20 @@ class LocatingMetrics(TypedDict):
 
 
 class MixMetrics(TypedDict):
-    """One measured fraction; `choice`, `advice` (by field model) and `estimator_choice` of the first repeat, `counts` of
-    spectra by origin in each training set, seconds to `fit` and `synthesize` of the trained field models and to `train` all
-    networks. `reference` is the method on measured spectra with the smallest test error, other than matched-field
-    processing. `locating` by method, `left_out` says why a method is not there."""
+    """Metrics of one measured fraction.
+
+    `choice`, `cross_validation` (by field model) and `estimator_choice` are of the first repeat. `counts` are spectra by
+    origin in each training set. Seconds are those to `fit` and `synthesize` of the trained field models and to `train` all
+    networks.
+
+    The method on measured spectra with the smallest test error, without matched-field processing, is the `reference`. Values
+    of `locating` are by method. Values of `left_out` are reasons why a method is missing.
+    """
 
     n_measured: int
     counts: dict[str, dict[str, int]]
     choice: ChoiceMetrics | None
-    advice: dict[str, AdviceMetrics] | None
+    cross_validation: dict[str, CrossValidationMetrics] | None
     estimator_choice: EstimatorChoiceMetrics | None
     synthesis: dict[str, SynthesisMetrics]
     methods: dict[str, MethodMetrics]
@@ -156,20 +164,20 @@ class AoaMetrics(RunMetrics):
 
 
 class PredictorSeconds(TypedDict):
-    """Of one predictor."""
+    """Seconds of one predictor."""
 
     fit: float
     predict: float
 
 
 class ReceiverMetrics(TypedDict):
-    """How wrong a predictor is at one receiver."""
+    """Errors of a predictor at one receiver."""
 
     abs_error_db: ErrorSummary
 
 
 class PredictorMetrics(ReceiverMetrics):
-    """How wrong a predictor is at all receivers, and how long it took."""
+    """Errors of a predictor at all receivers, and its seconds."""
 
     seconds: PredictorSeconds
 
@@ -182,7 +190,7 @@ class IntervalMetrics(TypedDict):
 
 
 class ChosenMetrics(TypedDict):
-    """What the fit of SwiftWRF chose."""
+    """Choices of the fit of SwiftWRF."""
 
     n_primitives: int
     floor_attenuation_db: NotRequired[float | None]
@@ -191,8 +199,8 @@ class ChosenMetrics(TypedDict):
 class RssiMetrics(RunMetrics):
     """Metrics of a run of tasks.rssi.
 
-    `notes` are those of the reader. `receivers` by receiver and method; `left_out` says why a method is not there. `model`
-    is the method whose maps and intervals the run contains; results of earlier versions lack it.
+    `notes` are those of the reader. `receivers` is by receiver and method, `left_out` is the reason why a method is missing.
+    `model` is the method whose maps and intervals the run contains. Results of earlier versions lack it.
     """
 
     notes: list[str]

@@ -30,6 +30,7 @@ from tasks.torchrun import process_count
 if TYPE_CHECKING:
     from tasks.steps import Step
 
+MAX_SECONDS_TO_END = 10.0  # from the signal to the end of a process
 MAX_PROCESSES = 4  # each holds the data and a copy of the libraries, a gigabyte with a network
 
 
@@ -76,8 +77,11 @@ class LocalProcesses:
     def close(self) -> None:
         """End the processes, whatever they compute."""
         self._pool.shutdown(wait=False, cancel_futures=True)
-        for process in active_children():
+        children = active_children()
+        for process in children:
             process.terminate()
+        for process in children:
+            process.join(MAX_SECONDS_TO_END)
 
 
 @contextmanager

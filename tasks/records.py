@@ -83,11 +83,11 @@ def write_table(file: Path, rows: Iterable[Row]) -> None:
 
 
 def as_table(rows: Iterable[Row]) -> str:
-    """Return the text of a comma-separated table with the keys of the rows as columns.
+    r"""Return the text of a comma-separated table with the keys of the rows as columns.
 
     Example:
         >>> as_table([{"receiver": "=1+1", "rssi_dbm": -60.5}])
-        "receiver,rssi_dbm\\r\\n'=1+1,-60.5\\r\\n"
+        "receiver,rssi_dbm\r\n'=1+1,-60.5\r\n"
     """
     import pandas as pd
 

@@ -1,4 +1,4 @@
-"""What an interrupted run has kept of its beginning. Importable without torch."""
+"""Command line and inputs that an interrupted run saved at its start. Importable without torch."""
 
 from __future__ import annotations
 

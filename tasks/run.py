@@ -1,4 +1,4 @@
-"""What an experiment runs in: its directory, its console and its device."""
+"""Context of an experiment: its directory, its console and its device."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ class Step(ABC, Generic[Context]):
 
     @property
     def title(self) -> str:
-        """What is computed, for the terminal."""
+        """Description of the step for the terminal."""
         return self.name
 
     @property
@@ -53,9 +53,44 @@ class Step(ABC, Generic[Context]):
         """Priority among the steps that could begin: 2 if other steps wait for this one, 1 if it takes long, else 0."""
         return 2 if type(self).then is not Step.then else 0
 
+    @property
+    def is_optional(self) -> bool:
+        """True for a step that a budget may leave out."""
+        return False
+
     def then(self, context: Context, value: Row) -> Sequence[Step[Context]]:
         """Return the steps that follow from the result."""
         return ()
+
+
+class Budget:
+    """Time of a run within which optional steps must end. Without a limit all steps are computed.
+
+    Args:
+        seconds: Time from now [s]. Defaults to no limit.
+    """
+
+    def __init__(self, seconds: float | None = None) -> None:
+        self._seconds = math.inf if seconds is None else seconds
+        self._began, self._longest = time.monotonic(), 0.0
+
+    def refusal(self, step: Step[Any]) -> Row | None:
+        """Return the result of a step that is left out, or None if it is computed.
+
+        An optional step is expected to take as long as the longest one so far.
+        """
+        if not step.is_optional or time.monotonic() - self._began + self._longest < self._seconds:
+            return None
+        return {"refused": f"its training does not fit into the budget of {self._seconds:g} s"}
+
+    def spent(self, step: Step[Any], seconds: float) -> None:
+        """Record the time of a step."""
+        if step.is_optional:
+            self._longest = max(self._longest, seconds)
+
+    def priority(self, step: Step[Any]) -> int:
+        """Return the priority of a step. With a limit optional steps come last."""
+        return -1 if step.is_optional and math.isfinite(self._seconds) else step.priority
 
 
 Arrived = Callable[[Step[Context], Row], None]
@@ -63,7 +98,7 @@ Arrived = Callable[[Step[Context], Row], None]
 
 
 class Workers(Protocol):
-    """Processes that compute steps, on this machine or on a cluster. The type of a future is theirs."""
+    """Processes that compute steps, on this machine or on a cluster. The type of a future depends on the implementation."""
 
     slots: float
     """number of steps that are computed at a time; infinite if the workers keep a queue"""
@@ -82,6 +117,7 @@ def computed(
     cluster: Cluster | None,
     processes: int = 1,
     arrived: Arrived[Context] = lambda step, value: None,
+    budget: Budget | None = None,
 ) -> Iterator[tuple[Step[Context], Row]]:
     """Yield each step with its result, followed by the steps that follow from it.
 
@@ -92,35 +128,48 @@ def computed(
         cluster: Cluster that computes the steps in parallel.
         processes: Number of processes of this machine that compute the steps. With 1 they are computed in this process.
         arrived: Called with each step and its result as soon as it arrives, in any order.
+        budget: Time within which optional steps must end. Steps that are left out are yielded with the reason as their
+            result, which is not kept.
 
     Raises:
         FitError: The cluster or a process is lost.
     """
-    steps = list(steps)
+    steps, budget = list(steps), budget or Budget()
     if cluster is not None:
-        _compute_on(_ClusterWorkers(cluster, run, context), run, steps, context, arrived)
+        _compute_on(_ClusterWorkers(cluster, run, context), run, steps, context, arrived, budget)
     elif processes > 1:
         with local_processes(processes, run.folder, context) as local:
-            _compute_on(local, run, steps, context, arrived)
-    yield from _computed_here(run, steps, context, None if cluster or processes > 1 else arrived)
+            _compute_on(local, run, steps, context, arrived, budget)
+    yield from _computed_here(run, steps, context, None if cluster or processes > 1 else arrived, budget)
 
 
 def _computed_here(
-    run: Run, steps: Sequence[Step[Context]], context: Context, arrived: Arrived[Context] | None
+    run: Run, steps: Sequence[Step[Context]], context: Context, arrived: Arrived[Context] | None, budget: Budget
 ) -> Iterator[tuple[Step[Context], Row]]:
     """Yield each step with its result, computed in this process unless it is kept, and the steps that follow."""
     terminal.expect(len({step.name for step in steps if not run.holds(step.name)}))
-    for step in steps:
+    for step in sorted(steps, key=lambda step: budget.priority(step) < 0):
         is_new = not run.holds(step.name)
+        if is_new and (refusal := budget.refusal(step)):
+            yield step, refusal
+            continue
+        began = time.perf_counter()
         value = run.step(step.name, step.title, partial(step.compute, context, run.folder))
+        if is_new:
+            budget.spent(step, time.perf_counter() - began)
         if arrived is not None and is_new:
             arrived(step, value)
         yield step, value
-        yield from _computed_here(run, step.then(context, value), context, arrived)
+        yield from _computed_here(run, step.then(context, value), context, arrived, budget)
 
 
 def _compute_on(
-    workers: Workers, run: Run, steps: Iterable[Step[Context]], context: Context, arrived: Arrived[Context]
+    workers: Workers,
+    run: Run,
+    steps: Iterable[Step[Context]],
+    context: Context,
+    arrived: Arrived[Context],
+    budget: Budget,
 ) -> None:
     """Compute steps, and those that follow, on workers and keep each result in the run when it arrives.
 
@@ -144,14 +193,18 @@ def _compute_on(
 
     begin(steps)
     while pending or waiting:
-        waiting.sort(key=lambda step: -step.priority)
+        waiting.sort(key=lambda step: -budget.priority(step))
         while waiting and len(pending) < workers.slots:
             step = waiting.pop(0)
-            pending[workers.submit(step)] = step
+            if not budget.refusal(step):
+                pending[workers.submit(step)] = step
+        if not pending:
+            break
         terminal.begin(", ".join(dict.fromkeys(step.title for step in pending.values())))
         future, value, seconds = workers.next(pending)
         step = pending.pop(future)
         value = run.keep(step.name, value, seconds)
+        budget.spent(step, seconds)
         terminal.end()
         arrived(step, value)
         for one in same.pop(step.name):

@@ -13,7 +13,7 @@ from pandas import DataFrame, Series
 from swiftwrf.metrics import summary
 from tasks.metrics import ChangeMetrics, ErrorSummary
 
-LEAST_ROWS = 10  # of a test, for an interval of differences
+MIN_ROWS = 10  # of a test, for an interval of differences
 N_BOOTSTRAP = 2000
 MIN_RELEVANT = 0.02  # difference of mean errors, relative to them, below which methods are equal in practice
 MAX_SPREAD = 0.5  # of labels about their mean direction, relative to the error of the peaks, for a warning
@@ -49,17 +49,20 @@ def averaged(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dic
 
 
 def paired_difference(errors: DataFrame, method: str, other: str) -> tuple[float, float, float]:
-    """Mean of one method's errors minus another's on the same pairs, and its 95 % interval.
+    """Return the mean of one method's errors minus another's on equal pairs, and its 95 % interval.
 
-    The interval is a bootstrap over test rows, for the receivers of one row are not independent; nan for fewer than 10 rows,
-    with which a bootstrap sees differences where there are none.
+    The interval is a bootstrap over test rows, because the receivers of one row are not independent. It is nan for fewer
+    than 10 rows, with which a bootstrap finds false differences.
 
     Args:
-        errors: a column a method, one row a pair, indexed by `index` (the test row) and `receiver`.
+        errors: Errors with a column for each method and a row for each pair, indexed by `index` (the test row) and
+            `receiver`.
+        method: Column of the method.
+        other: Column of the method that it is compared to.
     """
     difference = (errors[method] - errors[other]).groupby(level="index").agg(["sum", "count"]).to_numpy()
     mean = float(difference[:, 0].sum() / difference[:, 1].sum())
-    if len(difference) < LEAST_ROWS:
+    if len(difference) < MIN_ROWS:
         return mean, math.nan, math.nan
     draws = np.random.default_rng(0).integers(len(difference), size=(1000, len(difference)))
     sums = difference[draws].sum(axis=1)

@@ -1,4 +1,4 @@
-"""What a command shows: progress and results while it works, on stderr, and the answer at the end, on stdout."""
+"""Output of a command: progress and results on stderr while it works, and the answer at the end on stdout."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class Answer:
     Args:
         unit: Unit of the errors.
         rows: Names of what a row shows, e.g. condition and estimator, and the summary of its errors.
-        verdict: One sentence.
+        conclusion: One sentence.
         next_steps: Sentences.
     """
 
     unit: str
     rows: Sequence[tuple[Mapping[str, str], ErrorSummary]]
-    verdict: str
+    conclusion: str
     next_steps: Sequence[str]
 
     def values(self) -> dict[str, Any]:
@@ -57,7 +57,7 @@ class Answer:
                 }
                 for names, error in self.rows
             ],
-            "verdict": self.verdict,
+            "conclusion": self.conclusion,
             "next_steps": list(self.next_steps),
         }
 
@@ -154,7 +154,9 @@ class Terminal:
 
     def answer(self, found: Answer, page: Path) -> None:
         """Print the answer of a run and the place of its report."""
-        self._print(found.values(), page, found.table(), "", found.verdict, *(f"- {text}" for text in found.next_steps))
+        self._print(
+            found.values(), page, found.table(), "", found.conclusion, *(f"- {text}" for text in found.next_steps)
+        )
 
     def page(self, values: Mapping[str, Any], text: str, page: Path | None = None) -> None:
         """Print the text of a command, or its values with `--json`, and the place of its page if it has one."""

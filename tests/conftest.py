@@ -1,4 +1,4 @@
-"""What several tests build on: toy scenes, and the measured data where they are."""
+"""Fixtures of several tests: toy scenes, and the measured data if available."""
 
 from __future__ import annotations
 

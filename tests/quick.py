@@ -14,7 +14,7 @@ from unittest import mock
 from small import glances, small_published, small_swiftwrf
 
 from swiftwrf import AngularGrid, RssiConfig, RssiModel, rssi_room, simulated_room
-from swiftwrf.errors import LONGEST
+from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.runtime.validation import configuration
 from tasks.aoa import experiment as aoa
 from tasks.aoa.condition import NETWORKS
@@ -111,7 +111,7 @@ def said(capsys) -> str:
     sentences = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
     assert len(sentences) == 1
     sentence = sentences[0].removeprefix("error: ")
-    assert len(sentence) <= LONGEST
+    assert len(sentence) <= MAX_LENGTH
     return sentence
 
 

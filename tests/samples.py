@@ -43,7 +43,7 @@ def snapshots(
 
 
 def snapshot_arrays(data: Snapshots) -> dict[str, object]:
-    """What snapshots.npz holds."""
+    """Return the arrays of snapshots.npz."""
     return {
         "csi": data.channel.numpy(),
         "position": data.position.numpy(),
@@ -172,7 +172,7 @@ def record_source(shape: tuple[int, int], n: int = 24, count: int = 3) -> Snapsh
 
 
 def write_espargos(folder: Path, arrays: int = 1, **changes: object) -> Path:
-    """As many arrays, the first of them real."""
+    """Write `arrays` arrays, the first of them with measured data."""
     data = record_source((2, 4))
     csi = _seen_from_the_front(data, 2, 4)
     csi = np.stack([csi, *([csi[::-1]] * (arrays - 1))], axis=1)
@@ -188,7 +188,7 @@ def write_espargos(folder: Path, arrays: int = 1, **changes: object) -> Path:
 
 
 def write_dichasus(folder: Path, offsets: bool = False, **changes: object) -> Path:
-    """Two arrays whose antennas are numbered crosswise; with `offsets`, phases that a file tells."""
+    """Write two arrays whose antennas are numbered crosswise; with `offsets`, their phases are in a file."""
     data = record_source((2, 2), count=8)
     first = _seen_from_the_front(data, 2, 2).reshape(len(data), 4, -1)
     order = [6, 0, 3, 5]  # of the first array's antennas
@@ -216,7 +216,7 @@ def write_dichasus(folder: Path, offsets: bool = False, **changes: object) -> Pa
 
 
 def survey_rows(n: int = 40) -> tuple[list[str], list[list[object]]]:
-    """Header and rows of a wide table: x, y, z and three receivers, -100 where nothing was heard."""
+    """Return header and rows of a wide table: x, y, z and three receivers, -100 where nothing was detected."""
     data = rssi_room(n=n).columns([0, 4, 8])
     values = torch.cat([data.transmitter_position, data.rssi_dbm.nan_to_num(-100)], dim=1)
     return ["x", "y", "z", *data.receiver_names], values.tolist()

@@ -39,3 +39,9 @@ class Refusal(Sum):
 class Kill(Sum):
     def compute(self, context, folder):
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Optional(Sum):
+    """A step that a budget may leave out."""
+
+    is_optional = True

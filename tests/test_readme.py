@@ -12,7 +12,6 @@ from tables import FILES, rewrite
 
 from augment import Mixed
 from swiftwrf import AngularGrid, load, simulated_room
-from swiftwrf.data.writing import write_spectra
 
 ROOT = Path(__file__).parent.parent
 
@@ -23,13 +22,20 @@ def test_tables_come_from_the_results(name):
     assert rewrite(text) == text, "run python benchmarks/tables.py"
 
 
-@pytest.mark.parametrize(
-    "name",
-    [*FILES, "docs/architecture.md", "docs/conventions.md", "docs/formats.md", "docs/locating.md", "docs/view.md"],
-)
-def test_every_file_that_a_page_names_is_there(name):
-    for target in re.findall(r"\]\(([^)#:]+)\)", (ROOT / name).read_text()):
-        assert ((ROOT / name).parent / target).exists(), target
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of the headings of a Markdown page."""
+    headings = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL), flags=re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading).strip().lower().replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("name", [*FILES, "CONTRIBUTING.md"])
+def test_links_of_a_page_lead_to_files_and_headings(name):
+    page = ROOT / name
+    for target, _, anchor in (link.partition("#") for link in re.findall(r"\]\(([^):]+)\)", page.read_text())):
+        linked = page.parent / target if target else page
+        assert linked.exists(), target
+        if anchor:
+            assert anchor in anchors(linked), f"{target}#{anchor}"
 
 
 def run_blocks(name: str) -> dict[str, object]:
@@ -42,15 +48,13 @@ def run_blocks(name: str) -> dict[str, object]:
 
 def test_readme_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "DIR").mkdir()
-    write_spectra(simulated_room(n=60, grid=AngularGrid.hemisphere(15, 60)), tmp_path / "DIR")
     names = run_blocks("README.md")
-    assert names["prediction"].std.shape == names["prediction"].mean.shape == (len(names["test"]), 15, 60)
+    assert names["prediction"].std.shape == names["prediction"].mean.shape == (len(names["test"]), 30, 120)
 
 
 def test_documented_extensions_work(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    names = run_blocks("docs/architecture.md")
+    names = run_blocks("docs/development/architecture.md")
     room = simulated_room(n=30, grid=AngularGrid.hemisphere(15, 60))
     mean = names["MeanModel"]().fit(room)
     mean.save("mean.safetensors")

@@ -18,16 +18,6 @@ SOURCES = sorted(
     file for folder in ("swiftwrf", "augment", "tasks", "benchmarks", "tests") for file in (ROOT / folder).rglob("*.py")
 )
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-PENDING = (
-    "swiftwrf",
-    "augment",
-    "tasks",
-    "benchmarks",
-    "tests",
-    "docs",
-    "README.md",
-    "CONTRIBUTING.md",
-)  # not yet reworded
 
 FIRST_WORDS = "What|Of|The same|Whether|Where|Which|How|By|As|To"
 SPEECH = "says?|said|tells?|told|hears?|heard|teach(?:es)?|taught"
@@ -39,10 +29,6 @@ DENIED = re.compile(rf"\b(?:{SPEECH}|{PHRASES})\b", re.IGNORECASE)
 MAX_WORDS, MAX_MEAN_WORDS = 40, 18
 
 
-def _pending(file: Path) -> bool:
-    return str(file.relative_to(ROOT)).startswith(PENDING)
-
-
 def _docstrings(file: Path) -> list[tuple[int, str]]:
     tree = ast.parse(file.read_text())
     kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
@@ -51,6 +37,15 @@ def _docstrings(file: Path) -> list[tuple[int, str]]:
         for node in ast.walk(tree)
         if isinstance(node, kinds) and (text := ast.get_docstring(node))
     ]
+
+
+def _docstring_sentences(text: str) -> list[str]:
+    """Return the sentences of a docstring without its example; an argument and a list item begin a new one."""
+    text = re.split(r"^\s*Example:", text, flags=re.MULTILINE)[0]
+    text = re.sub(r"^\s*\|.*$|^\s*(?:Args|Returns|Raises|Attributes|Yields):$", "", text, flags=re.MULTILINE)
+    text = re.sub(r"`[^`]*`", "Code", re.sub(r"^\s+[\w`, .*]+: |^\s*- ", "\n\n", text, flags=re.MULTILINE))
+    blocks = (" ".join(block.split()) for block in re.split(r"\n\s*\n", text))
+    return [part for block in blocks for part in re.split(r"(?<=[.!?:;])\s+", block)]
 
 
 def _comments(file: Path) -> list[tuple[int, str]]:
@@ -74,21 +69,23 @@ def _sentences(text: str) -> list[str]:
 
 @pytest.mark.parametrize("file", SOURCES, ids=lambda file: str(file.relative_to(ROOT)))
 def test_docstrings_use_the_fields_words(file):
-    if _pending(file):
-        pytest.skip("not yet reworded")
     if file == Path(__file__):
         pytest.skip("holds the list")
     first = re.compile(rf"(?:{FIRST_WORDS})\b")
     wrong = [f"{line}: begins with {text.split()[0]!r}" for line, text in _docstrings(file) if first.match(text)]
     for line, text in _docstrings(file) + _comments(file):
         wrong += [f"{line}: {match[0]!r} in {' '.join(text.split())[:90]!r}" for match in DENIED.finditer(text)]
+    for line, text in _docstrings(file):
+        wrong += [
+            f"{line}: {words} words in {sentence[:90]!r}"
+            for sentence in _docstring_sentences(text)
+            if (words := len(sentence.split())) > MAX_WORDS
+        ]
     assert not wrong, "\n".join(wrong)
 
 
 @pytest.mark.parametrize("file", DOCUMENTS, ids=lambda file: str(file.relative_to(ROOT)))
 def test_documents_have_short_sentences_in_the_fields_words(file):
-    if _pending(file):
-        pytest.skip("not yet reworded")
     sentences = _sentences(file.read_text())
     counts = [len(sentence.split()) for sentence in sentences]
     wrong = [
@@ -119,6 +116,4 @@ def _public() -> list[tuple[str, object]]:
 
 @pytest.mark.parametrize(("name", "value"), [pytest.param(*item, id=item[0]) for item in _public()])
 def test_public_objects_have_an_example(name, value):
-    if inspect.getmodule(value).__name__.replace(".", "/").startswith(PENDING):
-        pytest.skip("not yet reworded")
     assert ">>>" in (inspect.getdoc(value) or ""), f"{name} has no example"

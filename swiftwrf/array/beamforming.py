@@ -11,7 +11,7 @@ spectrum S into [0, 1]. With steering vector a(k) and K elements:
 Capon's relative levels are not reliable if paths are coherent over the snapshots, because they cancel each other.
 
 A beamformer is a function `(channel (n, S, K), responses) -> squared spectra`; `responses` computes a^H M a of Hermitian
-matrices (n, K, K) at the directions of a grid. Other packages add theirs by entry points of the group
+matrices (n, K, K) at the directions of a grid. Other packages add beamformers by entry points of the group
 `swiftwrf.beamformers`.
 """
 

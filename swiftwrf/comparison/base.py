@@ -32,7 +32,13 @@ Depth = Annotated[int, Ge(1), Le(64)]
 
 @configuration
 class Config(ABC):
-    """Size and training of a method. The defaults of each method are its quick preset, `paper()` its publication."""
+    """Size and training of a method. The defaults of each method are its quick preset, `paper()` its publication.
+
+    Example:
+        >>> from swiftwrf.comparison import VaeConfig
+        >>> VaeConfig().steps, isinstance(VaeConfig.paper(), Config)
+        (1000, True)
+    """
 
     size: Any = None
     """size of the network"""
@@ -124,6 +130,11 @@ class TrainedModel(FieldModel):
     """Field model of a trained network.
 
     A subclass sets `network_type` and a `config_type` that derives from `Config`.
+
+    Example:
+        >>> import swiftwrf
+        >>> issubclass(swiftwrf.comparison.Vae, TrainedModel)
+        True
     """
 
     network_type: ClassVar[type[Any]]

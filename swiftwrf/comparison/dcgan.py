@@ -32,7 +32,12 @@ from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, Positiv
 
 @configuration
 class DcganSize(ConvolutionalSize):
-    """Size of the networks."""
+    """Size of the networks.
+
+    Example:
+        >>> DcganSize(noise=8).noise
+        8
+    """
 
     noise: Count = 16
     """number of noise variables"""
@@ -40,7 +45,12 @@ class DcganSize(ConvolutionalSize):
 
 @configuration
 class DcganConfig(Config):
-    """Options of `Dcgan`."""
+    """Options of `Dcgan`.
+
+    Example:
+        >>> Dcgan(DcganConfig(steps=200), l1_weight=10.0).config.l1_weight
+        10.0
+    """
 
     size: DcganSize = DcganSize()
     steps: PositiveInt = 1000

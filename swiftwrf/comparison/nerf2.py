@@ -7,9 +7,12 @@ Changed everywhere: positions are relative to the centre of the training positio
 millimetres. The attenuation network is evaluated once for all transmitters (the same function). Transmittance is the
 exponential of a sum, without the 1e-10 that keeps a product from 0. Rays start at the moving array if the receiver moves.
 
-Changed in the quick preset, sized for two cores: width 64 (256), 24 samples (64), 7 frequency bands (10), a step of 16
-spectra that share 64 rays (8,192 of any spectra), 3,000 steps (30,000) at rate 3e-3 (8e-4) that decays once (three times),
-averaged parameters (the last), clipped gradients, no weight decay (5e-5).
+The quick preset is sized for two cores. The values of the publication are in parentheses.
+
+- Width 64 (256), 24 samples (64), 7 frequency bands (10).
+- 3,000 steps (30,000) of 16 spectra that share 64 rays (8,192 of any spectra).
+- Rate 3e-3 (8e-4), which decays once (three times), clipped gradients, no weight decay (5e-5).
+- Averaged parameters (the last).
 """
 
 from __future__ import annotations
@@ -37,7 +40,12 @@ MAX_SAMPLES_AT_ONCE = 2**19  # samples of the field evaluated at a time, which b
 
 @configuration
 class NeRF2Size:
-    """Size of the network and its rays."""
+    """Size of the network and its rays.
+
+    Example:
+        >>> NeRF2Size(width=32, samples=12).width
+        32
+    """
 
     width: Count = 64
     """width of the layers"""
@@ -53,7 +61,12 @@ class NeRF2Size:
 
 @configuration
 class NeRF2Config(Config):
-    """Options of `NeRF2`."""
+    """Options of `NeRF2`.
+
+    Example:
+        >>> NeRF2(NeRF2Config(size=NeRF2Size(width=32), rays=128)).config.rays
+        128
+    """
 
     size: NeRF2Size = NeRF2Size()
     steps: PositiveInt = 3000
@@ -142,7 +155,8 @@ class NeRF2Network(LinkNetwork):
         """Return magnitudes (P, D) at P positions of the moving end.
 
         Args:
-            transmitter, receiver: Positions (P or 1, 3), see `Link`.
+            transmitter: Positions (P or 1, 3), see `Link`.
+            receiver: Positions (P or 1, 3).
             direction: Directions of the rays in world coordinates, (P or 1, D, 3).
         """
         return torch.hypot(*received(self.field, self.size, transmitter[:, None], receiver[:, None], direction))
@@ -160,7 +174,9 @@ def received(field: Field, size: NeRF2Size, transmitter: Tensor, receiver: Tenso
     Args:
         field: Field that the rays cross.
         size: Number of samples and length of a ray.
-        transmitter, receiver, direction: Ends and direction of each ray, (..., 3); they broadcast.
+        transmitter: Position of the transmitter, (..., 3). All three broadcast.
+        receiver: Start of each ray, (..., 3).
+        direction: Direction of each ray, (..., 3).
     """
     distance = torch.linspace(0, size.reach, size.samples, device=direction.device)
     point = receiver[..., None, :] + distance[:, None] * direction[..., None, :]

@@ -3,12 +3,14 @@
     rssi = 100 (a - 1) dBm,    a = |mean over the rays of S|
 
 with S as in `swiftwrf.comparison.volume` (X. Zhao et al., "NeRF2", 2023). `NeRF2RssiConfig.paper()` has the field of its
-code and 36 x 9 rays over the upper half space (the code averages a ninth of them, by a slip of an index); that the mean is
-taken before the magnitude, the batch and the number of steps are ours.
+code and 36 x 9 rays over the upper half space. (That code averages a ninth of them, by a slip of an index.) The mean before
+the magnitude, the batch and the number of steps are not from the publication.
 
-Changed in the quick preset, sized for two cores: 32 wide (256), 8 samples (64), 4 frequency bands (10), 6 x 3 rays (36 x 9),
-2,400 steps of 32 positions at rate 5e-3 (8e-4) that decays, averaged parameters (the last), gradients clipped, no weight
-decay.
+The quick preset is sized for two cores. The values of the publication are in parentheses.
+
+- Width 32 (256), 8 samples (64), 4 frequency bands (10), 6 x 3 rays (36 x 9).
+- 2,400 steps of 32 positions at rate 5e-3 (8e-4), which decays, clipped gradients, no weight decay.
+- Averaged parameters (the last).
 """
 
 from __future__ import annotations
@@ -36,7 +38,12 @@ from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, Positiv
 
 @configuration
 class NeRF2RssiSize(NeRF2Size):
-    """Size of the network and its rays."""
+    """Size of the network and its rays.
+
+    Example:
+        >>> NeRF2RssiSize(azimuths=8).azimuths
+        8
+    """
 
     width: Count = 32
     bands: Count = 4
@@ -49,7 +56,12 @@ class NeRF2RssiSize(NeRF2Size):
 
 @configuration
 class NeRF2RssiConfig(Config):
-    """Options of `NeRF2Rssi`; a batch consists of transmitter positions."""
+    """Options of `NeRF2Rssi`; a batch consists of transmitter positions.
+
+    Example:
+        >>> NeRF2Rssi(NeRF2RssiConfig(weight_decay=1e-4)).config.weight_decay
+        0.0001
+    """
 
     size: NeRF2RssiSize = NeRF2RssiSize()
     steps: PositiveInt = 2400

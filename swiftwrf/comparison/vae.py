@@ -26,7 +26,12 @@ from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, configuratio
 
 @configuration
 class VaeSize(ConvolutionalSize):
-    """Size of the networks."""
+    """Size of the networks.
+
+    Example:
+        >>> VaeSize(latent=8).latent
+        8
+    """
 
     latent: Count = 16
     """number of latent variables"""
@@ -34,7 +39,12 @@ class VaeSize(ConvolutionalSize):
 
 @configuration
 class VaeConfig(Config):
-    """Options of `Vae`."""
+    """Options of `Vae`.
+
+    Example:
+        >>> Vae(VaeConfig(size=VaeSize(latent=8))).config.size.latent
+        8
+    """
 
     size: VaeSize = VaeSize()
     steps: PositiveInt = 1000

@@ -1,5 +1,6 @@
-"""Signal of a ray through a medium that absorbs, shifts the phase and emits (X. Zhao, Z. An, Q. Pan and L. Yang,
-"NeRF2: Neural Radio-Frequency Radiance Fields", ACM MobiCom 2023).
+"""Signal of a ray through a medium that absorbs, shifts the phase and emits.
+
+X. Zhao, Z. An, Q. Pan and L. Yang, "NeRF2: Neural Radio-Frequency Radiance Fields", ACM MobiCom 2023:
 
     S = sum_i a_i exp(j phi_i) g(r_(i+1)) prod_(k < i) exp(-alpha_k d_k) exp(j (1 + sum_(k < i) beta_k d_k))
 

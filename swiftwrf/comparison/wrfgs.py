@@ -56,7 +56,12 @@ MIN_OPACITY, RESET_OPACITY = 0.005, 0.01
 
 @configuration
 class WrfGsSize:
-    """Size of the Gaussians and their network."""
+    """Size of the Gaussians and their network.
+
+    Example:
+        >>> WrfGsSize(n_gaussians=100).n_gaussians
+        100
+    """
 
     n_gaussians: Count = 500
     """initial number of Gaussians"""
@@ -72,7 +77,12 @@ class WrfGsSize:
 
 @configuration
 class WrfGsConfig(Config):
-    """Options of `WrfGs`."""
+    """Options of `WrfGs`.
+
+    Example:
+        >>> WrfGs(WrfGsConfig(size=WrfGsSize(n_gaussians=100))).config.size.n_gaussians
+        100
+    """
 
     size: WrfGsSize = WrfGsSize()
     steps: PositiveInt = 2000

@@ -60,6 +60,11 @@ def read_spectra(path: str | Path, options: ReadOptions) -> Spectra:
 
     Raises:
         InputError: As `load_spectra`.
+
+    Example:
+        >>> read_spectra("nowhere", ReadOptions(every=2))
+        Traceback (most recent call last):
+        swiftwrf.errors.InputError: nowhere is not a folder or file; expected measurements (formats: ...)
     """
     data = read(path, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS)
     return data.spectra(options.grid, options.beamformer or PHASE) if isinstance(data, Snapshots) else data
@@ -78,6 +83,11 @@ def load_snapshots(
 
     Raises:
         InputError: As `load_spectra`.
+
+    Example:
+        >>> load_snapshots("nowhere")
+        Traceback (most recent call last):
+        swiftwrf.errors.InputError: nowhere is not a folder or file; ...
     """
     options = ReadOptions(every=every, station=station, drop_null=drop_null, round_trip=round_trip)
     data: Snapshots = read(path, options, SNAPSHOT_FORMATS)
@@ -111,6 +121,16 @@ def load_rssi(
 
     Raises:
         InputError: A part that is missing or invalid, parts that do not match, or an argument that does not apply.
+
+    Example:
+        >>> import tempfile, pandas as pd
+        >>> rssi = [-40.0 - i for i in range(20)]
+        >>> survey = pd.DataFrame({"x": range(20), "y": range(20), "kitchen": rssi, "hall": rssi[::-1]})
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = Path(folder) / "survey.csv"
+        ...     survey.to_csv(file, index=False)
+        ...     load_rssi(file).receiver_names
+        ('kitchen', 'hall')
     """
     values = None if filler is None else tuple(map(float, filler))
     options = ReadOptions(
@@ -129,6 +149,11 @@ def read_rssi(path: str | Path, options: ReadOptions) -> Rssi:
 
     Raises:
         InputError: As `load_rssi`.
+
+    Example:
+        >>> read_rssi("nowhere", ReadOptions())
+        Traceback (most recent call last):
+        swiftwrf.errors.InputError: nowhere is not a folder or file; ...
     """
     data: Rssi = read(path, options, RSSI_FORMATS)
     return data

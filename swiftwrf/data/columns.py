@@ -73,7 +73,7 @@ def find_roles(
             continue
         if len(found) > 1:
             raise InputError(
-                f"{label} has {len(found)} columns that may be {role} ({listed(found)}); say which: columns {role}=NAME"
+                f"{label} has {len(found)} columns that may be {role} ({listed(found)}); choose one with columns {role}=NAME"
             )
         roles[role] = found[0]
     for role, other in GEODETIC.items():
@@ -81,11 +81,11 @@ def find_roles(
             del roles[other]
         if role not in roles and other not in roles:
             raise InputError(
-                f"{label} has no column for {role}; there are {listed(table.columns)}; say which: columns {role}=NAME"
+                f"{label} has no column for {role}; there are {listed(table.columns)}; choose one with columns {role}=NAME"
             )
     if "receiver" in roles and "rssi" not in roles:
         raise InputError(
-            f"{label} has receivers in column {roles['receiver']!r}, but no RSSI beside; say where: columns rssi=NAME"
+            f"{label} has receivers in column {roles['receiver']!r}, but no RSSI beside; name it with columns rssi=NAME"
         )
     return roles
 
@@ -125,4 +125,5 @@ def is_rssi(column: pd.Series) -> bool:
 
 
 def is_coordinate(name: str) -> bool:
+    """Return True for the name of a column with a coordinate."""
     return any(ROLES[role].fullmatch(plain_name(name)) for role in ("x", "y", "z", "longitude", "latitude"))

@@ -134,7 +134,7 @@ def degrees_in(
     if not (np.abs(degrees) <= (90, 180)).all():
         if asked == "degrees" or (named and (np.abs(degrees) <= 180).all()):
             raise InputError(
-                f"{columns} hold latitudes beyond 90 degrees; are they swapped? say which: columns latitude=NAME "
+                f"{columns} hold latitudes beyond 90 degrees; are they swapped? Name them with columns latitude=NAME "
                 "longitude=NAME"
             )
         return None
@@ -146,6 +146,6 @@ def degrees_in(
     if not named and extent <= MAX_FINE_EXTENT:
         return degrees
     raise InputError(
-        f"{columns} extend over {extent:.3g} and may be degrees or metres; say which: --coordinates degrees or "
+        f"{columns} extend over {extent:.3g} and may be degrees or metres; choose --coordinates degrees or "
         "--coordinates metres"
     )

@@ -28,7 +28,7 @@ def transmitter_columns(label: object, table: pd.DataFrame, given: Sequence[str]
             marked rx or receiver beside unmarked ones.
 
     Raises:
-        InputError: A column that is not there, or another number of columns.
+        InputError: A missing column, or another number of columns.
 
     Example:
         >>> table = pd.DataFrame(columns=["x", "y", "tx_x", "tx_y", "rssi"])

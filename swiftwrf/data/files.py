@@ -115,8 +115,10 @@ def read_yaml(file: Path) -> dict[str, Any]:
 
 
 def _plain(node: yaml.Node | None, done: dict[int, Any]) -> Any:
-    """Return the text, list or mapping of a node. Nodes referred to twice are built once, because nested references would
-    grow without bound."""
+    """Return the text, list or mapping of a node.
+
+    Nodes referred to twice are built once, because nested references would grow without bound.
+    """
     if node is None or id(node) in done:
         return done.get(id(node))
     if node.tag not in PLAIN_TAGS:
@@ -175,27 +177,31 @@ def read_cells(file: Path, separators: str = ",", skipped: int = 0) -> tuple[lis
     Raises:
         InputError: No such file, a column without name or a name twice, rows of unequal length, no rows.
     """
-    text = read_text(file).split("\n", skipped)[-1]
+    return cells_of(file, read_text(file).split("\n", skipped)[-1], separators)
+
+
+def cells_of(label: object, text: str, separators: str = ",") -> tuple[list[str], list[list[str]]]:
+    """Return header and rows of the text of a table, as `read_cells`; the label stands for it in messages."""
     first = text.split("\n", 1)[0]
     separator = max(separators, key=first.count)
     try:
         stream = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
         lines = [line for line in stream if line]
     except csv.Error as error:
-        raise InputError(f"{file} is not a comma-separated table ({error})") from None
+        raise InputError(f"{label} is not a comma-separated table ({error})") from None
     if not lines:
-        raise InputError(f"{file} is empty; expected a header and one row a measurement")
+        raise InputError(f"{label} is empty; expected a header and one row a measurement")
     header = [name.strip() for name in lines[0]]
     if "" in header:
-        raise InputError(f"{file} has no name for column {header.index('') + 1}; give it one in the header")
+        raise InputError(f"{label} has no name for column {header.index('') + 1}; give it one in the header")
     if len(set(header)) < len(header):
         twice = next(name for name in header if header.count(name) > 1)
-        raise InputError(f"{file} names column {twice!r} twice; each needs a name of its own")
+        raise InputError(f"{label} names column {twice!r} twice; each needs a name of its own")
     if len(lines) == 1:
-        raise InputError(f"{file} has a header but no rows")
+        raise InputError(f"{label} has a header but no rows")
     for row, line in enumerate(lines[1:], start=1):
         if len(line) != len(header):
-            raise InputError(f"{file} row {row} has {len(line)} values, but the header has {len(header)}")
+            raise InputError(f"{label} row {row} has {len(line)} values, but the header has {len(header)}")
     if separator == ",":
         return header, lines[1:]
     return header, [[DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in line] for line in lines[1:]]

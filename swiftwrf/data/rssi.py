@@ -252,7 +252,7 @@ class Rssi(PositionedData):
 
     @property
     def detected(self) -> Tensor:
-        """Whether a receiver detected the transmitter, bool (n, R)."""
+        """True where a receiver detected the transmitter, bool (n, R)."""
         return ~self.rssi_dbm.isnan()
 
     def about(self, origin: GeodeticOrigin | None) -> Rssi:

@@ -27,7 +27,7 @@ from swiftwrf.data.columns import (
 )
 from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin, degrees_in, without_fix
 from swiftwrf.data.ends import as_receivers, transmitter_columns
-from swiftwrf.data.files import MAX_COORDINATE_M, lines_before_header, read_cells
+from swiftwrf.data.files import MAX_COORDINATE_M, cells_of, lines_before_header, read_cells
 from swiftwrf.data.fillers import check_powers, find_fillers, without_fillers
 from swiftwrf.data.floors import STOREY_M, Floors, floors_of, height_of_floors
 from swiftwrf.data.pooling import pool_names, pooled
@@ -98,6 +98,12 @@ def read_frame(file: Path) -> pd.DataFrame:
         if (total := sum(content.metadata.row_group(i).total_byte_size for i in groups)) > MAX_UNPACKED_BYTES:
             raise InputError(f"it unpacks to {total} bytes; at most {MAX_UNPACKED_BYTES} are read, so split the data")
         return content.read().to_pandas()
+
+
+def frame_of(label: object, text: str) -> pd.DataFrame:
+    """Return the table in the text of a CSV file, as `read_frame`; the label stands for it in messages."""
+    header, rows = cells_of(label, text, SEPARATORS)
+    return pd.DataFrame(rows, columns=header, dtype=object)
 
 
 def has_positions(table: pd.DataFrame, columns: Mapping[str, str]) -> bool:
@@ -311,7 +317,7 @@ def _wide(
     if not names:
         raise InputError(
             f"{label} has no column of RSSI in dBm (numbers below 0) besides positions; there are {listed(table.columns)}; "
-            "say which: columns rssi=NAME or rssi='PREFIX*'"
+            "choose with columns rssi=NAME or rssi='PREFIX*'"
         )
     _check_size(label, len(table), len(names))
     return names, np.stack([column_of_numbers(label, table, name) for name in names], axis=1)

@@ -1,4 +1,4 @@
-"""Where the public data sets come from: address, commit, licence, checksums and conversion."""
+"""Sources of the public data sets: address, commit, licence, checksums and conversion."""
 
 from __future__ import annotations
 

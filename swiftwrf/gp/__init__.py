@@ -1,6 +1,6 @@
 """Gaussian processes over positions: the kernel and its choice, regression, smooth fields, and principal components."""
 
-from swiftwrf.gp.choice import choose_kernel, choose_rank, inner_products, most_informative, squared_errors, thinned
+from swiftwrf.gp.choice import choose_kernel, choose_rank, inner_products, most_informative, squared_errors, subsample
 from swiftwrf.gp.field import SmoothField
 from swiftwrf.gp.kernel import Kernel, candidates
 from swiftwrf.gp.pca import Components, principal_components
@@ -21,5 +21,5 @@ __all__ = [
     "most_informative",
     "principal_components",
     "squared_errors",
-    "thinned",
+    "subsample",
 ]

@@ -38,6 +38,12 @@ def choose_kernel(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> K
         position: Positions of the training spectra (n, 3) [m].
         spectrum: Training spectra (n, H, W).
         fold: Number of the group that each is held out with, (n,).
+
+    Example:
+        >>> import swiftwrf
+        >>> data = swiftwrf.simulated_room(n=40, grid=swiftwrf.AngularGrid.hemisphere(6, 12))
+        >>> choose_kernel(data.position, data.store, torch.arange(40) % 5).noise > 0
+        True
     """
     errors = _held_out_errors if len(position) <= MAX_ROWS else _local_errors
     evaluate = errors(position, spectrum, fold)
@@ -62,13 +68,13 @@ def _held_out_errors(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -
 def _local_errors(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> Callable[[Kernel], Tensor]:
     """Return the function from a kernel to the squared errors of some spectra, each predicted from its neighbours."""
     position = position.double()
-    (out,) = thinned(torch.arange(len(position)), rows=MAX_LOCAL_ROWS)
+    (out,) = subsample(torch.arange(len(position)), rows=MAX_LOCAL_ROWS)
     count = min(N_NEIGHBOURS, len(fold) - int(fold.bincount().max()))
     near = torch.empty(len(out), count, dtype=torch.int64)
     for number in fold[out].unique():
         kept, mine = (fold != number).nonzero()[:, 0], fold[out] == number
         near[mine] = kept[Neighbours(position[kept])(position[out[mine]], count)[1]]
-    mean = thinned(spectrum)[0].flatten(1).mean(dim=0)
+    mean = subsample(spectrum)[0].flatten(1).mean(dim=0)
     rows = torch.cat([out[:, None], near], dim=1)
     flat = (spectrum[some].flatten(1) - mean for some in rows)
     gram = torch.stack([some @ some.T for some in flat]).double() / len(mean)
@@ -88,10 +94,19 @@ def choose_rank(position: Tensor, spectrum: Tensor | Store, fold: Tensor, kernel
     """Return the number of principal components whose omitted variance is negligible beside the error at held-out positions.
 
     Args:
-        position, spectrum, fold: See `choose_kernel`.
+        position: Positions of the training spectra (n, 3) [m].
+        spectrum: Training spectra (n, H, W).
+        fold: Number of the group that each is held out with, (n,).
         kernel: Chosen kernel.
+
+    Example:
+        >>> import swiftwrf
+        >>> data = swiftwrf.simulated_room(n=40, grid=swiftwrf.AngularGrid.hemisphere(6, 12))
+        >>> fold = torch.arange(40) % 5
+        >>> 1 <= choose_rank(data.position, data.store, fold, choose_kernel(data.position, data.store, fold)) <= 40
+        True
     """
-    position, spectrum, fold = thinned(position, spectrum, fold)
+    position, spectrum, fold = subsample(position, spectrum, fold)
     variance, vector = torch.linalg.eigh(inner_products(spectrum))
     variance = variance.flip(0).clamp_min(0)
     component = vector.flip(1) * variance.sqrt()  # (n, n), one column a component
@@ -119,6 +134,11 @@ def most_informative(
     Returns:
         Numbers of the chosen candidates in order, (count,), and the mean variance before the first and after each of them,
         relative to k(0) = 1, float64 (1 + count,).
+
+    Example:
+        >>> known, candidate = torch.zeros(1, 3), torch.tensor([[0.1, 0, 0], [2.0, 0, 0]])
+        >>> most_informative(Kernel(noise=0.01), known, candidate, count=1)[0]
+        tensor([1])
     """
     candidate = candidate.double()
     weight = torch.ones(len(candidate)) if weight is None else weight
@@ -138,15 +158,26 @@ def most_informative(
     return torch.tensor(chosen, dtype=torch.int64), torch.stack(left).clamp_min(0)
 
 
-def thinned(*tensors: Tensor | Store, rows: int = MAX_ROWS) -> list[Tensor]:
-    """Return at most `rows` evenly spread rows of each tensor, the same rows of all."""
+def subsample(*tensors: Tensor | Store, rows: int = MAX_ROWS) -> list[Tensor]:
+    """Return at most `rows` evenly spread rows of each tensor, the same rows of all.
+
+    Example:
+        >>> subsample(torch.arange(100), rows=3)
+        [tensor([ 0, 49, 99])]
+    """
     n = len(tensors[0])
     some = torch.linspace(0, n - 1, rows).long() if n > rows else slice(None)
     return [t[some] for t in tensors]
 
 
 def inner_products(spectrum: Tensor) -> Tensor:
-    """Return the inner products of the spectra's differences from their mean, per pixel, float64 (n, n)."""
+    """Return the inner products of the spectra's differences from their mean, per pixel, float64 (n, n).
+
+    Example:
+        >>> inner_products(torch.tensor([[0.0, 0.0], [2.0, 2.0]]))
+        tensor([[ 1., -1.],
+                [-1.,  1.]], dtype=torch.float64)
+    """
     flat = spectrum.flatten(1)
     flat = flat - flat.mean(dim=0, dtype=torch.float64)  # the largest tensor in memory
     return flat @ flat.T / flat.shape[1]
@@ -160,6 +191,11 @@ def squared_errors(gram: Tensor, out: Tensor, kept: Tensor, weight: Tensor) -> T
         out: Rows that are predicted, as numbers (o,) or a mask (n,).
         kept: Rows that are summed, as numbers (k,) or a mask (n,).
         weight: Weights (o, k). The mean spectrum has the weight that a row lacks of 1.
+
+    Example:
+        >>> gram = inner_products(torch.tensor([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]))
+        >>> squared_errors(gram, torch.tensor([1]), torch.tensor([0, 2]), torch.tensor([[0.5, 0.5]]).double())
+        tensor([0.], dtype=torch.float64)
     """
     own = gram.diagonal()[out]
     return own - 2 * (weight * gram[out][:, kept]).sum(1) + ((weight @ gram[kept][:, kept]) * weight).sum(1)

@@ -26,6 +26,12 @@ class SmoothField(nn.Module):
         whiten: R^-T (M, M) if it is known already.
         value: Noisy values (M, K) of a regression at the anchors.
         correlation: See `GaussianProcess`.
+
+    Example:
+        >>> position = torch.rand(20, 3)
+        >>> field = SmoothField.regress(position, Kernel(noise=1e-3), position.sum(dim=1, keepdim=True))
+        >>> field(position[:4]).shape, field.variance(position[:4]).shape
+        (torch.Size([4, 1]), torch.Size([4]))
     """
 
     anchor: Tensor

@@ -75,7 +75,13 @@ class Kernel:
 
 
 def candidates(position: Tensor, noises: Sequence[float]) -> Iterator[Kernel]:
-    """Yield kernels with lengths from the extent of the positions (n, 3) [m] down, with and without a smooth part."""
+    """Yield kernels with lengths from the extent of the positions (n, 3) [m] down, with and without a smooth part.
+
+    Example:
+        >>> kernels = list(candidates(torch.rand(50, 3, dtype=torch.float64), noises=[0.01]))
+        >>> {kernel.noise for kernel in kernels}
+        {0.01}
+    """
     extent = float((position.max(0).values - position.min(0).values).max()) or 1.0
     for noise in noises:
         for k in range(5):

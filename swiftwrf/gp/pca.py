@@ -13,7 +13,13 @@ MIN_VARIANCE = 1e-6  # fraction of the variance below which a component is left 
 
 
 class Components(NamedTuple):
-    """Rows that are nearly mean + score @ component."""
+    """Rows that are nearly mean + score @ component.
+
+    Example:
+        >>> found = principal_components(torch.outer(torch.arange(5.0), torch.ones(8)), rank=1)
+        >>> (found.mean + found.score.float() @ found.component)[:, 0].round().tolist()
+        [0.0, 1.0, 2.0, 3.0, 4.0]
+    """
 
     mean: Tensor  # float32 (P,)
     score: Tensor  # float64 (n, K), each column of length 1, the least component first

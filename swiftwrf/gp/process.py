@@ -231,7 +231,13 @@ def local_weights(covariance: Tensor, cross: Tensor, noise: float) -> tuple[Tens
 
 
 def dense_weights(number: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return weights (m, k) of rows `number` (m, k) as unique row numbers (r,) and one weight of each, (m, r)."""
+    """Return weights (m, k) of rows `number` (m, k) as unique row numbers (r,) and one weight of each, (m, r).
+
+    Example:
+        >>> dense_weights(torch.tensor([[4, 7], [7, 9]]), torch.tensor([[0.5, 0.5], [0.2, 0.8]]))
+        (tensor([4, 7, 9]), tensor([[0.5000, 0.5000, 0.0000],
+                [0.0000, 0.2000, 0.8000]]))
+    """
     rows, column = number.unique(return_inverse=True)
     return rows, weight.new_zeros(len(weight), len(rows)).scatter(1, column, weight)
 
@@ -245,6 +251,13 @@ class LeaveGroupOut:
     Args:
         precision: Inverse covariance of the noisy values (n, n).
         out: Numbers of the rows that are held out, (o,).
+
+    Example:
+        >>> position = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None] * torch.ones(3)
+        >>> precision = torch.linalg.inv(Kernel(noise=0.01).covariance(position))
+        >>> group = LeaveGroupOut(precision, torch.tensor([3, 4]))
+        >>> group.errors(precision @ position[:, 0]).shape, group.covariance.shape
+        (torch.Size([2]), torch.Size([2, 2]))
     """
 
     def __init__(self, precision: Tensor, out: Tensor) -> None:
@@ -290,6 +303,12 @@ def held_out(kernel: Kernel, position: Tensor, fold: Tensor, value: Tensor) -> t
         position: Positions (n, 3).
         fold: Number of the group that each row is held out with, (n,).
         value: Values (n, K).
+
+    Example:
+        >>> position = torch.linspace(0, 1, 20, dtype=torch.float64)[:, None] * torch.ones(3)
+        >>> predicted, variance = held_out(Kernel(noise=0.01), position, torch.arange(20) % 5, position[:, :1])
+        >>> predicted.shape, variance.shape
+        (torch.Size([20, 1]), torch.Size([20]))
     """
     predicted, variance = torch.empty_like(value, dtype=torch.float64), torch.empty(len(value), dtype=torch.float64)
     dual: Tensor | None = None

@@ -1,4 +1,4 @@
-"""Where was it? Posterior over the position of the moving end, from a fitted field and an observation."""
+"""Posterior over the position of the mobile terminal, from a fitted field and an observation."""
 
 from swiftwrf.locate.matched_field import MatchedField, MatchedFieldConfig
 from swiftwrf.locate.posterior import Posterior

@@ -16,7 +16,7 @@ from swiftwrf.array.planar import differences
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.spectra import Spectra, check_training, direction_of_link
 from swiftwrf.errors import InputError
-from swiftwrf.gp import GaussianProcess, thinned
+from swiftwrf.gp import GaussianProcess, subsample
 from swiftwrf.locate.pool import inflation, pooled_weights
 from swiftwrf.locate.posterior import Posterior, normalised
 from swiftwrf.locate.region import Cells, Region, outside_mass
@@ -37,7 +37,7 @@ from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.path_gains import PathGains, fit_path_gains, prior
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
 from swiftwrf.runtime.options import Configured
-from swiftwrf.runtime.threads import side_by_side
+from swiftwrf.runtime.threads import parallel_map
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 
 FOLDS = 5
@@ -50,7 +50,12 @@ FIRST_WEIGHTS = (0.05, 0.05, 0.3)  # of the likelihoods, before calibration
 
 @configuration
 class MatchedFieldConfig:
-    """Options of matched-field processing."""
+    """Options of matched-field processing.
+
+    Example:
+        >>> MatchedField(MatchedFieldConfig(spacing=0.5, max_cells=10_000)).config.spacing
+        0.5
+    """
 
     spacing: Annotated[float, Ge(0.02)] = 0.2
     """spacing of the first cells, in wavelengths"""
@@ -101,7 +106,7 @@ class _Likelihoods:
             return torch.stack([part.log_likelihood(waves, target) for part in self.parts])
 
         batches = torch.arange(n * m).split(BATCH_CANDIDATES)
-        return torch.cat(side_by_side(of_batch, batches), dim=1).reshape(len(self.parts), n, m)
+        return torch.cat(parallel_map(of_batch, batches), dim=1).reshape(len(self.parts), n, m)
 
 
 class MatchedField(Configured, Saved):
@@ -174,7 +179,7 @@ class MatchedField(Configured, Saved):
 
         fold = torch.arange(len(train)) % FOLDS
         everything = torch.ones_like(fold, dtype=torch.bool)
-        *parts, self._fit = side_by_side(fitted, [*(fold != number for number in range(FOLDS)), everything])
+        *parts, self._fit = parallel_map(fitted, [*(fold != number for number in range(FOLDS)), everything])
         self._set_residuals(train.position, features, fold, parts)
         held_out = [train.position[fold == number] for number in range(FOLDS)]
         others = [Region(train.position[fold != number]) for number in range(FOLDS)]
@@ -203,7 +208,7 @@ class MatchedField(Configured, Saved):
         self.likelihoods = self._likelihoods(self._fit)
         screen = self.likelihoods.parts[0]
         batches = self.cells.position.split(BATCH_CANDIDATES)
-        self._whitened = torch.cat(side_by_side(lambda some: screen.whitened(PathWaves.at(self.room, some)), batches))
+        self._whitened = torch.cat(parallel_map(lambda some: screen.whitened(PathWaves.at(self.room, some)), batches))
 
     def _likelihoods(self, fit: _Fit, kept: Tensor | None = None) -> _Likelihoods:
         residual = self.residual if kept is None else self.residual[:, kept]
@@ -215,7 +220,7 @@ class MatchedField(Configured, Saved):
 
     def _calibrate(self, position: Tensor, features: SpectrumFeatures, fold: Tensor, parts: list[_Fit]) -> None:
         """Choose the weights of the likelihoods and the inflation of credible radii by held-out positions."""
-        (some,) = thinned(torch.arange(len(position)), rows=self.config.n_calibration)
+        (some,) = subsample(torch.arange(len(position)), rows=self.config.n_calibration)
         rows_of = {number: some[fold[some] == number] for number in fold[some].unique().tolist()}
         at_truth, values, volumes, candidates = [], [], [], []
         for number, rows in rows_of.items():

@@ -42,9 +42,9 @@ class Cells:
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Where the moving end can be: a box around known positions, most of its prior mass in their neighbourhood.
+    """Prior over positions: a box around known positions, with most of the prior mass in their neighbourhood.
 
-    The neighbourhood reaches as far from the known positions as these lie from each other. So it follows a measured path and
+    The radius of the neighbourhood is the spacing of the known positions. So it follows a measured path and
     fills a measured room.
 
     Args:

@@ -33,7 +33,12 @@ UNDETECTED_BELOW_DB = 5.0  # below the weakest value, of what is not detected, i
 
 @configuration
 class RssiLocatorConfig:
-    """Options of the locator."""
+    """Options of the locator.
+
+    Example:
+        >>> RssiLocator(RssiLocatorConfig(validation="block"), n_cells=500).config.validation
+        'block'
+    """
 
     validation: Validation = "random"
     """training rows held out to calibrate: single ones at random, or one region at a time"""

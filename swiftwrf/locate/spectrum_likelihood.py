@@ -33,11 +33,11 @@ PENALTY = 0.01  # of the squared logarithms of the variances: keeps those that t
 
 @dataclass(frozen=True, eq=False)
 class SpectrumFeatures:
-    """What a spectrum determines about the channel.
+    """Features of the channel that a spectrum determines.
 
     Args:
         coarray: Real and imaginary parts of the co-array numbers, float32 (n, F).
-        phases: Element phasors of unit modulus and their indistinguishable twins, complex64 (n, T, K), T = 1 or 2.
+        phases: Element phasors of unit modulus and their indistinguishable aliases, complex64 (n, T, K), T = 1 or 2.
     """
 
     coarray: Tensor

@@ -37,7 +37,12 @@ CPU = torch.device("cpu")
 
 @configuration
 class FieldConfig:
-    """Options of every field model."""
+    """Options of every field model.
+
+    Example:
+        >>> FieldConfig(validation="block", seed=3).validation
+        'block'
+    """
 
     validation: Validation = "random"
     """training spectra held out to choose settings: single ones at random, or one region at a time"""
@@ -74,6 +79,13 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
 
     Raises:
         InputError: An unknown option, or a value outside its range.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.simulated_room(n=50).split()
+        >>> model = swiftwrf.make_model("idw").fit(train)
+        >>> isinstance(model, FieldModel), model.predict(test.position).mean.shape
+        (True, torch.Size([10, 30, 120]))
     """
 
     config_type: ClassVar[type[Any]] = FieldConfig
@@ -373,12 +385,3 @@ def make_model(name: str, preset: Preset = "quick", **options: Any) -> FieldMode
     """
     model_type: type[FieldModel] = FIELD_MODELS[name]
     return model_type.with_known(preset, options)
-
-
-def model_types(names: Iterable[str] | None = None) -> dict[str, type[FieldModel]]:
-    """Return the classes of the given field models, of all registered ones by default.
-
-    Raises:
-        InputError: An unknown name.
-    """
-    return {name: FIELD_MODELS[name] for name in (FIELD_MODELS if names is None else names)}

@@ -10,7 +10,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import folds
-from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, thinned
+from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, subsample
 from swiftwrf.models.base import FitContext
 from swiftwrf.models.nearest import MemoryModel
 from swiftwrf.models.process import ProcessModel
@@ -47,7 +47,7 @@ class GPModel(ProcessModel, MemoryModel):
     def _prepare(self, process: GaussianProcess) -> None:
         """Precompute what predictions share: mean, and differences from the mean, if they are few."""
         self._mean, self.process = self.store.mean(), process
-        some = self.store[:] if process.exact else thinned(self.store)[0]
+        some = self.store[:] if process.exact else subsample(self.store)[0]
         self._change = (some - self._mean).flatten(1)
 
     def _values(self, new: Spectra) -> Tensor:

@@ -8,7 +8,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import folds
-from swiftwrf.gp import dense_weights, inner_products, squared_errors, thinned
+from swiftwrf.gp import dense_weights, inner_products, squared_errors, subsample
 from swiftwrf.models.base import FitContext
 from swiftwrf.models.nearest import MemoryModel
 from swiftwrf.positions import distance, nearest
@@ -37,7 +37,7 @@ class IDWModel(MemoryModel):
 
     def _fit(self, train: Spectra, context: FitContext) -> None:
         super()._fit(train, context)
-        (rows,) = thinned(torch.arange(len(train)), rows=MAX_CHOICE_SPECTRA)
+        (rows,) = subsample(torch.arange(len(train)), rows=MAX_CHOICE_SPECTRA)
         fold = folds(train.position, self.config.validation, self.config.seed)[rows]
         candidates = [k for k in NEIGHBOUR_CANDIDATES if k <= len(rows) - int(fold.bincount().max())]
         some = train.subset(rows)

@@ -14,6 +14,7 @@ from swiftwrf.models.process import ProcessModel
 from swiftwrf.online.adaptation import adapted
 from swiftwrf.online.change import Alarm
 from swiftwrf.online.monitor import Monitor, MonitorConfig
+from swiftwrf.online.obstacles import ObstacleMonitor
 from swiftwrf.online.prequential import Scores, learnt, score
 from swiftwrf.rssi.model import RssiModel
 
@@ -28,6 +29,14 @@ class Step:
         scores: Its scores before it was learnt, of length 1.
         alarms: Changes that it revealed, in words.
         correlation: Correlation of the fields before and after a change to which the model was adapted; None without one.
+
+    Example:
+        >>> import swiftwrf
+        >>> data = swiftwrf.simulated_room(n=50, grid=swiftwrf.AngularGrid.hemisphere(6, 12))
+        >>> train, new = data.subset(torch.arange(49)), data.subset(torch.tensor([49]))
+        >>> step = Follower(swiftwrf.make_model("gp").fit(train), train).step(new)
+        >>> len(step.scores), step.correlation is None
+        (1, True)
     """
 
     scores: Scores
@@ -38,7 +47,8 @@ class Step:
 class Follower:
     """A fitted model that learns measurements one by one.
 
-    An alarm adapts models of spectra to the change, if these can forget spectra, and starts the test again.
+    An alarm of the innovations adapts models of spectra to the change, if these can forget spectra, and restarts the test.
+    With a room and training spectra, obstacles that appear or leave are detected, too.
 
     Args:
         model: Fitted model with `update`.
@@ -63,6 +73,10 @@ class Follower:
     ) -> None:
         self.model, self.count = model, 0
         self.monitor = Monitor.of(model, train, config)
+        self.obstacles: ObstacleMonitor | None = None
+        """test for obstacles, None without room or training spectra"""
+        if isinstance(model, FieldModel) and model.room is not None and isinstance(train, Spectra):
+            self.obstacles = ObstacleMonitor(model.room, train, self.monitor.config.false_alarm_rate)
         self._recent: list[Spectra] = []
 
     def step(self, new: Spectra | Rssi) -> Step:
@@ -73,14 +87,16 @@ class Follower:
         """
         scores = score(self.model, new)
         alarms = self.monitor.observe(scores.position[0], scores.innovation[0])
-        words, correlation = tuple(map(self.monitor.describe, alarms)), None
+        words, correlation = list(map(self.monitor.describe, alarms)), None
+        if self.obstacles is not None and isinstance(new, Spectra):
+            words += map(self.obstacles.describe, self.obstacles.observe(new))
         self.model = learnt(self.model, new)
         self.count += 1
         if isinstance(new, Spectra) and isinstance(self.model, ProcessModel):
             self._recent = [*self._recent, new][-MAX_RECENT:]
             if alarms:
                 correlation = self._adapt(self.model, alarms[0])
-        return Step(scores, words, correlation)
+        return Step(scores, tuple(words), correlation)
 
     def _adapt(self, model: ProcessModel, alarm: Alarm) -> float:
         """Adapt the model to a change, and calibrate the test with the next measurements."""
@@ -91,12 +107,17 @@ class Follower:
         return correlation
 
     def state(self) -> dict[str, Any]:
-        """Return the count of measurements and the state of the test as plain values."""
-        return {"count": self.count, "monitor": self.monitor.state()}
+        """Return the count of measurements and the state of the tests as plain values."""
+        obstacles = None if self.obstacles is None else self.obstacles.state()
+        return {"count": self.count, "monitor": self.monitor.state(), "obstacles": obstacles}
 
     def resume(self, state: dict[str, Any]) -> None:
         """Continue from a `state`; the model is that of the same moment."""
         self.count, self.monitor = int(state["count"]), self.monitor.continued(state["monitor"])
+        room = self.model.room if isinstance(self.model, FieldModel) else None
+        if room is not None and state.get("obstacles") is not None:
+            rate = self.monitor.config.false_alarm_rate
+            self.obstacles = ObstacleMonitor(room, None, rate).continued(state["obstacles"])
 
 
 def joined(parts: list[Spectra]) -> Spectra:

@@ -28,7 +28,12 @@ MAX_INNOVATION = 3.0  # standard deviations; single outliers raise no alarm
 
 @configuration
 class MonitorConfig:
-    """Options of a `Monitor`."""
+    """Options of a `Monitor`.
+
+    Example:
+        >>> Monitor(torch.rand(50, 3), config=MonitorConfig(false_alarm_rate=1e-3)).config.n_regions
+        8
+    """
 
     false_alarm_rate: Annotated[float, Gt(0), Lt(1)] = 1e-4
     """false alarms a measurement, over all regions and receivers together"""

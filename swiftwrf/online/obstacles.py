@@ -8,13 +8,16 @@ segments that did not exclude it.
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass
 from itertools import permutations
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from swiftwrf.data.spectra import Spectra
+from swiftwrf.errors import InputError
 from swiftwrf.models.geometry.images import PhaseObservations, images
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.path_gains import paths
@@ -29,11 +32,10 @@ MIN_MISSING = 3e-3  # missing coherence that counts as none, phases of 3 degrees
 MIN_EVIDENCE = 2.5  # [nats] for an obstacle that the training spectra show
 MAX_STANDING = 12  # such obstacles
 MAX_NATS = 3.0  # of one spectrum, so that a single one raises no alarm
-ALLOWANCE_NATS = 0.5  # of a spectrum whose paths a box touches
-N_ERRORS = 2.0  # standard errors of a box' evidence in the training spectra that are allowed in addition
+N_ERRORS = 2.0  # standard errors by which a box' mean evidence in the training spectra may be wrong
 MIN_STD_NATS = 0.5  # of the evidence of one spectrum
 REGION_NATS = 5.0  # below the best box, of the region where an obstacle can stand
-BATCH_BOXES = 100  # evaluated at a time
+BATCH_BOXES, BATCH_SPECTRA = 100, 50  # evaluated at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,11 @@ class Boxes:
 
     Args:
         low, high: Opposite corners, float64 (M, 3) [m].
+
+    Example:
+        >>> corner = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
+        >>> len(Boxes(corner, corner + 0.5))
+        1
     """
 
     low: Tensor
@@ -142,12 +149,17 @@ def evidence(scene: PhaseObservations, wave: Tensor, gain: Tensor, base: Tensor,
 class ObstacleMonitor:
     """Sequential test for obstacles that appeared in a room or left it, and a map of where they can stand.
 
-    Every candidate has a cumulative sum of log likelihood ratios. A sum above log(candidates / rate) is an alarm, which
-    bounds the rate of false alarms (G. Lorden, Annals of Mathematical Statistics 42, 1971).
+    Every candidate has a cumulative sum of weighted log likelihood ratios w r. A sum above log(candidates / rate) is an
+    alarm, which bounds the rate of false alarms if E exp(w r) <= 1 without a change (G. Lorden, Annals of Mathematical
+    Statistics 42, 1971). A normal r of mean m < 0 and variance s^2 has this property for w <= -2 m / s^2. The training
+    spectra whose paths a box touches give m and s. The weight is at most 1, that of an exact room, and 0 for a box that
+    the training spectra do not exclude: it may have stood there before. The next alarm needs all sums to fall below the
+    region of the last one.
 
     Args:
         room: Fitted room.
-        train: Spectra of the unchanged scene, which show what stands in the room already.
+        train: Spectra of the unchanged scene, which calibrate the weights and show what stands in the room already. Without
+            them all weights are 1.
         false_alarm_rate: False alarms a measurement.
 
     Example:
@@ -164,14 +176,14 @@ class ObstacleMonitor:
         self.standing = Boxes(torch.zeros(0, 3).double(), torch.zeros(0, 3).double())
         """obstacles that the training spectra show"""
         self.threshold = math.log(len(self.candidates) / false_alarm_rate)
-        self.allowance = torch.full((len(self.candidates),), ALLOWANCE_NATS)
-        """evidence of a spectrum whose paths a box touches that counts as an error of the room, (M,) [nats]"""
+        self.weight = torch.ones(len(self.candidates))
+        """weight of the evidence for each box, (M,)"""
         if train is not None:
             self._learn(train)
         self.value = torch.zeros(len(self.boxes))
         """cumulative sum of each box [nats]"""
         self.since = torch.zeros(len(self.boxes), dtype=torch.int64)
-        self.count = 0
+        self.count, self.armed = 0, True
 
     @property
     def boxes(self) -> Boxes:
@@ -181,7 +193,7 @@ class ObstacleMonitor:
         )
 
     def _learn(self, train: Spectra) -> None:
-        """Find standing obstacles one after the other, and the evidence that the unchanged scene gives every box."""
+        """Find standing obstacles one after the other, and the weight of the evidence for every box."""
         scene, wave, gain, point = _links(self.room, train)
         blocked = self.candidates.block(point)
         base = torch.zeros(point.shape[:2], dtype=torch.bool)
@@ -199,7 +211,8 @@ class ObstacleMonitor:
         count = touched.sum(1).clamp_min(1)
         mean = (ratio * touched).sum(1) / count
         std = ((ratio - mean[:, None]).square() * touched).sum(1).div(count).sqrt().clamp_min(MIN_STD_NATS)
-        self.allowance = ALLOWANCE_NATS + (mean + N_ERRORS * std / count.sqrt()).clamp_min(0) * touched.any(1)
+        least = mean + N_ERRORS * std / count.sqrt()
+        self.weight = (-2 * least / std.square()).clamp(0, 1) * touched.any(1)
 
     def _alternatives(self, point: Tensor) -> tuple[Tensor, Tensor]:
         """Return which paths with corners (n, S, C, 3) [m] are blocked, (n, S), and if each box came or left, (M, n, S)."""
@@ -210,20 +223,51 @@ class ObstacleMonitor:
 
     def observe(self, new: Spectra) -> list[Alarm]:
         """Add spectra in order; return the alarms, each of the box with the largest sum."""
+        return [a for rows in torch.arange(len(new)).split(BATCH_SPECTRA) for a in self._observe(new.subset(rows))]
+
+    def _observe(self, new: Spectra) -> list[Alarm]:
         scene, wave, gain, point = _links(self.room, new)
         base, alternatives = self._alternatives(point)
         touched = (alternatives != base).any(-1)  # (M, n)
-        ratio = evidence(scene, wave, gain, base, alternatives) - self.allowance[:, None] * touched
+        ratio = evidence(scene, wave, gain, base, alternatives) * self.weight[:, None] * touched
         alarms = []
         for column in ratio.T:
-            before = float(self.value.max())
             self.since = self.since.where(self.value > 0, self.count)
             self.value = (self.value + column).clamp_min(0)
             best = int(self.value.argmax())
-            if before <= self.threshold < float(self.value[best]):
+            highest = float(self.value[best])
+            if self.armed and highest > self.threshold:
                 alarms.append(Alarm(best, self.count, int(self.since[best])))
+            self.armed = highest < self.threshold - REGION_NATS or (self.armed and highest <= self.threshold)
             self.count += 1
         return alarms
+
+    def describe(self, alarm: Alarm) -> str:
+        """Return what changed and where, in words."""
+        x, y, _ = ((self.boxes.low + self.boxes.high)[alarm.series] / 2).tolist()
+        return f"an obstacle {'left' if alarm.series >= len(self.candidates) else 'appeared'} around {x:.1f}, {y:.1f} m"
+
+    def state(self) -> dict[str, Any]:
+        """Return obstacles, weights and sums as plain values."""
+        names = ("weight", "value", "since")
+        tensors = {
+            "low": self.standing.low,
+            "high": self.standing.high,
+            **{name: getattr(self, name) for name in names},
+        }
+        return {"count": self.count, "armed": self.armed, **{name: tensor.tolist() for name, tensor in tensors.items()}}
+
+    def continued(self, state: dict[str, Any]) -> ObstacleMonitor:
+        """Return this monitor, made without training spectra, with the obstacles, weights and sums of a `state`."""
+        monitor = copy(self)
+        low, high = (torch.tensor(state[end], dtype=torch.float64).reshape(-1, 3) for end in ("low", "high"))
+        monitor.standing = Boxes(low, high)
+        monitor.count, monitor.armed = int(state["count"]), bool(state["armed"])
+        monitor.weight, monitor.value = torch.tensor(state["weight"]), torch.tensor(state["value"])
+        monitor.since = torch.tensor(state["since"], dtype=torch.int64)
+        if not len(monitor.weight) == len(monitor.value) == len(monitor.since) == len(monitor.boxes):
+            raise InputError("the state is of another room")
+        return monitor
 
     def region(self) -> Tensor:
         """Return which boxes explain the changes nearly as well as the best one, bool (M,); none below the threshold."""

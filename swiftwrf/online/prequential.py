@@ -63,6 +63,12 @@ def score(model: FieldModel | RssiPredictor, new: Spectra | Rssi) -> Scores:
 
     Raises:
         InputError: As `predict`.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.simulated_room(n=50).split()
+        >>> score(swiftwrf.make_model("coarray").fit(train), test).innovation.shape
+        torch.Size([10, 1])
     """
     with torch.no_grad():
         if isinstance(model, RssiPredictor):

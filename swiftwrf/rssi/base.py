@@ -25,7 +25,7 @@ from swiftwrf.positions import check_positions
 from swiftwrf.rssi.floors import FloorAttenuation, estimate_floor_attenuation, receiver_floors
 from swiftwrf.runtime.options import Configured
 from swiftwrf.runtime.session import Record
-from swiftwrf.runtime.threads import side_by_side
+from swiftwrf.runtime.threads import parallel_map
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 ITEMS_PER_THREAD = 4  # between two results that are kept: starting threads costs milliseconds
@@ -36,12 +36,19 @@ def map_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterabl
     """Apply a function to items as `map` does, in as many threads as torch has."""
     waiting, n_items = list(items), ITEMS_PER_THREAD * torch.get_num_threads()
     for start in range(0, len(waiting), n_items):
-        yield from side_by_side(function, waiting[start : start + n_items])
+        yield from parallel_map(function, waiting[start : start + n_items])
 
 
 @dataclass(frozen=True)
 class RssiFitContext(FitContext):
-    """Arguments of `RssiPredictor.fit` other than the training rows; see there."""
+    """Arguments of `RssiPredictor.fit` other than the training rows; see there.
+
+    Example:
+        >>> import swiftwrf
+        >>> data = swiftwrf.rssi_room(n=20)
+        >>> RssiFitContext(pool=data, device=torch.device("cpu")).pool is data
+        True
+    """
 
     pool: Rssi = field(kw_only=True)
     parallel: Map | None = None

@@ -20,7 +20,7 @@ from swiftwrf.data.rssi import Rssi
 from swiftwrf.positions import distance
 from swiftwrf.rssi.path_loss import MIN_DISTANCE_M
 
-MIN_FLOOR_ROWS = 3  # on a floor, before its mean tells where a receiver is
+MIN_FLOOR_ROWS = 3  # on a floor, for its mean to count as evidence of a receiver's floor
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,12 @@ class FloorAttenuation:
         floors: Floors of the building.
         receiver_floor: Number of each receiver's floor.
         db: Attenuation of a floor [dB].
+
+    Example:
+        >>> floors = Floors(("ground", "first"), (0.0, 3.0))
+        >>> FloorAttenuation(floors, receiver_floor=(0,), db=15.0).of(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 3.0]]))
+        tensor([[ -0.],
+                [-15.]], dtype=torch.float64)
     """
 
     floors: Floors

@@ -23,7 +23,7 @@ from torch import Tensor
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.rssi import Offsets, Rssi
 from swiftwrf.errors import InputError
-from swiftwrf.gp import GaussianProcess, Kernel, thinned
+from swiftwrf.gp import GaussianProcess, Kernel, subsample
 from swiftwrf.rssi.base import Map, RssiFitContext, RssiPredictor, fingerprint, map_threads
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.floors import FloorAttenuation
@@ -54,10 +54,10 @@ MAX_VARIANCE_POSITIONS = 200  # measured positions that determine where the fiel
 class RssiModel(RssiPredictor, Saved):
     """RSSI at fixed receivers for any position of the transmitter; predictions are differentiable in the position.
 
-    Everything is chosen on five held-out folds of the training rows: the kernel and whether there is a field at all; the
-    mixing weights of the field beside simpler predictors (the path-loss model of the receiver, that of all receivers, the
-    mean of the receiver); and the scale of the standard deviation. A receiver detected in fewer than 10 rows falls back to
-    the path-loss model of all receivers. If the positions of the receivers are unknown, a path-loss model is a level.
+    Five held-out folds of the training rows determine the kernel, the presence of a field, the mixing weights and the scale
+    of the standard deviation. The field is mixed with simpler predictors: the path-loss model of the receiver, that of all
+    receivers, and the mean of the receiver. A receiver detected in fewer than 10 rows falls back to the path-loss model of
+    all receivers. If the positions of the receivers are unknown, a path-loss model is a level.
 
     Args:
         config: Options as one object. Defaults to `RssiConfig()`.
@@ -197,7 +197,7 @@ class RssiModel(RssiPredictor, Saved):
 
     def _variance_process(self) -> GaussianProcess:
         """Return the process of few of the measured positions, which determine the standard deviation."""
-        return GaussianProcess(self.kernel, thinned(self.anchor.double(), rows=MAX_VARIANCE_POSITIONS)[0])
+        return GaussianProcess(self.kernel, subsample(self.anchor.double(), rows=MAX_VARIANCE_POSITIONS)[0])
 
     def _posterior_of(self, state: FitState) -> RssiPosterior:
         table, receiver = HeadTable(self.rendered), self.receiver - self.centre
@@ -360,6 +360,6 @@ def _held_out_std(training: RssiTraining) -> Tensor:
     variance = torch.empty(len(training.position), dtype=torch.float64)
     for number in training.fold.unique():
         out = training.fold == number
-        (known,) = thinned(training.position[~out], rows=MAX_VARIANCE_POSITIONS)
+        (known,) = subsample(training.position[~out], rows=MAX_VARIANCE_POSITIONS)
         variance[out] = GaussianProcess(training.kernel, known).variance(training.position[out])
     return (training.noise_db.square() + training.field_db.square() * variance[:, None]).sqrt()

@@ -44,7 +44,12 @@ PAIRS_AT_ONCE = 2048  # each needs a matrix of 64 x 64
 
 @configuration
 class PairConfig(FieldConfig):
-    """Options of models over pairs of positions."""
+    """Options of models over pairs of positions.
+
+    Example:
+        >>> PairModel(PairConfig(new_places=False)).config.new_places
+        False
+    """
 
     new_places: bool = True
     """choose settings for receivers at positions without a measurement; otherwise for new positions of the transmitter, as
@@ -55,6 +60,11 @@ class PairPredictor(RssiPredictor):
     """Base class of predictors over pairs of positions of transmitter and receiver; all receivers are alike.
 
     A subclass implements `_fit_pairs` and `_at_pairs` instead of `_fit` and `_predict`.
+
+    Example:
+        >>> import swiftwrf
+        >>> issubclass(swiftwrf.PairModel, PairPredictor), PairPredictor.requires_receiver_position
+        (True, True)
     """
 
     config_type = PairConfig

@@ -50,6 +50,12 @@ class PathLoss(NamedTuple):
     Args:
         level: RSSI at 1 m, float64 (..., R) or (..., 1) [dBm].
         slope: -10 times the path-loss exponent, of the same shape [dB a decade].
+
+    Example:
+        >>> model = PathLoss(torch.tensor([-40.0]), torch.tensor([-20.0]))
+        >>> model(torch.tensor([[0.0], [1.0]]))  # at 1 m and 10 m
+        tensor([[-40.],
+                [-60.]])
     """
 
     level: Tensor

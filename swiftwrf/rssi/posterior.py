@@ -159,6 +159,11 @@ class RssiPosterior:
             posteriors.append(torch.linalg.inv(torch.eye(feature.shape[1]).double() + feature.T @ products[-1]))
         return inverses, torch.stack(products), torch.stack(posteriors)
 
+    @cached_property
+    def _fitted(self) -> Tensor:
+        """Coefficients of the scaled regressors from the rows of the fit, (R, k, 1)."""
+        return self._feature.mT @ self.state.dual.T[..., None]
+
     def _regressors(self, position: Tensor) -> Tensor:
         """Return the scaled regressors of level, slope and directivity at positions (m, 3), float64 (R, m, k)."""
         distance, bearing = log_distance(position, self.receiver), harmonics(position, self.receiver)
@@ -168,7 +173,7 @@ class RssiPosterior:
     @property
     def linear(self) -> Tensor:
         """Change of level, slope and directivity from the prior path-loss model, float64 (R, k) [dB]."""
-        coefficient = self._feature.mT @ self.state.dual.T[..., None] + self.new.gain.mT @ self.new.dual[..., None]
+        coefficient = self._fitted + self.new.gain.mT @ self.new.dual[..., None]
         return coefficient[..., 0] * FEATURE_SCALE_DB
 
     def folded(self) -> RssiPosterior:
@@ -198,9 +203,8 @@ class RssiPosterior:
         latent = cross @ self.coefficient  # (m, R)
         head, tangent = self.table(latent)
         feature = self._regressors(position)
-        coefficient = self._feature.mT @ state.dual.T[..., None]  # of the fit, (R, k, 1)
         predicted = state.prior_level + state.prior_slope * log_distance(position, self.receiver)
-        predicted = predicted + (feature @ coefficient)[..., 0].T + head - self.table(torch.zeros_like(latent))[0]
+        predicted = predicted + (feature @ self._fitted)[..., 0].T + head - self.table(torch.zeros_like(latent))[0]
         tangent = tangent.T * detected
         inverses, product, posterior = self._base
         scaled = (state.field_variance[:, None] * tangent)[..., None]  # (R, m, 1)

@@ -40,10 +40,13 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
         device: Device to compute on.
 
     Returns:
-        With R = 1: level (R,) [dBm], slope (R,) [dB a decade] and directivity (R, 8) [dB]; coefficient (R, n) of the kernel
-        to the bins, whose sum is the latent field [dB]; dual, tangent and variance (R, n), see `posterior.FitState`;
-        rendered fields of the heads (R, 2, 2, directions); held_out (R, n),
-        predictions of detected bins by all other folds [dBm].
+        Tensors by name, with R = 1.
+
+        - level (R,) [dBm], slope (R,) [dB a decade] and directivity (R, 8) [dB].
+        - coefficient (R, n) of the kernel to the bins, whose sum is the latent field [dB].
+        - dual, tangent and variance (R, n). See `posterior.FitState`.
+        - rendered fields of the heads (R, 2, 2, directions).
+        - held_out (R, n), predictions of detected bins by all other folds [dBm].
 
     Raises:
         FitError: A system that cannot be solved, for positions or values beyond any measurement.

@@ -7,7 +7,7 @@ import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
-from swiftwrf.gp import thinned
+from swiftwrf.gp import subsample
 
 MAX_PAIRS = 20_000
 MIN_ERROR_DB = 0.5  # absolute errors below it count as squares, so that the solution is unique
@@ -41,7 +41,7 @@ def mixing_weights(held_out: Tensor, measured: Tensor) -> Tensor:
         tensor([1., 0.], dtype=torch.float64)
     """
     usable = comparable(held_out, measured)
-    predicted, target = thinned(held_out[:, usable].T.double(), measured[usable].double(), rows=MAX_PAIRS)
+    predicted, target = subsample(held_out[:, usable].T.double(), measured[usable].double(), rows=MAX_PAIRS)
     error = (predicted - target[:, None]).numpy()  # the error of a mean with weights of sum 1 is the mean of the errors
     n = error.shape[1]
     weight, importance = np.full(n, 1 / n), np.ones(len(error))

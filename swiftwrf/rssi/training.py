@@ -10,7 +10,7 @@ from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
-from swiftwrf.gp import Kernel, LeaveGroupOut, candidates, thinned
+from swiftwrf.gp import Kernel, LeaveGroupOut, candidates, subsample
 from swiftwrf.positions import cells
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import Head, render
@@ -166,9 +166,9 @@ def choose_residual_kernel(
         The kernel, and whether its error is lower than that of no field at all.
     """
     some = (~residual.isnan()).any(dim=1)
-    position, residual, fold = thinned(position[some], residual[some], fold[some], rows=MAX_KERNEL_ROWS)
+    position, residual, fold = subsample(position[some], residual[some], fold[some], rows=MAX_KERNEL_ROWS)
     residual = residual[:, (~residual.isnan()).any(dim=0)]
-    (columns,) = thinned(torch.arange(residual.shape[1]), rows=MAX_KERNEL_RECEIVERS)
+    (columns,) = subsample(torch.arange(residual.shape[1]), rows=MAX_KERNEL_RECEIVERS)
     residual = residual[:, columns]
     held_out = []  # (receiver, number of values, rows)
     for r, missing in enumerate(residual.isnan().T):

@@ -18,7 +18,7 @@ UNSUPPORTED = {errno.EACCES, errno.EPERM, errno.EINVAL, errno.ENOTSUP}
 
 
 def cache_folder() -> Path:
-    """Where files lie that can be made anew: `$XDG_CACHE_HOME/swiftwrf`, or `~/.cache/swiftwrf`."""
+    """Return the folder of files that can be recomputed: `$XDG_CACHE_HOME/swiftwrf`, or `~/.cache/swiftwrf`."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "swiftwrf"
 
 

@@ -1,7 +1,7 @@
 """Registries of implementations by name: field models, estimators, readers, beamformers.
 
 An implementation registers itself when its module is imported, or is declared as `module:object` and imported at first use.
-Other packages declare theirs by entry points of the registry's group. Names are known without any import.
+Other packages declare implementations by entry points of the registry's group. Names are known without any import.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ class _Users:
 
 
 _users = _Users()
-_workers: ContextVar[int | None] = ContextVar("workers", default=None)  # of `side_by_side` inside `single_thread`
+_workers: ContextVar[int | None] = ContextVar("workers", default=None)  # of `parallel_map` inside `single_thread`
 
 
 def set_threads(number: int) -> None:
@@ -71,7 +71,7 @@ def threads_kept() -> Iterator[None]:
 
 @contextmanager
 def single_thread() -> Iterator[None]:
-    """Use one thread for many small tensor operations; also a decorator. `side_by_side` inside still uses all threads.
+    """Use one thread for many small tensor operations; also a decorator. `parallel_map` inside still uses all threads.
 
     Threads synchronise after every operation. If an operation takes microseconds and other work shares the machine, most
     of the time is spent waiting: up to ten times the time of one thread.
@@ -85,13 +85,13 @@ def single_thread() -> Iterator[None]:
         _workers.reset(token)
 
 
-def side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+def parallel_map(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
     """Return the function of each item, computed in as many threads as torch has, with one thread inside each call.
 
     The threads synchronise once, so other work on the machine slows them little. Results are those of one thread.
 
     Example:
-        >>> side_by_side(abs, [-1, 2])
+        >>> parallel_map(abs, [-1, 2])
         [1, 2]
     """
     workers = _workers.get() or torch.get_num_threads()

@@ -1,1 +1,1 @@
-"""What tests and benchmarks share: hard cases, random scenes, tolerances. For those who change the code or add a backend."""
+"""Hard cases, random scenes and tolerances for tests and benchmarks, and for people who add a backend."""

@@ -32,7 +32,7 @@ class Case:
         cholesky: (N, 3) [rad].
         weight: (1, N, 2).
         grid: to draw on.
-        slack: how much looser its tolerance is, where `why` says why.
+        slack: factor of its tolerance, for the reason in `why`.
     """
 
     rule: str
@@ -118,8 +118,10 @@ def field_errors(draw: Draw, case: Case, cutoff: float | None, device: str = "cp
 
 
 def magnitude_errors(draw: Draw, case: Case, cutoff: float | None, device: str = "cpu") -> tuple[float, float]:
-    """Errors of |A|: value and the worst of the gradients. Beside |A| = 0 its gradient turns with the rounding of A, so the
-    cotangent fades there."""
+    """Return the errors of |A|: value and the worst of the gradients.
+
+    Near |A| = 0 the direction of its gradient depends on the rounding of A, so the cotangent is small there.
+    """
     exact_inputs, inputs = _leaves(case, device)
     exact = magnitude(reference.field(*exact_inputs, case.grid, cutoff))
     fade = (exact / exact.mean().clamp_min(1e-300)).clamp(max=1).detach()
@@ -136,8 +138,11 @@ def _leaves(case: Case, device: str) -> tuple[Inputs, Inputs]:
 def _compare(
     exact: Tensor, drawn: Tensor, exact_inputs: Inputs, inputs: Inputs, fade: Tensor | float = 1.0
 ) -> tuple[float, float]:
-    """Largest value error as a share of sum |weight|, and the largest relative L2 error of the gradients by mean, Cholesky
-    factor and weight for a random cotangent; infinite where something is not finite."""
+    """Return the largest value error relative to sum |weight|, and the largest relative L2 error of the gradients.
+
+    Gradients are by mean, Cholesky factor and weight for a random cotangent. Errors are infinite for values that are not
+    finite.
+    """
     cotangent = fade * torch.randn(exact.shape, generator=torch.Generator().manual_seed(1)).double()
     wanted = torch.autograd.grad(exact, exact_inputs, cotangent)
     got = torch.autograd.grad(drawn, inputs, cotangent.to(drawn))

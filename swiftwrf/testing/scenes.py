@@ -21,8 +21,10 @@ def random_scene(
     dtype: torch.dtype = torch.float32,
     grid: AngularGrid = GRID,
 ) -> list[Tensor]:
-    """Mean, Cholesky factor and weight of random primitives from the width's floor to a radian, sheared, means beyond both
-    edges and turns away; they await gradients."""
+    """Return mean, Cholesky factor and weight of random sheared primitives, which require gradients.
+
+    Widths are from the smallest one to a radian. Some means lie beyond both edges or whole turns away.
+    """
     generator = torch.Generator().manual_seed(seed)
     mean = torch.rand(batch, n, 2, generator=generator) * torch.tensor([6 * math.pi, 2.2]) - torch.tensor(
         [2 * math.pi, 0.3]

@@ -1,7 +1,7 @@
-"""How far a fast backend may be from the definition in float64; the one table of it.
+"""Tolerances of the fast backends relative to the definition in float64.
 
-Values as a share of the sum of |weight|, gradients as relative L2, both times a case's `slack`. Float32 rounding sets the
-entries without a cutoff; for values the cutoff itself those with one.
+Values are relative to the sum of |weight|, gradients are relative L2, and both are multiplied by a case's `slack`. Without a
+cutoff, float32 rounding determines them. With one, the cutoff determines those of values.
 """
 
 VALUE_TOLERANCE = {None: 5e-6, 1e-4: 3e-4}

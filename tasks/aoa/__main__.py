@@ -1,4 +1,4 @@
-"""python -m tasks.aoa --mix 0.3"""
+"""Run `python -m tasks.aoa --mix 0.3`."""
 
 import sys
 

@@ -14,7 +14,7 @@ from swiftwrf.models import FIELD_MODELS, FieldModel, make_model
 from tasks.aoa.condition import EVERYTHING, LOCATOR, Condition, MeasuredSubset, estimators
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.options import RAYTRACE, AoaConfig
-from tasks.metrics import AdviceMetrics
+from tasks.metrics import CrossValidationMetrics
 from tasks.run import Preset
 
 ROOM_MODEL = "geometry"  # field model that finds the room for all models with one
@@ -61,10 +61,10 @@ class Experiment:
         has_room = FIELD_MODELS[name].room is not FieldModel.room
         return has_room and not (name == RAYTRACE and self.config.scene is not None)
 
-    def n_extra(self, advice: AdviceMetrics | None) -> int:
+    def n_extra(self, validation: CrossValidationMetrics | None) -> int:
         """Return the number of further synthetic positions of a field model that trains estimators."""
         # by default only where held-out measured spectra gain from further positions
-        wanted = self.config.extra is not None or bool(advice and advice["recommended_extra"])
+        wanted = self.config.extra is not None or bool(validation and validation["recommended_n_synthetic"])
         return self.n_synthetic if wanted else 0
 
     @cached_property

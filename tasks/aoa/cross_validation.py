@@ -21,16 +21,15 @@ from torch import Tensor
 from augment import Fold, Mixed, synthetic_positions
 from augment.choose import BLIND_FOLDS
 from swiftwrf import FitError, InputError
-from swiftwrf.gp import thinned
+from swiftwrf.gp import subsample
 from swiftwrf.locate import MatchedField, MatchedFieldConfig
 from swiftwrf.metrics import angle_errors
-from swiftwrf.runtime.threads import side_by_side
-from tasks.aoa.condition import LOCATOR
+from swiftwrf.runtime.threads import parallel_map
+from tasks.aoa.condition import LOCATOR, STAND_IN
 from tasks.aoa.estimators import make_estimator
-from tasks.metrics import AdviceMetrics, EstimatorChoiceMetrics
+from tasks.metrics import CrossValidationMetrics, EstimatorChoiceMetrics
 from tasks.summarise import paired_change
 
-STAND_IN = "kernel_regression"
 N_SYNTHETIC_CANDIDATES = (300, 1000, 3000)
 N_SYNTHETIC_COMPARED = 1000  # number of positions at which predicted means and samples are compared
 MAX_LOCATED = 60  # held-out spectra of a fold that are located
@@ -40,8 +39,8 @@ _PREDICTING = threading.Lock()  # folds are computed side by side, but parallel 
 
 
 @dataclass(frozen=True)
-class Advice:
-    """Result of `advise`.
+class CrossValidation:
+    """Result of `cross_validate`.
 
     Args:
         metrics: Values for metrics.json.
@@ -49,12 +48,12 @@ class Advice:
         turbo: The same with synthetic spectra, their number chosen on the other folds. Empty without further positions.
     """
 
-    metrics: AdviceMetrics
+    metrics: CrossValidationMetrics
     measured_only: list[Errors]
     turbo: list[Errors]
 
 
-def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> Advice:
+def cross_validate(folds: Sequence[Fold], n_synthetic: int, seed: int) -> CrossValidation:
     """Return the change of the error on held-out measured spectra by synthetic spectra of one field model.
 
     Args:
@@ -68,7 +67,7 @@ def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> Advice:
 
     @cache
     def fold_errors(number: int, sampled: bool) -> list[Errors]:
-        return side_by_side(lambda fold: _errors(fold, number, sampled, seed), folds)
+        return parallel_map(lambda fold: _errors(fold, number, sampled, seed), folds)
 
     def errors(some: Iterable[int], number: int, sampled: bool = False) -> Errors:
         return np.concatenate([fold_errors(number, sampled)[fold] for fold in some])
@@ -82,31 +81,31 @@ def advise(folds: Sequence[Fold], n_synthetic: int, seed: int) -> Advice:
 
     alone = fold_errors(0, False)
     measured_only = np.concatenate(alone)
-    advice: AdviceMetrics = {
+    validation: CrossValidationMetrics = {
         "stand_in": STAND_IN,
         "n_held_out": len(measured_only),
         "measured_only_deg": float(np.median(measured_only)),
         "gains": [],
         "rule": None,
         "sampled": False,
-        "recommended_extra": 0,
+        "recommended_n_synthetic": 0,
         "helps": False,
     }
     if not numbers:
-        return Advice(advice, alone, [])
+        return CrossValidation(validation, alone, [])
     best, sampled = chosen(every)
     for with_samples in (False, True) if folds[0].model.samples else (False,):
         for number in numbers if with_samples == sampled else [compared]:
             change = paired_change(measured_only, errors(every, number, with_samples))
-            advice["gains"].append({"extra": number, "sampled": with_samples, **change})
+            validation["gains"].append({"n_synthetic": number, "sampled": with_samples, **change})
     by_rule = [fold_errors(*chosen([other for other in every if other != fold]))[fold] for fold in every]
-    rule = advice["rule"] = paired_change(measured_only, np.concatenate(by_rule))
-    advice["sampled"] = sampled
+    rule = validation["rule"] = paired_change(measured_only, np.concatenate(by_rule))
+    validation["sampled"] = sampled
     # a gain at one number of positions alone is likely chance, because few spectra are held out
-    if all(gain["change"] < 0 for gain in advice["gains"] if gain["sampled"] == sampled):
-        advice["recommended_extra"] = best
-        advice["helps"] = rule["high"] < 0
-    return Advice(advice, alone, by_rule)
+    if all(gain["change"] < 0 for gain in validation["gains"] if gain["sampled"] == sampled):
+        validation["recommended_n_synthetic"] = best
+        validation["helps"] = rule["high"] < 0
+    return CrossValidation(validation, alone, by_rule)
 
 
 def located_folds(folds: Sequence[Fold]) -> dict[int, Fold]:
@@ -128,8 +127,8 @@ def choose_estimator(
         seed: Seed of the locators.
     """
     compared = {name: np.concatenate(parts) for name, parts in errors.items()}
-    rows = {number: thinned(torch.arange(len(fold.test)), rows=MAX_LOCATED)[0] for number, fold in folds.items()}
-    located = side_by_side(lambda number: _located_errors(folds[number], rows[number], seed), folds)
+    rows = {number: subsample(torch.arange(len(fold.test)), rows=MAX_LOCATED)[0] for number, fold in folds.items()}
+    located = parallel_map(lambda number: _located_errors(folds[number], rows[number], seed), folds)
     if located and all(found is not None for found in located):
         compared = {
             name: np.concatenate([parts[number][some.numpy()] for number, some in rows.items()])

@@ -18,9 +18,6 @@ from tasks.steps import Step
 if TYPE_CHECKING:
     from tasks.aoa.synthesis import Synthesis
 
-KIND = "synthetic spectra"
-BATCH_POSITIONS = 4096  # spectra predicted before they are rounded: half a gigabyte of 90 x 360 pixels
-
 
 @dataclass(frozen=True)
 class Evaluation(Step[Experiment]):
@@ -54,6 +51,10 @@ class Evaluation(Step[Experiment]):
     @property
     def priority(self) -> int:
         return int(self.condition.is_network)
+
+    @property
+    def is_optional(self) -> bool:
+        return self.condition.is_network
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         train = self._training_set(experiment, folder)

@@ -25,7 +25,7 @@ from tasks.page.records import Records
 from tasks.processes import number_of_processes
 from tasks.run import Run, choose_device
 from tasks.source import located, reading
-from tasks.steps import Step, computed
+from tasks.steps import Budget, Step, computed
 from tasks.terminal import console, terminal
 
 
@@ -64,8 +64,8 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
     ):
         results = Results(experiment, directory)
         with terminal.progress():
-            processes = number_of_processes(device)
-            for step, value in computed(directory, steps, experiment, cluster, processes, results.show):
+            processes, budget = number_of_processes(device), Budget(config.budget)
+            for step, value in computed(directory, steps, experiment, cluster, processes, results.show, budget):
                 results.add(step, value)
         results.write()
         metrics: AoaMetrics = {

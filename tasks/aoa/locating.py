@@ -83,7 +83,7 @@ class Locating(Step[Experiment]):
 
 
 def located(locator: MatchedField, test: Spectra) -> dict[str, Tensor]:
-    """Return what the posteriors of some test spectra say about position and direction.
+    """Return position and direction by the posteriors of test spectra.
 
     Returns:
         estimate: Azimuth and elevation (n, 2) [rad].

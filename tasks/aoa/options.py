@@ -62,6 +62,9 @@ class AoaConfig(SpectraSource, Output):
     """quick: sized for a CPU; paper: the paper's model, network and measured fractions, and a long training, for a GPU"""
     repeats: int = 1
     """runs with different measured spectra and networks, pooled"""
+    budget: float | None = None
+    """time of the run [s]: cheap estimators and the room come first, and networks whose training would not end in time are
+    left out"""
     scheduler: str | None = None
     """address of a Dask scheduler whose workers compute the steps of the run (extra: cluster)"""
     seed: int = 0
@@ -93,13 +96,15 @@ class AoaConfig(SpectraSource, Output):
         if not 0 <= self.suggest <= MAX_SUGGESTIONS:
             raise InputError(f"--suggest takes 0 to {MAX_SUGGESTIONS} positions, got {self.suggest}")
         if self.moving is not None and self.data is not None:
-            raise InputError("--moving is for the built-in room; with --data the data say which end moves")
+            raise InputError("--moving is for the built-in room; with --data the data determine which end moves")
         if not self.mix or not all(0 < fraction <= 1 for fraction in self.mix):
             raise InputError(f"--mix takes measured fractions in (0, 1], got {_listed(self.mix) or 'none'}")
         if len(set(self.mix)) < len(self.mix):
             raise InputError(f"--mix names a fraction twice: {_listed(self.mix)}")
         if given(self) and self.data is None:
-            raise InputError(f"--{given(self)[0]} says how --data is read; give it with --data")
+            raise InputError(f"--{given(self)[0]} is an option of the reader; give it with --data")
+        if self.budget is not None and not self.budget > 0:
+            raise InputError(f"--budget takes a time in seconds above 0, got {self.budget:g}")
         if self.repeats < 1:
             raise InputError(f"--repeats must be at least 1, got {self.repeats}")
         if self.seed + self.repeats > SEEDS:
@@ -143,7 +148,7 @@ def check_data(data: Spectra, config: AoaConfig) -> None:
     for name in config.synthesizer:
         missing = [] if name == AUTO else FIELD_MODELS[name].lacking(data)
         if missing:
-            hint = "give it with --array" if "array" in missing else "the data must say where it stands"
+            hint = "give it with --array" if "array" in missing else "the data must contain its position"
             raise InputError(f"synthesizer {name} needs the {missing[0]}, which {data.name} does not describe; {hint}")
 
 

@@ -89,7 +89,7 @@ class Results:
                 self._add_synthesis(step, value)
             case RoomSearch() if not value.get("planes"):
                 self._leave_out(step.located, value.get("refused", NO_PLANE))
-            case Locating() if "refused" in value:
+            case Evaluation() | Locating() if "refused" in value:
                 self._leave_out((step.condition,), value["refused"])
             case Evaluation() | Locating():
                 self.evaluated.append((step.condition, value))
@@ -106,7 +106,7 @@ class Results:
         name = f"{condition.estimator}, {condition.meaning}"
         if condition.training != "all" and len(self.experiment.config.mix) > 1:
             name = f"{condition.measured_fraction:.0%}: {name}"
-        terminal.result(name, f"{float(error.nanmedian().rad2deg()):.2f} deg")
+        terminal.result(name, f"{float(error.nanquantile(0.5).rad2deg()):.2f} deg")
 
     @property
     def pooled(self) -> list[tuple[Condition, Row]]:
@@ -232,7 +232,7 @@ class Results:
             "n_measured": round(fraction * len(self.experiment.train)),
             "counts": {condition.training_set: value["counts"] for condition, value in evaluated},
             "choice": chosen.get("choice"),
-            "advice": chosen.get("advice"),
+            "cross_validation": chosen.get("cross_validation"),
             "estimator_choice": self.estimator_choice.get(fraction_key(fraction)),
             "synthesis": _synthesis_metrics(synthesis, fits),
             "methods": methods,
@@ -294,7 +294,9 @@ def _changes(
     """Return the changes of the angular error by synthetic spectra of each method, by the method that it is compared to."""
     error = errors.groupby(["method", "index"])["great_circle_deg"].mean()  # repeats of a position are not independent
     compared = {
-        method: dict.fromkeys((condition.measured_only.method, reference)) if condition.is_turbo else ()
+        method: [other for other in dict.fromkeys((condition.measured_only.method, reference)) if other in conditions]
+        if condition.is_turbo
+        else []
         for method, condition in conditions.items()
     }
     return {

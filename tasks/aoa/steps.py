@@ -12,20 +12,17 @@ import torch
 from augment import Fold, choose_model
 from swiftwrf import GeometryModel, InputError, Spectra, load
 from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.condition import EVERYTHING, Condition, MeasuredSubset, Training, estimators, trainable
+from tasks.aoa.condition import EVERYTHING, STAND_IN, Condition, MeasuredSubset, Training, estimators, trainable
 from tasks.aoa.context import ROOM_MODEL, Experiment
-from tasks.aoa.cross_validation import STAND_IN, advise, choose_estimator, located_folds
+from tasks.aoa.cross_validation import choose_estimator, cross_validate, located_folds
 from tasks.aoa.evaluation import Evaluation
 from tasks.aoa.options import AUTO
 from tasks.aoa.synthesis import RoomSearch, syntheses
 from tasks.claim import STEPS
-from tasks.metrics import AdviceMetrics
+from tasks.metrics import CrossValidationMetrics
 from tasks.records import read_json
 from tasks.run import Row
 from tasks.steps import Step
-
-KIND = "synthetic spectra"
-BATCH_POSITIONS = 4096  # spectra predicted before they are rounded: half a gigabyte of 90 x 360 pixels
 
 
 def first_steps(experiment: Experiment, subset: MeasuredSubset) -> list[Step[Experiment]]:
@@ -82,17 +79,17 @@ class CrossValidation(Step[Experiment]):
             if not self.compared:
                 raise
             # field models asked for by name need no comparison
-            return {"choice": None, "advice": {}}
+            return {"choice": None, "cross_validation": {}}
         trained = [name for name in self.compared if name in choice.folds] or [choice.name]
-        advice = {name: advise(choice.folds[name], experiment.n_synthetic, seed) for name in trained}
-        first = advice[trained[0]]
+        validation = {name: cross_validate(choice.folds[name], experiment.n_synthetic, seed) for name in trained}
+        first = validation[trained[0]]
         turbo = self._turbo(experiment, trained[0], first.metrics)
         errors = {Condition(STAND_IN, "measured").method: first.measured_only}
         errors |= {turbo.method: first.turbo} if first.turbo else {}
         with_room = next((found for found in choice.folds.values() if found[0].model.room is not None), [])
         return {
             "choice": {"name": choice.name, "psnr_db": choice.psnr_db, "seconds": choice.seconds},
-            "advice": {name: entry.metrics for name, entry in advice.items()},
+            "cross_validation": {name: entry.metrics for name, entry in validation.items()},
             "errors": errors,
             "folds": {number: self._keep(fold, number, folder) for number, fold in located_folds(with_room).items()},
         }
@@ -104,14 +101,14 @@ class CrossValidation(Step[Experiment]):
         fold.model.room.save(folder / file)
         return {"file": file, "train": fold.train.index, "test": fold.test.index}
 
-    def _turbo(self, experiment: Experiment, synthesizer: str, advice: AdviceMetrics) -> Condition:
+    def _turbo(self, experiment: Experiment, synthesizer: str, validation: CrossValidationMetrics) -> Condition:
         """Return the condition of the stand-in with all spectra of a field model."""
-        number = experiment.n_extra(advice)
+        number = experiment.n_extra(validation)
         return Condition(STAND_IN, "turbo_extra" if number else "turbo", synthesizer, number)
 
     def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
         named = [name for name in experiment.config.synthesizer if name != AUTO]
-        followed = syntheses(experiment, self.subset, named or [value["choice"]["name"]], value["advice"])
+        followed = syntheses(experiment, self.subset, named or [value["choice"]["name"]], value["cross_validation"])
         if value["choice"] is None:
             return followed
         return [*followed, EstimatorChoice(self, tuple(entry["file"] for entry in value["folds"].values()))]

@@ -22,7 +22,7 @@ from tasks.aoa.context import ROOM_MODEL, Experiment
 from tasks.aoa.evaluation import Evaluation
 from tasks.aoa.locating import Locating
 from tasks.claim import STEPS
-from tasks.metrics import AdviceMetrics
+from tasks.metrics import CrossValidationMetrics
 from tasks.run import Row
 from tasks.steps import Step
 
@@ -31,13 +31,16 @@ BATCH_POSITIONS = 4096  # spectra predicted before they are rounded: half a giga
 
 
 def syntheses(
-    experiment: Experiment, subset: MeasuredSubset, names: Sequence[str], advice: Mapping[str, AdviceMetrics]
+    experiment: Experiment,
+    subset: MeasuredSubset,
+    names: Sequence[str],
+    validation: Mapping[str, CrossValidationMetrics],
 ) -> list[Step[Experiment]]:
     """Return the syntheses whose spectra are trained on, and those for comparison; models with a room follow its search."""
     direct: list[Step[Experiment]] = []
     with_room: list[Synthesis] = []
     for name in dict.fromkeys((*names, *experiment.candidates)):
-        trains, own = name in names, advice.get(name)
+        trains, own = name in names, validation.get(name)
         n_synthetic = experiment.n_extra(own) if trains else 0
         synthesis = Synthesis(subset, name, trains, n_synthetic, bool(own and own["sampled"]))
         (with_room if experiment.finds_room(name) else direct).append(synthesis)

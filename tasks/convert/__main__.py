@@ -1,4 +1,4 @@
-"""python -m tasks.convert SOURCE OUT"""
+"""Run `python -m tasks.convert SOURCE OUT`."""
 
 import sys
 

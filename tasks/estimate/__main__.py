@@ -1,4 +1,4 @@
-"""python -m tasks.estimate ESTIMATOR SOURCE"""
+"""Run `python -m tasks.estimate ESTIMATOR SOURCE`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""python -m tasks.inspect SOURCE"""
+"""Run `python -m tasks.inspect SOURCE`."""
 
 import sys
 

@@ -11,7 +11,7 @@ from tasks.options import Output, SpectraSource, TableSource, command_options
 
 @command_options
 class InspectConfig(SpectraSource, TableSource, Output):
-    """What measurements of any known format hold: counts, extents, neighbours, frames, calibration, suspicious columns.
+    """Inspect measurements of any known format: counts, extents, neighbours, frames, calibration, suspicious columns.
 
     Example: python -m tasks.inspect DIR
     """

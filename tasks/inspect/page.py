@@ -22,8 +22,8 @@ from tasks.summarise import fingerprinting
 
 AXES = {"x": "#cf4a4a", "y": "#2a9165", "normal": "#3a7fd5"}
 DOTS, NONE = "#3a7fd5", "#7f8794"  # with line of sight, without
-MOST_DOTS = 2000
-MOST_RECEIVERS = 30  # in a figure
+MAX_DOTS = 2000
+MAX_RECEIVERS = 30  # in a figure
 PLAN = (
     "From above and from the side: positions with (blue) and without line of sight (grey); arrows: the array's axes x "
     "(red), y (green) and its normal (blue)."
@@ -49,20 +49,20 @@ def page(data: Spectra | Rssi, kind: str, findings: Findings, source: str) -> Pa
     ]
     task = "rssi --rx all" if isinstance(data, Rssi) else "aoa --mix 0.3"
     source = shlex.quote(source)
-    mend = [f"Fix what the warnings say, and inspect again: `python -m tasks.inspect {source}`."] if warnings else []
+    mend = [f"Correct the warnings and inspect again: `python -m tasks.inspect {source}`."] if warnings else []
     steps = [*mend, f"Go on with `python -m tasks.{task} --data {source}`."]
     meaning = warnings or ["Nothing looks wrong. Errors that the files alone do not reveal remain possible."]
-    verdict = _fingerprinting(data) if isinstance(data, Spectra) else ""
+    conclusion = _fingerprinting(data) if isinstance(data, Spectra) else ""
     return Page(
         f"Inspection: {data.name}",
-        Summary(numbers, [plan], meaning, steps, verdict),
+        Summary(numbers, [plan], meaning, steps, conclusion),
         [Section("Findings", tables=[table]), Section("Figures", plots=plots)],
     )
 
 
 def _fingerprinting(data: Spectra) -> str:
     """Return the warning of `fingerprinting`, from the spread of the lines of sight and the errors of the peaks."""
-    rows = data.line_of_sight.nonzero()[:MOST_DOTS, 0]
+    rows = data.line_of_sight.nonzero()[:MAX_DOTS, 0]
     if not len(rows):
         return ""
     line, peak = (to_direction(*angles.unbind(-1)) for angles in (data.label[rows], data.peak_direction(rows)))
@@ -125,7 +125,7 @@ def _draw_axes(ax: Axes, data: Spectra, a: int, b: int) -> None:
 
 
 def _directions(data: Spectra) -> Plot:
-    rows = data.line_of_sight.nonzero()[:MOST_DOTS, 0]
+    rows = data.line_of_sight.nonzero()[:MAX_DOTS, 0]
     peak = to_direction(*data.peak_direction(rows).unbind(-1))
     line = to_direction(*data.label[rows].unbind(-1))
     panels = []
@@ -178,7 +178,7 @@ def _floor(data: Rssi) -> Plot:
 def _against_distance(data: Rssi) -> Plot:
     figure, ax = figures.panel(6, 3.6)
     apart = distance(data.transmitter_position, data.receiver_position)
-    for c, name in enumerate(data.receiver_names[:MOST_RECEIVERS]):
+    for c, name in enumerate(data.receiver_names[:MAX_RECEIVERS]):
         ax.plot(apart[:, c], data.rssi_dbm[:, c], ".", markersize=2, label=figures.short(name))
     ax.set(xlabel="distance from the receiver [m]", ylabel="RSSI [dBm]", xscale="log")
     row, column = (~data.rssi_dbm.isnan()).nonzero(as_tuple=True)
@@ -189,16 +189,16 @@ def _against_distance(data: Rssi) -> Plot:
             "rssi_dbm": data.rssi_dbm[row, column].numpy(),
         }
     )
-    return Plot("law", [figure], "RSSI against the distance from the receiver.", table)
+    return Plot("path-loss", [figure], "RSSI against the distance from the receiver.", table)
 
 
 def _heard(data: Rssi) -> Plot:
     share = (~data.rssi_dbm.isnan()).double().mean(dim=0)
-    order = share.argsort(descending=True)[:MOST_RECEIVERS].tolist()
+    order = share.argsort(descending=True)[:MAX_RECEIVERS].tolist()
     names = [figures.short(data.receiver_names[i]) for i in order]
     figure, ax = figures.panel(max(4.0, 0.3 * len(order) + 2), 3)
     ax.bar(np.arange(len(order)), share[order].numpy(), color=DOTS)
     ax.set(xticks=range(len(order)), xticklabels=names, ylabel="share detected", ylim=(0, 1))
     ax.tick_params(axis="x", labelrotation=60)
     table = DataFrame({"receiver": data.receiver_names, "share_heard": share.numpy()})
-    return Plot("heard", [figure], "Share of the rows in which each receiver detected the transmitter.", table)
+    return Plot("detected", [figure], "Fraction of the rows in which each receiver detected the transmitter.", table)

@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.transforms import Bbox
 from numpy.typing import ArrayLike
 from pandas import DataFrame
@@ -24,7 +23,7 @@ from tasks.summarise import pareto
 RULE, LINES, PAPER = "#7f8794", "#e4e8ef", "#fffffe"  # marks of reference, grid, background
 THEMED = {"#000000": "currentColor", LINES: "var(--lines)", PAPER: "var(--paper)"}  # colours that follow the page's
 MARKERS = "osD^"  # of the series of a dot plot
-LONGEST = 100  # characters of a line of text
+MAX_LINE_LENGTH = 100  # characters of a line of text
 NAME = 24  # characters of a name among others
 LABEL = 7  # size of a point's name [pt]
 BESIDE = (((5, 3), "left"), ((5, -9), "left"), ((-5, 3), "right"), ((-5, -9), "right"))  # where it may stand [pt]
@@ -73,7 +72,7 @@ def colour_bar(axes: Axes, drawn: Any, label: str = "", extend: str = "neither",
         figure.colorbar(drawn, ax=axes, label=label, fraction=0.045, pad=pad, extend=extend)
 
 
-def plain(text: str, most: int = LONGEST) -> str:
+def plain(text: str, most: int = MAX_LINE_LENGTH) -> str:
     """Text of a figure: dollars in it begin no formula, and a line of it leaves room for the figure."""
     lines = (line if len(line) <= most else f"{line[: most - 1]}…" for line in text.split("\n"))
     return "\n".join(lines).replace("$", r"\$")
@@ -92,12 +91,15 @@ def as_svg(figure: Figure, title: str | None = None) -> str:
         if (engine := figure.get_layout_engine()) is not None:  # savefig would draw the figure twice to place its parts
             engine.execute(figure)
             figure.set_layout_engine("none")
-        canvas.print_figure(stream, format="svg", metadata={"Date": None, "Creator": None, "Title": title})
+        metadata: dict[str, str | None] = {"Date": None, "Creator": None}
+        if title is not None:
+            metadata["Title"] = title
+        canvas.print_figure(stream, format="svg", metadata=metadata)
     return stream.getvalue()
 
 
 def for_page(svg: str, name: str) -> str:
-    """The same drawing as an element of a page: in the page's colours, light or dark, its identifiers its own."""
+    """Return the SVG as an element of a page, in the page's colours (light or dark), with unique identifiers."""
     element = svg[svg.index("<svg") :]
     for colour, themed in THEMED.items():
         element = element.replace(colour, themed)
@@ -111,14 +113,8 @@ def legend_below(figure: Figure, axes: Axes) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=_columns(figure, labels), frameon=False)
 
 
-def legend_of(figure: Figure, palette: Palette, names: Sequence[str]) -> None:
-    """A legend of dots in the colours of methods."""
-    dots = [Line2D([], [], marker="o", linestyle="", color=palette.colour(name), label=name) for name in names]
-    figure.legend(handles=dots, loc="outside lower center", ncols=_columns(figure, names), frameon=False)
-
-
 def _columns(figure: Figure, labels: Sequence[str]) -> int:
-    """Of a legend that is no wider than its figure: a line, and 0.08 inches a letter."""
+    """Return the number of columns of a legend no wider than its figure: a line, and 0.08 inches a letter."""
     widest = max((len(label) for label in labels), default=0)
     return max(1, int(figure.get_figwidth() / (0.6 + 0.08 * widest)))
 
@@ -241,8 +237,10 @@ def speed(
     y: str,
     also: Sequence[str] = (),
 ) -> None:
-    """Cost against error, both logarithmic: the Pareto front is drawn, its members and those in `also` are named. Names
-    are coloured as methods by what stands before their first comma."""
+    """Draw cost against error, both logarithmic, with the Pareto front and the names of its members and of `also`.
+
+    The part of a name before its first comma determines its colour.
+    """
     front = pareto(points)
     axes.plot(*zip(*(points[name] for name in front), strict=True), color=RULE, linewidth=1, zorder=1)
     for name, (cost, error) in points.items():

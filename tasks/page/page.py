@@ -45,7 +45,7 @@ class Table:
 
     @property
     def wide(self) -> bool:
-        """Whether it needs the whole width of the page."""
+        """True if it needs the whole width of the page."""
         cells = [self.columns, *self.rows]
         return self.long or sum(max(map(len, column)) + 3 for column in zip(*cells, strict=True)) > HALF
 
@@ -73,7 +73,7 @@ class Plot:
 
     @property
     def wide(self) -> bool:
-        """Whether it needs the whole width of the page."""
+        """True if it needs the whole width of the page."""
         return sum(self.widths) > WIDE
 
     @property
@@ -113,14 +113,17 @@ class Number:
 
 @dataclass(frozen=True)
 class Summary:
-    """The first screen: numbers, figures, the verdict in one sentence, its meaning, next steps, a table of runs, and
-    notes on the data."""
+    """First screen of a page.
+
+    It contains numbers, figures, the conclusion in one sentence, its meaning, next steps, a table of runs, and notes on the
+    data.
+    """
 
     numbers: list[Number]
     plots: list[Plot]
     meaning: list[str]
     next_steps: list[str]
-    verdict: str = ""
+    conclusion: str = ""
     table: Table | None = None
     notes: list[str] = field(default_factory=list)
 

@@ -1,4 +1,4 @@
-"""Colours of methods, the same in all figures, and the line styles that tell curves of one panel apart."""
+"""Colours of methods, equal in all figures, and line styles that distinguish the curves of a panel."""
 
 from __future__ import annotations
 

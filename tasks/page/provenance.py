@@ -1,4 +1,4 @@
-"""What every report says of where its numbers come from."""
+"""Provenance of the numbers of a report."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tasks.page.records import Records
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """The value with so many digits, or a dash where there is none."""
+    """Return the value with `digits` decimal places, or a dash for None."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 

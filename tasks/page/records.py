@@ -1,4 +1,4 @@
-"""What a run has left on disk, read back for its report."""
+"""Files of a run, opened for its report."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ class Records(Generic[Metrics]):
     """The files of one run.
 
     Args:
-        folder: its directory.
-        metrics: the content of metrics.json, read from the directory unless given.
-        number: of the run in a report over several, counted from 1; 0 where it is alone.
+        folder: Directory of the run.
+        metrics: Content of metrics.json. Defaults to the file in the directory.
+        number: Number of the run in a report over several runs, from 1. 0 for a report over one run.
 
     Raises:
-        InputError: not the directory of a finished run.
+        InputError: The directory contains no finished run.
     """
 
     def __init__(self, folder: Path, metrics: dict[str, Any] | None = None, number: int = 0) -> None:
@@ -48,7 +48,7 @@ class Records(Generic[Metrics]):
 
     @property
     def label(self) -> str:
-        """What tells the run from the others of a report, to be put behind a title; nothing where it is alone."""
+        """Suffix of titles that distinguishes the run in a report over several runs, empty for one run."""
         return f", run {self.number}" if self.number else ""
 
     @property
@@ -64,7 +64,7 @@ class Records(Generic[Metrics]):
 
     @property
     def file_name(self) -> str:
-        """What the figures of the run are called after: no figure of one run takes the place of another's."""
+        """Prefix of the names of the run's figures, unique within a report."""
         names = [re.sub(r"[^\w.=-]+", "_", self.metrics[key], flags=re.ASCII)[:40] for key in ("data", "split")]
         return "-".join([*names, f"s{self.metrics['seed']}", *([f"run{self.number}"] if self.number else [])])
 
@@ -75,7 +75,7 @@ class Records(Generic[Metrics]):
 
     @cached_property
     def environment(self) -> dict[str, Any]:
-        """Where it ran."""
+        """Environment of the run: machine, versions, commit."""
         return read_json(self.folder / "environment.json")
 
     def table(self, name: str) -> DataFrame:
@@ -85,7 +85,7 @@ class Records(Generic[Metrics]):
         return self._tables[name]
 
     def holds(self, name: str) -> bool:
-        """Whether the run left arrays of that name."""
+        """Return True if the run saved arrays of that name."""
         return (self.folder / f"{name}.npz").is_file()
 
     def arrays(self, name: str) -> dict[str, NDArray[Any]]:

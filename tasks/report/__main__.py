@@ -1,4 +1,4 @@
-"""python -m tasks.report RUN [RUN ...]"""
+"""Run `python -m tasks.report RUN [RUN ...]`."""
 
 import sys
 

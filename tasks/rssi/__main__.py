@@ -1,4 +1,4 @@
-"""python -m tasks.rssi --rx 6"""
+"""Run `python -m tasks.rssi --rx 6`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""python -m tasks.scenes --room NAME --moving END --positions N --out DIR"""
+"""Run `python -m tasks.scenes --room NAME --moving END --positions N --out DIR`."""
 
 import sys
 

@@ -73,5 +73,5 @@ class ScenesConfig(Output):
                 raise InputError(f"--{name} is for the rooms ({', '.join(ROOMS)}); {self.room} names its own materials")
         if self.fixed is None or self.region is None:
             raise InputError(
-                f"{self.room} does not say where the ends are; give --fixed X Y Z and --region X Y Z X Y Z"
+                f"{self.room} does not contain the positions of the ends; give --fixed X Y Z and --region X Y Z X Y Z"
             )

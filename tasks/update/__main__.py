@@ -1,4 +1,4 @@
-"""python -m tasks.update MODEL SOURCE --out NEW"""
+"""Run `python -m tasks.update MODEL SOURCE --out NEW`."""
 
 import sys
 

@@ -5,17 +5,20 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from swiftwrf import FieldModel, InputError, Rssi, Spectra
+from swiftwrf.data.survey import SurveyOptions, frame_of, read_survey
 from swiftwrf.online import Step
 from swiftwrf.online.prequential import LEVEL
 from swiftwrf.rssi import RssiModel
 from tasks.records import strict
+from tasks.update.options import UpdateConfig
 
 POLL_S = 0.2  # between two looks at a file that grows
 
@@ -34,6 +37,40 @@ def lines(source: str) -> Iterator[str]:
                 part = ""
             else:
                 time.sleep(POLL_S)
+
+
+def measurements(config: UpdateConfig, model: FieldModel | RssiModel) -> Iterator[Callable[..., Rssi | Spectra]]:
+    """Yield a reader of each measurement of a followed source, a function of its number and the model.
+
+    Raises:
+        InputError: A table, but a model that predicts no RSSI.
+    """
+    found = (line for line in lines(config.source) if line.strip())
+    if Path(config.source).suffix.lower() != ".csv":
+        yield from (partial(measurement, line) for line in found)
+        return
+    if not isinstance(model, RssiModel):
+        raise InputError(f"{config.source} is a table, but the model predicts spectra; give JSON lines")
+    header, stated = next(found, ""), SurveyOptions(config.column_names, config.fillers, config.coordinates)
+    yield from (partial(table_row, header, line, stated) for line in found)
+
+
+def table_row(header: str, line: str, options: SurveyOptions, number: int, model: RssiModel) -> Rssi:
+    """Return the measurement in a row of a survey table; receivers that the model does not have are left out.
+
+    Raises:
+        InputError: A row without position, or without RSSI at a receiver of the model.
+    """
+    label = f"row {number}"
+    survey = read_survey(label, frame_of(label, header + line), options)
+    rssi = zip(survey.receiver_names, survey.rssi_dbm[0].tolist(), strict=True)
+    value = {name: x for name, x in rssi if name in model.receiver_names}
+    if not value:
+        raise InputError(f"{label}: no receiver of the model detected the transmitter")
+    data = Rssi(
+        torch.tensor([list(value.values())]), survey.position, receiver_names=tuple(value), origin=survey.origin
+    )
+    return _rssi(data.about(model.origin).transmitter_position.tolist(), value, model)
 
 
 def measurement(line: str, number: int, model: FieldModel | RssiModel) -> Rssi | Spectra:

@@ -10,7 +10,8 @@ import tyro
 from swiftwrf.errors import InputError
 from tasks.options import Output, SpectraSource, TableSource, command_options
 
-FOLLOWED = (".ndjson", ".jsonl")
+JSON_LINES = (".ndjson", ".jsonl")
+FOLLOWED = (*JSON_LINES, ".csv")
 
 
 @command_options
@@ -18,7 +19,8 @@ class UpdateConfig(SpectraSource, TableSource, Output):
     """Update a fitted model with new measurements. Each is predicted before the model learns it, and tested for a change.
 
     With --follow the measurements come one by one, a JSON object a line: {"position": [x, y, z], "rssi_dbm": {"NAME": -60}}
-    or {"position": [x, y, z], "spectrum": [[...], ...]}. The model in --out is replaced after each line.
+    or {"position": [x, y, z], "spectrum": [[...], ...]}; or rows of RSSI in a CSV table, which has a column a receiver. The
+    model in --out is replaced after each line.
 
     Example: python -m tasks.update model.safetensors DIR --out updated
     """
@@ -26,8 +28,8 @@ class UpdateConfig(SpectraSource, TableSource, Output):
     model: Annotated[str, tyro.conf.Positional]
     """file of a fitted model of spectra or RSSI"""
     source: Annotated[str, tyro.conf.Positional]
-    """measurements of any known format in the order in which they were taken; with --follow a .ndjson file that grows, or -
-    for standard input"""
+    """measurements of any known format in the order in which they were taken; with --follow a .ndjson or .csv file
+    that grows, or - for standard input"""
     out: str
     """directory to write; must not exist. With --follow, one that exists is continued"""
     data: str | None = None

@@ -11,20 +11,22 @@ import torch
 from swiftwrf import FieldModel, InputError, Rssi, Spectra, load
 from swiftwrf.data import ReadOptions, Snapshots
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
-from swiftwrf.online import Follower, MonitorConfig, ObstacleMonitor
+from swiftwrf.online import Follower, MonitorConfig
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime import checkpoint
+from tasks.claim import CONFIG, MODEL, Claim
 from tasks.directory import new_directory
+from tasks.environment import invocation
 from tasks.locate.observations import aligned
+from tasks.options import plain
 from tasks.page.page import write_page
-from tasks.records import write_json, write_table
+from tasks.records import write_json
 from tasks.source import reading
 from tasks.terminal import console, terminal
-from tasks.update.lines import answer, lines, measurement
+from tasks.update.lines import answer, measurements
 from tasks.update.options import UpdateConfig
-from tasks.update.page import Followed, page
-
-MODEL = "model.safetensors"
+from tasks.update.page import page
+from tasks.update.record import Record, resumed
 
 
 def run(config: UpdateConfig) -> None:
@@ -41,52 +43,62 @@ def run(config: UpdateConfig) -> None:
         options = reading(config)
         new, train = _read(config.source, options, model), _training(config, options, model)
         follower = Follower(model, train, MonitorConfig(false_alarm_rate=config.false_alarm_rate))
-        followed = Followed(config.source, new, [follower.step(new.subset(torch.tensor([i]))) for i in range(len(new))])
-        room = model.room if isinstance(model, FieldModel) else None
-        obstacles = None
-        if room is not None and isinstance(new, Spectra) and isinstance(train, Spectra):
-            obstacles = ObstacleMonitor(room, train, config.false_alarm_rate)
-            obstacles.observe(new)
-        _save(follower, folder / MODEL)
-        write_table(folder / "measurements.csv", followed.rows())
-        write_json(folder / "update.json", followed.summary(obstacles))
-        write_page(folder, page(followed, obstacles))
-    terminal.page(
-        followed.summary(obstacles), "\n".join(followed.sentences(obstacles)), Path(config.out) / "report.html"
-    )
+        record = Record(config.source, _unit(model))
+        for i, index in enumerate(new.index.tolist()):
+            record.add(index, follower.step(new.subset(torch.tensor([i]))), follower.obstacles)
+        _save(follower, folder / MODEL, {})
+        record.write(folder)
+        _write_config(config, folder)
+        write_page(folder, page(record, new.name))
+    terminal.page(record.summary(), "\n".join(record.sentences()), Path(config.out) / "report.html")
 
 
 def follow(config: UpdateConfig) -> None:
-    """Print the answer to each line, then replace the model; a line whose answer was lost with a kill is answered again."""
+    """Print the answer to each line, then record it and replace the model; a line lost with a kill is answered again."""
     folder = Path(config.out)
     folder.mkdir(parents=True, exist_ok=True)
+    claim = Claim(folder, new=False)
     file = folder / MODEL
     model = _model(str(file) if file.exists() else config.model)
     train = None if file.exists() else _training(config, reading(config), model)
     follower = Follower(model, train, MonitorConfig(false_alarm_rate=config.false_alarm_rate))
+    source, skipped = "" if config.source == "-" else str(Path(config.source).resolve()), 0
+    record = Record(config.source, _unit(model))
     if file.exists():
         _, _, header = checkpoint.read(file, model.kind)
         with checkpoint.refusing(f"{file} is no model that a followed source continues"):
             follower.resume(json.loads(header["provenance"]["followed"]))
-    skipped = follower.count if config.source != "-" else 0
-    for number, line in enumerate(lines(config.source), start=1):
-        if number <= skipped:
-            continue
-        try:
-            new = measurement(line, number, follower.model)
-        except InputError as error:  # one bad line does not end a run of days
-            console.print(f"error: {error}", markup=False)
-            if config.source != "-":
-                raise
+            record = resumed(folder, follower.count) or record
+            skipped = int(header["provenance"].get("lines", 0)) * (source == header["provenance"].get("source"))
+    record.write(folder)
+    _write_config(config, folder)
+    for number, parse in enumerate(measurements(config, model), start=1):
+        if source and number <= skipped:
             continue
         before = follower.model
-        step = follower.step(new)
+        try:
+            new = parse(number, before)
+            step = follower.step(new)
+        except InputError as error:  # one bad line does not end a run of days
+            console.print(f"error: {error}", markup=False)
+            continue
         print(answer(follower.count, new, before, step), flush=True)
-        _save(follower, file)
+        record.append(folder, record.add(follower.count - 1, step, follower.obstacles))
+        _save(follower, file, {"source": source, "lines": str(number)})
+    claim.release()
 
 
-def _save(follower: Follower, file: Path) -> None:
-    follower.model.save(file, {"followed": json.dumps(follower.state())})
+def _save(follower: Follower, file: Path, read: dict[str, str]) -> None:
+    follower.model.save(file, {"followed": json.dumps(follower.state()), **read})
+
+
+def _write_config(config: UpdateConfig, folder: Path) -> None:
+    write_json(folder / CONFIG, {"task": "update", "command": invocation("update"), "config": plain(config)})
+
+
+def _unit(model: FieldModel | RssiModel) -> str:
+    """Return the unit of the errors of a model, in brackets."""
+    return " [dB]" if isinstance(model, RssiModel) else ""
 
 
 def _model(path: str) -> FieldModel | RssiModel:

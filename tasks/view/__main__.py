@@ -1,4 +1,4 @@
-"""python -m tasks.view RUN_OR_MODEL"""
+"""Run `python -m tasks.view RUN_OR_MODEL`."""
 
 import sys
 

@@ -22,7 +22,8 @@ class ViewConfig(Options):
     """
 
     source: Annotated[str, tyro.conf.Positional]
-    """directory of a run of tasks.aoa, tasks.rssi or tasks.locate, or a saved model"""
+    """directory of a run of tasks.aoa, tasks.rssi, tasks.locate or tasks.update, or a saved model; an update that is being
+    followed is shown as it grows"""
     port: int = 8080
     """port of the page; 0 takes any free port"""
     host: str = "127.0.0.1"

@@ -29,6 +29,9 @@ STYLE = """
 .quiet { opacity: 0.8; font-size: 0.85rem; overflow-wrap: anywhere; }
 .extrapolated img { filter: grayscale(0.9); opacity: 0.6; }
 .nicegui-content, .nicegui-content > * { min-width: 0; max-width: 100%; }
+:root { --lines: #e4e8ef; --paper: #ffffff; }
+.body--dark { --lines: #2b3340; --paper: #121212; }
+.figure svg { width: 100%; height: auto; }
 @media (max-width: 700px) { .nicegui-content { padding: 8px 10px; } }
 """
 

@@ -248,7 +248,7 @@ class RssiView:
 
     @cached_property
     def inside(self) -> NDArray[np.bool_]:
-        """Whether each cell lies inside the measured positions, in plan (rows, columns)."""
+        """True for each cell inside the measured positions, in plan (rows, columns)."""
         return maps.inside(np.stack(np.meshgrid(*self.cells), axis=-1), self.floor.position)
 
     def sentence(self, selection: MapSelection) -> str:
@@ -358,7 +358,7 @@ class RssiView:
         ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", xlim=corners[:2], ylim=corners[2:])
         ax.grid(visible=False)
         height_m = "" if selection.kind in LOCATING else f" Height {selection.height:.2f} m."
-        title = textwrap.fill(f"{self.sentence(selection)}{height_m}", figures.LONGEST)
+        title = textwrap.fill(f"{self.sentence(selection)}{height_m}", figures.MAX_LINE_LENGTH)
         ax.set_title(figures.plain(title), fontsize=8)
         if coloured.label:
             figure.colorbar(drawn, ax=ax, label=coloured.label, fraction=0.04, pad=0.02)

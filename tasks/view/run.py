@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from swiftwrf import InputError
+from tasks.view.followed import FollowedView
 from tasks.view.options import ViewConfig
+from tasks.view.rssi import RssiView
 from tasks.view.sources import open_source
 from tasks.view.spectra import SpectraView
 
@@ -17,6 +20,7 @@ def run(config: ViewConfig) -> None:
         InputError: The source holds no model, the port is in use, or the optional extra is not installed.
     """
     try:
+        from tasks.view.followed_page import FollowedPage
         from tasks.view.page import free_port, serve
         from tasks.view.rssi_page import RssiPage
         from tasks.view.spectra_page import SpectraPage
@@ -26,5 +30,5 @@ def run(config: ViewConfig) -> None:
         raise InputError("tasks.view needs the optional extra: pip install 'swiftwrf-tasks[view]'") from None
     port = free_port(config.host, config.port)
     view = open_source(Path(config.source))
-    build = (lambda: SpectraPage(view)) if isinstance(view, SpectraView) else (lambda: RssiPage(view))
-    serve(view.title, build, config.host, port, config.open)
+    page: Any = {SpectraView: SpectraPage, RssiView: RssiPage, FollowedView: FollowedPage}[type(view)]
+    serve(view.title, lambda: page(view), config.host, port, config.open)

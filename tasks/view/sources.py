@@ -21,14 +21,18 @@ from tasks.command_line import configured
 from tasks.locate.experiment import measurements as rssi_of
 from tasks.locate.options import LocateConfig
 from tasks.records import Row, read_json
+from tasks.view.followed import FollowedView, open_followed
 from tasks.view.locating import RssiLocating, SpectrumLocating
 from tasks.view.rssi import MeasuredFloor, RssiView
 from tasks.view.spectra import LoadedModel, SpectraView
 
-EXPECTED = "give the directory of a run of tasks.aoa, tasks.rssi or tasks.locate, or a saved model of spectra or RSSI"
+EXPECTED = (
+    "give the directory of a run of tasks.aoa, tasks.rssi, tasks.locate or tasks.update, or a saved model of spectra or "
+    "RSSI"
+)
 
 
-def open_source(source: Path) -> SpectraView | RssiView:
+def open_source(source: Path) -> SpectraView | RssiView | FollowedView:
     """Open the directory of a run or the file of a saved model.
 
     Raises:
@@ -41,7 +45,7 @@ def open_source(source: Path) -> SpectraView | RssiView:
     if is_file:
         return _saved_model(source)
     if not is_folder:
-        raise InputError(f"{source} is not there; {EXPECTED}")
+        raise InputError(f"{source} does not exist; {EXPECTED}")
     if not (source / CONFIG).is_file():
         raise InputError(f"{source} is no run: it has no {CONFIG}; {EXPECTED}")
     content = read_json(source / CONFIG)
@@ -52,6 +56,8 @@ def open_source(source: Path) -> SpectraView | RssiView:
             return _rssi_run(source)
         case "locate":
             return _locate_run(source, content)
+        case "update":
+            return open_followed(source)
         case other:
             raise InputError(f"{source} is a run of tasks.{other}; {EXPECTED}")
 

@@ -22,7 +22,7 @@ OPTIONS = {
     task: ("--resume", *(f"--{option.name.replace('_', '-')}" for option in fields(config)))
     for task, (config, _) in TASKS.items()
 }
-NEEDED = {
+REQUIRED_OPTIONS = {
     "aoa": ["--mix", "0.5"],
     "rssi": ["--rx", "1"],
     "report": ["run"],
@@ -59,7 +59,7 @@ RIGHT = {
 
 
 def command_lines(draw: random.Random, folder: Path, count: int) -> Iterator[tuple[str, list[str]]]:
-    """So many of them, with paths inside the folder."""
+    """Yield `count` random command lines with paths inside the folder."""
     taken, broken = folder / "taken", folder / "broken.partial"
     taken.mkdir()
     broken.mkdir()
@@ -68,7 +68,7 @@ def command_lines(draw: random.Random, folder: Path, count: int) -> Iterator[tup
     values = [*VALUES, str(taken), str(broken), str(folder / "data")]
     for _ in range(count):
         task = draw.choice(list(OPTIONS))
-        arguments = list(NEEDED[task]) if draw.random() < 0.8 else []
+        arguments = list(REQUIRED_OPTIONS[task]) if draw.random() < 0.8 else []
         for _ in range(draw.randint(0, 3)):
             arguments.append(draw.choice(OPTIONS[task]))
             arguments += [draw.choice(values) for _ in range(draw.choice([0, 1, 1, 1, 2, 3, 4]))]
@@ -78,7 +78,7 @@ def command_lines(draw: random.Random, folder: Path, count: int) -> Iterator[tup
 
 
 def right_command_lines(draw: random.Random, folder: Path, count: int) -> Iterator[tuple[str, list[str]]]:
-    """So many that are right, each a short run into a directory of its own."""
+    """Yield `count` valid command lines, each a short run into a separate directory."""
     for number in range(count):
         task = draw.choice(list(RIGHT))
         (needed, values), *others = RIGHT[task].items()

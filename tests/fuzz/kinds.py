@@ -1,6 +1,6 @@
-"""What is fuzzed: one function a kind writes a well-formed sample and gives the way in that reads it.
+"""Kinds of fuzzed files: one function for each kind writes a well-formed sample and returns its reader.
 
-A format or a kind of model joins by a sample here (a test refuses those without one), a task by its options in
+A format or a kind of model joins by a sample here (a test fails for one without), a task by its options in
 `commands.py`.
 """
 

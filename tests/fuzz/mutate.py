@@ -54,7 +54,7 @@ def _token(content: bytes, draw: random.Random) -> bytes:
 
 
 def _number(content: bytes, draw: random.Random) -> bytes:
-    """Four or eight bytes that say something extreme where a binary number may stand."""
+    """Replace four or eight bytes, possibly a binary number, by an extreme value."""
     at = draw.randrange(len(content) + 1)
     extreme = draw.choice(EXTREME)
     return content[:at] + extreme + content[at + len(extreme) :]

@@ -21,7 +21,7 @@ from fuzz.mutate import spoil
 from swiftwrf import FitError, InputError
 from swiftwrf.data.files import read_table, read_yaml
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
-from swiftwrf.errors import LONGEST
+from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.runtime.checkpoint import Saved
 
 SHORT = 200  # mutations a kind
@@ -29,10 +29,10 @@ LONG = -(-10_000 // len(KINDS))
 
 
 def attack(kind: str, folder: Path, seeds: range) -> dict[str, int]:
-    """How many mutated samples were read and how many refused.
+    """Return the number of mutated samples that were read and that were refused.
 
     Raises:
-        AssertionError: one ended otherwise.
+        AssertionError: A sample was neither read nor refused.
     """
     write, read = KINDS[kind]
     sound, spoilt = folder / "sound", folder / "spoilt"
@@ -47,7 +47,7 @@ def attack(kind: str, folder: Path, seeds: range) -> dict[str, int]:
         try:
             read(spoilt)
         except (InputError, FitError) as refusal:
-            if len(str(refusal)) > LONGEST or "\n" in str(refusal):
+            if len(str(refusal)) > MAX_LENGTH or "\n" in str(refusal):
                 raise AssertionError(f"{kind}, seed {seed}: {refusal}") from refusal
             ends["refused"] += 1
         except BaseException as error:
@@ -79,7 +79,7 @@ def test_many_mutations(kind, tmp_path):
 
 
 def _end(task, arguments, capfd):
-    """Runs a command line; its exit code, and what it said where that was a refusal of ours."""
+    """Run a command line and return its exit code, and the message of a refusal."""
     try:
         code = run(task, *arguments)
     except SystemExit as end:  # help, or options that the parser does not know
@@ -90,7 +90,7 @@ def _end(task, arguments, capfd):
     if said:
         assert code in (1, 2)
         assert len(said) == 1
-        assert len(said[0]) <= LONGEST + len("error: ")
+        assert len(said[0]) <= MAX_LENGTH + len("error: ")
     return code
 
 

@@ -1,10 +1,13 @@
 """Reader of DeepMIMO v4 folders, the exchange format of ray tracers (Sionna RT, Wireless InSite, AODT): one array a file.
 
-`{key}_t{set}_tx{index}_r{set}.npz` holds `key`: power [dB], phase [deg], delay [s], aoa_az, aoa_el [deg] of up to 25 paths a
-receiver, nan for missing ones; inter, the interactions of a path as digits (0: line of sight, 1: reflection, 2: diffraction,
-3: scattering, 4: transmission); rx_pos and tx_pos [m]. params.json holds the carrier and the name of the ray tracer. aoa_el
-is the angle from the zenith, or from the horizon (AODT), which direct paths show. Angles point from the receiver to where a
-path arrives from, in world coordinates.
+`{key}_t{set}_tx{index}_r{set}.npz` holds the array `key`. Arrays of paths have up to 25 paths a receiver, nan for missing
+ones. params.json holds the carrier and the name of the ray tracer.
+
+- power [dB], phase [deg], delay [s].
+- aoa_az and aoa_el [deg]: direction from the receiver against the arriving path, in world coordinates. aoa_el is the angle
+  from the zenith, or from the horizon (AODT). Direct paths determine which.
+- inter: interactions of a path as digits (0 line of sight, 1 reflection, 2 diffraction, 3 scattering, 4 transmission).
+- rx_pos and tx_pos [m].
 
 Wireless InSite gives the phase of a path over its whole length. Sionna gives that of the passband coefficient, to which the
 phase -2 pi f delay of the propagation is added here. The line-of-sight paths, whose phase is known, show the convention.
@@ -203,8 +206,10 @@ def _from_horizon(
 
     Args:
         folder: Source, for the message.
-        azimuth, zenith: Angles of the paths, (n, paths) [deg].
-        direct, known: Whether a path is direct, and whether there is one, (n, paths).
+        azimuth: Azimuths of the paths, (n, paths) [deg].
+        zenith: Zenith angles of the paths, (n, paths) [deg].
+        direct: True for direct paths, (n, paths).
+        known: True for paths that exist, (n, paths).
         away: Vectors from the receivers to the transmitter, (n, 3).
 
     Raises:
@@ -223,7 +228,7 @@ def _from_horizon(
     if min(declared, horizon) <= MAX_ANGLE_OFFSET_DEG:
         return horizon < declared
     others: dict[str, Any] = {
-        "the angles say where a path goes; give those from the receiver to where it comes from": (
+        "the angles are directions of propagation; give those from the receiver against the arriving path": (
             azimuth + 180,
             180 - zenith,
         ),

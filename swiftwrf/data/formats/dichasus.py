@@ -1,5 +1,7 @@
-"""Reader of DICHASUS data sets (https://dichasus.inue.uni-stuttgart.de): TFRecord files and a JSON file that describes the
-arrays, with the phase and time offsets of the antennas if reftx-offsets-NAME.json lies beside NAME.tfrecords."""
+"""Reader of DICHASUS data sets (https://dichasus.inue.uni-stuttgart.de): TFRecord files and a JSON file of the arrays.
+
+The phase and time offsets of the antennas are those of reftx-offsets-NAME.json if it lies beside NAME.tfrecords.
+"""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def read_paths(source: Path, grid: AngularGrid = GRID) -> PropagationPaths:
 def _read(file: Path, grid: AngularGrid) -> dict[str, Tensor]:
     """Return the checked arrays by name."""
     if not file.is_file():
-        raise InputError(f"{file} is not there; expected ray paths")
+        raise InputError(f"{file} does not exist; expected ray paths")
     arrays = read_arrays(file, list(SHAPES), [LENGTH])
     count = arrays["path_count"]
     if count.ndim != 1 or count.dtype.kind not in "iu":

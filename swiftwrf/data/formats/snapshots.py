@@ -18,7 +18,7 @@ from swiftwrf.data.snapshots import Snapshots, check_spacing, round_trip_array, 
 from swiftwrf.data.splits import read_splits
 from swiftwrf.errors import InputError
 
-NEEDED = ("csi", "position", "frequency_hz", "array_position", "array_orientation")
+REQUIRED_ARRAYS = ("csi", "position", "frequency_hz", "array_position", "array_orientation")
 OPTIONAL = ("element_position", "rows", "columns", "spacing_m", "line_of_sight", "time")
 SCALARS = ("frequency_hz", "rows", "columns", "spacing_m")
 VECTORS = ("array_position", "array_orientation", "line_of_sight", "time")
@@ -37,7 +37,7 @@ class SnapshotArrays(Format[Snapshots]):
     def read(self, path: Path, options: ReadOptions) -> Snapshots:
         file = _file(path)
         assert file is not None
-        arrays = read_arrays(file, NEEDED, OPTIONAL)
+        arrays = read_arrays(file, REQUIRED_ARRAYS, OPTIONAL)
         for name, values in arrays.items():
             if name != "csi" and values.dtype.kind == "c":
                 raise InputError(f"{file}: {name} holds complex numbers, expected real ones")

@@ -69,7 +69,7 @@ class Scene:
             InputError: As the constructor, no such file, or a file that is no scene with objects.
         """
         if not file.is_file():
-            raise InputError(f"{file} is not there; expected a Mitsuba scene (XML) or the name of a room")
+            raise InputError(f"{file} does not exist; expected a Mitsuba scene (XML) or the name of a room")
         rt, scene = sionna(), cls.__new__(cls)
         try:
             held = rt.load_scene(str(file))

@@ -73,7 +73,8 @@ class ShoeboxRoom:
         """Return the 25 paths with at most two reflections of each link, the direct path first.
 
         Args:
-            transmitter, receiver: Positions, (n, 3) [m], which broadcast.
+            transmitter: Positions, (n, 3) [m]. Both ends broadcast.
+            receiver: Positions, (n, 3) [m].
 
         Raises:
             InputError: A position outside the room, or both ends at one position.
@@ -153,7 +154,8 @@ def _hits(segments: Sequence[tuple[Tensor, Tensor]], low: Point, high: Point) ->
 
     Args:
         segments: Start and step (...) along each axis; no step is 0.
-        low, high: Corners.
+        low: Corner of lowest coordinates.
+        high: Opposite corner.
     """
     enter = torch.zeros_like(segments[0][0])
     leave = torch.ones_like(enter)

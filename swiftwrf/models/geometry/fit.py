@@ -13,7 +13,7 @@ from torch import Tensor
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.errors import InputError
-from swiftwrf.gp import thinned
+from swiftwrf.gp import subsample
 from swiftwrf.models.base import FieldConfig
 from swiftwrf.models.geometry.ambiguity import phase_alternatives
 from swiftwrf.models.geometry.images import PhaseObservations
@@ -243,7 +243,7 @@ def update_room(room: RoomEstimate, planes: PlaneSet, new: Spectra, config: Geom
 
 def _evenly(train: Spectra, most: int) -> tuple[Spectra, Tensor]:
     """Return at most `most` of the spectra, evenly chosen, and their row numbers."""
-    (rows,) = thinned(torch.arange(len(train)), rows=most)
+    (rows,) = subsample(torch.arange(len(train)), rows=most)
     return train.subset(rows) if len(train) > most else train, rows
 
 

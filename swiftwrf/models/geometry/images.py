@@ -94,18 +94,18 @@ class PhaseObservations:
         length = ray.norm(dim=-1, keepdim=True)
         return spherical((ray / length) @ self.element.T - self.wavenumber * length, length)
 
-    def waves(self, ray: Tensor, strength: Tensor) -> Tensor:
-        """Return strength times the waves that arrive along rays, as `wave`, in the order of memory for many waves.
+    def waves(self, ray: Tensor, amplitude: Tensor) -> Tensor:
+        """Return waves along rays times an amplitude, as `wave`, in the memory order for many waves.
 
         Args:
             ray: Vectors from the receiver to the source, float32 (3, ...) [m].
-            strength: Real strengths that broadcast to (...).
+            amplitude: Real amplitudes that broadcast to (...).
 
         Returns:
             Waves, complex64 (K, ...).
         """
         length = ray.square().sum(0).sqrt()  # the norm over a first dimension is slow
-        unit, amplitude = ray / length, strength / length
+        unit, amplitude = ray / length, amplitude / length
         wave = self.chain.phasors(unit.flatten(1), amplitude.flatten(), -self.wavenumber * length.flatten())
         return wave.reshape(-1, *length.shape)
 

@@ -181,9 +181,9 @@ class GeometryModel(FieldModel):
         return self.estimate.order
 
     @property
-    def verdict(self) -> str:
+    def conclusion(self) -> str:
         """Result of the search in one sentence."""
-        return self.estimate.verdict
+        return self.estimate.conclusion
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         return self.array.spectrum(self.channel(position), grid), None
@@ -248,7 +248,7 @@ class GeometryModel(FieldModel):
         header = self.to_json() | {
             "wavelength": self.array.wavelength,
             "moving": self.moving,
-            "verdict": self.verdict,
+            "conclusion": self.conclusion,
             "residual": asdict(self.estimate.residual),
             "fingerprint": self.fingerprint,
         }
@@ -271,7 +271,7 @@ class GeometryModel(FieldModel):
             order=order,
             score_held_out=float(header["score_held_out"]),
             unexplained=float(header["unexplained"]),
-            verdict=str(header["verdict"]),
+            conclusion=str(header.get("conclusion", header.get("verdict"))),
             covariance=tensors["covariance"].double(),
             residual=Residual(**header["residual"]),
         )

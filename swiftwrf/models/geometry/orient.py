@@ -10,7 +10,7 @@ from torch import Tensor
 
 from swiftwrf.models.geometry.batched import batched, batched_field, batched_score
 from swiftwrf.models.geometry.images import PhaseObservations
-from swiftwrf.runtime.threads import side_by_side
+from swiftwrf.runtime.threads import parallel_map
 
 N_HORIZONTAL_NORMALS = 90  # of upright walls
 N_SPHERE_NORMALS = 1200  # in all directions
@@ -58,5 +58,5 @@ def candidates(scene: PhaseObservations, base: Tensor, reach: float, top: int) -
             found += [(v, n, o, sign) for v, n, o in zip(best.values.tolist(), normal, at, strict=True)]
         return found
 
-    found = itertools.chain.from_iterable(side_by_side(of_normals, directions().split(BATCH_SIZE)))
+    found = itertools.chain.from_iterable(parallel_map(of_normals, directions().split(BATCH_SIZE)))
     return [f[1:] for f in sorted(found, key=lambda f: f[0])[:top]]

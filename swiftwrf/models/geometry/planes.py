@@ -50,7 +50,7 @@ class RoomEstimate:
         score_held_out: 1 - correlation of predicted and observed co-array coefficients of the training spectra that were
             held out from the first stage of the search.
         unexplained: Fraction of the power of the co-array coefficients of the training spectra that is not predicted.
-        verdict: Result in one sentence.
+        conclusion: Result in one sentence.
         covariance: Covariance of the offsets (P, P) [m^2].
         residual: Statistics of the prediction error, for samples.
     """
@@ -59,7 +59,7 @@ class RoomEstimate:
     order: int
     score_held_out: float
     unexplained: float
-    verdict: str
+    conclusion: str
     covariance: Tensor
     residual: Residual
 
@@ -81,6 +81,7 @@ class PlaneSet:
 
     @classmethod
     def of(cls, found: CandidateRoom) -> PlaneSet:
+        """Return the planes of a candidate room."""
         normal, offset, gain = found.tensors()
         return cls(normal, offset, gain, 2)
 
@@ -92,6 +93,7 @@ class PlaneSet:
 
     @property
     def sequence(self) -> list[Sequence]:
+        """Sequences of reflections up to the order."""
         return sequences(self.normal[0], self.order) if self.normal.shape[1] else []
 
     def field(self, scene: PhaseObservations) -> Tensor:

@@ -34,6 +34,11 @@ def phase_jacobian(
     where e_k . u is the phase at element k. So the derivatives are sums over images of a vector times dx.
 
     Args:
+        scene: Observed phases.
+        normal: Normals of the planes (B, P, 3).
+        offset: Offsets of the planes (B, P) [m].
+        gain: Gains of the planes (B, P).
+        sequence: Sequences of reflections.
         movement: `image_jacobian` of the planes.
     """
     ray = (images(scene, normal, offset, sequence) - scene.receiver).permute(3, 0, 1, 2).float().contiguous()
@@ -131,6 +136,13 @@ def refine(
     """Return score (B,), normals (B, P, 3), offsets and gains (B, P) after Levenberg-Marquardt steps.
 
     Args:
+        scene: Observed phases.
+        normal: Normals of the planes (B, P, 3).
+        offset: Offsets of the planes (B, P) [m].
+        gain: Gains of the planes (B, P).
+        sequence: Sequences of reflections.
+        steps: Number of steps.
+        tilt: True to rotate the normals, too.
         signs: Fixed signs of the gains (P,). Defaults to free signs.
         limit: Maximum movement [m] or tilt [rad] of a plane in one step.
     """

@@ -84,6 +84,11 @@ def residual_statistics(
     """Return the statistics with which samples have the same coherence with the prediction as the observed channels.
 
     Args:
+        scene: Observed phases.
+        normal: Normals of the planes (1, P, 3).
+        offset: Offsets of the planes (1, P) [m].
+        gain: Gains of the planes (1, P).
+        sequence: Sequences of reflections.
         direct: Fraction of the positions with a line of sight.
     """
     mean = scene.wave(scene.transmitter) + field(scene, normal, offset, gain, sequence)[0]

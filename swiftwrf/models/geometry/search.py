@@ -22,7 +22,7 @@ from swiftwrf.models.geometry.batched import batched, batched_field, batched_sco
 from swiftwrf.models.geometry.images import PhaseObservations, phase_period_m, sequences
 from swiftwrf.models.geometry.refine import refine
 from swiftwrf.models.geometry.responses import SteeringResponses
-from swiftwrf.runtime.threads import side_by_side
+from swiftwrf.runtime.threads import parallel_map
 
 SIDES = torch.tensor(
     [[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], dtype=torch.float64
@@ -174,7 +174,7 @@ class Search:
                     far.append(o)
             return own + [(o, gain) for o in far]
 
-        return side_by_side(of_side, range(6))
+        return parallel_map(of_side, range(6))
 
     def responses(self, alternatives: Alternatives) -> SteeringResponses:
         """Return the steering responses of all alternatives."""
@@ -257,7 +257,7 @@ def find_room(
         return SIGNS[0], nothing
     searches = [Search(scene, reach, signs) for signs in SIGNS]
     searched = list(itertools.product((SEARCH_ORDER, 1), searches))
-    rooms = side_by_side(lambda item: item[1].beam(width, item[0])[0], searched)
+    rooms = parallel_map(lambda item: item[1].beam(width, item[0])[0], searched)
     starts = [(room, search) for room, (_, search) in zip(rooms, searched, strict=True)]
     best: tuple[Tensor, CandidateRoom] | None = None
     for start, search in sorted(starts, key=lambda s: s[0].score):

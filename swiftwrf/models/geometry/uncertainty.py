@@ -24,7 +24,7 @@ from swiftwrf.models.geometry.planes import (
 )
 from swiftwrf.models.geometry.refine import offset_covariance
 from swiftwrf.models.geometry.sample import Residual, residual_statistics
-from swiftwrf.runtime.threads import side_by_side
+from swiftwrf.runtime.threads import parallel_map
 
 MAX_STD_RAD = 0.5  # of phase, beyond which a plane is not certain
 MIN_SPREAD_RAD = 0.8  # of phase: positions with less spread in any direction count as flat
@@ -55,23 +55,23 @@ def assess(
     covariance = covariance + systematic**2 * torch.eye(len(covariance), dtype=torch.float64)
     direct = float(train.line_of_sight.double().mean())
     residual = residual_statistics(scene, room.normal, room.offset, room.gain, room.sequence, direct)
-    doubt = _flat(scene) or _other_carrier(scene, room, certainty)
+    reason = _flat(scene) or _other_carrier(scene, room, certainty)
     std = covariance.diagonal().clamp_min(0).sqrt().tolist()
     alternatives = [
         (room_, log_explained(scene.coherence(room_.field(scene)))) for room_ in phase_alternatives(scene, room)
     ]
-    nearest = side_by_side(lambda plane: _nearest_alternative(scene, room, plane, alternatives), range(len(std)))
+    nearest = parallel_map(lambda plane: _nearest_alternative(scene, room, plane, alternatives), range(len(std)))
     lost = [lead <= certainty or s * scene.wavenumber > MAX_STD_RAD for s, (lead, _) in zip(std, nearest, strict=True)]
     # a room most of whose planes have alternatives may be wrong as a whole, because each plane holds the others
-    all_lost = bool(doubt) or sum(lost) > len(lost) / 2
+    all_lost = bool(reason) or sum(lost) > len(lost) / 2
     planes = []
     for i, (lead, distance) in enumerate(nearest):
         away = reach if all_lost else distance if lead <= certainty else 0.0
         x, y, z = room.normal[0, i].tolist()
         offset, gain = float(room.offset[0, i]), float(room.gain[0, i])
         planes.append(Plane((x, y, z), offset, gain, 1000 * max(std[i], away), not (lost[i] or all_lost)))
-    verdict = f"{len(planes)} planes, {sum(plane.certain for plane in planes)} of them certain{doubt}"
-    return RoomEstimate(planes, room.order, score, unexplained, verdict, covariance, residual)
+    conclusion = f"{len(planes)} planes, {sum(plane.certain for plane in planes)} of them certain{reason}"
+    return RoomEstimate(planes, room.order, score, unexplained, conclusion, covariance, residual)
 
 
 def _nearest_alternative(
@@ -127,7 +127,7 @@ def _other_carrier(scene: PhaseObservations, room: PlaneSet, certainty: float) -
         other = replace(scene, wavenumber=scale * scene.wavenumber)
         return advantage(other.coherence(room.refined(other, 6).field(other)), here)
 
-    for scale, found in zip(CARRIER_SCALES, side_by_side(lead, CARRIER_SCALES), strict=True):
+    for scale, found in zip(CARRIER_SCALES, parallel_map(lead, CARRIER_SCALES), strict=True):
         if found > certainty:
             return f"; a carrier {100 * (scale - 1):+.0f} % from the given one explains the spectra better"
     return ""

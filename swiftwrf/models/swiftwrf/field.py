@@ -54,7 +54,8 @@ class DeformableGaussians(nn.Module):
         """Return Gaussians with random parameters, the start of a fit by gradient descent.
 
         Args:
-            config, grid: See the class.
+            config: Options of the model.
+            grid: Directions of the spectra.
             anchor: Training positions (M, 3) [m], which give the frame and the anchors of the deformation.
             kernel: Prior covariance of the deformation over positions, with lengths in metres.
             generator: Source of randomness.
@@ -89,7 +90,7 @@ class DeformableGaussians(nn.Module):
 
     @property
     def shapes_deform(self) -> bool:
-        """Whether means or widths depend on the position, so that kernels differ between positions."""
+        """True if means or widths depend on the position, so that kernels differ between positions."""
         return self.config.deformation != "none" and not {"mean", "cholesky"}.isdisjoint(self.config.components)
 
     def normalise(self, position: Tensor) -> Tensor:

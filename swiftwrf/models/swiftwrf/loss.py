@@ -16,7 +16,8 @@ def spectrum_loss(
     """Return (1 - w) pixel loss + w (1 - SSIM), averaged over spectra.
 
     Args:
-        predicted, measured: Magnitudes (B, H, W).
+        predicted: Predicted magnitudes (B, H, W).
+        measured: Measured magnitudes (B, H, W).
         ssim_weight: Weight w of the SSIM term, in [0, 1].
         pixel_loss: "l1" for the absolute error, "l2" for the squared error.
 

@@ -162,7 +162,10 @@ def fit(
     Args:
         train: Training spectra, at least 10.
         config: Options of the model and its fit. Defaults to `FitConfig()`.
-        device, checkpoint, on_record, progress: See `FieldModel.fit`.
+        device: See `FieldModel.fit`.
+        checkpoint: See `FieldModel.fit`.
+        on_record: See `FieldModel.fit`.
+        progress: See `FieldModel.fit`.
 
     Raises:
         InputError: As `FieldModel.fit`.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.gp import Kernel, thinned
+from swiftwrf.gp import Kernel, subsample
 from swiftwrf.models.swiftwrf.config import FitConfig
 from swiftwrf.models.swiftwrf.field import DeformableGaussians
 from swiftwrf.models.swiftwrf.loss import spectrum_loss
@@ -37,7 +37,7 @@ class Optimisation(Descent[DeformableGaussians]):
         self.config, steps = config, config.steps
         self.coarse_steps = round(config.coarse_fraction * steps)
         generator = torch.Generator().manual_seed(config.seed)
-        (anchor,) = thinned(train.position, rows=MAX_ANCHORS)
+        (anchor,) = subsample(train.position, rows=MAX_ANCHORS)
         field = DeformableGaussians.initial(config.model, train.grid, anchor, kernel, generator=generator).to(device)
         groups = [{"params": list(field.primitives.parameters()), "peak": config.rate}]
         groups += field.deformation.parameter_groups(config.rate, config.deformation_rate)

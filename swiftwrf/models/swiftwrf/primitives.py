@@ -24,7 +24,7 @@ class Gaussians(NamedTuple):
 
     @property
     def weight(self) -> Tensor:
-        """delta psi, (..., N, 2)."""
+        """Product delta psi, (..., N, 2)."""
         return self.attenuation[..., None] * self.response
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.gp import Kernel, SmoothField, held_out, principal_components, thinned
+from swiftwrf.gp import Kernel, SmoothField, held_out, principal_components, subsample
 from swiftwrf.metrics import NORMAL_80
 from swiftwrf.models.swiftwrf.config import FitConfig, ModelConfig
 from swiftwrf.models.swiftwrf.deformation import COMPONENTS, Deformation
@@ -56,7 +56,7 @@ class Regression:
 
     def __init__(self, train: Spectra, config: FitConfig, kernel: Kernel, fold: Tensor) -> None:
         self.config, self.kernel = config, kernel
-        (rows,) = thinned(torch.arange(len(train)), rows=MAX_ROWS)
+        (rows,) = subsample(torch.arange(len(train)), rows=MAX_ROWS)
         self.train, self.fold = train, fold[rows]
         self.some = train.subset(rows).in_memory()
         self.small = self.some.at_most(SHAPE_AZIMUTHS).in_memory()

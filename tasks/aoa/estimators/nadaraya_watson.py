@@ -117,13 +117,12 @@ def choose(distance: NDArray[Any], target: NDArray[Any], seed: int) -> tuple[flo
     """Return the width gamma and the penalty alpha with the least mean absolute error on held-out rows.
 
     Args:
-        distance: Squared distances between the rows, (n, n).
+        distance: Squared distances between the rows, (n, n), in double precision. In single precision products of small
+            kernel values are denormal numbers, which take ten times as long.
         target: Values of the rows, (n, k).
         seed: Seed of the folds.
     """
     width = 1 / max(float(np.median(distance[~np.eye(len(distance), dtype=bool)])), 1e-9)
-    # single precision: the penalty, relative to the row sums, is a thousand times its rounding
-    distance, target = distance.astype(np.float32), target.astype(np.float32)
     folds = KFold(min(5, len(distance)), shuffle=True, random_state=seed)
     errors: dict[tuple[float, float], float] = {}
     with threadpool_limits(1):  # many small problems: several threads would mostly wait for each other

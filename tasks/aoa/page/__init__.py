@@ -11,7 +11,7 @@ from tasks.aoa.page.records import AoaRecords, FractionRecords
 from tasks.aoa.page.results import results_section, turbo_distribution
 from tasks.aoa.page.room import choice_section, room_section
 from tasks.aoa.page.suggest import suggestion_section
-from tasks.aoa.page.summary import next_steps, summary, verdict
+from tasks.aoa.page.summary import conclusion, next_steps, summary
 from tasks.aoa.page.synthesis import similarity, synthesis_section
 from tasks.page.page import Page, Plot, Section, Summary, sections_of
 from tasks.page.provenance import provenance
@@ -44,7 +44,7 @@ def page(runs: list[AoaRecords]) -> Page:
 def _comparison(fractions: list[FractionRecords]) -> Summary:
     """Return the first screen of several measured fractions or runs."""
     table, plot = compared(fractions)
-    meaning = [f"{fraction.scene}: {verdict(fraction)}" for fraction in fractions]
+    meaning = [f"{fraction.scene}: {conclusion(fraction)}" for fraction in fractions]
     runs = {fraction.run.path: fraction.run for fraction in fractions}
     steps = [f"Explore{run.label.replace(',', '')}: `python -m tasks.view {path}`." for path, run in runs.items()]
     if len(runs) == 1:
@@ -68,9 +68,9 @@ def _field_models(fraction: FractionRecords) -> list[Plot]:
 
 def _limits(run: AoaRecords) -> Section:
     texts = [
-        "The test positions lie in the region and time of one measurement campaign; nothing here says how the network does "
-        "in another room, after furniture moved, or with another array.",
-        "The label is the geometric direction of the transmitter, computed from positions; where the direct path is blocked "
+        "The test positions lie in the region and time of one measurement campaign. They do not predict errors in "
+        "another room, after furniture moved, or with another array.",
+        "The label is the geometric direction of the transmitter, computed from positions. If the direct path is blocked, "
         "the spectrum may not contain it.",
         "Intervals treat test spectra as independent draws. Along a measured path they are not, so on such data the "
         "intervals are too narrow.",

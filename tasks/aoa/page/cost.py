@@ -1,4 +1,4 @@
-"""What it cost: speed against error, sizes tried, losses over the steps, seconds."""
+"""Cost of a run: speed against error, sizes tried, losses over the steps, seconds."""
 
 from __future__ import annotations
 

@@ -10,8 +10,14 @@ from tasks.page.provenance import number
 
 
 def turbo_method(fraction: FractionRecords) -> str:
-    """Return the method of the network with all spectra of the first field model."""
+    """Return the method of the network, or of kernel regression without one, with all spectra of the first field model."""
     return headline(fraction.conditions.values()).method
+
+
+def learner(fraction: FractionRecords) -> str:
+    """Return the estimator of `turbo_method` in words."""
+    condition = headline(fraction.conditions.values())
+    return "the network" if condition.is_network else condition.estimator
 
 
 def reference(fraction: FractionRecords) -> str:
@@ -58,8 +64,8 @@ def gain_sentence(fraction: FractionRecords) -> str:
     if not parts:
         return ""
     return (
-        f"Synthetic spectra change the median angular error of the network ({method}) by {' and '.join(parts)}. Intervals "
-        "are paired over the test positions."
+        f"Synthetic spectra change the median angular error of {learner(fraction)} ({method}) by {' and '.join(parts)}. "
+        "Intervals are paired over the test positions."
     )
 
 

@@ -14,7 +14,7 @@ from pandas import DataFrame, concat
 from swiftwrf.models import FIELD_MODELS
 from tasks import labels
 from tasks.aoa.page.records import FractionRecords
-from tasks.metrics import AdviceMetrics, ChangeMetrics, GainMetrics
+from tasks.metrics import ChangeMetrics, CrossValidationMetrics, GainMetrics
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
 from tasks.page.palette import DASHES
@@ -24,46 +24,47 @@ MARGIN = 0.5  # [m] around the room in a plan
 FIXED, MEASURED, IMAGE = "#cf4a4a", "#3a7fd5", "#d1620f"
 
 
-def _advice_of(fraction: FractionRecords) -> dict[str, AdviceMetrics]:
+def _cross_validations(fraction: FractionRecords) -> dict[str, CrossValidationMetrics]:
     """Return the cross-validation of each field model, if it has further positions. Older runs have the chosen one alone."""
-    advice: dict[str, Any] = dict(fraction.mix["advice"] or {})
+    validation: dict[str, Any] = dict(fraction.mix["cross_validation"] or {})
     choice = fraction.mix["choice"]
-    if "stand_in" in advice and choice is not None:
-        advice = {choice["name"]: advice}
-    return {name: entry for name, entry in advice.items() if entry["gains"]}
+    if "stand_in" in validation and choice is not None:
+        validation = {choice["name"]: validation}
+    return {name: entry for name, entry in validation.items() if entry["gains"]}
 
 
-def advice_sentences(fraction: FractionRecords) -> list[str]:
+def cross_validation_sentences(fraction: FractionRecords) -> list[str]:
     """Return a text for each field model that was compared: does turbo learning help?"""
     texts = []
-    for name, advice in _advice_of(fraction).items():
-        best, rule = _best_and_rule(advice)
-        how = "chosen on other held-out spectra" if advice.get("rule") else "chosen on the same spectra"
+    for name, validation in _cross_validations(fraction).items():
+        best, rule = _best_and_rule(validation)
+        how = "chosen on other held-out spectra" if validation.get("rule") else "chosen on the same spectra"
         found = (
-            f"Cross-validation inside the measured fraction ({advice['n_held_out']} spectra held out, {advice['stand_in']} "
-            f"as stand-in for the network): spectra {'sampled' if advice['sampled'] else 'predicted'} by {name} at further "
-            f"positions change the median error by {rule['change']:+.0%} [{rule['low']:+.0%}, {rule['high']:+.0%}], from "
-            f"{advice['measured_only_deg']:.2f} to {rule['median_deg']:.2f} degrees, with their number {how}. "
-            f"The best number is {best['extra']}."
+            f"Cross-validation inside the measured fraction ({validation['n_held_out']} spectra held out, "
+            f"{validation['stand_in']} as stand-in for the network): spectra "
+            f"{'sampled' if validation['sampled'] else 'predicted'} by {name} at synthetic positions change the "
+            f"median error by {rule['change']:+.0%} [{rule['low']:+.0%}, {rule['high']:+.0%}], from "
+            f"{validation['measured_only_deg']:.2f} to {rule['median_deg']:.2f} degrees, with their number {how}. "
+            f"The best number is {best['n_synthetic']}."
         )
-        texts.append(f"{found} {_verdict(advice)}")
+        texts.append(f"{found} {_verdict(validation)}")
     return texts
 
 
-def _verdict(advice: AdviceMetrics) -> str:
+def _verdict(validation: CrossValidationMetrics) -> str:
     """Return in one sentence whether turbo learning helps by a field model."""
-    if advice["helps"]:
-        return f"Turbo learning helps here: use --extra {advice['recommended_extra']} with this fraction."
-    if _best_and_rule(advice)[1]["low"] > 0:
+    if validation["helps"]:
+        return f"Turbo learning helps here: use --extra {validation['recommended_n_synthetic']} with this fraction."
+    if _best_and_rule(validation)[1]["low"] > 0:
         return "Turbo learning harms here: measure more instead, or use another synthesizer."
     return "The change is not significant: more measured positions are the safer way."
 
 
-def _best_and_rule(advice: AdviceMetrics) -> tuple[GainMetrics, ChangeMetrics]:
+def _best_and_rule(validation: CrossValidationMetrics) -> tuple[GainMetrics, ChangeMetrics]:
     """Return the number with the lowest error, and the number chosen on other folds."""
-    gains = [gain for gain in advice["gains"] if gain["sampled"] == advice["sampled"]]
+    gains = [gain for gain in validation["gains"] if gain["sampled"] == validation["sampled"]]
     best = min(gains, key=lambda gain: gain["median_deg"])
-    return best, advice.get("rule") or best  # older runs have the best number alone
+    return best, validation.get("rule") or best  # older runs have the best number alone
 
 
 def choice_section(fraction: FractionRecords) -> Section | None:
@@ -85,17 +86,21 @@ def choice_section(fraction: FractionRecords) -> Section | None:
     name = choice["name"]
     meaning = labels.labels(FIELD_MODELS, labels.FIELD_MODELS, [name])
     text = f"{name} predicts held-out measured spectra best" + (f": {meaning[name].meaning}." if meaning else ".")
-    plots = [_gain(fraction, *item) for item in _advice_of(fraction).items()]
-    return Section("Which field model, and does it help?", [text, *advice_sentences(fraction)], [table], plots)
+    plots = [_gain(fraction, *item) for item in _cross_validations(fraction).items()]
+    return Section(
+        "Which field model, and does it help?", [text, *cross_validation_sentences(fraction)], [table], plots
+    )
 
 
-def _gain(fraction: FractionRecords, name: str, advice: AdviceMetrics) -> Plot:
+def _gain(fraction: FractionRecords, name: str, validation: CrossValidationMetrics) -> Plot:
     figure, ax = figures.panel(5.8, 3.2)
     colour, ends = fraction.palette.colour(name), []
     for sampled, dashes, label in ((False, DASHES[0], "predicted"), (True, DASHES[1], "sampled")):
-        gains = sorted((gain for gain in advice["gains"] if gain["sampled"] == sampled), key=lambda gain: gain["extra"])
+        gains = sorted(
+            (gain for gain in validation["gains"] if gain["sampled"] == sampled), key=lambda gain: gain["n_synthetic"]
+        )
         if gains:
-            at = [0, *(gain["extra"] for gain in gains)]
+            at = [0, *(gain["n_synthetic"] for gain in gains)]
             change = [0, *(100 * gain["change"] for gain in gains)]
             ends.append(at[-1])
             ax.plot(at, change, linestyle=dashes, marker="o", markersize=4, color=colour, label=label)
@@ -105,10 +110,10 @@ def _gain(fraction: FractionRecords, name: str, advice: AdviceMetrics) -> Plot:
     ax.set(xlabel="further positions with synthetic spectra", ylabel="change of the median error [%]")
     figures.end_labels(ax)
     caption = (
-        f"Held-out measured spectra, {advice['stand_in']} trained on the other measured spectra and on spectra by {name}. "
-        "Bands: 95 % bootstrap intervals of the change. Turbo learning helps below zero."
+        f"Held-out measured spectra, {validation['stand_in']} trained on the other measured spectra and on spectra by "
+        f"{name}. Bands: 95 % bootstrap intervals of the change. Turbo learning helps below zero."
     )
-    return Plot(f"gain-{name}-{fraction.file_name}", [figure], caption, DataFrame(advice["gains"]))
+    return Plot(f"gain-{name}-{fraction.file_name}", [figure], caption, DataFrame(validation["gains"]))
 
 
 def _band(gains: list[GainMetrics]) -> tuple[list[float], list[float]]:
@@ -205,8 +210,10 @@ def extent(planes: list[dict[str, Any]], inside: NDArray[Any]) -> tuple[NDArray[
 
 
 def in_plan(plane: dict[str, Any], low: NDArray[Any], high: NDArray[Any]) -> NDArray[Any] | None:
-    """Both ends (2, 2) [m] of a plane's line through the box from `low` to `high` (3,) at half its height, seen from
-    above; None for floors and ceilings."""
+    """Return both ends (2, 2) [m] of a plane's line through the box from `low` to `high` (3,), seen from above.
+
+    The line is at half the height of the box. None for floors and ceilings.
+    """
     nx, ny, nz = plane["normal"]
     if abs(nz) > 0.7:
         return None

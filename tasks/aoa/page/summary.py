@@ -5,11 +5,11 @@ from __future__ import annotations
 from tasks.aoa.condition import LOCATOR
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.former import FORMER_NAMES
-from tasks.aoa.page.gains import change_text, changes_of, gain_sentence, judgement, reference, turbo_method
+from tasks.aoa.page.gains import change_text, changes_of, gain_sentence, judgement, learner, reference, turbo_method
 from tasks.aoa.page.overview import overview
 from tasks.aoa.page.records import AoaRecords, FractionRecords
 from tasks.aoa.page.results import choice_sentence
-from tasks.aoa.page.room import advice_sentences
+from tasks.aoa.page.room import cross_validation_sentences
 from tasks.page.page import Number, Summary
 from tasks.page.suggestion import worth
 from tasks.summarise import fingerprinting
@@ -21,12 +21,12 @@ def summary(fraction: FractionRecords) -> Summary:
     metrics, mix = fraction.run.metrics, fraction.mix
     meaning = [
         f"On {fraction.run.scene}, {mix['n_measured']} of {metrics['n_train']} training spectra are measured "
-        f"({fraction.percent}); the spectra at the other positions are synthesized, and the network learns from both. "
-        f"It is tested on {metrics['n_test']} spectra that take no part in any fit.",
+        f"({fraction.percent}). The spectra at the other positions are synthesized, and {learner(fraction)} learns from "
+        f"both. It is tested on {metrics['n_test']} spectra that take no part in any fit.",
         *(text for text in (choice_sentence(fraction), gain_sentence(fraction)) if text),
-        *advice_sentences(fraction),
+        *cross_validation_sentences(fraction),
     ]
-    return Summary(_numbers(fraction), [overview(fraction)], meaning, next_steps(fraction), verdict(fraction))
+    return Summary(_numbers(fraction), [overview(fraction)], meaning, next_steps(fraction), conclusion(fraction))
 
 
 def _numbers(fraction: FractionRecords) -> list[Number]:
@@ -55,10 +55,10 @@ def answer(run: AoaRecords) -> Answer:
         for method, condition in fraction.conditions.items():
             names = {"condition": condition.meaning, "estimator": condition.estimator}
             rows.append((share | names, fraction.mix["methods"][method]["great_circle_deg"]))
-    return Answer("deg", rows, verdict(fractions[0]), next_steps(fractions[0]))
+    return Answer("deg", rows, conclusion(fractions[0]), next_steps(fractions[0]))
 
 
-def verdict(fraction: FractionRecords) -> str:
+def conclusion(fraction: FractionRecords) -> str:
     """Return which estimator to take and what synthetic spectra change, in short sentences."""
     sentences, medians = [], fraction.medians
     if choice := fraction.mix.get("estimator_choice"):
@@ -67,13 +67,13 @@ def verdict(fraction: FractionRecords) -> str:
     best = reference(fraction)
     if change := changes_of(fraction, turbo).get(best):
         sentences.append(
-            f"The network with synthetic spectra changes the median error by {change_text(change)} against {best}, the best "
-            f"estimator without them: {judgement(change)}."
+            f"With synthetic spectra {learner(fraction)} changes the median error by {change_text(change)} against {best}, "
+            f"the best estimator without them: {judgement(change)}."
         )
     else:
         sentences.append(
-            f"{best}, the best estimator without synthetic spectra, has a median error of {medians[best]:.2f} degrees, the "
-            f"network with them {medians[turbo]:.2f}."
+            f"{best}, the best estimator without synthetic spectra, has a median error of {medians[best]:.2f} degrees, "
+            f"{learner(fraction)} with them {medians[turbo]:.2f}."
         )
     if "peak" in medians and "constant" in medians:
         sentences.append(fingerprinting(medians["constant"], medians["peak"]))

@@ -10,7 +10,7 @@ from tasks.labels import LOCALIZERS as LABELS
 from tasks.labels import labels
 from tasks.locate.localizers import LOCALIZERS
 from tasks.locate.page import drawing
-from tasks.locate.page.summary import LEVEL, NEIGHBOURS, OWN, LocateRecords, by_method, summary, verdict
+from tasks.locate.page.summary import LEVEL, NEIGHBOURS, OWN, LocateRecords, by_method, conclusion, summary
 from tasks.locate.steps import SUGGESTED
 from tasks.page.comparison import Compared, comparison, with_interval
 from tasks.page.page import Page, Plot, Section, Summary, Table, sections_of
@@ -47,7 +47,7 @@ def _comparison(runs: list[LocateRecords]) -> Summary:
         compared.append(Compared(f"{run.number}: {run.place}", found, further))
     shown = [name for name in (OWN, *NEIGHBOURS, "mean") if any(name in one.errors for one in compared)]
     table, plot = comparison(compared, drawing.palette(), shown, "m", "position error")
-    meaning = [f"Run {run.number}, {run.place}: {verdict(run)}" for run in runs]
+    meaning = [f"Run {run.number}, {run.place}: {conclusion(run)}" for run in runs]
     steps = [f"Explore run {run.number}: `python -m tasks.view {run.path}`." for run in runs]
     return Summary([], [plot], meaning, steps, table=table)
 

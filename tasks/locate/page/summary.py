@@ -44,17 +44,17 @@ def summary(run: LocateRecords, picture: Plot) -> Summary:
         f"On {run.scene}: {run.metrics['n_train']} training rows and {run.metrics['n_test']} test rows at {receivers} "
         f"{'receiver' if receivers == 1 else 'receivers'}.",
     ]
-    return Summary(numbers, [picture], meaning, _next_steps(run), verdict(run), notes=notes(run))
+    return Summary(numbers, [picture], meaning, _next_steps(run), conclusion(run), notes=notes(run))
 
 
 def answer(run: LocateRecords) -> Answer:
     """Return what the terminal shows of a run."""
     overall = sorted(run.metrics["overall"].items(), key=lambda item: item[1]["position_error_m"]["median"])
     rows = [({"localizer": name}, entry["position_error_m"]) for name, entry in overall]
-    return Answer("m", rows, verdict(run), _next_steps(run))
+    return Answer("m", rows, conclusion(run), _next_steps(run))
 
 
-def verdict(run: LocateRecords) -> str:
+def conclusion(run: LocateRecords) -> str:
     """Return a sentence that compares the posterior with the best other localizer."""
     error = {name: entry["position_error_m"]["median"] for name, entry in run.metrics["overall"].items() if name != OWN}
     best = min(error, key=lambda name: error[name])

@@ -10,7 +10,7 @@ from tasks.page.provenance import provenance
 from tasks.page.records import notes
 from tasks.rssi.page import errors
 from tasks.rssi.page.maps import CERTAINTY, COVERED_DBM, Maps
-from tasks.rssi.page.summary import RssiRecords, best_baseline, model_of, next_steps, title, verdict
+from tasks.rssi.page.summary import RssiRecords, best_baseline, conclusion, model_of, next_steps, title
 from tasks.rssi.predictors import PREDICTORS
 
 
@@ -56,7 +56,7 @@ def _summary(run: RssiRecords) -> Summary:
         f"On {run.scene}: {run.metrics['n_train']} training rows and {run.metrics['n_test']} test rows with {own['n']} "
         f"detected pairs at {receivers} {'receiver' if receivers == 1 else 'receivers'}.",
     ]
-    return Summary(numbers, [maps.summary()], meaning, next_steps(run), verdict(run), notes=notes(run))
+    return Summary(numbers, [maps.summary()], meaning, next_steps(run), conclusion(run), notes=notes(run))
 
 
 def _comparison(runs: list[RssiRecords]) -> Summary:
@@ -70,7 +70,7 @@ def _comparison(runs: list[RssiRecords]) -> Summary:
     baselines = dict.fromkeys([*(best_baseline(run) for run in runs), "mean"])
     shown = [*dict.fromkeys(map(model_of, runs)), *(name for name in baselines if name in every)]
     table, plot = comparison(compared, errors.palette(), shown, "dB", "absolute error")
-    meaning = [f"Run {run.number}, {run.place}: {verdict(run)}" for run in runs]
+    meaning = [f"Run {run.number}, {run.place}: {conclusion(run)}" for run in runs]
     steps = [f"Explore run {run.number}: `python -m tasks.view {run.path}`." for run in runs]
     return Summary([], [plot], meaning, steps, table=table)
 

@@ -59,7 +59,7 @@ class Maps:
 
     @cached_property
     def inside(self) -> NDArray[np.bool_]:
-        """Whether each cell lies inside the measured positions, (H, W)."""
+        """True for each cell inside the measured positions, (H, W)."""
         at = np.stack(np.meshgrid(self.arrays["x"], self.arrays["y"]), axis=-1)
         return maps.inside(at, self.arrays["measured_position"])
 

@@ -1,4 +1,4 @@
-"""Sentences of the RSSI report and of the terminal: the verdict and the next steps."""
+"""Sentences of the RSSI report and of the terminal: the conclusion and the next steps."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def answer(run: RssiRecords) -> Answer:
     """Return what the terminal shows of a run."""
     overall = sorted(run.metrics["overall"].items(), key=lambda item: item[1]["abs_error_db"]["median"])
     rows = [({"model": name}, entry["abs_error_db"]) for name, entry in overall]
-    return Answer("dB", rows, verdict(run), next_steps(run))
+    return Answer("dB", rows, conclusion(run), next_steps(run))
 
 
 def model_of(run: RssiRecords) -> str:
@@ -40,7 +40,7 @@ def best_baseline(run: RssiRecords) -> str:
     return min(error, key=lambda name: error[name])
 
 
-def verdict(run: RssiRecords) -> str:
+def conclusion(run: RssiRecords) -> str:
     """Return a sentence that compares the model with the best baseline."""
     best = best_baseline(run)
     n_test = run.metrics["n_test"]

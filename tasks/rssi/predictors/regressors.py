@@ -19,7 +19,7 @@ from torch import Tensor
 from swiftwrf import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.rssi import RssiFitContext, RssiPredictor
-from swiftwrf.runtime.threads import side_by_side
+from swiftwrf.runtime.threads import parallel_map
 from tasks.rssi.predictors.path_loss import Mean, ReceiverPathLoss
 
 # scikit-learn's own choice for many neighbours computes distances from squares and a product, which cancel map coordinates
@@ -67,7 +67,7 @@ class ReceiverRegressors(RssiPredictor):
 
         with warnings.catch_warnings():  # around all: threads share the filters
             warnings.simplefilter("ignore", ConvergenceWarning)  # a bound that is reached is the answer
-            self._regressors = side_by_side(fit, residual.numpy().T)
+            self._regressors = parallel_map(fit, residual.numpy().T)
 
     def _predict(self, position: Tensor) -> tuple[Tensor, None]:
         if not len(position):  # scikit-learn refuses it

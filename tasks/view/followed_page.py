@@ -1,0 +1,71 @@
+"""The page of a followed run, which shows each measurement as it is learnt."""
+
+from __future__ import annotations
+
+from nicegui import run, ui
+
+from swiftwrf import InputError
+from tasks.records import Row, rounded
+from tasks.view.followed import FollowedView, Snapshot, Version
+from tasks.view.page import header
+
+PERIOD_S = 1.0  # between two looks at the files
+COLUMNS = {
+    "index": "measurement",
+    "x_m": "x [m]",
+    "y_m": "y [m]",
+    "z_m": "z [m]",
+    "error": "error",
+    "running_error": "running error",
+    "innovation": "innovation",
+    "alarm": "alarm",
+}
+
+
+class FollowedPage:
+    """The page for one visitor."""
+
+    def __init__(self, view: FollowedView) -> None:
+        self._view, self._shown, self._busy = view, Version(), False
+        header(view.title, view.notes)
+        self._sentences = ui.label().classes("numbers").props('id="sentence"').style("white-space: pre-line")
+        self._figures = {}
+        with ui.row().classes("w-full items-start gap-8"):
+            for name in ("error", "changes"):
+                box = ui.html("", sanitize=False).classes("figure").props(f'id="{name}"')
+                self._figures[name] = box.style("width: 620px; max-width: 100%")
+        columns = [{"name": key, "label": label, "field": key, "align": "left"} for key, label in COLUMNS.items()]
+        self._table = ui.table(rows=[], columns=columns, row_key="index", title="Last measurements")
+        self._table.props('dense flat id="rows"').classes("w-full")
+        ui.label(
+            f"Maps and spectra of the newest model: python -m tasks.view {view.folder / 'model.safetensors'}"
+        ).classes("quiet")
+        ui.timer(PERIOD_S, self._look)
+
+    async def _look(self) -> None:
+        """Show the record if its files have changed."""
+        if self._busy or self._view.version == self._shown:
+            return
+        self._busy = True
+        try:
+            found = await run.io_bound(self._view.snapshot)
+            if found is not None:  # the server is being ended
+                self._show(found)
+        except InputError as error:
+            self._sentences.set_text(str(error))
+        finally:
+            self._busy = False
+
+    def _show(self, found: Snapshot) -> None:
+        self._shown = found.version
+        self._sentences.set_text("\n".join(found.sentences))
+        for name, box in self._figures.items():
+            box.set_content(found.figures.get(name, ""))
+        self._table.rows = [_cells(row) for row in found.rows]
+        self._table.update()
+
+
+def _cells(row: Row) -> Row:
+    """Return the cells of a row as text."""
+    row = rounded([row])[0]
+    return {key: row[key] if isinstance(row[key], int | str) else f"{row[key]:.4g}" for key in COLUMNS}

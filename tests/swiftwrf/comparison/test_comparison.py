@@ -1,0 +1,445 @@
+"""The methods of comparison: what is published of them, the physics that they draw, and that they fit as SwiftWRF does."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+
+import pytest
+import torch
+from small import PUBLISHED, PUBLISHED_RSSI
+from torch.nn import functional
+
+from swiftwrf import (
+    FIELD_MODELS,
+    AngularGrid,
+    FitError,
+    InputError,
+    Spectra,
+    load,
+    make_model,
+    rasterize_magnitude,
+    rssi_room,
+    simulated_room,
+)
+from swiftwrf.comparison import (
+    DcganConfig,
+    DcganSize,
+    NeRF2Config,
+    NeRF2Rssi,
+    NeRF2Size,
+    VaeConfig,
+    VaeSize,
+    WrfGsConfig,
+    WrfGsSize,
+    wrfgs,
+)
+from swiftwrf.comparison.base import Training
+from swiftwrf.comparison.convolution import Double, Halve, stages
+from swiftwrf.comparison.dcgan import DcganNetwork
+from swiftwrf.comparison.nerf2 import Field, NeRF2Network, received
+from swiftwrf.comparison.network import draw_parameters
+from swiftwrf.comparison.sphere import on_sphere
+from swiftwrf.comparison.vae import Normal
+from swiftwrf.comparison.volume import FIRST_PHASE, PATH_GAIN, Medium, integrate
+from swiftwrf.comparison.wrfgs import WrfGsNetwork
+from swiftwrf.data.store import Store
+from swiftwrf.metrics import psnr
+from swiftwrf.models.swiftwrf.mlp import encode
+from swiftwrf.runtime.checkpoint import read, write
+
+GRID = AngularGrid.hemisphere(90, 360)
+LEARNS = {
+    "nerf2": NeRF2Config(size=NeRF2Size(width=48, bands=4, samples=12), steps=400, rate=5e-3),
+    "wrfgs": WrfGsConfig(size=WrfGsSize(n_gaussians=100, width=32, depth=4, bands=4), steps=250, rate=5e-3),
+    "vae": VaeConfig(size=VaeSize(latent=4, bands=2, hidden=64), steps=300),
+    "dcgan": DcganConfig(size=DcganSize(noise=2, bands=2, hidden=64), steps=300),
+}
+
+
+def blob(n=40) -> Spectra:
+    """One source that goes round as the transmitter moves along a line."""
+    grid = AngularGrid.hemisphere(15, 60)
+    room = simulated_room(n=n, seed=0, grid=grid)
+    along = torch.linspace(-0.5, 0.5, n, dtype=torch.float64)
+    position = torch.stack([3 + along, torch.full_like(along, 2.5), torch.ones_like(along)], dim=1)
+    mean = torch.stack([math.pi + 2 * along, torch.full_like(along, 0.7)], dim=1)[:, None].float()
+    cholesky, weight = torch.tensor([[0.5, 0.0, 0.4]]), torch.tensor([[[0.9, 0.0]]]).repeat(n, 1, 1)
+    return replace(room, position=position, store=Store(rasterize_magnitude(mean, cholesky, weight, grid, cutoff=None)))
+
+
+def fit(train, name, config=None, **arguments):
+    """A fitted model, of the small configuration if there is no other."""
+    return FIELD_MODELS[name](config or PUBLISHED[name]).fit(train, **arguments)
+
+
+def count(model):
+    return sum(parameter.numel() for parameter in model.parameters())
+
+
+def test_the_published_sizes_are_the_publications():
+    assert count(NeRF2Network(NeRF2Config.paper().size, GRID, "transmitter")) == 690_564
+    assert (
+        count(WrfGsNetwork(WrfGsConfig.paper().size, GRID, "transmitter").network)
+        == 126 * 128 + 6 * 128**2 + 254 * 128 + 8 * 128
+    )
+    generator = DcganNetwork(DcganConfig.paper().size, GRID).generator
+    assert [m.in_channels for m in generator.modules() if isinstance(m, Double)] == [1024, 512, 256, 128]
+    paper = NeRF2Config.paper()
+    assert (paper.batch * paper.rays, paper.rate, paper.weight_decay, paper.steps) == (8192, 8e-4, 5e-5, 30_000)
+    paper = WrfGsConfig.paper()
+    assert (paper.size.n_gaussians, paper.rate, paper.steps, paper.size.spread) == (20_000, 8e-4, 600_000, 10.0)
+
+
+def test_published_rates(room):
+    """NeRF2's rises again after 10,000 of its 30,000 steps; WRF-GS's stays low after 200,000."""
+    small = {"size": PUBLISHED["nerf2"].size, "batch": 4}
+    rate = NeRF2Config.paper(**small).training(room, torch.device("cpu")).rate
+    assert [rate(step) for step in (0, 10_000, 20_000)] == pytest.approx([1, 1e-6 / 8e-4, 1])
+    rate = WrfGsConfig.paper(size=PUBLISHED["wrfgs"].size).training(room, torch.device("cpu")).rate
+    assert [rate(step) for step in (0, 200_000, 400_000)] == pytest.approx([1, 0.02, 0.02])
+
+
+# rays
+
+
+def nothing(samples):
+    zero = torch.zeros(samples, dtype=torch.float64)
+    return Medium(zero.clone(), zero.clone(), zero.clone(), zero.clone())
+
+
+@pytest.mark.parametrize("at", [0, 3, 30])
+def test_one_sample_that_emits_arrives_with_its_phase_and_path_loss(at):
+    distance = torch.linspace(0, 5, 64, dtype=torch.float64)
+    medium = nothing(64)
+    medium.amplitude[at], medium.phase[at] = 2.0, 0.7
+    medium.turning[:] = 0.3
+    real, imaginary = integrate(medium, distance)
+    size = 2.0 * PATH_GAIN / float(distance[at + 1])
+    angle = 0.7 + FIRST_PHASE + 0.3 * float(distance[at])
+    torch.testing.assert_close(
+        torch.stack([real, imaginary]), size * torch.tensor([math.cos(angle), math.sin(angle)]).double()
+    )
+
+
+def test_a_slab_absorbs_what_lies_behind_it_and_nothing_before_it():
+    distance = torch.linspace(0, 5, 101, dtype=torch.float64)  # 0.05 m apart
+    medium = nothing(101)
+    medium.absorption[20:40] = 1.5  # from 1 m to 2 m
+    for at, through in ((10, 0.0), (20, 0.0), (30, 0.5), (60, 1.0)):
+        medium.amplitude[:] = 0
+        medium.amplitude[at] = 1
+        arrived = torch.hypot(*integrate(medium, distance))
+        torch.testing.assert_close(arrived, math.exp(-1.5 * through) * PATH_GAIN / distance[at + 1])
+
+
+def test_the_last_sample_does_not_arrive():
+    medium = nothing(5)
+    medium.amplitude[-1] = 1
+    assert integrate(medium, torch.linspace(0, 5, 5, dtype=torch.float64)).abs().max() == 0
+
+
+def test_the_field_shared_by_transmitters_is_the_field_of_each(generator):
+    size = NeRF2Size(width=16, bands=3)
+    field = Field(size)
+    draw_parameters(field, generator)
+    point, direction, transmitter = (torch.randn(n, 1, 3, generator=generator) for n in (7, 7, 4))
+    shared = field(point, direction, transmitter.transpose(0, 1))
+    x, d, t = (encode(v.expand(7, 4, 3), 3, lowest=1.0) for v in (point, direction, transmitter.transpose(0, 1)))
+    h = field.layers(x)
+    parallel_map = field.emission(field.mixing(torch.cat([field.feature(h), d, t], dim=-1)))
+    torch.testing.assert_close(shared.amplitude, functional.leaky_relu(parallel_map[..., 0]).abs())
+    torch.testing.assert_close(shared.phase, 2 * math.pi * parallel_map[..., 1].sigmoid())
+    assert shared.absorption.shape == (7, 1)
+
+
+# sphere
+
+
+def drawn_point(direction, grid=GRID, width=0.02):
+    """A small round Gaussian 3 m away."""
+    mean = 3 * functional.normalize(torch.tensor([direction]), dim=-1)
+    blur = torch.tensor([0.3 * grid.azimuth_step, 0.3 * grid.elevation_step])
+    projected = on_sphere(mean, 3 * width * torch.eye(3)[None], blur)
+    return rasterize_magnitude(*projected, torch.tensor([[1.0, 0.0]]), grid, cutoff=None), projected
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "elevation"), [(30.0, 20.0), (359.0, 45.0), (0.0, 45.0), (0.5, 10.0), (200.0, 80.0), (200.0, -80.0)]
+)
+def test_a_point_lands_on_its_direction(azimuth, elevation):
+    az, el = math.radians(azimuth), math.radians(elevation)
+    spectrum, (_, cholesky) = drawn_point((math.cos(el) * math.cos(az), math.cos(el) * math.sin(az), math.sin(el)))
+    row, column = divmod(int(spectrum.argmax()), 360)
+    assert row == abs(elevation) - 1
+    assert min(abs(column - azimuth), 360 - abs(column - azimuth)) <= 0.5
+    assert spectrum.max() > 0.9
+    # as wide in elevation as it is seen, and in azimuth by 1 / cos(elevation) wider
+    blur = 0.3 * math.radians(1)
+    assert float(cholesky[0, 2]) == pytest.approx(math.hypot(0.02, blur), rel=1e-3)
+    assert float(cholesky[0, 0]) == pytest.approx(math.hypot(0.02 / math.cos(el), blur), rel=1e-2)
+
+
+def test_a_point_at_the_seam_is_drawn_on_both_sides():
+    spectrum, _ = drawn_point((math.cos(0.6), 0.0, math.sin(0.6)))
+    row = int(spectrum[:, 0].argmax())
+    torch.testing.assert_close(spectrum[row, 1:5], spectrum[row, -4:].flip(0))
+    assert spectrum[row, 359] > 0.5
+
+
+def test_a_point_at_the_pole_is_at_all_azimuths():
+    for tilt in (0.0, 1e-4):
+        spectrum, _ = drawn_point((tilt, 0.0, 1.0))
+        assert spectrum[89].min() > 0.9
+        assert spectrum[80].max() < 1e-3
+
+
+def test_projection_is_the_derivative_of_the_direction(generator):
+    """A Gaussian so small that its image is linear: covariances of drawn points and of the formula agree."""
+    mean = torch.tensor([[1.0, 2.0, 1.5], [-2.0, 0.5, -1.0]], dtype=torch.float64)
+    factor = 1e-4 * torch.randn(2, 3, 3, generator=generator, dtype=torch.float64)
+    angles, cholesky = on_sphere(mean, factor, torch.zeros(2, dtype=torch.float64))
+    points = mean[:, None] + torch.randn(2, 100_000, 3, generator=generator, dtype=torch.float64) @ factor.mT
+    azimuth, elevation = (
+        torch.atan2(points[..., 1], points[..., 0]),
+        torch.asin(points[..., 2].abs() / points.norm(dim=-1)),
+    )
+    torch.testing.assert_close(angles[:, 1], elevation.mean(dim=1), atol=1e-5, rtol=0)
+    for i in range(2):
+        found = torch.cov(torch.stack([azimuth[i], elevation[i]]))
+        l1, l2, l3 = cholesky[i]
+        lower = torch.stack([torch.stack([l1, 0 * l1]), torch.stack([l2, l3])])
+        torch.testing.assert_close(lower @ lower.T, found, rtol=0.03, atol=1e-10)
+
+
+# convolutions
+
+
+@pytest.mark.parametrize("shape", [(90, 360), (15, 60), (8, 32), (7, 9)])
+def test_halvings_and_doublings_meet(shape):
+    shapes = stages(AngularGrid.hemisphere(*shape))
+    x = torch.rand(2, 1, *shape)
+    for before, after in pairwise(shapes):
+        x = Halve(1, 1)(x)
+        assert x.shape[-2:] == after
+        assert Double(1, 1, before)(x).shape[-2:] == before
+
+
+def test_convolutions_are_periodic_in_azimuth():
+    x = torch.rand(1, 1, 6, 16)
+    halve, double = Halve(1, 1), Double(1, 1, (12, 32))
+    torch.testing.assert_close(halve(x.roll(4, -1)), halve(x).roll(2, -1))
+    torch.testing.assert_close(double(x.roll(4, -1)), double(x).roll(8, -1))
+
+
+def test_convolutions_refuse_specks(room):
+    with pytest.raises(InputError, match="at least 4 x 4"):
+        fit(room.coarsen(5), "vae")
+
+
+def test_divergence_is_that_of_normal_distributions(generator):
+    a, b = (Normal(torch.randn(3, 4, generator=generator), torch.randn(3, 4, generator=generator)) for _ in range(2))
+    p, q = (torch.distributions.Normal(n.mean, (0.5 * n.log_variance).exp()) for n in (a, b))
+    torch.testing.assert_close(a.divergence(b), torch.distributions.kl_divergence(p, q).sum(dim=-1))
+
+
+# growing
+
+
+def test_gaussians_that_are_pulled_at_are_doubled(room):
+    config = replace(PUBLISHED["wrfgs"], grows=True)
+    training = config.training(room, torch.device("cpu"))
+    for _ in range(3):
+        training.advance()
+    model, old = training.model, training.model.log_scale.detach().clone()
+    state = training.optimiser.state[model.log_scale]["exp_avg"].clone()
+    training.pull[:] = 0
+    training.pull[[3, 5]] = 1
+    with torch.no_grad():
+        model.log_scale[5] = math.log(wrfgs.MAX_CLONED * model.size.spread) - 1  # small: cloned
+        model.opacity[7] = -20  # hardly seen: removed
+    training._grow()
+    # 20, 1 removed, 1 cloned, 1 split into two
+    assert len(model.mean) == len(model.opacity) == model.size.n_gaussians == 21
+    assert len(training.result.mean) == 21
+    torch.testing.assert_close(model.mean[18], model.mean[4])  # the clone, after 18 that stayed
+    torch.testing.assert_close(model.log_scale[-2:], (old[3] - math.log(wrfgs.SPLIT_FACTOR)).expand(2, 3))
+    assert (model.mean[-1] != model.mean[-2]).all()
+    kept = training.optimiser.state[model.log_scale]["exp_avg"]
+    torch.testing.assert_close(kept[:3], state[:3])
+    assert (kept[18:] == 0).all()
+    training.advance()
+
+
+def test_an_interrupted_fit_that_grew_goes_on_to_the_same_bits(room, tmp_path, monkeypatch):
+    monkeypatch.setattr(wrfgs, "GROW_FROM", 2)
+    monkeypatch.setattr(wrfgs, "GROW_EVERY", 3)
+    monkeypatch.setattr(wrfgs, "MIN_PULL", 1e-9)
+    config = replace(PUBLISHED["wrfgs"], grows=True)
+    whole = fit(room, "wrfgs", config)
+    assert len(whole.network.mean) > 40
+    with pytest.raises(KeyboardInterrupt):
+        fit(room, "wrfgs", config, checkpoint=tmp_path / "state", on_record=interrupt)
+    again = fit(room, "wrfgs", config, checkpoint=tmp_path / "state")
+    assert torch.equal(again.synthesize(room.position), whole.synthesize(room.position))
+    whole.save(tmp_path / "model")
+    assert torch.equal(load(tmp_path / "model").synthesize(room.position), whole.synthesize(room.position))
+
+
+# every method
+
+
+def interrupt(record):
+    raise KeyboardInterrupt
+
+
+every = pytest.mark.parametrize("name", PUBLISHED)
+
+
+@every
+def test_learns_a_source_that_moves(name):
+    data = blob()
+    rows = torch.arange(len(data))
+    train, test = data.subset(rows[rows % 4 != 2]), data.subset(rows[rows % 4 == 2])
+    predicted = fit(train, name, LEARNS[name]).synthesize(test.position)
+    mean = psnr(train.spectrum.mean(dim=0), test.spectrum).median()
+    assert psnr(predicted, test.spectrum).median() > mean + 4
+
+
+@every
+def test_same_seed_same_model_and_interruptions_do_not_show(room, tmp_path, name):
+    config = PUBLISHED[name]
+    whole = fit(room, name).synthesize(room.position)
+    records = []
+    with pytest.raises(KeyboardInterrupt):
+        fit(room, name, checkpoint=tmp_path / "state", on_record=interrupt)
+    again = fit(room, name, checkpoint=tmp_path / "state", on_record=records.append)
+    assert [record["step"] for record in records] == [config.check_every, config.steps]
+    assert torch.equal(again.synthesize(room.position), whole)
+    other = fit(room, name, replace(config, seed=1))
+    assert not torch.equal(other.synthesize(room.position), whole)
+    with pytest.raises(InputError, match="another fit"):
+        fit(room, name, replace(config, seed=1), checkpoint=tmp_path / "state")
+
+
+@every
+def test_the_paper_preset_has_the_publications_settings(name):
+    config = type(PUBLISHED[name])
+    assert make_model(name, preset="paper", seed=3, validation="block").config == config.paper(seed=3)
+    assert make_model(name, seed=3).config == config(seed=3)
+
+
+@every
+@pytest.mark.parametrize(
+    "change", [{"steps": -5}, {"batch": 0}, {"rate": -1}, {"averaging": 1.0}, {"check_every": 0}, {"size": None}]
+)
+def test_options_outside_their_ranges_are_refused(name, change):
+    with pytest.raises(InputError, match=f"{next(iter(change))} must be"):
+        FIELD_MODELS[name](**change)
+
+
+@every
+def test_both_ends_may_move(name):
+    data = simulated_room(n=12, moving="receiver", grid=AngularGrid.hemisphere(8, 32))
+    training = PUBLISHED[name].training(data, torch.device("cpu"))
+    for _ in range(3):
+        training.advance()
+    rendered = training.result.eval().render(data.position, data.grid)
+    assert (rendered[0] - rendered[1]).abs().max() > 0
+
+
+@every
+def test_what_is_not_finite_stops_the_fit(room, monkeypatch, name):
+    broken = room.spectrum.clone()
+    broken[7, 3, 3] = float("nan")
+    with pytest.raises(InputError, match="training spectrum 7"):
+        fit(replace(room, store=Store(broken)), name)
+    monkeypatch.setattr(Training, "rate", lambda self, step: 1e30)
+    with pytest.raises(FitError, match="rate below"):
+        fit(room, name)
+
+
+def test_one_field_for_all_receivers(tmp_path):
+    """RSSI is averaged over rays, in dBm; rows without detection do not train."""
+    train = rssi_room(n=40).receivers(["1", "2", "3"])
+    train.rssi_dbm[::3, 1] = torch.nan
+    model = NeRF2Rssi(PUBLISHED_RSSI).fit(train)
+    model.save(tmp_path / "model")
+    position = train.transmitter_position
+    predicted = load(tmp_path / "model").predict(position).mean
+    assert predicted.shape == (40, 3)
+    torch.testing.assert_close(predicted, model.predict(position).mean)
+    network = model.network
+    rays = AngularGrid.hemisphere(2, 4).direction.flatten(0, 1).float()
+    transmitter, receiver = network.local(position[7:8]), network.local(train.receiver_position[2:])
+    signal = received(network.field, network.size, transmitter, receiver, rays).mean(dim=1)
+    torch.testing.assert_close(predicted[7, 2].float(), 100 * (torch.hypot(*signal) - 1))
+    with pytest.raises(KeyboardInterrupt):
+        NeRF2Rssi(PUBLISHED_RSSI).fit(train, checkpoint=tmp_path / "state", on_record=interrupt)
+    again = NeRF2Rssi(PUBLISHED_RSSI).fit(train, checkpoint=tmp_path / "state")
+    assert torch.equal(again.predict(position).mean, predicted)
+
+
+@pytest.mark.parametrize("name", ["nerf2", "wrfgs"])
+def test_any_resolution(room, name):
+    """Every other pixel of the doubled grid is one of the grid."""
+    model = fit(room, name)
+    coarse, fine = (model.synthesize(room.position[:3], grid) for grid in (None, AngularGrid.hemisphere(30, 120)))
+    torch.testing.assert_close(fine[:, 1::2, ::2], coarse, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["nerf2", "wrfgs"])
+def test_rays_need_to_know_where_they_start(room, name):
+    with pytest.raises(InputError, match="needs the fixed end"):
+        fit(replace(room, fixed_position=None), name)
+
+
+@pytest.mark.parametrize("name", ["vae", "dcgan"])
+def test_samples_differ_and_scatter_about_the_mean(room, name):
+    model = fit(room, name)
+    position = room.position[:4]
+    samples = torch.stack([model.sample(position, generator=torch.Generator().manual_seed(seed)) for seed in range(30)])
+    assert (samples[0] - samples[1]).abs().max() > 0
+    assert (samples.mean(dim=0) - model.synthesize(position)).abs().mean() < samples.std(dim=0).mean()
+
+
+def test_the_compiled_field_is_the_field(room, monkeypatch):
+    honest = torch.nn.Module.compile
+    monkeypatch.setattr(torch.nn.Module, "compile", lambda self: honest(self, backend="eager"))  # no minute of C++
+    plain, compiled = (
+        replace(PUBLISHED["nerf2"], compiled=c).training(room, torch.device("cpu")).objective() for c in (False, True)
+    )
+    torch.testing.assert_close(plain, compiled)
+
+
+@pytest.fixture(scope="module")
+def fitted(room):
+    """A fitted model of each name, once."""
+    return cache(lambda name: fit(room, name))
+
+
+@every
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"size": {}},
+        {"size": None},
+        {"size": {"width": 10**9}},
+        {"size": {"width": -1}},
+        {"size": {"width": 2.5}},
+        {"size": {"bands": 10**6}},
+        {"grid": None},
+        {"moving": "both"},
+    ],
+)
+def test_damaged_models_are_refused(fitted, tmp_path, name, change):
+    fitted(name).save(tmp_path / "model")
+    kind, tensors, header = read(tmp_path / "model", type(fitted(name)).kind)
+    if change == {"moving": "both"} and "moving" not in header:
+        pytest.skip("has no ends")
+    damaged = {k: header[k] | v if isinstance(v, dict) and v else v for k, v in change.items()}
+    write(tmp_path / "damaged", kind, tensors, header | damaged)
+    with pytest.raises(InputError):
+        load(tmp_path / "damaged")

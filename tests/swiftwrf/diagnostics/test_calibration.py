@@ -1,0 +1,141 @@
+"""Element phases and orientation: recovered if the data determine them, refused otherwise."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from samples import snapshots
+from scipy.spatial.transform import Rotation
+
+from swiftwrf import InputError, calibrate
+from swiftwrf.array.angles import AngularGrid, wrap
+from swiftwrf.array.planar import PlanarArray
+
+
+def spoilt(data, degrees=20.0, seed=0):
+    """The snapshots with phases of 0 to 2 pi and an orientation that is wrong by so much; the phases and the turn back."""
+    generator = torch.Generator().manual_seed(seed)
+    phase = 2 * math.pi * torch.rand(len(data.array.element), generator=generator, dtype=torch.float64)
+    axis = torch.randn(3, generator=generator, dtype=torch.float64)
+    turn = math.radians(degrees) * axis / axis.norm()
+    wrong = torch.from_numpy(Rotation.from_rotvec((-turn).numpy()).as_matrix())
+    channel = (data.channel * torch.polar(torch.ones_like(phase), phase)).to(torch.complex64)
+    return replace(data, channel=channel, rotation=data.rotation @ wrong), phase, turn
+
+
+def errors(found, phase, turn):
+    """Return the errors of the rotation and of the worst phase [deg], up to a common phase."""
+    left = Rotation.from_rotvec(found.turn.numpy()).inv() * Rotation.from_rotvec(turn.numpy())
+    beside = torch.polar(torch.ones_like(phase), found.phase - phase)
+    return math.degrees(left.magnitude()), float((beside * beside.sum().conj()).angle().abs().max().rad2deg())
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("echo", [0.0, 0.1])
+def test_phases_and_a_turn_of_20_degrees_are_recovered(seed, echo):
+    data, phase, turn = spoilt(snapshots(n=300, noise=0.2, echo=echo), seed=seed)
+    found = calibrate(data)
+    by_turn, by_phase = errors(found, phase, turn)
+    assert by_turn < 1
+    assert by_phase < 5
+    assert found.before < 0.3
+    assert found.after > 0.9
+    assert found.clear == 300
+
+
+def test_deviations_are_those_of_the_estimates():
+    """Over draws of the noise, errors in units of their deviation have a deviation of one."""
+    score = []
+    for seed in range(8):
+        data, phase, turn = spoilt(snapshots(n=120, count=1, noise=0.3, seed=seed))
+        found = calibrate(data)
+        turn_error = Rotation.from_rotvec(found.turn.numpy()).inv() * Rotation.from_rotvec(turn.numpy())
+        phase_error = wrap(found.phase - (phase - phase[0]))[1:]
+        score += (turn_error.as_rotvec() / found.turn_std.numpy()).tolist()
+        score += (phase_error / found.phase_std[1:]).tolist()
+    assert 0.5 < float(torch.tensor(score).square().mean().sqrt()) < 1.5
+
+
+def test_a_calibrated_array_is_left_as_it_is():
+    found = calibrate(snapshots(n=200))
+    assert float(found.turn.norm().rad2deg()) < 0.2
+    assert float(found.phase.abs().max().rad2deg()) < 1
+    assert found.after == pytest.approx(found.before, abs=0.01)
+
+
+def test_what_it_found_mends_the_spectra():
+    data, *_ = spoilt(snapshots(n=150))
+    mended = calibrate(data).apply(data).spectra(AngularGrid.hemisphere(24, 96))
+    usual = snapshots(n=150).spectra(AngularGrid.hemisphere(24, 96))
+    torch.testing.assert_close(mended.spectrum, usual.spectrum, atol=0.02, rtol=0)
+    torch.testing.assert_close(mended.label[:, 1], usual.label[:, 1], atol=0.01, rtol=0)
+
+
+def test_positions_without_line_of_sight_do_not_count():
+    data, phase, turn = spoilt(snapshots(n=200))
+    generator = torch.Generator().manual_seed(0)
+    hidden = torch.rand(200, generator=generator) < 0.4
+    noise = torch.randn(data.channel.shape, dtype=torch.complex64, generator=generator)
+    channel = torch.where(hidden[:, None, None], noise, data.channel)
+    unknown = calibrate(replace(data, channel=channel))
+    known = calibrate(replace(data, channel=channel, line_of_sight=~hidden))
+    for found in (unknown, known):
+        assert errors(found, phase, turn)[0] < 1
+    assert unknown.clear < 140
+    assert known.clear == int((~hidden).sum())
+
+
+QUARTER_TURN = Rotation.from_euler("z", 90, degrees=True)
+
+
+def narrow(data):
+    """Only positions straight in front of the array."""
+    return data.subset((data.direction[:, 2] > 0.97).nonzero()[:, 0])
+
+
+REFUSED = {
+    "few": (lambda: snapshots(n=12), "needs at least 20"),
+    "no line of sight": (
+        lambda: replace(snapshots(), line_of_sight=torch.zeros(120, dtype=torch.bool)),
+        "has 0 training positions",
+    ),
+    "noise": (lambda: snapshots(n=200, noise=30.0), "positions where a direct path stands out"),
+    "a cone": (lambda: narrow(snapshots(n=900, noise=0.5)), "measure positions in more directions"),
+    "a line": (
+        lambda: replace(
+            (data := snapshots()),
+            channel=data.channel[..., :4],
+            array=PlanarArray(data.array.element[:4], data.array.wavelength),
+        ),
+        "the elements of made lie on a line",
+    ),
+    "constant phases": (
+        lambda: replace((data := snapshots()), channel=data.channel[..., :1].expand_as(data.channel)),
+        "hardly depend on the position",
+    ),
+    "a quarter turn": (
+        lambda: replace((data := snapshots()), rotation=data.rotation @ torch.from_numpy(QUARTER_TURN.as_matrix())),
+        "an error of frames, not of mounting|a direct path stands out|does not determine",
+    ),
+    "positions of others": (
+        lambda: replace(snapshots(), position=snapshots().position.flip(0)),
+        "a direct path stands out|does not determine|does harm",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_refuses_what_cannot_be_told(name):
+    make, says = REFUSED[name]
+    with pytest.raises(InputError, match=says):
+        calibrate(make())
+
+
+def test_plain_values_are_strict_json():
+    found = json.loads(json.dumps(calibrate(snapshots(n=100)).to_json(), allow_nan=False))
+    assert len(found["phase_deg"]) == 16
+    assert 0 < found["turn_std_deg"][0] < 1

@@ -1,0 +1,223 @@
+"""Diagnoses of measurements with a known error name the true cause, and never another one.
+
+Scenes are random: size of the room, shape, place and orientation of the array, noise and an echo from the floor.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from swiftwrf import AngularGrid, load_spectra
+from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
+from swiftwrf.data import ReadOptions, Snapshots
+from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
+from tasks.inspect.findings import inspect
+
+GRID = AngularGrid.hemisphere(18, 72)
+SHAPES = ((2, 4), (3, 4), (2, 5), (3, 5), (4, 5))  # of arrays; not square, whose x and y may be exchanged
+
+
+def scene(seed: int, n: int = 80, count: int = 2, shape: tuple[int, int] | None = None) -> Snapshots:
+    """Snapshots of an array on the wall x = 0 of a room, with an echo from the floor."""
+    draw = torch.Generator().manual_seed(seed)
+
+    def uniform(low: float, high: float, *size: int) -> Tensor:
+        return low + (high - low) * torch.rand(*size, generator=draw, dtype=torch.float64)
+
+    frequency = float(uniform(0.9e9, 5.8e9, 1))
+    size = torch.stack([uniform(5, 9, 1), uniform(6, 10, 1), uniform(2.6, 3.2, 1)])[:, 0]
+    at = size * torch.tensor([0.0, 0.35, 0.45]) + torch.cat([torch.zeros(1), uniform(0, 0.6, 2)])
+    position = torch.stack([uniform(1.2, float(size[0]), n),
+                            uniform(0.3, float(size[1]), n), uniform(0.3, float(size[2]), n)], dim=1)  # fmt: skip
+    askew = uniform(-25, 25, 3)
+    rotation = Rotation.from_euler("y", 90, degrees=True) * Rotation.from_euler("zxy", askew.numpy(), degrees=True)
+    rows, columns = shape or SHAPES[seed % len(SHAPES)]
+    array = PlanarArray.grid(rows, columns, LIGHT_SPEED / frequency / 2, frequency)
+    turned = torch.from_numpy(rotation.as_matrix())
+    data = Snapshots(torch.ones(n, count, rows * columns, dtype=torch.complex64), position, array=array,
+                     fixed_position=at, rotation=turned, name="scene")  # fmt: skip
+    return received(data, seed, echo=float(uniform(0, 0.3, 1)), noise=float(uniform(0.05, 0.2, 1)))
+
+
+def received(data: Snapshots, seed: int, echo: float = 0.1, noise: float = 0.1, ways: int = 1) -> Snapshots:
+    """The snapshots with the channel of the direct path, an echo and noise."""
+    draw = torch.Generator().manual_seed(1000 + seed)
+    channel = torch.zeros(data.channel.shape, dtype=torch.complex128)
+    bands = torch.linspace(1, 1.01, data.channel.shape[1], dtype=torch.float64)
+    for mirror, amplitude in ((1.0, 1.0), (-1.0, echo)):
+        away = data.position * torch.tensor([1.0, 1.0, mirror]) - data.fixed_position
+        length = away.norm(dim=1, keepdim=True)
+        phase = data.array.phase(away / length @ data.rotation)[:, None] - 2 * math.pi / data.array.wavelength * (
+            length[:, :, None] * bands[:, None]
+        )
+        channel += amplitude * torch.polar(torch.ones_like(phase), phase)
+    channel = channel**ways + noise * torch.randn(channel.shape, dtype=torch.complex128, generator=draw)
+    return replace(data, channel=channel.to(torch.complex64))
+
+
+def without_delay(seed):
+    data = scene(seed)
+    return replace(data, channel=data.channel[..., :1] * (1 + 0.05 * torch.randn(data.channel.shape)))
+
+
+def axes_swapped(seed):
+    rows, columns = SHAPES[seed % len(SHAPES)]
+    data = scene(seed, count=rows * columns)
+    return replace(data, channel=data.channel.mT)
+
+
+def by_column(seed):
+    data = scene(seed)
+    rows, columns = SHAPES[seed % len(SHAPES)]
+    order = torch.arange(rows * columns).reshape(rows, columns).T.flatten()
+    return replace(data, channel=data.channel[..., order])
+
+
+def normalised(seed):
+    data = scene(seed)
+    low, high = data.position.amin(dim=0), data.position.amax(dim=0)
+    return replace(data, position=2 * (data.position - low) / (high - low) - 1)
+
+
+def there_and_back(seed):
+    return received(scene(seed), seed, echo=0.1, ways=2)
+
+
+def flipped(seed):
+    data = scene(seed, count=1)
+    draw = torch.Generator().manual_seed(seed)
+    half = torch.arange(data.channel.shape[2]) >= data.channel.shape[2] // 2
+    flip = torch.rand(len(data), 1, 1, generator=draw) < 0.5
+    return replace(data, channel=torch.where(flip & half, -data.channel, data.channel))
+
+
+def uncalibrated(seed):
+    data = scene(seed, n=100)
+    phase = 2 * math.pi * torch.rand(data.channel.shape[2], generator=torch.Generator().manual_seed(seed))
+    return replace(data, channel=data.channel * torch.polar(torch.ones_like(phase), phase))
+
+
+def tilted(seed):
+    data = scene(seed)
+    wrong = Rotation.from_rotvec([0, 0, math.radians(25 + seed)])
+    return replace(data, rotation=data.rotation @ torch.from_numpy(wrong.as_matrix()))
+
+
+def image_axes(seed):
+    data = scene(seed)
+    top = float(data.position[:, 1].max()) + 0.7
+    return replace(data, position=data.position * torch.tensor([1.0, -1.0, 1.0]) + torch.tensor([0.0, top, 0.0]))
+
+
+def narrow(seed):
+    data = scene(seed, n=4000)
+    ahead = torch.nn.functional.normalize(data.direction.mean(dim=0), dim=0)
+    return data.subset(((data.direction @ ahead) > 0.996).nonzero()[:40, 0])
+
+
+def behind(seed):
+    data = scene(seed)
+    position = data.position.clone()
+    normal = data.rotation[:, 2]
+    away = position - data.fixed_position
+    back = torch.arange(len(data))[:, None] % 3 == 0
+    return received(
+        replace(data, position=torch.where(back, position - 2 * (away @ normal)[:, None] * normal, position)), seed
+    )
+
+
+def hidden(seed):
+    data = scene(seed)
+    draw = torch.Generator().manual_seed(seed)
+    return replace(data, channel=torch.randn(data.channel.shape, dtype=torch.complex64, generator=draw))
+
+
+CAUSES = {  # measurements, and the statement of the cause of an error
+    "nothing": (scene, "in one frame"),
+    "a line": (lambda seed: scene(seed, shape=(1, 3 + seed % 4)), "angle to the array's axis) and follow it"),
+    "behind": (behind, "behind the array"),
+    "no line of sight": (hidden, "do not follow it in any frame"),
+    "phases without delay": (without_delay, "hardly depend on the position"),
+    "axes swapped": (axes_swapped, "csi.transpose(0, 2, 1)"),
+    "elements by column": (by_column, "the elements are given column by column"),
+    "normalised positions": (normalised, "look normalised"),
+    "there and back": (there_and_back, "there and back"),
+    "half-turn flips": (flipped, "jumps by half a turn"),
+    "uncalibrated": (uncalibrated, "The array is not calibrated"),
+    "tilted": (tilted, "constant rotation of"),
+    "x and y swapped": (
+        lambda s: replace(d := scene(s), position=d.position[:, [1, 0, 2]]),
+        "x and y of the positions",
+    ),
+    "millimetres": (lambda s: replace(d := scene(s), position=1000 * d.position), "the positions are in millimetres"),
+    "image axes": (image_axes, "y of the positions counts from the other side"),
+    "one direction": (narrow, "nearly one direction"),
+}
+ERRORS = [says for name, (_, says) in CAUSES.items() if name not in ("nothing", "a line", "behind", "no line of sight")]
+ALSO = {"tilted": "The array is not calibrated"}  # its calibration includes the rotation
+
+
+def check(name: str, seed: int) -> None:
+    make, expected = CAUSES[name]
+    findings, _ = inspect(make(seed), ReadOptions(grid=GRID))
+    text = " ".join(finding.text for finding in findings.sentences)
+    assert expected in text
+    assert not [says for says in ERRORS if says in text and says not in (expected, ALSO.get(name))]
+    assert all(expected in cause for cause in findings.numbers["explanations"])
+
+
+@pytest.mark.parametrize("name", CAUSES)
+def test_true_cause_is_stated_and_no_other(name):
+    for seed in range(5):
+        check(name, seed)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", CAUSES)
+def test_true_cause_is_stated_in_further_scenes(name):
+    for seed in range(5, 25):
+        check(name, seed)
+
+
+CASES = os.environ.get("SWIFTWRF_CASES")
+
+
+@pytest.mark.skipif(CASES is None, reason="set SWIFTWRF_CASES to the folder of inputs that went wrong")
+@pytest.mark.parametrize(
+    ("case", "expected"),
+    [
+        ("07-image-axes", "y of the positions counts from the other side (y = 14.0 - y)"),
+        ("16-null-subcarriers", "(4 of 32, counted from 0): 0 to 1, 16, 31"),
+        ("17-coefficients-without-delay", "hardly depend on the position"),
+        ("18-square-axes-swapped", "csi.transpose(0, 2, 1)"),
+        ("19-linear-array", "angle to the array's axis) and follow it"),
+        ("20-behind-the-array", "50% of the positions lie behind the array"),
+        ("21-elements-column-by-column", "the elements are given column by column"),
+        ("22-normalised-positions", "look normalised"),
+        ("23-backscatter-phase", "there and back"),
+        ("24-sign-flips", "elements 9 to 16 jumps by half a turn"),
+        ("25-matlab-complex", "in one frame"),
+        ("26-deepmimo-aodt", "90 - aoa_el is taken"),
+        ("27-calibration-beyond-45-degrees", "the array's x and y are swapped"),
+    ],
+)
+def test_inputs_that_went_wrong(case, expected):
+    options = ReadOptions(beamformer="bartlett" if case.startswith("16") else None)
+    data = read(Path(CASES) / case / "input", options, SNAPSHOT_FORMATS, SPECTRA_FORMATS, RSSI_FORMATS)
+    findings, _ = inspect(data, replace(options, grid=GRID))
+    text = " ".join(finding.text for finding in findings.sentences)
+    assert expected in text
+    assert "--calibrate" not in text
+
+
+@pytest.mark.skipif(CASES is None, reason="set SWIFTWRF_CASES to the folder of inputs that went wrong")
+def test_grid_as_a_pair_in_an_input_that_went_wrong():
+    assert load_spectra(Path(CASES) / "28-grid-as-a-pair/input", grid=(30, 120)).grid.shape == (30, 120)

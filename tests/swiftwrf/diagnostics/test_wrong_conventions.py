@@ -1,0 +1,180 @@
+"""Wrong frames, units and conventions: each is refused by the reader or named by the inspection."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from samples import FACING_X, snapshots, survey_rows, write_deepmimo, write_snapshots, write_survey
+from scipy.spatial.transform import Rotation
+
+from swiftwrf import AngularGrid, InputError, load_rssi, load_snapshots, load_spectra, rssi_room
+from swiftwrf.data import ReadOptions
+from swiftwrf.data.store import Store
+from swiftwrf.diagnostics.path_loss import check_path_loss
+from tasks.inspect.findings import inspect
+
+GRID = AngularGrid.hemisphere(24, 96)
+HOW = ReadOptions(grid=GRID)
+DATA = snapshots(n=150)
+SPECTRA = DATA.spectra(GRID)
+ROOM = rssi_room(n=300)
+QUATERNION = FACING_X.as_quat()
+
+
+def warnings(data):
+    return " ".join(f.text for f in inspect(data, HOW)[0].sentences if f.level == "warning")
+
+
+def oriented(rotation):
+    return replace(SPECTRA, rotation=torch.from_numpy(rotation.as_matrix()))
+
+
+def moved(change):
+    return replace(DATA, position=change(DATA.position))
+
+
+def drawn(change):
+    return replace(SPECTRA, store=Store(change(SPECTRA.spectrum)))
+
+
+def placed(change, receivers=False):
+    places = change(ROOM.receiver_position) if receivers else ROOM.receiver_position
+    return replace(ROOM, transmitter_position=change(ROOM.transmitter_position), receiver_position=places)
+
+
+def column(values):
+    """The floor with other values at its first receiver."""
+    rssi = ROOM.rssi_dbm.clone()
+    rssi[:, 0] = values.double()
+    return replace(ROOM, rssi_dbm=rssi)
+
+
+def offsets():
+    phase = 2 * math.pi * torch.rand(16, generator=torch.Generator().manual_seed(1))
+    return replace(DATA, channel=DATA.channel * torch.polar(torch.ones(16), phase))
+
+
+def shrunk(p):
+    return p * 1000
+
+
+ALL_SHRUNK = replace(DATA, position=shrunk(DATA.position), fixed_position=shrunk(DATA.fixed_position))
+FLIP_Y = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
+TURNED = oriented(FACING_X * Rotation.from_euler("x", 20, degrees=True))
+
+NAMED = {
+    "x and y swapped": (moved(lambda p: p[:, [1, 0, 2]]), "x and y of the positions are swapped"),
+    "y and z swapped": (moved(lambda p: p[:, [0, 2, 1]]), "y and z of the positions are swapped"),
+    "y mirrored": (moved(lambda p: p * FLIP_Y), "y of the positions has the wrong sign"),
+    "positions in millimetres": (moved(shrunk), "the positions are in millimetres"),
+    "everything in millimetres": (ALL_SHRUNK, "are they millimetres"),
+    "quaternion w, x, y, z": (oriented(Rotation.from_quat(np.roll(QUATERNION, 1))), "in the order w, x, y, z"),
+    "quaternion inverted": (oriented(FACING_X.inv()), "the quaternion turns world into array coordinates"),
+    "array turned by 20 degrees": (TURNED, "constant rotation of 20 degrees"),
+    "azimuth clockwise": (drawn(lambda s: s.flip(2).roll(1, 2)), "azimuths of the spectra turn clockwise"),
+    "azimuth from y": (drawn(lambda s: s.roll(-24, 2)), "azimuths of the spectra count from y"),
+    "zenith for elevation": (drawn(lambda s: s.flip(1)), "run from the zenith down"),
+    "phases reversed": (replace(DATA, channel=DATA.channel.conj()), "phases have the wrong sign"),
+    "phases uncalibrated": (offsets(), "The array is not calibrated"),
+    "RSSI, x and y swapped": (placed(lambda p: p[:, [1, 0, 2]]), "x and y of the positions are swapped"),
+    "RSSI, y counts down an image": (
+        placed(lambda p: p * FLIP_Y + torch.tensor([0.0, 17.0, 0.0], dtype=torch.float64)),
+        "y of the positions counts from the other side (y = 17.",
+    ),
+    "RSSI, positions in millimetres": (placed(shrunk), "the positions are in millimetres"),
+    "RSSI, everything in millimetres": (placed(shrunk, receivers=True), "are positions in millimetres"),
+    "RSSI, one value everywhere": (column(torch.full((300,), -70.0)), "one value everywhere: receiver01"),
+    "RSSI, values above 0 dBm": (column(torch.linspace(-80, 20, 300)), "0 dBm and more"),
+    "RSSI, a receiver twice": (column(ROOM.rssi_dbm[:, 1]), "the same values: receiver02 = receiver01"),
+    "RSSI, hardly heard": (column(torch.where(torch.arange(300) < 5, -70.0, torch.nan)), "fewer than 10 rows"),
+}
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_inspection_names_it(name):
+    data, says = NAMED[name]
+    assert says in warnings(data)
+
+
+@pytest.mark.parametrize("data", [DATA, SPECTRA, ROOM], ids=["snapshots", "spectra", "RSSI"])
+def test_inspection_names_nothing_where_all_is_right(data):
+    assert not any(
+        word in warnings(data) for word in ("frame", "rotation", "metres", "calibrat", "would fit", "would explain")
+    )
+
+
+def test_inspection_names_a_sign_of_not_heard_that_is_not_known():
+    rssi = ROOM.rssi_dbm.clone()
+    rssi[torch.rand(rssi.shape, generator=torch.Generator().manual_seed(0)) < 0.3] = torch.nan
+    assert "does it mean not detected" in warnings(replace(ROOM, rssi_dbm=rssi.nan_to_num(-127.0)))
+
+
+def _deepmimo(**changes):
+    return lambda folder: load_spectra(write_deepmimo(folder, **changes), grid=GRID)
+
+
+def _snapshots(**changes):
+    return lambda folder: load_snapshots(write_snapshots(folder, data=DATA, **changes))
+
+
+def _survey(header):
+    return lambda folder: load_rssi(write_survey(folder, header=header))
+
+
+REFUSED = {
+    "radians for degrees": (
+        _deepmimo(aoa_el=lambda a: np.deg2rad(a["aoa_el"]), aoa_az=lambda a: np.deg2rad(a["aoa_az"])),
+        "look like radians",
+    ),
+    "angles of departure": (
+        _deepmimo(aoa_el=lambda a: 180 - a["aoa_el"], aoa_az=lambda a: a["aoa_az"] + 180),
+        "directions of propagation",
+    ),
+    "x and y swapped": (
+        _deepmimo(rx_pos=lambda a: a["rx_pos"][:, [1, 0, 2]], tx_pos=lambda a: a["tx_pos"][:, [1, 0, 2]]),
+        "x and y are swapped",
+    ),
+    "azimuth clockwise": (_deepmimo(aoa_az=lambda a: -a["aoa_az"]), "turns clockwise"),
+    "positions in millimetres": (_deepmimo(rx_pos=lambda a: 1000 * a["rx_pos"]), "not in metres"),
+    "delays in nanoseconds": (_deepmimo(delay=lambda a: 1e9 * a["delay"]), "not in metres or delays not in seconds"),
+    "elements in millimetres": (
+        _snapshots(element_position=None, rows=4, columns=4, spacing_m=1000 * DATA.array.wavelength / 2),
+        "is the spacing in metres",
+    ),
+    "carrier in GHz": (_snapshots(frequency_hz=2.4), "carrier in Hz"),
+    "Euler angles in degrees": (_snapshots(array_orientation=np.array([0.0, 90.0, 25.0])), "Euler angles"),
+    "quaternion in degrees": (_snapshots(array_orientation=np.array([0.0, 90.0, 25.0, 1.0])), "unit quaternion"),
+    "subcarriers and elements swapped": (_snapshots(csi=DATA.channel.numpy().transpose(0, 2, 1)), "transpose"),
+    "missing columns": (_survey(["a", "y", "z", *survey_rows()[0][3:]]), "no column for x"),
+    "metres called longitude": (
+        lambda folder: load_rssi(
+            write_survey(folder, header=["lon", "lat", "a"], rows=[[11.5 + i, 48.1, -50] for i in range(12)])
+        ),
+        "may be degrees or metres",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_reader_refuses_it(name, tmp_path):
+    read, says = REFUSED[name]
+    with pytest.raises(InputError, match=says):
+        read(tmp_path / "a")
+
+
+def test_a_rotation_is_told_from_the_axes_of_the_array():
+    turned = oriented(FACING_X * Rotation.from_rotvec([0, 0, math.radians(-20)]))
+    findings, _ = inspect(turned, HOW)
+    assert findings.numbers["turn_deg"] == pytest.approx([0, 0, 20], abs=1.5)
+    assert findings.numbers["frame"] == "turned"
+
+
+def test_axes_along_which_all_positions_are_equal_are_not_swapped():
+    flat = replace(ROOM, transmitter_position=ROOM.transmitter_position * torch.tensor([1.0, 1.0, 0.0]))
+    mirrored = replace(flat, transmitter_position=11.0 - flat.transmitter_position)
+    report = check_path_loss(mirrored)
+    assert "z" not in report.explanation

@@ -1,0 +1,174 @@
+"""The Gaussian process: kernel, its choice, regression, smooth fields."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import Matern
+
+from swiftwrf.gp import (
+    GaussianProcess,
+    Kernel,
+    LeaveGroupOut,
+    SmoothField,
+    choose_kernel,
+    choose_rank,
+    held_out,
+    most_informative,
+    subsample,
+)
+from swiftwrf.gp.choice import _held_out_errors, _local_errors
+
+KERNEL = Kernel(long=1.0, short=0.3, share=0.6, noise=1e-2)
+
+
+def test_regression_is_that_of_scikit_learn(generator):
+    known, asked = (torch.rand(n, 3, generator=generator, dtype=torch.float64) for n in (30, 7))
+    values = torch.randn(30, generator=generator, dtype=torch.float64)
+    process = GaussianProcess(KERNEL, known)
+    kernel = 0.6 * Matern(1.0, nu=0.5) + 0.4 * Matern(0.3, nu=1.5)
+    theirs = GaussianProcessRegressor(kernel, alpha=1e-2, optimizer=None).fit(known, values)
+    mean, deviation = theirs.predict(asked, return_std=True)
+    rows, weight = process.weights(asked)
+    np.testing.assert_allclose(weight @ values[rows], mean, rtol=1e-8, atol=1e-9)
+    regressed = GaussianProcess.regress(KERNEL, known, values[:, None])
+    np.testing.assert_allclose(regressed.mean(asked)[:, 0], mean, rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(process.variance(asked).sqrt(), deviation, rtol=1e-6)
+
+
+def test_kernel_is_positive_definite_and_one_at_home(generator):
+    position = torch.rand(40, 3, generator=generator, dtype=torch.float64)
+    gram = KERNEL(position, position)
+    torch.testing.assert_close(gram.diagonal(), torch.ones(40, dtype=torch.float64))
+    assert torch.linalg.eigvalsh(gram).min() > 0
+    torch.testing.assert_close(KERNEL.scaled(3.0)(3 * position, 3 * position), gram)
+
+
+def test_motion_is_a_draw_of_its_prior(generator):
+    """With standard normal z the coefficients at the anchors have the prior's covariance k K^-1 k, close to k."""
+    anchor = torch.rand(6, 3, generator=generator)
+    basis = SmoothField(anchor, KERNEL, 20_000)
+    with torch.no_grad():
+        basis.coefficient.normal_(generator=generator)
+    drawn = basis(anchor)
+    covariance = (drawn @ drawn.T / 20_000).detach()
+    gram = KERNEL(anchor, anchor)
+    expected = gram @ torch.linalg.inv(gram + KERNEL.noise * torch.eye(6)) @ gram
+    torch.testing.assert_close(covariance, expected, atol=0.04, rtol=0)
+
+
+def test_kernel_choice_finds_smooth_and_rough_fields(generator):
+    position = torch.rand(80, 3, generator=generator, dtype=torch.float64)
+    fold = torch.arange(80) % 5
+    smooth = torch.sin(position @ torch.rand(3, 64, generator=generator, dtype=torch.float64)).reshape(80, 8, 8)
+    noise = torch.rand(80, 8, 8, generator=generator)
+    assert choose_kernel(position, smooth, fold).noise < choose_kernel(position, noise, fold).noise
+
+
+def test_kernel_of_many_spectra_follows_their_density(generator):
+    """A sample of the spectra is too sparse for the fine part of the field, which is noise to its kernel."""
+    position = torch.rand(2500, 3, generator=generator, dtype=torch.float64) * torch.tensor([1.0, 1.0, 0.0])
+    wave = torch.nn.functional.normalize(torch.randn(2, 50, generator=generator, dtype=torch.float64), dim=0)
+    phase = position[:, :2] @ wave
+    spectrum = (torch.sin(2 * phase) + 0.2 * torch.sin(60 * phase))[:, None]
+    fold = torch.arange(2500) % 5
+    assert choose_kernel(position, spectrum, fold).noise < choose_kernel(*subsample(position, spectrum, fold)).noise
+
+
+def test_local_errors_of_all_neighbours_are_the_exact_ones(generator):
+    position, spectrum = (torch.rand(40, *shape, generator=generator, dtype=torch.float64) for shape in ((3,), (4, 5)))
+    exact, local = (
+        errors(position, spectrum, torch.arange(40))(KERNEL) for errors in (_held_out_errors, _local_errors)
+    )
+    torch.testing.assert_close(local, exact)
+
+
+def test_rank_counts_what_matters(generator):
+    """Thirty directions in which smooth fields vary are all it takes, with or without a little noise."""
+    position = torch.rand(200, 3, generator=generator, dtype=torch.float64)
+    fold = torch.arange(200)
+    fields = torch.sin(position @ torch.randn(3, 30, generator=generator, dtype=torch.float64) * 20)
+    smooth = (fields @ torch.randn(30, 64, generator=generator, dtype=torch.float64)).reshape(200, 8, 8)
+    noisy = smooth + 1e-3 * torch.randn(smooth.shape, generator=generator)
+    for spectrum in (smooth, noisy):
+        kernel = choose_kernel(position, spectrum, fold % 5)
+        assert 25 <= choose_rank(position, spectrum, fold, kernel) <= 30
+
+
+@pytest.mark.parametrize("n_folds", [5, 40], ids=["a fifth", "one"])
+def test_held_out_predictions_are_those_of_a_process_without_the_fold(generator, n_folds):
+    position = torch.rand(40, 3, generator=generator, dtype=torch.float64)
+    value = torch.randn(40, 2, generator=generator, dtype=torch.float64)
+    fold = torch.arange(40) % n_folds
+    predicted, variance = held_out(KERNEL, position, fold, value)
+    for number in range(n_folds):
+        out, kept = fold == number, fold != number
+        process = GaussianProcess.regress(KERNEL, position[kept], value[kept])
+        torch.testing.assert_close(predicted[out], process.mean(position[out]))
+        torch.testing.assert_close(variance[out], process.variance(position[out]) + KERNEL.noise)
+        group = LeaveGroupOut(torch.linalg.inv(KERNEL.covariance(position)), out.nonzero()[:, 0])
+        torch.testing.assert_close(group.weights, process.weights(position[out])[1])
+        torch.testing.assert_close(group.errors(group.precision @ value), value[out] - predicted[out])
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_local_process_of_all_neighbours_is_the_exact_one(generator, dtype):
+    known, asked = (torch.rand(n, 3, generator=generator, dtype=torch.float64) for n in (40, 6))
+    value = torch.randn(40, 3, generator=generator, dtype=torch.float64)
+    exact, local = (GaussianProcess.regress(KERNEL, known, value, e, dtype) for e in (True, False))
+    torch.testing.assert_close(local.mean(asked), exact.mean(asked).double(), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(local.variance(asked), exact.variance(asked))
+    for process in (exact, local):
+        again = GaussianProcess.from_state(*process.state("a."), dtype, process.exact, prefix="a.")
+        assert torch.equal(again.mean(asked), process.mean(asked))
+        rows, weight = process.weights(asked)
+        assert len(rows) == 40
+        torch.testing.assert_close((weight @ value[rows]), exact.mean(asked).double(), atol=1e-4, rtol=1e-4)
+
+
+def test_local_predictions_condition_on_the_nearest_positions(generator):
+    known = torch.rand(300, 3, generator=generator, dtype=torch.float64)
+    value = torch.sin(5 * known)
+    asked = known[:20] + 0.01
+    exact, local = (GaussianProcess.regress(KERNEL, known, value, e) for e in (True, False))
+    torch.testing.assert_close(local.mean(asked), exact.mean(asked), atol=0.02, rtol=0)
+    rows, weight = local.weights(asked)
+    torch.testing.assert_close(weight @ value[rows], local.mean(asked))
+
+
+def test_smooth_fields_are_the_process(generator):
+    """Values and derivatives agree, from all positions and from the nearest (here all but a few far ones)."""
+    position = 2 * torch.rand(70, 3, generator=generator) - 1
+    value = torch.sin(position @ torch.randn(3, 2, generator=generator))
+    kernel = Kernel(long=8.0, short=0.4, share=0.05, noise=1e-2)
+    new = 1.6 * torch.rand(50, 3, generator=generator) - 0.8
+    process = GaussianProcess.regress(kernel, position, value)
+    wanted = process.mean(new).float()
+    for field, tolerance in (
+        (SmoothField.regress(position, kernel, value), 1e-4),
+        (SmoothField(position, kernel, 2, value=value), 0.02),
+    ):
+        torch.testing.assert_close(field(new), wanted, atol=tolerance, rtol=0)
+        torch.testing.assert_close(field.variance(new), process.variance(new).float(), atol=tolerance, rtol=0)
+        at = new[:3].clone().requires_grad_()
+        field(at).sum().backward()
+        step = torch.tensor([1e-3, 0.0, 0.0])
+        slope = (field(new[:3] + step) - field(new[:3] - step)).sum(dim=1) / 2e-3
+        torch.testing.assert_close(at.grad[:, 0], slope.detach(), atol=0.01, rtol=0.01)
+
+
+def test_suggested_positions_beat_random_ones(generator):
+    """The variance that is left is what a process with them measured has, and less than with as many at random."""
+    known, candidate = (torch.rand(n, 3, generator=generator, dtype=torch.float64) for n in (20, 200))
+    chosen, left = most_informative(KERNEL, known, candidate, 8)
+    assert len(set(chosen.tolist())) == 8
+    assert (left.diff() < 0).all()
+
+    def remaining(rows):
+        return GaussianProcess(KERNEL, torch.cat([known, candidate[rows]])).variance(candidate).mean()
+
+    torch.testing.assert_close(left[-1], remaining(chosen), atol=1e-5, rtol=1e-4)
+    random = [remaining(torch.randperm(200, generator=generator)[:8]) for _ in range(20)]
+    assert left[-1] < min(random)

@@ -1,0 +1,544 @@
+"""Rooms in closed form found again, conclusions on what is not identifiable, samples, state."""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import replace
+
+import pytest
+import torch
+
+from swiftwrf import AngularGrid, InputError, load, simulated_room
+from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data.store import Store
+from swiftwrf.gp import GaussianProcess, Kernel
+from swiftwrf.metrics import psnr
+from swiftwrf.models.geometry import GeometryConfig, GeometryModel, Plane, fit_geometry, refit_geometry
+from swiftwrf.models.geometry import fit as geometry_fit
+from swiftwrf.models.geometry.ambiguity import _AlternativeTable, phase_alternatives
+from swiftwrf.models.geometry.batched import batched, batched_field, batched_score
+from swiftwrf.models.geometry.fit import _with_weak_planes, _without_aliases, observe, split
+from swiftwrf.models.geometry.hybrid import HybridModel, fit_hybrid
+from swiftwrf.models.geometry.images import PhaseObservations, field, image_gain, images, mirror, sequences
+from swiftwrf.models.geometry.path_gains import PathGains, fit_path_gains
+from swiftwrf.models.geometry.phase_retrieval import autocorrelation, correlations, retrieve_phases
+from swiftwrf.models.geometry.planes import PlaneSet, refined
+from swiftwrf.models.geometry.refine import image_jacobian, phase_jacobian
+from swiftwrf.models.geometry.responses import SteeringResponses
+from swiftwrf.models.geometry.search import SIDES, SIGNS
+from swiftwrf.models.nearest import NearestModel
+from swiftwrf.runtime.checkpoint import write
+from swiftwrf.testing.rooms import ARRAY, GRID, mirror_room
+
+QUICK = GeometryConfig(reach=2.0, width=2)
+SIX = {
+    (-1, 0, 0): 0.0,
+    (1, 0, 0): 5.0,
+    (0, -1, 0): 0.0,
+    (0, 1, 0): 4.0,
+    (0, 0, -1): 0.0,
+    (0, 0, 1): 2.8,
+}
+
+
+def fit(data, **changes):
+    return fit_geometry(data, replace(QUICK, **changes), progress=False)
+
+
+def errors(model, planes):
+    """Distance of each true plane from the found one with that normal [mm], and that one's deviation [mm]."""
+    found = []
+    for normal, offset in planes.items():
+        unit = torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
+        near = max(model.planes, key=lambda p: float(torch.tensor(p.normal, dtype=torch.float64) @ unit))
+        found.append((1000 * abs(near.offset_m - offset), near.std_mm))
+    return found
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    return mirror_room(SIX, noise=0.1)
+
+
+@pytest.fixture(scope="module")
+def room(noisy):
+    return fit(noisy)
+
+
+def test_elements_may_be_listed_in_any_order():
+    """One of two phase aliases fits the room, whatever the order of opposite elements."""
+    order = torch.randperm(16, generator=torch.Generator().manual_seed(1))
+    plain, shuffled = ARRAY, PlanarArray(ARRAY.element[order], ARRAY.wavelength)
+    normal = torch.tensor([list(SIX)], dtype=torch.float64)
+    offset = torch.tensor([list(SIX.values())], dtype=torch.float64)
+    for array in (plain, shuffled):
+        scene, _ = observe(mirror_room(SIX, array=array))
+        waves = field(scene, normal, offset, torch.full((1, 6), -0.6), sequences(normal[0], 2))[0]
+        assert float(scene.score(scene.wave(scene.transmitter) + waves)) < 1e-3
+    assert PlanarArray(ARRAY.element[:7], ARRAY.wavelength).opposite is None
+
+
+def test_phases_of_the_elements_follow_from_the_spectra():
+    generator = torch.Generator().manual_seed(0)
+    angle = 3 * torch.randn(30, 16, dtype=torch.float64, generator=generator)
+    channel = torch.polar(torch.ones_like(angle), angle)
+    data = replace(mirror_room({}, n=30), store=Store(ARRAY.spectrum(channel, GRID)))
+    torch.testing.assert_close(correlations(data), autocorrelation(channel, ARRAY), atol=1e-5, rtol=0)
+    found, error = retrieve_phases(correlations(data), ARRAY)
+    match = torch.stack([(channel.conj() * f).mean(1).abs() for f in (found, found.conj().flip(1))]).amax(0)
+    assert float(error.max()) < 1e-3
+    assert float(match.min()) > 0.999
+
+
+@pytest.mark.parametrize("moving", ["receiver", "transmitter"])
+def test_derivatives_of_the_phase_are_differences_of_the_field(moving):
+    """Includes rooms with oblique planes, and images that a plane makes twice."""
+    scene, _ = observe(mirror_room({}, moving=moving, n=10))
+    normal = torch.tensor([[[1, 0, 0], [0, 0, -1], [0, 1, 0]], [[1, 0.1, 0], [0.1, 0, -1], [-0.2, 1, 0.1]]]).double()
+    normal = torch.nn.functional.normalize(normal, dim=-1)
+    offset, gain = torch.tensor([[5.0, 0.4, 4.0], [4.8, 0.2, 4.1]]).double(), torch.full((2, 3), -0.6)
+    chain, step = [*sequences(normal[1], 2), (0, 1, 0)], 1e-3
+    across = torch.linalg.svd(normal[:, :, None]).Vh[:, :, 1:]
+    movement = image_jacobian(normal, offset, scene.transmitter, chain, tilt=True)
+    total, jacobian = phase_jacobian(scene, normal, offset, gain, chain, movement)
+    direct = scene.wave(scene.transmitter)
+    torch.testing.assert_close(total.permute(1, 2, 0), direct + field(scene, normal, offset, gain, chain))
+    for plane in range(3):
+        for q in range(4):
+            moved = []
+            for side in (-step, step):
+                n, o, g = normal.clone(), offset.clone(), gain.clone()
+                if q == 0:
+                    o[:, plane] += side
+                elif q == 1:
+                    g[:, plane] += side
+                else:
+                    n[:, plane] += side * across[:, plane, q - 2]
+                moved.append(direct + field(scene, n, o, g, chain))
+            difference = (moved[1] / moved[0]).angle() / (2 * step)
+            found = jacobian[:, :, 3 * q + plane].permute(1, 2, 0)
+            assert float((found - difference).norm() / difference.norm()) < 0.02
+
+
+@pytest.mark.parametrize("moving", ["receiver", "transmitter"])
+def test_batched_fields_and_scores_are_the_plain_ones(moving):
+    """Also of an array that is no lattice, where each element is a step of its own."""
+    generator = torch.Generator().manual_seed(0)
+    scattered = PlanarArray(ARRAY.element + 0.02 * torch.rand(16, 2, generator=generator).double(), ARRAY.wavelength)
+    offset, gain = 4 + torch.rand(9, 3, generator=generator).double(), torch.rand(9, 3, generator=generator) - 0.5
+    tilted = torch.nn.functional.normalize(torch.tensor([[1, 0.3, 0], [-0.2, 1, 0.1], [0, 0, -1]]).double(), dim=1)
+    for array in (ARRAY, scattered):
+        data, observed = (
+            mirror_room({}, moving=moving, n=10),
+            torch.randn(10, 16, generator=generator, dtype=torch.complex64),
+        )
+        scene = PhaseObservations.of(data.position, data.fixed_position, moving, array, data.rotation, observed.sgn())
+        assert len(scene.chain.step) == (3 if array is ARRAY else 16)
+        for normal in (tilted, SIDES[[0, 1, 3]]):
+            planes, chain = (normal.expand(9, 3, 3), offset, gain), sequences(normal, 2)
+            plain, fast = field(scene, *planes, chain), batched_field(scene, *planes, chain)
+            torch.testing.assert_close(
+                torch.cat([plain.real, plain.imag], dim=-1).permute(1, 2, 0), fast, atol=1e-5, rtol=0
+            )
+            torch.testing.assert_close(batched_score(scene, fast), scene.score(plain), atol=1e-5, rtol=0)
+            torch.testing.assert_close(batched(plain[0]), fast[..., :1], atol=1e-5, rtol=0)
+
+
+def test_rooms_are_refined_together_as_one_by_one():
+    scene, _ = observe(mirror_room(SIX, n=20))
+    normal, offset = torch.tensor([list(SIX)]).double(), torch.tensor([list(SIX.values())]).double()
+    room = PlaneSet(normal, offset + 0.01, torch.full((1, 6), -0.5), 2)
+    rooms = [
+        room,
+        room.without(0),
+        replace(room, offset=offset - 0.01),
+        PlaneSet(normal[:, :0], offset[:, :0], offset[:, :0], 2),
+    ]
+    for together, given in zip(refined(rooms, scene, 3), rooms, strict=True):
+        alone = given.refined(scene, 3)
+        torch.testing.assert_close(together.offset, alone.offset, atol=1e-6, rtol=0)
+        torch.testing.assert_close(together.gain, alone.gain, atol=1e-4, rtol=0)
+
+
+def test_mirroring_twice_returns():
+    point = torch.randn(3, 4, dtype=torch.float64)
+    normal = torch.nn.functional.normalize(torch.randn(3, 4, dtype=torch.float64), dim=0)
+    offset = torch.randn(4, dtype=torch.float64)
+    torch.testing.assert_close(mirror(mirror(point, normal, offset), normal, offset), point)
+
+
+@pytest.mark.parametrize(
+    ("planes", "gain", "moving"),
+    [
+        ({(1, 0, 0): 4.6}, -0.7, "receiver"),
+        ({(1, 0, 0): 4.6, (0, 0, -1): 0.0}, 0.8, "transmitter"),
+        (SIX, -0.6, "transmitter"),
+        (SIX, (-0.6, -0.6, -0.6, -0.6, 0.4, 0.4), "receiver"),
+    ],
+    ids=["one", "two", "six", "floor and ceiling of the other sign"],
+)
+def test_rooms_without_noise_are_found_to_a_millimetre(planes, gain, moving):
+    model = fit(mirror_room(planes, gain, moving, n=40))
+    assert len(model.planes) == len(planes)
+    assert max(e for e, _ in errors(model, planes)) < 1
+    true = torch.tensor(gain).expand(len(planes)).tolist()
+    assert all(abs(p.gain - g) < 0.02 and p.certain for p, g in zip(model.planes, true, strict=True))
+    assert model.order == (1 if len(planes) == 1 else 2)
+
+
+def test_a_sign_does_not_change_for_a_little():
+    """Half a turn away the wrong sign explains a weak wall better by chance, but not clearly."""
+    scene, _ = observe(mirror_room({(1, 0, 0): 4.6, (0, 0, -1): 0.0}, (-0.6, -0.2), n=40, noise=0.5))
+    normal, offset = torch.tensor([[[1, 0, 0], [0, 0, -1]]]).double(), torch.tensor([[4.6, 0.0]]).double()
+    room = PlaneSet(normal, offset, torch.tensor([[-0.6, -0.2]]), 2).refined(scene)
+    other = phase_alternatives(scene, room)[0]
+    assert float(scene.score(other.field(scene))) < 0.99 * float(scene.score(room.field(scene)))
+    assert _without_aliases(room, scene, QUICK) is room
+
+
+def test_a_plane_among_the_positions_has_no_turns():
+    """Wavelengths inside of the furthest one, where refinement may leave an oblique plane."""
+    scene, _ = observe(mirror_room({(1, 0, 0): 4.6}, n=12, array=PlanarArray.square(4, 60e9)))
+    normal, offset = torch.tensor([[[1.0, 0, 0]]]).double(), torch.tensor([[2.0]]).double()
+    assert phase_alternatives(scene, PlaneSet(normal, offset, torch.tensor([[-0.6]]), 1)) == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("away", [(8, 8, 6, 6, 0, 2), (3, 3, 4, 4, 0, 3)], ids=["whole turns", "half turns"])
+def test_planes_that_are_turns_away_together_return(away):
+    """Images of images hold planes at wrong places together, from where no one to three of them find back."""
+    gain = (-0.4, -0.3, -0.65, -0.75, 0.25, 0.4)
+    scene, _ = observe(mirror_room(SIX, gain, "transmitter", n=40))
+    normal, offset = torch.tensor([list(SIX)]).double(), torch.tensor([list(SIX.values())]).double()
+    true = PlaneSet(normal, offset, torch.tensor([gain]), 2)
+    wrong = _AlternativeTable(scene, true).room(away).refined(scene, 20)
+    assert float((wrong.offset - offset).abs().max()) > 0.2
+    assert float(scene.score(wrong.field(scene))) < 0.02  # explains nearly all
+    assert float((_without_aliases(wrong, scene, QUICK).offset - offset).abs().max()) < 1e-3
+
+
+def test_a_weak_wall_beside_strong_ones_is_added():
+    gain = (-0.6, -0.6, -0.12, -0.6, -0.6, -0.6)
+    scene, _ = observe(mirror_room(SIX, gain, n=60, noise=0.1))
+    normal, offset = torch.tensor([list(SIX)]).double(), torch.tensor([list(SIX.values())]).double()
+    rest = PlaneSet(normal, offset, torch.tensor([gain]), 2).without(2).refined(scene)
+    folds = split(scene, torch.arange(60) % 5)
+    whole = _with_weak_planes(rest, scene, scene, folds, SIGNS[0], QUICK)
+    assert whole.normal.shape[1] == 6
+    assert float((whole.offset - offset).abs().max()) < 0.02
+    assert abs(float(whole.gain[0, 2]) + 0.12) < 0.05
+    assert _with_weak_planes(whole, scene, scene, folds, SIGNS[0], QUICK) is whole
+
+
+def test_scores_of_combinations_are_those_of_their_rooms():
+    scene, _ = observe(mirror_room(SIX, n=12))
+    normal = torch.tensor(list(SIX)).double()
+    offset = [o + 0.05 * torch.arange(1 + i % 3, dtype=torch.float64) for i, o in enumerate(SIX.values())]
+    gain = [torch.linspace(-0.6, 0.4, len(o)) for o in offset]
+    direct, waves = batched(scene.wave(scene.transmitter)), SteeringResponses.of(scene, normal, offset, gain)
+    score = waves.scores(scene, direct)
+    base, moving = waves.moved(direct, (1, 2, 4, 5))
+    torch.testing.assert_close(moving.scores(scene, base), score[0, :, :, 0])
+    for choice in ((0, 0, 0, 0, 0, 0), (0, 1, 2, 0, 1, 2), (0, 1, 0, 0, 0, 1)):
+        own = ([t[c] for t, c in zip(table, choice, strict=True)] for table in (offset, gain))
+        room = PlaneSet(normal[None], *(torch.stack(row)[None] for row in own), 2)
+        torch.testing.assert_close(score[choice], scene.score(room.field(scene)), atol=1e-5, rtol=0)
+        picked = batched_score(scene, direct + waves.of_choices([torch.tensor([c]) for c in choice]))
+        torch.testing.assert_close(score[choice], picked[0], atol=1e-5, rtol=0)
+
+
+def test_a_room_of_a_search_is_extended_to_more_spectra_unless_it_does_not_explain_them(monkeypatch):
+    """A wall at a phase alias moves to its place, and a room fitted to too few spectra is refused."""
+    data = simulated_room(n=70, grid=AngularGrid.hemisphere(12, 48))
+    is_new = torch.arange(70) >= 52
+    observed, _ = observe(data.subset((~is_new).nonzero()[:, 0]))
+    walls = [*zip(SIDES.tolist(), (0.0, 6.166, 0.0, 5.0, 0.0, 3.0), (-0.7,) * 4 + (-0.6,) * 2, strict=True)]
+    start = GeometryModel.of_planes(data, [Plane(tuple(n), offset, gain) for n, offset, gain in walls])
+    start.config = GeometryConfig(further=0)
+    room = start.refined_on(observed).extended(data, is_new)
+    assert [plane.offset_m for plane in room.planes] == pytest.approx([0, 6, 0, 5, 0, 3], abs=0.01)
+    assert start.extended(data, torch.arange(70) >= 49) is None
+    monkeypatch.setattr(geometry_fit, "MAX_MISSING_RATIO", 0.1)
+    assert room.extended(data, is_new) is None
+
+
+@pytest.mark.long
+def test_a_tilted_plane_is_found_to_a_millimetre():
+    model = fit(mirror_room({(0.8, 0.5, 0.1): 5.0}, -0.7, n=60), width=1)
+    assert len(model.planes) == 1
+    assert errors(model, {(0.8, 0.5, 0.1): 5.0})[0][0] < 1
+    torch.testing.assert_close(
+        torch.tensor(model.planes[0].normal), torch.tensor([0.8433, 0.5270, 0.1054]), atol=1e-3, rtol=0
+    )
+
+
+def test_images_are_mirrored_in_one_plane_after_another():
+    """Holds for any sequences, also without their prefixes."""
+    generator = torch.Generator().manual_seed(0)
+    normal = torch.nn.functional.normalize(torch.randn(2, 3, 3, generator=generator, dtype=torch.float64), dim=-1)
+    offset, gain = torch.rand(2, 3, generator=generator, dtype=torch.float64), torch.rand(2, 3, generator=generator)
+    position = torch.rand(5, 3, generator=generator, dtype=torch.float64)
+    scene = PhaseObservations.of(position, torch.zeros(3), "transmitter", ARRAY, torch.eye(3), torch.ones(5, 16))
+    chain = [(1, 0, 2), (2,), (0, 1)]
+    found, strength = images(scene, normal, offset, chain), image_gain(gain, chain)
+    for row, sequence in enumerate(chain):
+        point, product = position.T[:, None], torch.ones(2)
+        for plane in sequence:
+            point = mirror(point, normal[:, plane].T[..., None], offset[:, plane, None])
+            product = product * gain[:, plane]
+        torch.testing.assert_close(found[:, row], point.movedim(0, -1))
+        torch.testing.assert_close(strength[:, row], product)
+
+
+@pytest.mark.parametrize("moving", ["receiver", "transmitter"])
+def test_the_field_is_the_sum_over_any_parts_of_its_images(moving):
+    """Also where planes are oblique, so that paths are followed through images that the part does not have."""
+    scene, _ = observe(mirror_room({}, moving=moving, n=10))
+    normal = torch.nn.functional.normalize(torch.tensor([[1, 0.3, 0], [-0.2, 1, 0.1], [0, 0, -1]]).double(), dim=1)
+    offset, gain = torch.tensor([[5.2, 4.1, 0.0]]).double(), torch.tensor([[-0.6, 0.5, -0.4]])
+    chain = sequences(normal, 2)
+    whole = field(scene, normal[None], offset, gain, chain)
+    parts = sum(field(scene, normal[None], offset, gain, [s]) for s in chain)
+    torch.testing.assert_close(parts, whole)
+
+
+def test_nothing_to_find_is_no_plane():
+    model = fit(mirror_room({}))
+    assert model.planes == []
+    assert "no plane" in model.conclusion
+    assert len(model.image_sources()[0]) == 1
+
+
+def test_a_reach_without_walls_ends_without_them():
+    assert not any(p.certain for p in fit(mirror_room(SIX, n=12), reach=0.3, width=1, further=0).planes)
+
+
+def test_noise_stays_within_the_deviations(room):
+    assert len(room.planes) == 6
+    assert all(error < 4 * std and error < 20 for error, std in errors(room, SIX))
+
+
+def test_positions_in_a_plane_leave_no_plane_certain():
+    model = fit(mirror_room(SIX, noise=0.1, n=24, low=(1.5, 1.2, 1.2), high=(3.5, 3.2, 1.2)), further=0, width=1)
+    assert not any(p.certain for p in model.planes)
+    assert all(error < 3 * std for error, std in errors(model, SIX) if model.planes)
+
+
+def test_pure_noise_has_no_certain_plane():
+    generator = torch.Generator().manual_seed(0)
+    data = mirror_room({}, n=30)
+    channel = torch.randn(30, 16, dtype=torch.complex128, generator=generator)
+    model = fit(replace(data, store=Store(ARRAY.spectrum(channel, GRID))), further=0, width=1)
+    assert not any(p.certain for p in model.planes)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"array": None}, "needs the array, which"),
+        ({"rotation": None}, "needs the fixed end"),
+        ({"fixed_position": None}, "fixed end"),
+        ({"array": PlanarArray.square(4, 915e6, spacing=0.11)}, "check its geometry and carrier"),
+    ],
+)
+def test_refusals_say_what_is_missing(change, message):
+    with pytest.raises(InputError, match=message):
+        fit(replace(mirror_room(SIX, n=12), **change))
+
+
+def test_few_spectra_are_refused():
+    with pytest.raises(InputError, match="at least 10"):
+        fit(mirror_room(SIX, n=9))
+
+
+def test_the_same_seed_finds_the_same_room_and_draws_the_same_spectra(noisy, room):
+    few = noisy.subset(torch.arange(12))
+    quick = {"reach": 0.5, "width": 1, "further": 0}
+    assert fit(few, **quick).to_json() == fit(few, **quick).to_json()
+    drawn = [room.sample(noisy.position[:5], generator=torch.Generator().manual_seed(s)) for s in (1, 1, 2)]
+    assert torch.equal(drawn[0], drawn[1])
+    assert not torch.equal(drawn[0], drawn[2])
+
+
+def test_draws_differ_from_the_mean_as_much_as_measurements_do(noisy, room):
+    mean = room.synthesize(noisy.position)
+    drawn = [room.sample(noisy.position, generator=torch.Generator().manual_seed(seed)) for seed in range(32)]
+    assert mean.shape == drawn[0].shape == noisy.spectrum.shape
+    apart = torch.cat([psnr(one, mean) for one in drawn]).median() - psnr(noisy.spectrum, mean).median()
+    assert abs(float(apart)) < 4
+
+
+def test_state_returns_the_same_model(noisy, room):
+    again = GeometryModel.from_state(*room.state())
+    assert again.to_json() == room.to_json()
+    assert torch.equal(again.synthesize(noisy.position), room.synthesize(noisy.position))
+
+
+def test_json_and_images_describe_the_room(room):
+    content = room.to_json()
+    assert set(content) == {"planes", "order", "score_held_out", "unexplained"}
+    assert set(content["planes"][0]) == {"normal", "offset_m", "gain", "std_mm", "certain"}
+    position, gain, order = room.image_sources()
+    assert len(position) == len(gain) == len(order) == 25
+    assert torch.equal(position[0], room.fixed_position)
+
+
+def test_hybrid_is_not_worse_than_geometry():
+    data = simulated_room(n=60, grid=GRID)
+    train, test = data.split("random")
+    room = fit(train, further=0, width=1)
+    hybrid = fit_hybrid(train, room)
+    gained = psnr(hybrid.synthesize(test.position), test.spectrum) - psnr(room.synthesize(test.position), test.spectrum)
+    assert float(gained.mean()) > -0.5
+    again = HybridModel.from_state(*hybrid.state())
+    assert torch.equal(again.synthesize(test.position), hybrid.synthesize(test.position))
+
+
+def with_path_gains(hybrid, path_gains):
+    """A copy of the hybrid with other path gains."""
+    other = copy(hybrid)
+    other.path_gains = path_gains
+    return other
+
+
+def test_path_gains_follow_a_shadow():
+    """A wall that does not reflect to one half of the region: its amplitude is known where the phases determine it."""
+    whole, bare = mirror_room(SIX, n=140), mirror_room({n: o for n, o in SIX.items() if n != (0, 0, 1)}, n=140)
+    hidden = whole.position[:, 0] > 2.5
+    spectrum = torch.where(hidden[:, None, None], bare.spectrum, whole.spectrum)
+    data = replace(whole, store=Store(spectrum))
+    train, test = data.subset(torch.arange(0, 110)), data.subset(torch.arange(110, 140))
+    room = fit(train, further=0, width=1)
+    hybrid = fit_hybrid(train, room)
+    assert hybrid.path_gains is not None
+    gained = psnr(hybrid.synthesize(test.position), test.spectrum) - psnr(room.synthesize(test.position), test.spectrum)
+    assert float(gained.median()) > 5
+    process, paths = hybrid.path_gains.process, hybrid.path_gains.n_paths
+    first = process.coefficient[:, : 2 * paths]  # one of the fields that are averaged
+    one = PathGains(GaussianProcess(process.kernel, process.known, first), paths)
+    sample = hybrid.sample(test.position, generator=torch.Generator().manual_seed(0))
+    for worse in (with_path_gains(hybrid, one).synthesize(test.position), sample):
+        assert float(psnr(worse, test.spectrum).median()) < float(
+            psnr(hybrid.synthesize(test.position), test.spectrum).median()
+        )
+    again = HybridModel.from_state(*hybrid.state())
+    assert torch.equal(again.synthesize(test.position), hybrid.synthesize(test.position))
+    like = HybridModel().fit(train.subset(torch.arange(60)), like=hybrid)
+    assert like.path_gains is not None
+    assert like.path_gains.process.kernel == hybrid.path_gains.process.kernel
+    assert [plane.normal for plane in like.room.planes] == [plane.normal for plane in room.planes]
+
+
+@pytest.mark.long
+def test_path_gains_are_held_out_from_spectra_without_observed_phases_too():
+    """Predictions of one fold depend on the observed spectra of the other folds alone."""
+    data, fold = mirror_room(SIX, n=80), torch.arange(80) % 3
+    kernel = Kernel(long=0.5, short=1.0, share=1.0, noise=1e-3)
+    few = GeometryConfig(max_spectra=40)
+    hybrid, like = HybridModel(few), HybridModel()
+    hybrid._room, hybrid.grid = fit(data, further=0, width=1, max_spectra=40), data.grid
+    like.path_gains = PathGains(GaussianProcess(kernel, data.position, torch.zeros(80, 2)), 1)
+    known = hybrid._fit_path_gains(data, fold, like)
+    scene, rows = observe(data, few)
+    assert len(rows) <= 40
+    for number in range(3):
+        fitted = fit_path_gains(hybrid.room, scene.subset((fold[rows] != number).nonzero()[:, 0]), kernel)
+        expected = ARRAY.spectrum(fitted.channel(hybrid.room, data.position[fold == number]), GRID)
+        torch.testing.assert_close(known[fold == number], expected)
+
+
+def test_path_gains_stay_constant_where_nothing_is_hidden():
+    data = mirror_room(SIX, n=120)
+    assert fit_hybrid(data, fit(data, further=0, width=1)).path_gains is None
+
+
+@pytest.fixture(scope="module")
+def hybrid(noisy, room):
+    return fit_hybrid(noisy, room)
+
+
+def test_a_room_of_the_same_spectra_is_reused_and_of_others_refined(noisy, room, hybrid):
+    assert hybrid.room.estimate is room.estimate
+    few = noisy.subset(torch.arange(20))
+    for model in (room, hybrid):
+        refined = GeometryModel().fit(few, like=model)
+        assert [plane.normal for plane in refined.planes] == [plane.normal for plane in room.planes]
+        assert refined.to_json() == refit_geometry(room, few).to_json() != room.to_json()
+    with pytest.raises(InputError, match="cannot reuse the structure"):
+        GeometryModel().fit(few, like=NearestModel().fit(few))
+
+
+@pytest.mark.parametrize("moving", ["receiver", "transmitter"])
+def test_spectra_are_differentiable_in_the_position(moving):
+    data = simulated_room(n=40, moving=moving, grid=GRID)
+    walls = [Plane((1.0, 0.0, 0.0), 6.0, -0.5), Plane((0.0, 0.0, -1.0), 0.0, -0.5)]
+    room = GeometryModel.of_planes(data, walls)
+    hybrid = fit_hybrid(data, room)
+    assert hybrid.mixing_weight > 0
+    assert hybrid.process.coefficient.shape[1]
+    position = data.position[:3] + 0.02
+    for model in (room, hybrid):
+        weight = torch.rand(3, *data.grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        at = position.clone().requires_grad_()
+        (model.predict(at).mean * weight).sum().backward()
+        for axis in range(3):
+            step = torch.zeros(3, dtype=torch.float64)
+            step[axis] = 5e-4
+            ends = [(model.synthesize(position + sign * step) * weight).sum((1, 2)) for sign in (1, -1)]
+            torch.testing.assert_close(at.grad[:, axis], (ends[0] - ends[1]) / 1e-3, rtol=0.02, atol=1.0)
+
+
+def test_room_predicts_any_grid(noisy, room):
+    """On a grid twice as fine every second pixel is the same."""
+    fine = room.synthesize(noisy.position[:3], AngularGrid.hemisphere(20, 80))
+    torch.testing.assert_close(fine[:, 1::2, ::2], room.synthesize(noisy.position[:3]))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "element",
+        "rotation",
+        "fixed_position",
+        "covariance",
+        "position",
+        "coefficient",
+        "component",
+        "path_gains.coefficient",
+    ],
+)
+def test_states_of_wrong_sizes_are_refused(hybrid, name, tmp_path):
+    """Also tensors that only `predict` would need."""
+    known, kernel = hybrid.process.known.clone(), hybrid.process.kernel
+    some = PathGains(GaussianProcess(kernel, known, torch.zeros(len(known), 2 * 25 * 2)), 25)
+    tensors, header = with_path_gains(hybrid, some).state()
+    HybridModel.from_state(tensors, header)
+    cut = tensors[name][:, :1] if name == "element" else tensors[name][:-1]
+    write(tmp_path / "model", HybridModel.kind, tensors | {name: cut}, header)
+    with pytest.raises(InputError):
+        load(tmp_path / "model")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("residual", {"direct": "x"}),
+        ("moving", "reciever"),
+        ("mixing_weight", "x"),
+        ("order", 9),
+        ("planes", [{"normal": [1]}]),
+    ],
+)
+def test_headers_of_wrong_values_are_refused(hybrid, key, value, tmp_path):
+    tensors, header = hybrid.state()
+    write(tmp_path / "model", HybridModel.kind, tensors, header | {key: value})
+    with pytest.raises(InputError):
+        load(tmp_path / "model")
+
+
+@pytest.mark.parametrize(
+    "change", [{"positions": 0}, {"reach": -1.0}, {"max_order": 9}, {"width": 0}, {"validation": "blok"}]
+)
+def test_options_outside_their_range_are_refused(change):
+    with pytest.raises(InputError):
+        GeometryModel(**change)

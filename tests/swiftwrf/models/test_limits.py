@@ -1,0 +1,103 @@
+"""Coordinates far from the origin, grids and sizes that cannot be, installations without a home."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+
+from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, SwiftWRF, rssi_room
+from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data.spectra import coarsening
+from swiftwrf.gp import Kernel
+from swiftwrf.models import FIELD_MODELS
+from tasks.rssi.predictors import PREDICTORS
+
+
+def moved(spectra, shift):
+    """Return the measurements in coordinates from another origin."""
+    fixed = None if spectra.fixed_position is None else spectra.fixed_position + shift
+    return replace(spectra, position=spectra.position + shift, fixed_position=fixed)
+
+
+@pytest.mark.parametrize("name", [name for name in FIELD_MODELS if name != "swiftwrf"])
+def test_field_models_do_not_depend_on_the_origin(room, small_published, glances, name):
+    """The origin of map coordinates may be thousands of kilometres away."""
+    train, test = room.split("random")
+    predicted = [
+        FIELD_MODELS[name]().fit(moved(train, shift)).predict(test.position + shift).mean for shift in (0.0, 1e7)
+    ]
+    # positions at 1e7 m are rounded to 2e-9 m, which two networks that train against each other amplify
+    torch.testing.assert_close(*predicted, atol=2e-2 if name == "dcgan" else 2e-3, rtol=0)
+
+
+def test_swiftwrf_does_not_depend_on_the_origin(room):
+    small = FitConfig(model=ModelConfig(n_primitives=4, rank=2), steps=10, check_every=5)
+    predicted = [
+        SwiftWRF(small).fit(moved(room, shift)).predict(room.position[:5] + shift).mean for shift in (0.0, 1e7)
+    ]
+    torch.testing.assert_close(*predicted, atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize("name", [name for name in PREDICTORS if name != "swiftwrf"])
+def test_predictors_do_not_depend_on_the_origin(small_published, name):
+    data, predicted = rssi_room(n=40).receivers(["1", "2"]), []
+    for shift in (0.0, 1e7):
+        moved = replace(
+            data,
+            transmitter_position=data.transmitter_position + shift,
+            receiver_position=data.receiver_position + shift,
+        )
+        predicted.append(PREDICTORS[name]().fit(moved).predict(moved.transmitter_position[:10]).mean)
+    torch.testing.assert_close(*predicted, atol=0.05, rtol=0)  # dB
+
+
+def test_grids_arrays_and_kernels_refuse_what_they_cannot_be():
+    nan = float("nan")
+    with pytest.raises(InputError, match="ascend"):
+        AngularGrid.degrees([nan, nan], range(360))
+    with pytest.raises(InputError, match="ascend"):
+        AngularGrid.degrees(range(90), [nan, nan])
+    for frequency, spacing in ((nan, 0.1), (1e9, nan), (float("inf"), 0.1)):
+        with pytest.raises(InputError):
+            PlanarArray.square(4, frequency, spacing)
+    for settings in ({"long": nan}, {"short": 0.0}, {"share": 2.0}, {"noise": -1.0}):
+        with pytest.raises(InputError):
+            Kernel(**settings)
+
+
+def test_prime_numbers_of_rows_leave_the_network_something():
+    from tasks.aoa.estimators.aann import MIN_ROWS
+
+    assert coarsening((89, 356), 120, MIN_ROWS) == 1
+    assert coarsening((90, 360), 120, MIN_ROWS) == 3
+
+
+def test_small_spectra_are_refused_before_the_training():
+    from swiftwrf import simulated_room
+    from tasks.aoa.options import AoaConfig, check_data
+
+    with pytest.raises(InputError, match="7 x 7"):
+        check_data(simulated_room(n=20, grid=AngularGrid.hemisphere(4, 16)), AoaConfig((0.5,)))
+
+
+def test_an_installation_without_a_place_for_caches(tmp_path):
+    """Numba keeps what it compiled beside the source or in the home; where it can do neither, it must do without."""
+    code = (
+        "import numba.core.caching as c\n"
+        "c._Cache._impl_class = None\n"
+        "for l in c.CacheImpl._locator_classes: l.from_function = classmethod(lambda *a: None)\n"
+        "import swiftwrf.rasterize.cpu\nprint('imported')"
+    )
+    child = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": os.getcwd()},
+        check=False,
+    )
+    assert "imported" in child.stdout, child.stderr[-500:]

@@ -1,0 +1,325 @@
+"""Scores of measurements before they are learnt, tests for changes, adaptation, obstacles, and the command that follows."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import torch
+
+from swiftwrf import AngularGrid, GeometryModel, RssiModel, load, make_model
+from swiftwrf.data.simulated import rssi_room, simulated_room
+from swiftwrf.data.simulated.room import ShoeboxRoom
+from swiftwrf.data.writing import write_rssi
+from swiftwrf.metrics import psnr
+from swiftwrf.models.geometry.planes import Plane
+from swiftwrf.online import (
+    Boxes,
+    Cusum,
+    Follower,
+    Monitor,
+    MonitorConfig,
+    ObstacleMonitor,
+    adapted,
+    alarm_threshold,
+    prequential,
+    score,
+)
+from swiftwrf.online.obstacles import corners
+from swiftwrf.testing.rooms import room_with_box
+from tasks.command import main
+from tasks.update.record import Record, resumed
+
+GRID = AngularGrid.hemisphere(15, 60)
+WALLS = [
+    ((-1.0, 0, 0), 0.0),
+    ((1.0, 0, 0), 6.0),
+    ((0, -1.0, 0), 0.0),
+    ((0, 1.0, 0), 5.0),
+    ((0, 0, -1.0), 0.0),
+    ((0, 0, 1.0), 3.0),
+]
+PLACE = (1.6, 2.4)
+
+
+@cache
+def spectra(n, seed, place=None):
+    return simulated_room(n=n, seed=seed, grid=GRID, room=room_with_box(place) if place else None)
+
+
+@cache
+def coarray():
+    return make_model("coarray").fit(spectra(72, 0))
+
+
+@cache
+def floor():
+    return rssi_room(n=100)
+
+
+@cache
+def walls():
+    """The built-in room with its walls as they are."""
+    planes = [Plane(normal, offset_m=offset, gain=-0.6) for normal, offset in WALLS]
+    return GeometryModel.of_planes(spectra(72, 0), planes)
+
+
+def test_thresholds_have_the_run_length_of_simulated_series(generator):
+    rate, n = 0.005, 400
+    threshold = alarm_threshold(rate)
+    lengths = []
+    for _ in range(150):
+        value, length = 0.0, 0
+        series = torch.randn(20 * n, generator=generator).tolist()
+        while value <= threshold and length < len(series):
+            value = max(0.0, value + series[length] - 0.5)
+            length += 1
+        lengths.append(length)
+    mean = sum(lengths) / len(lengths)
+    assert 0.7 / rate < mean < 1.4 / rate
+    assert alarm_threshold(rate, 10) == pytest.approx(alarm_threshold(rate / 10))
+
+
+def test_sums_restart_after_an_alarm_and_skip_missing_values():
+    test = Cusum.start(2)
+    for z in ([torch.nan, 0.0], [2.0, 0.0], [torch.nan, 0.0], [2.0, 0.0]):
+        test, alarms = test.updated(torch.tensor(z), threshold=2.5)
+    assert [(alarm.series, alarm.at, alarm.since) for alarm in alarms] == [(0, 3, 1)]
+    assert test.value.tolist() == [0.0, 0.0]
+
+
+def test_each_measurement_is_predicted_before_it_is_learnt():
+    model, new = coarray(), spectra(12, 1)
+    scores, learnt = prequential(model, new)
+    torch.testing.assert_close(scores.error[0], score(model, new).error[0])
+    third = score(model.update(new.subset(torch.arange(2))), new).error[2]
+    torch.testing.assert_close(scores.error[2], third)
+    assert len(learnt.process.known) == 84
+    assert scores.running_error(3)[5] == pytest.approx(float(scores.error[3:6].mean()))
+
+
+def test_intervals_of_rssi_contain_their_share():
+    model = RssiModel().fit(floor().subset(torch.arange(70)))
+    scores, _ = prequential(model, floor().subset(torch.arange(70, 100)))
+    assert 0.6 < scores.covered.mean() < 0.95
+
+
+def test_a_change_raises_an_alarm_and_the_same_scene_does_not():
+    monitor = Monitor.of(coarray(), spectra(72, 0), MonitorConfig(false_alarm_rate=1e-3))
+    same, changed = score(coarray(), spectra(60, 1)), score(coarray(), spectra(30, 2, PLACE))
+    assert not [a for at, z in zip(same.position, same.innovation, strict=True) for a in monitor.observe(at, z)]
+    alarms = [a for at, z in zip(changed.position, changed.innovation, strict=True) for a in monitor.observe(at, z)]
+    assert alarms[0].since >= 55
+    assert alarms[0].at < 75
+
+
+def test_a_model_adapts_to_a_change():
+    after, test = spectra(40, 2, PLACE), spectra(60, 3, PLACE)
+    model, correlation = adapted(coarray(), after)
+    found, updated, stale = (
+        float(psnr(m.synthesize(test.position), test.spectrum).mean())
+        for m in (model, coarray().update(after), coarray())
+    )
+    assert correlation < 0.7
+    assert found > updated + 1 > stale + 1
+
+
+def test_a_follower_adapts_and_goes_on():
+    follower = Follower(coarray(), spectra(72, 0))
+    changed = spectra(30, 2, PLACE)
+    steps = [follower.step(changed.subset(torch.tensor([i]))) for i in range(30)]
+    assert any(step.alarms for step in steps)
+    assert min(step.correlation for step in steps if step.correlation is not None) < 0.7
+    assert follower.count == 30
+    assert len(follower.model.process.known) == 102
+
+
+def test_corners_and_blocked_paths_are_those_of_the_simulator():
+    """The built-in room's own boxes block the same paths, whichever way these are traced."""
+    data, room = spectra(30, 4), ShoeboxRoom()
+    scene = walls().scene(data.position)
+    low, high = (torch.tensor(ends, dtype=torch.float64) for ends in zip(*room.boxes, strict=True))
+    blocked = Boxes(low, high).block(corners(walls(), scene)).any(0)
+    rays = room.rays(data.position, data.fixed_position)
+    length = corners(walls(), scene).diff(dim=2).norm(dim=-1).sum(-1)
+    order, expected = length.argsort(1), rays.length.argsort(1)
+    torch.testing.assert_close(length.gather(1, order), rays.length.gather(1, expected))
+    assert torch.equal(blocked.gather(1, order), ~rays.clear.gather(1, expected))
+
+
+def test_an_obstacle_is_found_where_it_stands():
+    monitor = ObstacleMonitor(walls(), spectra(72, 0))
+    assert not monitor.observe(spectra(40, 1))
+    assert not monitor.region().any()
+    assert monitor.observe(spectra(30, 2, PLACE))
+    boxes, region = monitor.boxes, monitor.region()
+    centre = (boxes.low + boxes.high)[region, :2] / 2
+    assert (centre - torch.tensor(PLACE).double()).norm(dim=1).max() < 0.5
+
+
+@cache
+def rssi_lines():
+    names = floor().receiver_names
+    rows = zip(floor().transmitter_position.tolist(), floor().rssi_dbm.tolist(), strict=True)
+    return [
+        json.dumps({"position": at, "rssi_dbm": {n: x for n, x in zip(names, row, strict=True) if x == x}}) + "\n"
+        for at, row in rows
+    ]
+
+
+@pytest.fixture
+def model_file(tmp_path):
+    file = tmp_path / "model.safetensors"
+    RssiModel().fit(floor().subset(torch.arange(60))).save(file)
+    return file
+
+
+def test_an_update_from_files_writes_model_table_and_page(tmp_path, model_file, capsys):
+    (tmp_path / "data").mkdir()
+    write_rssi(floor().subset(torch.arange(60, 75)), tmp_path / "data")
+    out = tmp_path / "updated"
+    assert main(["update", str(model_file), str(tmp_path / "data"), "--out", str(out)]) == 0
+    assert "15 measurements learnt" in capsys.readouterr().out
+    assert {"model.safetensors", "report.html", "measurements.csv", "update.json"} <= {f.name for f in out.iterdir()}
+    assert len(load(out / "model.safetensors").anchor) == 75
+    assert main(["update", str(model_file), str(tmp_path / "data"), "--out", str(out)]) == 2
+
+
+@pytest.mark.parametrize("arguments", [("--follow", "--json"), ("--false-alarm-rate", "2"), ("--follow", "--open")])
+def test_wrong_options_are_refused(arguments, capsys):
+    assert main(["update", "m", "table.csv", "--out", "x", *arguments]) == 2
+    assert capsys.readouterr().err.startswith("error: ")
+
+
+def test_a_model_that_cannot_be_updated_is_refused(tmp_path, capsys):
+    file = tmp_path / "nearest.safetensors"
+    make_model("nearest").fit(spectra(72, 0)).save(file)
+    assert main(["update", str(file), str(tmp_path), "--out", str(tmp_path / "x")]) == 2
+    assert "fit it again" in capsys.readouterr().err
+
+
+def follow(model_file, source, out, **options):
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3]), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "tasks.update", str(model_file), str(source), "--out", str(out), "--follow"]
+    return subprocess.Popen(
+        command,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=model_file.parent,
+        **options,
+    )
+
+
+def test_lines_are_answered_and_a_bad_one_is_left_out(tmp_path, model_file):
+    process = follow(model_file, "-", tmp_path / "out", stdin=subprocess.PIPE)
+    out, err = process.communicate("".join([rssi_lines()[60], "nonsense\n", rssi_lines()[61]]), timeout=300)
+    answers = [json.loads(line) for line in out.splitlines()]
+    assert [answer["measurement"] for answer in answers] == [1, 2]
+    assert answers[0].keys() >= {"predicted", "observed", "low", "high", "alarm"}
+    assert "line 2" in err
+    assert len(load(tmp_path / "out" / "model.safetensors").anchor) == 62
+
+
+def csv_rows(rows):
+    header = ",".join(["x", "y", "z", *floor().receiver_names])
+    cells = [[*floor().transmitter_position[i].tolist(), *floor().rssi_dbm[i].tolist()] for i in rows]
+    return [header + "\n", *(",".join("" if x != x else f"{x:g}" for x in row) + "\n" for row in cells)]
+
+
+def test_rows_of_a_table_wait_until_they_are_complete(tmp_path, model_file):
+    rows, source = csv_rows([60, 61, 62]), tmp_path / "rows.csv"
+    source.write_text(rows[0] + rows[1] + "\n" + rows[2][:20])
+    process = follow(model_file, source, tmp_path / "out")
+    try:
+        first = json.loads(process.stdout.readline())
+        assert first["measurement"] == 1
+        observed = dict(zip(floor().receiver_names, floor().rssi_dbm[60].tolist(), strict=True))
+        assert all(x is None or x == pytest.approx(observed[name], abs=0.01) for name, x in first["observed"].items())
+        time.sleep(1)
+        with source.open("a") as file:
+            file.write(rows[2][20:] + "no,number\n" + rows[3])
+        answers = [json.loads(process.stdout.readline()) for _ in range(2)]
+    finally:
+        process.kill()
+        process.communicate(timeout=60)
+    assert [answer["measurement"] for answer in answers] == [2, 3]
+    assert answers[0]["position"] == pytest.approx(floor().transmitter_position[61].tolist(), abs=1e-4)
+    record = Record.read(tmp_path / "out")
+    assert [row["index"] for row in record.rows][:2] == [0, 1]
+    assert record.rows[1]["running_error"] == pytest.approx((record.rows[0]["error"] + record.rows[1]["error"]) / 2)
+
+
+def test_a_record_is_cut_to_what_the_model_has_learnt(tmp_path):
+    record, model = Record("source", " [dB]"), RssiModel().fit(floor().subset(torch.arange(60)))
+    follower = Follower(model)
+    for i in range(60, 63):
+        record.append(tmp_path, record.add(i, follower.step(floor().subset(torch.tensor([i])))))
+    with (tmp_path / "measurements.csv").open("a") as file:
+        file.write("63,1.0")  # a kill while a row was written
+    assert [row["index"] for row in Record.read(tmp_path).rows] == [60, 61, 62]
+    kept = resumed(tmp_path, 2)
+    assert [row["index"] for row in kept.rows] == [row["index"] for row in Record.read(tmp_path).rows] == [60, 61]
+    assert kept.column("error").tolist() == pytest.approx(record.column("error")[:2].tolist())
+
+
+def test_a_follower_of_a_room_continues_its_test_for_obstacles():
+    changed = spectra(12, 2, PLACE)
+    follower = Follower(walls(), None)
+    follower.obstacles = ObstacleMonitor(walls(), spectra(72, 0))
+    follower.obstacles.observe(changed.subset(torch.arange(6)))
+    again = Follower(walls(), None)
+    again.resume(json.loads(json.dumps(follower.state())))
+    for one in (follower, again):
+        one.obstacles.observe(changed.subset(torch.arange(6, 12)))
+    torch.testing.assert_close(again.obstacles.value, follower.obstacles.value)
+    assert len(again.obstacles.standing) == len(follower.obstacles.standing)
+
+
+def test_a_box_that_the_training_spectra_do_not_exclude_raises_no_alarm():
+    monitor = ObstacleMonitor(walls(), spectra(72, 0))
+    assert 0 <= monitor.weight.min() < monitor.weight.max() <= 1
+    monitor.weight[:] = 0
+    assert not monitor.observe(spectra(30, 2, PLACE))
+    assert (ObstacleMonitor(walls()).weight == 1).all()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["rows.ndjson", "rows.csv"])
+def test_kills_lose_nothing_and_repeat_at_most_the_last_line(tmp_path, model_file, name):
+    kills, source, out = int(os.environ.get("UPDATE_KILLS", "5")), tmp_path / name, tmp_path / "out"
+    rows = list(range(60, 100)) * max(1, kills // 5)  # that no run of the command reaches the end of them
+    source.write_text("".join([rssi_lines()[i] for i in rows] if name == "rows.ndjson" else csv_rows(rows)))
+    wait, answered = random.Random(0), []
+    for _ in range(kills):
+        process = follow(model_file, source, out)
+        first = process.stdout.readline()
+        time.sleep(wait.uniform(0, 0.3))
+        process.send_signal(signal.SIGKILL)
+        rest, _ = process.communicate(timeout=60)
+        answered.append(
+            [
+                json.loads(line)["measurement"]
+                for line in [first, *rest.splitlines()]
+                if line.endswith("}") or line == first
+            ]
+        )
+        if (out / "model.safetensors").exists():
+            assert len(load(out / "model.safetensors").anchor) - 60 in (answered[-1][-1] - 1, answered[-1][-1])
+        if answered[-1][-1] >= len(rows) - 2:
+            break
+    for before, after in pairwise(answered):
+        assert after[0] - before[-1] in (0, 1)
+        assert after == list(range(after[0], after[0] + len(after)))
+    learnt = len(load(out / "model.safetensors").anchor) - 60
+    assert learnt <= len(Record.read(out).rows) <= learnt + 1

@@ -1,0 +1,70 @@
+"""The number of threads: restored whoever uses it, and however users overlap."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+from swiftwrf.runtime.threads import parallel_map, single_thread, threads_kept
+
+
+@pytest.fixture(autouse=True)
+def four_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(4)
+    yield
+    torch.set_num_threads(before)
+
+
+def in_a_new_thread() -> int:
+    """Return torch's number of threads in a thread that starts now."""
+    found: list[int] = []
+    thread = threading.Thread(target=lambda: found.append(torch.get_num_threads()))
+    thread.start()
+    thread.join()
+    return found[0]
+
+
+def test_users_of_several_threads_may_overlap():
+    """The first to come is the first to go: the second must not restore what the first had set."""
+    first_in, second_in, first_out = (threading.Event() for _ in range(3))
+
+    def first() -> None:
+        with single_thread():
+            first_in.set()
+            second_in.wait()
+        first_out.set()
+
+    def second() -> None:
+        first_in.wait()
+        with single_thread():
+            second_in.set()
+            first_out.wait()
+
+    threads = [threading.Thread(target=user) for user in (first, second)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert in_a_new_thread() == 4
+
+
+def test_users_may_be_nested():
+    with single_thread():
+        with threads_kept():
+            torch.set_num_threads(3)
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == 4
+
+
+def test_each_of_several_threads_uses_one():
+    def uses_threads(_: int) -> int:
+        with threads_kept():
+            torch.set_num_threads(2)
+        return torch.get_num_threads()
+
+    assert parallel_map(uses_threads, range(8)) == [1] * 8
+    assert torch.get_num_threads() == in_a_new_thread() == 4

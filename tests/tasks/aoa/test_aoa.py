@@ -1,0 +1,731 @@
+"""The angle-of-arrival task: estimators, one whole run, its refusals, its resumption."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from sklearn.model_selection import KFold
+from small import with_defaults
+
+from augment import Fold, Mixed, choose, sample_positions
+from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, load, make_model, simulated_room
+from swiftwrf.data.store import Store
+from swiftwrf.data.writing import write_spectra
+from swiftwrf.metrics import angle_errors
+from swiftwrf.models import FIELD_MODELS, FieldModel
+from swiftwrf.models.geometry import model as geometry
+from tasks.aoa import context, cross_validation, experiment
+from tasks.aoa import synthesis as synthesizing
+from tasks.aoa.condition import Condition, MeasuredSubset, conditions_of, headline
+from tasks.aoa.estimators import ESTIMATORS, aann, make_estimator, nadaraya_watson
+from tasks.aoa.estimators.aann import AANN, AANNConfig
+from tasks.aoa.estimators.aann_kernel import AANNKernel, AANNKernelConfig
+from tasks.aoa.estimators.baselines import Constant, NearestSpectrum, Peak
+from tasks.aoa.estimators.kernel_regression import KernelRegression
+from tasks.aoa.evaluation import Evaluation
+from tasks.aoa.options import AoaConfig, fraction_key
+from tasks.aoa.page.records import palette
+from tasks.command_line import command_line
+from tasks.page.palette import Palette
+from tasks.report.run import merge
+
+TINY_FIT = FitConfig(model=ModelConfig(n_primitives=8), steps=20, check_every=10)
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """The task on a toy: few spectra, few steps."""
+    room = simulated_room(n=50, grid=AngularGrid.hemisphere(10, 40))
+    monkeypatch.setattr(experiment, "simulated_room", lambda **_: room)
+    monkeypatch.setattr(FIELD_MODELS["swiftwrf"], "config_type", with_defaults(TINY_FIT))
+    for place in (context, choose):  # the search for a room has its own tests
+        monkeypatch.setattr(
+            place,
+            "candidates",
+            lambda data: [name for name in ("idw", "gp", "coarray") if not FIELD_MODELS[name].lacking(data)],
+        )
+    for config in (AANNConfig, AANNKernelConfig):
+        monkeypatch.setattr(config, "quick", lambda n_spectra, **options: AANNKernelConfig(steps=2, batch=4, **options))
+    return room
+
+
+def run(*arguments):
+    if arguments[:1] == ("--mix",) and "--extra" not in arguments:
+        arguments = (*arguments, "--extra", 0)
+    return command_line("tasks.aoa", AoaConfig, experiment.run, [str(a) for a in arguments])
+
+
+def labelled(spectrum, label, grid):
+    """Return a training set of these spectra."""
+    n = len(spectrum)
+    return Mixed((Store(spectrum),), label, torch.arange(n), torch.zeros(n).bool(), grid)
+
+
+def test_peak_of_a_known_spectrum():
+    grid = AngularGrid.hemisphere(10, 40)
+    spectrum = torch.zeros(1, 10, 40)
+    spectrum[0, 3, 10] = 1
+    peak = Peak().fit(labelled(spectrum, torch.zeros(1, 2), grid))
+    assert peak.predict(spectrum).rad2deg()[0].tolist() == pytest.approx([90, 36])
+
+
+def test_constant_is_the_mean_direction_over_the_seam():
+    label = torch.tensor([[350.0, 10], [10, 10]]).deg2rad()
+    constant = Constant().fit(labelled(torch.zeros(2, 10, 40), label, AngularGrid.hemisphere(10, 40)))
+    azimuth = constant.predict(torch.zeros(3, 10, 40))[:, 0]
+    assert (1 - torch.cos(azimuth)).max() < 1e-9
+
+
+def test_nearest_spectrum_returns_the_label_of_a_copy(room):
+    nearest = NearestSpectrum().fit(Mixed.measured(room))
+    torch.testing.assert_close(nearest.predict(room.spectrum[5:8]), room.label[5:8])
+
+
+def test_nearest_spectrum_distinguishes_spectra_that_differ_in_their_last_digits(room):
+    """Inner products of float32 spectra lose these digits."""
+    generator = torch.Generator().manual_seed(0)
+    base = torch.rand(15, 60, generator=generator)
+    close = base + 1e-6 * torch.randn(30, 15, 60, generator=generator)
+    train = labelled(close, room.label[:30], room.grid)
+    query = close[torch.randperm(30, generator=generator)] + 1e-8
+    distance = (query.double()[:, None] - close.double()).square().sum(dim=(2, 3))
+    assert torch.equal(NearestSpectrum().fit(train).predict(query), room.label[distance.argmin(dim=1)])
+
+
+def test_kernel_regression_reads_only_the_spectra_that_it_keeps(room, monkeypatch):
+    monkeypatch.setattr(nadaraya_watson, "MAX_ROWS", 12)
+    train, read = Mixed.measured(room), []
+    select = Mixed.select
+    monkeypatch.setattr(Mixed, "batches", lambda self: pytest.fail("all spectra were read"))
+    monkeypatch.setattr(Mixed, "select", lambda self, rows: read.append(len(rows)) or select(self, rows))
+    KernelRegression(seed=3).fit(train)
+    assert sum(read) == 12
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("circular", [False, True])
+def test_aann_learns_a_toy(circular):
+    """Four directions, four patterns: a network that cannot distinguish them keeps the error of a constant."""
+    label = torch.tensor([[0.0, 30], [90, 30], [180, 30], [270, 60]]).deg2rad().repeat(4, 1).double()
+    spectrum = torch.zeros(16, 16, 64)
+    for i in range(16):
+        spectrum[i, 4:10, 16 * (i % 4) : 16 * (i % 4) + 8] = 1
+    train = labelled(spectrum, label, AngularGrid.hemisphere(16, 64))
+    network = AANN(steps=60, batch=8, rate=1e-3, max_azimuths=0, circular=circular).fit(train)
+    constant = Constant().fit(train)
+    errors = [angle_errors(e.predict(spectrum), label)["great_circle"].mean() for e in (network, constant)]
+    assert errors[0] < 0.5 * errors[1]
+
+
+def test_every_spectrum_counts_alike_in_the_batch_norms():
+    """65: in parts of 64 the last one would be a single spectrum, which a network of one pixel cannot normalise."""
+    spectrum = torch.rand(65, 8, 32, generator=torch.Generator().manual_seed(0))
+    spectrum[-20:] *= 0.1
+    label = torch.stack([torch.linspace(0, 3, 65), torch.full((65,), 0.5)], dim=1).double()
+    network = AANN(steps=2, batch=4).fit(labelled(spectrum, label, AngularGrid.hemisphere(8, 32)))
+    first = network._network.conv1(network._prepare(spectrum))
+    spread = first.std(dim=(0, 2, 3))
+    torch.testing.assert_close(
+        network._network.bn1.running_mean / spread, first.mean(dim=(0, 2, 3)) / spread, atol=0.02, rtol=0
+    )
+
+
+def test_circular_padding_makes_rolled_spectra_alike():
+    from tasks.aoa.estimators.resnet import CircularConv
+
+    convolution = CircularConv(torch.nn.Conv2d(1, 3, 5, padding=2))
+    x = torch.rand(1, 1, 9, 12)
+    torch.testing.assert_close(convolution(x).roll(4, dims=-1), convolution(x.roll(4, dims=-1)))
+
+
+def test_the_headline_is_of_the_network_that_is_kept():
+    """Named by its training set, not by its error on test spectra."""
+    conditions = [
+        Condition("aann_kernel", "measured"),
+        Condition("aann_kernel", "turbo", "gp"),
+        Condition("kernel_regression", "turbo_extra", "gp"),
+        Condition("aann_kernel", "turbo_extra", "gp"),
+        Condition("aann_kernel", "turbo_extra", "idw"),
+        Condition("aann_kernel", "all"),
+    ]
+    assert headline(conditions).method == "turbo_gp_extra"
+    assert headline([conditions[1], Condition("aann_kernel", "turbo", "idw"), conditions[2]]).method == "turbo_gp"
+
+
+@pytest.mark.parametrize(
+    ("condition", "method"),
+    [
+        (Condition("aann_kernel", "measured"), "measured_only"),
+        (Condition("aann_kernel", "all"), "measured_all"),
+        (Condition("aann_kernel", "turbo", "hybrid"), "turbo_hybrid"),
+        (Condition("aann_kernel", "turbo_extra", "hybrid"), "turbo_hybrid_extra"),
+        (Condition("peak", "measured"), "peak"),
+        (Condition("kernel_regression", "all"), "kernel_regression_measured_all"),
+        (Condition("kernel_regression", "turbo_extra", "gp"), "kernel_regression_turbo_gp_extra"),
+        (Condition("aann_kernel", "turbo", "auto"), "turbo_auto"),
+    ],
+)
+def test_names_of_conditions_are_those_of_metrics_json(condition, method):
+    assert condition.method == method
+    older = conditions_of({method: {"great_circle_deg": {}}})
+    assert older == {method: condition}
+    assert conditions_of({method: condition.description}) == {method: condition}
+
+
+def test_keys_of_fractions_are_exact():
+    fractions = [0.3, 1.0, 0.1, 0.6666667, 0.66666671, 1 / 3, 0.33333334, 1e-5, 0.30000001]
+    keys = [fraction_key(fraction) for fraction in fractions]
+    assert [float(key) for key in keys] == fractions
+    assert len(set(keys)) == len(keys)
+    assert keys[:3] == ["0.3", "1", "0.1"]
+
+
+def test_kernel_regression_regression_is_what_its_definition_says():
+    """The chosen width and penalty have the least error on held-out rows, each row's value found by plain inversion."""
+    generator = np.random.default_rng(0)
+    feature, target = generator.normal(size=(60, 2)), generator.normal(size=(60, 3))
+    target[:, 0] += 5 * feature[:, 0]
+    apart = np.square(feature[:, None] - feature[None]).sum(axis=-1)
+
+    def normalised(squared, gamma):
+        kernel = np.exp(-gamma * squared)
+        return kernel / kernel.sum(axis=1, keepdims=True)
+
+    def told(kept, out, gamma, alpha):
+        own = normalised(apart[np.ix_(kept, kept)], gamma) + alpha * np.eye(len(kept))
+        return normalised(apart[np.ix_(out, kept)], gamma) @ np.linalg.inv(own) @ target[kept] * (1 + alpha)
+
+    median = np.median(apart[~np.eye(60, dtype=bool)])
+    folds = list(KFold(5, shuffle=True, random_state=3).split(feature))
+    errors = {
+        (width / median, alpha): sum(
+            np.abs(told(*fold, width / median, alpha) - target[fold[1]]).mean() for fold in folds
+        )
+        for width in nadaraya_watson.WIDTH_CANDIDATES
+        for alpha in nadaraya_watson.PENALTY_CANDIDATES
+    }
+    best = min(errors, key=errors.get)
+    assert nadaraya_watson.choose(apart, target, seed=3) == pytest.approx(best)
+    rows, new = np.arange(50), np.arange(50, 60)
+    gamma, alpha = nadaraya_watson.choose(apart[:50, :50], target[:50], seed=3)
+    found = nadaraya_watson.NadarayaWatson.fit(feature[:50], target[:50], seed=3)(feature[50:])
+    np.testing.assert_allclose(found, told(rows, new, gamma, alpha), rtol=1e-8)
+
+
+def test_what_all_distances_have_in_common_does_not_move_an_estimate():
+    """Noise adds a constant to all distances of a measured spectrum; synthetic ones have none."""
+    generator = np.random.default_rng(0)
+    feature, new = generator.normal(size=(40, 3)), generator.normal(size=(5, 3))
+    regression = nadaraya_watson.NadarayaWatson.fit(np.c_[feature, np.zeros(40)], feature, seed=0)
+    clean, noisy = (regression(np.c_[new, np.full(5, beside)]) for beside in (0, 100))
+    np.testing.assert_allclose(noisy, clean, rtol=1e-8)
+    assert np.abs(clean - new).mean() < 0.5 * np.abs(new).mean()
+
+
+@pytest.mark.parametrize("circular", [False, True])
+def test_pointwise_convolutions_are_matrix_products(circular):
+    """Both agree in value and gradient for equal weights."""
+    from tasks.aoa.estimators.resnet import Pointwise, backbone
+
+    spectrum = torch.rand(4, 1, 9, 40, dtype=torch.float64)
+    found = {}
+    for products in (False, True):
+        torch.manual_seed(0)
+        network = backbone(circular, products).double()
+        torch.nn.init.normal_(network.fc[2].weight)
+        x = spectrum.clone().requires_grad_()
+        value = network(x)
+        gradient = torch.autograd.grad(value.square().sum(), [x, *network.parameters()])
+        found[products] = network, value, gradient
+    (definition, *expected), (network, *actual) = found[False], found[True]
+    assert sum(isinstance(m, Pointwise) for m in network.modules()) == 36
+    torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-7)
+    assert list(network.state_dict()) == list(definition.state_dict())
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+@pytest.mark.parametrize("size", [(1, 1), (1, 4), (2, 2), (2, 8), (3, 5), (4, 1)])
+def test_convolutions_over_few_pixels_are_matrix_products(size, stride):
+    """The convolution, in value and gradient, whatever rows of the kernel meet nothing but padding."""
+    from tasks.aoa.estimators.resnet import Neighbours
+
+    definition = torch.nn.Conv2d(64, 64, 3, stride, padding=1, bias=False).double()
+    product = Neighbours(definition)
+    x = torch.rand(2, 64, *size, dtype=torch.float64, requires_grad=True)
+    with mock.patch.object(torch.nn.functional, "conv2d") as convolution:
+        actual = product(x)
+    convolution.assert_not_called()
+    expected = definition(x)
+    wanted = [torch.autograd.grad(value.square().sum(), [x, definition.weight]) for value in (actual, expected)]
+    torch.testing.assert_close([actual, *wanted[0]], [expected, *wanted[1]])
+
+
+@pytest.mark.parametrize(("spectra", "batch", "sizes"), [(11, 64, [5, 5, 5]), (11, 4, [4, 4, 4]), (3, 64, [1, 1, 1])])
+def test_batches_are_at_most_half_of_what_trains(room, monkeypatch, spectra, batch, sizes):
+    found = []
+    monkeypatch.setattr(aann, "_train", lambda network, config, device, batches, *_: found.extend(batches) or [])
+    AANN(steps=3, batch=batch).fit(Mixed.measured(room.subset(torch.arange(spectra))))
+    assert [len(rows) for rows in found] == sizes
+    assert not torch.equal(found[0], found[1])
+
+
+@pytest.mark.long
+def test_kernel_regression_on_the_features_is_better_than_the_head_after_a_short_training():
+    """On spectra that neither has seen."""
+    room = simulated_room(n=300, grid=AngularGrid.hemisphere(10, 40))
+    train, test = room.split("random")
+    network = AANNKernel(steps=5).fit(Mixed.measured(train))
+    estimates = (network.predict(test.spectrum), AANN.predict(network, test.spectrum))
+    kernel, head = (angle_errors(estimate, test.label)["great_circle"].median() for estimate in estimates)
+    assert kernel < 0.5 * head
+
+
+def test_the_estimate_of_the_network_is_that_of_its_head(room):
+    """The direction of a changed head changes alike: no other regression stands between."""
+    train = Mixed.measured(room)
+    network = AANN(steps=2, batch=4).fit(train)
+    head = network._network.fc[2]
+    with torch.no_grad():
+        head.weight.zero_()
+        head.bias.copy_(torch.tensor([0.0, 0.0, 100.0]))
+    upwards = network.predict(room.spectrum)[:, 1].rad2deg()
+    assert (upwards > 85).all()
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5])
+def test_spectra_that_are_all_alike_are_in_the_mean_direction(value):
+    label = torch.tensor([[0.0, 30], [90, 30]]).deg2rad().repeat(6, 1).double()
+    alike = torch.full((12, 8, 32), value)
+    train = labelled(alike, label, AngularGrid.hemisphere(8, 32))
+    estimators = (AANN(steps=2, batch=4), AANNKernel(steps=2, batch=4), Constant())
+    *networks, constant = (estimator.fit(train).predict(alike[:1]) for estimator in estimators)
+    for network in networks:
+        torch.testing.assert_close(network, constant, atol=0.05, rtol=0)
+
+
+@pytest.mark.parametrize("kind", [AANN, AANNKernel])
+def test_networks_are_seeded_and_leave_the_global_generator_alone(room, kind):
+    state = torch.get_rng_state()
+    train = Mixed.measured(room)
+    estimates = [kind(seed=7, steps=2, batch=4).fit(train).predict(room.spectrum) for _ in range(2)]
+    assert torch.equal(*estimates)
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+@pytest.mark.parametrize(("right", "sampled"), [("means", False), ("samples", True), ("both", False)])
+def test_samples_train_only_if_they_are_significantly_better_than_means(room, right, sampled):
+    known = make_model("gp").fit(room)
+
+    class Informed(FieldModel):
+        """Knows all spectra. In the wrong way it predicts those of other positions."""
+
+        name = "informed"
+        kind = "informed model"
+        samples = True
+
+        def _fit(self, train, context):
+            pass
+
+        def _predict(self, position, grid, with_std):
+            return known.synthesize(position if right != "samples" else position.roll(1, dims=0)), None
+
+        def _sample(self, position, grid, generator):
+            return known.synthesize(position if right != "means" else position.roll(1, dims=0))
+
+        def _state(self):
+            return {}, {}
+
+        def _restore(self, tensors, header):
+            pass
+
+    part = torch.arange(len(room)) % 4
+    folds = []
+    for number in range(2):
+        train, test = (room.subset(rows.nonzero()[:, 0]) for rows in (part != number, part == number))
+        folds.append(Fold(Informed().fit(train), train, test))
+    given = cross_validation.cross_validate(folds, n_synthetic=100, seed=0).metrics
+    assert given["sampled"] is sampled
+    assert [gain["sampled"] for gain in given["gains"]] == [False, True]
+
+
+def pretended(monkeypatch, room, errors):
+    """Return the cross-validation for four folds with these errors by fold and number of synthetic positions."""
+    monkeypatch.setattr(cross_validation, "_errors", lambda fold, number, *_: errors(fold.test, number))
+    model = make_model("idw").fit(room)
+    folds = [SimpleNamespace(model=model, test=fold) for fold in range(4)]
+    return cross_validation.cross_validate(folds, n_synthetic=3000, seed=0).metrics
+
+
+@pytest.mark.parametrize(
+    ("factors", "recommended"),
+    [((0.9, 0.8, 0.5), 3000), ((0.9, 1.1, 0.5), 0), ((0.9, 0.5, 0.8), 1000), ((1.2, 1.1, 1.3), 0)],
+)
+def test_further_positions_are_recommended_if_each_number_of_them_gains(monkeypatch, room, factors, recommended):
+    """With few held-out spectra one number alone gains by chance."""
+    factor = dict(zip((0, *cross_validation.N_SYNTHETIC_CANDIDATES), (1, *factors), strict=True))
+    given = pretended(monkeypatch, room, lambda fold, number: factor[number] * np.linspace(1, 1.01, 20))
+    assert given["recommended_n_synthetic"] == recommended
+    assert given["helps"] == (recommended > 0)
+
+
+def test_the_interval_of_cross_validation_is_that_of_the_rule(monkeypatch, room):
+    """Errors without any gain on average: the best number of each fold is chance, and other folds do not confirm it."""
+    generator = np.random.default_rng(1)
+    drawn = {(fold, number): generator.uniform(0.5, 1.5, 4) for fold in range(4) for number in (0, 300, 1000, 3000)}
+    given = pretended(monkeypatch, room, lambda fold, number: drawn[fold, number])
+    best = {}
+    for fold in range(4):
+        others = [other for other in range(4) if other != fold]
+        best[fold] = min((300, 1000, 3000), key=lambda n: np.median([drawn[other, n] for other in others]))
+    expected = np.median([drawn[fold, number] for fold, number in best.items()])
+    assert given["rule"]["median_deg"] == pytest.approx(expected)
+    assert given["rule"]["median_deg"] > min(gain["median_deg"] for gain in given["gains"])
+
+
+def test_a_training_is_as_long_as_the_scene_needs():
+    quick = [AANNConfig.quick(n) for n in (0, 240, 780, 1525, 100_000)]
+    assert [(config.steps, config.batch) for config in quick] == [
+        (125, 64),
+        (125, 64),
+        (366, 64),
+        (715, 64),
+        (1000, 64),
+    ]
+    assert make_estimator("aann_kernel", 780).config.steps == AANNKernelConfig().steps < AANNConfig().steps
+    assert make_estimator("aann", 780, "paper").config.steps == AANNConfig.paper().steps
+
+
+def test_a_budget_without_time_for_networks(small, tmp_path):
+    out = tmp_path / "run"
+    assert run("--mix", 0.5, "--extra", 10, "--budget", 1e-3, "--out", out) == 0
+    part = json.loads((out / "metrics.json").read_text())["mixes"]["0.5"]
+    assert {entry["estimator"] for entry in part["methods"].values()} >= {"peak", "kernel_regression"}
+    assert not any(entry["estimator"] == "aann_kernel" for entry in part["methods"].values())
+    assert "budget of 0.001 s" in part["left_out"]["measured_only"]
+    text = (out / "report.html").read_text()
+    assert "With synthetic spectra kernel_regression changes" in text
+    assert "its training does not fit" in text
+
+
+def test_whole_run(small, tmp_path):
+    out = tmp_path / "run"
+    more = ("--repeats", 2, "--extra", 20, "--suggest", 4)
+    assert run("--mix", 0.5, 1.0, "--synthesizer", "swiftwrf", "idw", *more, "--out", out) == 0
+    metrics = json.loads((out / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(name))
+    assert (metrics["task"], metrics["data"], metrics["split"], metrics["seed"]) == (
+        "aoa",
+        "simulated-room",
+        "random",
+        0,
+    )
+    methods = metrics["mixes"]["0.5"]["methods"]
+    trainings = ["measured_all", *(f"turbo_{name}{more}" for name in ("swiftwrf", "idw") for more in ("", "_extra"))]
+    others = ("nearest_spectrum", "kernel_regression")
+    networks = {name for name in trainings if name == "measured_all" or name.endswith("_extra")}
+    expected = {"measured_only", "constant", "peak", *others, *networks}
+    expected |= {f"{estimator}_{training}" for estimator in others for training in trainings}
+    assert set(methods) == expected
+    drawn = {"swiftwrf", "idw", "gp", "gp sample", "coarray", "coarray sample"}
+    assert set(metrics["mixes"]["0.5"]["synthesis"]) == drawn
+    assert metrics["mixes"]["0.5"]["counts"]["turbo_idw_extra"] == {"measured": 20, "withheld": 20, "further": 20}
+    assert (
+        metrics["mixes"]["0.5"]["cross_validation"]["swiftwrf"]["n_held_out"] == 16
+    )  # of 20: one fold is never scored
+    assert set(metrics["mixes"]["1"]["seconds"]) == {"fit", "synthesize", "train"}
+
+    errors = pd.read_csv(out / "errors.csv")
+    assert len(errors) == 2 * 2 * 18 * 10  # fractions, repeats, methods, test spectra
+    own = errors[(errors.measured_fraction == 0.5) & (errors.method == "turbo_swiftwrf_extra")]
+    assert set(own.estimator) == {"aann_kernel"}
+    assert set(own.training) == {"turbo_extra"}
+    assert set(own.synthesizer) == {"swiftwrf"}
+    median = own.groupby("index").great_circle_deg.mean().median()
+    assert methods["turbo_swiftwrf_extra"]["great_circle_deg"]["median"] == pytest.approx(median)
+    assert methods["turbo_swiftwrf_extra"]["great_circle_deg"]["low"] <= median
+    truth = np.degrees(small.label[own["index"].tolist()].numpy())
+    np.testing.assert_allclose(own[["truth_azimuth_deg", "truth_elevation_deg"]], truth, rtol=1e-9)
+
+    assert list((out / "figures").glob("turbo-mix0.5*.svg"))
+    suggested = pd.read_csv(out / "suggested-mix0.5.csv")
+    assert suggested.columns.tolist() == ["x_m", "y_m", "z_m", "variance_left"]
+    assert len(suggested) == 4
+    assert suggested["variance_left"].is_monotonic_decreasing
+
+    html = (out / "report.html").read_text()
+    assert "Where to measure next" in html
+    assert "What to do next" in html
+    field = pd.read_csv(next((out / "figures").glob("field-swiftwrf-mix0.5*.csv")))
+    for place, known in zip((field["x_m"], field["y_m"]), small.position.T.tolist(), strict=False):
+        assert place.between(min(known) - 1e-9, max(known) + 1e-9).all()
+    assert field["azimuth_deg"].between(0, 360).all()
+    assert field["elevation_deg"].between(0, 90).all()
+    motion = pd.read_csv(next((out / "figures").glob("motion-mix0.5*.csv")))
+    assert motion["strength"].ge(0).all()
+    assert motion["walked_m"].iloc[-1] > motion["walked_m"].iloc[0]
+    assert "What this does not show" in html
+    assert "<svg" in html
+    assert not [line for line in html.splitlines() if 'src="http' in line or 'href="http' in line]
+    assert load(out / "model-mix0.5.safetensors").synthesize(small.position[:2]).shape == (2, 10, 40)
+    assert not list(tmp_path.glob("*.partial"))
+
+    merge([out, out], tmp_path / "both")
+    assert (tmp_path / "both" / "report.html").stat().st_size > 10_000
+
+
+@pytest.fixture
+def registered(monkeypatch, tmp_path):
+    """An estimator of another package during a test, found by its entry point."""
+    (tmp_path / "northern.py").write_text(NORTHERN)
+    installed = tmp_path / "northern-1.dist-info"
+    installed.mkdir()
+    (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: northern\nVersion: 1\n")
+    (installed / "entry_points.txt").write_text("[swiftwrf.estimators]\nnorthern = northern:Northern\n")
+    monkeypatch.setattr(ESTIMATORS, "_registered", dict(ESTIMATORS._registered))
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+NORTHERN = """
+import torch
+from tasks.aoa.estimators import Estimator
+
+
+class Northern(Estimator):
+    "Always due north."
+
+    trainable = False
+
+    def _fit(self, train, device):
+        pass
+
+    def predict(self, spectra):
+        return torch.zeros(len(spectra), 2, dtype=torch.float64)
+"""
+
+
+def test_an_estimator_of_another_package_is_in_metrics_report_and_colours(small, registered, tmp_path):
+    colours = palette([Condition("northern", "measured")])
+    assert colours.colour("northern") == Palette().colour("northern")
+    assert run("--mix", 0.5, "--synthesizer", "nearest", "--extra", 0, "--out", tmp_path / "run") == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["mixes"]["0.5"]["methods"]["northern"]["elevation_deg"]["median"] > 0
+    html = (tmp_path / "run" / "report.html").read_text()
+    assert "<dt>northern</dt><dd>Always due north</dd>" in html
+
+
+def test_a_new_field_model_is_in_help_and_colours(monkeypatch, capsys):
+    monkeypatch.setattr(FIELD_MODELS, "_registered", dict(FIELD_MODELS._registered))
+
+    @FIELD_MODELS.register("dark")
+    class Dark:
+        """No power anywhere."""
+
+    with pytest.raises(SystemExit):
+        run("--help")
+    assert "dark: No power anywhere" in " ".join(capsys.readouterr().out.replace("│", " ").split())
+    colours = palette([Condition("aann_kernel", "turbo", "dark")])
+    assert colours.colour("dark") == colours.colour("turbo_dark") == Palette().colour("dark")
+
+
+def test_a_name_without_colour_has_one_that_depends_on_the_name_alone():
+    assert Palette().colour("unknown") == Palette({"other": "#000000"}).colour("unknown")
+
+
+@pytest.mark.long
+def test_interrupted_run_goes_on_to_the_same_numbers(small, tmp_path, monkeypatch):
+    arguments = ("--mix", 0.5, "--extra", 20, "--out")
+    assert run(*arguments, tmp_path / "whole") == 0
+
+    honest, calls = AANN.fit, []
+
+    def interrupt(self, train, **options):
+        calls.append(len(train))
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return honest(self, train, **options)
+
+    monkeypatch.setattr(AANN, "fit", interrupt)
+    assert run(*arguments, tmp_path / "cut") == 130
+    assert not (tmp_path / "cut").exists()
+    monkeypatch.setattr(AANN, "fit", honest)
+    assert run("--resume", tmp_path / "cut.partial") == 0
+    whole, cut = (
+        json.loads((tmp_path / name / "metrics.json").read_text())["mixes"]["0.5"] for name in ("whole", "cut")
+    )
+    for mix in (whole, cut):
+        for entry in (*mix["methods"].values(), *mix["synthesis"].values()):
+            assert all(seconds >= 0 for seconds in entry.pop("seconds").values())
+    assert whole["methods"] == cut["methods"]
+    assert whole["synthesis"] == cut["synthesis"]
+
+
+@pytest.mark.long
+def test_fractions_of_many_digits_have_results_of_their_own(small, tmp_path, monkeypatch):
+    """Through to the report, also of a resumed run, for fractions that are equal to six digits, too."""
+    fractions = (0.6666667, 0.66666671, 0.3333333)
+    arguments = (
+        "--mix",
+        *fractions,
+        "--synthesizer",
+        "nearest",
+        "--extra",
+        0,
+        "--suggest",
+        2,
+        "--out",
+        tmp_path / "run",
+    )
+    with monkeypatch.context() as interrupted:
+        interrupted.setattr(experiment, "reporting", lambda page: mock.Mock(side_effect=KeyboardInterrupt))
+        assert run(*arguments) == 130
+    assert run("--resume", tmp_path / "run.partial") == 0
+    mixes = json.loads((tmp_path / "run" / "metrics.json").read_text())["mixes"]
+    assert [float(key) for key in mixes] == list(fractions)
+    for key in mixes:
+        assert mixes[key]["methods"]["turbo_nearest"]["great_circle_deg"]["n"] == 10
+        for name in (f"suggested-mix{key}.csv", f"aann_kernel-mix{key}.safetensors"):
+            assert (tmp_path / "run" / name).is_file()
+        assert list((tmp_path / "run" / "figures").glob(f"cdf-mix{key}-*.svg"))
+
+
+def test_labels_of_synthetic_spectra_are_those_of_their_positions(small, tmp_path, monkeypatch):
+    """Stored with the spectra: a program that chooses positions differently does not mislabel those of an earlier one."""
+    given = AoaConfig((0.5,), synthesizer=("idw",), extra=20)
+    train, test = small.split("random", 0)
+    data = context.Experiment(given, train, test, 20, torch.device("cpu"))
+    synthesis = synthesizing.Synthesis(MeasuredSubset(0.5), "idw", trains=True, n_synthetic=20, sampled=False)
+    (tmp_path / "steps").mkdir()
+    synthesis.compute(data, tmp_path)
+    measured, _ = data.withhold(synthesis.subset)
+    position = sample_positions(measured.position, 20, 0)
+    for place in ("augment.positions.sample_positions", "tasks.aoa.synthesis.synthetic_positions"):
+        monkeypatch.setattr(place, lambda *_: pytest.fail("positions were computed again"))
+    condition = Condition("kernel_regression", "turbo_extra", "idw", 20, 0.5)
+    mixed = Evaluation(condition, synthesis)._training_set(data, tmp_path)
+    torch.testing.assert_close(mixed.label[-20:], small.direction_at(position))
+    expected = make_model("idw").fit(measured).synthesize(position)
+    torch.testing.assert_close(mixed.spectrum[-20:], expected, atol=1 / 255, rtol=0)
+
+
+def test_models_for_comparison_are_always_quick(small, monkeypatch):
+    """A field model asked for by name does not bring fits of the published size of others along."""
+    given = AoaConfig((0.5,), synthesizer=("idw",), preset="paper", extra=0)
+    train, test = small.split("random", 0)
+    data = context.Experiment(given, train, test, 0, torch.device("cpu"))
+    made = []
+    monkeypatch.setattr(
+        context, "make_model", lambda name, preset, **options: made.append((name, preset)) or mock.Mock()
+    )
+    for synthesis in synthesizing.syntheses(data, MeasuredSubset(0.5), ["idw"], {}):
+        synthesis._fitted(data, train, synthesizing._FitHistory(), Path())
+    assert made == [("idw", "paper"), ("gp", "quick"), ("coarray", "quick")]
+
+
+def test_the_room_is_searched_once_for_all_models_with_one(room, glances, tmp_path, monkeypatch):
+    """Its time counts as part of the fit of each of them."""
+    given = AoaConfig((0.5,), synthesizer=("hybrid",), extra=0)
+    train, test = room.split("random", 0)
+    data = context.Experiment(given, train, test, 0, torch.device("cpu"))
+    monkeypatch.setattr(context, "candidates", lambda data: ["geometry", "hybrid"])
+    searched, search = [], geometry.search_room
+    monkeypatch.setattr(geometry, "search_room", lambda *given: searched.append(1) or search(*given))
+    (tmp_path / "steps").mkdir()
+    (first,) = synthesizing.syntheses(data, MeasuredSubset(0.7), ["hybrid"], {})
+    value = first.compute(data, tmp_path)
+    syntheses = first.then(data, value)
+    assert [synthesis.synthesizer for synthesis in syntheses] == ["hybrid", "geometry"]
+    for synthesis in syntheses:
+        assert synthesis.reads == (first.file,)
+        assert synthesis.compute(data, tmp_path)["seconds"]["fit"] > value["seconds"]
+    assert len(searched) == 1
+
+
+def test_cross_validation_is_that_of_each_field_model(small):
+    """A model without cross-validation adds no further positions by default."""
+    given = AoaConfig((0.5,), synthesizer=("idw", "gp", "vae"))
+    train, test = small.split("random", 0)
+    data = context.Experiment(given, train, test, 3000, torch.device("cpu"))
+    validation = {
+        "idw": {"recommended_n_synthetic": 300, "sampled": False},
+        "gp": {"recommended_n_synthetic": 0, "sampled": True},
+    }
+    found = {s.synthesizer: s for s in synthesizing.syntheses(data, MeasuredSubset(0.5), given.synthesizer, validation)}
+    assert {name: found[name].n_synthetic for name in given.synthesizer} == {"idw": 3000, "gp": 0, "vae": 0}
+    assert {name: found[name].sampled for name in given.synthesizer} == {"idw": False, "gp": True, "vae": False}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--seed", 1), "got none"),
+        (("--mix", 0), "in (0, 1]"),
+        (("--mix", 1.5), "in (0, 1]"),
+        (("--mix", 0.3, 0.3), "twice"),
+        (("--mix", 0.1), "leaves 4 of 40"),
+        (("--mix", 0.5, "--split", "nowhere"), "choose one of block, random"),
+        (("--mix", 0.5, "--synthesizer", "oracle"), "unknown field model"),
+        (("--mix", 0.5, "--repeats", 0), "--repeats"),
+        (("--mix", 0.5, "--suggest", -1), "--suggest"),
+        (("--mix", 0.5, "--data", "/nowhere"), "is not a folder"),
+        (("--resume", "nowhere"), "no interrupted run"),
+    ],
+)
+def test_wrong_input_is_one_sentence_and_code_2(small, tmp_path, capsys, arguments, says):
+    extra = () if arguments[0] == "--resume" else ("--out", tmp_path / "run")
+    assert run(*arguments, *extra) == 2
+    error = capsys.readouterr().err.strip()
+    assert says in error
+    assert error.count("\n") == 0
+    assert not list(tmp_path.iterdir())
+
+
+def test_coarray_needs_the_array_and_takes_it_from_the_command_line(small, tmp_path, capsys):
+    (tmp_path / "data").mkdir()
+    write_spectra(replace(small, array=None), tmp_path / "data")
+    assert run("--mix", 0.5, "--array", 4, 0.164, 915e6, "--out", tmp_path / "run") == 2
+    assert "give it with --data" in capsys.readouterr().err
+    turbo = ("--mix", 0.5, "--synthesizer", "coarray", "--data", tmp_path / "data", "--out", tmp_path / "run")
+    assert run(*turbo) == 2
+    assert "give it with --array" in capsys.readouterr().err
+    assert run(*turbo, "--array", 1, 0.16, 915e6) == 2
+    assert "2 to 32 elements a side" in capsys.readouterr().err
+    assert run(*turbo, "--array", 4, 0.164, 915e6) == 0
+    model = load(tmp_path / "run" / "coarray-mix0.5.safetensors")
+    assert model.synthesize(small.position[:2]).shape == (2, 10, 40)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_cuda_without_a_gpu(small, tmp_path, capsys):
+    assert run("--mix", 0.5, "--device", "cuda", "--out", tmp_path / "run") == 2
+    assert "NVIDIA GPU" in capsys.readouterr().err
+
+
+def test_existing_directory_is_not_overwritten(small, tmp_path, capsys):
+    (tmp_path / "run").mkdir()
+    assert run("--mix", 0.5, "--out", tmp_path / "run") == 2
+    assert "exists already" in capsys.readouterr().err
+    assert not list((tmp_path / "run").iterdir())
+
+
+def test_report_refuses_unfinished_runs(tmp_path):
+    with pytest.raises(InputError, match="no finished run"):
+        merge([tmp_path], tmp_path / "out")
+
+
+def test_metrics_are_strict_json(tmp_path):
+    from tasks.records import strict
+
+    assert strict({"a": math.nan, "b": [math.inf, 1.0], "c": (1, 2)}) == {"a": None, "b": [None, 1.0], "c": [1, 2]}
+
+
+def test_paper_preset_keeps_all_pixels():
+    assert AANNConfig.paper().max_azimuths == 0
+    assert AANNConfig.paper().steps > AANNConfig().steps

@@ -1,0 +1,164 @@
+"""Gains by synthetic spectra: their reference, their interval, and how tables and reports show them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import committed
+import numpy as np
+import pytest
+import targets
+import torch
+
+from swiftwrf import simulated_room
+from tasks.aoa.condition import LOCATOR, Condition
+from tasks.aoa.evaluation import Evaluation
+from tasks.aoa.options import AoaConfig
+from tasks.aoa.page.gains import gain_sentence, gain_table
+from tasks.aoa.page.records import FractionRecords
+from tasks.aoa.page.summary import summary
+from tasks.aoa.results import Results
+from tasks.page.records import Records
+from tasks.report.run import merge
+from tasks.summarise import paired_change
+
+MEASURED = Condition("aann_kernel", "measured", measured_fraction=0.3)
+TURBO = replace(MEASURED, training="turbo", synthesizer="gp")
+
+
+def test_what_positions_differ_in_does_not_widen_the_interval_of_a_change():
+    """Errors over four decades, all of them halved but for a little noise."""
+    generator = np.random.default_rng(0)
+    before = 10 ** generator.uniform(-2, 2, 60)
+    after = 0.5 * before * generator.uniform(0.95, 1.05, 60)
+    change = paired_change(before, after)
+    assert -0.6 < change["low"] < -0.5 < change["high"] < -0.4
+    shuffled = paired_change(before, generator.permutation(after))
+    assert shuffled["high"] - shuffled["low"] > 5 * (change["high"] - change["low"])
+
+
+def test_the_interval_of_a_change_covers_the_truth_as_often_as_it_says():
+    generator = np.random.default_rng(1)
+    covered = 0
+    for _ in range(60):
+        before = generator.gamma(2, size=80)
+        change = paired_change(before, generator.gamma(2, size=80))
+        covered += change["low"] <= 0 <= change["high"]
+    assert covered >= 52  # 95 % of 60 are 57
+
+
+def metrics_of(errors, repeats=1):
+    """Return the metrics of conditions with these elevation errors [deg] at the test positions."""
+    room = simulated_room(n=20)
+    found = Results(SimpleNamespace(test=room, train=room, config=AoaConfig((0.3,)), lacking={}), SimpleNamespace())
+    for repeat in range(repeats):
+        for condition, error in errors.items():
+            off = torch.stack([torch.zeros(20), torch.as_tensor(error)], dim=1).double().deg2rad()
+            value = {"estimate": (room.label - off).tolist(), "seconds": {"train": 1.0, "estimate": 1.0}, "history": []}
+            found.add(Evaluation(replace(condition, repeat=repeat)), value)
+    return found._method_metrics(0.3)
+
+
+def test_the_reference_of_a_gain_is_the_best_estimator_without_synthetic_spectra():
+    peak, locator = (replace(MEASURED, estimator=name) for name in ("peak", LOCATOR))
+    spread = np.linspace(0.9, 1.1, 20)
+    methods, reference = metrics_of({MEASURED: 4 * spread, TURBO: 2 * spread, peak: 3 * spread, locator: spread})
+    assert reference == "peak"
+    assert set(methods["turbo_gp"]["changes"]) == {"measured_only", "peak"}
+    assert methods["turbo_gp"]["changes"]["peak"]["change"] == pytest.approx(-1 / 3, abs=1e-3)
+    assert methods["turbo_gp"]["changes"]["measured_only"]["high"] < 0
+    assert methods["peak"]["changes"] == {}
+
+
+def test_repeats_do_not_narrow_the_interval_of_a_gain():
+    generator = np.random.default_rng(0)
+    errors = {MEASURED: generator.uniform(1, 3, 20), TURBO: generator.uniform(1, 3, 20)}
+    once, often = (metrics_of(errors, repeats)[0]["turbo_gp"]["changes"]["measured_only"] for repeats in (1, 4))
+    assert often["low"] == pytest.approx(once["low"], abs=1e-6)
+    assert often["high"] == pytest.approx(once["high"], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "low", "verdict"), [(0.2, -0.1, "met"), (0.2, 0.1, "missed by 10%"), (0.2, None, "missed by 20%")]
+)
+def test_never_worse_is_decided_by_the_interval(monkeypatch, change, low, verdict):
+    """Results of earlier versions have no interval. There the change itself decides."""
+    angle = {"median": 1.0, "low": 0.9, "high": 1.1}
+    methods = {
+        condition.method: condition.description | {"great_circle_deg": dict(angle), "changes": {}}
+        for condition in (MEASURED, TURBO, replace(MEASURED, training="all"))
+    }
+    methods["turbo_gp"]["great_circle_deg"]["median"] = 1 + change
+    if low is not None:
+        found = {"median_deg": 1 + change, "change": change, "low": low, "high": 0.5}
+        methods["turbo_gp"]["changes"] = {"measured_only": found}
+    metrics = {"data": "s23-200", "split": "block", "moving": "transmitter"}
+    mix = {"methods": methods, "reference": "measured_only"}
+    monkeypatch.setattr(targets, "aoa_shares", lambda: [("0.3", mix, {"metrics": metrics})])
+    row = targets.aoa_targets().splitlines()[-1]
+    assert row.endswith(f"| never worse | {verdict} |")
+
+
+def test_the_report_states_gain_interval_and_judgement(aoa_run):
+    fraction = FractionRecords.of(Records(aoa_run))[0]
+    for other, change in fraction.mix["methods"]["turbo_swiftwrf"]["changes"].items():
+        assert (
+            f"{change['change']:+.0%} [{change['low']:+.0%}, {change['high']:+.0%}] against {other}"
+            in gain_sentence(fraction)
+        )
+    assert any(text in gain_sentence(fraction) for text in ("a gain", "a loss", "not significant"))
+    (table,) = gain_table(fraction)
+    assert {row[0] for row in table.rows} >= {"turbo_swiftwrf", "kernel_regression_turbo_swiftwrf"}
+
+
+def test_the_summary_begins_with_the_estimator_that_cross_validation_chose(aoa_run):
+    fraction = FractionRecords.of(Records(aoa_run))[0]
+    fraction.mix["estimator_choice"] = {"name": "peak", "held_out_deg": {"peak": 1.0}, "n_held_out": 9}
+    numbers = summary(fraction).numbers
+    assert numbers[0].value == f"{fraction.medians['peak']:.2f}\N{DEGREE SIGN}"
+    assert "peak" in numbers[0].meaning
+    assert "turbo_swiftwrf" in numbers[1].meaning
+
+
+def test_a_run_of_an_earlier_version_is_shown_by_the_present_names(aoa_run, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(aoa_run, run)
+    for file in (*run.glob("*.json"), *run.glob("*.csv")):
+        text = file.read_text().replace("kernel_regression", "kernel_ridge").replace("aann_kernel", "aann")
+        file.write_text(text)
+    metrics = json.loads((run / "metrics.json").read_text())
+    for mix in metrics["mixes"].values():
+        del mix["reference"]
+        for method in mix["methods"].values():
+            del method["changes"]
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    for file in run.glob("kernel_regression-*"):
+        file.rename(run / file.name.replace("kernel_regression", "kernel_ridge"))
+    merge([run], tmp_path / "report")
+    html = (tmp_path / "report" / "report.html").read_text()
+    assert "kernel_regression_turbo_swiftwrf" in html
+    conditions = FractionRecords.of(Records(run))[0].conditions
+    assert conditions["turbo_swiftwrf"].estimator == "aann_kernel"
+    assert conditions["kernel_regression"].estimator == "kernel_regression"
+    assert "kernel_ridge-mix0.5.safetensors" in html  # the file has its former name
+
+
+def test_results_of_earlier_versions_are_read_by_the_present_names(tmp_path, monkeypatch):
+    text = (Path(committed.RESULTS) / "aoa_room_receiver.json").read_text()
+    former = text.replace("kernel_regression", "kernel_ridge").replace("aann_kernel", "aann")
+    (tmp_path / "former.json").write_text(former)
+    present = committed.load("aoa_room_receiver")
+    monkeypatch.setattr(committed, "RESULTS", tmp_path)
+    assert committed.load("former")["metrics"] == present["metrics"]
+
+
+def test_the_preset_of_the_paper_has_its_fractions_and_no_further_positions():
+    paper = AoaConfig(preset="paper")
+    assert (paper.mix, paper.extra) == ((0.1, 0.3, 0.5, 0.7), 0)
+    given = AoaConfig(mix=(0.2,), preset="paper", extra=9)
+    assert (given.mix, given.extra) == ((0.2,), 9)
+    assert AoaConfig(mix=(0.3,)).extra is None

@@ -1,0 +1,125 @@
+"""The console script: its sub-commands, its speed, and where it may be started."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import time
+import tomllib
+from importlib import import_module
+from inspect import signature
+from pathlib import Path
+from typing import get_type_hints
+
+import pytest
+from quick import said
+
+from tasks.command import COMMANDS, main
+from tasks.command_line import BROKEN_PIPE
+
+ROOT = Path(__file__).parents[2]
+
+
+def started(folder: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run the console script as pip installs it, in a directory of its own."""
+    script = folder / "bin" / "swiftwrf"
+    script.parent.mkdir(exist_ok=True)
+    script.write_text("import sys\nfrom tasks.command import main\nsys.exit(main())\n")
+    environment = os.environ | {"PYTHONPATH": str(ROOT)} | variables
+    return subprocess.run(
+        [sys.executable, str(script), *arguments],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_python_m_tasks_lists_the_commands():
+    done = subprocess.run([sys.executable, "-m", "tasks"], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert re.findall(r"^  (\w+) +\S", done.stdout, flags=re.MULTILINE) == [*COMMANDS, "resume"]
+
+
+def test_the_package_declares_the_script():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["scripts"] == {"swiftwrf": "tasks.command:main"}
+
+
+def test_help_lists_every_command_at_once(tmp_path):
+    began = time.perf_counter()
+    done = started(tmp_path, "--help")
+    assert time.perf_counter() - began < 1.5
+    assert done.returncode == 0
+    listed = re.findall(r"^  (\w+) +\S", done.stdout, flags=re.MULTILINE)
+    assert listed == [*COMMANDS, "resume"]
+
+
+@pytest.mark.parametrize("arguments", [("--help",), ("inspect", "--help")])
+def test_a_closed_output_ends_a_command_without_a_message(arguments):
+    """A case is `swiftwrf --help | head -1`, where `head` ends first."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tasks", *arguments], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    process.stdout.close()
+    assert (process.stderr.read(), process.wait()) == (b"", BROKEN_PIPE)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_options_and_a_package_of_its_name(name):
+    task = import_module(f"tasks.{name}.{COMMANDS[name].module}").run
+    config_type = get_type_hints(task)["config"]
+    assert config_type is getattr(import_module(f"tasks.{name}.options"), COMMANDS[name].options)
+    assert config_type.__doc__
+    assert config_type.resumable == ("resume" in signature(task).parameters)
+    assert f'run_command("{name}"' in (ROOT / "tasks" / name / "__main__.py").read_text()
+
+
+def test_a_file_called_tasks_in_the_working_directory(tmp_path):
+    """A common name: invoke and celery use it."""
+    (tmp_path / "tasks.py").write_text("raise SystemExit('the wrong module')")
+    done = started(tmp_path, "rssi", "--rx", "")
+    assert done.returncode == 2
+    assert done.stderr == "error: --rx is empty; give it a value or leave it out\n"
+
+
+def test_help_of_a_command_names_the_console_script(tmp_path):
+    done = started(tmp_path, "inspect", "--help")
+    assert done.returncode == 0
+    assert done.stdout.startswith("usage: swiftwrf inspect")
+
+
+@pytest.mark.parametrize(
+    ("given", "spins"), [({}, "30000"), ({"GOMP_SPINCOUNT": "5"}, "5"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "None")]
+)
+def test_commands_shorten_the_wait_of_threads_and_libraries_do_not(given, spins):
+    """libgomp reads the variable when torch is loaded."""
+    code = (
+        "import os, sys, tasks, swiftwrf.errors\n"
+        "show = lambda: print(os.environ.get('GOMP_SPINCOUNT'))\n"
+        "show()\n"
+        "class Stop:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'torch': show(); sys.exit()\n"
+        "for name in [name for name in sys.modules if name.startswith(('torch', 'swiftwrf'))]: del sys.modules[name]\n"
+        "sys.meta_path.insert(0, Stop())\n"
+        "from tasks.command import main\n"
+        "main(['rssi', '--rx', '1'])\n"
+    )
+    own = {key: value for key, value in os.environ.items() if key not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}
+    done = subprocess.run([sys.executable, "-c", code], env=own | given, stdout=subprocess.PIPE, text=True, check=True)
+    assert done.stdout.split() == [given.get("GOMP_SPINCOUNT", "None"), spins]
+
+
+def test_unknown_commands_and_directories(tmp_path, capsys):
+    assert main(["rsi"]) == 2
+    assert "unknown command 'rsi'; choose from aoa, rssi" in said(capsys)
+    assert main(["resume", str(tmp_path)]) == 2
+    assert "no interrupted run" in said(capsys)
+    assert main(["resume"]) == 2
+    (tmp_path / "old.partial").mkdir()
+    (tmp_path / "old.partial" / "config.json").write_text('{"task": "other"}')
+    assert main(["resume", str(tmp_path / "old.partial")]) == 2
+    assert "unknown task 'other'" in said(capsys)

@@ -1,0 +1,207 @@
+"""tasks.convert: what any reader reads comes back as it was from the toolkit's own layout."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import quick
+import torch
+from quick import said
+from samples import (
+    snapshots,
+    write_deepmimo,
+    write_dichasus,
+    write_espargos,
+    write_snapshots,
+    write_survey,
+)
+from test_calibration import spoilt
+
+from swiftwrf import AngularGrid, InputError, load_rssi, load_spectra, simulated_room
+from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data import ReadOptions
+from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
+from swiftwrf.data.writing import write_rssi, write_spectra
+
+GRID = ("--grid", 24, 96)
+
+
+def run(*arguments):
+    return quick.run("convert", *arguments)
+
+
+SPECTRA = {
+    "snapshots": (write_snapshots, {}),
+    "HDF5": (lambda folder: write_snapshots(folder, "snapshots.h5"), {}),
+    "DeepMIMO": (write_deepmimo, {}),
+    "ESPARGOS": (write_espargos, {}),
+    "DICHASUS": (write_dichasus, {"station": 1}),
+}
+
+
+@pytest.mark.parametrize("name", SPECTRA)
+def test_spectra_come_back_as_they_were(name, tmp_path):
+    write, how = SPECTRA[name]
+    write(tmp_path / "source")
+    options = [x for key, value in how.items() for x in (f"--{key}", value)]
+    assert run(tmp_path / "source", tmp_path / "own", *GRID, *options) == 0
+    before = load_spectra(tmp_path / "source", grid=AngularGrid.hemisphere(24, 96), **how)
+    after = load_spectra(tmp_path / "own")
+    for field in ("position", "spectrum", "line_of_sight", "fixed_position"):
+        assert torch.equal(getattr(after, field), getattr(before, field)), field
+    torch.testing.assert_close(after.label, before.label, rtol=0, atol=1e-12)
+    torch.testing.assert_close(after.array.element, before.array.element)
+    assert (after.grid, after.moving) == (before.grid, before.moving)
+    record = json.loads((tmp_path / "own" / "conversion.json").read_text())
+    assert record["source_sha256"] == before.source
+    assert record["notes"] == list(before.notes)
+
+
+def test_rssi_comes_back_as_it_was(tmp_path):
+    file = write_survey(tmp_path / "source")
+    (tmp_path / "source" / "train_index.txt").write_text("\n".join(map(str, range(30))))
+    (tmp_path / "source" / "test_index.txt").write_text("\n".join(map(str, range(30, 40))))
+    assert run(file, tmp_path / "own") == 0
+    before, after = load_rssi(file), load_rssi(tmp_path / "own")
+    assert torch.equal(after.rssi_dbm.nan_to_num(), before.rssi_dbm.nan_to_num())
+    assert torch.equal(after.transmitter_position, before.transmitter_position)
+    assert after.receiver_names == before.receiver_names
+    assert not after.located
+    assert torch.equal(after.named_splits["random"][1], before.named_splits["random"][1])
+
+
+def test_names_and_values_that_the_layout_has_signs_for(tmp_path):
+    data = replace(
+        load_rssi(write_survey(tmp_path / "a")),
+        receiver_names=('a,"b"', "NA", "1"),
+        receiver_position=torch.eye(3, dtype=torch.float64),
+    )
+    data.rssi_dbm[0, 0] = -100.0
+    write_rssi(data, tmp_path)
+    back = load_rssi(tmp_path)
+    assert back.receiver_names == data.receiver_names
+    assert torch.equal(back.receiver_position, data.receiver_position)
+    assert back.rssi_dbm[0, 0] == -99.99
+
+
+def test_moving_receivers_and_splits_come_back(tmp_path):
+    room = simulated_room(n=20, moving="receiver", grid=AngularGrid.hemisphere(8, 32))
+    split = {"walk": (torch.arange(12), torch.arange(12, 20))}
+    write_spectra(replace(room, named_splits=split), tmp_path)
+    back = load_spectra(tmp_path)
+    assert back.moving == "receiver"
+    assert torch.equal(back.named_splits["walk"][1], split["walk"][1])
+    torch.testing.assert_close(back.label, room.label)
+
+
+def test_an_array_that_the_files_contradict_is_refused(tmp_path):
+    write_spectra(simulated_room(n=20, grid=AngularGrid.hemisphere(8, 32)), tmp_path)
+    with pytest.raises(InputError, match="another array"):
+        load_spectra(tmp_path, array=PlanarArray.square(2, 915e6))
+    assert load_spectra(tmp_path, array=PlanarArray.square(4, 915e6)).array == PlanarArray.square(4, 915e6)
+
+
+@pytest.mark.parametrize("name", ["spectrum.npy", "spectrum.npz"])
+def test_arrays_beside_images(name, tmp_path):
+    room = simulated_room(n=20, grid=AngularGrid.hemisphere(9, 30))
+    write_spectra(room, tmp_path)
+    (tmp_path / "spectrum.npz").unlink()
+    if name == "spectrum.npy":
+        np.save(tmp_path / name, room.spectrum.numpy())
+    else:
+        np.savez(tmp_path / name, spectrum=(room.spectrum * 255).round().byte().numpy())
+    torch.testing.assert_close(load_spectra(tmp_path).spectrum, room.spectrum, rtol=0, atol=0.5 / 255)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda s: s.transpose(0, 2, 1), "transpose"),
+        (lambda s: 20 * np.log10(s + 1e-9), "convert decibels"),
+        (lambda s: s[:5], "for 20 positions"),
+        (lambda s: s * np.nan, "in \\[0, 1\\]"),
+        (lambda s: s > 0.5, "got bool"),
+    ],
+)
+def test_arrays_of_something_else_are_refused(tmp_path, change, says):
+    room = simulated_room(n=20, grid=AngularGrid.hemisphere(8, 32))
+    write_spectra(room, tmp_path)
+    np.savez(tmp_path / "spectrum.npz", spectrum=change(room.spectrum.numpy()))
+    with pytest.raises(ValueError, match=says):
+        load_spectra(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("asked", "array"),
+    [
+        ((4, 0.06, 2.4e9), PlanarArray.square(4, 2.4e9, 0.06)),
+        ((4, 4, 0.06, 2.4e9), PlanarArray.square(4, 2.4e9, 0.06)),
+        ((2, 8, 0.06, 2.4e9), PlanarArray.grid(2, 8, 0.06, 2.4e9)),
+        ((1, 8, 0.06, 2.4e9), PlanarArray.grid(1, 8, 0.06, 2.4e9)),
+    ],
+)
+def test_an_array_of_any_rows_and_columns(tmp_path, asked, array):
+    write_deepmimo(tmp_path / "source")
+    assert run(tmp_path / "source", tmp_path / "own", *GRID, "--array", *asked) == 0
+    expected = load_spectra(tmp_path / "source", array=array, grid=AngularGrid.hemisphere(24, 96))
+    assert torch.equal(load_spectra(tmp_path / "own").spectrum, expected.spectrum)
+
+
+def test_calibration_sees_the_training_part_alone(tmp_path, capsys):
+    data, *_ = spoilt(snapshots(n=150))
+    folder = write_snapshots(tmp_path / "source", data=data)
+    assert run(folder, tmp_path / "own", *GRID, "--calibrate", "--split", "block", "--seed", 1) == 0
+    record = json.loads((tmp_path / "own" / "conversion.json").read_text())["calibration"]
+    assert np.linalg.norm(record["turn_deg"]) == pytest.approx(20, abs=1.5)
+    mended = load_spectra(tmp_path / "own")
+    usual = snapshots(n=150).spectra(AngularGrid.hemisphere(24, 96))
+    assert float((mended.spectrum - usual.spectrum).abs().mean()) < 0.01
+    assert {name: (len(a), len(b)) for name, (a, b) in mended.named_splits.items()} == {"block": (120, 30)}
+    assert torch.equal(mended.split("block")[1].index, data.split("block", 1)[1].index)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("{source}", "{taken}"), "never overwritten; choose another directory"),
+        (("/nowhere", "{new}"), "is not a folder or file"),
+        (("{source}", "{new}", "--columns", "x"), "x=NAME"),
+        (("{source}", "{new}", "--columns", "x=a"), "takes no columns"),
+        (("{source}", "{new}", "--grid", 1, 1), "--grid"),
+        (("{source}", "{new}", "--every", 0), "--every must be at least 1"),
+        (("{source}", "{new}", "--array", 1, 0.06, 2.4e9), "2 to 32 elements a side"),
+        (("{source}", "{new}", "--array", 2, 64, 0.06, 2.4e9), "2 to 32 elements a side"),
+        (("{source}", "{new}", "--array", 2, 0, 0.06, 2.4e9), "2 to 32 elements a side"),
+        (("{source}", "{new}", "--array", 2, 8, -0.06, 2.4e9), "above 0"),
+        (("{survey}", "{new}", "--calibrate"), "takes array snapshots"),
+        (("{source}", "{new}", "--split", "block"), "--split and --seed are of the calibration; give --calibrate, too"),
+        (("{survey}", "{new}", "--beamformer", "capon"), "takes no beamformer"),
+        (("{source}", "{new}", "--beamformer", "music"), "unknown beamformer"),
+        (("{source}", "{new}", "--calibrate", "--split", "days"), "no split 'days'"),
+    ],
+)
+def test_refusals_leave_nothing(tmp_path, capsys, arguments, says):
+    places = {
+        "source": write_snapshots(tmp_path / "source"),
+        "survey": write_survey(tmp_path / "walk"),
+        "new": tmp_path / "new",
+    }
+    (tmp_path / "taken").mkdir()
+    places["taken"] = tmp_path / "taken"
+    assert run(*(str(a).format(**places) for a in arguments)) == 2
+    assert says in said(capsys)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["source", "taken", "walk"]
+
+
+def test_every_format_is_described():
+    text = (Path(__file__).parents[2] / "docs" / "formats.md").read_text()
+    for formats in (SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS):
+        for name in formats:
+            assert f"[{name}](#" in text, f"describe {name} in docs/formats.md"
+    for option in ReadOptions.__dataclass_fields__:
+        assert re.search(f"`--{option.replace('_', '-')}[ `]", text), f"describe --{option} in docs/formats.md"

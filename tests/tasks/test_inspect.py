@@ -1,0 +1,84 @@
+"""tasks.inspect on valid measurements: findings and page. Wrong ones are in test_wrong_conventions.py."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import quick
+import torch
+from quick import said
+from samples import WAVELENGTH, snapshots, write_snapshots, write_survey
+
+from swiftwrf import AngularGrid, simulated_room
+from swiftwrf.data.writing import write_spectra
+from tasks.inspect.findings.positions import nearest
+
+
+def run(*arguments):
+    return quick.run("inspect", *arguments)
+
+
+def test_snapshots(tmp_path, capsys):
+    write_snapshots(tmp_path / "source")
+    assert run(tmp_path / "source", "--grid", 24, 96, "--out", tmp_path / "page") == 0
+    text = capsys.readouterr().out
+    content = json.loads(
+        (tmp_path / "page" / "inspect.json").read_text(), parse_constant=lambda name: pytest.fail(name)
+    )
+    numbers = content["numbers"]
+    assert (content["kind"], numbers["n"], numbers["elements"], numbers["frame"]) == (
+        "array snapshots",
+        120,
+        16,
+        "fits",
+    )
+    assert numbers["spacing_wavelengths"] == pytest.approx(0.5)
+    assert numbers["peak_to_line_of_sight_deg"] < 3
+    assert numbers["nearest_wavelengths"] == pytest.approx(numbers["nearest_m"] / WAVELENGTH)
+    assert "interpolators see no fringes" in text
+    assert "needs no calibration" in text
+    html = (tmp_path / "page" / "report.html").read_text()
+    assert html.count("<figcaption>") == 3
+    assert all(finding["text"][:20] in html for finding in content["findings"])
+
+
+def test_a_single_position(tmp_path, capsys):
+    write_snapshots(tmp_path / "source", data=snapshots(n=1))
+    assert run(tmp_path / "source", "--grid", 24, 96, "--out", tmp_path / "page") == 0
+    text = capsys.readouterr().out
+    assert "1 positions" in text
+    assert "inf m away" not in text
+
+
+def test_survey(tmp_path, capsys):
+    assert run(write_survey(tmp_path / "walk"), "--out", tmp_path / "page") == 0
+    text = capsys.readouterr().out
+    assert "40 rows of RSSI at 3 receivers" in text
+    assert "positions are unknown" in text
+    assert (tmp_path / "page" / "report.html").read_text().count("<svg") == 2
+
+
+def test_the_nearest_other_position():
+    position = torch.tensor([[0.0, 0, 0], [0, 0, 2], [0, 1, 0], [0, 1, 0]], dtype=torch.float64)
+    rows, apart = nearest(position)
+    assert rows.tolist() == [0, 1, 2, 3]
+    assert apart.tolist() == [1, 2, 0, 0]
+
+
+def test_more_positions_than_are_looked_at(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("tasks.inspect.findings.positions.MAX_POSITIONS", 20)
+    room = simulated_room(n=15, grid=AngularGrid.hemisphere(8, 32))
+    (tmp_path / "source").mkdir()
+    write_spectra(room.subset(torch.arange(15).repeat(2)), tmp_path / "source")
+    assert run(tmp_path / "source", "--out", tmp_path / "page") == 0
+    assert "30 positions occur more than once" in capsys.readouterr().out
+
+
+def test_refusals_leave_nothing(tmp_path, capsys):
+    assert run("/nowhere", "--out", tmp_path / "page") == 2
+    assert "is not a folder or file" in said(capsys)
+    write_survey(tmp_path / "walk")
+    assert run(tmp_path / "walk", "--station", 1, "--out", tmp_path / "page") == 2
+    assert "takes no station" in said(capsys)
+    assert [file.name for file in tmp_path.iterdir()] == ["walk"]

@@ -1,0 +1,149 @@
+"""Steps in several processes: the results of one process, in one order, and a sentence if a process is lost."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+import time
+from multiprocessing import active_children
+from pathlib import Path
+from unittest import mock
+
+import pytest
+import torch
+from sums import Kill, Optional, Refusal, Sum
+
+from swiftwrf import AngularGrid, FitError, InputError, simulated_room
+from swiftwrf.data.writing import write_spectra
+from tasks.aoa.options import AoaConfig
+from tasks.directory import Run
+from tasks.processes import number_of_processes
+from tasks.steps import Budget, computed
+
+HERE = Path(__file__).parents[1]
+STEPS = [Sum(1, (3, 4)), Sum(2), Sum(1, (5,))]  # the third is the first one, and has another follower
+
+
+def results(folder, steps, processes, budget=None):
+    arrived = []
+    with Run("aoa", str(folder), "", AoaConfig(mix=(0.5,)), torch.device("cpu"), {}) as run:
+        found = list(computed(run, steps, 10, None, processes, lambda step, value: arrived.append(step.name), budget))
+        run.finish({}, lambda folder, metrics: None)
+    return found, arrived
+
+
+def test_processes_give_the_results_of_one_process_in_the_same_order(tmp_path):
+    (here, _), (there, arrived) = (results(tmp_path / str(n), STEPS, n) for n in (1, 2))
+    assert [step.name for step, _ in there] == [step.name for step, _ in here]
+    assert [value["sum"] for _, value in there] == [11, 13, 14, 12, 11, 15]
+    assert sorted(arrived) == [f"sum-{number}" for number in range(1, 6)]
+    assert all(value["process"] != os.getpid() and value["threads"] == 1 for _, value in there)
+    assert (tmp_path / "2" / "sum-5.txt").read_text() == "5"
+    assert not active_children()
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_a_budget_leaves_out_optional_steps_and_no_others(tmp_path, processes):
+    steps = [Optional(1), Sum(2), Sum(3, (4,))]
+    found, arrived = results(tmp_path / "none", steps, processes, Budget(1e-9))
+    assert {step.name: "refused" in value for step, value in found} == {
+        "sum-1": True,
+        "sum-2": False,
+        "sum-3": False,
+        "sum-4": False,
+    }
+    assert "sum-1" not in arrived
+    assert not (tmp_path / "none" / "sum-1.txt").exists()
+    found, _ = results(tmp_path / "all", steps, processes, Budget(600))
+    assert not any("refused" in value for _, value in found)
+
+
+def test_an_optional_step_is_expected_to_take_as_long_as_the_longest():
+    budget = Budget(100)
+    assert budget.refusal(Optional(1)) is None
+    budget.spent(Optional(1), 100)
+    assert budget.refusal(Optional(2))["refused"] == "its training does not fit into the budget of 100 s"
+    assert budget.refusal(Sum(2)) is None
+    assert budget.priority(Optional(2)) < budget.priority(Sum(2))
+    assert Budget().priority(Optional(2)) == Budget().priority(Sum(2))
+
+
+@pytest.mark.parametrize(("step", "error"), [(Refusal(1), InputError("no such number")), (Kill(1), FitError("killed"))])
+def test_a_step_that_fails_ends_the_run_and_its_processes(tmp_path, step, error):
+    with pytest.raises(type(error), match=str(error)):
+        results(tmp_path / "run", [Sum(2), step], 2)
+    deadline = time.monotonic() + 10
+    while active_children() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not active_children()
+
+
+def test_one_process_with_one_thread_on_a_gpu_and_with_torchrun():
+    assert number_of_processes(torch.device("cpu")) == 1
+    with mock.patch("torch.get_num_threads", return_value=16):
+        assert number_of_processes(torch.device("cpu")) == 4
+        assert number_of_processes(torch.device("cuda")) == 1
+        with mock.patch("tasks.processes.process_count", return_value=2):
+            assert number_of_processes(torch.device("cpu")) == 1
+
+
+def prepare(folder):
+    (folder / "data").mkdir()
+    write_spectra(simulated_room(n=26, grid=AngularGrid.hemisphere(8, 32)), folder / "data")
+
+
+def is_running(process):
+    stat = Path(f"/proc/{process}/stat")
+    return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+def command(folder, threads, *more):
+    environment = os.environ | {"PYTHONPATH": str(HERE.parent), "OMP_NUM_THREADS": str(threads)}
+    arguments = [
+        "--mix",
+        "0.5",
+        "--synthesizer",
+        "gp",
+        "--data",
+        "data",
+        "--extra",
+        "0",
+        "--out",
+        f"run-{threads}",
+        *more,
+    ]
+    return subprocess.Popen([sys.executable, "-m", "tasks.aoa", *arguments], cwd=folder, env=environment)
+
+
+@pytest.mark.fuzz
+def test_the_command_gives_the_same_numbers_with_one_thread_and_with_two_processes(tmp_path):
+    prepare(tmp_path)
+    for threads in (1, 2):
+        assert command(tmp_path, threads).wait(timeout=600) == 0
+    one, two = (list(csv.DictReader((tmp_path / f"run-{threads}" / "errors.csv").open())) for threads in (1, 2))
+    assert one == two
+    chosen = [
+        json.loads((tmp_path / f"run-{n}" / "metrics.json").read_text())["mixes"]["0.5"]["choice"] for n in (1, 2)
+    ]
+    assert chosen[0]["psnr_db"] == chosen[1]["psnr_db"]
+
+
+@pytest.mark.long
+def test_processes_end_with_a_run_that_is_killed(tmp_path):
+    prepare(tmp_path)
+    run = command(tmp_path, 2)
+    children: list[int] = []
+    while run.poll() is None and len(children) < 2:
+        time.sleep(0.1)
+        listed = subprocess.run(["pgrep", "-P", str(run.pid)], capture_output=True, text=True, check=False).stdout
+        children = [int(number) for number in listed.split()]
+    run.kill()
+    run.wait()
+    deadline = time.monotonic() + 30
+    while any(map(is_running, children)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert children
+    assert not any(map(is_running, children))

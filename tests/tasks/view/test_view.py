@@ -1,0 +1,512 @@
+"""Content of the page without widgets: views, plans, spectra, maps and refusals."""
+
+from __future__ import annotations
+
+import base64
+import copy
+import io
+import itertools
+import json
+import shutil
+import socket
+import sys
+from dataclasses import asdict, replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import quick
+import small
+import torch
+from fuzz import kinds
+from PIL import Image
+
+from swiftwrf import AngularGrid, GeometryModel, InputError, RssiModel, load, load_rssi, rssi_room
+from swiftwrf.locate import MatchedField, RssiLocator
+from swiftwrf.models.geometry import Plane, fit_hybrid
+from swiftwrf.online import Follower
+from tasks.command_line import command_line
+from tasks.locate.options import LocateConfig
+from tasks.page.floor_plan import FloorPlan
+from tasks.page.raster import colour_image
+from tasks.update.record import Record
+from tasks.view import spectra
+from tasks.view.drawing import HemisphereProjection, PlanProjection, data_url, text
+from tasks.view.locating import N_POSITIONS, RssiLocating
+from tasks.view.options import ViewConfig
+from tasks.view.rssi import MapSelection, at_least, probability_above
+from tasks.view.run import run
+from tasks.view.sources import open_source
+from tasks.view.spectra import angle_between
+
+GRID = AngularGrid.hemisphere(15, 60)
+needs_the_extra = pytest.mark.skipif(find_spec("nicegui") is None, reason="needs the extra view")
+
+
+@pytest.mark.parametrize(
+    "projection", [HemisphereProjection.rectangular(GRID), HemisphereProjection.disc()], ids=["rectangular", "polar"]
+)
+@pytest.mark.parametrize("pixel", [(0, 0), (3, 10), (7, 59), (13, 31)])
+def test_a_direction_is_drawn_where_it_is_marked(projection, pixel):
+    spectrum = np.zeros(GRID.shape)
+    spectrum[pixel] = 1
+    azimuth, elevation = GRID.azimuth[pixel[1]].rad2deg(), GRID.elevation[pixel[0]].rad2deg()
+    row, column = (projection.project(spectrum, GRID) == 1).nonzero()
+    if not projection.polar and pixel[1] == 0:  # half of it lies beyond the seam
+        row, column = row[column < projection.width / 2], column[column < projection.width / 2]
+    x, y = projection.pixel(float(azimuth), float(elevation))
+    assert np.hypot(column + 0.5 - x, row + 0.5 - y).min() <= 1
+    assert abs(row.mean() + 0.5 - y) <= 0.6 * projection.height / GRID.n_elevation
+
+
+def test_polar_view_is_clear_outside_the_hemisphere():
+    laid = HemisphereProjection.disc().project(np.ones(GRID.shape), GRID)
+    assert np.isnan(laid[0, 0])
+    assert np.isfinite(laid).mean() == pytest.approx(np.pi / 4, abs=0.01)
+
+
+def test_pictures_have_the_ends_of_the_colours_and_clear_pixels():
+    content = data_url(colour_image(np.array([[0.0, 1.0, np.nan, 7.0]]), "viridis")).removeprefix(
+        "data:image/png;base64,"
+    )
+    pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(content))).convert("RGBA"))[0]
+    np.testing.assert_allclose(pixels[:, 3], [255, 255, 0, 255])
+    np.testing.assert_allclose(pixels[[0, 1], :3], [[68, 1, 84], [253, 231, 37]], atol=2)
+    assert (pixels[3] == pixels[1]).all()
+
+
+def test_plan_goes_there_and_back_and_keeps_inside():
+    plan = PlanProjection.around(np.array([[0.0, 0, 1], [4, 2, 1]]), [np.nan, np.nan, 0], max_px=(400, 300))
+    assert plan.position(*plan.pixel([1.5, 0.5])) == pytest.approx((1.5, 0.5))
+    assert plan.contains([[0, 0], [4, 2]])
+    assert not plan.contains([[0, 0], [4, 9]])
+    assert plan.position(-1e6, 1e6) == pytest.approx((plan.low[0], plan.low[1]))
+    assert max(plan.size[0] / 400, plan.size[1] / 300) == pytest.approx(1, abs=0.01)
+
+
+def test_a_path_along_an_axis_leaves_room_to_drag():
+    width, height = PlanProjection.around([[0.0, 3], [10, 3]], max_px=(500, 500)).size
+    assert height > 0.3 * width
+
+
+def test_texts_are_texts():
+    assert "<script>" not in text(0, 0, "<script>")
+
+
+def test_view_of_a_run(aoa_run, room):
+    view = open_source(aoa_run)
+    assert [loaded.title for loaded in view.models] == ["swiftwrf, 50% measured", "swiftwrf, 100% measured"]
+    train, test = room.split("random", 0)
+    assert [int(loaded.in_training.sum()) for loaded in view.models] == [round(0.5 * len(train)), len(train)]
+    assert not view.models[1].in_training[test.index].any()
+    np.testing.assert_allclose(view.data.position, room.position, atol=1e-6)
+    assert (view.positions == view.start).all(axis=1).any()
+
+
+def test_predicted_spectrum_is_that_of_the_model(aoa_run):
+    view = open_source(aoa_run)
+    loaded, at = view.models[1], np.array([3.0, 2.5, 1.1])
+    shown = view.predict(loaded, at)
+    predicted = loaded.model.predict(torch.from_numpy(at)[None])
+    np.testing.assert_allclose(shown.mean, predicted.mean[0].detach(), atol=1e-4)
+    np.testing.assert_allclose(shown.std, predicted.std[0].detach(), atol=1e-5)
+    row, column = np.unravel_index(shown.mean.argmax(), GRID.shape)
+    peak = float(GRID.azimuth[column].rad2deg()), float(GRID.elevation[row].rad2deg())
+    assert shown.peak == pytest.approx(peak)
+    direction = view.data.direction_at(torch.from_numpy(at)[None])[0].rad2deg()
+    assert shown.line_of_sight == pytest.approx(tuple(direction.tolist()))
+    assert view.predict(view.models[0], at).std is None  # fitted by gradient
+
+
+def test_nearest_measured_spectrum(aoa_run, room):
+    view = open_source(aoa_run)
+    at = room.position[7].numpy() + np.array([0, 0, 0.001])
+    index, away_m = view.nearest(at)
+    assert index == 7
+    assert away_m == pytest.approx(0.001, abs=1e-5)
+    np.testing.assert_allclose(view.data.store[7:8][0], room.spectrum[7], atol=1 / 255)
+
+
+@pytest.mark.parametrize(("seconds", "shape"), [(1e9, (15, 60)), (0.0, (1, 4))])
+def test_a_slow_model_is_dragged_on_a_coarser_grid(aoa_run, monkeypatch, seconds, shape):
+    monkeypatch.setattr(spectra, "MAX_DRAG_SECONDS", seconds)
+    view = open_source(aoa_run)
+    shown = view.predict(view.models[1], view.start, dragging=True)
+    assert shown.grid.shape == shown.mean.shape == shown.std.shape == shape
+    assert view.predict(view.models[1], view.start).mean.shape == (15, 60)
+
+
+def saved(kind, folder, room) -> Path:
+    """A model of that kind, by itself; rooms are made, for finding one takes long."""
+    if kind in ("geometry", "hybrid"):
+        plane = Plane((1.0, 0.0, 0.0), 6.0, -0.5, 1.0, True)
+        model = GeometryModel.of_planes(room, [plane], order=1)
+        if kind == "hybrid":
+            model = fit_hybrid(room, model, progress=False)
+        model.save(folder / "model")
+    elif kind in small.PUBLISHED:
+        kinds.model_published(kind, folder)
+    else:
+        getattr(kinds, f"model_{kind}")(folder)
+    return folder / "model"
+
+
+@pytest.mark.parametrize("kind", ["swiftwrf", "coarray", "geometry", "hybrid", *small.PUBLISHED])
+def test_a_model_by_itself(tmp_path, room, kind):
+    view = open_source(saved(kind, tmp_path, room))
+    shown = view.predict(view.models[0], view.start, dragging=True)
+    assert np.isfinite(shown.mean).all()
+    assert (view.positions.min(axis=0) <= view.start).all()
+    assert (view.start <= view.positions.max(axis=0)).all()
+    assert (shown.line_of_sight is not None) == (kind in ("geometry", "hybrid", "nerf2", "wrfgs"))
+    assert bool(view.models[0].planes) == (kind in ("geometry", "hybrid"))
+
+
+def test_far_ends_leave_room_to_drag(aoa_run):
+    view = open_source(aoa_run)
+    low, high = view.box
+    assert (low <= view.fixed).all()
+    assert (view.fixed <= high).all()
+    far = replace(view, data=replace(view.data, fixed_position=torch.tensor([100.0, 2, 1])))
+    width = np.ptp(view.positions, axis=0).max()
+    assert far.box[1][0] == pytest.approx(view.positions[:, 0].max() + spectra.MAX_BEYOND_DATA * width)
+
+
+def test_angles_are_great_circles():
+    assert angle_between((350, 0), (10, 0)) == pytest.approx(20)
+    assert angle_between((0, 80), (180, 80)) == pytest.approx(20)
+
+
+def test_measurements_that_changed_or_went_are_not_shown(aoa_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(aoa_run, folder)
+    environment = json.loads((folder / "environment.json").read_text())
+    environment["input_sha256"]["scene box.xml"] = "of a scene that was traced"
+    (folder / "environment.json").write_text(json.dumps(environment))
+    assert open_source(folder).data is not None
+    for file, key, value in (
+        ("environment.json", "input_sha256", {}),
+        ("config.json", "data", str(tmp_path / "gone")),
+    ):
+        content = json.loads((folder / file).read_text())
+        content.get("config", content)[key] = value
+        (folder / file).write_text(json.dumps(content))
+        view = open_source(folder)
+        assert view.data is None
+        assert len(view.notes) == 1
+        assert np.isfinite(view.predict(view.models[0], view.start).mean).all()
+
+
+def test_room_of_another_model_on_the_same_spectra(aoa_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(aoa_run, folder)
+    plane = {"normal": [1.0, 0, 0], "offset_m": 6.0, "gain": -0.5, "std_mm": 1.0, "certain": True}
+    (folder / "geometry-mix1.json").write_text(json.dumps({"planes": [plane]}))
+    assert [loaded.planes for loaded in open_source(folder).models] == [[], [plane]]
+
+
+def test_maps_are_those_of_the_model(rssi_run):
+    view = open_source(rssi_run)
+    assert view.receivers == ("receiver01", "receiver06", "receiver12")
+    assert view.floor.plan.corners == (0, 20, 0, 15)
+    i, j = 5, 17
+    place = view.cells[0][j], view.cells[1][i]
+    at = torch.tensor([[*place, 1.2]], dtype=torch.float64)
+    predicted = load(rssi_run / "model.safetensors").predict(at)
+    np.testing.assert_allclose(view.map(1.2).mean[:, i, j], predicted.mean[0], atol=1e-3)
+    selection = MapSelection("RSSI", 1, 1.2)
+    for shown, expected in zip(view.at(selection, *place).interval(0.8), predicted.interval(0.8), strict=True):
+        np.testing.assert_allclose(shown, expected[0])
+    described = view.describe(selection, *place)
+    assert f"receiver06: {predicted.mean[0, 1]:.1f} dBm" in described
+    assert f"best receiver: {view.receivers[predicted.mean[0].argmax()]}" in described
+
+
+def test_certainty_is_that_of_the_interval(rssi_run):
+    """90 % of a normal variable lie above the lower end of its 80 % interval, half above its mean."""
+    rssi = open_source(rssi_run).map(1.2)
+    for threshold, certainty in ((rssi.interval(0.8)[0], 0.9), (rssi.mean, 0.5)):
+        selection = MapSelection("coverage", 0, 1.2, threshold)
+        np.testing.assert_allclose(probability_above(rssi, selection), certainty, atol=1e-4)
+
+
+def test_coverage_is_where_the_probability_is_high_enough(rssi_run):
+    view = open_source(rssi_run)
+    threshold = float(view.map(1.2).interval(0.8)[0][2].median())
+    selection = MapSelection("coverage", 2, 1.2, threshold, 0.9)
+    covered = np.isfinite(view.coloured(selection).values)
+    assert covered.mean() == pytest.approx(0.5, abs=0.01)
+    assert view.sentence(selection).startswith("50% of the map")
+    for cells, sign in ((covered, 1), (~covered, -1)):
+        i, j = np.argwhere(cells)[0]
+        above = float(probability_above(view.at(selection, view.cells[0][j], view.cells[1][i]), selection)[2])
+        assert sign * above >= sign * 0.9 - 1e-3
+
+
+def test_exports(rssi_run):
+    view = open_source(rssi_run)
+    for kind in view.kinds:
+        assert Image.open(io.BytesIO(view.picture(MapSelection(kind, 1, 1.2)))).format == "PNG"
+    table = pd.read_csv(io.StringIO(view.table(MapSelection("coverage", 1, 1.2, -70.0, 0.9))))
+    rssi = view.map(1.2)
+    assert len(table) == rssi.mean[0].numel()
+    np.testing.assert_allclose(table["predicted_dbm"], rssi.mean[1].flatten(), atol=0.006)
+    np.testing.assert_array_equal(table["above_-70_dbm_with_90%"], rssi.interval(0.8)[0][1].flatten() >= -70)
+    assert list(table["best_receiver"]) == [view.receivers[best] for best in rssi.mean.argmax(dim=0).flatten()]
+
+
+def test_one_receiver_has_no_best(rssi_run):
+    view = open_source(rssi_run)
+    assert "best receiver" in view.kinds
+    view.model.receiver_names = view.receivers[:1]
+    assert "best receiver" not in view.kinds
+
+
+def test_an_rssi_model_by_itself(rssi_run):
+    view = open_source(rssi_run / "model.safetensors")
+    assert np.isfinite(view.coloured(MapSelection("RSSI", 0, view.heights[1])).values).all()
+    assert np.isnan(view.floor.rssi_dbm).all()
+
+
+@pytest.fixture(scope="module")
+def located_floor():
+    """A locator on the built-in floor, its data, and which rows it was fitted to."""
+    data = rssi_room(n=120)
+    train, _ = data.split()
+    return RssiLocator(n_cells=400).fit(train), data, torch.isin(data.index, train.index)
+
+
+@pytest.fixture
+def locating(located_floor):
+    return RssiLocating(*located_floor)
+
+
+def test_posterior_of_a_row_is_that_of_the_locator(locating, located_floor):
+    locator, data, in_training = located_floor
+    assert not in_training[locating.first]
+    row = locating.nearest(*data.transmitter_position[7, :2].tolist())
+    assert row == 7 == locating.numbered(7.2)
+    found, posterior = locating.located(row), locator.locate(data.rssi_dbm[7:8])
+    np.testing.assert_allclose(found.median, posterior.median[0])
+    assert found.radius == (float(posterior.credible_radius(0.5)), float(posterior.credible_radius(0.8)))
+    assert found.error_m == pytest.approx(float((posterior.median[0] - data.transmitter_position[7]).norm()))
+    assert np.nanmax(found.density.values) == 1
+    assert found.density.at(*posterior.most_likely[0, :2].tolist()) == pytest.approx(1)
+    assert f"row 7: median at {found.median[0]:.2f}" in locating.describe(row)
+
+
+def test_rows_are_simulated_from_the_distributions_of_the_locator(located_floor, generator):
+    locator, data, _ = located_floor
+    at = data.transmitter_position[:3]
+    rssi = locator.sample(at, 4000, generator)
+    assert not rssi.isnan().all(dim=2).any()
+    predicted = locator.model.predict(at)
+    median = rssi.nanmedian(dim=0).values
+    often = rssi.isnan().double().mean(dim=0) < 0.5
+    # losses do not depend on the noise, so that they leave the median alone
+    assert float(((median - predicted.mean) / predicted.std)[often].abs().max()) < 0.1
+
+
+def test_expected_error_is_that_of_the_test_rows(locating, located_floor):
+    locator, data, in_training = located_floor
+    test = data.subset(~in_training)
+    error = (locator.locate(test.rssi_dbm).median - test.transmitter_position).norm(dim=1).mean()
+    expected = locating.expected_error
+    inside = np.isfinite(expected.values)
+    assert 0.5 * N_POSITIONS <= inside.sum() <= 2 * N_POSITIONS
+    assert expected.values[inside].mean() == pytest.approx(float(error), rel=0.5)
+    assert np.isnan(expected.at(1e3, 0))
+    again = RssiLocating(*located_floor).expected_error
+    np.testing.assert_array_equal(expected.values, again.values)
+
+
+def test_larger_errors_of_rssi_make_the_expected_error_larger(located_floor):
+    """Here RSSI deviates three times as far from the maps."""
+    locator, data, in_training = located_floor
+    noisy = copy.copy(locator)
+    noisy.values = replace(locator.values, correlation=9 * locator.values.correlation)
+    expected = [np.nanmean(RssiLocating(one, data, in_training).expected_error.values) for one in (locator, noisy)]
+    assert expected[1] > 1.3 * expected[0]
+
+
+def test_view_of_a_locator_by_itself(located_floor, tmp_path):
+    locator, data, in_training = located_floor
+    locator.save(tmp_path / "locator.safetensors")
+    view = open_source(tmp_path / "locator.safetensors")
+    assert view.kinds[-2:] == ("posterior", "expected error")
+    train = data.subset(in_training)
+    np.testing.assert_allclose(view.floor.rssi_dbm, train.rssi_dbm, atol=1e-4)
+    assert view.locating.in_training.all()
+    selection = MapSelection("posterior", 0, 1.2, row=3)
+    coloured = view.coloured(selection)
+    assert coloured.values.shape == view.locating.located(3).density.values.shape
+    assert coloured.corners == view.locating.located(3).density.corners
+    assert Image.open(io.BytesIO(view.picture(selection))).format == "PNG"
+    assert list(pd.read_csv(io.StringIO(view.table(selection)))) == ["x_m", "y_m", "posterior_of_row_3"]
+    assert "of its maximum" in view.describe(selection, *train.transmitter_position[3, :2].tolist())
+    assert "outside the region" in view.describe(selection, 1e3, 1e3)
+
+
+def test_view_of_a_run_of_locate(located_floor, tmp_path):
+    locator, data, in_training = located_floor
+    table = data.to_frame()
+    table.to_csv(tmp_path / "survey.csv", index=False)
+    folder = tmp_path / "run"
+    folder.mkdir()
+    locator.save(folder / "locator.safetensors")
+    read = load_rssi(tmp_path / "survey.csv")
+    config = {"task": "locate", "config": asdict(LocateConfig(data=str(tmp_path / "survey.csv")))}
+    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "environment.json").write_text(json.dumps({"input_sha256": dict(read.source)}))
+    view = open_source(folder)
+    assert not view.notes
+    np.testing.assert_array_equal(view.locating.in_training, in_training)
+    np.testing.assert_allclose(view.floor.position, data.transmitter_position)
+    (tmp_path / "survey.csv").write_text("changed")
+    view = open_source(folder)
+    assert len(view.notes) == 1
+    assert view.locating.in_training.all()
+    (folder / "locator.safetensors").unlink()
+    with pytest.raises(InputError, match="holds no model"):
+        open_source(folder)
+
+
+def test_posterior_of_a_spectrum_is_that_of_the_locator(aoa_run, room, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(aoa_run, folder)
+    with small.glances():
+        locator = MatchedField(max_cells=200, n_best=20, n_background=10, n_rounds=1).fit(room)
+    locator.save(folder / "matched_field-mix1.safetensors")
+    view = open_source(folder)
+    assert view.models[0].locating is None
+    found, posterior = view.located(view.models[1], 3), locator.locate(view.data.store[3:4])
+    np.testing.assert_allclose(found.median, posterior.median[0], atol=1e-3)
+    np.testing.assert_allclose(found.truth, room.position[3], atol=1e-6)
+    x0, x1, y0, y1 = found.density.corners
+    low, high = locator.cells.position.amin(dim=0), locator.cells.position.amax(dim=0)
+    assert x0 <= low[0] <= high[0] <= x1
+    assert y0 <= low[1] <= high[1] <= y1
+    assert np.nanmax(found.density.values) == 1
+    shutil.copy(folder / "model-mix1.safetensors", folder / "matched_field-mix1.safetensors")
+    with pytest.raises(InputError, match="expected a matched-field locator"):
+        open_source(folder).models[1].locating.locator  # noqa: B018
+
+
+def said(capsys, *arguments) -> str:
+    assert command_line("tasks.view", ViewConfig, run, [str(a) for a in arguments]) == 2
+    return quick.said(capsys)
+
+
+@needs_the_extra
+def test_refusals(tmp_path, capsys, aoa_run, rssi_run):
+    assert "does not exist" in said(capsys, tmp_path / "nowhere", "--port", 0)
+    assert "is no run" in said(capsys, tmp_path, "--port", 0)
+    assert "cannot be read" in said(capsys, "x" * 300, "--port", 0)
+    (tmp_path / "text").write_text("x")
+    assert "safetensors" in said(capsys, tmp_path / "text", "--port", 0)
+    for source, names in ((aoa_run, "*mix*"), (rssi_run, "model.safetensors")):
+        bare = tmp_path / source.parent.name
+        shutil.copytree(source, bare)
+        for file in bare.glob(names):
+            file.unlink()
+        assert "holds no model" in said(capsys, bare, "--port", 0)
+    (bare / "config.json").write_text('{"task": "inspect"}')
+    assert "tasks.inspect" in said(capsys, bare, "--port", 0)
+    kinds.model_nerf2_rssi(tmp_path)
+    assert "cannot be shown" in said(capsys, tmp_path / "model", "--port", 0)
+
+
+@needs_the_extra
+def test_addresses_that_cannot_be_listened_on(capsys, rssi_run):
+    assert "--port must be" in said(capsys, rssi_run, "--port", 70000)
+    assert "--host" in said(capsys, rssi_run, "--host", "203.0.113.1")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        assert "is in use" in said(capsys, rssi_run, "--port", taken.getsockname()[1])
+
+
+def test_without_the_extra(capsys, monkeypatch, rssi_run):
+    for name in [name for name in sys.modules if name.startswith("tasks.view.") and name.endswith(("server", "page"))]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "nicegui", None)
+    assert "pip install 'swiftwrf-tasks[view]'" in said(capsys, rssi_run)
+
+
+def test_records_that_are_damaged(aoa_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(aoa_run, folder)
+    (folder / "geometry-mix1.json").write_text("{}")
+    with pytest.raises(InputError, match="not those of a run"):
+        open_source(folder)
+
+
+def test_a_dropped_floor_plan_lies_at_its_scale_and_origin_and_stays(rssi_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(rssi_run, folder)
+    view = open_source(folder)
+    before = len(view.cells[0]), view.inside.shape
+    pixels = np.full((30, 80, 3), 9, dtype=np.uint8)
+    view.place(FloorPlan.scaled(pixels, 0.5, (4, 26)))  # y counts down from the upper edge
+    assert view.floor.plan.corners == (-2, 38, -2, 13)
+    assert view.corners[1] >= 38
+    assert (len(view.cells[0]), view.inside.shape) != before
+    again = open_source(folder).floor.plan
+    assert again.corners == (-2, 38, -2, 13)
+    np.testing.assert_array_equal(again.pixels, pixels)
+    for scale, origin in ((0.0, (0, 0)), (np.nan, (0, 0)), (1.0, (np.inf, 0))):
+        with pytest.raises(InputError, match="scale"):
+            FloorPlan.scaled(pixels, scale, origin)
+
+
+def test_a_followed_run_is_read_again_when_it_grows(tmp_path):
+    data = rssi_room(n=70)
+    follower, record = Follower(RssiModel().fit(data.subset(torch.arange(60)))), Record("source", " [dB]")
+    (tmp_path / "config.json").write_text(json.dumps({"task": "update"}))
+    with pytest.raises(InputError, match="no record"):
+        open_source(tmp_path)
+    record.write(tmp_path)
+    view = open_source(tmp_path)
+    assert view.snapshot().sentences == ["no measurement yet"]
+    for i in range(60, 63):
+        step = follower.step(data.subset(torch.tensor([i])))
+        record.append(tmp_path, record.add(i, replace(step, alarms=("hall weaker everywhere",)) if i == 62 else step))
+    shown = view.snapshot()
+    assert view.snapshot() is shown
+    assert [row["index"] for row in shown.rows] == [62, 61, 60]
+    assert shown.rows[0]["alarm"] == "hall weaker everywhere"
+    assert "change at measurement 2: hall weaker everywhere" in shown.sentences
+    assert all(figure.startswith("<svg") for figure in shown.figures.values())
+    record.append(tmp_path, record.add(63, step))
+    assert view.version != shown.version
+    assert "4 measurements" in view.snapshot().sentences[0]
+
+
+def test_total_coverage_counts_receivers(rssi_run):
+    view = open_source(rssi_run)
+    fraction = [
+        view._covered(MapSelection("coverage", 0, 1.2, threshold=-60, certainty=0.7, at_least=number)).mean()
+        for number in (1, 2, 3)
+    ]
+    single = [
+        view._covered(MapSelection("coverage", receiver, 1.2, threshold=-60, certainty=0.7)).mean()
+        for receiver in range(3)
+    ]
+    assert 0 < max(single) <= fraction[0]
+    assert fraction[0] > fraction[1] >= fraction[2]
+    generator = torch.Generator().manual_seed(0)
+    probability = torch.rand(3, 4, generator=generator, dtype=torch.float64)
+    every = torch.tensor(list(itertools.product((0.0, 1.0), repeat=3)), dtype=torch.float64)
+    weight = torch.stack(
+        [(row[:, None] * probability + (1 - row[:, None]) * (1 - probability)).prod(dim=0) for row in every]
+    )
+    for number in (1, 2, 3):
+        expected = weight[every.sum(dim=1) >= number].sum(dim=0)
+        torch.testing.assert_close(at_least(probability, number), expected)
+
+
+def test_positions_outside_of_the_measured_ones_are_extrapolated(aoa_run):
+    view = open_source(aoa_run)
+    middle = view.positions.mean(axis=0)
+    assert not view.extrapolates(middle)
+    assert view.extrapolates(view.positions.max(axis=0) + 1)

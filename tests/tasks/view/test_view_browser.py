@@ -1,0 +1,236 @@
+"""The page as a visitor has it: a server of its own, a real browser without a window, a pointer that drags.
+
+Ten seconds a server: it starts as a program, as it does for a visitor. The browser is Chromium with its driver, of the
+system (Debian: chromium, chromium-driver).
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+
+from swiftwrf import RssiModel, rssi_room
+from swiftwrf.locate import RssiLocator
+from swiftwrf.online import Follower
+from tasks.update.record import Record
+
+LIBRARIES = ("nicegui", "selenium")
+PROGRAMS = ("chromium", "chromedriver")
+missing = [name for name in LIBRARIES if find_spec(name) is None] + [
+    name for name in PROGRAMS if not shutil.which(name)
+]
+pytestmark = pytest.mark.skipif(bool(missing), reason=f"needs {' and '.join(missing)}")
+ROOT = Path(__file__).parents[3]
+PATIENCE = 60  # [s], for machines that are busy
+MOVES = 60  # of a drag, one in 16 ms as a pointer's are
+COUNT = """
+const image = document.querySelector('#synthesized img');
+window.frames_seen = [];
+image.addEventListener('load', () => window.frames_seen.push(performance.now()));
+"""
+
+
+@pytest.fixture
+def serve():
+    """Start the page of a run or model and return its address."""
+    processes = []
+
+    def start(source: Path) -> str:
+        inherited = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+        command = [sys.executable, "-m", "tasks.view", str(source), "--port", "0"]
+        process = subprocess.Popen(command, cwd=ROOT, env=inherited, stdout=subprocess.PIPE, text=True)
+        processes.append(process)
+        line = process.stdout.readline()
+        assert line.startswith("page: http://127.0.0.1:"), line
+        return line.split()[1]
+
+    yield start
+    for process in processes:
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE) in (0, 130)
+
+
+@pytest.fixture
+def browser(serve, tmp_path):
+    """A browser that must have nothing to complain about in the end, which comes before that of the servers."""
+    from selenium import webdriver
+    from selenium.webdriver.chrome.service import Service
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = shutil.which("chromium")
+    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1400,1037"):
+        options.add_argument(argument)
+    several = "profile.default_content_setting_values.automatic_downloads"  # without asking the visitor
+    options.add_experimental_option("prefs", {"download.default_directory": str(tmp_path), several: 1})
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options, Service(shutil.which("chromedriver")))
+    yield driver
+    complaints = [entry["message"] for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
+    driver.quit()
+    assert complaints == []
+
+
+def until(check):
+    """Waits for something true, and returns it."""
+    end = time.monotonic() + PATIENCE
+    while not (value := check()):
+        assert time.monotonic() < end, check
+        time.sleep(0.05)
+    return value
+
+
+def find(browser, selector):
+    return browser.find_element("css selector", selector)
+
+
+def said(browser, name):
+    return find(browser, f"#{name}").text
+
+
+def press(browser, label):
+    browser.find_element("xpath", f"//button[.//*[text()='{label}']]").click()
+
+
+def pointer(browser):
+    from selenium.webdriver import ActionChains
+
+    return ActionChains(browser, duration=16)  # [ms] a move
+
+
+def opened(browser, address, name, label):
+    """Return the page once this label has text."""
+    browser.get(address)
+    until(lambda: browser.find_elements("id", name) and said(browser, label))
+    return find(browser, f"#{name}")
+
+
+def follows_the_pointer(browser, plan):
+    """Frames a second while the moving end is dragged."""
+    before = said(browser, "where"), find(browser, "#synthesized img").get_attribute("src")
+    browser.execute_script(COUNT)
+    chain = pointer(browser).move_to_element_with_offset(plan, -100, 0).click_and_hold()
+    for move in range(MOVES):
+        chain.move_by_offset(3, 1 if move % 2 else -1)
+    chain.release().perform()
+    until(lambda: said(browser, "where") != before[0])
+    frames = browser.execute_script("return window.frames_seen")
+    assert find(browser, "#synthesized img").get_attribute("src") != before[1]
+    assert len(frames) >= 10  # it follows on the way, not only at the end
+    assert "ms" in said(browser, "frame")
+    return 1e3 * (len(frames) - 1) / (frames[-1] - frames[0])
+
+
+def has_views_models_and_keys(browser, plan):
+    from selenium.webdriver.common.keys import Keys
+
+    rectangular = find(browser, "#measured img").get_attribute("src")
+    press(browser, "polar")
+    until(lambda: find(browser, "#measured img").get_attribute("src") != rectangular)
+    assert not find(browser, "#deviation").is_displayed()
+    find(browser, ".q-select").click()
+    until(lambda: browser.find_elements("css selector", ".q-item"))
+    browser.find_elements("css selector", ".q-item")[1].click()  # a model that knows its deviation
+    until(lambda: find(browser, "#deviation").is_displayed())
+    pointer(browser).move_to_element_with_offset(plan, 20, 10).click().perform()
+    for key in (Keys.ARROW_RIGHT, Keys.ARROW_UP, Keys.PAGE_UP):
+        before = said(browser, "where")
+        pointer(browser).send_keys(key).perform()
+        until(lambda before=before: said(browser, "where") != before)
+
+
+def serves_nothing_else(address):
+    for path in ("config.json", "metrics.json", "..%2f..%2fetc/passwd", "docs", "openapi.json", "static/"):
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(f"{address}/{path}")
+    # nor answers to a name that somebody else lets point to this machine
+    request = urllib.request.Request(address, headers={"Host": "elsewhere.example"})
+    with pytest.raises(urllib.error.HTTPError, match="400"):
+        urllib.request.urlopen(request)
+
+
+def test_page_of_spectra(browser, serve, aoa_run, record_property):
+    address = serve(aoa_run)
+    serves_nothing_else(address)
+    plan = opened(browser, address, "plan", "where")
+    rate = follows_the_pointer(browser, plan)
+    record_property("frames_per_second", rate)
+    print(f"{rate:.1f} frames a second while dragging")
+    has_views_models_and_keys(browser, plan)
+
+
+def test_page_of_rssi(browser, serve, rssi_run, tmp_path):
+    plan = opened(browser, serve(rssi_run), "map", "sentence")
+    pointer(browser).move_to_element_with_offset(plan, 30, 20).perform()
+    told = until(lambda: "dBm" in said(browser, "here") and said(browser, "here"))
+    pointer(browser).move_by_offset(-150, 60).perform()
+    until(lambda: said(browser, "here") != told)
+    for kind, sentence in (
+        ("coverage", "% of the map"),
+        ("best receiver", "highest prediction"),
+        ("uncertainty", "interval"),
+    ):
+        press(browser, kind)
+        until(lambda sentence=sentence: sentence in said(browser, "sentence"))
+    press(browser, "PNG")
+    press(browser, "CSV")
+    file = until(lambda: next(tmp_path.glob("*.csv"), None))
+    until(lambda: next(tmp_path.glob("*.png"), None))
+    assert set(pd.read_csv(file)["receiver"]) == {"receiver01"}
+
+
+def test_page_of_a_followed_run_grows_without_reloading(browser, serve, tmp_path):
+    data, folder = rssi_room(n=70), tmp_path / "live"
+    folder.mkdir()
+    follower, record = Follower(RssiModel().fit(data.subset(torch.arange(60)))), Record("source", " [dB]")
+    (folder / "config.json").write_text('{"task": "update"}')
+    record.write(folder)
+
+    def learn(i, **changes):
+        step = replace(follower.step(data.subset(torch.tensor([i]))), **changes)
+        record.append(folder, record.add(i, step))
+
+    opened(browser, serve(folder), "rows", "sentence")
+    assert said(browser, "sentence") == "no measurement yet"
+    browser.execute_script("window.not_reloaded = true")
+    learn(60)
+    until(lambda: "1 measurements learnt" in said(browser, "sentence"))
+    before = find(browser, "#changes").get_attribute("innerHTML")
+    for i in range(61, 66):
+        learn(i, alarms=("hall weaker everywhere",) if i == 63 else ())
+    until(lambda: "6 measurements learnt" in said(browser, "sentence"))
+    assert "change at measurement 3: hall weaker everywhere" in said(browser, "sentence")
+    assert len(browser.find_elements("css selector", "#rows tbody tr")) == 6
+    assert find(browser, "#changes").get_attribute("innerHTML") != before
+    assert find(browser, "#error svg").is_displayed()
+    assert browser.execute_script("return window.not_reloaded")
+    for width in (360, 700, 1400):
+        browser.set_window_size(width, 900)
+        assert browser.execute_script("return document.querySelector('.q-layout').scrollWidth <= window.innerWidth")
+    browser.save_screenshot(str(tmp_path / "followed.png"))
+
+
+def test_page_of_a_locator(browser, serve, tmp_path):
+    train, _ = rssi_room(n=100).split()
+    RssiLocator(n_cells=300).fit(train).save(tmp_path / "locator.safetensors")
+    plan = opened(browser, serve(tmp_path / "locator.safetensors"), "map", "sentence")
+    press(browser, "posterior")
+    shown = until(lambda: "median at" in said(browser, "sentence") and said(browser, "sentence"))
+    pointer(browser).move_to_element_with_offset(plan, 150, 60).click().perform()
+    until(lambda: "median at" in said(browser, "sentence") and said(browser, "sentence") != shown)
+    press(browser, "expected error")
+    until(lambda: "simulated rows" in said(browser, "sentence"))
+    pointer(browser).move_to_element_with_offset(plan, 0, 0).perform()
+    until(lambda: "expected position error" in said(browser, "here"))
