@@ -19,7 +19,7 @@ from swiftwrf.gp import (
     most_informative,
     subsample,
 )
-from swiftwrf.gp.choice import _held_out_errors, _local_errors
+from swiftwrf.gp.choice import MAX_LOCAL_ROWS, _held_out_errors, _local_errors
 
 KERNEL = Kernel(long=1.0, short=0.3, share=0.6, noise=1e-2)
 
@@ -67,14 +67,15 @@ def test_kernel_choice_finds_smooth_and_rough_fields(generator):
     assert choose_kernel(position, smooth, fold).noise < choose_kernel(position, noise, fold).noise
 
 
-def test_kernel_of_many_spectra_follows_their_density(generator):
-    """A sample of the spectra is too sparse for the fine part of the field, which is noise to its kernel."""
-    position = torch.rand(2500, 3, generator=generator, dtype=torch.float64) * torch.tensor([1.0, 1.0, 0.0])
-    wave = torch.nn.functional.normalize(torch.randn(2, 50, generator=generator, dtype=torch.float64), dim=0)
-    phase = position[:, :2] @ wave
-    spectrum = (torch.sin(2 * phase) + 0.2 * torch.sin(60 * phase))[:, None]
-    fold = torch.arange(2500) % 5
-    assert choose_kernel(position, spectrum, fold).noise < choose_kernel(*subsample(position, spectrum, fold)).noise
+def test_kernel_of_many_spectra_is_judged_at_their_own_density(generator):
+    """The neighbours that predict a held-out spectrum are the nearest of all spectra in other folds, not of a sample."""
+    position, spectrum = (torch.rand(500, *shape, generator=generator, dtype=torch.float64) for shape in ((3,), (2, 3)))
+    fold, change = torch.arange(500) % 5, (spectrum - subsample(spectrum)[0].mean(dim=0)).flatten(1)
+    errors = _local_errors(position, spectrum, fold)(KERNEL)
+    for row, error in list(zip(subsample(torch.arange(500), rows=MAX_LOCAL_ROWS)[0], errors, strict=True))[::50]:
+        kept = fold != fold[row]
+        process = GaussianProcess.regress(KERNEL, position[kept], change[kept], exact=False)
+        torch.testing.assert_close(error, (process.mean(position[row, None])[0] - change[row]).square().mean())
 
 
 def test_local_errors_of_all_neighbours_are_the_exact_ones(generator):
