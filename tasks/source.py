@@ -18,6 +18,7 @@ from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
 from swiftwrf.datasets import fetch
 from swiftwrf.datasets.sources import DATA_SETS
+from swiftwrf.errors import listed
 from swiftwrf.rssi import estimate_offsets
 from tasks.options import OffsetSource, SpectraSource, TableSource
 from tasks.terminal import console
@@ -90,6 +91,15 @@ def asked_offsets(train: Rssi, config: OffsetSource) -> Offsets | None:
         InputError: One group only, or an unknown reference.
     """
     return None if config.offset_by is None else estimate_offsets(train, config.offset_by.partition("=")[2] or None)
+
+
+def offset_notes(data: Rssi, config: OffsetSource) -> list[str]:
+    """Return a note on columns that may distinguish devices or channels and are not used, or none."""
+    if config.offset_by is not None or not data.labels:
+        return []
+    return [
+        f"rows differ in {listed(data.labels)}; if tasks.inspect finds offsets between them, give --offset-by COLUMN"
+    ]
 
 
 def split_notes(train: Rssi, test: Rssi) -> list[str]:

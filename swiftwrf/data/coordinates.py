@@ -15,6 +15,14 @@ Coordinates = Literal["degrees", "metres"]
 FAR_RATIO = 10.0  # distance of the origin relative to the distance between positions, or to their extent
 MAX_EXTENT_DEG = 2.0  # of positions that are recognised as degrees
 MAX_FINE_EXTENT = 0.05  # extent that is a walk in degrees (5 km), and none in metres (5 cm)
+NO_FIX = (
+    0.0,
+    -1.0,
+    999.0,
+    -999.0,
+    9999.0,
+    -9999.0,
+)  # of x and y, that receivers of satellites write without a position
 
 
 class GeodeticOrigin(NamedTuple):
@@ -76,8 +84,8 @@ def degree_columns(origin: GeodeticOrigin | None, xy: Floats) -> dict[str, Float
 def without_fix(position: Floats) -> tuple[NDArray[np.bool_], list[str]]:
     """Return which positions are no fix, and notes on them.
 
-    An empty position is no fix. Neither is x = y = 0 if it is far from all others, or if it occurs more often than any other
-    position without being the neighbour of one.
+    An empty position is no fix. Neither is x = y = 0 if it is far from all others, if it occurs more often than any other
+    position without being the neighbour of one, or if z is 0 there alone. The same holds for -1, 999 and 9999, if repeated.
 
     Args:
         position: Coordinates (n, 3) in any unit, nan where they are empty.
@@ -86,24 +94,31 @@ def without_fix(position: Floats) -> tuple[NDArray[np.bool_], list[str]]:
         >>> without_fix(np.array([[50.0, 5.0, 1.0], [50.0, 6.0, 1.0], [np.nan, 5.0, 1.0], [0.0, 0.0, 0.0]]))[0]
         array([False, False,  True,  True])
     """
-    empty = np.isnan(position).any(axis=1)
-    at_origin = (position[:, :2] == 0).all(axis=1)
-    places, times = np.unique(position[~empty & ~at_origin, :2], axis=0, return_counts=True)
-    if at_origin.any():
-        at_origin &= len(places) > 1 and _is_apart(places, int(times.max()), int(at_origin.sum()))
+    empty = np.isnan(position.sum(axis=1))
+    found = {"without a position": empty}
+    omitted = empty.copy()
+    for value in NO_FIX:
+        rows = (position[:, 0] == value) & (position[:, 1] == value)
+        if (rows.sum() > 1 or (value == 0 and rows.any())) and _is_apart(position[~omitted & ~rows], position[rows]):
+            found[f"at {value:g}, {value:g}, apart from all others"] = rows
+            omitted |= rows
     notes = [
-        f"rows {what} are left out: {int(rows.sum())} of {len(position)}"
-        for what, rows in (("without a position", empty), ("at 0, 0, apart from all others", at_origin))
-        if rows.any()
+        f"rows {what} are left out: {int(rows.sum())} of {len(position)}" for what, rows in found.items() if rows.any()
     ]
-    return empty | at_origin, notes
+    return omitted, notes
 
 
-def _is_apart(places: Floats, most: int, at_origin: int) -> bool:
+def _is_apart(others: Floats, same: Floats) -> bool:
+    """Return True if repeated positions (m, 3) are no place among the others (n, 3)."""
+    places, times = np.unique(others[:, :2], axis=0, return_counts=True)
+    if len(places) < 2:
+        return False
     tree = cKDTree(places)
     spacing = float(np.median(tree.query(places, k=2)[0][:, 1]))
-    distance = float(tree.query(np.zeros(2))[0])
-    return distance > FAR_RATIO * spacing or (at_origin > most and distance > spacing)
+    distance = float(tree.query(same[0, :2])[0])
+    of_no_height = not bool(same.any()) and bool((others[:, 2] != 0).all())
+    more_often = len(same) > int(times.max())
+    return of_no_height or distance > FAR_RATIO * spacing or (more_often and distance > spacing)
 
 
 def degrees_in(
@@ -138,7 +153,8 @@ def degrees_in(
                 "longitude=NAME"
             )
         return None
-    extent, distance = float(np.ptp(xy, axis=0).max()), float(np.abs(xy).max())
+    east = (degrees[:, 1] - degrees[0, 1] + 180) % 360  # on either side of the antimeridian
+    extent, distance = float(max(np.ptp(degrees[:, 0]), np.ptp(east))), float(np.abs(xy).max())
     if asked == "degrees" or (named and extent <= MAX_EXTENT_DEG):
         return degrees
     if not named and (distance <= FAR_RATIO * extent or extent == 0 or extent > MAX_EXTENT_DEG):

@@ -23,7 +23,8 @@ N_NEIGHBOURS_DB = 5  # of the next stronger values that a filler at the lower ed
 MIN_FREQUENCY_RATIO = 3.0  # of a filler to the values beside it
 MIN_REPEATS = 5  # cells with a filler that is not known
 MIN_VALUES = 5  # different values that are left
-MIN_RECEIVER_SHARE = 0.8  # of the receivers whose weakest value is the filler
+MIN_EDGE_SHARE = 0.2  # of the least value of a receiver that may stand for not detected
+MIN_RECEIVER_SHARE = 0.5  # of the receivers, more of which have the filler: near ones detect every row
 
 
 def find_fillers(rssi: Floats) -> list[float]:
@@ -33,7 +34,7 @@ def find_fillers(rssi: Floats) -> list[float]:
         >>> find_fillers(np.array([[-60.0, 127.0], [-70.0, -65.0], [0.0, -80.0]]))
         [127.0, 0.0]
     """
-    value, count = np.unique(rssi[np.isfinite(rssi)], return_counts=True)
+    value, count = np.unique(rssi[rssi > -np.inf], return_counts=True)
     impossible = (value < MIN_RSSI_DBM) | (value > MAX_RSSI_DBM)
     is_filler = impossible & np.isin(value, KNOWN_FILLERS)
     if (others := impossible & ~is_filler).sum() == 1:
@@ -51,6 +52,19 @@ def find_fillers(rssi: Floats) -> list[float]:
     return found
 
 
+def has_frequent_edge(rssi: Floats) -> bool:
+    """Return True if the least of the values of a receiver (n,) [dBm] is far more frequent than those above it.
+
+    Example:
+        >>> has_frequent_edge(np.array([-90.0] * 9 + [-89, -88, -87, -80, -75, -70, -60]))
+        True
+    """
+    value, count = np.unique(rssi, return_counts=True)
+    if len(value) <= MIN_VALUES or int(count[0]) < MIN_EDGE_SHARE * len(rssi):
+        return False
+    return _is_frequent(value, count, 0, N_NEIGHBOURS_DB)
+
+
 def _is_frequent(value: Floats, count: NDArray[np.int64], index: int, within_db: float) -> bool:
     """Return True if a value is much more frequent than every other one within a distance, in bins of 1 dB."""
     near = np.abs(value - value[index]) <= within_db
@@ -60,11 +74,11 @@ def _is_frequent(value: Floats, count: NDArray[np.int64], index: int, within_db:
 
 
 def _fills_the_lower_edge(rssi: Floats, value: Floats, count: NDArray[np.int64]) -> bool:
-    """Return True if the least value is frequent, and the least of nearly all receivers."""
+    """Return True if the least value is frequent, and the least of most receivers."""
     if len(value) <= MIN_VALUES or count[0] < MIN_REPEATS or not _is_frequent(value, count, 0, N_NEIGHBOURS_DB):
         return False
     weakest = np.where((rssi >= MIN_RSSI_DBM) & (rssi <= MAX_RSSI_DBM), rssi, np.inf).min(axis=0)
-    return bool((weakest[np.isfinite(weakest)] == value[0]).mean() >= MIN_RECEIVER_SHARE)
+    return bool((weakest[np.isfinite(weakest)] == value[0]).mean() > MIN_RECEIVER_SHARE)
 
 
 def without_fillers(rssi: Floats, fillers: list[float]) -> tuple[Floats, list[str]]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Literal
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from swiftwrf.data.files import read_text
@@ -15,6 +17,7 @@ from swiftwrf.runtime.validation import PositiveInt, checked
 TEST_SHARE = 0.2
 MIN_TRAINING = 10  # measurements
 MAX_REPEATED = 0.1  # fraction of test rows at training positions, beyond which a split tests look-up
+REPEATED_SPACING = 0.02  # distance of positions that count as one, relative to the mean spacing
 MAX_INDEX_DIGITS = 18
 FOLDS = 5
 
@@ -132,12 +135,19 @@ def random_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:
 def repeated_fraction(train: Tensor, test: Tensor) -> float:
     """Return the fraction of test positions (n, 3) that are training positions (m, 3), too.
 
+    Positions measured again differ by the error of positioning. Those closer than 2 % of the mean spacing of the training
+    positions, sqrt(area / m), count as one.
+
     Example:
         >>> repeated_fraction(torch.zeros(1, 3), torch.tensor([[0.0, 0, 0], [1, 0, 0]]))
         0.5
     """
-    known = set(map(tuple, train.tolist()))
-    return sum(tuple(row) in known for row in test.tolist()) / max(len(test), 1)
+    if not len(test):
+        return 0.0
+    sides = (train.amax(dim=0) - train.amin(dim=0)).sort(descending=True).values
+    spacing = math.sqrt(float(sides[0] * sides[1]) / len(train))
+    distance, _ = cKDTree(train.numpy()).query(test.numpy())
+    return float((distance <= REPEATED_SPACING * spacing).mean())
 
 
 def slabs(position: Tensor, n_slabs: int) -> Tensor:

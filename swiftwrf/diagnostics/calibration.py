@@ -147,7 +147,7 @@ def calibrate(train: Snapshots) -> Calibration:
     phase_std, turn_std = problem.standard_errors(found)
     if float(turn_std.max()) > MAX_TURN_STD or float(phase_std.max()) > MAX_PHASE_STD:
         reason = "phases change from position to position as no direct path explains"
-        if problem.cone() < MIN_CONE:
+        if problem.cone() < MIN_CONE and clear >= len(seen) / 2:
             reason = "measure positions in more directions from the array"
         raise InputError(
             f"{train.name} does not determine the array's orientation and its elements' phases (standard errors "

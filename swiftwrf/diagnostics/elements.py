@@ -19,6 +19,8 @@ LATTICE_TOLERANCE_WAVELENGTHS = 1e-3  # between coordinates of elements in one r
 MIN_FLIP_GAIN = 0.15  # in the fraction of the power along the line of sight, above no flips and above chance
 MIN_FLIP_SHARE = 0.75  # of the power along the line of sight, once flips are taken back
 MIN_DOUBLED_SHARE = 0.5  # of the power of the squared channel along the line of sight, which flips do not change
+MIN_ALONG = 0.45  # of the power along a line of sight, above that of random phases
+MIN_FLIP_COSINE = 0.85  # mean magnitude of the cosine between flipping and steady elements; 0.64 for random phases
 MIN_CORRELATION = 0.8  # between the signs of elements that flip together
 MIN_COMMON_SHARE = 0.8  # of the power in one direction, to call phases constant
 MAX_GEOMETRIC_SHARE = 0.65  # the same by the lines of sight: beyond, they are too close to each other
@@ -74,10 +76,15 @@ def _ranks(values: Tensor, tolerance: float) -> Tensor:
     return rank
 
 
-def power_share(data: Snapshots, direction: Tensor) -> float:
-    """Return the mean fraction of the power that arrives along directions (n, 3) in array coordinates."""
+def arrives_along(data: Snapshots, direction: Tensor) -> bool:
+    """Return True if most of the power arrives along directions (n, 3) in array coordinates.
+
+    Random phases at K elements have the fraction 1 / K along any direction. Only the excess over it counts, and it must be
+    larger for fewer elements, whose phases agree more easily by chance.
+    """
     residual = _unit_channel(data) * _steering(data.array, direction)[:, None].conj()
-    return float(residual.mean(dim=-1).abs().square().mean())
+    share, chance = float(residual.mean(dim=-1).abs().square().mean()), 1 / residual.shape[-1]
+    return (share - chance) / (1 - chance) >= MIN_ALONG + chance
 
 
 def flipping_elements(data: Snapshots) -> list[int]:
@@ -97,6 +104,10 @@ def flipping_elements(data: Snapshots) -> list[int]:
     signs = sign.flatten(0, 1)
     together = (signs.T @ signs / len(signs)).abs() > MIN_CORRELATION
     steady = together[int(together.sum(dim=1).argmax())]
+    reference = residual[..., steady].mean(dim=-1, keepdim=True).angle()
+    cosine = (residual * torch.polar(torch.ones_like(reference), -reference)).real.abs().mean(dim=(0, 1))
+    if bool((cosine[~steady] < MIN_FLIP_COSINE).any()):  # phases that change by other angles
+        return []
     return [number + 1 for number in (~steady).nonzero()[:, 0].tolist()]
 
 

@@ -10,7 +10,8 @@ nearest one counts. The chance level is the mean over pairs of different positio
 
 An error of frames is named if its agreement clearly exceeds that of the declared frame and it explains most of the peaks:
 axes swapped, a quaternion in another order, millimetres, azimuths clockwise, elements in another order. So is any other
-constant rotation, if both halves of the positions have it.
+constant rotation, if both halves of the positions have it. With snapshots, most of the power must arrive along the lines of
+sight that the error implies: peaks alone may agree by chance.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import slabs
-from swiftwrf.diagnostics.elements import other_readings, power_share
+from swiftwrf.diagnostics.elements import arrives_along, other_readings
 
 SIGMA = math.radians(10)
 MAX_ANGLE_DEG = 10.0  # median angle between peak and line of sight in a frame that fits
@@ -196,23 +197,28 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None, beamforme
     frame = _Frame(spectra.position[rows], spectra.fixed_position, spectra.rotation, sign, spectra.array)
     peak, declared = frame.peaks(spectra.store[rows], spectra.grid), frame.direction()
     agreement, chance = _agreement(declared, peak)
-    found = {name: _agreement(to, peak) for name, to in _others(frame, computed=snapshots is not None)}
-    if snapshots is not None:
-        for name, other in other_readings(snapshots.subset(rows)).items():
-            found[name] = _agreement(
-                declared, frame.peaks(other.spectra(spectra.grid, beamformer).store[:], spectra.grid)
-            )
+    towards = dict(_others(frame, computed=snapshots is not None))
+    found = {name: _agreement(to, peak) for name, to in towards.items()}
+    seen = None if snapshots is None else snapshots.subset(rows)
+    readings = {} if seen is None else other_readings(seen)
+    for name, other in readings.items():
+        found[name] = _agreement(declared, frame.peaks(other.spectra(spectra.grid, beamformer).store[:], spectra.grid))
     best = max(value for value, _ in found.values())
-    found |= {name: pair for name, pair in _mirrors(frame, peak) if pair[0] >= best + MIN_TURN_GAIN}
+    for name, to in _mirrors(frame, peak):
+        if (pair := _agreement(to, peak))[0] >= best + MIN_TURN_GAIN:
+            towards[name], found[name] = to, pair
     named, by_chance = max(found.values())
     turn, turned, turned_by_chance = _constant_turn(frame, peak)
     clear = named - max(by_chance, agreement) >= MIN_EVIDENCE
     error = clear and named >= max(MIN_EXPLAINED, turned - MIN_TURN_GAIN)
-    rotates = not error and turned >= MIN_TURN_EXPLAINED and turned - turned_by_chance >= MIN_EVIDENCE
+    explanations = [name for name, (value, _) in found.items() if error and value >= named - TIE]
+    if seen is not None:
+        explanations = [
+            name for name in explanations if arrives_along(readings.get(name, seen), towards.get(name, declared))
+        ]
+    rotates = not explanations and turned >= MIN_TURN_EXPLAINED and turned - turned_by_chance >= MIN_EVIDENCE
     rotates = rotates and float(np.linalg.norm(turn)) >= MIN_TURN and turned - agreement >= MIN_TURN_GAIN
-    if rotates and snapshots is not None:
-        seen = snapshots.subset(rows)
-        rotates = power_share(seen, seen.direction @ _matrix(turn)) >= MIN_EXPLAINED
+    rotates = rotates and (seen is None or arrives_along(seen, seen.direction @ _matrix(turn)))
     rotates = rotates and _constant(turn, frame, peak)
     return FrameReport(
         agreement=agreement,
@@ -221,8 +227,8 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None, beamforme
         span_deg=_span_deg(declared),
         peak_span_deg=_span_deg(peak[:, 0]),
         behind=0.0 if frame.linear else float((frame.towards()[:, 2] < 0).double().mean()),
-        explanations=tuple(name for name, (value, _) in found.items() if value >= named - TIE) if error else (),
-        explained=named if error else turned if rotates else agreement,
+        explanations=tuple(explanations),
+        explained=named if explanations else turned if rotates else agreement,
         turn_deg=tuple(np.degrees(turn).tolist()) if rotates else None,
         positions=len(rows),
     )
@@ -302,18 +308,19 @@ def _frames(frame: _Frame) -> Iterator[tuple[str, _Frame]]:
         yield metres, replace(frame, fixed=scale * frame.fixed)
 
 
-def _mirrors(frame: _Frame, peak: Tensor) -> Iterator[tuple[str, tuple[float, float]]]:
-    """Yield the mirror c - x of each axis of the positions with most agreement."""
+def _mirrors(frame: _Frame, peak: Tensor) -> Iterator[tuple[str, Tensor]]:
+    """Yield the directions (n, 3) of the line of sight for the mirror c - x of each axis with most agreement."""
     every = torch.cat([frame.position, frame.fixed[None]])
     for number, axis in enumerate("xyz"):
         low, high = 2 * float(every[:, number].amin()), 2 * float(every[:, number].amax())
-        mirrored = []
+        mirrored = {}
         for offset in torch.linspace(low, high, SCANNED_OFFSETS).tolist():
             position = frame.position.clone()
             position[:, number] = offset - position[:, number]
-            mirrored.append((_agreement(replace(frame, position=position).direction(), peak), offset))
-        pair, offset = max(mirrored)
-        yield f"{axis} of the positions counts from the other side (near {axis} = {offset:.1f} - {axis})", pair
+            mirrored[offset] = replace(frame, position=position).direction()
+        offset = max(mirrored, key=lambda c: _agreement(mirrored[c], peak))
+        name = f"{axis} of the positions counts from the other side (near {axis} = {offset:.1f} - {axis})"
+        yield name, mirrored[offset]
 
 
 def _constant_turn(frame: _Frame, peak: Tensor) -> tuple[NDArray[np.float64], float, float]:

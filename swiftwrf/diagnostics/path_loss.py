@@ -1,8 +1,9 @@
 """Check that RSSI decreases with the distance from the receivers, and diagnose the error of frames or units if not.
 
-The score of a frame is the fraction of the variance of RSSI that path-loss models explain. An error is named if its fraction
-clearly exceeds that of the declared frame. Errors that the positions cannot show are not tried, e.g. swaps with an axis
-along which all positions are equal.
+The score of a frame is the fraction of the variance of RSSI that path-loss models explain. Its upper limit is the fraction
+with the receivers' positions fitted to RSSI. An error is named if its fraction clearly exceeds that of the declared frame
+and comes close to the limit, because a wrong frame may also be better than the declared one. Errors that the positions
+cannot show are not tried, e.g. swaps with an axis along which all positions are equal.
 """
 
 from __future__ import annotations
@@ -15,12 +16,18 @@ from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
+from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.diagnostics.frames import MIRRORS, SWAPS, UNITS
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
 
 MIN_VARIANCE_GAIN = 0.1  # in explained variance, to prefer another frame
 MIN_EXPLAINED = 0.25  # of the variance, by an error that is named
-MAX_ROWS = 2000  # that are compared
+MIN_ATTAINED = 0.9  # fraction of the limit that an error that is named explains
+MAX_MISPLACED = 0.5  # fraction of the limit, below which the declared frame does not fit
+MAX_ROWS, MAX_RECEIVERS = 2000, 20  # that are compared
+MAX_FITTED_ROWS = 400  # for the limit
+ZOOMS, ZOOM = 4, 4.0  # grids of positions of a receiver, and the ratio of their sizes
+MIN_DISTANCE_RATIO = 1e-3  # of a receiver, relative to the extent of the positions
 TIE = 0.02  # difference in explained variance of errors that are not distinguished
 MIN_EXTENT_M = 1e-6  # of an axis along which positions differ
 SCANNED_OFFSETS = 40  # of a mirror
@@ -34,13 +41,17 @@ class PathLossReport:
         explained: Fraction of the variance of RSSI that path-loss models of each receiver explain.
         level_dbm: RSSI at 1 m by one path-loss model of all receivers [dBm].
         exponent: Path-loss exponent of that model.
-        explanation: Errors of frames with clearly more explained variance, in words, or an empty text.
+        explanation: Errors of frames that explain nearly all that can be explained, in words, or an empty text.
+        attainable: Fraction with the receivers' positions fitted to RSSI, of the receivers that detected most rows.
+        misplaced: True if the declared frame explains far less than that, and no error that was tried explains it.
     """
 
     explained: float
     level_dbm: float
     exponent: float
-    explanation: str
+    explanation: str = ""
+    attainable: float = 1.0
+    misplaced: bool = False
 
 
 def check_path_loss(data: Rssi) -> PathLossReport | None:
@@ -58,19 +69,21 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
         return None
     report = _declared(data)
     data = data.subset(torch.linspace(0, len(data) - 1, min(MAX_ROWS, len(data))).round().long())
+    data = data.columns(data.detected.sum(dim=0).argsort(descending=True, stable=True)[:MAX_RECEIVERS].tolist())
     place = data.transmitter_position
     found = {meaning: _explained(other, data) for meaning, other in _others(place)}
     best = max(found.values(), default=0.0)
-    mirrors = {
+    found |= {
         f"{axis} of the positions counts from the other side ({axis} = {offset:.1f} - {axis})": value
         for axis, offset, value in _mirrors(place, data)
         if value >= best + TIE
     }
-    found |= mirrors
-    best, declared = max(found.values(), default=0.0), _explained(place, data)
-    if best < MIN_EXPLAINED or best - declared < MIN_VARIANCE_GAIN:
-        return report
-    return replace(report, explanation="; or if ".join(name for name, value in found.items() if value >= best - TIE))
+    best, declared, attainable = max(found.values(), default=0.0), _explained(place, data), _attainable(data)
+    report = replace(report, attainable=attainable)
+    if best >= max(MIN_EXPLAINED, MIN_ATTAINED * attainable) and best - declared >= MIN_VARIANCE_GAIN:
+        named = [name for name, value in found.items() if value >= best - TIE]
+        return replace(report, explanation="; or if ".join(named))
+    return replace(report, misplaced=attainable >= MIN_EXPLAINED and declared < MAX_MISPLACED * attainable)
 
 
 def _declared(data: Rssi) -> PathLossReport:
@@ -78,7 +91,7 @@ def _declared(data: Rssi) -> PathLossReport:
     distance = log_distance(data.transmitter_position, data.receiver_position)
     model = fit_path_loss(distance, data.rssi_dbm, shared=True)
     explained = _explained(data.transmitter_position, data)
-    return PathLossReport(explained, float(model.level), float(-model.slope / 10), explanation="")
+    return PathLossReport(explained, float(model.level), float(-model.slope / 10))
 
 
 def _others(place: Tensor) -> Iterator[tuple[str, Tensor]]:
@@ -127,3 +140,48 @@ def _explained(position: Tensor, data: Rssi) -> float:
     model = fit_path_loss(distance, data.rssi_dbm)
     residual = data.rssi_dbm - model.where(model.slope < 0, constant)(distance)
     return 1 - float(residual.square().nansum() / (data.rssi_dbm - constant.level).square().nansum().clamp_min(1e-12))
+
+
+def _attainable(data: Rssi) -> float:
+    """Return the fraction of the variance of RSSI that path-loss models explain with fitted positions of the receivers.
+
+    The position of each receiver is that of a grid around the positions with the highest fraction, then of finer grids.
+    """
+    data = data.subset(torch.linspace(0, len(data) - 1, min(MAX_FITTED_ROWS, len(data))).round().long())
+    residual = total = 0.0
+    for rssi, detected in zip(data.rssi_dbm.T, data.detected.T, strict=True):
+        if int(detected.sum()) < MIN_TRAINING:
+            continue
+        place, level = data.transmitter_position[detected], rssi[detected] - rssi[detected].mean()
+        variance = float(level.square().sum())
+        residual += variance - _fitted_receiver(place, level)
+        total += variance
+    return 1 - residual / total if total else 0.0
+
+
+def _fitted_receiver(place: Tensor, level: Tensor) -> float:
+    """Return the sum of squares of centred RSSI (n,) that a path-loss model explains with a fitted position.
+
+    Args:
+        place: Positions of the transmitter, (n, 3).
+        level: RSSI less its mean, (n,) [dB].
+    """
+    low, high = place.amin(dim=0), place.amax(dim=0)
+    centre, reach = (low + high) / 2, high - low
+    width = float(reach.sort().values[1]) or float(reach.max())
+    flat = int(reach.argmin())
+    reach[flat] = reach[flat].clamp_min(width / 2)  # receivers may hang above or below all positions
+    explained = 0.0
+    for _ in range(ZOOMS):
+        axes = [
+            centre[axis] + reach[axis] * torch.linspace(-1, 1, 5 if axis == flat else 11, dtype=torch.float64)
+            for axis in range(3)
+        ]
+        receiver = torch.cartesian_prod(*axes)
+        distance = torch.cdist(receiver, place).clamp_min(MIN_DISTANCE_RATIO * width).log10()
+        offset = distance - distance.mean(dim=1, keepdim=True)
+        covariance, variance = offset @ level, offset.square().sum(dim=1)
+        value = (covariance.square() / variance.clamp_min(1e-12)).where(covariance < 0, 0.0)
+        explained = max(explained, float(value.max()))
+        centre, reach = receiver[int(value.argmax())], reach / ZOOM
+    return explained

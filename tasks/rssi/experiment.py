@@ -31,7 +31,7 @@ from tasks.rssi.page import page
 from tasks.rssi.page.summary import answer
 from tasks.rssi.predictors import PREDICTORS, make_predictor
 from tasks.run import Row, Run, choose_device
-from tasks.source import asked_offsets, measured_rssi, split_notes
+from tasks.source import asked_offsets, measured_rssi, offset_notes, split_notes
 from tasks.summarise import error_summary, grouped
 from tasks.terminal import console, terminal
 
@@ -54,7 +54,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     train, test = data.split(config.split, config.seed)
     if not bool((~test.rssi_dbm.isnan()).any()):
         raise InputError(f"split {config.split!r} of {data.name} has no test rows that detect these receivers")
-    notes = [*split_notes(train, test), *data.notes]
+    notes = [*split_notes(train, test), *offset_notes(data, config), *data.notes]
     if (offsets := asked_offsets(pool, config)) is not None:
         train, pool = offsets.removed(train), offsets.removed(pool)
         notes.append(offsets.note())

@@ -13,7 +13,7 @@ from tasks.inspect.findings.base import Findings
 MAX_POSITIONS = 3000  # whose neighbours are searched
 SMOOTH, ROUGH = 0.25, 0.5  # wavelengths between neighbours: below, fields are smooth; above, fringes are lost
 MAX_END_OFFSET = 1e-3  # of normalised coordinates from the ends of their interval
-MAX_EXTENT_M = 1000.0  # beyond, coordinates may be millimetres
+MAX_EXTENT_M = 1000.0  # beyond, coordinates may be millimetres or pixels
 
 
 def check_positions(position: Tensor, findings: Findings, wavelength: float | None = None) -> None:
@@ -25,7 +25,7 @@ def check_positions(position: Tensor, findings: Findings, wavelength: float | No
     )
     findings.say(f"{len(position)} positions, {ranges} m.", n=len(position), extent_m=extent)
     if max(extent) > MAX_EXTENT_M:
-        findings.warn(f"Positions extend over {max(extent):.0f} m; are they millimetres? The toolkit takes metres.")
+        findings.warn(f"Positions extend over {max(extent):.0f} m; are they metres?")
     flat = [axis for axis, size in zip("xyz", extent, strict=True) if size < 1e-9]
     if {"x", "y"} & set(flat):
         findings.warn(f"All positions have one {' and one '.join(flat)}; directions and planes are not identifiable.")

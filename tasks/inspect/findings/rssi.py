@@ -7,6 +7,7 @@ from collections.abc import Callable
 from torch import Tensor
 
 from swiftwrf.data import Rssi
+from swiftwrf.data.fillers import has_frequent_edge
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.diagnostics.path_loss import check_path_loss
 from swiftwrf.errors import listed
@@ -16,7 +17,6 @@ from tasks.inspect.findings.positions import check_positions, say_splits
 
 MAX_LEVEL_DBM = 10.0  # at 1 m, which no usual transmitter reaches
 MIN_EXPLAINED, MIN_SPREAD_DB = 0.15, 1.0  # of offsets that are proposed
-MAX_EDGE_SHARE = 0.2  # of the weakest value, if it stands apart
 
 
 def check_rssi(data: Rssi, findings: Findings) -> None:
@@ -73,18 +73,10 @@ def _columns(data: Rssi, detected: Tensor, findings: Findings) -> None:
     if positive := those(lambda v: bool(v.min() < v.max() and v.max() >= 0)):
         findings.warn(f"Receivers with values of 0 dBm and more, which few receivers measure: {listed(positive)}.")
 
-    def edged(values: Tensor) -> bool:
-        weakest = values == values.min()
-        others = values[~weakest]
-        return (
-            len(others) > 0
-            and float(weakest.double().mean()) > MAX_EDGE_SHARE
-            and float(others.min() - values.min()) > 3
-        )
-
-    if repeated := those(edged):
+    if repeated := those(lambda v: has_frequent_edge(v.numpy())):
         findings.warn(
-            f"The weakest value is frequent and stands apart; does it mean not detected? Receivers: {listed(repeated)}."
+            "The weakest value is far more frequent than those above it; does it mean not detected? Receivers: "
+            f"{listed(repeated)}."
         )
     filled = data.rssi_dbm.nan_to_num(0.0)
     same = [
@@ -110,6 +102,12 @@ def _path_loss(data: Rssi, findings: Findings) -> None:
     )
     if report.explanation:
         findings.warn(f"It would explain far more if {report.explanation}.", explanation=report.explanation)
+    if report.misplaced:
+        findings.warn(
+            f"Other positions of the receivers would explain {report.attainable:.0%}; no frame that was tried comes close: "
+            "are origin, axes and units those of the positions?",
+            law_attainable=report.attainable,
+        )
     if report.level_dbm > MAX_LEVEL_DBM:
         findings.warn(
             f"{report.level_dbm:.0f} dBm at 1 m is more than usual transmitters give; are positions in millimetres?"

@@ -311,6 +311,16 @@ def test_a_place_measured_again_is_in_one_part_of_every_random_split(floor):
     assert len(train) + len(test) == len(frequent)
 
 
+def test_positions_measured_again_differ_by_the_error_of_positioning():
+    draw = np.random.default_rng(0)
+    place = draw.uniform(0, 12, (30, 3)).repeat(8, axis=0)
+    position = torch.from_numpy(place + draw.normal(0, 0.001, place.shape))
+    train, test = random_split(position, seed=0)
+    assert repeated_fraction(position[train], position[test]) > 0.9
+    spread = torch.from_numpy(draw.uniform(0, 12, (240, 3)))
+    assert repeated_fraction(spread[train], spread[test]) < 0.05
+
+
 def test_a_split_that_tests_look_up_is_named_first(tmp_path, capsys):
     floor = Floor.made(5, n=30)
     table = pd.concat([floor.table()] * 2, ignore_index=True)

@@ -153,6 +153,42 @@ def test_positions_of_receivers_beside_the_table(tmp_path):
         load_rssi(file)
 
 
+@pytest.mark.parametrize("value", [0, -1, 999, -9999])
+def test_rows_without_a_fix_hold_a_constant(tmp_path, value):
+    rows = [[value] * 3 + row[3:] if number % 8 == 0 else row for number, row in enumerate(ROWS)]
+    data = load_rssi(write_survey(tmp_path, rows=rows))
+    assert len(data) == 35
+    assert f"rows at {value}, {value}, apart from all others are left out: 5 of 40" in data.notes
+
+
+def test_one_row_without_a_fix_has_no_height(tmp_path):
+    near = [[0.3 + 0.5 * i, 0.3 + 0.2 * i, 1.2, -50.0 - i] for i in range(12)]
+    data = load_rssi(write_survey(tmp_path, header=["x", "y", "z", "a"], rows=[*near, [0, 0, 0, -60]]))
+    assert len(data) == 12
+    floor = [[x, y, 0, rssi] for x, y, _, rssi in near]
+    assert len(load_rssi(write_survey(tmp_path, header=["x", "y", "z", "a"], rows=[*floor, [0, 0, 0, -60]]))) == 13
+
+
+def test_degrees_on_both_sides_of_the_antimeridian(tmp_path):
+    rows = [[-17.8 + 1e-5 * i, (179.99995 + 1e-5 * i + 180) % 360 - 180, -50 - i] for i in range(12)]
+    position = load_rssi(write_survey(tmp_path, header=["Lat", "Lng", "a"], rows=rows)).transmitter_position
+    assert float((position.amax(dim=0) - position.amin(dim=0)).max()) == pytest.approx(12.2, abs=0.1)
+
+
+def test_a_filler_of_receivers_some_of_which_detect_every_row(tmp_path):
+    draw = np.random.default_rng(0)
+    weak = np.maximum(draw.normal(-92, 8, (80, 4)).round(), -92)
+    table = pd.DataFrame(np.hstack([draw.uniform(0, 9, (80, 2)), weak, draw.normal(-50, 8, (80, 2)).round()]))
+    header = ["x", "y", "a", "b", "c", "d", "near", "nearer"]
+    data = load_rssi(write_survey(tmp_path, header=header, rows=table.to_numpy().tolist()))
+    assert "-92 counts as not detected" in " ".join(data.notes)
+
+
+def test_infinite_values_are_not_detected(tmp_path):
+    rows = [["inf" if v == -100 else v for v in row] for row in ROWS]
+    assert same(load_rssi(write_survey(tmp_path, rows=rows)))
+
+
 def test_splits_beside_the_table(tmp_path):
     file = write_survey(tmp_path)
     (tmp_path / "train_index_days.txt").write_text("\n".join(map(str, range(30))))

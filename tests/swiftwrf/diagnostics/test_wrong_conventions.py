@@ -71,7 +71,7 @@ NAMED = {
     "y and z swapped": (moved(lambda p: p[:, [0, 2, 1]]), "y and z of the positions are swapped"),
     "y mirrored": (moved(lambda p: p * FLIP_Y), "y of the positions has the wrong sign"),
     "positions in millimetres": (moved(shrunk), "the positions are in millimetres"),
-    "everything in millimetres": (ALL_SHRUNK, "are they millimetres"),
+    "everything in millimetres": (ALL_SHRUNK, "are they metres?"),
     "quaternion w, x, y, z": (oriented(Rotation.from_quat(np.roll(QUATERNION, 1))), "in the order w, x, y, z"),
     "quaternion inverted": (oriented(FACING_X.inv()), "the quaternion turns world into array coordinates"),
     "array turned by 20 degrees": (TURNED, "constant rotation of 20 degrees"),
@@ -171,6 +171,41 @@ def test_a_rotation_is_told_from_the_axes_of_the_array():
     findings, _ = inspect(turned, HOW)
     assert findings.numbers["turn_deg"] == pytest.approx([0, 0, 20], abs=1.5)
     assert findings.numbers["frame"] == "turned"
+
+
+TURNED_PLAN = torch.from_numpy(Rotation.from_euler("z", 30, degrees=True).as_matrix())
+UNKNOWN = {
+    "pixels": lambda p: 37.8 * p,
+    "pixels from the top": lambda p: 37.8 * p * FLIP_Y + torch.tensor([0.0, 600.0, 0.0], dtype=torch.float64),
+    "another origin": lambda p: p + torch.tensor([9.0, -7.0, 0.0], dtype=torch.float64),
+    "turned by 30 degrees": lambda p: p @ TURNED_PLAN.T,
+    "half a turn about a corner": lambda p: 20 - p,
+}
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_another_frame_of_rssi_is_not_given_a_wrong_cause(name):
+    report = check_path_loss(placed(UNKNOWN[name]))
+    assert not report.explanation
+    assert report.attainable > report.explained + 0.1
+
+
+def test_positions_of_receivers_that_do_not_fit_are_reported_without_a_cause():
+    assert "are origin, axes and units those of the positions" in warnings(placed(UNKNOWN["pixels"]))
+    assert not check_path_loss(ROOM).misplaced
+
+
+def test_rssi_of_no_field_fits_no_other_receivers():
+    noise = torch.randn(ROOM.rssi_dbm.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    report = check_path_loss(replace(ROOM, rssi_dbm=noise - 60).subset(torch.arange(100)))
+    assert not report.misplaced
+    assert not report.explanation
+
+
+def test_a_filler_of_each_receiver_is_asked_about():
+    level = ROOM.rssi_dbm.nan_to_num(-100).round()
+    floor = level.quantile(0.4, dim=0).round()
+    assert "does it mean not detected" in warnings(replace(ROOM, rssi_dbm=level.maximum(floor)))
 
 
 def test_axes_along_which_all_positions_are_equal_are_not_swapped():
