@@ -2,7 +2,7 @@
 # The paper's tables at the paper's size: benchmarks/paper_scale.sh DATA [OPTION ...]
 #
 # Traces six scenes of 6,000 positions into the folder DATA (extra: raytrace) and measures every method on them. It continues
-# where it was stopped: a scene, a fit or a run that is finished is not repeated. --quick takes less than 15 minutes. Options
+# where it was stopped: a scene, a fit or a run that is finished is not repeated. --quick measures one scene of 300 positions. Options
 # are those of paper_scale.py. Each scene has a process of its own, which bounds the memory.
 set -euo pipefail
 
