@@ -12,6 +12,15 @@ from comparison_tables import comparison, comparison_counts, comparison_methods,
 from geometry import SIDES, WALLS, nearest
 from locating_tables import locating_rssi, locating_spectra
 from measured_tables import measured_spectra
+from paper_scale_tables import (
+    paper_scale,
+    paper_scale_aoa,
+    paper_scale_counts,
+    paper_scale_density,
+    paper_scale_locating,
+    paper_scale_quick,
+    paper_scale_targets,
+)
 from rssi_tables import rssi_glance, rssi_heads, rssi_methods
 from speed_tables import busy, drawing, networks, scaling, scaling_quality, scaling_rssi, size, speed
 from targets import aoa_targets, rssi_targets, synthesis_targets
@@ -287,6 +296,13 @@ TABLES = {
     "raytracing": raytracing,
     "comparison_counts": comparison_counts,
     "comparison_turbo": comparison_turbo,
+    "paper_scale": paper_scale,
+    "paper_scale_aoa": paper_scale_aoa,
+    "paper_scale_counts": paper_scale_counts,
+    "paper_scale_density": paper_scale_density,
+    "paper_scale_locating": paper_scale_locating,
+    "paper_scale_quick": paper_scale_quick,
+    "paper_scale_targets": paper_scale_targets,
     "synthesis_targets": synthesis_targets,
     "aoa_targets": aoa_targets,
     "rssi_targets": rssi_targets,
