@@ -274,13 +274,51 @@ def plane_waves(n: int, packets: int, subcarriers: int) -> tuple[np.ndarray, np.
     return position, np.round(channel.real) + 1j * np.round(channel.imag)
 
 
-def write_captures(folder: Path, n: int = 12, packets: int = 3, **changes: object) -> np.ndarray:
-    """A folder of captures of the Linux 802.11n CSI Tool; returns the channels that they hold, (n, packets, 30, 3)."""
+NEXMON_FLOATS = {
+    3: (9, 5),
+    106: (12, 6),
+}  # by number of the chip: bits of each mantissa with its sign, and of the exponent
+
+
+def nexmon_payload(csi: np.ndarray, core: int, number: int = 1, chip: int = 106, stream: int = 0) -> bytes:
+    """A packet of nexmon_csi: the channel (subcarriers,) of one core for one stream of a frame."""
+    mantissa, exponent = NEXMON_FLOATS.get(chip, (12, 6))
+    parts = (csi.real, csi.imag)
+    scale = math.ceil(math.log2(np.abs(parts).max() + 1)) - (mantissa - 1)
+    size = [np.minimum(np.round(np.abs(part) / 2.0**scale).astype(int), 2 ** (mantissa - 1) - 1) for part in parts]
+    real, imag = (((part < 0) << (mantissa - 1)) | value for part, value in zip(parts, size, strict=True))
+    words = real << (mantissa + exponent) | imag << exponent | (scale & (2**exponent - 1))
+    header = struct.pack("<HbB6sHHHH", 0x1111, -40, 8, b"\1\2\3\4\5\6", number, core | stream << 3, 0xE02A, chip)
+    return header + words.astype("<u4").tobytes()
+
+
+def pcap(payloads: list[bytes], order: str = "<", mark: int = 0xA1B2C3D4) -> bytes:
+    """A pcap file of UDP packets with these payloads."""
+    frames = [bytes(42) + payload for payload in payloads]
+    records = [struct.pack(f"{order}IIII", 0, 0, len(frame), len(frame)) + frame for frame in frames]
+    return struct.pack(f"{order}IHHiIII", mark, 2, 4, 0, 0, 65535, 1) + b"".join(records)
+
+
+def nexmon(channel: np.ndarray, chip: int = 106, **form: object) -> bytes:
+    """A capture of nexmon_csi of channels (packets, subcarriers, cores)."""
+    packets = [
+        nexmon_payload(csi, core, number, chip)
+        for number, cores in enumerate(channel)
+        for core, csi in enumerate(cores.T)
+    ]
+    return pcap(packets, **form)
+
+
+def write_captures(
+    folder: Path, n: int = 12, packets: int = 3, suffix: str = ".dat", tones: int = 30, **changes: object
+) -> np.ndarray:
+    """A folder of captures; returns the channels that they hold, (n, packets, tones, 3)."""
     folder.mkdir(exist_ok=True)
-    position, channel = plane_waves(n, packets, 30)
-    rows = [f"walk{i}.dat,{x},{y},{z}\n" for i, (x, y, z) in enumerate(position)]
+    position, channel = plane_waves(n, packets, tones)
+    rows = [f"walk{i}{suffix},{x},{y},{z}\n" for i, (x, y, z) in enumerate(position)]
     (folder / "positions.csv").write_text("file,x,y,z\n" + "".join(rows))
     (folder / "array.yml").write_text(array_yml(**changes))
     for i in range(n):
-        (folder / f"walk{i}.dat").write_bytes(b"".join(bfee(csi[..., None]) for csi in channel[i]))
+        content = nexmon(channel[i]) if suffix == ".pcap" else b"".join(bfee(csi[..., None]) for csi in channel[i])
+        (folder / f"walk{i}{suffix}").write_bytes(content)
     return channel

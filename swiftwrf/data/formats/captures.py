@@ -5,9 +5,7 @@ The files are NAME.dat (Linux 802.11n CSI Tool) or NAME.pcap (nexmon_csi), posit
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -15,14 +13,14 @@ from numpy.typing import NDArray
 
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES, Arrays, refusing_broken
 from swiftwrf.data.columns import column_of, column_of_numbers, text_of
+from swiftwrf.data.csi_tools import ONE_ANTENNA, TOOLS, Channel
 from swiftwrf.data.files import read_bytes, read_yaml
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.snapshots import array_of, snapshots_of
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.survey import read_frame
-from swiftwrf.errors import InputError, listed
+from swiftwrf.errors import InputError, listed, ranges
 
-Channel = NDArray[np.complex128]
 POSITIONS, DESCRIPTION = "positions.csv", "array.yml"
 NEEDED = (
     f"captures need, in their folder, {POSITIONS} (file,x,y,z: a row per capture) and {DESCRIPTION} (array_position, "
@@ -33,22 +31,6 @@ ELEMENTS = ("rows", "columns", "spacing_m", "element_position")
 OFFSETS = "phases of the receiver's chains are as measured; they contain constant offsets unless these were corrected"
 MAX_PACKETS = 32  # used of each capture, evenly spaced
 ESP32_MARK, MARK_BYTES = b"CSI_DATA", 4096  # in the first bytes of its tables
-
-BFEE = 0xBB  # code of the frames with CSI; others are skipped
-BFEE_HEADER_BYTES = 21  # code included
-BFEE_SUBCARRIERS, BFEE_ANTENNAS = 30, 3
-
-
-class Tool(NamedTuple):
-    """Captures of one tool: recognition and decoding."""
-
-    name: str
-    recognises: Callable[[bytes], bool]
-    """whether the first bytes of a file are of such a capture"""
-    split: Callable[[bytes, int], tuple[list[bytes], int]]
-    """packets of that many antennas in a capture, and the number of others; refuses damaged captures by ValueError"""
-    decode: Callable[[bytes, int], Channel]
-    """channel (subcarriers, K) of a packet"""
 
 
 @SNAPSHOT_FORMATS.register("captures")
@@ -64,7 +46,7 @@ class Captures(Format[Snapshots]):
         table, described = path / POSITIONS, path / DESCRIPTION
         for file in _captures(path):
             if file.suffix == ".csv":
-                raise InputError(f"{file} is a capture of an ESP32, which has one antenna and receives no direction")
+                raise InputError(f"{file} is a capture of an ESP32, {ONE_ANTENNA}")
         if path.is_file():
             raise InputError(f"{path} is one capture; name its folder: {NEEDED}")
         missing = [file.name for file in (table, described) if not file.is_file()]
@@ -83,7 +65,7 @@ class Captures(Format[Snapshots]):
         position = np.stack([_column(table, frame, axis) for axis in "xyz"], axis=1)
         time = {"time": _column(table, frame, "time")} if column_of(frame, "time", {}) else {}
         arrays = description | time | {"csi": csi.reshape(len(files), -1, elements), "position": position}
-        notes = [f"{min(counts)} to {max(counts)} packets of a capture are used", OFFSETS]
+        notes = [f"packets used of each capture: {ranges(sorted(set(counts)))}", OFFSETS]
         if any(left_out):
             notes.append(f"packets without a channel of all {elements} elements are left out: {sum(left_out)}")
         if unlisted := [file.name for file in _captures(path) if file not in files]:
@@ -165,51 +147,3 @@ def _read_capture(file: Path, elements: int) -> tuple[Channel, int]:
             )
         size = min(len(packets), MAX_PACKETS)
         return np.stack([tool.decode(packets[i * len(packets) // size], elements) for i in range(size)]), left_out
-
-
-def _split_csitool(content: bytes, elements: int) -> tuple[list[bytes], int]:
-    packets, left_out, start = [], 0, 0
-    while start < len(content):
-        size = int.from_bytes(content[start : start + 2], "big")
-        frame = content[start + 2 : start + 2 + size]
-        if not 0 < size == len(frame):
-            raise ValueError(f"the frame at byte {start} is cut off")
-        if frame[0] == BFEE:
-            n_receive, n_transmit = frame[9:11] if size > BFEE_HEADER_BYTES else (0, 0)
-            expected = (BFEE_SUBCARRIERS * (16 * n_receive * n_transmit + 3) + 7) // 8
-            if not (
-                1 <= n_receive <= BFEE_ANTENNAS
-                and 1 <= n_transmit <= BFEE_ANTENNAS
-                and int.from_bytes(frame[17:19], "little") == expected == size - BFEE_HEADER_BYTES
-            ):
-                raise ValueError(f"the frame at byte {start} does not have the size of its antennas")
-            port = [frame[16] >> shift & 3 for shift in (0, 2, 4)][:n_receive]  # of each chain
-            if n_receive == elements and sorted(port) == list(range(elements)):
-                packets.append(frame)
-            else:
-                left_out += 1
-        start += 2 + size
-    return packets, left_out
-
-
-def _decode_csitool(packet: bytes, elements: int) -> Channel:
-    """Return the channel of the first transmitted stream. Elements are the ports A, B, C."""
-    capture = _csiread().Intel(None, nrxnum=BFEE_ANTENNAS, ntxnum=BFEE_ANTENNAS, if_report=False)
-    capture.pmsg(packet)
-    channel: Channel = capture.csi[0, :, :elements, 0].copy()
-    return channel
-
-
-def _csiread() -> Any:
-    try:
-        import csiread
-    except ImportError:
-        raise InputError("captures are decoded by csiread; install it with pip install 'swiftwrf-tasks[csi]'") from None
-    return csiread
-
-
-TOOLS = {
-    ".dat": Tool(
-        "the Linux 802.11n CSI Tool", lambda start: start[2:3] in (b"\xbb", b"\xc1"), _split_csitool, _decode_csitool
-    ),
-}

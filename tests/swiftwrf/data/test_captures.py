@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from samples import array_yml, bfee, plane_waves, write_captures
+from samples import array_yml, bfee, nexmon, nexmon_payload, pcap, plane_waves, write_captures
 
 from swiftwrf import InputError, load_rssi, load_snapshots, load_spectra
 from swiftwrf.data.formats import captures
@@ -67,7 +67,9 @@ def test_captures_with_fewer_packets_repeat_them(tmp_path):
     written = write_captures(tmp_path, n=2, packets=4)
     (tmp_path / "walk1.dat").write_bytes(b"".join(bfee(csi[..., None]) for csi in written[1, :2]))
     written[1] = written[1, [0, 0, 1, 1]]
-    torch.testing.assert_close(load_snapshots(tmp_path).channel, unit_power(written))
+    data = load_snapshots(tmp_path)
+    torch.testing.assert_close(data.channel, unit_power(written))
+    assert "packets used of each capture: 2, 4" in data.notes
 
 
 def test_packets_of_long_captures_are_evenly_spaced(tmp_path, monkeypatch):
@@ -168,4 +170,87 @@ def test_the_extra_is_named(tmp_path, monkeypatch):
     write_captures(tmp_path)
     monkeypatch.setitem(__import__("sys").modules, "csiread", None)
     with pytest.raises(InputError, match=r"pip install 'swiftwrf-tasks\[csi\]'"):
+        load_snapshots(tmp_path)
+
+
+def subcarriers(tones, first, last, step=1):
+    """Indices of the subcarriers first to last on both sides of DC, in the order of the FFT."""
+    return [*range(first, last + 1), *range(tones - last, tones - first + 1)][::step]
+
+
+@pytest.mark.parametrize(("tones", "used"), [(64, (1, 28)), (128, (2, 58)), (256, (2, 122, 3))])
+@pytest.mark.parametrize(("chip", "bits"), [(3, 8), (106, 11)])
+def test_nexmon_channels_are_those_written(tmp_path, tones, used, chip, bits):
+    written = write_captures(tmp_path, n=2, suffix=".pcap", tones=tones)
+    written[:, :, [0, tones // 2]] = 120 + 120j  # DC and guard
+    for i in range(2):
+        (tmp_path / f"walk{i}.pcap").write_bytes(nexmon(written[i], chip))
+    expected = unit_power(written[:, :, subcarriers(tones, *used)])
+    torch.testing.assert_close(load_snapshots(tmp_path).channel, expected, rtol=0, atol=2 * 2.0**-bits)
+
+
+@pytest.mark.parametrize("form", [{}, {"order": ">"}, {"mark": 0xA1B23C4D}, {"order": ">", "mark": 0xA1B23C4D}])
+def test_nexmon_directions_in_all_kinds_of_pcap(tmp_path, form):
+    written = write_captures(tmp_path, n=3, suffix=".pcap", tones=64)
+    usual = load_snapshots(tmp_path)
+    for i in range(3):
+        (tmp_path / f"walk{i}.pcap").write_bytes(nexmon(written[i], **form))
+    data = load_snapshots(tmp_path)
+    torch.testing.assert_close(data.channel, usual.channel)
+    cosine = data.direction @ data.array.axis
+    turn = torch.angle((data.channel[:, :, 1:] * data.channel[:, :, :-1].conj()).mean(dim=(1, 2)))
+    spacing = 0.0288 / data.array.wavelength
+    assert (turn / (2 * torch.pi * spacing)).tolist() == pytest.approx(cosine.tolist(), abs=0.01)
+
+
+def test_nexmon_packets_of_one_frame_make_a_channel(tmp_path):
+    written = write_captures(tmp_path, n=2, packets=2, suffix=".pcap", tones=64)
+    usual = load_snapshots(tmp_path)
+    first, second = (
+        [nexmon_payload(csi, core, number) for core, csi in enumerate(written[1, number].T)] for number in range(2)
+    )
+    other_stream = nexmon_payload(written[0, 0, :, 0], core=0, number=0, stream=1)
+    payloads = [
+        b"other traffic",
+        first[0],
+        first[2],
+        other_stream,
+        first[1],
+        second[0],
+        second[0],
+        *second[1:],
+        first[0],
+    ]
+    (tmp_path / "walk1.pcap").write_bytes(pcap(payloads))
+    data = load_snapshots(tmp_path)
+    torch.testing.assert_close(data.channel, usual.channel)
+    assert any("left out: 2" in note for note in data.notes)
+
+
+NEXMON_CHANGES = {
+    "cut off": (lambda content: content[:-1], "is cut off"),
+    "cut in a header": (lambda content: content[: 24 + 10], "is cut off"),
+    "pcapng": (lambda content: b"\x0a\x0d\x0d\x0a" + content, "does not begin as a pcap file"),
+    "empty": (lambda content: b"", "does not begin as a pcap file"),
+    "without packets": (lambda content: content[:24], "no packet has a channel of the 3 elements"),
+    "other bandwidth": (lambda content: pcap([nexmon_payload(np.ones(100), 0)]), "64, 128 or 256 subcarriers"),
+    "no channel": (lambda content: pcap([b"\x11\x11"]), "64, 128 or 256 subcarriers"),
+    "unknown chip": (lambda content: nexmon(np.ones((1, 64, 3)), chip=9), "chip 9 is none of 4358, 4366c0"),
+    "one antenna": (lambda content: nexmon(np.ones((1, 64, 1)), chip=101), "43455c0 .* has one antenna"),
+    "two bandwidths": (
+        lambda content: content + nexmon(np.ones((1, 128, 3)))[24:],
+        "packets have several bandwidths",
+    ),
+    "another bandwidth than others": (lambda content: nexmon(np.ones((1, 128, 3))), "different numbers of subcarriers"),
+    "four cores": (lambda content: nexmon(np.ones((2, 64, 4))), "no packet .* 3 elements .* 2 have others"),
+}
+
+
+@pytest.mark.parametrize("change", NEXMON_CHANGES)
+def test_nexmon_captures_that_are_damaged_are_refused(tmp_path, change):
+    write_captures(tmp_path, n=3, suffix=".pcap", tones=64)
+    file = tmp_path / "walk1.pcap"
+    spoil, says = NEXMON_CHANGES[change]
+    file.write_bytes(spoil(file.read_bytes()))
+    with pytest.raises(InputError, match=says):
         load_snapshots(tmp_path)
