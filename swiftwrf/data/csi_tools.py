@@ -24,7 +24,7 @@ PCAP_ORDERS: dict[bytes, Literal["little", "big"]] = dict.fromkeys((b"\xd4\xc3\x
 PCAP_ORDERS |= dict.fromkeys((b"\xa1\xb2\xc3\xd4", b"\xa1\xb2\x3c\x4d"), "big")
 PCAP_HEADER_BYTES, RECORD_HEADER_BYTES, UDP_HEADER_BYTES = 24, 16, 42  # the last with those of Ethernet and IP
 NEXMON_MARK, NEXMON_HEADER_BYTES = b"\x11\x11", 18
-NEXMON_CHIPS = {3: "4358", 106: "4366c0"}
+NEXMON_CHIPS = {3: "4358", 0xDEAD: "4358", 106: "4366c0"}  # 0xDEAD in captures of earlier versions
 NEXMON_ONE_ANTENNA = 101  # 43455c0, of the Raspberry Pi
 NEXMON_USED = {64: (1, 28), 128: (2, 58), 256: (2, 122)}  # size of the FFT: first and last subcarrier beside DC
 MAX_SUBCARRIERS = 64  # used of each packet, about
@@ -114,7 +114,7 @@ def _decode_nexmon(packet: bytes, elements: int) -> Channel:
     number, tones = int.from_bytes(packet[16:18], "little"), (size - NEXMON_HEADER_BYTES) // 4
     chip = NEXMON_CHIPS.get(number)
     if chip is None:
-        raise ValueError(f"chip {number} is none of {', '.join(NEXMON_CHIPS.values())}")
+        raise ValueError(f"chip {number} is none of {', '.join(sorted({*NEXMON_CHIPS.values()}))}")
     capture = _csiread().Nexmon(None, chip=chip, bw=tones * 5 // 16, if_report=False)
     channel = np.empty((tones, elements), dtype=np.complex128)
     for core in range(elements):

@@ -179,7 +179,7 @@ def subcarriers(tones, first, last, step=1):
 
 
 @pytest.mark.parametrize(("tones", "used"), [(64, (1, 28)), (128, (2, 58)), (256, (2, 122, 3))])
-@pytest.mark.parametrize(("chip", "bits"), [(3, 8), (106, 11)])
+@pytest.mark.parametrize(("chip", "bits"), [(3, 8), (0xDEAD, 8), (106, 11)])
 def test_nexmon_channels_are_those_written(tmp_path, tones, used, chip, bits):
     written = write_captures(tmp_path, n=2, suffix=".pcap", tones=tones)
     written[:, :, [0, tones // 2]] = 120 + 120j  # DC and guard
