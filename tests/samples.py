@@ -230,3 +230,95 @@ def write_survey(folder: Path, name: str = "walk.csv", header: list[str] | None 
     lines = [",".join(header), *(",".join(str(v) for v in row) for row in rows)]
     (folder / name).write_text("\n".join(lines) + "\n")
     return folder / name
+
+
+ROW = {"rows": 1, "columns": 3, "spacing_m": 0.0288, "frequency_hz": 5.2e9}  # the antennas of an Intel 5300
+
+
+def array_yml(**changes: object) -> str:
+    """array.yml of a row of three elements whose normal is +x; None leaves a name out."""
+    content = ROW | {"array_position": [0, 2, 1], "array_orientation": [0.5, 0.5, 0.5, 0.5]} | changes
+    return "".join(f"{name}: {value}\n" for name, value in content.items() if value is not None)
+
+
+def bfee(csi: np.ndarray, port: tuple[int, ...] = (0, 1, 2), code: int = 0xBB) -> bytes:
+    """A frame of the Linux 802.11n CSI Tool: parts of 8 bits of csi (30, ports, streams), in the order of the chains."""
+    n_receive, n_transmit = csi.shape[1:]
+    bits = at = 0
+    for values in csi[:, port[:n_receive]].reshape(30, -1):
+        at += 3
+        for part in np.stack([values.real, values.imag], axis=1).astype(int).flatten():
+            bits |= (int(part) & 0xFF) << at
+            at += 8
+    content = bits.to_bytes((at + 7) // 8, "little")
+    chains = sum(number << 2 * chain for chain, number in enumerate(port))
+    numbers = (code, 1, 1, 0, n_receive, n_transmit, 40, 40, 40, -90, 30, chains, len(content), 0)
+    header = struct.pack("<BIHHBBBBBbBBHH", *numbers)
+    return struct.pack(">H", len(header) + len(content)) + header + content
+
+
+def plane_waves(n: int, packets: int, subcarriers: int) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (n, 3) before the row of `array_yml`, and channels (n, packets, subcarriers, 3) of parts in 8 bits.
+
+    The common phase of a packet is random, and the phase over subcarriers that of the delay.
+    """
+    draw = np.random.default_rng(0)
+    position = np.stack([draw.uniform(2, 6, n), draw.uniform(-2, 6, n), np.full(n, 1.0)], axis=1)
+    away = position - [0, 2, 1]
+    length = np.linalg.norm(away, axis=1)
+    along = ROW["spacing_m"] * np.array([-1, 0, 1]) * (away[:, 1] / length)[:, None]  # (n, 3)
+    offset = 312.5e3 * 4 * np.arange(subcarriers)[:, None] / LIGHT_SPEED * length[:, None, None]  # (n, subcarriers, 1)
+    common = draw.uniform(size=(n, packets, 1, 1))
+    cycles = (along * ROW["frequency_hz"] / LIGHT_SPEED)[:, None, None] - offset[:, None] + common
+    channel = 100 * np.exp(2j * math.pi * cycles)
+    return position, np.round(channel.real) + 1j * np.round(channel.imag)
+
+
+NEXMON_FLOATS = {
+    3: (9, 5),
+    106: (12, 6),
+}  # by number of the chip: bits of each mantissa with its sign, and of the exponent
+
+
+def nexmon_payload(csi: np.ndarray, core: int, number: int = 1, chip: int = 106, stream: int = 0) -> bytes:
+    """A packet of nexmon_csi: the channel (subcarriers,) of one core for one stream of a frame."""
+    mantissa, exponent = NEXMON_FLOATS.get(chip, (12, 6))
+    parts = (csi.real, csi.imag)
+    scale = math.ceil(math.log2(np.abs(parts).max() + 1)) - (mantissa - 1)
+    size = [np.minimum(np.round(np.abs(part) / 2.0**scale).astype(int), 2 ** (mantissa - 1) - 1) for part in parts]
+    real, imag = (((part < 0) << (mantissa - 1)) | value for part, value in zip(parts, size, strict=True))
+    words = real << (mantissa + exponent) | imag << exponent | (scale & (2**exponent - 1))
+    header = struct.pack("<HbB6sHHHH", 0x1111, -40, 8, b"\1\2\3\4\5\6", number, core | stream << 3, 0xE02A, chip)
+    return header + words.astype("<u4").tobytes()
+
+
+def pcap(payloads: list[bytes], order: str = "<", mark: int = 0xA1B2C3D4) -> bytes:
+    """A pcap file of UDP packets with these payloads."""
+    frames = [bytes(42) + payload for payload in payloads]
+    records = [struct.pack(f"{order}IIII", 0, 0, len(frame), len(frame)) + frame for frame in frames]
+    return struct.pack(f"{order}IHHiIII", mark, 2, 4, 0, 0, 65535, 1) + b"".join(records)
+
+
+def nexmon(channel: np.ndarray, chip: int = 106, **form: object) -> bytes:
+    """A capture of nexmon_csi of channels (packets, subcarriers, cores)."""
+    packets = [
+        nexmon_payload(csi, core, number, chip)
+        for number, cores in enumerate(channel)
+        for core, csi in enumerate(cores.T)
+    ]
+    return pcap(packets, **form)
+
+
+def write_captures(
+    folder: Path, n: int = 12, packets: int = 3, suffix: str = ".dat", tones: int = 30, **changes: object
+) -> np.ndarray:
+    """A folder of captures; returns the channels that they hold, (n, packets, tones, 3)."""
+    folder.mkdir(exist_ok=True)
+    position, channel = plane_waves(n, packets, tones)
+    rows = [f"walk{i}{suffix},{x},{y},{z}\n" for i, (x, y, z) in enumerate(position)]
+    (folder / "positions.csv").write_text("file,x,y,z\n" + "".join(rows))
+    (folder / "array.yml").write_text(array_yml(**changes))
+    for i in range(n):
+        content = nexmon(channel[i]) if suffix == ".pcap" else b"".join(bfee(csi[..., None]) for csi in channel[i])
+        (folder / f"walk{i}{suffix}").write_bytes(content)
+    return channel

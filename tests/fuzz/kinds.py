@@ -10,15 +10,18 @@ import functools
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
 import pandas as pd
+import pytest
 import torch
 from PIL import Image
 from samples import snapshots as made_snapshots
 from samples import (
     survey_rows,
+    write_captures,
     write_deepmimo,
     write_dichasus,
     write_espargos,
@@ -88,6 +91,11 @@ def snapshot_arrays(folder: Path) -> None:
 
 def snapshots_hdf5(folder: Path) -> None:
     write_snapshots(folder, "snapshots.h5", data=made_snapshots(n=N, count=2, side=2))
+
+
+def captures(folder: Path, **form: Any) -> None:
+    pytest.importorskip("csiread", reason="needs the extra csi")
+    write_captures(folder, n=3, **form)
 
 
 def spectra_array(folder: Path) -> None:
@@ -239,6 +247,8 @@ KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "format of array snapshots snapshots": (snapshot_arrays, read_snapshots),
     "format of array snapshots espargos": (write_espargos, read_snapshots),
     "format of array snapshots dichasus": (functools.partial(write_dichasus, offsets=True), read_first_station),
+    "format of array snapshots captures": (captures, read_snapshots),
+    "captures in pcap": (functools.partial(captures, suffix=".pcap", tones=64), read_snapshots),
     "spectra as an array": (spectra_array, read_spectra),
     "snapshots in HDF5": (snapshots_hdf5, read_snapshots),
     "format of RSSI nerf2": (rssi_nerf2, read_rssi),

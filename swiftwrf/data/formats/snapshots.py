@@ -38,33 +38,52 @@ class SnapshotArrays(Format[Snapshots]):
         file = _file(path)
         assert file is not None
         arrays = read_arrays(file, REQUIRED_ARRAYS, OPTIONAL)
-        for name, values in arrays.items():
-            if name != "csi" and values.dtype.kind == "c":
-                raise InputError(f"{file}: {name} holds complex numbers, expected real ones")
-            if not np.isfinite(values).all():
-                raise InputError(f"{file}: {name} holds a value that is not finite; leave that row out")
-        arrays, reversed_axes = _turned_round(_without_unit_axes(arrays))
-        position, array = _points(file, arrays, "position", 3), _array(file, arrays)
-        n, folder, pose = len(position), file.parent, _pose(file, arrays)
-        raw = _channel(file, arrays["csi"], n, len(array.element))
-        raw, null = without_null(raw, options.drop_null)
-        channel = _scaled(file, raw)
-        array, turned = round_trip_array(array) if options.round_trip else (array, ())
-        if bool((position == torch.tensor(pose.position, dtype=torch.float64)).all(dim=1).any()):
-            raise InputError(f"{file} has a position equal to array_position, from which there is no direction")
-        data = Snapshots(
-            channel,
-            position,
-            array=array,
-            pose=pose,
-            name=file.stem if file.stem != "snapshots" else folder.resolve().name,
-            named_splits=read_splits(folder, n, first=1) if options.every in (None, 1) else None,
-            source=digests([file], folder),
-            line_of_sight=_one_each(file, arrays, "line_of_sight", n),
-            time=_one_each(file, arrays, "time", n),
-            notes=(*reversed_axes, *null, *turned),
-        )
-        return data if options.every in (None, 1) else data.subset(torch.arange(0, n, options.every))
+        return snapshots_of(file, arrays, options, [file], file.stem if file.stem != "snapshots" else None)
+
+
+def snapshots_of(
+    source: Path, arrays: Arrays, options: ReadOptions, files: list[Path], name: str | None, notes: tuple[str, ...] = ()
+) -> Snapshots:
+    """Return the snapshots in arrays of the names of snapshots.npz.
+
+    Args:
+        source: File or folder of the arrays, for messages.
+        arrays: All of `REQUIRED_ARRAYS`, and some of `OPTIONAL`.
+        options: What the user states.
+        files: Files that were read, in the folder of the splits.
+        name: Name of the data set. Defaults to that of the folder.
+        notes: What the user has to know about the arrays.
+
+    Raises:
+        InputError: An array that is invalid, or arrays that do not match.
+    """
+    for array_name, values in arrays.items():
+        if array_name != "csi" and values.dtype.kind == "c":
+            raise InputError(f"{source}: {array_name} holds complex numbers, expected real ones")
+        if not np.isfinite(values).all():
+            raise InputError(f"{source}: {array_name} holds a value that is not finite; leave that row out")
+    arrays, reversed_axes = _turned_round(_without_unit_axes(arrays))
+    position, array = _points(source, arrays, "position", 3), array_of(source, arrays)
+    n, folder, pose = len(position), files[0].parent, _pose(source, arrays)
+    raw = _channel(source, arrays["csi"], n, len(array.element))
+    raw, null = without_null(raw, options.drop_null)
+    channel = _scaled(source, raw)
+    array, turned = round_trip_array(array) if options.round_trip else (array, ())
+    if bool((position == torch.tensor(pose.position, dtype=torch.float64)).all(dim=1).any()):
+        raise InputError(f"{source} has a position equal to array_position, from which there is no direction")
+    data = Snapshots(
+        channel,
+        position,
+        array=array,
+        pose=pose,
+        name=name or folder.resolve().name,
+        named_splits=read_splits(folder, n, first=1) if options.every in (None, 1) else None,
+        source=digests(files, folder),
+        line_of_sight=_one_each(source, arrays, "line_of_sight", n),
+        time=_one_each(source, arrays, "time", n),
+        notes=(*notes, *reversed_axes, *null, *turned),
+    )
+    return data if options.every in (None, 1) else data.subset(torch.arange(0, n, options.every))
 
 
 def _file(path: Path) -> Path | None:
@@ -169,7 +188,7 @@ def _pose(file: Path, arrays: Arrays) -> ArrayPose:
         raise InputError(f"{file}: {error}") from None
 
 
-def _array(file: Path, arrays: Arrays) -> PlanarArray:
+def array_of(file: Path, arrays: Arrays) -> PlanarArray:
     """Return the array, described by the positions of its elements or by rows, columns and spacing."""
     frequency = arrays["frequency_hz"]
     if frequency.shape != ():

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from swiftwrf.data.files import digests, lines_before_header
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
+from swiftwrf.data.formats.captures import holds_captures
 from swiftwrf.data.formats.nerf2_rssi import FILES as NERF2_FILES
 from swiftwrf.data.receivers import read_receivers
 from swiftwrf.data.rssi import Groups, Rssi
@@ -78,6 +79,8 @@ class SurveyTable(Format[Rssi]):
 
 
 def _tables(path: Path) -> list[Path]:
+    if holds_captures(path):
+        return []
     if path.is_file():
         return [path] if path.suffix.lower() in SUFFIXES else []
     if any((path / name).is_file() for name in NERF2_FILES):
