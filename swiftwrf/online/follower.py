@@ -13,6 +13,7 @@ from swiftwrf.models.base import FieldModel
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.online.adaptation import adapted
 from swiftwrf.online.change import Alarm
+from swiftwrf.online.kernel import KernelMonitor, described
 from swiftwrf.online.monitor import Monitor, MonitorConfig
 from swiftwrf.online.obstacles import ObstacleMonitor
 from swiftwrf.online.prequential import Scores, learnt, score
@@ -29,6 +30,7 @@ class Step:
         scores: Its scores before it was learnt, of length 1.
         alarms: Changes that it revealed, in words.
         correlation: Correlation of the fields before and after a change to which the model was adapted; None without one.
+        notice: What the model changed beside its data, in words; empty if nothing.
 
     Example:
         >>> import swiftwrf
@@ -42,12 +44,14 @@ class Step:
     scores: Scores
     alarms: tuple[str, ...]
     correlation: float | None = None
+    notice: str = ""
 
 
 class Follower:
     """A fitted model that learns measurements one by one.
 
     An alarm of the innovations adapts models of spectra to the change, if these can forget spectra, and restarts the test.
+    Kernel and noise are chosen again while the data grow (`KernelMonitor`).
     With a room and training spectra, obstacles that appear or leave are detected, too.
 
     Args:
@@ -73,6 +77,7 @@ class Follower:
     ) -> None:
         self.model, self.count = model, 0
         self.monitor = Monitor.of(model, train, config)
+        self._kernel = KernelMonitor(self.monitor.config.false_alarm_rate)
         self.obstacles: ObstacleMonitor | None = None
         """test for obstacles, None without room or training spectra"""
         if isinstance(model, FieldModel) and model.room is not None and isinstance(train, Spectra):
@@ -87,7 +92,7 @@ class Follower:
         """
         scores = score(self.model, new)
         alarms = self.monitor.observe(scores.position[0], scores.innovation[0])
-        words, correlation = list(map(self.monitor.describe, alarms)), None
+        words, correlation, notice = list(map(self.monitor.describe, alarms)), None, ""
         if self.obstacles is not None and isinstance(new, Spectra):
             words += map(self.obstacles.describe, self.obstacles.observe(new))
         self.model = learnt(self.model, new)
@@ -96,7 +101,18 @@ class Follower:
             self._recent = [*self._recent, new][-MAX_RECENT:]
             if alarms:
                 correlation = self._adapt(self.model, alarms[0])
-        return Step(scores, tuple(words), correlation)
+        if correlation is None and isinstance(self.model, ProcessModel | RssiModel):
+            notice = self._choose_kernel(self.model, new, scores)
+        return Step(scores, tuple(words), correlation, notice)
+
+    def _choose_kernel(self, model: ProcessModel | RssiModel, new: Spectra | Rssi, scores: Scores) -> str:
+        """Choose the kernel again if the last measurements require it; return the notice."""
+        found = self._kernel.observe(model, new, scores)
+        if found is None:
+            return ""
+        self.model, self.monitor = found, Monitor.of(found, None, self.monitor.config)
+        change = described(model.kernel, found.kernel)
+        return f"kernel chosen again after {self.count} measurements: {change}"
 
     def _adapt(self, model: ProcessModel, alarm: Alarm) -> float:
         """Adapt the model to a change, and calibrate the test with the next measurements."""
@@ -104,6 +120,7 @@ class Follower:
         after = joined(self._recent[-n:])
         self.model, correlation = adapted(model.forget(torch.arange(learnt - n, learnt)), after)
         self.monitor = Monitor.of(self.model, None, self.monitor.config)
+        self._kernel.restart()
         return correlation
 
     def state(self) -> dict[str, Any]:
