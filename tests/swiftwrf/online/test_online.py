@@ -372,6 +372,43 @@ def test_a_kernel_of_enough_spectra_stays(seed):
     assert follower.model.kernel == model.kernel
 
 
+@cache
+def moved(n, seed):
+    """The room with a wall that is 0.3 m away from its place."""
+    return simulated_room(n=n, seed=seed, grid=GRID, room=ShoeboxRoom(size=(6.3, 5.0, 3.0)))
+
+
+def test_a_room_whose_wall_moved_is_searched_again():
+    follower, new = Follower(walls(), spectra(72, 0)), moved(30, 2)
+    follower.resume(json.loads(json.dumps(follower.state())))
+    steps = [follower.step(new.subset(torch.tensor([i]))) for i in range(30)]
+    (notice,) = [step.notice for step in steps if step.notice]
+    assert re.match(r"the room no longer explains the spectra since measurement \d;.*fit it again$", notice)
+    again = Follower(walls())
+    again.resume(json.loads(json.dumps(follower.state())))
+    assert again.room is None
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_room_that_explains_its_spectra_gives_no_notice(seed):
+    follower, new = Follower(walls(), spectra(72, 0)), spectra(100, seed)
+    missing = follower.obstacles.unexplained(new)
+    assert not [a for at, x in zip(new.position, missing, strict=True) for a in follower.room.observe(at, x[None])]
+
+
+def test_a_followed_geometry_is_refined_with_every_ten_spectra():
+    follower, new = Follower(walls()), spectra(12, 1)
+    models = []
+    for i in range(12):
+        follower.step(new.subset(torch.tensor([i])))
+        models.append(follower.model)
+    assert models[8] is walls()
+    assert models[9] is not walls()
+    assert models[11] is models[9]
+    offset = walls().tensors().offset  # of planes without uncertainty
+    torch.testing.assert_close(models[9].tensors().offset, offset)
+
+
 def test_a_notice_is_recorded_and_tables_without_notices_are_read(tmp_path):
     record, follower = Record("source", " [dB]"), Follower(RssiModel().fit(floor().subset(torch.arange(60))))
     for i in range(60, 62):
