@@ -9,7 +9,7 @@ from typing import Any
 
 from tasks.aoa.condition import Condition, conditions_of, headline, reference_of
 from tasks.aoa.former import with_present_names
-from tasks.metrics import AoaMetrics, ChangeMetrics, ErrorSummary, MixMetrics, RssiMetrics
+from tasks.metrics import AoaMetrics, ChangeMetrics, ErrorSummary, MixMetrics
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
@@ -64,11 +64,6 @@ def change_text(found: ChangeMetrics) -> str:
     """Return a change with its interval if there is one."""
     interval = f" [{found['low']:+.0%}, {found['high']:+.0%}]" if math.isfinite(found["low"]) else ""
     return f"{found['change']:+.0%}{interval}"
-
-
-def rssi_runs() -> list[RssiMetrics]:
-    """Return the metrics of all runs of tasks.rssi, sorted by file name."""
-    return [load(file.stem)["metrics"] for file in sorted(RESULTS.glob("rssi_*.json"))]
 
 
 def markdown(columns: list[str], rows: list[list[str]]) -> str:

@@ -7,10 +7,21 @@ import statistics
 from dataclasses import replace
 from typing import Any
 
-from committed import RESULTS, ROOT, aoa_shares, interval, load, markdown, rssi_runs, turbo_condition
+from committed import ROOT, aoa_shares, interval, load, markdown, turbo_condition
 from comparison_tables import comparison, comparison_counts, comparison_methods, comparison_turbo
 from geometry import SIDES, WALLS, nearest
 from locating_tables import locating_rssi, locating_spectra
+from measured_tables import measured_spectra
+from paper_scale_tables import (
+    paper_scale,
+    paper_scale_aoa,
+    paper_scale_counts,
+    paper_scale_density,
+    paper_scale_locating,
+    paper_scale_quick,
+    paper_scale_targets,
+)
+from rssi_tables import rssi_glance, rssi_heads, rssi_methods
 from speed_tables import busy, drawing, networks, scaling, scaling_quality, scaling_rssi, size, speed
 from targets import aoa_targets, rssi_targets, synthesis_targets
 
@@ -99,21 +110,22 @@ def headline() -> str:
 
 def headline_rssi() -> str:
     """Return errors of RSSI and of positions on the measured sets of which both are known."""
-    sets, rows = load("locating_rssi")["sets"], []
-    for metrics in rssi_runs():
-        name = f"{metrics['data']}, {metrics['split']}"
-        errors = {method: entry["abs_error_db"] for method, entry in metrics["overall"].items()}
-        cells = [
-            f"{errors[method]['median']:.2f} / {errors[method]['p90']:.1f}" for method in ("mri_receiver", "swiftwrf")
-        ]
-        cells.append(f"{metrics['interval']['coverage']:.0%}")
-        located = sets.get(name.replace(",", ""))
-        if located is None:
+    located, rows = load("locating_rssi")["sets"], []
+    for name, found in load("rssi")["sets"].items():
+        if name not in located:
             continue
-        found = {method: entry["position_error_m"] for method, entry in located["localizers"].items()}
-        cells += [f"{found[method]['median']:.2f} / {found[method]['p90']:.2f}" for method in ("knn", "posterior")]
-        rows.append([name, *cells, f"{located['coverage']['0.8']:.0%}"])
-    columns = ["RSSI [dB]: path-loss model", "SwiftWRF", "80 % intervals cover"]
+        methods, best = found["methods"], found["best_baseline"]
+        own = methods["swiftwrf"]
+        errors = (methods["mri_receiver"], methods[best], own)
+        cells = [f"{entry['abs_error_db']['median']:.2f} / {entry['abs_error_db']['p90']:.1f}" for entry in errors]
+        cells[1] += f" (`{best}`)"
+        position = {method: entry["position_error_m"] for method, entry in located[name]["localizers"].items()}
+        cells.append(f"{own['coverage']:.0%}")
+        cells += [
+            f"{position[method]['median']:.2f} / {position[method]['p90']:.2f}" for method in ("knn", "posterior")
+        ]
+        rows.append([name, *cells, f"{located[name]['coverage']['0.8']:.0%}"])
+    columns = ["RSSI [dB]: path-loss model", "best baseline", "SwiftWRF", "80 % intervals cover"]
     columns += ["position [m]: nearest fingerprints", "posterior", "80 % regions cover"]
     return markdown(["data, split", *columns], rows)
 
@@ -171,29 +183,6 @@ def random_rooms() -> str:
 
 def _millimetres(plane: dict[str, Any] | None) -> str:
     return "not found" if plane is None else f"{plane['error_mm']:.1f}"
-
-
-def rssi() -> str:
-    """Return median and 90 % quantile of the absolute errors of each predictor, and the coverage of the interval."""
-    methods = ("mean", "mri_pooled", "mri_receiver", "mri_residual", "knn", "gp", "swiftwrf", "blend")
-    rows = []
-    for metrics in rssi_runs():
-        errors = [metrics["overall"][name]["abs_error_db"] for name in methods]
-        cells = [f"{e['median']:.2f} / {e['p90']:.1f}" for e in errors]
-        rows.append([f"{metrics['data']}, {metrics['split']}", *cells, f"{metrics['interval']['coverage']:.0%}"])
-    return markdown(["data, split", *methods, "80 % interval of swiftwrf covers"], rows)
-
-
-def floor() -> str:
-    """Return the difference of `swiftwrf` and the blend to the best baseline of each run on the built-in floor."""
-    own, rows = ("swiftwrf", "blend"), []
-    for file in sorted(RESULTS.glob("floor_*.json")):
-        metrics = load(file.stem)["metrics"]
-        median = {name: entry["abs_error_db"]["median"] for name, entry in metrics["overall"].items()}
-        best = min((name for name in median if name not in own), key=lambda name: median[name])
-        cells = [f"{median[name]:.2f} ({median[name] - median[best]:+.3f})" for name in own]
-        rows.append([str(metrics["seed"]), f"`{best}`: {median[best]:.2f}", *cells])
-    return markdown(["seed", "best baseline [dB]", *own], rows)
 
 
 def hard_cases() -> str:
@@ -289,12 +278,11 @@ TABLES = {
     "locating_rssi": locating_rssi,
     "reliability": reliability,
     "synthesis": synthesis,
+    "measured_spectra": measured_spectra,
     "aoa": aoa,
     "room": room,
     "walls": walls,
     "random_rooms": random_rooms,
-    "rssi": rssi,
-    "floor": floor,
     "size": size,
     "hard_cases": hard_cases,
     "precision": precision,
@@ -308,9 +296,19 @@ TABLES = {
     "raytracing": raytracing,
     "comparison_counts": comparison_counts,
     "comparison_turbo": comparison_turbo,
+    "paper_scale": paper_scale,
+    "paper_scale_aoa": paper_scale_aoa,
+    "paper_scale_counts": paper_scale_counts,
+    "paper_scale_density": paper_scale_density,
+    "paper_scale_locating": paper_scale_locating,
+    "paper_scale_quick": paper_scale_quick,
+    "paper_scale_targets": paper_scale_targets,
     "synthesis_targets": synthesis_targets,
     "aoa_targets": aoa_targets,
     "rssi_targets": rssi_targets,
+    "rssi_glance": rssi_glance,
+    "rssi_heads": rssi_heads,
+    "rssi_methods": rssi_methods,
 }
 DOCS = sorted(file.relative_to(ROOT).as_posix() for file in (ROOT / "docs").rglob("*.md"))
 FILES = ("README.md", *DOCS)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from committed import aoa_shares, change, change_text, load, markdown, reference, rssi_runs, turbo_condition
+from committed import aoa_shares, change, change_text, load, markdown, reference, turbo_condition
 
 # by scene and split: SSIM and PSNR [dB], with the digits they were asked for
 SYNTHESIS: dict[str, tuple[str, str]] = {
@@ -95,12 +95,12 @@ def aoa_targets() -> str:
 def rssi_targets() -> str:
     """Return median and 90 % quantile of the absolute error beside their targets, and the best other predictor."""
     rows = []
-    found = {f"{metrics['data']} {metrics['split']}": metrics["overall"] for metrics in rssi_runs()}
+    found = load("rssi")["sets"]
     for scene, (median, p90) in RSSI.items():
-        overall = found[scene]
+        overall = found[scene]["methods"]
         own = overall["swiftwrf"]["abs_error_db"]
         missed = _missed(own["median"], median, "dB (median)", False) + _missed(own["p90"], p90, "dB (90 %)", False)
-        error = {name: entry["abs_error_db"] for name, entry in overall.items() if name != "swiftwrf"}
+        error = {name: entry["abs_error_db"] for name, entry in overall.items() if name not in ("swiftwrf", "identity")}
         best = min(error, key=lambda name: error[name]["median"])
         cells = [f"{own['median']:.2f} / {own['p90']:.1f}"]
         cells += [f"`{best}`: {error[best]['median']:.2f} / {error[best]['p90']:.1f}"]

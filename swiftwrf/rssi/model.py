@@ -33,8 +33,8 @@ from swiftwrf.rssi.paper_head import HELD_OUT_FOLD, learn_receivers
 from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
 from swiftwrf.rssi.posterior import FitState, RssiPosterior
 from swiftwrf.rssi.regression import fit_receiver
-from swiftwrf.rssi.stacking import MIN_STACKING_ROWS, comparable, receiver_weights
-from swiftwrf.rssi.training import RssiTraining, prepare
+from swiftwrf.rssi.stacking import comparable, mixing_weights
+from swiftwrf.rssi.training import RssiTraining, prepare, representative_receivers
 from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.options import from_plain
@@ -48,6 +48,9 @@ if TYPE_CHECKING:
 LEVEL = 0.8  # nominal coverage of the interval that the standard deviation is calibrated for
 MAX_DISTANCE_M = 1e9  # from the measurements: float32 ends beyond, and so does any receiver's range
 PAPER_RECEIVERS = 4  # receivers that the paper's head is learnt for together, which saves time
+FIELD_ALONE = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)  # mixing weights
+SHRINKAGE = 0.05  # of the mixing weights towards the field, by nested cross-validation in the training rows
+MIN_SCORES = 30  # held-out rows of a receiver below which the scores of all receivers scale its standard deviation
 MAX_VARIANCE_POSITIONS = 200  # measured positions that determine where the field is known
 
 
@@ -56,8 +59,9 @@ class RssiModel(RssiPredictor, Saved):
 
     Five held-out folds of the training rows determine the kernel, the presence of a field, the mixing weights and the scale
     of the standard deviation. The field is mixed with simpler predictors: the path-loss model of the receiver, that of all
-    receivers, and the mean of the receiver. A receiver detected in fewer than 10 rows falls back to the path-loss model of
-    all receivers. If the positions of the receivers are unknown, a path-loss model is a level.
+    receivers, and the mean of the receiver. All receivers share the mixing weights. A receiver detected in fewer than 10
+    rows falls back to the path-loss model of all receivers. If the positions of the receivers are unknown, a path-loss model
+    is a level.
 
     Args:
         config: Options as one object. Defaults to `RssiConfig()`.
@@ -86,7 +90,7 @@ class RssiModel(RssiPredictor, Saved):
     kernel: Kernel
     """kernel of the latent field, lengths in [m]"""
     mixing_weight: Tensor
-    """weights (4, R) of the field and the three simpler predictors, contained in the tensors below"""
+    """weights (4, R) of the field and the three simpler predictors, contained in the tensors below, equal in all columns"""
     receiver: Tensor
     """positions of the receivers, float64 (R, 3) [m]"""
     centre: Tensor
@@ -136,22 +140,44 @@ class RssiModel(RssiPredictor, Saved):
                 record |= {"stage": "final", "receivers": list(training.receiver_names[part])}
                 record |= {"validation": float(error.abs().nanmean()), "seconds": time.perf_counter() - began}
                 session.evaluated(record, found, {})
-        self._assemble(train, training, found)
+        weight = FIELD_ALONE
+        if not self.config.paper_head:
+            weight = self._mixing_weights(train, training, found, context)
+        self._assemble(train, training, found, weight[:, None].repeat(1, len(training.receiver_names)))
+
+    def _mixing_weights(
+        self, train: Rssi, training: RssiTraining, found: dict[str, Tensor], context: RssiFitContext
+    ) -> Tensor:
+        """Return the weights (4,) of the field and the simpler predictors with the lowest error on held-out rows.
+
+        The weights are those of all receivers: the few folds determine no weights for each of them. They follow from the
+        receivers of the pool, so that a receiver's prediction is the same whichever others are fitted with it.
+        """
+        pool = representative_receivers(context.pool)
+        if set(pool.receiver_names) <= set(train.receiver_names):
+            columns = [train.receiver_names.index(name) for name in pool.receiver_names]
+            predictors = _held_out_predictors(training, found["held_out"], self.config)[:, :, columns]
+        else:
+            others = prepare(pool, context.pool, self.config, training)
+            fit = partial(fit_receiver, data=others, config=self.config, device=context.device)
+            each = [slice(r, r + 1) for r in range(len(pool.receiver_names))]
+            fits = (context.parallel or map_threads)(fit, each)
+            predictors = _held_out_predictors(others, torch.cat([one["held_out"] for one in fits]), self.config)
+        held_out = predictors[:, training.bin_of_row]
+        if not comparable(held_out, pool.rssi_dbm).any():
+            return FIELD_ALONE
+        return mixing_weights(held_out, pool.rssi_dbm, SHRINKAGE)
 
     @single_thread()
-    def _assemble(self, train: Rssi, training: RssiTraining, found: dict[str, Tensor]) -> None:
-        """Mix the fits of all receivers with the simpler predictors, and calibrate the standard deviation."""
-        held_out = found["held_out"].T.where(_held_out_mask(training, self.config), torch.nan)
-        predictors = torch.cat([held_out[None], training.baseline_held_out])  # (4, n, R)
+    def _assemble(self, train: Rssi, training: RssiTraining, found: dict[str, Tensor], weight: Tensor) -> None:
+        """Mix the fits of all receivers with the simpler predictors by weights (4, R), and calibrate the deviation."""
+        predictors = _held_out_predictors(training, found["held_out"], self.config)
         measured, row = train.rssi_dbm, training.bin_of_row
         if not comparable(predictors[: 1 if self.config.paper_head else None, row], measured).any():
             raise InputError(
                 "no rows can be held out to estimate the error of the model: all measurements are in one part of the "
                 'region; measure elsewhere, too, give a pool of more receivers, or take validation="random"'
             )
-        weight = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)[:, None].repeat(1, len(training.receiver_names))
-        if not self.config.paper_head:
-            weight = receiver_weights(predictors, measured, row)
         predicted = (weight[:, None] * predictors).where(weight[:, None] > 0, 0.0).sum(dim=0)
         score = ((measured - predicted[row]) / _held_out_std(training)[row]).abs()
         scale = _receiver_quantiles(score) / NormalDist().inv_cdf((1 + LEVEL) / 2)
@@ -381,11 +407,17 @@ def _held_out_mask(training: RssiTraining, config: RssiConfig) -> Tensor:
     return detected & (training.fold == HELD_OUT_FOLD)[:, None] if config.paper_head else detected
 
 
+def _held_out_predictors(training: RssiTraining, held_out: Tensor, config: RssiConfig) -> Tensor:
+    """Return held-out predictions of the field (R, n), and those of the simpler predictors after them, (4, n, R) [dBm]."""
+    field = held_out.T.where(_held_out_mask(training, config), torch.nan)
+    return torch.cat([field[None], training.baseline_held_out])
+
+
 def _receiver_quantiles(score: Tensor) -> Tensor:
     """Return the 80 % quantile of finite scores (rows, R) at each receiver (R,); of all scores at receivers with few."""
     finite = score.where(score.isfinite(), torch.nan)
     quantile = finite.nanquantile(LEVEL, dim=0)
-    few = (~finite.isnan()).sum(dim=0) < MIN_STACKING_ROWS
+    few = (~finite.isnan()).sum(dim=0) < MIN_SCORES
     return quantile.where(~few, score[score.isfinite()].quantile(LEVEL)) if few.any() else quantile
 
 

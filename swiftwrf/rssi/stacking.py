@@ -12,7 +12,6 @@ from swiftwrf.gp import subsample
 MAX_PAIRS = 20_000
 MIN_ERROR_DB = 0.5  # absolute errors below it count as squares, so that the solution is unique
 N_REWEIGHTINGS = 20
-MIN_STACKING_ROWS = 30  # held-out rows of a receiver below which its weights are those of all receivers
 
 
 def comparable(held_out: Tensor, measured: Tensor) -> Tensor:
@@ -25,12 +24,14 @@ def comparable(held_out: Tensor, measured: Tensor) -> Tensor:
     return (~held_out.isnan()).all(dim=0) & ~measured.isnan()
 
 
-def mixing_weights(held_out: Tensor, measured: Tensor) -> Tensor:
+def mixing_weights(held_out: Tensor, measured: Tensor, shrinkage: float = 0.0) -> Tensor:
     """Return the weights of the weighted mean of predictors with the lowest mean absolute error on held-out rows.
 
     Args:
         held_out: Held-out predictions (predictors, rows, R) [dBm], nan where there is none.
         measured: Measurements (rows, R) [dBm], nan where not detected.
+        shrinkage: Ridge penalty on the distance of the weights to those of the first predictor alone, relative to the mean
+            squared error of a predictor. It steadies weights that few folds determine.
 
     Returns:
         Non-negative weights of sum 1, float64 (predictors,).
@@ -46,32 +47,14 @@ def mixing_weights(held_out: Tensor, measured: Tensor) -> Tensor:
     n = error.shape[1]
     weight, importance = np.full(n, 1 / n), np.ones(len(error))
     scale = 1e-9 * max(float((error**2).mean()), 1.0)
+    away = np.eye(n)
+    away[0] -= 1.0  # weights less (1, 0, ...), for weights of sum 1
     for _ in range(N_REWEIGHTINGS):  # least absolute errors by weighted least squares
         gram = (error * importance[:, None]).T @ error / max(len(error), 1)
+        gram += shrinkage * np.trace(gram) / n * away.T @ away
         # the weights of least squares are proportional to argmin of w' G w / 2 - sum w over w >= 0
         factor = np.linalg.cholesky(gram + scale * np.eye(n))
         weight = nnls(factor.T, np.linalg.solve(factor, np.ones(n)))[0]
         weight /= weight.sum()
         importance = 1 / np.maximum(np.abs(error @ weight), MIN_ERROR_DB)
     return torch.from_numpy(weight)
-
-
-def receiver_weights(held_out: Tensor, measured: Tensor, bin_of_row: Tensor) -> Tensor:
-    """Return the mixing weights at each receiver; those of all receivers together at receivers with few rows.
-
-    Args:
-        held_out: Held-out predictions by location bin, (predictors, n, R) [dBm], nan where there is none.
-        measured: Measurements (rows, R) [dBm], nan where not detected.
-        bin_of_row: Bin of each row, (rows,).
-
-    Returns:
-        float64 (predictors, R).
-    """
-
-    def of(columns: slice) -> Tensor:
-        return mixing_weights(held_out[:, :, columns][:, bin_of_row], measured[:, columns])
-
-    n_rows = comparable(held_out[:, bin_of_row], measured).sum(dim=0).tolist()
-    common = of(slice(None)) if min(n_rows) < MIN_STACKING_ROWS else torch.empty(0)
-    weights = [common if n < MIN_STACKING_ROWS else of(slice(r, r + 1)) for r, n in enumerate(n_rows)]
-    return torch.stack(weights, dim=1)

@@ -21,7 +21,7 @@ PAPER_LEVEL_DBM = -100.0  # of the paper's head where nothing is received
 # variance of a packet relative to the variance of the field: fading is as large as shadowing
 RELATIVE_NOISE_VARIANCES = (0.3, 1.0, 2.0, 3.0)
 VERTICALS = (1.0, 5.0)  # factors of the heights of floors: floors alike, or nearly independent beyond their attenuation
-MAX_KERNEL_ROWS, MAX_KERNEL_RECEIVERS = 300, 12  # more do not change the choice of the kernel
+MAX_KERNEL_ROWS, MAX_KERNEL_RECEIVERS = 300, 12  # more do not change the chosen kernel or weights
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,15 @@ class RssiTraining:
 
 
 @single_thread()
-def prepare(train: Rssi, pool: Rssi, config: RssiConfig) -> RssiTraining:
-    """Average the rows by location bin, fit the path-loss models and choose the kernel; arguments as of `RssiModel.fit`."""
+def prepare(train: Rssi, pool: Rssi, config: RssiConfig, like: RssiTraining | None = None) -> RssiTraining:
+    """Average the rows by location bin, fit the path-loss models and choose the kernel.
+
+    Args:
+        train: See `RssiModel.fit`.
+        pool: See `RssiModel.fit`.
+        config: Options.
+        like: Training data of the same pool whose kernel is taken. Defaults to a choice on held-out rows.
+    """
     position, rssi, count, bin_of_row = bin_locations(train, config.max_locations)
     pool_rssi = bin_locations(pool, config.max_locations)[1]
     fold = folds(position, config.validation, config.seed)
@@ -98,8 +105,12 @@ def prepare(train: Rssi, pool: Rssi, config: RssiConfig) -> RssiTraining:
     else:
         pool_residual = pool_rssi - fit_path_loss(pool_distance, pool_rssi)(pool_distance)
         prior_mean, residual = own, rssi - own(distance)
-    kernel, helps = choose_residual_kernel(local, pool_residual, fold, (1.0,) if train.floors is None else VERTICALS)
-    n_primitives = config.n_primitives if helps or config.paper_head else 0
+    if like is None:
+        verticals = (1.0,) if train.floors is None else VERTICALS
+        kernel, helps = choose_residual_kernel(local, pool_residual, fold, verticals)
+        n_primitives = config.n_primitives if helps or config.paper_head else 0
+    else:
+        kernel, n_primitives = like.kernel, like.n_primitives
     common = float(pool_residual.square().nanmean())  # of a receiver without measurements
     variance = residual.square().nanmean(dim=0).nan_to_num(common).clamp_min(1e-6)
     noise = kernel.noise / (1 + kernel.noise) if n_primitives else 1.0
@@ -122,6 +133,12 @@ def prepare(train: Rssi, pool: Rssi, config: RssiConfig) -> RssiTraining:
         baselines=baselines,
         baseline_held_out=held_out,
     )
+
+
+def representative_receivers(pool: Rssi) -> Rssi:
+    """Return the data of at most 12 receivers of the pool that detected the transmitter, evenly chosen."""
+    detecting = pool.detected.any(dim=0).nonzero()[:, 0]
+    return pool.columns(subsample(detecting, rows=MAX_KERNEL_RECEIVERS)[0].tolist())
 
 
 def bin_locations(rows: Rssi, max_locations: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -26,10 +26,7 @@ from tasks.view.locating import RssiLocating, SpectrumLocating
 from tasks.view.rssi import MeasuredFloor, RssiView
 from tasks.view.spectra import LoadedModel, SpectraView
 
-EXPECTED = (
-    "give the directory of a run of tasks.aoa, tasks.rssi, tasks.locate or tasks.update, or a saved model of spectra or "
-    "RSSI"
-)
+EXPECTED = "give the directory of a run of aoa, rssi, locate or update, or a saved model of spectra or RSSI"
 
 
 def open_source(source: Path) -> SpectraView | RssiView | FollowedView:

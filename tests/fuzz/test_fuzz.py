@@ -1,6 +1,6 @@
 """Whatever is done to files and command lines, there is a result that is finite, or one sentence; never a traceback.
 
-200 mutations a kind with every test run; `pytest -m fuzz` makes 10,000 more, 200 command lines, and some whole runs.
+80 mutations a kind with every test run; `pytest -m fuzz` makes 10,000 more, 200 command lines, and some whole runs.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMAT
 from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.runtime.checkpoint import Saved
 
-SHORT = 200  # mutations a kind
+SHORT = 80  # mutations a kind
 LONG = -(-10_000 // len(KINDS))
 
 

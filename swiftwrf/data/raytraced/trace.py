@@ -24,9 +24,9 @@ from swiftwrf.data.raytraced.scene import Scene, sionna
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.validation import NonNegativeInt, configuration
 
-SEARCH_RAYS = 100_000  # that search for chains of surfaces
+SEARCH_RAYS = 30_000  # that search for chains of surfaces
 SCATTERED_RAYS = 300  # each is a path wherever it scatters
-BATCH_POSITIONS = 8  # chains share a table, which many positions would fill
+BATCH_POSITIONS = 32  # chains share a table, which many positions would fill
 SAME_IMAGE_M = 1e-3  # distance below which two image sources are one, found twice
 DIFFUSE = 2  # Sionna's number of a scattering
 Table = dict[str, NDArray[Any]]

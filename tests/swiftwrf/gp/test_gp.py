@@ -17,7 +17,9 @@ from swiftwrf.gp import (
     choose_rank,
     held_out,
     most_informative,
+    subsample,
 )
+from swiftwrf.gp.choice import MAX_LOCAL_ROWS, _held_out_errors, _local_errors
 
 KERNEL = Kernel(long=1.0, short=0.3, share=0.6, noise=1e-2)
 
@@ -63,6 +65,25 @@ def test_kernel_choice_finds_smooth_and_rough_fields(generator):
     smooth = torch.sin(position @ torch.rand(3, 64, generator=generator, dtype=torch.float64)).reshape(80, 8, 8)
     noise = torch.rand(80, 8, 8, generator=generator)
     assert choose_kernel(position, smooth, fold).noise < choose_kernel(position, noise, fold).noise
+
+
+def test_kernel_of_many_spectra_is_judged_at_their_own_density(generator):
+    """The neighbours that predict a held-out spectrum are the nearest of all spectra in other folds, not of a sample."""
+    position, spectrum = (torch.rand(500, *shape, generator=generator, dtype=torch.float64) for shape in ((3,), (2, 3)))
+    fold, change = torch.arange(500) % 5, (spectrum - subsample(spectrum)[0].mean(dim=0)).flatten(1)
+    errors = _local_errors(position, spectrum, fold)(KERNEL)
+    for row, error in list(zip(subsample(torch.arange(500), rows=MAX_LOCAL_ROWS)[0], errors, strict=True))[::50]:
+        kept = fold != fold[row]
+        process = GaussianProcess.regress(KERNEL, position[kept], change[kept], exact=False)
+        torch.testing.assert_close(error, (process.mean(position[row, None])[0] - change[row]).square().mean())
+
+
+def test_local_errors_of_all_neighbours_are_the_exact_ones(generator):
+    position, spectrum = (torch.rand(40, *shape, generator=generator, dtype=torch.float64) for shape in ((3,), (4, 5)))
+    exact, local = (
+        errors(position, spectrum, torch.arange(40))(KERNEL) for errors in (_held_out_errors, _local_errors)
+    )
+    torch.testing.assert_close(local, exact)
 
 
 def test_rank_counts_what_matters(generator):

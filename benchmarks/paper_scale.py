@@ -1,0 +1,296 @@
+"""Measure every field model on ray-traced scenes of the size of the paper's: 6,000 positions a scene.
+
+The positions lie at one height, as a trolley would measure them. Scenes are traced into the folder `--data`, unless they are
+there. Each measured row is kept in the folder `--work`, and unfinished fits and runs continue from their state. Rows of the
+committed result that were not measured again stay in the result. All seconds are processor seconds of one thread, so that
+other work on the machine changes them little.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import tyro
+from committed import RESULTS
+from comparison import MEAN, SHARES, milliseconds, weight
+from locating_aoa import KERNEL, angle_summary
+from record import write_result
+from torch import Tensor
+
+from augment import Mixed, withhold
+from swiftwrf import FitConfig, MatchedField, Spectra, SwiftWRF, load_spectra, make_model
+from swiftwrf.array.planar import LIGHT_SPEED
+from swiftwrf.choices import Moving
+from swiftwrf.data.raytraced import ROOMS
+from swiftwrf.data.splits import validation_for
+from swiftwrf.gp import subsample
+from swiftwrf.metrics import l1, psnr, ssim, summary
+from swiftwrf.models.base import FieldModel
+from swiftwrf.positions import Neighbours
+from swiftwrf.runtime.durable import write_text
+from tasks.aoa.context import ROOM_MODEL
+from tasks.aoa.estimators import make_estimator
+from tasks.aoa.experiment import run as run_aoa
+from tasks.aoa.options import AoaConfig, fraction_key
+from tasks.environment import machine
+from tasks.scenes.options import ScenesConfig
+from tasks.scenes.run import run as trace
+
+POSITIONS, QUICK_POSITIONS = 6000, 300
+HEIGHT_M = 1.2  # of all positions
+SCENES: tuple[tuple[str, Moving], ...] = tuple(
+    (room, moving) for room in ("conference", "office", "bedroom") for moving in ("transmitter", "receiver")
+)
+DEFORMING = "swiftwrf_paper"  # the paper's own deformation, fitted by gradient descent
+CLOSED_FORM = (MEAN, "nearest", "idw", "gp", "coarray", "geometry", "hybrid", "swiftwrf")
+BY_GRADIENT = ("nerf2", "wrfgs", "vae", "dcgan", DEFORMING)
+METHODS = (*CLOSED_FORM, *BY_GRADIENT)
+DEFORMING_PRIMITIVES, DEFORMING_BATCH, DEFORMING_STEPS = 256, 4, 4000  # sized for a CPU
+QUICK_DIVISOR = 20  # of the steps of a fit by gradient descent under --quick
+JUDGES = 200  # test spectra of a split, evenly chosen: a neural field takes seconds to predict one
+COUNTS, QUICK_COUNTS = (200, 500, 1000, 2000, 3000), (60, 120)  # training spectra
+TURBO = ("swiftwrf", "nerf2", "wrfgs", "hybrid")
+LOCATED_FRACTIONS = (0.1, 1.0)  # measured fractions of the estimators without a network
+MATCHED = "matched_field"  # at the smallest fraction alone
+CPU = torch.device("cpu")
+Split = Literal["random", "block"]
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Config:
+    data: Path
+    """folder of the scenes; those that are missing are traced (extra: raytrace)"""
+    only: tuple[str, ...] = tuple(f"{room}-{moving}" for room, moving in SCENES)
+    """scenes to measure"""
+    parts: tuple[Literal["scenes", "counts", "locating", "aoa"], ...] = ("scenes", "counts", "locating", "aoa")
+    """every method on every scene; with fewer training spectra; angle of arrival without and with networks. All but the
+    first on the first scene only"""
+    splits: tuple[Split, ...] = ("random", "block")
+    """splits of the scenes"""
+    methods: tuple[str, ...] = METHODS
+    """methods of the part `scenes`"""
+    steps: int | None = None
+    """number of steps of every fit by gradient descent. Defaults to that of each quick preset"""
+    synthesizers: tuple[str, ...] = TURBO
+    """field models of the part `aoa`"""
+    repeats: int = 3
+    """draws of the measured spectra in the part `aoa`"""
+    quick: bool = False
+    """300 positions, a twentieth of the steps, no angle of arrival"""
+    work: Path = Path("runs/paper_scale")
+    """folder of the rows measured so far"""
+    seed: int = 0
+    """seed of scenes, splits and fits"""
+
+
+def main(config: Config) -> None:
+    """Measure the missing rows and write `results/paper_scale.json` (`paper_scale_quick.json`)."""
+    torch.set_num_threads(1)
+    positions = QUICK_POSITIONS if config.quick else POSITIONS
+    work = config.work / str(positions)
+    work.mkdir(parents=True, exist_ok=True)
+    name = "paper_scale_quick" if config.quick else "paper_scale"
+    for room, moving in SCENES:
+        scene = f"{room}-{moving}"
+        if scene not in config.only:
+            continue
+        folder = traced(room, moving, positions, config)
+        data = load_spectra(folder)
+        first = (room, moving) == SCENES[0]
+        write_text(work / f"{scene}.scene.json", json.dumps(described(room, data, folder)))
+        for split in config.splits:
+            train, test = data.split(split, config.seed)
+            measure(config, work / f"{scene} {split}", train, test, split, first)
+            if first and split == "random" and "locating" in config.parts:
+                locate(work, train, test, config.seed)
+        if first and "aoa" in config.parts and not config.quick:
+            estimate_angles(config, folder, work / "aoa")
+        write_result(name, gathered(work, name) | {"positions": positions, "height_m": HEIGHT_M, "seed": config.seed})
+
+
+def traced(room: str, moving: Moving, positions: int, config: Config) -> Path:
+    """Return the folder of a scene, traced unless it is there."""
+    folder = config.data / str(positions) / f"{room}-{moving}"
+    if not folder.exists():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        (x, y, _), (far_x, far_y, _) = ROOMS[room].region
+        region = (x, y, HEIGHT_M, far_x, far_y, HEIGHT_M)
+        trace(ScenesConfig(room, moving, positions, str(folder), region=region, seed=config.seed))
+    return folder
+
+
+def described(room: str, data: Spectra, folder: Path) -> Row:
+    """Return the density of the positions in wavelengths, and how the scene was traced."""
+    scene = json.loads((folder / "scene.json").read_text())
+    wavelength = LIGHT_SPEED / scene["options"]["frequency"]
+    train, test = data.split("random")
+    nearest = Neighbours(train.position)(test.position, 1)[0].median()
+    low, high = ROOMS[room].region
+    area = (high[0] - low[0]) * (high[1] - low[1])
+    kept = ("positions", "line_of_sight", "paths_per_position", "seconds", "command")
+    return {
+        "spacing_wavelengths": math.sqrt(area / len(data)) / wavelength,
+        "nearest_training_wavelengths": float(nearest) / wavelength,
+        "traced": {key: scene[key] for key in kept},
+    }
+
+
+def measure(config: Config, prefix: Path, train: Spectra, test: Spectra, split: Split, first: bool) -> None:
+    """Measure the missing rows of one split."""
+    test = test.subset(*subsample(torch.arange(len(test)), rows=JUDGES)).in_memory()
+    for method, n in wanted(config, len(train), split, first):
+        file = Path(f"{prefix} {n} {method}")
+        if not Path(f"{file}.json").exists():
+            some = train.subset(torch.randperm(len(train), generator=torch.Generator().manual_seed(config.seed))[:n])
+            found = row(built(method, split, config), some, test, Path(f"{file}.state"))
+            write_text(Path(f"{file}.json"), json.dumps(found | {"machine": machine(CPU)}))
+            print(file.name, f"{found['psnr_db']['median']:.2f} dB, {found['fit_seconds']:.0f} s", flush=True)
+
+
+def wanted(config: Config, everything: int, split: Split, first: bool) -> Iterator[tuple[str, int]]:
+    """Yield the methods of a split and their numbers of training spectra."""
+    if "scenes" in config.parts:
+        yield from ((method, everything) for method in config.methods)
+    if "counts" in config.parts and first and split == "random":
+        yield from (("swiftwrf", n) for n in (QUICK_COUNTS if config.quick else COUNTS))
+
+
+def built(method: str, split: Split, config: Config) -> FieldModel | None:
+    """Return a method, not fitted. None for the mean training spectrum."""
+    if method == MEAN:
+        return None
+    options: dict[str, Any] = {"validation": validation_for(split), "seed": config.seed}
+    if method == DEFORMING:
+        paper = FitConfig.paper()
+        model: FieldModel = SwiftWRF(
+            replace(
+                paper,
+                model=replace(paper.model, n_primitives=DEFORMING_PRIMITIVES),
+                batch=DEFORMING_BATCH,
+                steps=DEFORMING_STEPS,
+                max_azimuths=FitConfig().max_azimuths,
+                check_every=FitConfig().check_every,
+                **options,
+            )
+        )
+    else:
+        model = make_model(method, **options)
+    steps = getattr(model.config, "steps", 0)
+    if steps and (config.steps or config.quick):
+        model = type(model)(replace(model.config, steps=config.steps or steps // QUICK_DIVISOR))
+    return model
+
+
+def row(model: FieldModel | None, train: Spectra, test: Spectra, state: Path) -> Row:
+    """Return scores at the test positions, seconds of the fit and of a spectrum, and size of a method."""
+    clock, seconds = time.process_time, state.with_suffix(".seconds")
+    earlier = json.loads(seconds.read_text()) if seconds.exists() else 0.0
+    began = clock()
+
+    def on_record(record: Row) -> None:
+        """Keep the seconds of an unfinished fit beside its state."""
+        write_text(seconds, json.dumps(earlier + clock() - began))
+
+    if model is None:
+        mean = train.spectrum.mean(dim=0)
+        size: Row = {"parameters": mean.numel(), "megabytes": 4e-6 * mean.numel()}
+
+        def synthesize(position: Tensor) -> Tensor:
+            return mean.repeat(len(position), 1, 1)
+    else:
+        model.fit(train, checkpoint=state, on_record=on_record)
+        synthesize = model.synthesize
+    fit_seconds = earlier + clock() - began
+    if model is not None:
+        size = weight(model, train, state.with_suffix(".model")) | {"steps": getattr(model.config, "steps", 0)}
+    predicted = synthesize(test.position)
+    scores = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
+    found: Row = {name: summary(score(predicted, test.spectrum)) for name, score in scores.items()}
+    found |= {"fit_seconds": fit_seconds, "ms": milliseconds(synthesize, test.position, clock), **size}
+    for file in (state, seconds):
+        file.unlink(missing_ok=True)
+    return found | {"n_train": len(train), "n_test": len(test)}
+
+
+def locate(work: Path, train: Spectra, test: Spectra, seed: int) -> None:
+    """Measure the angular errors of the estimators without a network, unless they are measured."""
+    test = test.subset(*subsample(torch.arange(len(test)), rows=JUDGES)).in_memory()
+    for fraction in LOCATED_FRACTIONS:
+        measured = withhold(train, fraction, seed)[0] if fraction < 1 else train
+        for method in ("nearest_spectrum", KERNEL, *((MATCHED,) if fraction < 1 else ())):
+            file = work / f"{fraction_key(fraction)} {method}.angles.json"
+            if file.exists():
+                continue
+            began = time.process_time()
+            if method == MATCHED:
+                locator = MatchedField(seed=seed).fit(measured, room=make_model(ROOM_MODEL, seed=seed).fit(measured))
+                estimate = locator.predict(test.spectrum)
+            else:
+                estimate = make_estimator(method, seed=seed).fit(Mixed.measured(measured)).predict(test.spectrum)
+            seconds = time.process_time() - began
+            errors = {"n_measured": len(measured), "seconds": seconds, "angle_deg": angle_summary(estimate, test)}
+            print(file.stem, f"{errors['angle_deg']['median']:.2f} degrees", flush=True)
+            write_text(file, json.dumps(errors))
+
+
+def estimate_angles(config: Config, folder: Path, out: Path) -> None:
+    """Run turbo learning with the spectra of several field models, unless the run is finished."""
+    stopped = out.with_name("aoa.partial")
+    if not out.exists():
+        task = AoaConfig(
+            SHARES, str(folder), synthesizer=config.synthesizers, extra=0, repeats=config.repeats, out=str(out)
+        )
+        run_aoa(task, stopped if stopped.exists() else None)
+
+
+def gathered(work: Path, name: str) -> Row:
+    """Return all measured rows, and the rows of the committed result that were not measured again."""
+    committed = RESULTS / f"{name}.json"
+    found: Row = {"described": {}, "scenes": {}, "locating": {}, "aoa": None}
+    if committed.exists():
+        found |= {key: value for key, value in json.loads(committed.read_text()).items() if key in found}
+    found = copy.deepcopy(found)
+    for file in work.glob("* * * *.json"):
+        scene, split, n, method = file.stem.split()
+        found["scenes"].setdefault(scene, {}).setdefault(split, {}).setdefault(n, {})[method] = json.loads(
+            file.read_text()
+        )
+    for file in work.glob("*.scene.json"):
+        found["described"][file.name.removesuffix(".scene.json")] = json.loads(file.read_text())
+    for file in work.glob("*.angles.json"):
+        fraction, method = file.name.removesuffix(".angles.json").split()
+        found["locating"].setdefault(fraction, {})[method] = json.loads(file.read_text())
+    if (work / "aoa" / "metrics.json").exists():
+        mixes = json.loads((work / "aoa" / "metrics.json").read_text())["mixes"]
+        angles = ("elevation_deg", "azimuth_deg", "great_circle_deg")
+        found["aoa"] = {
+            share: {method: {angle: errors[angle] for angle in angles} for method, errors in mix["methods"].items()}
+            for share, mix in mixes.items()
+        }
+    order = [f"{room}-{moving}" for room, moving in SCENES]
+    found["described"] = {scene: found["described"][scene] for scene in order if scene in found["described"]}
+    found["scenes"] = {
+        scene: {
+            split: {
+                n: dict(sorted(rows.items(), key=lambda item: METHODS.index(item[0])))
+                for n, rows in sorted(by_count.items(), key=lambda item: -int(item[0]))
+            }
+            for split, by_count in sorted(found["scenes"][scene].items(), reverse=True)
+        }
+        for scene in order
+        if scene in found["scenes"]
+    }
+    return found
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

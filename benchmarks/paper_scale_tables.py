@@ -1,0 +1,210 @@
+"""Make the tables of docs/paper-scale.md, with the paper's values beside the measured ones."""
+
+from __future__ import annotations
+
+import statistics
+from typing import Any
+
+from committed import interval, load, markdown
+from comparison_tables import PAPER_TURBO
+
+OURS = ("swiftwrf", "coarray", "geometry", "hybrid")
+PUBLISHED = ("nerf2", "wrfgs", "vae", "dcgan")
+# median PSNR [dB], median SSIM and mean L1 of the paper's table of scenes, on its own spectra of rooms of these names
+PAPER = {
+    "conference-transmitter": {
+        "vae": (21.54, 0.7095, 0.0656),
+        "dcgan": (22.41, 0.7290, 0.0600),
+        "nerf2": (26.12, 0.8122, 0.0555),
+        "wrfgs": (25.53, 0.7888, 0.0514),
+        "swiftwrf_paper": (30.75, 0.9039, 0.0410),
+    },
+    "conference-receiver": {
+        "vae": (23.93, 0.7664, 0.0524),
+        "dcgan": (21.26, 0.7164, 0.0608),
+        "nerf2": (28.21, 0.8528, 0.0387),
+        "wrfgs": (26.64, 0.7916, 0.0423),
+        "swiftwrf_paper": (30.54, 0.9137, 0.0315),
+    },
+    "office-transmitter": {
+        "vae": (23.51, 0.7647, 0.0549),
+        "dcgan": (22.55, 0.7441, 0.0559),
+        "nerf2": (27.52, 0.8118, 0.0497),
+        "wrfgs": (24.00, 0.7422, 0.0534),
+        "swiftwrf_paper": (32.96, 0.9376, 0.0355),
+    },
+    "office-receiver": {
+        "vae": (22.75, 0.7562, 0.0612),
+        "dcgan": (20.95, 0.7809, 0.0529),
+        "nerf2": (24.16, 0.7863, 0.0515),
+        "wrfgs": (24.07, 0.7460, 0.0510),
+        "swiftwrf_paper": (28.01, 0.8755, 0.0406),
+    },
+    "bedroom-transmitter": {
+        "vae": (22.90, 0.7468, 0.0612),
+        "dcgan": (21.66, 0.7314, 0.0625),
+        "nerf2": (25.99, 0.8004, 0.0608),
+        "wrfgs": (26.10, 0.7995, 0.0534),
+        "swiftwrf_paper": (30.17, 0.9166, 0.0442),
+    },
+    "bedroom-receiver": {
+        "vae": (22.57, 0.7414, 0.0609),
+        "dcgan": (21.79, 0.7208, 0.0601),
+        "nerf2": (25.51, 0.8057, 0.0505),
+        "wrfgs": (25.50, 0.7901, 0.0482),
+        "swiftwrf_paper": (28.15, 0.9023, 0.0398),
+    },
+}
+Rows = dict[str, dict[str, Any]]  # by method
+
+
+def _with_all(scene: dict[str, Any], split: str) -> Rows:
+    """Return the rows of a split with all training spectra."""
+    by_count = scene.get(split, {})
+    rows: Rows = by_count[max(by_count, key=int)] if by_count else {}
+    return rows
+
+
+def _score(row: dict[str, Any] | None, best: bool = False) -> str:
+    if row is None:
+        return ""
+    psnr = f"{row['psnr_db']['median']:.2f}"
+    return f"{f'**{psnr}**' if best else psnr} / {row['ssim']['median']:.3f} / {row['l1']['mean']:.4f}"
+
+
+def _best(rows: Rows) -> float:
+    return max((row["psnr_db"]["median"] for row in rows.values()), default=0.0)
+
+
+def paper_scale() -> str:
+    """Return every method on every scene and split, the best PSNR of a split in bold."""
+    return _methods("paper_scale")
+
+
+def paper_scale_quick() -> str:
+    """Return the same table of the quick study."""
+    return _methods("paper_scale_quick")
+
+
+def _methods(result: str) -> str:
+    table = []
+    for name, scene in load(result)["scenes"].items():
+        splits = {split: _with_all(scene, split) for split in ("random", "block")}
+        for method in dict.fromkeys(method for rows in splits.values() for method in rows):
+            own = [rows.get(method) for rows in splits.values()]
+            scores = [
+                _score(row, row is not None and row["psnr_db"]["median"] == _best(rows))
+                for row, rows in zip(own, splits.values(), strict=True)
+            ]
+            row = next(row for row in own if row)
+            cost = [f"{row['fit_seconds']:.0f}", f"{row['ms']['median']:.1f}", f"{row['megabytes']:.2f}"]
+            paper = PAPER[name].get(method)
+            table.append(
+                [
+                    f"{name} ({row['n_train']:,})",
+                    method,
+                    *scores,
+                    f"{row['steps']:,}" if row.get("steps") else "",
+                    *cost,
+                    f"{paper[0]:.2f} / {paper[1]:.3f} / {paper[2]:.4f}" if paper else "",
+                ]
+            )
+    columns = ["scene (training spectra)", "method", "random", "block", "steps", "fit [s]", "ms a spectrum", "MB"]
+    return markdown([*columns, "paper, other spectra of a room of the same name"], table)
+
+
+def paper_scale_density() -> str:
+    """Return how densely the positions of each scene lie."""
+    rows = [
+        [
+            name,
+            f"{scene['traced']['positions']:,}",
+            f"{scene['spacing_wavelengths']:.2f}",
+            f"{scene['nearest_training_wavelengths']:.2f}",
+            f"{scene['traced']['line_of_sight'] / scene['traced']['positions']:.0%}",
+            f"{scene['traced']['paths_per_position']:.0f}",
+        ]
+        for name, scene in load("paper_scale")["described"].items()
+    ]
+    columns = ["scene", "positions", "spacing [wavelengths]", "nearest training position [wavelengths]"]
+    return markdown([*columns, "line of sight", "paths a position"], rows)
+
+
+def paper_scale_counts() -> str:
+    """Return the scores of swiftwrf against the number of training spectra."""
+    rows = []
+    for name, scene in load("paper_scale")["scenes"].items():
+        found = {n: methods["swiftwrf"] for n, methods in scene.get("random", {}).items() if "swiftwrf" in methods}
+        if len(found) > 1:
+            for n in sorted(found, key=int):
+                row = found[n]
+                cells = [f"{row['ssim']['median']:.3f} [{row['ssim']['low']:.3f}, {row['ssim']['high']:.3f}]"]
+                cells += [f"{row['psnr_db']['median']:.2f}", f"{row['fit_seconds']:.0f}", f"{row['megabytes']:.2f}"]
+                rows.append([name, f"{int(n):,}", *cells])
+    return markdown(["scene, random split", "training spectra", "SSIM", "PSNR [dB]", "fit [s]", "MB"], rows)
+
+
+def paper_scale_targets() -> str:
+    """Return the comparisons on the random split that the targets name, and their means over the scenes."""
+    table, means = [], []
+    for name, scene in load("paper_scale")["scenes"].items():
+        rows = _with_all(scene, "random")
+        if "swiftwrf" not in rows:
+            continue
+        own = max((m for m in OURS if m in rows), key=lambda m: rows[m]["psnr_db"]["median"])
+        best, mine = rows[own], rows["swiftwrf"]
+        paper = PAPER[name]["swiftwrf_paper"]
+        means.append((best["psnr_db"]["median"], best["ssim"]["median"], *paper[:2]))
+        others = {m: rows[m] for m in PUBLISHED if m in rows}
+        other = max(others, key=lambda m: others[m]["psnr_db"]["median"], default="")
+        gp = rows.get("gp")
+        table.append(
+            [
+                name,
+                f"{best['psnr_db']['median']:.2f} / {best['ssim']['median']:.3f} ({own})",
+                f"{paper[0]:.2f} / {paper[1]:.3f}",
+                f"{mine['psnr_db']['median']:.2f} / {mine['ssim']['median']:.3f}",
+                f"{others[other]['psnr_db']['median']:.2f} / {others[other]['ssim']['median']:.3f} ({other})"
+                if other
+                else "",
+                f"{mine['psnr_db']['median'] - gp['psnr_db']['median']:+.2f}" if gp else "",
+                f"{mine['megabytes'] / gp['megabytes']:.1%}" if gp else "",
+                f"{mine['fit_seconds']:.0f}",
+            ]
+        )
+    mean = [statistics.fmean(column) for column in zip(*means, strict=True)]
+    table.append(
+        [f"mean of {len(means)}", f"{mean[0]:.2f} / {mean[1]:.3f}", f"{mean[2]:.2f} / {mean[3]:.3f}", *[""] * 5]
+    )
+    columns = ["scene, random split: PSNR [dB] / SSIM", "best of ours", "paper, other spectra", "swiftwrf"]
+    columns += ["best of the published methods", "swiftwrf against gp [dB]", "size against gp", "fit of swiftwrf [s]"]
+    return markdown(columns, table)
+
+
+def paper_scale_locating() -> str:
+    """Return the angular errors of the estimators without a network at each measured fraction."""
+    rows = [
+        [
+            f"{float(fraction):.0%} ({errors['n_measured']:,} spectra)",
+            method,
+            f"{errors['angle_deg']['median']:.2f}",
+            f"{errors['angle_deg']['p90']:.2f}",
+            f"{errors['seconds']:.0f}",
+        ]
+        for fraction, methods in sorted(load("paper_scale")["locating"].items())
+        for method, errors in methods.items()
+    ]
+    columns = ["measured", "estimator", "median angular error [deg]", "90th percentile [deg]", "fit and estimates [s]"]
+    return markdown(columns, rows)
+
+
+def paper_scale_aoa() -> str:
+    """Return the median errors of the angle of arrival at each measured fraction."""
+    rows = []
+    for share, methods in (load("paper_scale")["aoa"] or {}).items():
+        for name, errors in methods.items():
+            paper = PAPER_TURBO.get(share, {}).get(name.removeprefix("turbo_"))
+            cells = [interval(errors[angle]) for angle in ("elevation_deg", "azimuth_deg", "great_circle_deg")]
+            rows.append([f"{float(share):.0%}", name, *cells, " / ".join(map(str, paper)) if paper else ""])
+    columns = ["measured", "estimator", "elevation [deg]", "azimuth [deg]", "angular error [deg]"]
+    return markdown([*columns, "paper, other spectra: elevation / azimuth"], rows)
