@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from scipy.optimize import brentq
 from torch import Tensor
 
 from swiftwrf.errors import InputError
@@ -47,6 +48,12 @@ class Kernel:
         finite = all(map(math.isfinite, (self.long, self.short, self.share, self.noise)))
         if not (finite and self.long > 0 and self.short > 0 and 0 <= self.share <= 1 and self.noise >= 0):
             raise InputError(f"a kernel needs lengths above 0, a share in [0, 1] and a noise from 0, got {self}")
+
+    @property
+    def correlation_length(self) -> float:
+        """Distance at which the covariance has fallen to 1/e, in the unit of the positions."""
+        longest = max(self.long, self.short)
+        return float(brentq(lambda r: float(self.at(torch.tensor(r).double())) - 1 / math.e, 0.0, 2 * longest))
 
     def scaled(self, factor: float) -> Kernel:
         """Return the equivalent kernel for positions that are multiplied by `factor`."""

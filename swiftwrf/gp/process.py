@@ -111,6 +111,12 @@ class GaussianProcess:
         options = self._asked_exact, self.coefficient.dtype, self.correlation[kept]
         return self.regress(self.kernel, self.known[kept], self.value[kept], *options)
 
+    def with_kernel(self, kernel: Kernel) -> GaussianProcess:
+        """Return the process of the values with another kernel."""
+        assert self.coefficient is not None
+        options = self._asked_exact, self.coefficient.dtype, self.correlation
+        return self.regress(kernel, self.known, self.value, *options)
+
     def widened(self, count: int) -> GaussianProcess:
         """Return the process with some more columns of values, all 0."""
         process = copy(self)

@@ -10,6 +10,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import folds
+from swiftwrf.data.store import Store
 from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, subsample
 from swiftwrf.models.base import FitContext
 from swiftwrf.models.nearest import MemoryModel
@@ -39,11 +40,6 @@ class GPModel(ProcessModel, MemoryModel):
         fold = folds(train.position, self.config.validation, self.config.seed)
         self._prepare(_without_values(choose_kernel(train.position, train.store, fold), train.position))
 
-    @property
-    def kernel(self) -> Kernel:
-        """Kernel of the process."""
-        return self.process.kernel
-
     def _prepare(self, process: GaussianProcess) -> None:
         """Precompute what predictions share: mean, and differences from the mean, if they are few."""
         self._mean, self.process = self.store.mean(), process
@@ -52,6 +48,12 @@ class GPModel(ProcessModel, MemoryModel):
 
     def _values(self, new: Spectra) -> Tensor:
         return torch.zeros(len(new), 0)  # the values are the spectra of the store
+
+    def _weighted_values(self) -> Store:
+        return self.store
+
+    def _set_process(self, process: GaussianProcess) -> None:
+        self._prepare(process)
 
     def _update(self, new: Spectra) -> None:
         super()._update(new)

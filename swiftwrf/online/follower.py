@@ -9,15 +9,19 @@ import torch
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
+from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.models.base import FieldModel
+from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.online.adaptation import adapted
 from swiftwrf.online.change import Alarm
+from swiftwrf.online.kernel import KernelMonitor, described
 from swiftwrf.online.monitor import Monitor, MonitorConfig
 from swiftwrf.online.obstacles import ObstacleMonitor
 from swiftwrf.online.prequential import Scores, learnt, score
 from swiftwrf.rssi.model import RssiModel
 
+ROOM_NOTICE = "the room no longer explains the spectra since measurement {}; unless an obstacle does, fit it again"
 MAX_RECENT = 500  # spectra that are kept to adapt the model to a change
 
 
@@ -29,6 +33,7 @@ class Step:
         scores: Its scores before it was learnt, of length 1.
         alarms: Changes that it revealed, in words.
         correlation: Correlation of the fields before and after a change to which the model was adapted; None without one.
+        notice: Another kernel, or that a room no longer explains the spectra, in words; empty without either.
 
     Example:
         >>> import swiftwrf
@@ -42,13 +47,16 @@ class Step:
     scores: Scores
     alarms: tuple[str, ...]
     correlation: float | None = None
+    notice: str = ""
 
 
 class Follower:
     """A fitted model that learns measurements one by one.
 
     An alarm of the innovations adapts models of spectra to the change, if these can forget spectra, and restarts the test.
-    With a room and training spectra, obstacles that appear or leave are detected, too.
+    Kernel and noise are chosen again while the data grow (`KernelMonitor`).
+    With a room and training spectra, obstacles that appear or leave are detected, too. A notice reports once if the room no
+    longer explains the spectra. The planes of a geometry are refined whenever 10 positions are new.
 
     Args:
         model: Fitted model with `update`.
@@ -73,11 +81,16 @@ class Follower:
     ) -> None:
         self.model, self.count = model, 0
         self.monitor = Monitor.of(model, train, config)
+        self._kernel = KernelMonitor(self.monitor.config.false_alarm_rate)
         self.obstacles: ObstacleMonitor | None = None
         """test for obstacles, None without room or training spectra"""
+        self.room: Monitor | None = None
+        """test of the coherence of room and spectra; None without room or training spectra, and after its alarm"""
         if isinstance(model, FieldModel) and model.room is not None and isinstance(train, Spectra):
             self.obstacles = ObstacleMonitor(model.room, train, self.monitor.config.false_alarm_rate)
+            self.room = Monitor(train.position, (), self.obstacles.unexplained(train), self.monitor.config)
         self._recent: list[Spectra] = []
+        self._waiting: list[Spectra | Rssi] = []  # of a geometry, for its next update
 
     def step(self, new: Spectra | Rssi) -> Step:
         """Score one measurement, test it for a change, and learn it.
@@ -87,16 +100,46 @@ class Follower:
         """
         scores = score(self.model, new)
         alarms = self.monitor.observe(scores.position[0], scores.innovation[0])
-        words, correlation = list(map(self.monitor.describe, alarms)), None
+        words, correlation, notices = list(map(self.monitor.describe, alarms)), None, []
         if self.obstacles is not None and isinstance(new, Spectra):
             words += map(self.obstacles.describe, self.obstacles.observe(new))
-        self.model = learnt(self.model, new)
+            notices += self._check_room(self.obstacles, new)
+        self._learn(new)
         self.count += 1
         if isinstance(new, Spectra) and isinstance(self.model, ProcessModel):
             self._recent = [*self._recent, new][-MAX_RECENT:]
             if alarms:
                 correlation = self._adapt(self.model, alarms[0])
-        return Step(scores, tuple(words), correlation)
+        if correlation is None and isinstance(self.model, ProcessModel | RssiModel):
+            notices += self._choose_kernel(self.model, new, scores)
+        return Step(scores, tuple(words), correlation, "; ".join(notices))
+
+    def _learn(self, new: Spectra | Rssi) -> None:
+        self._waiting.append(new)
+        if isinstance(self.model, GeometryModel):
+            waiting = [one for one in self._waiting if isinstance(one, Spectra)]
+            if len(torch.cat([one.position for one in waiting]).unique(dim=0)) < MIN_TRAINING:
+                return
+            new = joined(waiting)
+        self._waiting = []
+        self.model = learnt(self.model, new)
+
+    def _check_room(self, obstacles: ObstacleMonitor, new: Spectra) -> list[str]:
+        """Return a notice if the room no longer explains the spectra, which ends the test."""
+        alarms = self.room.observe(new.position[0], obstacles.unexplained(new)) if self.room is not None else []
+        if not alarms:
+            return []
+        self.room = None
+        return [ROOM_NOTICE.format(alarms[0].since)]
+
+    def _choose_kernel(self, model: ProcessModel | RssiModel, new: Spectra | Rssi, scores: Scores) -> list[str]:
+        """Choose the kernel again; return a notice if another one predicts better."""
+        found = self._kernel.observe(model, new, scores)
+        if found is None:
+            return []
+        self.model, self.monitor = found, Monitor.of(found, None, self.monitor.config)
+        change = described(model.kernel, found.kernel)
+        return [f"kernel chosen again after {self.count} measurements: {change}"]
 
     def _adapt(self, model: ProcessModel, alarm: Alarm) -> float:
         """Adapt the model to a change, and calibrate the test with the next measurements."""
@@ -104,12 +147,14 @@ class Follower:
         after = joined(self._recent[-n:])
         self.model, correlation = adapted(model.forget(torch.arange(learnt - n, learnt)), after)
         self.monitor = Monitor.of(self.model, None, self.monitor.config)
+        self._kernel.restart()
         return correlation
 
     def state(self) -> dict[str, Any]:
         """Return the count of measurements and the state of the tests as plain values."""
         obstacles = None if self.obstacles is None else self.obstacles.state()
-        return {"count": self.count, "monitor": self.monitor.state(), "obstacles": obstacles}
+        room = None if self.room is None else self.room.state()
+        return {"count": self.count, "monitor": self.monitor.state(), "obstacles": obstacles, "room": room}
 
     def resume(self, state: dict[str, Any]) -> None:
         """Continue from a `state`; the model is that of the same moment."""
@@ -118,6 +163,9 @@ class Follower:
         if room is not None and state.get("obstacles") is not None:
             rate = self.monitor.config.false_alarm_rate
             self.obstacles = ObstacleMonitor(room, None, rate).continued(state["obstacles"])
+        if (known := state.get("room")) is not None:
+            centre = torch.tensor(known["centre"], dtype=torch.float64)
+            self.room = Monitor(centre, (), None, self.monitor.config).continued(known)
 
 
 def joined(parts: list[Spectra]) -> Spectra:

@@ -124,6 +124,16 @@ def _reflections(
     return torch.stack(points, dim=1), possible
 
 
+def missing_coherence(scene: PhaseObservations, wave: Tensor, gain: Tensor, blocked: Tensor) -> Tensor:
+    """Return the missing coherence (M, n) of each alternative and the observed phases; arguments as of `evidence`."""
+
+    def missing(some: Tensor) -> Tensor:
+        factor = torch.where(some, BLOCKED_GAIN, 1.0) * gain
+        return 1 - scene.coherence(torch.einsum("mns,nsk->mnk", factor.to(wave.dtype), wave)) + MIN_MISSING
+
+    return torch.cat([missing(part) for part in blocked.split(BATCH_BOXES)])
+
+
 def evidence(scene: PhaseObservations, wave: Tensor, gain: Tensor, base: Tensor, blocked: Tensor) -> Tensor:
     """Return the log likelihood ratios of alternatives and of the base, given the phases of each spectrum.
 
@@ -137,12 +147,7 @@ def evidence(scene: PhaseObservations, wave: Tensor, gain: Tensor, base: Tensor,
     Returns:
         (M, n) [nats], at most 3 in size.
     """
-
-    def missing(some: Tensor) -> Tensor:
-        factor = torch.where(some, BLOCKED_GAIN, 1.0) * gain
-        return 1 - scene.coherence(torch.einsum("mns,nsk->mnk", factor.to(wave.dtype), wave)) + MIN_MISSING
-
-    ratio = torch.cat([missing(base[None]) / missing(part) for part in blocked.split(BATCH_BOXES)])
+    ratio = missing_coherence(scene, wave, gain, base[None]) / missing_coherence(scene, wave, gain, blocked)
     return ((wave.shape[-1] - 1) / 2 * ratio.log()).clamp(-MAX_NATS, MAX_NATS)
 
 
@@ -241,6 +246,11 @@ class ObstacleMonitor:
             self.armed = highest < self.threshold - REGION_NATS or (self.armed and highest <= self.threshold)
             self.count += 1
         return alarms
+
+    def unexplained(self, spectra: Spectra) -> Tensor:
+        """Return the missing coherence of each spectrum and the paths of the room with its standing obstacles, (n,)."""
+        scene, wave, gain, point = _links(self.room, spectra)
+        return missing_coherence(scene, wave, gain, self.standing.block(point).any(0)[None])[0].double()
 
     def describe(self, alarm: Alarm) -> str:
         """Return what changed and where, in words."""

@@ -174,6 +174,8 @@ class RssiPredictor(Configured, Displayed, ABC):
                 f"{listed(self.receiver_names)}; give the same ones in this order"
             )
         predictor = copy(self)
+        if self.attenuation is not None:
+            new = self.attenuation.removed(new)
         if len(new):
             predictor._update(new)
         return predictor

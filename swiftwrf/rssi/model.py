@@ -231,18 +231,56 @@ class RssiModel(RssiPredictor, Saved):
 
     @single_thread()
     def _update(self, new: Rssi) -> None:
-        if self._posterior is None:
-            raise InputError(
-                f"this {self.kind} has the paper's head or is of an earlier version; fit it again to all rows"
-            )
+        posterior = self._checked_posterior()
         if self.offsets is not None:
             new = self.offsets.removed(new)
-        new, before = new.about(self.origin), self._posterior.linear
-        self._posterior = self._posterior.updated(new.transmitter_position - self.centre, new.rssi_dbm)
+        new, before = new.about(self.origin), posterior.linear
+        self._posterior = posterior.updated(new.transmitter_position - self.centre, new.rssi_dbm)
         change = self.mixing_weight[0] * (self._posterior.linear - before).T  # (10, R)
         self.level, self.slope = self.level + change[0], self.slope + change[1]
         self.directivity = self.directivity + change[2:].T.float()
         self._take_rows(self._posterior.folded())
+
+    def with_chosen_kernel(self, without: Tensor | None = None) -> Self:
+        """Return the model fitted again to all rows that it has learnt, with kernel, noise and mixing weights chosen again.
+
+        The rows follow from their residuals. Attenuation of floors and offsets stay as fitted.
+
+        Args:
+            without: Numbers of rows that are forgotten first, in the order in which the model received them, int64. Defaults
+                to none.
+
+        Raises:
+            InputError: A model that cannot be updated, or fewer than 10 measurements.
+
+        Example:
+            >>> import swiftwrf
+            >>> model = RssiModel().fit(swiftwrf.rssi_room(n=60))
+            >>> len(model.with_chosen_kernel(without=torch.arange(10)).anchor)
+            50
+        """
+        self.check_fitted()
+        posterior = self._checked_posterior().folded()
+        kept = torch.ones(len(posterior.anchor), dtype=torch.bool)
+        if without is not None:
+            kept[without] = False
+        rows = Rssi(
+            posterior.rssi[kept],
+            self.region()[kept],
+            receiver_position=self.receiver.where(posterior.state.located[:, None] > 0, torch.nan),
+            receiver_names=self.receiver_names,
+            origin=self.origin,
+        )
+        model = type(self)(self.config).fit(rows)
+        model.attenuation, model.offsets = self.attenuation, self.offsets
+        return model
+
+    def _checked_posterior(self) -> RssiPosterior:
+        if self._posterior is None:
+            raise InputError(
+                f"this {self.kind} has the paper's head or is of an earlier version; fit it again to all rows"
+            )
+        return self._posterior
 
     def _take_rows(self, folded: RssiPosterior) -> None:
         self.anchor, self.coefficient = folded.anchor.float(), folded.coefficient.float()

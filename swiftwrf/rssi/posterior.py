@@ -194,6 +194,16 @@ class RssiPosterior:
         """Coefficients of the kernel to the bins whose sum is the latent field, float64 (n, R) [dB]."""
         return self.state.field_variance * self.state.tangent * self.state.dual
 
+    @property
+    def rssi(self) -> Tensor:
+        """RSSI of the bins of the fit, from fitted values and residuals, float64 (n, R) [dBm]; nan where not detected."""
+        state = self.state
+        latent = self.kernel(self.anchor, self.anchor) @ self.coefficient
+        fitted = state.prior_level + state.prior_slope * log_distance(self.anchor, self.receiver)
+        fitted = fitted + (self._feature @ self._fitted)[..., 0].T
+        fitted = fitted + self.table(latent)[0] - self.table(torch.zeros_like(latent))[0]
+        return (fitted + state.variance * state.dual).where(state.variance > 0, torch.nan)
+
     def updated(self, position: Tensor, rssi: Tensor) -> RssiPosterior:
         """Return the posterior with more rows, RSSI (m, R) [dBm], nan where not detected, at positions (m, 3) [m]."""
         if len(self.new.position) and len(self.new.position) + len(position) > MAX_NEW_ROWS:

@@ -144,6 +144,8 @@ def answer(number: int, new: Rssi | Spectra, before: FieldModel | RssiModel, ste
             found[f"{name}_peak_deg"] = [round(x, 1) for x in direction.tolist()]
         found["covered"] = float(step.scores.covered[0])
     found |= {"error": round(float(step.scores.error[0]), 5), "alarm": "; ".join(step.alarms) or None}
+    if step.notice:
+        found["notice"] = step.notice
     if step.correlation is not None:
         found["correlation"] = step.correlation
     return json.dumps(strict(found), allow_nan=False, ensure_ascii=False)

@@ -35,10 +35,17 @@ def page(record: Record, name: str) -> Page:
         for i in order
     ]
     columns = ["measurement", "x [m]", "y [m]", "z [m]", f"error{record.unit}", "innovation"]
-    changes = [[str(number), text] for number, text in record.alarms]
+    changes = [[str(number), text] for number, text in sorted(record.alarms + record.notices)]
     tables = [Table(columns, cells, "Measurements with the largest innovations.")]
     if changes:
-        tables.append(Table(["measurement", "change"], changes, "Detected changes.", long=True))
+        tables.append(
+            Table(
+                ["measurement", "change"],
+                changes,
+                "Detected changes, and changes of the model beside its data.",
+                long=True,
+            )
+        )
     sections = [Section("Surprising measurements", tables=tables), Section("Changes", plots=[map_plot(record)])]
     return Page(f"Update: {name}", summary, sections)
 

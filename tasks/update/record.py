@@ -17,7 +17,20 @@ from swiftwrf.runtime.durable import write_text
 from tasks.records import Row, as_table, read_json, write_json
 
 TABLE, SUMMARY = "measurements.csv", "update.json"
-COLUMNS = ("index", "x_m", "y_m", "z_m", "error", "running_error", "innovation", "covered", "alarm", "correlation")
+COLUMNS = (
+    "index",
+    "x_m",
+    "y_m",
+    "z_m",
+    "error",
+    "running_error",
+    "innovation",
+    "covered",
+    "alarm",
+    "correlation",
+    "notice",
+)
+WORDS = ("alarm", "notice")  # columns of text
 WINDOW = 30  # measurements of the running error
 BOXES = ("obstacles", "standing")  # that can have appeared or left; that the training spectra show
 
@@ -62,6 +75,7 @@ class Record:
             "covered": float(scores.covered[0]),
             "alarm": "; ".join(step.alarms),
             "correlation": step.correlation,
+            "notice": step.notice,
         }
         self.rows.append(row)
         if obstacles is not None:
@@ -79,6 +93,11 @@ class Record:
         """Number of the measurement that raised each alarm, and the change in words."""
         return [(number, row["alarm"]) for number, row in enumerate(self.rows) if row["alarm"]]
 
+    @property
+    def notices(self) -> list[tuple[int, str]]:
+        """Number of the measurement after which the model changed beside its data, and how, in words."""
+        return [(number, row["notice"]) for number, row in enumerate(self.rows) if row["notice"]]
+
     def summary(self) -> Row:
         """Return the results as plain values."""
         changes = [
@@ -93,6 +112,7 @@ class Record:
             "last_running_error": self.rows[-1]["running_error"] if self.rows else None,
             "coverage": float(self.column("covered").nanmean()),
             "alarms": changes,
+            "notices": [{"measurement": number, "what": text} for number, text in self.notices],
             **self.boxes,
         }
 
@@ -104,6 +124,7 @@ class Record:
             f"learnt, {found['last_running_error'] or float('nan'):.4g} over the last {WINDOW}"
         ]
         text += [f"change at measurement {number}: {what}" for number, what in self.alarms] or ["no change detected"]
+        text += [what for _, what in self.notices]
         if self.boxes.get("obstacles"):
             n = len(self.boxes["obstacles"])
             text.append(f"an obstacle appeared or left: {n} candidate positions, see the map")
@@ -162,7 +183,9 @@ def _rows(table: Path) -> list[Row]:
         return []
     try:
         text = table.read_bytes().decode()
-        rows = pd.read_csv(io.StringIO(text[: text.rfind("\n") + 1]), dtype={"alarm": str}).fillna({"alarm": ""})
-        return list(rows[list(COLUMNS)].to_dict("records"))
+        rows = pd.read_csv(io.StringIO(text[: text.rfind("\n") + 1]), dtype=dict.fromkeys(WORDS, str))
+        if "notice" not in rows:  # tables of earlier versions
+            rows["notice"] = ""
+        return list(rows[list(COLUMNS)].fillna(dict.fromkeys(WORDS, "")).to_dict("records"))
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"{table} is not the table of an update ({error}); restore it") from None

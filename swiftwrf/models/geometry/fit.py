@@ -235,7 +235,8 @@ def update_room(room: RoomEstimate, planes: PlaneSet, new: Spectra, config: Geom
     offset = planes.offset[0] + weight @ (found.offset - planes.offset)[0]
     gain = planes.gain[0] + weight.diagonal().float() * (found.gain - planes.gain)[0]
     remaining = room.covariance - weight @ room.covariance
-    scale = (remaining.diagonal() / room.covariance.diagonal()).clamp(0, 1).sqrt()
+    ratio = (remaining.diagonal() / room.covariance.diagonal()).nan_to_num(1.0)  # 0 / 0 for planes without uncertainty
+    scale = ratio.clamp(0, 1).sqrt()
     values = zip(room.planes, offset.tolist(), gain.tolist(), scale.tolist(), strict=True)
     refined = [replace(p, offset_m=o, gain=g, std_mm=s * p.std_mm) for p, o, g, s in values]
     return replace(room, planes=refined, covariance=remaining)

@@ -14,7 +14,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
-from swiftwrf.gp import GaussianProcess, SmoothField
+from swiftwrf.gp import GaussianProcess, Kernel, SmoothField
 from swiftwrf.models.base import FitContext
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.models.swiftwrf.config import FitConfig, ModelConfig
@@ -90,6 +90,15 @@ class SwiftWRF(ProcessModel):
         self.field = copy(self.field)
         self.field._modules = self.field._modules | {"deformation": deformation}
 
+    @property
+    def kernel(self) -> Kernel:
+        """Kernel of the component scores, lengths in [m].
+
+        Raises:
+            InputError: As `process`.
+        """
+        return self.process.kernel.scaled(float(self.field.scale))
+
     def _process_position(self, position: Tensor) -> Tensor:
         return self.field.normalise(position)
 
@@ -97,6 +106,12 @@ class SwiftWRF(ProcessModel):
         work = new.at_most(self.config.max_azimuths)
         projection = self._cached("projection", work.grid, self.field.projection)
         return (work.store[:] - projection[0]).flatten(1) @ projection[1:].flatten(1).T
+
+    def _weighted_values(self) -> Tensor:
+        projection = self._cached("projection", self.grid, self.field.projection)[1:]
+        inverse_norm = projection.flatten(1).norm(dim=1)  # of the components, which are orthogonal
+        weighted: Tensor = self.process.value / inverse_norm
+        return weighted
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         field, x = self.field, self.field.normalise(position)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -323,3 +325,98 @@ def test_kills_lose_nothing_and_repeat_at_most_the_last_line(tmp_path, model_fil
         assert after == list(range(after[0], after[0] + len(after)))
     learnt = len(load(out / "model.safetensors").anchor) - 60
     assert learnt <= len(Record.read(out).rows) <= learnt + 1
+
+
+@cache
+def coarse(n, seed):
+    return simulated_room(n=n, seed=seed, grid=AngularGrid.hemisphere(10, 40))
+
+
+def followed(model, new):
+    follower = Follower(model)
+    return follower, [follower.step(new.subset(torch.tensor([i]))) for i in range(len(new))]
+
+
+@pytest.mark.parametrize("name", ["gp", "coarray"])
+def test_a_kernel_of_few_spectra_is_chosen_again(name):
+    train, new = (coarse(105, 0).subset(rows) for rows in (torch.arange(15), torch.arange(15, 105)))
+    model = make_model(name).fit(train)
+    follower, steps = followed(model, new)
+    notices = [step.notice for step in steps if step.notice]
+    assert len(notices) == 1
+    assert re.match(r"kernel chosen again after 60 measurements: correlation length 0\.\d+ -> 1\.9 m", notices[0])
+    assert follower.model.kernel.correlation_length > 10 * model.kernel.correlation_length
+    stale, _ = prequential(model, new)
+    error = torch.cat([step.scores.error for step in steps])
+    torch.testing.assert_close(error[:60], stale.error[:60])
+    assert error[60:].mean() < 0.97 * stale.error[60:].mean()
+
+
+def test_a_kernel_of_few_rows_of_rssi_is_chosen_again():
+    data = rssi_room(n=170)
+    model = RssiModel().fit(data.subset(torch.arange(15)))
+    new = data.subset(torch.arange(15, 170))
+    follower, steps = followed(model, new)
+    assert [step.notice[:12] for step in steps if step.notice] == ["kernel chose"]
+    assert follower.model.kernel != model.kernel
+    error = torch.cat([step.scores.error for step in steps])
+    assert error.nanmean() <= prequential(model, new)[0].error.nanmean()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_a_kernel_of_enough_spectra_stays(seed):
+    data = coarse(170, seed)
+    model = make_model("coarray").fit(data.subset(torch.arange(80)))
+    follower, steps = followed(model, data.subset(torch.arange(80, 170)))
+    assert not any(step.notice for step in steps)
+    assert follower.model.kernel == model.kernel
+
+
+@cache
+def moved(n, seed):
+    """The room with a wall that is 0.3 m away from its place."""
+    return simulated_room(n=n, seed=seed, grid=GRID, room=ShoeboxRoom(size=(6.3, 5.0, 3.0)))
+
+
+def test_a_room_whose_wall_moved_is_searched_again():
+    follower, new = Follower(walls(), spectra(72, 0)), moved(30, 2)
+    follower.resume(json.loads(json.dumps(follower.state())))
+    steps = [follower.step(new.subset(torch.tensor([i]))) for i in range(30)]
+    (notice,) = [step.notice for step in steps if step.notice]
+    assert re.match(r"the room no longer explains the spectra since measurement \d;.*fit it again$", notice)
+    again = Follower(walls())
+    again.resume(json.loads(json.dumps(follower.state())))
+    assert again.room is None
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_room_that_explains_its_spectra_gives_no_notice(seed):
+    follower, new = Follower(walls(), spectra(72, 0)), spectra(100, seed)
+    missing = follower.obstacles.unexplained(new)
+    assert not [a for at, x in zip(new.position, missing, strict=True) for a in follower.room.observe(at, x[None])]
+
+
+def test_a_followed_geometry_is_refined_with_every_ten_spectra():
+    follower, new = Follower(walls()), spectra(12, 1)
+    models = []
+    for i in range(12):
+        follower.step(new.subset(torch.tensor([i])))
+        models.append(follower.model)
+    assert models[8] is walls()
+    assert models[9] is not walls()
+    assert models[11] is models[9]
+    offset = walls().tensors().offset  # of planes without uncertainty
+    torch.testing.assert_close(models[9].tensors().offset, offset)
+
+
+def test_a_notice_is_recorded_and_tables_without_notices_are_read(tmp_path):
+    record, follower = Record("source", " [dB]"), Follower(RssiModel().fit(floor().subset(torch.arange(60))))
+    for i in range(60, 62):
+        step = follower.step(floor().subset(torch.tensor([i])))
+        record.append(tmp_path, record.add(i, replace(step, notice="kernel chosen again" if i == 61 else "")))
+    again = Record.read(tmp_path)
+    assert again.notices == [(1, "kernel chosen again")]
+    assert "kernel chosen again" in again.sentences()
+    table = tmp_path / "measurements.csv"
+    table.write_text("\n".join(line.rpartition(",")[0] for line in table.read_text().splitlines()) + "\n")
+    assert [row["notice"] for row in Record.read(tmp_path).rows] == ["", ""]
