@@ -276,6 +276,7 @@ def plane_waves(n: int, packets: int, subcarriers: int) -> tuple[np.ndarray, np.
 
 NEXMON_FLOATS = {
     3: (9, 5),
+    0xDEAD: (9, 5),
     106: (12, 6),
 }  # by number of the chip: bits of each mantissa with its sign, and of the exponent
 
