@@ -180,7 +180,7 @@ def test_true_cause_is_stated_and_no_other(name):
         check(name, seed)
 
 
-@pytest.mark.long
+@pytest.mark.fuzz
 @pytest.mark.parametrize("name", CAUSES)
 def test_true_cause_is_stated_in_further_scenes(name):
     for seed in range(5, 25):
@@ -251,7 +251,7 @@ def test_no_cause_is_stated_of_other_errors(name):
         check_unknown(name, seed)
 
 
-@pytest.mark.long
+@pytest.mark.fuzz
 @pytest.mark.parametrize("name", UNKNOWN)
 def test_no_cause_is_stated_of_other_errors_in_further_scenes(name):
     for seed in range(34, 50):
