@@ -101,7 +101,7 @@ def is_running(process):
 
 
 def command(folder, threads, *more):
-    environment = os.environ | {"PYTHONPATH": str(HERE.parents[1]), "OMP_NUM_THREADS": str(threads)}
+    environment = os.environ | {"PYTHONPATH": str(HERE.parent), "OMP_NUM_THREADS": str(threads)}
     arguments = [
         "--mix",
         "0.5",

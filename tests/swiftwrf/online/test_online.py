@@ -297,7 +297,7 @@ def test_a_box_that_the_training_spectra_do_not_exclude_raises_no_alarm():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["rows.ndjson", "rows.csv"])
+@pytest.mark.parametrize("name", ["rows.ndjson", pytest.param("rows.csv", marks=pytest.mark.fuzz)])
 def test_kills_lose_nothing_and_repeat_at_most_the_last_line(tmp_path, model_file, name):
     kills, source, out = int(os.environ.get("UPDATE_KILLS", "5")), tmp_path / name, tmp_path / "out"
     rows = list(range(60, 100)) * max(1, kills // 5)  # that no run of the command reaches the end of them
