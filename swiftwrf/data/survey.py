@@ -202,9 +202,7 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
     groups = group.to_numpy()[source.max(axis=1)[row]].tolist() if options.offset_by else []
     labels = tuple(name for name in unused if _distinguishes(table[name]))
     if labels and not options.offset_by:
-        notes.append(
-            f"rows differ in {listed(labels)}; --offset-by COLUMN estimates constant offsets between its values"
-        )
+        notes.append(f"rows differ in {listed(labels)}; tasks.inspect tests whether its values have constant offsets")
     moves = bool(end or options.transmitter)
     if moves and not end:
         notes.append(f"both ends move; {len(names)} positions of column {options.transmitter[0]} count as receivers")
