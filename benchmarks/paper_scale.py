@@ -136,7 +136,7 @@ def described(room: str, data: Spectra, folder: Path) -> Row:
     nearest = Neighbours(train.position)(test.position, 1)[0].median()
     low, high = ROOMS[room].region
     area = (high[0] - low[0]) * (high[1] - low[1])
-    kept = ("positions", "line_of_sight", "paths_per_position", "seconds", "command")
+    kept = ("positions", "line_of_sight", "paths_per_position", "seconds")
     return {
         "spacing_wavelengths": math.sqrt(area / len(data)) / wavelength,
         "nearest_training_wavelengths": float(nearest) / wavelength,
