@@ -7,7 +7,7 @@ from importlib.util import find_spec
 
 import pytest
 import quick
-from test_view_browser import PROGRAMS, serve, until  # noqa: F401, a fixture of the tests
+from test_view_browser import PROGRAMS, chromium, serve, until  # noqa: F401, a fixture of the tests
 
 from swiftwrf.data.writing import write_spectra
 from tasks.report.run import merge
@@ -56,20 +56,9 @@ return [...found];
 
 @pytest.fixture(scope="module")
 def browser():
-    """A browser whose console must be empty in the end."""
-    from selenium import webdriver
-    from selenium.webdriver.chrome.service import Service
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = shutil.which("chromium")
-    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--hide-scrollbars"):
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options, Service(shutil.which("chromedriver")))
-    yield driver
-    complaints = [entry["message"] for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
-    driver.quit()
-    assert complaints == []
+    """A browser for all reports."""
+    with chromium("--hide-scrollbars") as driver:
+        yield driver
 
 
 def looks(browser, width, theme):

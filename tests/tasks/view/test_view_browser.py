@@ -14,6 +14,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -63,24 +64,32 @@ def serve():
         assert process.wait(PATIENCE) in (0, 130)
 
 
-@pytest.fixture
-def browser(serve, tmp_path):
-    """A browser that must have nothing to complain about in the end, which comes before that of the servers."""
+@contextmanager
+def chromium(*arguments, preferences=None):
+    """Yield a browser without a window that must have nothing to complain about in the end."""
     from selenium import webdriver
     from selenium.webdriver.chrome.service import Service
 
     options = webdriver.ChromeOptions()
     options.binary_location = shutil.which("chromium")
-    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1400,1037"):
+    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", *arguments):
         options.add_argument(argument)
-    several = "profile.default_content_setting_values.automatic_downloads"  # without asking the visitor
-    options.add_experimental_option("prefs", {"download.default_directory": str(tmp_path), several: 1})
+    options.add_experimental_option("prefs", preferences or {})
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     driver = webdriver.Chrome(options, Service(shutil.which("chromedriver")))
     yield driver
     complaints = [entry["message"] for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
     driver.quit()
     assert complaints == []
+
+
+@pytest.fixture
+def browser(serve, tmp_path):
+    """A browser that ends before the servers and downloads without asking the visitor."""
+    several = "profile.default_content_setting_values.automatic_downloads"
+    preferences = {"download.default_directory": str(tmp_path), several: 1}
+    with chromium("--window-size=1400,1037", preferences=preferences) as driver:
+        yield driver
 
 
 def until(check):
