@@ -68,7 +68,7 @@ def sizes(config: Config) -> tuple[AngularGrid, tuple[int, ...], tuple[int, ...]
     """Grid, numbers of primitives, batches."""
     if config.quick:
         return AngularGrid.hemisphere(8, 32), (16, 64), (4,)
-    return AngularGrid.hemisphere(90, 360), (64, 1000, 10_000), (64, 1024)
+    return AngularGrid.hemisphere(90, 360), (64, 1000, 10_000), (64, 1024, 4096)
 
 
 def rates(config: Config, device: torch.device) -> Row:

@@ -2,8 +2,9 @@
 
 The positions lie at one height, as a trolley would measure them. Scenes are traced into the folder `--data`, unless they are
 there. Each measured row is kept in the folder `--work`, and unfinished fits and runs continue from their state. Rows of the
-committed result that were not measured again stay in the result. All seconds are processor seconds of one thread, so that
-other work on the machine changes them little.
+committed result that were not measured again stay in the result. Seconds on a CPU are processor seconds of one thread, so
+that other work on the machine changes them little. With `--device cuda` the fits by gradient descent have the settings of
+their publications, shortened to minutes, and seconds are wall-clock.
 """
 
 from __future__ import annotations
@@ -29,6 +30,9 @@ from augment import Mixed, withhold
 from swiftwrf import FitConfig, MatchedField, Spectra, SwiftWRF, load_spectra, make_model
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.choices import Moving
+from swiftwrf.comparison.dcgan import DcganSize
+from swiftwrf.comparison.nerf2 import NeRF2Size
+from swiftwrf.comparison.vae import VaeSize
 from swiftwrf.data.raytraced import ROOMS
 from swiftwrf.data.splits import validation_for
 from swiftwrf.gp import subsample
@@ -54,6 +58,14 @@ CLOSED_FORM = (MEAN, "nearest", "idw", "gp", "coarray", "geometry", "hybrid", "s
 BY_GRADIENT = ("nerf2", "wrfgs", "vae", "dcgan", DEFORMING)
 METHODS = (*CLOSED_FORM, *BY_GRADIENT)
 DEFORMING_PRIMITIVES, DEFORMING_BATCH, DEFORMING_STEPS = 256, 4, 4000  # sized for a CPU
+ON_GPU: dict[str, dict[str, Any]] = {  # changes of the paper presets, for a few minutes of a GPU
+    "nerf2": {"size": NeRF2Size(width=128, bands=10, samples=64), "batch": 2048, "steps": 4000, "decay_steps": None},
+    "wrfgs": {"steps": 5000, "decay_steps": None},
+    "vae": {"size": VaeSize(width=32, hidden=512, latent=64), "batch": 32, "steps": 4000},
+    "dcgan": {"size": DcganSize(width=32, hidden=512, noise=100), "batch": 32, "steps": 4000},
+    DEFORMING: {"batch": 16, "steps": 8000, "smoothing_steps": 800},
+}
+DEFORMING_PRIMITIVES_ON_GPU = 2000
 QUICK_DIVISOR = 20  # of the steps of a fit by gradient descent under --quick
 JUDGES = 200  # test spectra of a split, evenly chosen: a neural field takes seconds to predict one
 COUNTS, QUICK_COUNTS = (200, 500, 1000, 2000, 3000), (60, 120)  # training spectra
@@ -84,6 +96,8 @@ class Config:
     """field models of the part `aoa`"""
     repeats: int = 3
     """draws of the measured spectra in the part `aoa`"""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """where fits run; on a GPU only those by gradient descent"""
     quick: bool = False
     """300 positions, a twentieth of the steps, no angle of arrival"""
     work: Path = Path("runs/paper_scale")
@@ -151,8 +165,9 @@ def measure(config: Config, prefix: Path, train: Spectra, test: Spectra, split: 
         file = Path(f"{prefix} {n} {method}")
         if not Path(f"{file}.json").exists():
             some = train.subset(torch.randperm(len(train), generator=torch.Generator().manual_seed(config.seed))[:n])
-            found = row(built(method, split, config), some, test, Path(f"{file}.state"))
-            write_text(Path(f"{file}.json"), json.dumps(found | {"machine": machine(CPU)}))
+            device = torch.device(config.device if method in BY_GRADIENT else "cpu")
+            found = row(built(method, split, config), some, test, Path(f"{file}.state"), device)
+            write_text(Path(f"{file}.json"), json.dumps(found | {"machine": machine(device)}))
             print(file.name, f"{found['psnr_db']['median']:.2f} dB, {found['fit_seconds']:.0f} s", flush=True)
 
 
@@ -171,17 +186,16 @@ def built(method: str, split: Split, config: Config) -> FieldModel | None:
     options: dict[str, Any] = {"validation": validation_for(split), "seed": config.seed}
     if method == DEFORMING:
         paper = FitConfig.paper()
-        model: FieldModel = SwiftWRF(
-            replace(
-                paper,
-                model=replace(paper.model, n_primitives=DEFORMING_PRIMITIVES),
-                batch=DEFORMING_BATCH,
-                steps=DEFORMING_STEPS,
-                max_azimuths=FitConfig().max_azimuths,
-                check_every=FitConfig().check_every,
-                **options,
-            )
-        )
+        if config.device == "cuda":
+            n_primitives, sizes = DEFORMING_PRIMITIVES_ON_GPU, ON_GPU[DEFORMING]
+        else:
+            n_primitives = DEFORMING_PRIMITIVES
+            sizes = {"batch": DEFORMING_BATCH, "steps": DEFORMING_STEPS}
+            sizes |= {"max_azimuths": FitConfig().max_azimuths, "check_every": FitConfig().check_every}
+        smaller = replace(paper.model, n_primitives=n_primitives)
+        model: FieldModel = SwiftWRF(replace(paper, model=smaller, **sizes, **options))
+    elif config.device == "cuda" and method in BY_GRADIENT:
+        model = make_model(method, "paper", **ON_GPU[method], **options)
     else:
         model = make_model(method, **options)
     steps = getattr(model.config, "steps", 0)
@@ -190,9 +204,9 @@ def built(method: str, split: Split, config: Config) -> FieldModel | None:
     return model
 
 
-def row(model: FieldModel | None, train: Spectra, test: Spectra, state: Path) -> Row:
+def row(model: FieldModel | None, train: Spectra, test: Spectra, state: Path, device: torch.device) -> Row:
     """Return scores at the test positions, seconds of the fit and of a spectrum, and size of a method."""
-    clock, seconds = time.process_time, state.with_suffix(".seconds")
+    clock, seconds = time.process_time if device == CPU else time.perf_counter, state.with_suffix(".seconds")
     earlier = json.loads(seconds.read_text()) if seconds.exists() else 0.0
     began = clock()
 
@@ -207,8 +221,11 @@ def row(model: FieldModel | None, train: Spectra, test: Spectra, state: Path) ->
         def synthesize(position: Tensor) -> Tensor:
             return mean.repeat(len(position), 1, 1)
     else:
-        model.fit(train, checkpoint=state, on_record=on_record)
-        synthesize = model.synthesize
+        model.fit(train, device=device, checkpoint=state, on_record=on_record)
+
+        def synthesize(position: Tensor) -> Tensor:
+            return model.synthesize(position).cpu()
+
     fit_seconds = earlier + clock() - began
     if model is not None:
         size = weight(model, train, state.with_suffix(".model")) | {"steps": getattr(model.config, "steps", 0)}

@@ -102,6 +102,32 @@ def drawing() -> str:
     return markdown(["scene, split", "setting", "ms a spectrum", "RMS numerical", "RMS held-out"], rows)
 
 
+def gpu_rates() -> str:
+    """Return spectra per second on a GPU by number of primitives and batch size."""
+    rates = ("forward", "forward_backward", "model", "synthesize")
+    rows = [
+        [f"{row['n']:,}", f"{row['batch']:,}", *(f"{row[f'{name}_per_s']['median']:,.0f}" for name in rates)]
+        for row in load("gpu_rates")["rows"]
+    ]
+    columns = ["primitives", "batch", "forward", "forward and backward", "model", "synthesize"]
+    return markdown(columns, rows)
+
+
+def gpu_targets() -> str:
+    """Return the rates of the GPU beside their targets."""
+    rows = []
+    for target in load("gpu_rates")["targets"]:
+        values = [target[key] for key in ("least", "goal", "measured")]
+        cells = [f"{value:.0%}" if target["least"] < 1 else f"{value:,.0f}" for value in values]
+        rows.append([target["what"], *cells, "met" if target["met"] else "missed"])
+    return markdown(["spectra per second, 90 x 360", "at least", "goal", "measured", "state"], rows)
+
+
+def gpu_seconds() -> str:
+    """Return seconds of the fits on a GPU."""
+    return markdown(["fit", "seconds"], [[name, f"{s:.1f}"] for name, s in load("gpu_training")["seconds"].items()])
+
+
 def scaling() -> str:
     """Return processor seconds and peak memory of each stage at each size, and the growth to the largest size."""
     content = load("scaling")

@@ -22,7 +22,19 @@ from paper_scale_tables import (
     paper_scale_targets,
 )
 from rssi_tables import rssi_glance, rssi_heads, rssi_methods
-from speed_tables import busy, drawing, networks, scaling, scaling_quality, scaling_rssi, size, speed
+from speed_tables import (
+    busy,
+    drawing,
+    gpu_rates,
+    gpu_seconds,
+    gpu_targets,
+    networks,
+    scaling,
+    scaling_quality,
+    scaling_rssi,
+    size,
+    speed,
+)
 from targets import aoa_targets, rssi_targets, synthesis_targets
 
 from tasks.aoa.condition import LOCATOR, Condition
@@ -272,6 +284,9 @@ TABLES = {
     "scaling_quality": scaling_quality,
     "scaling_rssi": scaling_rssi,
     "busy": busy,
+    "gpu_rates": gpu_rates,
+    "gpu_seconds": gpu_seconds,
+    "gpu_targets": gpu_targets,
     "headline": headline,
     "headline_rssi": headline_rssi,
     "locating_spectra": locating_spectra,

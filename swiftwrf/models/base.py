@@ -258,6 +258,10 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
         """Device of the fitted tensors."""
         return next((tensor.device for tensor in self.parameters()), torch.device("cpu"))
 
+    def _batch_on(self, device: torch.device) -> int:
+        """Return the number of positions evaluated at a time on a device."""
+        return self.batch
+
     def _checked(self, position: Numbers) -> Tensor:
         return check_positions(position).to(self.device)
 
@@ -272,16 +276,17 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
         self, evaluate: Callable[[Tensor], tuple[Tensor, Tensor | None]], position: Tensor, grid: AngularGrid
     ) -> tuple[Tensor, Tensor | None]:
         """Evaluate some positions at a time, with gradients only where something requires them."""
+        batch = self._batch_on(position.device)
         with_gradient = position.requires_grad or any(tensor.requires_grad for tensor in self.parameters())
         if torch.is_grad_enabled() and with_gradient:
-            parts = [evaluate(some) for some in position.split(self.batch)]
+            parts = [evaluate(some) for some in position.split(batch)]
             stds = [std for _, std in parts if std is not None]
             return check_finite(torch.cat([mean for mean, _ in parts])), torch.cat(stds) if stds else None
         out = torch.empty(len(position), *grid.shape, device=position.device)
         spread: Tensor | None = None
         with torch.no_grad():
-            for start in range(0, len(position), self.batch):
-                rows = slice(start, start + self.batch)
+            for start in range(0, len(position), batch):
+                rows = slice(start, start + batch)
                 out[rows], std = evaluate(position[rows])
                 if std is not None:
                     spread = torch.empty_like(out) if spread is None else spread

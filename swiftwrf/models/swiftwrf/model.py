@@ -26,6 +26,7 @@ from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.session import Record
 
 MAX_CACHED_VALUES = 2**26  # float32 values that one model caches: 256 MiB
+MAX_BATCH_ON_GPU, MAX_PRIMITIVES_ON_GPU = 1024, 2**20  # positions at a time, and primitives of all of them
 
 
 class SwiftWRF(ProcessModel):
@@ -124,6 +125,12 @@ class SwiftWRF(ProcessModel):
             mean = field.render(gaussians, len(x), grid)
         scale = field.deformation.unscaled_std(x) if with_std else None
         return mean, None if scale is None else scale[:, None, None] * self._cached("spread", grid, field.spread)
+
+    def _batch_on(self, device: torch.device) -> int:
+        """Return more positions on a GPU, which takes as long to start the kernels of 64 as to compute them."""
+        if device.type == "cpu":
+            return self.batch
+        return max(self.batch, min(MAX_BATCH_ON_GPU, MAX_PRIMITIVES_ON_GPU // len(self.field.primitives)))
 
     def region(self) -> Tensor:
         if not isinstance(self.field.deformation, LowRankDeformation):

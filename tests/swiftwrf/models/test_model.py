@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest import mock
 
 import pytest
 import torch
@@ -251,3 +252,11 @@ def test_the_paper_preset_has_the_papers_settings_and_given_options():
     assert SwiftWRF(preset="paper", batch=4).config == FitConfig.paper(batch=4)
     with pytest.raises(InputError, match="takes a FitConfig"):
         SwiftWRF(ModelConfig())
+
+
+@pytest.mark.parametrize(("n_primitives", "batch"), [(16, 1024), (2000, 524), (50_000, 64)])
+def test_a_gpu_evaluates_more_positions_at_a_time_within_its_memory(n_primitives, batch):
+    model = SwiftWRF()
+    model.field = mock.Mock(primitives=range(n_primitives))
+    assert model._batch_on(torch.device("cpu")) == 64
+    assert model._batch_on(torch.device("cuda")) == batch
