@@ -21,7 +21,7 @@ from swiftwrf.metrics import psnr
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.model import GeometryModel
-from swiftwrf.models.geometry.path_gains import PathGains, fit_path_gains, prior
+from swiftwrf.models.geometry.path_gains import PathGains, PriorName, choose_prior, fit_path_gains, kernel_of
 from swiftwrf.models.geometry.planes import advantage
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.runtime.checkpoint import Header, expect
@@ -110,20 +110,26 @@ class HybridModel(ProcessModel):
         if not self.room.planes or (like and not like.path_gains):
             return self.room.synthesize(train.position)
         scene, rows = observe(train, self.config)
-        kernel = like.path_gains.process.kernel if like and like.path_gains else prior(scene.moving)
+        found = self.room
+        if like and like.path_gains:
+            kernel, prior = like.path_gains.process.kernel, like.path_gains.prior
+            self._room = found.with_order(like.room.order)
+        else:
+            kernel = kernel_of(scene.moving)
+            self._room, prior = choose_prior(found, scene, fold[rows])
         known = torch.empty(len(train), *train.grid.shape)
         for number in fold.unique():
             out = (fold == number).nonzero()[:, 0]  # including spectra without observed phases
             kept = scene.subset((fold[rows] != number).nonzero()[:, 0])
-            self.path_gains = fit_path_gains(self.room, kept, kernel)
+            self.path_gains = fit_path_gains(self.room, kept, kernel, prior)
             for part in out.split(self.batch):
                 known[part] = self._paths(train.position[part])
         if not like:
-            constant, seen = self.room.synthesize(train.position), train.spectrum
+            constant, seen = found.synthesize(train.position), train.spectrum
             if advantage(psnr(constant, seen), psnr(known, seen)) > CONSTANT_GAINS_MARGIN:
-                self.path_gains = None
+                self._room, self.path_gains = found, None
                 return constant
-        self.path_gains = fit_path_gains(self.room, scene, kernel)
+        self.path_gains = fit_path_gains(self.room, scene, kernel, prior)
         return known
 
     def _update(self, new: Spectra) -> None:
@@ -171,10 +177,11 @@ class HybridModel(ProcessModel):
         return self._total(position, generator)
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
-        parts = [self.room._state(), self.process.state()]
+        parts, own = [self.room._state(), self.process.state()], Header(mixing_weight=self.mixing_weight)
         if self.path_gains is not None:
             parts.append(self.path_gains.process.state("path_gains."))
-        tensors, own = {"component": self.component}, {"mixing_weight": self.mixing_weight}
+            own["path_gains.prior"] = self.path_gains.prior
+        tensors = {"component": self.component}
         for some, header in parts:
             tensors |= some
             own |= header
@@ -193,7 +200,9 @@ class HybridModel(ProcessModel):
         )
         if "path_gains.kernel" in header:
             process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True, prefix="path_gains.")
-            self.path_gains = PathGains(process, len(self.room.image_sources()[0]))
+            prior = header.get("path_gains.prior", "loose")  # the only one of versions up to 0.2.0
+            check_value("path_gains.prior", prior, PriorName)
+            self.path_gains = PathGains(process, len(self.room.image_sources()[0]), prior)
 
 
 def fit_hybrid(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, Self
 
 import torch
@@ -163,6 +163,12 @@ class GeometryModel(FieldModel):
         """Return the room with offsets and gains refined on the observed phases of some spectra, without a search."""
         model = copy(self)
         model.estimate = refine_room(self.estimate, self.tensors(), scene)
+        return model
+
+    def with_order(self, order: int) -> Self:
+        """Return the same planes with image sources of up to `order` reflections."""
+        model = copy(self)
+        model.estimate = replace(self.estimate, order=order)
         return model
 
     @property

@@ -12,6 +12,9 @@ N. He and A. C. Reynolds, "Conditioning permeability fields to pressure data", E
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Literal
+
 import torch
 from torch import Tensor
 
@@ -19,14 +22,42 @@ from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.models.geometry.images import PhaseObservations, image_gain, images, visibility
 from swiftwrf.models.geometry.model import GeometryModel
+from swiftwrf.models.geometry.phase_retrieval import autocorrelation
 
-GAIN_STD = torch.tensor([0.6, 0.3])  # of a gain about that of its planes, in phase and in quadrature
 EXTENT_PER_LENGTH = 4  # extent of the region over the correlation length of gains
-MISSING_SCALE = 0.05  # twice the expected missing coherence of a spectrum
 NOISE_VARIANCE = 1e-3  # of a gain, relative to its prior variance
 N_FIELDS = 8  # whose spectra are averaged
-PRIOR_SAMPLE_STD = 0.5  # relative to the prior; samples of the whole prior explain held-out spectra worse
-N_STEPS, LEARNING_RATE = 30, 0.2  # of Adam, on standard normal variables
+LEARNING_RATE = 0.2  # of Adam, on standard normal variables
+MAX_CHOICE = 400  # spectra that choose the prior
+MIN_ERROR = 1e-6  # of squared co-array numbers, by rounding
+HIGHEST_ORDER, MAX_PATHS = 3, 100  # of the image sources that may be added to those of the room
+
+PriorName = Literal["loose", "tight"]
+
+
+@dataclass(frozen=True)
+class GainPrior:
+    """Prior of path gains, and how closely a fit follows the observed phases.
+
+    Args:
+        std: Standard deviation of a gain about that of its planes, in phase and in quadrature.
+        sample_std: Standard deviation of the samples around which fields are fitted, relative to the prior. Samples of the
+            whole prior explain held-out spectra worse.
+        missing_scale: Twice the expected missing coherence of a spectrum.
+        steps: Number of Adam steps.
+    """
+
+    std: tuple[float, float]
+    sample_std: float
+    missing_scale: float
+    steps: int
+
+
+# Loose where many paths are unknown, tight where the image sources explain nearly all of the field.
+PRIORS: dict[PriorName, GainPrior] = {
+    "loose": GainPrior(std=(0.6, 0.3), sample_std=0.5, missing_scale=0.05, steps=30),
+    "tight": GainPrior(std=(0.3, 0.3), sample_std=0.25, missing_scale=0.02, steps=120),
+}
 
 
 class PathGains:
@@ -36,14 +67,15 @@ class PathGains:
         process: Process of the differences of each gain from that of its planes, real and imaginary part, with
             coefficients float32 (n, F * S * 2).
         n_paths: Number of paths S, the direct one included.
+        prior: Name of the prior.
 
     Raises:
         InputError: Coefficients that do not fit the number of paths.
     """
 
-    def __init__(self, process: GaussianProcess, n_paths: int) -> None:
+    def __init__(self, process: GaussianProcess, n_paths: int, prior: PriorName = "loose") -> None:
         assert process.coefficient is not None
-        self.process, self.n_paths = process, n_paths
+        self.process, self.n_paths, self.prior = process, n_paths, prior
         if (size := process.coefficient.shape[1]) == 0 or size % (2 * n_paths):
             raise InputError(f"path gains of {n_paths} paths need multiples of {2 * n_paths} coefficients, got {size}")
 
@@ -56,7 +88,8 @@ class PathGains:
         if generator is not None:
             field = torch.randint(change.shape[1], (len(change),), generator=generator)
             change = change[torch.arange(len(change)), field, None]
-            spread = self.process.variance(position).sqrt().float()[:, None, None, None] * GAIN_STD
+            spread = self.process.variance(position).sqrt().float()[:, None, None, None]
+            spread = spread * torch.tensor(PRIORS[self.prior].std)
             noise = spread * torch.randn(*change.shape, 2, generator=generator)
             change = change + torch.view_as_complex(noise)
         wave, gain = paths(geometry, geometry.scene(position))
@@ -82,33 +115,65 @@ def paths(geometry: GeometryModel, scene: PhaseObservations) -> tuple[Tensor, Te
 
 
 @torch.enable_grad()
-def fit_path_gains(geometry: GeometryModel, scene: PhaseObservations, kernel: Kernel) -> PathGains:
+def fit_path_gains(
+    geometry: GeometryModel, scene: PhaseObservations, kernel: Kernel, name: PriorName = "loose"
+) -> PathGains:
     """Fit path gains around several samples of their prior to the observed phases."""
-    wave, gain = paths(geometry, scene)
+    prior, (wave, gain) = PRIORS[name], paths(geometry, scene)
+    std = torch.tensor(prior.std)
     anchor = scene.moving.double()
     root = torch.linalg.cholesky(kernel.covariance(anchor))
     smooth = root.float()
-    sample = PRIOR_SAMPLE_STD * torch.randn(
+    sample = prior.sample_std * torch.randn(
         len(scene), N_FIELDS, len(gain), 2, generator=torch.Generator().manual_seed(0)
     )
     normal = sample.clone().requires_grad_()
     optimiser = torch.optim.Adam([normal], lr=LEARNING_RATE)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, N_STEPS)
-    for _ in range(N_STEPS):
-        change = GAIN_STD * (smooth @ normal.flatten(1)).view_as(normal)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, prior.steps)
+    for _ in range(prior.steps):
+        change = std * (smooth @ normal.flatten(1)).view_as(normal)
         field = (gain + torch.view_as_complex(change)) @ wave
         missing = 1 - scene.coherence(field.transpose(0, 1))
-        loss = missing.sum() / MISSING_SCALE + (normal - sample).square().sum() / 2
+        loss = missing.sum() / prior.missing_scale + (normal - sample).square().sum() / 2
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
         schedule.step()
     weight = torch.linalg.solve_triangular(root.T, normal.detach().flatten(1).double(), upper=True)
-    coefficient = (GAIN_STD * weight.float().view_as(normal)).flatten(1)
-    return PathGains(GaussianProcess(kernel, anchor, coefficient, exact=True), len(gain))
+    coefficient = (std * weight.float().view_as(normal)).flatten(1)
+    return PathGains(GaussianProcess(kernel, anchor, coefficient, exact=True), len(gain), name)
 
 
-def prior(position: Tensor) -> Kernel:
+def choose_prior(geometry: GeometryModel, scene: PhaseObservations, fold: Tensor) -> tuple[GeometryModel, PriorName]:
+    """Return the room, perhaps with image sources of a higher order, and the prior that predict held-out spectra best.
+
+    Args:
+        geometry: Room with planes.
+        scene: Observed phases at n positions, of which at most 400 are used.
+        fold: Fold of each position, (n,).
+    """
+    some = torch.linspace(0, len(scene) - 1, min(MAX_CHOICE, len(scene))).long()
+    scene, fold = scene.subset(some), fold[some]
+    candidates: list[tuple[GeometryModel, PriorName]] = [(geometry, name) for name in PRIORS]
+    further = geometry.with_order(HIGHEST_ORDER)
+    if geometry.order < HIGHEST_ORDER and len(further.image_sources()[0]) <= MAX_PATHS:
+        candidates.append((further, "tight"))
+    return min(candidates, key=lambda candidate: _held_out_error(candidate[0], candidate[1], scene, fold))
+
+
+def _held_out_error(geometry: GeometryModel, name: PriorName, scene: PhaseObservations, fold: Tensor) -> float:
+    """Return the mean logarithm of the squared error of the co-array numbers at held-out positions."""
+    kernel, errors = kernel_of(scene.moving), []
+    for number in fold.unique():
+        kept, out = (scene.subset(rows.nonzero()[:, 0]) for rows in (fold != number, fold == number))
+        predicted = fit_path_gains(geometry, kept, kernel, name).channel(geometry, out.moving).sgn()
+        mean = autocorrelation(predicted, geometry.array).mean(dim=1)
+        missed = mean - autocorrelation(out.channel[:, 0], geometry.array)
+        errors.append(missed.abs().square().sum(dim=1))
+    return float((torch.cat(errors) + MIN_ERROR).log().mean())
+
+
+def kernel_of(position: Tensor) -> Kernel:
     """Return the prior kernel of path gains in the region of positions (n, 3) [m]."""
     extent = float((position.max(0).values - position.min(0).values).max())
     return Kernel(long=extent / EXTENT_PER_LENGTH, short=extent, share=1.0, noise=NOISE_VARIANCE)
