@@ -20,7 +20,7 @@ from swiftwrf.models.geometry.batched import batched, batched_field, batched_sco
 from swiftwrf.models.geometry.fit import _with_weak_planes, _without_aliases, observe, split
 from swiftwrf.models.geometry.hybrid import HybridModel, fit_hybrid
 from swiftwrf.models.geometry.images import PhaseObservations, field, image_gain, images, mirror, sequences
-from swiftwrf.models.geometry.path_gains import PathGains, fit_path_gains
+from swiftwrf.models.geometry.path_gains import PathGains, choose_prior, fit_path_gains
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation, correlations, retrieve_phases
 from swiftwrf.models.geometry.planes import PlaneSet, refined
 from swiftwrf.models.geometry.refine import image_jacobian, phase_jacobian
@@ -437,6 +437,7 @@ def test_path_gains_are_held_out_from_spectra_without_observed_phases_too():
     few = GeometryConfig(max_spectra=40)
     hybrid, like = HybridModel(few), HybridModel()
     hybrid._room, hybrid.grid = fit(data, further=0, width=1, max_spectra=40), data.grid
+    like._room = hybrid._room
     like.path_gains = PathGains(GaussianProcess(kernel, data.position, torch.zeros(80, 2)), 1)
     known = hybrid._fit_path_gains(data, fold, like)
     scene, rows = observe(data, few)
@@ -445,6 +446,27 @@ def test_path_gains_are_held_out_from_spectra_without_observed_phases_too():
         fitted = fit_path_gains(hybrid.room, scene.subset((fold[rows] != number).nonzero()[:, 0]), kernel)
         expected = ARRAY.spectrum(fitted.channel(hybrid.room, data.position[fold == number]), GRID)
         torch.testing.assert_close(known[fold == number], expected)
+
+
+@pytest.mark.parametrize(("known", "chosen"), [(1, 3), (2, 2)])
+def test_image_sources_of_a_higher_order_are_added_where_held_out_spectra_need_them(known, chosen):
+    """The spectra contain images up to the second order."""
+    data = mirror_room(SIX, n=100)
+    found = GeometryModel.of_planes(data, [Plane(n, o, gain=-0.6) for n, o in SIX.items()], order=known)
+    room, prior = choose_prior(found, observe(data)[0], torch.arange(100) % 5)
+    assert (room.order, prior) == (chosen, "tight")
+    assert found.order == known
+
+
+def test_hybrids_of_earlier_versions_have_loose_path_gains(hybrid):
+    known, kernel = hybrid.process.known, hybrid.process.kernel
+    gains = PathGains(GaussianProcess(kernel, known, torch.zeros(len(known), 2 * 25 * 2)), 25, "tight")
+    tensors, header = with_path_gains(hybrid, gains).state()
+    assert HybridModel.from_state(tensors, header).path_gains.prior == "tight"
+    del header["path_gains.prior"]
+    assert HybridModel.from_state(tensors, header).path_gains.prior == "loose"
+    with pytest.raises(InputError, match=r"path_gains\.prior"):
+        HybridModel.from_state(tensors, header | {"path_gains.prior": "narrow"})
 
 
 def test_path_gains_stay_constant_where_nothing_is_hidden():
