@@ -28,7 +28,7 @@ EXTENT_PER_LENGTH = 4  # extent of the region over the correlation length of gai
 NOISE_VARIANCE = 1e-3  # of a gain, relative to its prior variance
 N_FIELDS = 8  # whose spectra are averaged
 LEARNING_RATE = 0.2  # of Adam, on standard normal variables
-MAX_CHOICE = 400  # spectra that choose the prior
+MAX_CHOICE = 200  # spectra that choose the prior
 MIN_ERROR = 1e-6  # of squared co-array numbers, by rounding
 HIGHEST_ORDER, MAX_PATHS = 3, 100  # of the image sources that may be added to those of the room
 
@@ -149,7 +149,7 @@ def choose_prior(geometry: GeometryModel, scene: PhaseObservations, fold: Tensor
 
     Args:
         geometry: Room with planes.
-        scene: Observed phases at n positions, of which at most 400 are used.
+        scene: Observed phases at n positions, of which at most 200 are used.
         fold: Fold of each position, (n,).
     """
     some = torch.linspace(0, len(scene) - 1, min(MAX_CHOICE, len(scene))).long()
