@@ -28,6 +28,7 @@ from swiftwrf.models.geometry.path_gains import PathGains, paths
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation, coarray_numbers, retrieve_phases
 
 MAX_STEPS = 20  # of L-BFGS
+BOUNDS = (-10.0, 6.0)  # of the logarithms of variances: products of four of them stay within float32
 PENALTY = 0.01  # of the squared logarithms of the variances: keeps those that the data do not determine near 1
 
 
@@ -176,7 +177,8 @@ class PathStatistics:
             (gradient,) = torch.autograd.grad(total, raw)
             return float(total.detach()), gradient.double().numpy()
 
-        found = minimize(loss, start.double().numpy(), jac=True, method="L-BFGS-B", options={"maxiter": MAX_STEPS})
+        first, bounds = start.double().numpy(), [BOUNDS] * len(start)
+        found = minimize(loss, first, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": MAX_STEPS})
         return cls.of(torch.from_numpy(found.x).float())
 
     @property

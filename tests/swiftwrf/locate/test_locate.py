@@ -17,7 +17,9 @@ from swiftwrf.locate.region import Cells
 from swiftwrf.locate.residuals import ResidualDistribution
 from swiftwrf.locate.rssi_likelihood import DetectionLikelihood, RssiMaps, ValueLikelihood
 from swiftwrf.locate.search import best_cells, refined
+from swiftwrf.locate.spectrum_likelihood import BOUNDS, PathStatistics, PathWaves, PhaseLikelihood, SpectrumFeatures
 from swiftwrf.models.geometry import GeometryModel, Plane
+from swiftwrf.testing.rooms import mirror_room
 
 SMALL = {"n_best": 60, "n_background": 40, "n_split": 8, "spacing": 0.4, "n_calibration": 40}
 ROOM = [
@@ -247,3 +249,18 @@ def test_spectra_on_another_grid_are_refused(closed_form):
 def test_data_without_an_array_have_no_matched_field(room):
     with pytest.raises(InputError, match="array"):
         MatchedField().fit(replace(room, array=None))
+
+
+def test_variances_of_phases_that_no_room_explains_stay_finite():
+    """Signs of the gains that are wrong, images up to the third order, and phases that are nearly noise."""
+    sides = [(-1.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)]
+    six = dict(zip(sides, (0.0, 5.0, 0.0, 4.0, 0.0, 3.0), strict=True))
+    data = mirror_room(six, n=60, noise=1.0)
+    room = GeometryModel.of_planes(data, [Plane(*plane, gain=0.6) for plane in six.items()], order=3)
+    assert data.array is not None
+    features = SpectrumFeatures.of(data.store.batches(), data.array, data.grid, 0)
+    statistics = PathStatistics.fit(room, data.position, features)
+    assert bool((statistics.raw >= BOUNDS[0] - 1e-4).all())
+    assert bool((statistics.raw <= BOUNDS[1] + 1e-4).all())
+    density = PhaseLikelihood(room, statistics).log_likelihood(PathWaves.at(room, data.position), features)
+    assert bool(density.isfinite().all())
