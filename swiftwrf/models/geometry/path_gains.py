@@ -7,7 +7,8 @@ Direct path and image sources keep their directions and lengths. Their gains are
 with length d_i and direction u_i of path i, its phase phi_k at element k, and Gaussian processes f_i, g_i. Spectra determine
 phases only, so several fields explain the training spectra equally well, and the mean of their spectra predicts better than
 any of them. Each field is a maximum a posteriori around a sample of the prior (randomised maximum likelihood, D. S. Oliver,
-N. He and A. C. Reynolds, "Conditioning permeability fields to pressure data", ECMOR 1996).
+N. He and A. C. Reynolds, "Conditioning permeability fields to pressure data", ECMOR 1996). How wide the prior is, and how
+closely a field follows the phases, is chosen on held-out spectra.
 """
 
 from __future__ import annotations
