@@ -24,12 +24,14 @@ from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.models.geometry.images import PhaseObservations, image_gain, images, visibility
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation
+from swiftwrf.models.geometry.planes import advantage
 
 EXTENT_PER_LENGTH = 4  # extent of the region over the correlation length of gains
 NOISE_VARIANCE = 1e-3  # of a gain, relative to its prior variance
 N_FIELDS = 8  # whose spectra are averaged
 LEARNING_RATE = 0.2  # of Adam, on standard normal variables
 MAX_CHOICE = 200  # spectra that choose the prior
+MAX_ADVANTAGE = 3.0  # standard errors by which a choice must be behind to be given up before all folds are seen
 MIN_ERROR = 1e-6  # of squared co-array numbers, by rounding
 HIGHEST_ORDER, MAX_PATHS = 3, 100  # of the image sources that may be added to those of the room
 
@@ -159,19 +161,27 @@ def choose_prior(geometry: GeometryModel, scene: PhaseObservations, fold: Tensor
     further = geometry.with_order(HIGHEST_ORDER)
     if geometry.order < HIGHEST_ORDER and len(further.image_sources()[0]) <= MAX_PATHS:
         candidates.append((further, "tight"))
-    return min(candidates, key=lambda candidate: _held_out_error(candidate[0], candidate[1], scene, fold))
-
-
-def _held_out_error(geometry: GeometryModel, name: PriorName, scene: PhaseObservations, fold: Tensor) -> float:
-    """Return the mean logarithm of the squared error of the co-array numbers at held-out positions."""
-    kernel, errors = kernel_of(scene.moving), []
+    error: list[list[Tensor]] = [[] for _ in candidates]
+    left = list(range(len(candidates)))
     for number in fold.unique():
-        kept, out = (scene.subset(rows.nonzero()[:, 0]) for rows in (fold != number, fold == number))
-        predicted = fit_path_gains(geometry, kept, kernel, name).channel(geometry, out.moving).sgn()
-        mean = autocorrelation(predicted, geometry.array).mean(dim=1)
-        missed = mean - autocorrelation(out.channel[:, 0], geometry.array)
-        errors.append(missed.abs().square().sum(dim=1))
-    return float((torch.cat(errors) + MIN_ERROR).log().mean())
+        for row in left:
+            error[row].append(_held_out_error(*candidates[row], scene, fold == number))
+        so_far = {row: torch.cat(error[row]) for row in left}
+        best = min(left, key=lambda row: float(so_far[row].mean()))
+        # one held-out position has no standard error, and gives nothing up
+        left = [row for row in left if row == best or not advantage(so_far[row], so_far[best]) >= MAX_ADVANTAGE]
+        if len(left) == 1:
+            break
+    return candidates[best]
+
+
+def _held_out_error(geometry: GeometryModel, name: PriorName, scene: PhaseObservations, out: Tensor) -> Tensor:
+    """Return the logarithm of the squared error of the co-array numbers at the held-out positions."""
+    kept, held = (scene.subset(rows.nonzero()[:, 0]) for rows in (~out, out))
+    predicted = fit_path_gains(geometry, kept, kernel_of(scene.moving), name).channel(geometry, held.moving).sgn()
+    mean = autocorrelation(predicted, geometry.array).mean(dim=1)
+    missed = mean - autocorrelation(held.channel[:, 0], geometry.array)
+    return (missed.abs().square().sum(dim=1) + MIN_ERROR).log()
 
 
 def kernel_of(position: Tensor) -> Kernel:
