@@ -16,7 +16,7 @@ from swiftwrf.array.planar import differences
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.spectra import Spectra, check_training, direction_of_link
 from swiftwrf.errors import InputError
-from swiftwrf.gp import GaussianProcess, subsample
+from swiftwrf.gp import subsample
 from swiftwrf.locate.pool import inflation, pooled_weights
 from swiftwrf.locate.posterior import Posterior, normalised
 from swiftwrf.locate.region import Cells, Region, outside_mass
@@ -304,7 +304,7 @@ class MatchedField(Configured, Saved):
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """Return the fitted tensors by name, and plain values."""
         tensors, header = self.room.state()
-        gains, values = self._fit.gains.process.state("path_gains.")
+        gains, values = self._fit.gains.state()
         own = {
             "statistics": self._fit.statistics.raw,
             "residual": self.residual,
@@ -334,8 +334,7 @@ class MatchedField(Configured, Saved):
         expect(tensors, shapes)
         if n < MIN_SPECTRA or bool((tensors["statistics"].abs() > MAX_LOG_VARIANCE).any()):
             raise InputError("residuals, positions or variances are not those of a fitted locator")
-        process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True, prefix="path_gains.")
-        gains = PathGains(process, len(room.image_sources()[0]))
+        gains = PathGains.from_state(tensors, header, room)
         locator.grid, locator.room = room.grid, room
         locator._fit = _Fit(room, gains, PathStatistics.of(tensors["statistics"]))
         locator.residual, locator.weight = tensors["residual"], tensors["weight"]

@@ -21,7 +21,7 @@ from swiftwrf.metrics import psnr
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.model import GeometryModel
-from swiftwrf.models.geometry.path_gains import PathGains, PriorName, choose_prior, fit_path_gains, kernel_of
+from swiftwrf.models.geometry.path_gains import PathGains, choose_prior, fit_path_gains, kernel_of
 from swiftwrf.models.geometry.planes import advantage
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.runtime.checkpoint import Header, expect
@@ -177,11 +177,10 @@ class HybridModel(ProcessModel):
         return self._total(position, generator)
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
-        parts, own = [self.room._state(), self.process.state()], Header(mixing_weight=self.mixing_weight)
+        parts = [self.room._state(), self.process.state()]
         if self.path_gains is not None:
-            parts.append(self.path_gains.process.state("path_gains."))
-            own["path_gains.prior"] = self.path_gains.prior
-        tensors = {"component": self.component}
+            parts.append(self.path_gains.state())
+        tensors, own = {"component": self.component}, {"mixing_weight": self.mixing_weight}
         for some, header in parts:
             tensors |= some
             own |= header
@@ -199,10 +198,7 @@ class HybridModel(ProcessModel):
             None,
         )
         if "path_gains.kernel" in header:
-            process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True, prefix="path_gains.")
-            prior = header.get("path_gains.prior", "loose")  # the only one of versions up to 0.2.0
-            check_value("path_gains.prior", prior, PriorName)
-            self.path_gains = PathGains(process, len(self.room.image_sources()[0]), prior)
+            self.path_gains = PathGains.from_state(tensors, header, self.room)
 
 
 def fit_hybrid(

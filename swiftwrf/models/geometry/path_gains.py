@@ -25,6 +25,8 @@ from swiftwrf.models.geometry.images import PhaseObservations, image_gain, image
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation
 from swiftwrf.models.geometry.planes import advantage
+from swiftwrf.runtime.checkpoint import Header
+from swiftwrf.runtime.validation import check_value
 
 EXTENT_PER_LENGTH = 4  # extent of the region over the correlation length of gains
 NOISE_VARIANCE = 1e-3  # of a gain, relative to its prior variance
@@ -34,6 +36,8 @@ MAX_CHOICE = 200  # spectra that choose the prior
 MAX_ADVANTAGE = 3.0  # standard errors by which a choice must be behind to be given up before all folds are seen
 MIN_ERROR = 1e-6  # of squared co-array numbers, by rounding
 HIGHEST_ORDER, MAX_PATHS = 3, 100  # of the image sources that may be added to those of the room
+
+PREFIX = "path_gains."  # of the names in a file
 
 PriorName = Literal["loose", "tight"]
 
@@ -81,6 +85,19 @@ class PathGains:
         self.process, self.n_paths, self.prior = process, n_paths, prior
         if (size := process.coefficient.shape[1]) == 0 or size % (2 * n_paths):
             raise InputError(f"path gains of {n_paths} paths need multiples of {2 * n_paths} coefficients, got {size}")
+
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        """Return the tensors by name, and plain values."""
+        tensors, header = self.process.state(PREFIX)
+        return tensors, header | {f"{PREFIX}prior": self.prior}
+
+    @classmethod
+    def from_state(cls, tensors: dict[str, Tensor], header: Header, geometry: GeometryModel) -> PathGains:
+        """Return the path gains of a room that `state` describes."""
+        prior = header.get(f"{PREFIX}prior", "loose")  # the only one of versions up to 0.2.0
+        check_value(f"{PREFIX}prior", prior, PriorName)
+        process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True, prefix=PREFIX)
+        return cls(process, len(geometry.image_sources()[0]), prior)
 
     def channel(self, geometry: GeometryModel, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Return the channel of each element in each field at positions (n, 3) [m], complex64 (n, F, K), as of F snapshots.
