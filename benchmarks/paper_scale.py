@@ -63,7 +63,7 @@ ON_GPU: dict[str, dict[str, Any]] = {  # changes of the paper presets, for a few
     "wrfgs": {"steps": 5000, "decay_steps": None},
     "vae": {"size": VaeSize(width=32, hidden=512, latent=64), "batch": 32, "steps": 4000},
     "dcgan": {"size": DcganSize(width=32, hidden=512, noise=100), "batch": 32, "steps": 4000},
-    DEFORMING: {"batch": 16, "steps": 8000, "smoothing_steps": 800},
+    DEFORMING: {"batch": 16, "steps": 20_000, "smoothing_steps": 2000},
 }
 DEFORMING_PRIMITIVES_ON_GPU = 2000
 QUICK_DIVISOR = 20  # of the steps of a fit by gradient descent under --quick
@@ -107,12 +107,13 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Measure the missing rows and write `results/paper_scale.json` (`paper_scale_quick.json`)."""
+    """Measure the missing rows and write `results/paper_scale.json` (with `_quick`, `_gpu`)."""
     torch.set_num_threads(1)
     positions = QUICK_POSITIONS if config.quick else POSITIONS
-    work = config.work / str(positions)
+    gpu = "" if config.device == "cpu" else "_gpu"
+    work = config.work / f"{positions}{gpu}"
     work.mkdir(parents=True, exist_ok=True)
-    name = "paper_scale_quick" if config.quick else "paper_scale"
+    name = f"paper_scale{'_quick' if config.quick else ''}{gpu}"
     for room, moving in SCENES:
         scene = f"{room}-{moving}"
         if scene not in config.only:

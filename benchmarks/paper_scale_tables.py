@@ -86,10 +86,17 @@ def paper_scale_quick() -> str:
     return _methods("paper_scale_quick")
 
 
+def paper_scale_gpu() -> str:
+    """Return the fits by gradient descent on a GPU."""
+    return _methods("paper_scale_gpu")
+
+
 def _methods(result: str) -> str:
     table = []
-    for name, scene in load(result)["scenes"].items():
-        splits = {split: _with_all(scene, split) for split in ("random", "block")}
+    scenes = load(result)["scenes"]
+    measured = [split for split in ("random", "block") if any(split in scene for scene in scenes.values())]
+    for name, scene in scenes.items():
+        splits = {split: _with_all(scene, split) for split in measured}
         for method in dict.fromkeys(method for rows in splits.values() for method in rows):
             own = [rows.get(method) for rows in splits.values()]
             scores = [
@@ -109,7 +116,7 @@ def _methods(result: str) -> str:
                     f"{paper[0]:.2f} / {paper[1]:.3f} / {paper[2]:.4f}" if paper else "",
                 ]
             )
-    columns = ["scene (training spectra)", "method", "random", "block", "steps", "fit [s]", "ms a spectrum", "MB"]
+    columns = ["scene (training spectra)", "method", *measured, "steps", "fit [s]", "ms a spectrum", "MB"]
     return markdown([*columns, "paper, other spectra of a room of the same name"], table)
 
 

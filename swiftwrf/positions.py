@@ -57,7 +57,11 @@ def distance(a: Tensor, b: Tensor) -> Tensor:
     origin is (map coordinates lie thousands of kilometres from it). Farther than 1e15 counts as that: an infinite distance
     would give weights of inf / inf.
     """
-    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist").clamp(max=MAX_COORDINATE)
+    if a.is_cuda:  # cdist would start a block of threads for each pair
+        apart = torch.linalg.vector_norm(a.unsqueeze(1) - b, dim=-1)
+    else:
+        apart = torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
+    return apart.clamp(max=MAX_COORDINATE)
 
 
 def cells(position: Tensor, n: int) -> tuple[Tensor, float]:

@@ -26,7 +26,7 @@ from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.session import Record
 
 MAX_CACHED_VALUES = 2**26  # float32 values that one model caches: 256 MiB
-MAX_BATCH_ON_GPU, MAX_PRIMITIVES_ON_GPU = 1024, 2**20  # positions at a time, and primitives of all of them
+MAX_BATCH_ON_GPU, MAX_PRIMITIVES_ON_GPU = 4096, 2**24  # positions at a time, and primitives of all of them
 
 
 class SwiftWRF(ProcessModel):
@@ -117,7 +117,10 @@ class SwiftWRF(ProcessModel):
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         field, x = self.field, self.field.normalise(position)
         gaussians = field.gaussians(x)
-        cacheable = not field.shapes_deform and len(field.primitives) * math.prod(grid.shape) <= MAX_CACHED_VALUES
+        few = len(field.primitives) * math.prod(grid.shape) <= MAX_CACHED_VALUES
+        cacheable = (
+            few and not field.shapes_deform and x.device.type == "cpu"
+        )  # a GPU renders faster than it multiplies
         if cacheable and not any(parameter.requires_grad for parameter in self.parameters()):
             kernel = self._cached("kernel", grid, field.kernels)
             mean = _magnitudes(gaussians.weight.expand(len(x), -1, -1), kernel)
