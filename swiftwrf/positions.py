@@ -57,6 +57,7 @@ def distance(a: Tensor, b: Tensor) -> Tensor:
     origin is (map coordinates lie thousands of kilometres from it). Farther than 1e15 counts as that: an infinite distance
     would give weights of inf / inf.
     """
+    apart: Tensor
     if a.is_cuda:  # cdist would start a block of threads for each pair
         apart = torch.linalg.vector_norm(a.unsqueeze(1) - b, dim=-1)
     else:
