@@ -82,7 +82,6 @@ def glances() -> Iterator[None]:
 
     with (
         mock.patch("swiftwrf.models.geometry.model.search_room", glance),
-        mock.patch("swiftwrf.models.geometry.fit.MIN_HELD_OUT", 1),
         mock.patch.object(Search, "improve", lambda search, room: room),
     ):
         yield

@@ -38,7 +38,7 @@ from swiftwrf.models.geometry.search import (
     SIGNS,
     WEAK_GAIN,
     Search,
-    find_room,
+    find_rooms,
 )
 from swiftwrf.models.geometry.uncertainty import assess
 from swiftwrf.runtime.progress import progress_bar
@@ -53,7 +53,7 @@ MAX_FURTHER_TRIED = 8  # candidates of any orientation that are refined
 MAX_ORDER = 4  # reflections of an image source
 MIN_SEARCHED = 50  # spectra of a search whose room is extended; searches in fewer end at phase aliases more often
 MAX_MISSING_RATIO = 1.4  # of the missing coherence of new spectra and of those of a search, geometric means
-MIN_HELD_OUT = 300  # positions to decide by: folds are held out in turn until their number is reached
+N_FINAL = 400  # positions of the last moves of a search; fewer do not tell planes of furnished rooms from their aliases
 
 
 Splits = list[tuple[PhaseObservations, PhaseObservations]]  # kept and held-out positions
@@ -99,9 +99,10 @@ def search_room(train: Spectra, config: GeometryConfig, progress: bool = False) 
     with progress_bar(progress) as bar:
         task = bar.add_task("finding the room", total=N_STARTS)
         some = _some(evidence.kept, config.positions, config.seed)
-        signs, found = find_room(some, config.reach, config.width, tick=lambda: bar.advance(task))
-    score = evidence.held_out_score(PlaneSet.of(found))
-    found = Search(evidence.some, config.reach, signs).improve(found)
+        rooms = find_rooms(some, config.reach, config.width, tick=lambda: bar.advance(task))
+    improved = [Search(evidence.more, config.reach, signs).improve(room) for signs, room in rooms]
+    found, (signs, searched) = min(zip(improved, rooms, strict=True), key=lambda item: item[0].score)
+    score = evidence.held_out_score(PlaneSet.of(searched))
     return _completed(PlaneSet.of(found).refined(evidence.scene), signs, score, evidence, config)
 
 
@@ -134,7 +135,7 @@ def extend_room(room: PlaneSet, train: Spectra, is_new: Tensor, config: Geometry
     gains = room.by_side().gain
     signs = max(SIGNS, key=lambda row: sum(float(row[side]) * gain > 0 for side, gain in gains.items()))
     score, room = evidence.held_out_score(room), room.refined(scene)
-    improved = PlaneSet.of(Search(evidence.some, config.reach, signs).improve(room.by_side())).refined(scene)
+    improved = PlaneSet.of(Search(evidence.more, config.reach, signs).improve(room.by_side())).refined(scene)
     # a phase alias explains new spectra nearly as well as others, but all positions together less than the right room
     if scene.score(improved.field(scene)) < MAX_SCORE_RATIO * scene.score(room.field(scene)):
         room = improved
@@ -152,6 +153,7 @@ class _Evidence:
         rows: Number of each position's spectrum among all training spectra.
         fold: Fold of each position.
         some: Positions of the search.
+        more: Positions of its last moves.
     """
 
     train: Spectra
@@ -160,6 +162,7 @@ class _Evidence:
     rows: Tensor
     fold: Tensor
     some: PhaseObservations
+    more: PhaseObservations
 
     @classmethod
     def of(cls, train: Spectra, config: GeometryConfig) -> _Evidence:
@@ -168,7 +171,8 @@ class _Evidence:
         scene = observed.around(train.fixed_position)
         fold = folds(scene.moving, config.validation, config.seed)
         used, _ = _evenly(train, config.max_spectra)
-        return cls(used, observed, scene, rows, fold, _some(scene, config.positions, config.seed))
+        some, more = (_some(scene, most, config.seed) for most in (config.positions, max(config.positions, N_FINAL)))
+        return cls(used, observed, scene, rows, fold, some, more)
 
     @property
     def origin(self) -> Tensor:
@@ -255,10 +259,8 @@ def _some(scene: PhaseObservations, most: int, seed: int) -> PhaseObservations:
 
 
 def split(scene: PhaseObservations, fold: Tensor) -> Splits:
-    """Return pairs of kept and held-out positions, one fold after the other until 300 positions have been held out."""
-    numbers, sizes = fold.unique(return_counts=True)
-    needed = int((sizes.cumsum(0) < MIN_HELD_OUT).sum()) + 1
-    out = [fold == number for number in numbers[:needed]]
+    """Return pairs of kept and held-out positions, one for each fold."""
+    out = [fold == number for number in fold.unique()]
     return [(scene.subset((~o).nonzero()[:, 0]), scene.subset(o.nonzero()[:, 0])) for o in out]
 
 

@@ -9,6 +9,7 @@ double reflections, until none is better. All six sides move together by whole p
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from dataclasses import field as of
@@ -241,10 +242,12 @@ class Search:
         yield self.refined(few.moves(aliases, few.responses(aliases), 6, N_REFINED), SEARCH_ORDER)[0]
 
 
-def find_room(
+def find_rooms(
     scene: PhaseObservations, reach: float, width: int = 8, tick: Callable[[], None] | None = None
-) -> tuple[Tensor, CandidateRoom]:
-    """Return the signs of the gains and the best room over all SIGNS, from beams with and without second-order images.
+) -> list[tuple[Tensor, CandidateRoom]]:
+    """Return the best room of each of SIGNS with the signs of its gains, the best first.
+
+    Rooms come from beams with and without second-order images. Those that start far behind the best one are left out.
 
     Args:
         scene: Observed phases at the positions of the search, preferably at most 100.
@@ -254,18 +257,23 @@ def find_room(
     """
     nothing = CandidateRoom(float(scene.score(scene.wave(scene.transmitter))))
     if nothing.score < PERFECT_SCORE:
-        return SIGNS[0], nothing
+        return [(SIGNS[0], nothing)]
     searches = [Search(scene, reach, signs) for signs in SIGNS]
     searched = list(itertools.product((SEARCH_ORDER, 1), searches))
     rooms = parallel_map(lambda item: item[1].beam(width, item[0])[0], searched)
     starts = [(room, search) for room, (_, search) in zip(rooms, searched, strict=True)]
-    best: tuple[Tensor, CandidateRoom] | None = None
+    found: dict[Search, CandidateRoom] = {}
     for start, search in sorted(starts, key=lambda s: s[0].score):
-        if best is None or PERFECT_SCORE < start.score < MAX_START_RATIO * best[1].score:
+        lowest = min((room.score for room in found.values()), default=math.inf)
+        if not found or PERFECT_SCORE < start.score < MAX_START_RATIO * lowest:
             room = search.improve(start)
-            if best is None or room.score < best[1].score:
-                best = search.signs, room
+            if search not in found or room.score < found[search].score:
+                found[search] = room
         if tick:
             tick()
-    assert best is not None
-    return best
+    best = sorted(found.items(), key=lambda item: item[1].score)
+    return [
+        (search.signs, room)
+        for search, room in best
+        if room.score < max(PERFECT_SCORE, MAX_START_RATIO * best[0][1].score)
+    ]
