@@ -34,7 +34,7 @@ from swiftwrf.locate.spectrum_likelihood import (
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
-from swiftwrf.models.geometry.path_gains import PathGains, choose_prior, fit_path_gains, kernel_of
+from swiftwrf.models.geometry.path_gains import PathGains, PriorChoice, choose_prior, fit_path_gains, kernel_of
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
 from swiftwrf.runtime.options import Configured
 from swiftwrf.runtime.threads import parallel_map
@@ -169,15 +169,15 @@ class MatchedField(Configured, Saved):
         features = SpectrumFeatures.of(train.store.batches(), train.array, train.grid, self.config.seed)
         scene, rows = observe(train, GeometryConfig(seed=self.config.seed))
         fold = torch.arange(len(train)) % FOLDS
-        own, prior = choose_prior(own, scene, fold[rows]) if own.planes else (own, "loose")
+        choice = choose_prior(own, scene, fold[rows]) if own.planes else PriorChoice(own, "loose", {})
         kernel = kernel_of(scene.moving)
-        self.grid, self.room = train.grid, own
+        self.grid, self.room = train.grid, choice.room
 
         def fitted(kept: Tensor) -> _Fit:
             phases = scene.subset(kept[rows].nonzero()[:, 0])
-            part = own.refined_on(phases)
+            part = choice.room.refined_on(phases)
             statistics = PathStatistics.fit(part, train.position[kept], features.subset(kept))
-            return _Fit(part, fit_path_gains(part, phases, kernel, prior), statistics)
+            return _Fit(part, fit_path_gains(part, phases, kernel, choice.prior), statistics)
 
         everything = torch.ones_like(fold, dtype=torch.bool)
         *parts, self._fit = parallel_map(fitted, [*(fold != number for number in range(FOLDS)), everything])

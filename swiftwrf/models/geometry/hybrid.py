@@ -21,7 +21,7 @@ from swiftwrf.metrics import psnr
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.model import GeometryModel
-from swiftwrf.models.geometry.path_gains import PathGains, choose_prior, fit_path_gains, kernel_of
+from swiftwrf.models.geometry.path_gains import PathGains, PriorChoice, choose_prior, fit_path_gains, kernel_of
 from swiftwrf.models.geometry.planes import advantage
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.runtime.checkpoint import Header, expect
@@ -112,16 +112,16 @@ class HybridModel(ProcessModel):
         scene, rows = observe(train, self.config)
         found = self.room
         if like and like.path_gains:
-            kernel, prior = like.path_gains.process.kernel, like.path_gains.prior
-            self._room = found.with_order(like.room.order)
+            kernel = like.path_gains.process.kernel
+            choice = PriorChoice(found.with_order(like.room.order), like.path_gains.prior, {})
         else:
-            kernel = kernel_of(scene.moving)
-            self._room, prior = choose_prior(found, scene, fold[rows])
+            kernel, choice = kernel_of(scene.moving), choose_prior(found, scene, fold[rows])
+        self._room, prior = choice.room, choice.prior
         known = torch.empty(len(train), *train.grid.shape)
-        for number in fold.unique():
+        for number in fold.unique().tolist():
             out = (fold == number).nonzero()[:, 0]  # including spectra without observed phases
             kept = scene.subset((fold[rows] != number).nonzero()[:, 0])
-            self.path_gains = fit_path_gains(self.room, kept, kernel, prior)
+            self.path_gains = choice.fits.get(number) or fit_path_gains(self.room, kept, kernel, prior)
             for part in out.split(self.batch):
                 known[part] = self._paths(train.position[part])
         if not like:

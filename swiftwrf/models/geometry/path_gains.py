@@ -164,38 +164,58 @@ def fit_path_gains(
     return PathGains(GaussianProcess(kernel, anchor, coefficient, exact=True), len(gain), name)
 
 
-def choose_prior(geometry: GeometryModel, scene: PhaseObservations, fold: Tensor) -> tuple[GeometryModel, PriorName]:
-    """Return the room, perhaps with image sources of a higher order, and the prior that predict held-out spectra best.
+@dataclass(frozen=True)
+class PriorChoice:
+    """Result of `choose_prior`.
+
+    Args:
+        room: Room, perhaps with image sources of a higher order.
+        prior: Name of the prior.
+        fits: Path gains fitted without each fold, by its number. Empty if not all positions were used.
+    """
+
+    room: GeometryModel
+    prior: PriorName
+    fits: dict[int, PathGains]
+
+
+def choose_prior(geometry: GeometryModel, scene: PhaseObservations, fold: Tensor) -> PriorChoice:
+    """Return the order of the image sources and the prior that predict held-out spectra best.
 
     Args:
         geometry: Room with planes.
         scene: Observed phases at n positions, of which at most 200 are used.
         fold: Fold of each position, (n,).
     """
+    complete = len(scene) <= MAX_CHOICE
     some = torch.linspace(0, len(scene) - 1, min(MAX_CHOICE, len(scene))).long()
     scene, fold = scene.subset(some), fold[some]
+    kernel = kernel_of(scene.moving)
     candidates: list[tuple[GeometryModel, PriorName]] = [(geometry, name) for name in PRIORS]
     further = geometry.with_order(HIGHEST_ORDER)
     if geometry.order < HIGHEST_ORDER and len(further.image_sources()[0]) <= MAX_PATHS:
         candidates.append((further, "tight"))
     error: list[list[Tensor]] = [[] for _ in candidates]
+    fits: list[dict[int, PathGains]] = [{} for _ in candidates]
     left = list(range(len(candidates)))
-    for number in fold.unique():
+    for number in fold.unique().tolist():
+        kept, held = (scene.subset(rows.nonzero()[:, 0]) for rows in (fold != number, fold == number))
         for row in left:
-            error[row].append(_held_out_error(*candidates[row], scene, fold == number))
+            room, name = candidates[row]
+            fits[row][number] = fit_path_gains(room, kept, kernel, name)
+            error[row].append(_error(fits[row][number], room, held))
         so_far = {row: torch.cat(error[row]) for row in left}
         best = min(left, key=lambda row: float(so_far[row].mean()))
         # one held-out position has no standard error, and gives nothing up
         left = [row for row in left if row == best or not advantage(so_far[row], so_far[best]) >= MAX_ADVANTAGE]
         if len(left) == 1:
             break
-    return candidates[best]
+    return PriorChoice(*candidates[best], fits[best] if complete else {})
 
 
-def _held_out_error(geometry: GeometryModel, name: PriorName, scene: PhaseObservations, out: Tensor) -> Tensor:
-    """Return the logarithm of the squared error of the co-array numbers at the held-out positions."""
-    kept, held = (scene.subset(rows.nonzero()[:, 0]) for rows in (~out, out))
-    predicted = fit_path_gains(geometry, kept, kernel_of(scene.moving), name).channel(geometry, held.moving).sgn()
+def _error(gains: PathGains, geometry: GeometryModel, held: PhaseObservations) -> Tensor:
+    """Return the logarithm of the squared error of the co-array numbers at held-out positions."""
+    predicted = gains.channel(geometry, held.moving).sgn()
     mean = autocorrelation(predicted, geometry.array).mean(dim=1)
     missed = mean - autocorrelation(held.channel[:, 0], geometry.array)
     return (missed.abs().square().sum(dim=1) + MIN_ERROR).log()

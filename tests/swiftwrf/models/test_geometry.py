@@ -17,10 +17,10 @@ from swiftwrf.models.geometry import GeometryConfig, GeometryModel, Plane, fit_g
 from swiftwrf.models.geometry import fit as geometry_fit
 from swiftwrf.models.geometry.ambiguity import _AlternativeTable, phase_alternatives
 from swiftwrf.models.geometry.batched import batched, batched_field, batched_score
-from swiftwrf.models.geometry.fit import _with_weak_planes, _without_aliases, observe, split
+from swiftwrf.models.geometry.fit import _pruned, _with_weak_planes, _without_aliases, observe, split
 from swiftwrf.models.geometry.hybrid import HybridModel, fit_hybrid
 from swiftwrf.models.geometry.images import PhaseObservations, field, image_gain, images, mirror, sequences
-from swiftwrf.models.geometry.path_gains import PathGains, choose_prior, fit_path_gains
+from swiftwrf.models.geometry.path_gains import PathGains, choose_prior, fit_path_gains, kernel_of
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation, correlations, retrieve_phases
 from swiftwrf.models.geometry.planes import PlaneSet, refined
 from swiftwrf.models.geometry.refine import image_jacobian, phase_jacobian
@@ -453,9 +453,32 @@ def test_image_sources_of_a_higher_order_are_added_where_held_out_spectra_need_t
     """The spectra contain images up to the second order."""
     data = mirror_room(SIX, n=100)
     found = GeometryModel.of_planes(data, [Plane(n, o, gain=-0.6) for n, o in SIX.items()], order=known)
-    room, prior = choose_prior(found, observe(data)[0], torch.arange(100) % 5)
-    assert (room.order, prior) == (chosen, "tight")
+    choice = choose_prior(found, observe(data)[0], torch.arange(100) % 5)
+    assert (choice.room.order, choice.prior) == (chosen, "tight")
     assert found.order == known
+
+
+def test_fits_that_the_choice_of_a_prior_hands_on_are_those_of_the_folds():
+    data, fold = mirror_room(SIX, n=60), torch.arange(60) % 3
+    found = GeometryModel.of_planes(data, [Plane(n, o, gain=-0.6) for n, o in SIX.items()], order=1)
+    scene, _ = observe(data)
+    choice = choose_prior(found, scene, fold)
+    assert choice.fits
+    for number, handed in choice.fits.items():
+        kept = scene.subset((fold != number).nonzero()[:, 0])
+        fitted = fit_path_gains(choice.room, kept, kernel_of(scene.moving), choice.prior)
+        torch.testing.assert_close(handed.change(data.position), fitted.change(data.position))
+    assert not choose_prior(found, observe(mirror_room(SIX, n=210))[0], torch.arange(210) % 2).fits
+
+
+def test_weak_planes_are_kept_if_all_folds_together_resolve_them():
+    """Noise of the phases hides a floor of gain -0.1 from the positions of the first fold."""
+    data = mirror_room({(-1, 0, 0): 0.0, (0, 0, -1): 0.0}, gain=(-0.6, -0.1), n=600, noise=0.3)
+    scene, rows = observe(data)
+    true = GeometryModel.of_planes(data, [Plane((-1, 0, 0), 0.0, -0.6), Plane((0, 0, -1), 0.0, -0.1)])
+    room, splits = true.tensors().refined(scene), split(scene, rows % 5)
+    found = [_pruned(room, scene, some, GeometryConfig()).normal.shape[1] for some in (splits[:1], splits)]
+    assert found == [1, 2]
 
 
 def test_hybrids_of_earlier_versions_have_loose_path_gains(hybrid):
