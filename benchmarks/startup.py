@@ -1,6 +1,6 @@
-"""Measure how long commands take from the command line: help, refusals, and a whole run of RSSI.
+"""Measure how long commands take from the command line: help, refusals, and whole runs.
 
-python benchmarks/startup.py [--against CHECKOUT]
+python benchmarks/startup.py [--against CHECKOUT] [--only NAME...]
 
 Rounds alternate between this checkout and the other one, so that other work on the machine slows both. Wall time is what a
 user waits; processor time, of all threads, depends less on other work.
@@ -19,6 +19,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import tyro
+from committed import load
 from record import write_result
 
 HERE = Path(__file__).parent.parent
@@ -33,15 +34,19 @@ COMMANDS = {
     "unknown option": ("-m", "tasks.aoa", "--mix", "0.3", "--no-such-option"),
     "wrong value": ("-m", "tasks.aoa", "--mix", "2"),
     "tasks.rssi --rx 6": ("-m", "tasks.rssi", "--rx", "6", "--out", "run"),
+    "tasks.aoa --mix 0.3": ("-m", "tasks.aoa", "--mix", "0.3", "--out", "run"),
 }
+FEW_ROUNDS = {"tasks.aoa --mix 0.3": 2}  # of commands that take a minute
 
 
 @dataclass(frozen=True)
 class Config:
-    """Seconds of commands, medians of 5 rounds after one that is not counted."""
+    """Seconds of commands: medians of 5 rounds after one that is not counted, of 2 for commands that take a minute."""
 
     against: Path | None = None
     """another checkout, measured in turn with this one"""
+    only: tuple[str, ...] = tuple(COMMANDS)
+    """commands to measure; the others keep their committed rows"""
 
 
 def seconds(checkout: Path, arguments: tuple[str, ...]) -> tuple[float, float]:
@@ -56,17 +61,19 @@ def seconds(checkout: Path, arguments: tuple[str, ...]) -> tuple[float, float]:
 
 def main(config: Config) -> None:
     checkouts = {"this": HERE} | ({"other": config.against.resolve()} if config.against else {})
-    rows = []
-    for name, arguments in COMMANDS.items():
+    rows = [row for row in load("startup")["rows"] if row["command"] not in config.only]
+    for name in config.only:
+        arguments, rounds = COMMANDS[name], FEW_ROUNDS.get(name, ROUNDS)
         taken: dict[str, list[tuple[float, float]]] = {checkout: [] for checkout in checkouts}
-        for _ in range(ROUNDS + 1):
+        for _ in range(rounds + 1):
             for checkout, folder in checkouts.items():
                 taken[checkout].append(seconds(folder, arguments))
         for checkout, values in taken.items():
             wall, processor = (statistics.median(column) for column in zip(*values[1:], strict=True))
-            rows.append({"command": name, "checkout": checkout, "wall_s": wall, "processor_s": processor})
+            row = {"command": name, "checkout": checkout, "rounds": rounds, "wall_s": wall, "processor_s": processor}
+            rows.append(row)
             print(f"{name:<24} {checkout:<6} {wall:6.2f} s, processor {processor:6.2f} s", flush=True)
-    write_result("startup", {"rounds": ROUNDS, "rows": rows})
+    write_result("startup", {"rows": rows})
 
 
 if __name__ == "__main__":
