@@ -22,11 +22,11 @@ import torch
 import tyro
 from committed import RESULTS
 from comparison import MEAN, SHARES, milliseconds, weight
-from locating_aoa import KERNEL, angle_summary
+from locating_aoa import KERNEL, quantiles
 from record import write_result
 from torch import Tensor
 
-from augment import Mixed, withhold
+from augment import Mixed, SyntheticPositions, withhold
 from swiftwrf import FitConfig, MatchedField, Spectra, SwiftWRF, load_spectra, make_model
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.choices import Moving
@@ -36,7 +36,7 @@ from swiftwrf.comparison.vae import VaeSize
 from swiftwrf.data.raytraced import ROOMS
 from swiftwrf.data.splits import validation_for
 from swiftwrf.gp import subsample
-from swiftwrf.metrics import l1, psnr, ssim, summary
+from swiftwrf.metrics import angle_errors, l1, psnr, ssim, summary
 from swiftwrf.models.base import FieldModel
 from swiftwrf.positions import Neighbours
 from swiftwrf.runtime.durable import write_text
@@ -70,8 +70,9 @@ QUICK_DIVISOR = 20  # of the steps of a fit by gradient descent under --quick
 JUDGES = 200  # test spectra of a split, evenly chosen: a neural field takes seconds to predict one
 COUNTS, QUICK_COUNTS = (200, 500, 1000, 2000, 3000), (60, 120)  # training spectra
 TURBO = ("swiftwrf", "nerf2", "wrfgs", "hybrid")
-LOCATED_FRACTIONS = (0.1, 1.0)  # measured fractions of the estimators without a network
-MATCHED = "matched_field"  # at the smallest fraction alone
+LOCATED_FRACTIONS = (0.1, 0.3, 0.5, 0.7, 1.0)  # measured fractions of the estimators without a network
+MATCHED = "matched_field"
+WITH_SYNTHETIC = {f"{KERNEL}_with_{name}": name for name in ("swiftwrf", "hybrid")}  # at the withheld positions
 CPU = torch.device("cpu")
 Split = Literal["random", "block"]
 Row = dict[str, Any]
@@ -243,21 +244,32 @@ def locate(work: Path, train: Spectra, test: Spectra, seed: int) -> None:
     """Measure the angular errors of the estimators without a network, unless they are measured."""
     test = test.subset(*subsample(torch.arange(len(test)), rows=JUDGES)).in_memory()
     for fraction in LOCATED_FRACTIONS:
-        measured = withhold(train, fraction, seed)[0] if fraction < 1 else train
-        for method in ("nearest_spectrum", KERNEL, *((MATCHED,) if fraction < 1 else ())):
+        measured, withheld = withhold(train, fraction, seed)
+        for method in ("nearest_spectrum", KERNEL, *((*WITH_SYNTHETIC, MATCHED) if fraction < 1 else ())):
             file = work / f"{fraction_key(fraction)} {method}.angles.json"
             if file.exists():
                 continue
             began = time.process_time()
-            if method == MATCHED:
-                locator = MatchedField(seed=seed).fit(measured, room=make_model(ROOM_MODEL, seed=seed).fit(measured))
-                estimate = locator.predict(test.spectrum)
-            else:
-                estimate = make_estimator(method, seed=seed).fit(Mixed.measured(measured)).predict(test.spectrum)
+            estimate = directions(method, measured, withheld, test.spectrum, seed)
             seconds = time.process_time() - began
-            errors = {"n_measured": len(measured), "seconds": seconds, "angle_deg": angle_summary(estimate, test)}
-            print(file.stem, f"{errors['angle_deg']['median']:.2f} degrees", flush=True)
+            errors: Row = {"n_measured": len(measured), "seconds": seconds}
+            errors |= {
+                f"{name}_deg": quantiles(error.rad2deg()) for name, error in angle_errors(estimate, test.label).items()
+            }
+            print(file.stem, f"{errors['great_circle_deg']['median']:.2f} degrees", flush=True)
             write_text(file, json.dumps(errors))
+
+
+def directions(method: str, measured: Spectra, withheld: SyntheticPositions, spectrum: Tensor, seed: int) -> Tensor:
+    """Return the directions (n, 2) [rad] that an estimator fitted to measured spectra finds in spectra (n, H, W)."""
+    if method == MATCHED:
+        room = make_model(ROOM_MODEL, seed=seed).fit(measured)
+        return MatchedField(seed=seed).fit(measured, room=room).predict(spectrum)
+    train, name = Mixed.measured(measured), method
+    if method in WITH_SYNTHETIC:
+        model, name = make_model(WITH_SYNTHETIC[method], seed=seed).fit(measured), KERNEL
+        train = train.add(withheld, model.synthesize(withheld.position))
+    return make_estimator(name, seed=seed).fit(train).predict(spectrum)
 
 
 def estimate_angles(config: Config, folder: Path, out: Path) -> None:

@@ -194,14 +194,15 @@ def paper_scale_locating() -> str:
         [
             f"{float(fraction):.0%} ({errors['n_measured']:,} spectra)",
             method,
-            f"{errors['angle_deg']['median']:.2f}",
-            f"{errors['angle_deg']['p90']:.2f}",
+            *(f"{errors[f'{angle}_deg']['median']:.2f}" for angle in ("elevation", "azimuth", "great_circle")),
+            f"{errors['great_circle_deg']['p90']:.2f}",
             f"{errors['seconds']:.0f}",
         ]
         for fraction, methods in sorted(load("paper_scale")["locating"].items())
         for method, errors in methods.items()
     ]
-    columns = ["measured", "estimator", "median angular error [deg]", "90th percentile [deg]", "fit and estimates [s]"]
+    columns = ["measured", "estimator", "elevation [deg]", "azimuth [deg]", "angular error [deg]"]
+    columns += ["90th percentile [deg]", "fit and estimates [s]"]
     return markdown(columns, rows)
 
 
