@@ -71,7 +71,7 @@ JUDGES = 200  # test spectra of a split, evenly chosen: a neural field takes sec
 COUNTS, QUICK_COUNTS = (200, 500, 1000, 2000, 3000), (60, 120)  # training spectra
 TURBO = ("swiftwrf", "nerf2", "wrfgs", "hybrid")
 LOCATED_FRACTIONS = (0.1, 0.3, 0.5, 0.7, 1.0)  # measured fractions of the estimators without a network
-MATCHED = "matched_field"
+MATCHED, NETWORK = "matched_field", "aann_kernel"
 WITH_SYNTHETIC = {f"{KERNEL}_with_{name}": name for name in ("swiftwrf", "hybrid")}  # at the withheld positions
 CPU = torch.device("cpu")
 Split = Literal["random", "block"]
@@ -241,11 +241,11 @@ def row(model: FieldModel | None, train: Spectra, test: Spectra, state: Path, de
 
 
 def locate(work: Path, train: Spectra, test: Spectra, seed: int) -> None:
-    """Measure the angular errors of the estimators without a network, unless they are measured."""
+    """Measure the angular errors of the estimators, of the network only with all spectra, unless they are measured."""
     test = test.subset(*subsample(torch.arange(len(test)), rows=JUDGES)).in_memory()
     for fraction in LOCATED_FRACTIONS:
         measured, withheld = withhold(train, fraction, seed)
-        for method in ("nearest_spectrum", KERNEL, *((*WITH_SYNTHETIC, MATCHED) if fraction < 1 else ())):
+        for method in ("nearest_spectrum", KERNEL, *((*WITH_SYNTHETIC, MATCHED) if fraction < 1 else (NETWORK,))):
             file = work / f"{fraction_key(fraction)} {method}.angles.json"
             if file.exists():
                 continue
