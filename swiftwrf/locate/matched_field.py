@@ -171,7 +171,7 @@ class MatchedField(Configured, Saved):
         fold = torch.arange(len(train)) % FOLDS
         choice = choose_prior(own, scene, fold[rows]) if own.planes else PriorChoice(own, "loose", {})
         kernel = kernel_of(scene.moving)
-        self.grid, self.room = train.grid, choice.room
+        self.grid = train.grid
 
         def fitted(kept: Tensor) -> _Fit:
             phases = scene.subset(kept[rows].nonzero()[:, 0])
@@ -181,6 +181,7 @@ class MatchedField(Configured, Saved):
 
         everything = torch.ones_like(fold, dtype=torch.bool)
         *parts, self._fit = parallel_map(fitted, [*(fold != number for number in range(FOLDS)), everything])
+        self.room = self._fit.room
         self._set_residuals(train.position, features, fold, parts)
         held_out = [train.position[fold == number] for number in range(FOLDS)]
         others = [Region(train.position[fold != number]) for number in range(FOLDS)]

@@ -254,7 +254,7 @@ def test_the_paper_preset_has_the_papers_settings_and_given_options():
         SwiftWRF(ModelConfig())
 
 
-@pytest.mark.parametrize(("n_primitives", "batch"), [(16, 1024), (2000, 524), (50_000, 64)])
+@pytest.mark.parametrize(("n_primitives", "batch"), [(16, 4096), (10_000, 1677), (500_000, 64)])
 def test_a_gpu_evaluates_more_positions_at_a_time_within_its_memory(n_primitives, batch):
     model = SwiftWRF()
     model.field = mock.Mock(primitives=range(n_primitives))
