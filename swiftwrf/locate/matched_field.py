@@ -137,6 +137,11 @@ class MatchedField(Configured, Saved):
     config_type: ClassVar[type[MatchedFieldConfig]] = MatchedFieldConfig
     config: MatchedFieldConfig
 
+    @property
+    def room(self) -> GeometryModel:
+        """Room whose paths the likelihoods use."""
+        return self._fit.room
+
     def fit(
         self,
         train: Spectra,
@@ -181,7 +186,6 @@ class MatchedField(Configured, Saved):
 
         everything = torch.ones_like(fold, dtype=torch.bool)
         *parts, self._fit = parallel_map(fitted, [*(fold != number for number in range(FOLDS)), everything])
-        self.room = self._fit.room
         self._set_residuals(train.position, features, fold, parts)
         held_out = [train.position[fold == number] for number in range(FOLDS)]
         others = [Region(train.position[fold != number]) for number in range(FOLDS)]
@@ -336,7 +340,7 @@ class MatchedField(Configured, Saved):
         if n < MIN_SPECTRA or bool((tensors["statistics"].abs() > MAX_LOG_VARIANCE).any()):
             raise InputError("residuals, positions or variances are not those of a fitted locator")
         gains = PathGains.from_state(tensors, header, room)
-        locator.grid, locator.room = room.grid, room
+        locator.grid = room.grid
         locator._fit = _Fit(room, gains, PathStatistics.of(tensors["statistics"]))
         locator.residual, locator.weight = tensors["residual"], tensors["weight"]
         locator.region, locator.observed_power = Region.from_state(tensors, header), float(header["observed_power"])

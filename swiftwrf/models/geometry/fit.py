@@ -53,9 +53,7 @@ MAX_FURTHER_TRIED = 8  # candidates of any orientation that are refined
 MAX_ORDER = 4  # reflections of an image source
 MIN_SEARCHED = 50  # spectra of a search whose room is extended; searches in fewer end at phase aliases more often
 MAX_MISSING_RATIO = 1.4  # of the missing coherence of new spectra and of those of a search, geometric means
-N_FINAL = (
-    400  # positions of the last moves of a search; fewer do not separate planes of furnished rooms from their aliases
-)
+N_FINAL = 400  # positions of the last moves of a search; fewer do not separate planes from aliases in furnished rooms
 
 
 Splits = list[tuple[PhaseObservations, PhaseObservations]]  # kept and held-out positions

@@ -118,9 +118,8 @@ class SwiftWRF(ProcessModel):
         field, x = self.field, self.field.normalise(position)
         gaussians = field.gaussians(x)
         few = len(field.primitives) * math.prod(grid.shape) <= MAX_CACHED_VALUES
-        cacheable = (
-            few and not field.shapes_deform and x.device.type == "cpu"
-        )  # a GPU renders faster than it multiplies
+        # a GPU renders kernels faster than it multiplies cached ones
+        cacheable = few and not field.shapes_deform and x.device.type == "cpu"
         if cacheable and not any(parameter.requires_grad for parameter in self.parameters()):
             kernel = self._cached("kernel", grid, field.kernels)
             mean = _magnitudes(gaussians.weight.expand(len(x), -1, -1), kernel)
