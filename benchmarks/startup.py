@@ -2,14 +2,12 @@
 
 python benchmarks/startup.py [--against CHECKOUT] [--only NAME...]
 
-Rounds alternate between this checkout and the other one, so that other work on the machine slows both. Wall time is what a
-user waits; processor time, of all threads, depends less on other work.
+Rounds alternate between this checkout and the other one, so that other work on the machine slows both.
 """
 
 from __future__ import annotations
 
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -19,7 +17,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import tyro
-from committed import load
 from record import write_result
 
 HERE = Path(__file__).parent.parent
@@ -46,33 +43,30 @@ class Config:
     against: Path | None = None
     """another checkout, measured in turn with this one"""
     only: tuple[str, ...] = tuple(COMMANDS)
-    """commands to measure; the others keep their committed rows"""
+    """commands to measure; the result has their rows alone"""
 
 
-def seconds(checkout: Path, arguments: tuple[str, ...]) -> tuple[float, float]:
-    """Return the wall and processor time of one command of a checkout [s]."""
+def seconds(checkout: Path, arguments: tuple[str, ...]) -> float:
+    """Return the time of one command of a checkout [s]."""
     with TemporaryDirectory() as folder:
-        before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-        environment = os.environ | {"PYTHONPATH": str(checkout)}
+        began, environment = time.perf_counter(), os.environ | {"PYTHONPATH": str(checkout)}
         subprocess.run([sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, check=False)
-        wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
-    return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        return time.perf_counter() - began
 
 
 def main(config: Config) -> None:
     checkouts = {"this": HERE} | ({"other": config.against.resolve()} if config.against else {})
-    rows = [row for row in load("startup")["rows"] if row["command"] not in config.only]
+    rows = []
     for name in config.only:
         arguments, rounds = COMMANDS[name], FEW_ROUNDS.get(name, ROUNDS)
-        taken: dict[str, list[tuple[float, float]]] = {checkout: [] for checkout in checkouts}
+        taken: dict[str, list[float]] = {checkout: [] for checkout in checkouts}
         for _ in range(rounds + 1):
             for checkout, folder in checkouts.items():
                 taken[checkout].append(seconds(folder, arguments))
         for checkout, values in taken.items():
-            wall, processor = (statistics.median(column) for column in zip(*values[1:], strict=True))
-            row = {"command": name, "checkout": checkout, "rounds": rounds, "wall_s": wall, "processor_s": processor}
-            rows.append(row)
-            print(f"{name:<24} {checkout:<6} {wall:6.2f} s, processor {processor:6.2f} s", flush=True)
+            wall = statistics.median(values[1:])
+            rows.append({"command": name, "checkout": checkout, "rounds": rounds, "wall_s": wall})
+            print(f"{name:<24} {checkout:<6} {wall:6.2f} s", flush=True)
     write_result("startup", {"rows": rows})
 
 

@@ -22,11 +22,13 @@ class Command(NamedTuple):
         summary: One line for the help.
         options: Dataclass of the options, in the module `options` of the command's package, which imports no torch.
         module: Module of that package with `run(config)`, or `run(config, resume)` if its runs can be resumed.
+        preloaded: Modules that processes of a run load while the run itself begins.
     """
 
     summary: str
     options: str
     module: str = "run"
+    preloaded: tuple[str, ...] = ()
 
 
 COMMANDS = {
@@ -34,6 +36,7 @@ COMMANDS = {
         "estimate angles of arrival with few measured spectra, and report the errors",
         "AoaConfig",
         "experiment",
+        ("tasks.aoa.steps", "torchvision", "torch._dynamo"),
     ),
     "rssi": Command("predict RSSI maps of receivers, and report the errors", "RssiTaskConfig", "experiment"),
     "locate": Command("locate transmitters from RSSI or spectra, and report the errors", "LocateConfig", "experiment"),
@@ -114,10 +117,12 @@ def _resume(options: Sequence[str]) -> int:
 
 def _execute(name: str, options: Sequence[str], program: str | None) -> None:
     from tasks.command_line import execute
+    from tasks.preload import preload
 
     command = COMMANDS[name]
 
     def task(*arguments: Any) -> None:
+        preload(command.preloaded)
         import_module(f"tasks.{name}.{command.module}").run(*arguments)
 
     execute(f"tasks.{name}", getattr(import_module(f"tasks.{name}.options"), command.options), task, options, program)

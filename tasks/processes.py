@@ -15,7 +15,7 @@ from collections.abc import Collection, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import active_children, get_context, parent_process
+from multiprocessing import active_children, parent_process
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,7 @@ import torch
 from swiftwrf import FitError
 from swiftwrf.runtime.progress import silent
 from swiftwrf.runtime.threads import set_threads
+from tasks.preload import process_context
 from tasks.torchrun import process_count
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ class LocalProcesses:
     def __init__(self, number: int, folder: Path, content: Path) -> None:
         self.slots: float = number
         threads = max(1, torch.get_num_threads() // number)
-        self._pool = ProcessPoolExecutor(number, get_context("spawn"), _begin, (threads, folder, content))
+        self._pool = ProcessPoolExecutor(number, process_context(), _begin, (threads, folder, content))
 
     def submit(self, step: Step[Any]) -> Future[Any]:
         """Begin a step in a process."""

@@ -86,15 +86,16 @@ def short(name: str) -> str:
 def as_svg(figure: Figure, title: str | None = None) -> str:
     """Return the figure as SVG without date or random names, with a title for readers who do not see it."""
     stream = io.StringIO()
-    canvas = FigureCanvasSVG(figure)
+    canvas, dpi = FigureCanvasSVG(figure), figure.dpi
     with matplotlib.style.context(STYLE):
         if (engine := figure.get_layout_engine()) is not None:  # savefig would draw the figure twice to place its parts
             engine.execute(figure)
             figure.set_layout_engine("none")
+            figure.dpi = dpi  # the layout changed it
         metadata: dict[str, str | None] = {"Date": None, "Creator": None}
         if title is not None:
             metadata["Title"] = title
-        canvas.print_figure(stream, format="svg", metadata=metadata)
+        canvas.print_svg(stream, metadata=metadata)  # print_figure would draw it twice
     return stream.getvalue()
 
 

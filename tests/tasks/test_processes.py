@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import time
+from importlib import import_module
 from multiprocessing import active_children
 from pathlib import Path
 from unittest import mock
@@ -19,7 +20,9 @@ from sums import Kill, Optional, Refusal, Sum
 from swiftwrf import AngularGrid, FitError, InputError, simulated_room
 from swiftwrf.data.writing import write_spectra
 from tasks.aoa.options import AoaConfig
+from tasks.command import COMMANDS
 from tasks.directory import Run
+from tasks.preload import SERVED
 from tasks.processes import number_of_processes
 from tasks.steps import Budget, computed
 
@@ -43,6 +46,19 @@ def test_processes_give_the_results_of_one_process_in_the_same_order(tmp_path):
     assert all(value["process"] != os.getpid() and value["threads"] == 1 for _, value in there)
     assert (tmp_path / "2" / "sum-5.txt").read_text() == "5"
     assert not active_children()
+
+
+@pytest.mark.skipif(not SERVED, reason="processes are forks of a server on Linux alone")
+def test_processes_begin_with_the_modules_that_a_command_preloads():
+    assert set(map(import_module, COMMANDS["aoa"].preloaded)) <= set(sys.modules.values())
+    code = """if __name__ == "__main__":
+        from tasks.preload import preload, process_context
+        preload(["colorsys"])
+        with process_context().Pool(1) as pool:
+            print(pool.apply(exec, ("import sys; assert 'colorsys' in sys.modules; assert 'torch' not in sys.modules",)))
+    """
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("None\n", "")
 
 
 @pytest.mark.parametrize("processes", [1, 2])
