@@ -1,9 +1,10 @@
 """RSSI where both ends of the link move: one model over pairs of positions.
 
-    rssi(p, q) = T - 10 gamma log10 |p - q| + c(p, r q)       [dBm]
+    rssi(p, q) = T_q - 10 gamma_q log10 |p - q| + c(p, r q)       [dBm]
 
-p and q are the positions of both ends, c is a Gaussian process over the six coordinates, and r is a ratio of lengths. So the
-model predicts ends at positions where none was measured.
+p and q are the positions of both ends, c is a Gaussian process over the six coordinates, and r is a ratio of lengths. T and
+gamma are those of all receivers, so that the model predicts ends at positions where none was measured. If only receivers at
+known places are predicted, they depend on the place, by a ridge regression.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from swiftwrf.positions import Neighbours, check_positions, distance
 from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiFitContext, RssiPredictor
 from swiftwrf.rssi.floors import FloorAttenuation
 from swiftwrf.rssi.model import LEVEL
-from swiftwrf.rssi.path_loss import MIN_DISTANCE_M, fit_path_loss
+from swiftwrf.rssi.path_loss import PairPathLoss
 from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.options import from_plain
@@ -52,8 +53,8 @@ class PairConfig(FieldConfig):
     """
 
     new_places: bool = True
-    """choose settings for receivers at positions without a measurement; otherwise for new positions of the transmitter, as
-    `validation` states"""
+    """fit for receivers at positions without a measurement, with one path-loss model; otherwise for new positions of the
+    transmitter, as `validation` states, with a path-loss model for each receiver"""
 
 
 class PairPredictor(RssiPredictor):
@@ -204,8 +205,8 @@ class PairModel(PairPredictor, Saved):
     """how distances of both ends count"""
     kernel: Kernel
     """kernel of the field, lengths in [m]"""
-    path_loss: Tensor
-    """RSSI at 1 m [dBm] and slope [dB a decade], float64 (2,)"""
+    path_loss: PairPathLoss
+    """path-loss model, of all receivers or of each place"""
     pair: Tensor
     """measured pairs, float64 (m, 6) [m]"""
     residual: Tensor
@@ -219,30 +220,41 @@ class PairModel(PairPredictor, Saved):
 
     @single_thread()
     def _fit_pairs(self, pair: Tensor, rssi: Tensor, fold: Tensor) -> None:
-        level, slope = fit_path_loss(_log_distance(pair)[:, None], rssi[:, None])
-        self.path_loss = torch.cat([level, slope])
-        self.pair, self.residual = pair, rssi - self._path_loss(pair)
+        self.path_loss = PairPathLoss.fit(pair, rssi, not self.config.new_places)
+        self.pair, self.residual = pair, rssi - self.path_loss(pair)
         order = torch.randperm(len(pair), generator=torch.Generator().manual_seed(self.config.seed))
         sample = order[:MAX_HELD_OUT]
         # one region only: none is left to predict it from
         fold = fold if len(fold.unique()) > 1 else torch.arange(len(fold)) % 2
-        choices = [choice for metric in METRICS for choice in self._judged(metric, fold, sample)]
+        held_out = self._residuals_without(rssi, fold, sample)
+        choices = [choice for metric in METRICS for choice in self._judged(metric, fold, sample, held_out)]
         _, self.metric, self.kernel, score = min(choices, key=lambda choice: choice[0])
         self.scale_db = score.quantile(LEVEL)[None] / NormalDist().inv_cdf((1 + LEVEL) / 2)
         self._precompute()
 
-    def _judged(self, metric: Metric, fold: Tensor, sample: Tensor) -> list[tuple[float, Metric, Kernel, Tensor]]:
+    def _residuals_without(self, rssi: Tensor, fold: Tensor, sample: Tensor) -> dict[int, Tensor]:
+        """Return the residuals (m,) of the path-loss model fitted without each fold of the sample."""
+        residual = {}
+        for number in fold[sample].unique().tolist():
+            kept = fold != number
+            fitted = PairPathLoss.fit(self.pair[kept], rssi[kept], not self.config.new_places)
+            residual[number] = rssi - fitted(self.pair)
+        return residual
+
+    def _judged(
+        self, metric: Metric, fold: Tensor, sample: Tensor, held_out: dict[int, Tensor]
+    ) -> list[tuple[float, Metric, Kernel, Tensor]]:
         """Return kernels with their mean absolute error at held-out pairs, and the errors by their relative deviations."""
         n_near = min(N_NEIGHBOURS, int((fold[:, None] != fold.unique()).sum(dim=0).min()))
         between, across, value, residual = [], [], [], []
-        for number in fold[sample].unique():
+        for number, own in held_out.items():
             out, kept = sample[fold[sample] == number], fold != number
             known, query = metric.known(self.pair[kept]), metric.coordinates(self.pair[out])
             near = Neighbours(known)(query, n_near)[1]
             between.append(distance(known[near], known[near]))
             across.append(distance(query[:, None], known[near])[:, 0])
-            value.append(metric.values(self.residual[kept])[near])
-            residual.append(self.residual[out])
+            value.append(metric.values(own[kept])[near])
+            residual.append(own[out])
         r_between, r_across, values, truth = (torch.cat(parts) for parts in (between, across, value, residual))
         # rough fields only, as in the model of each receiver
         kernels = [k for k in candidates(metric.coordinates(self.pair), RELATIVE_NOISE_VARIANCES) if k.share == 1]
@@ -257,9 +269,6 @@ class PairModel(PairPredictor, Saved):
                 judged.append((float(error.mean()), metric, kernel, score))
         return judged
 
-    def _path_loss(self, pair: Tensor) -> Tensor:
-        return self.path_loss[0] + self.path_loss[1] * _log_distance(pair)
-
     def _precompute(self) -> None:
         known, value = self.metric.known(self.pair), self.metric.values(self.residual)
         self._process = GaussianProcess(self.kernel, known, value[:, None], exact=False)
@@ -267,11 +276,13 @@ class PairModel(PairPredictor, Saved):
     @single_thread()
     def _at_pairs(self, pair: Tensor) -> tuple[Tensor, Tensor]:
         field, variance = self._process.local(self.metric.coordinates(pair))
-        return self._path_loss(pair) + field[:, 0], self.scale_db * (variance + self.kernel.noise).sqrt()
+        return self.path_loss(pair) + field[:, 0], self.scale_db * (variance + self.kernel.noise).sqrt()
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         self.check_fitted()
-        tensors = {name: getattr(self, name) for name in _shapes(0, 0)}
+        own = {"receiver": self.receiver, "pair": self.pair, "residual": self.residual, "scale_db": self.scale_db}
+        loss = self.path_loss
+        tensors = own | {"path_loss": loss.shared, "place": loss.place, "correction": loss.correction}
         header = {
             "options": asdict(self.config),
             "origin": self.origin,
@@ -292,26 +303,18 @@ class PairModel(PairPredictor, Saved):
         model.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
         ratio, reciprocal = header["metric"]
         model.metric, model.kernel = Metric(float(ratio), bool(reciprocal)), Kernel(**header["kernel"])
-        shapes = _shapes(len(model.receiver_names), len(tensors["pair"]))
-        files.expect(tensors, shapes)
+        # files of earlier versions have no places
+        tensors = {"place": torch.zeros(0, 3).double(), "correction": torch.zeros(0, 2).double()} | tensors
+        n_pairs, n_places = len(tensors["pair"]), len(tensors["place"])
+        shapes = {
+            "receiver": (len(model.receiver_names), 3),
+            "pair": (n_pairs, 6),
+            "residual": (n_pairs,),
+            "scale_db": (1,),
+        }
+        files.expect(tensors, shapes | {"path_loss": (2,), "place": (n_places, 3), "correction": (n_places, 2)})
         for name in shapes:
             setattr(model, name, tensors[name])
+        model.path_loss = PairPathLoss(tensors["path_loss"], tensors["place"], tensors["correction"])
         model._precompute()
         return model
-
-
-def _shapes(n_receivers: int, n_pairs: int) -> dict[str, tuple[int, ...]]:
-    """Return the shape of every saved tensor."""
-    return {
-        "receiver": (n_receivers, 3),
-        "path_loss": (2,),
-        "pair": (n_pairs, 6),
-        "residual": (n_pairs,),
-        "scale_db": (1,),
-    }
-
-
-def _log_distance(pair: Tensor) -> Tensor:
-    """Return the log10 of the distances [m] between the ends of pairs (m, 6), float64 (m,)."""
-    squared = (pair[:, :3] - pair[:, 3:]).square().sum(dim=1)
-    return squared.clamp_min(MIN_DISTANCE_M**2).log10() / 2

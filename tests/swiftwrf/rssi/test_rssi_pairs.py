@@ -178,9 +178,10 @@ def test_intervals_contain_the_nominal_fraction_at_new_places():
     assert 0.7 < float(inside.double().mean()) < 0.92
 
 
-def test_predictions_of_pairs_rows_and_measured_cells_agree(tmp_path):
+@pytest.mark.parametrize("new_places", [True, False])
+def test_predictions_of_pairs_rows_and_measured_cells_agree(tmp_path, new_places):
     data = Rssi.from_frame(links(n_places=8, rows=12))
-    model = PairModel(seed=1).fit(data)
+    model = PairModel(seed=1, new_places=new_places).fit(data)
     model.save(tmp_path / "pairs.safetensors")
     loaded = swiftwrf.load(tmp_path / "pairs.safetensors")
     assert isinstance(loaded, PairModel)
@@ -198,6 +199,21 @@ def test_ends_that_are_alike_are_exchanged():
     assert model.metric.reciprocal
     p, q = torch.rand(2, 20, 3, dtype=torch.float64) * ROOM_M
     torch.testing.assert_close(model.predict_pairs(p, q).mean, model.predict_pairs(q, p).mean)
+
+
+def test_known_places_have_their_own_path_loss():
+    """Transmitters of different power: a place that is known has its level, a new place has that of all."""
+    table = links(n_places=12, rows=40)
+    place = table.groupby(["tx_x", "tx_y"], sort=False).ngroup()
+    strong = place % 2 == 0
+    data = Rssi.from_frame(table.assign(rssi=table.rssi + np.where(strong, 10.0, -10.0)))
+    train, test = data.split("random")
+    known, new = (error_db(PairModel(new_places=places), train, test) for places in (False, True))
+    assert known < 0.9 * new
+    model = PairModel(new_places=False).fit(train)
+    assert model.path_loss.correction.shape == (12, 2)
+    away = model.path_loss(torch.tensor([[0.0, 0, 0, 0, 0, 1]]))
+    torch.testing.assert_close(away, model.path_loss.shared[:1])
 
 
 def run(*arguments):
