@@ -29,7 +29,6 @@ from torch import Tensor
 
 from swiftwrf import Rssi, load_rssi
 from swiftwrf.data.rssi import PLACE
-from swiftwrf.data.splits import validation_for
 from swiftwrf.rssi import LEVEL, PairModel, RssiModel
 from swiftwrf.rssi.head import DB_PER_UNIT, Head, render
 from tasks.rssi.predictors import PREDICTORS, make_predictor
@@ -117,7 +116,7 @@ def measure(data: Rssi, split: str, also: tuple[str, ...] = ()) -> Row:
 
 def _measured(name: str, train: Rssi, test: Rssi, split: str) -> tuple[Row, NDArray[np.float64]]:
     """Return the entry of one predictor, and its absolute errors at the detected test pairs [dB]."""
-    options = {"validation": validation_for(split), "new_places": split == PLACE}
+    options = {"validation": train.validation_for(split, test), "new_places": split == PLACE}
     predictor = make_predictor(RssiModel.name if name == IDENTITY else name, **options)
     began = time.process_time()
     with patch("swiftwrf.rssi.training.render", in_phase if name == IDENTITY else render):

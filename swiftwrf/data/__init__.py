@@ -110,7 +110,7 @@ def load_rssi(
     Args:
         path: Folder or file.
         columns: Names of columns of a table that are not recognised, by role: x, y, z, longitude, latitude, floor, time,
-            receiver, rssi.
+            session, receiver, rssi.
         filler: Values that stand for not detected, [] for none. Defaults to those that are recognised.
         coordinates: "degrees" or "metres", of the positions in a table. Defaults to the unit that is recognised.
         offset_by: Column of a table with groups of rows, e.g. devices, between which RSSI has constant offsets.

@@ -25,6 +25,7 @@ ROLES = {  # names of columns, in lower case with underscores
     "latitude": re.compile("(?:gps_?|current_?)?(?:lat|latitude)(?:_deg(?:rees)?)?"),
     "floor": re.compile("floor(?:_?id)?"),
     "time": re.compile("time(?:_s)?|timestamp|t|date(?:_?time)?|first_?seen"),
+    "session": re.compile("(?:session|run|walk)(?:_?id)?"),
     "receiver": re.compile("receiver(?:_(?:name|id))?|rx|gateway|ap|bssid|mac|sensor|anchor"),
     "rssi": re.compile("(?:rssi?|rsrp|signal|power)(?:_dbm)?|rss_dbm|dbm"),
 }

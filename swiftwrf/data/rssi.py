@@ -16,12 +16,13 @@ from swiftwrf.data.dataset import Numbers, PositionedData, to_positions
 from swiftwrf.data.floors import Floors
 from swiftwrf.data.labelled import Variable, position_coordinates, receiver_coordinates
 from swiftwrf.data.receivers import receiver_row
-from swiftwrf.data.splits import MIN_TRAINING, random_split
+from swiftwrf.data.splits import MIN_TRAINING, Validation, random_split, validation_for
 from swiftwrf.data.survey import SurveyOptions, read_survey
 from swiftwrf.errors import InputError, listed
 from swiftwrf.plotting import MARK, plan
 from swiftwrf.runtime.validation import checked
 
+SESSIONS = "meta.csv"  # file of the NeRF2 layout with a row for each measurement
 PLACE, MIN_PLACES = "place", 5  # split by receiver, a fifth of which is held out
 if TYPE_CHECKING:
     import matplotlib.axes
@@ -107,6 +108,7 @@ class Rssi(PositionedData):
         labels: Names of columns of the table that distinguish groups of rows.
         floors: Floors of the building, by height.
         receiver_moves: Whether the receivers are positions of one receiver that moves, too.
+        session: Session of measurements that each row is of, e.g. a walk or a day, int64 (n,).
         name: Name of the data set.
         details: index, named_splits, source and notes of `PositionedData`.
 
@@ -130,8 +132,9 @@ class Rssi(PositionedData):
     labels: tuple[str, ...]
     floors: Floors | None
     receiver_moves: bool
+    session: Tensor | None
 
-    row_fields: ClassVar[tuple[str, ...]] = ("transmitter_position", "rssi_dbm", "index", "groups")
+    row_fields: ClassVar[tuple[str, ...]] = ("transmitter_position", "rssi_dbm", "index", "groups", "session")
 
     @checked
     def __init__(
@@ -147,6 +150,7 @@ class Rssi(PositionedData):
         labels: tuple[str, ...] = (),
         floors: Floors | None = None,
         receiver_moves: bool = False,
+        session: Tensor | None = None,
         name: str = "rssi",
         **details: Any,
     ) -> None:
@@ -183,6 +187,7 @@ class Rssi(PositionedData):
             labels=labels,
             floors=floors,
             receiver_moves=receiver_moves,
+            session=session,
         )
 
     @classmethod
@@ -204,7 +209,7 @@ class Rssi(PositionedData):
         Args:
             frame: Columns of positions [m] and RSSI [dBm], recognised by their names as in docs/formats.md.
             columns: Names of columns that are not recognised, by role: x, y, z, longitude, latitude, floor,
-                time, receiver, rssi.
+                time, session, receiver, rssi.
             filler: Values that stand for not detected, [] for none. Defaults to those that are recognised.
             coordinates: "degrees" or "metres". Defaults to the unit that is recognised.
             offset_by: Column with the groups of rows between which RSSI has constant offsets.
@@ -235,6 +240,7 @@ class Rssi(PositionedData):
             labels=survey.labels,
             floors=survey.floors,
             receiver_moves=survey.receiver_moves,
+            session=survey.session,
             name=name,
             index=survey.row,
             notes=survey.notes,
@@ -304,6 +310,20 @@ class Rssi(PositionedData):
                 f"split {PLACE!r} of {self.name} has {len(parts[0])} training rows, too few to fit anything"
             )
         return parts[0], parts[1]
+
+    def validation_for(self, split: str, test: Rssi) -> Validation:
+        """Return the kind of folds of this training part that resembles the test part of a split.
+
+        Folds are whole sessions if the test rows are of other sessions than the training rows.
+
+        Example:
+            >>> import swiftwrf
+            >>> train, test = swiftwrf.rssi_room(n=60).split("block")
+            >>> train.validation_for("block", test)
+            'block'
+        """
+        own, others = ({*data.session.tolist()} if data.session is not None else {0} for data in (self, test))
+        return "session" if len(own) > 1 and own.isdisjoint(others) else validation_for(split)
 
     def receivers(self, asked: Sequence[str]) -> Rssi:
         """Return the data of some receivers.

@@ -21,7 +21,7 @@ REPEATED_SPACING = 0.02  # distance of positions that count as one, relative to 
 MAX_INDEX_DIGITS = 18
 FOLDS = 5
 
-Validation = Literal["random", "block"]
+Validation = Literal["random", "block", "session"]
 
 
 def split_names(folder: Path) -> list[str]:
@@ -175,27 +175,49 @@ def block_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:
 
 
 @checked
-def folds(position: Tensor, validation: Validation, seed: int, number: PositiveInt = FOLDS) -> Tensor:
-    """Return the fold of each training position (n, 3), counted from 0. Rows at one position share a fold.
+def folds(
+    position: Tensor,
+    validation: Validation,
+    seed: int,
+    number: PositiveInt = FOLDS,
+    session: Tensor | None = None,
+) -> Tensor:
+    """Return the fold of each training position, counted from 0. Rows at one position, or of one session, share a fold.
 
     Args:
         position: Training positions, (n, 3) [m].
-        validation: "random" for random folds, "block" for slabs.
+        validation: "random" for random folds, "block" for slabs, "session" for whole sessions. A single session has random
+            folds.
         seed: Seed of random folds.
         number: Number of folds.
+        session: Session of each row, int64 (n,).
 
     Raises:
-        InputError: Another `validation`.
+        InputError: Another `validation`, or "session" without sessions.
 
     Example:
         >>> folds(torch.rand(20, 3), "random", seed=0).bincount().tolist()
         [4, 4, 4, 4, 4]
     """
+    if validation == "session" and session is None:
+        raise InputError('validation="session" needs measurements with sessions, see docs/formats.md')
+    if validation == "session" and session is not None and len(session.unique()) > 1:
+        return _whole(session, number)
     if validation == "block":
         return slabs(position, number)
     place = places(position, number)
     order = torch.randperm(len(place.unique()), generator=torch.Generator().manual_seed(seed))
     return (order % number)[place]
+
+
+def _whole(session: Tensor, number: int) -> Tensor:
+    """Return folds of whole sessions, of nearly equal size."""
+    _, own, size = session.unique(return_inverse=True, return_counts=True)
+    fold, filled = torch.zeros_like(size), torch.zeros(min(number, len(size)), dtype=torch.int64)
+    for which in size.argsort(descending=True, stable=True).tolist():
+        fold[which] = filled.argmin()
+        filled[fold[which]] += size[which]
+    return fold[own]
 
 
 def validation_for(split: str) -> Validation:

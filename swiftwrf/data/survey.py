@@ -12,7 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES, refusing_broken
 from swiftwrf.data.columns import (
@@ -70,6 +72,7 @@ class Survey(NamedTuple):
     n_rows: int  # of the table
     origin: GeodeticOrigin | None  # of positions in degrees
     group: list[str]  # of each row; empty if it was not asked for
+    session: Tensor | None  # of each row, if the table contains sessions, int64 (n,)
     labels: tuple[str, ...]  # columns that distinguish groups of rows
     floors: Floors | None  # if the table contains them
     receiver_moves: bool  # receivers are positions of one that moves
@@ -142,7 +145,7 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
     Raises:
         InputError: A column that is missing or ambiguous, or a value that is no position or received power.
     """
-    table = table.set_axis([str(name).strip() for name in table.columns], axis=1)
+    table = table.set_axis([str(name).strip() for name in table.columns], axis=1).reset_index(drop=True)
     if not len(table) or not table.columns.is_unique:
         raise InputError(f"{label} must have rows, and a name of its own for each column")
     asked, end = _second_end(label, table, options)
@@ -155,8 +158,10 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
     if options.offset_by is not None and options.offset_by not in table.columns:
         raise InputError(f"{label} has no column {options.offset_by!r} for offsets; there are {listed(table.columns)}")
     group = text_of(table[options.offset_by]) if options.offset_by else pd.Series([""] * len(table))
+    session = text_of(table[roles["session"]]) if "session" in roles else None
     if "receiver" in roles:
-        names, rssi, source, coordinate = _long(label, table, roles, coordinate, group)
+        apart = group if session is None else group + "\n" + session
+        names, rssi, source, coordinate = _long(label, table, roles, coordinate, apart)
         unused = [name for name in table.columns if name not in roles.values()]
     else:
         names, rssi = _wide(label, table, roles, asked)
@@ -199,14 +204,17 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
     if end:
         names, rssi, position, where, found = as_receivers(label, rssi, position)
         places, notes = dict(zip(names, where.tolist(), strict=True)), notes + found
-    groups = group.to_numpy()[source.max(axis=1)[row]].tolist() if options.offset_by else []
-    labels = tuple(name for name in unused if _distinguishes(table[name]))
+    origins = source.max(axis=1)[row]  # row of the table that each row is of
+    groups = group.to_numpy()[origins].tolist() if options.offset_by else []
+    sessions = None if session is None else torch.from_numpy(pd.factorize(session.to_numpy()[origins])[0]).long()
+    labels = tuple(name for name in (*unused, roles.get("session")) if name and _distinguishes(table[name]))
     if labels and not options.offset_by:
         notes.append(f"rows differ in {listed(labels)}; tasks.inspect tests whether its values have constant offsets")
     moves = bool(end or options.transmitter)
     if moves and not end:
         notes.append(f"both ends move; {len(names)} positions of column {options.transmitter[0]} count as receivers")
-    return Survey(names, rssi, position, row, len(omitted), origin, groups, labels, floors, moves, places, tuple(notes))
+    counts = (row, len(omitted))
+    return Survey(names, rssi, position, *counts, origin, groups, sessions, labels, floors, moves, places, tuple(notes))
 
 
 def _pools(label: object, table: pd.DataFrame, roles: dict[str, str], names: list[str], by: str) -> list[str]:

@@ -18,7 +18,7 @@ from swiftwrf.array.angles import AngularGrid, to_angles
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.data.fillers import NOT_DETECTED_DBM
 from swiftwrf.data.paths import PropagationPaths
-from swiftwrf.data.rssi import Rssi
+from swiftwrf.data.rssi import SESSIONS, Rssi
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.store import write_npy
 from swiftwrf.errors import InputError
@@ -60,7 +60,7 @@ def write_spectra(data: Spectra, folder: Path) -> None:
 
 
 def write_rssi(data: Rssi, folder: Path) -> None:
-    """Write tx_pos.csv, gateway_rssi.csv, the splits, and gateway_position.yml with the known positions of receivers.
+    """Write tx_pos.csv, gateway_rssi.csv, the splits, meta.csv with sessions, and gateway_position.yml with known receivers.
 
     Measurements of exactly -100 dBm, which the layout uses for not detected, are written as -99.99.
 
@@ -76,6 +76,8 @@ def write_rssi(data: Rssi, folder: Path) -> None:
         known = zip(data.receiver_names, data.receiver_position.tolist(), data.receiver_located.tolist(), strict=True)
         places = {name: position for name, position, is_located in known if is_located}
         write_text(folder / "gateway_position.yml", yaml.safe_dump(places, sort_keys=False, allow_unicode=True))
+    if data.session is not None:
+        write_text(folder / SESSIONS, "\n".join(["session", *map(str, data.session.tolist()), ""]))
     _write_splits(data.named_splits, folder, first=0)
 
 

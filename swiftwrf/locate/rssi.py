@@ -111,7 +111,7 @@ class RssiLocator(Configured, Saved):
         self.model = model or RssiModel(validation=config.validation, seed=config.seed).fit(train)
         known, rssi = train.transmitter_position, train.rssi_dbm
         self.floor_dbm = float(rssi[~rssi.isnan()].min()) - UNDETECTED_BELOW_DB
-        fold = folds(known, config.validation, config.seed)
+        fold = folds(known, config.validation, config.seed, session=train.session)
         numbers = tracked(fold.unique().tolist(), "held-out folds", progress)
         parts = [self._part(train, fold, number) for number in numbers]
         self.region = region or Region(

@@ -45,7 +45,7 @@ class FieldConfig:
     """
 
     validation: Validation = "random"
-    """training spectra held out to choose settings: single ones at random, or one region at a time"""
+    """training rows held out to choose settings: single ones at random, one region at a time, or whole sessions of RSSI"""
     seed: NonNegativeInt = 0
     """seed of everything random"""
 

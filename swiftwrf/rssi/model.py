@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from statistics import NormalDist
@@ -271,7 +271,9 @@ class RssiModel(RssiPredictor, Saved):
             receiver_names=self.receiver_names,
             origin=self.origin,
         )
-        model = type(self)(self.config).fit(rows)
+        # the rows have lost their sessions
+        validation = "block" if self.config.validation == "session" else self.config.validation
+        model = type(self)(replace(self.config, validation=validation)).fit(rows)
         model.attenuation, model.offsets = self.attenuation, self.offsets
         return model
 

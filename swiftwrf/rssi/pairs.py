@@ -97,7 +97,8 @@ class PairPredictor(RssiPredictor):
         row, column = train.detected.nonzero(as_tuple=True)
         self.receiver = train.receiver_position
         pair = torch.cat([train.transmitter_position[row], self.receiver[column]], dim=1)
-        fold = folds(pair[:, :3], self.config.validation, self.config.seed)
+        session = train.session if train.session is None else train.session[row]
+        fold = folds(pair[:, :3], self.config.validation, self.config.seed, session=session)
         if self.config.new_places and len(self.receiver[column].unique(dim=0)) > 1:
             fold = folds(pair[:, 3:], "random", self.config.seed)
         self._fit_pairs(pair, train.rssi_dbm[row, column], fold)

@@ -77,7 +77,7 @@ def prepare(train: Rssi, pool: Rssi, config: RssiConfig, like: RssiTraining | No
     """
     position, rssi, count, bin_of_row = bin_locations(train, config.max_locations)
     pool_rssi = bin_locations(pool, config.max_locations)[1]
-    fold = folds(position, config.validation, config.seed)
+    fold = folds(position, config.validation, config.seed, session=_most_frequent(train.session, bin_of_row))
     centre = position.mean(dim=0)
     local, receiver = position - centre, train.receiver_position.double() - centre
     distance = log_distance(local, receiver)
@@ -139,6 +139,15 @@ def representative_receivers(pool: Rssi) -> Rssi:
     """Return the data of at most 12 receivers of the pool that detected the transmitter, evenly chosen."""
     detecting = pool.detected.any(dim=0).nonzero()[:, 0]
     return pool.columns(subsample(detecting, rows=MAX_KERNEL_RECEIVERS)[0].tolist())
+
+
+def _most_frequent(session: Tensor | None, bin_of_row: Tensor) -> Tensor | None:
+    """Return the session that most rows of each bin are of, int64 (n,)."""
+    if session is None:
+        return None
+    _, own = session.unique(return_inverse=True)
+    times = torch.zeros(int(bin_of_row.max()) + 1, int(own.max()) + 1)
+    return times.index_put((bin_of_row, own), torch.ones(()), accumulate=True).argmax(dim=1)
 
 
 def bin_locations(rows: Rssi, max_locations: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

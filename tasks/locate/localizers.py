@@ -124,7 +124,7 @@ class FingerprintLocalizer(Localizer):
         train = train.subset(train.detected.any(dim=1))
         relative = self._relative(train.rssi_dbm)
         self._undetected = float(relative[~relative.isnan()].min()) - UNDETECTED_BELOW_DB
-        fold = folds(train.transmitter_position, self.config.validation, self.config.seed)
+        fold = folds(train.transmitter_position, self.config.validation, self.config.seed, session=train.session)
         self._regress(self._fingerprint(train.rssi_dbm), train.transmitter_position.numpy(), fold.numpy())
         return self
 

@@ -14,7 +14,6 @@ from torch import Tensor
 from augment.suggest import suggest_positions
 from swiftwrf import Rssi
 from swiftwrf.data.coordinates import degree_columns
-from swiftwrf.data.splits import validation_for
 from swiftwrf.locate import Posterior, RssiLocator
 from swiftwrf.positions import nearest
 from tasks.claim import LOCATOR
@@ -110,7 +109,11 @@ class Localization(Step[Experiment]):
 
     def compute(self, context: Experiment, folder: Path) -> Row:
         train, test = context.part(self.rows, self.receivers)
-        options = {"validation": validation_for(context.split), "n_cells": context.cells, "seed": context.seed}
+        options = {
+            "validation": train.validation_for(context.split, test),
+            "n_cells": context.cells,
+            "seed": context.seed,
+        }
         localizer = LOCALIZERS[self.localizer](**options)
         began = time.perf_counter()
         localizer.fit(train)

@@ -95,7 +95,8 @@ def as_svg(figure: Figure, title: str | None = None) -> str:
         metadata: dict[str, str | None] = {"Date": None, "Creator": None}
         if title is not None:
             metadata["Title"] = title
-        canvas.print_svg(stream, metadata=metadata)  # print_figure would draw it twice
+        # print_figure would draw it twice
+        canvas.print_svg(stream, metadata=metadata)  # type: ignore[no-untyped-call]
     return stream.getvalue()
 
 

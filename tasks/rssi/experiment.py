@@ -16,7 +16,6 @@ from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.files import sha256
 from swiftwrf.data.rssi import PLACE
-from swiftwrf.data.splits import validation_for
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance
 from swiftwrf.rssi import LEVEL, PairModel, RssiModel
@@ -156,7 +155,7 @@ class _Tables:
 
         def compute() -> Row:
             config = self.config
-            options = {"validation": validation_for(config.split), "seed": config.seed}
+            options = {"validation": self.train.validation_for(config.split, self.test), "seed": config.seed}
             options["new_places"] = config.split == PLACE
             predictor = make_predictor(name, config.preset, **options)
             began = time.perf_counter()

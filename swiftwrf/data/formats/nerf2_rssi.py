@@ -1,6 +1,7 @@
 """Reader of the NeRF2 layout for RSSI: a table of RSSI, positions with the same rows, and positions of the receivers.
 
-The files are gateway_rssi.csv, tx_pos.csv or rx_pos.csv, and gateway_position.yml; or, as the BLE data of the paper are
+The files are gateway_rssi.csv, tx_pos.csv or rx_pos.csv, gateway_position.yml, and perhaps meta.csv with a column of
+sessions; or, as the BLE data of the paper are
 offered, rssi.csv, beacon_pos.csv and gateway_pos.csv.
 """
 
@@ -9,16 +10,17 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
 
-from swiftwrf.data.columns import column_of_numbers
+from swiftwrf.data.columns import column_of, column_of_numbers, text_of
 from swiftwrf.data.coordinates import without_fix
 from swiftwrf.data.files import MAX_COORDINATE_M, digests, numbers, read_yaml
 from swiftwrf.data.fillers import NOT_DETECTED_DBM, check_powers, find_fillers, without_fillers
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
 from swiftwrf.data.receivers import read_receivers, unknown_positions
-from swiftwrf.data.rssi import Rssi
+from swiftwrf.data.rssi import SESSIONS, Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
 from swiftwrf.data.survey import read_frame
 from swiftwrf.errors import InputError, listed
@@ -65,6 +67,8 @@ class Nerf2Rssi(Format[Rssi]):
             missing.append(
                 "the receiver moves; RSSI is reciprocal, so it counts as the transmitter and the others as receivers"
             )
+        meta = path / SESSIONS
+        session = _sessions(meta, len(rssi)) if meta.is_file() else None
         return Rssi(
             rssi[row],
             position[row],
@@ -73,9 +77,21 @@ class Nerf2Rssi(Format[Rssi]):
             receiver_position=receiver_position,
             index=row,
             named_splits=kept_splits(read_splits(path, len(rssi), first=0), row, len(rssi)),
-            source=digests([f for f in (positions, table, receivers) if f], path),
+            session=None if session is None else session[row],
+            source=digests([f for f in (positions, table, receivers, session is not None and meta) if f], path),
             notes=(*notes, *missing, *unknown),
         )
+
+
+def _sessions(file: Path, n: int) -> Tensor | None:
+    """Return the session of each of n rows (n,), by the column of sessions if there is one."""
+    frame = read_frame(file)
+    name = column_of(frame, "session", {})
+    if name is None:
+        return None
+    if len(frame) != n:
+        raise InputError(f"{file} has {len(frame)} rows, the RSSI {n}; they must match")
+    return torch.from_numpy(pd.factorize(text_of(frame[name]))[0]).long()
 
 
 def _is_raw(path: Path) -> bool:

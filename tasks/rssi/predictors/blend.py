@@ -48,7 +48,7 @@ class Blend(RssiPredictor):
 
     def _fit(self, train: Rssi, context: RssiFitContext) -> None:
         names = [name for name in self.config.members if not PREDICTORS[name].lacking(train)]
-        fold = folds(train.transmitter_position, self.config.validation, self.config.seed)
+        fold = folds(train.transmitter_position, self.config.validation, self.config.seed, session=train.session)
         held_out = torch.full((len(names), *train.rssi_dbm.shape), torch.nan, dtype=torch.float64)
         for number in fold.unique():
             out = fold == number

@@ -50,7 +50,8 @@ class ReceiverRegressors(RssiPredictor):
         self._simpler = base and base.fit(train)
         if self._simpler is not None:
             residual = residual - self._simpler.predict(train.transmitter_position).mean
-        fold = folds(train.transmitter_position, self.config.validation, self.config.seed).numpy()
+        at, config = train.transmitter_position, self.config
+        fold = folds(at, config.validation, config.seed, session=train.session).numpy()
         self._scale = torch.tensor([1.0, 1.0, FLOOR_STRETCH if train.floors else 1.0], dtype=torch.float64)
         position = (train.transmitter_position * self._scale).numpy()
         mean = float(residual.nanmean())

@@ -125,7 +125,7 @@ def test_columns_named_by_the_user(tmp_path):
     with pytest.raises(InputError, match="no column 'nowhere' for y"):
         load_rssi(file, columns={"x": "easting_of_robot", "y": "nowhere"})
     with pytest.raises(
-        InputError, match="columns takes x, y, z, longitude, latitude, floor, time, receiver, rssi, got 'w'"
+        InputError, match="columns takes x, y, z, longitude, latitude, floor, time, session, receiver, rssi, got 'w'"
     ):
         load_rssi(file, columns={"w": "y"})
 
