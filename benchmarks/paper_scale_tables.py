@@ -72,52 +72,70 @@ def _score(row: dict[str, Any] | None, best: bool = False) -> str:
     return f"{f'**{psnr}**' if best else psnr} / {row['ssim']['median']:.3f} / {row['l1']['mean']:.4f}"
 
 
-def _best(rows: Rows) -> float:
-    return max((row["psnr_db"]["median"] for row in rows.values()), default=0.0)
-
-
 def paper_scale() -> str:
-    """Return every method on every scene and split, the best PSNR of a split in bold."""
-    return _methods("paper_scale")
+    """Return the scores of every method on the random split of every scene, and those of the paper."""
+    return _scores("paper_scale", "random", with_paper=True)
 
 
-def paper_scale_quick() -> str:
-    """Return the same table of the quick study."""
-    return _methods("paper_scale_quick")
+def paper_scale_block() -> str:
+    """Return the scores of every method on the block split of every scene."""
+    return _scores("paper_scale", "block", with_paper=False)
 
 
 def paper_scale_gpu() -> str:
-    """Return the fits by gradient descent on a GPU."""
-    return _methods("paper_scale_gpu")
+    """Return the scores of the fits by gradient descent on a GPU, and those of the paper."""
+    return _scores("paper_scale_gpu", "random", with_paper=True)
 
 
-def _methods(result: str) -> str:
+def _scores(result: str, split: str, with_paper: bool) -> str:
+    """Return a row for each method and a column for each scene, the best PSNR of a scene in bold."""
+    scenes = {name: _with_all(scene, split) for name, scene in load(result)["scenes"].items() if split in scene}
+    best = {name: max(row["psnr_db"]["median"] for row in rows.values()) for name, rows in scenes.items()}
     table = []
-    scenes = load(result)["scenes"]
-    measured = [split for split in ("random", "block") if any(split in scene for scene in scenes.values())]
-    for name, scene in scenes.items():
-        splits = {split: _with_all(scene, split) for split in measured}
-        for method in dict.fromkeys(method for rows in splits.values() for method in rows):
-            own = [rows.get(method) for rows in splits.values()]
-            scores = [
-                _score(row, row is not None and row["psnr_db"]["median"] == _best(rows))
-                for row, rows in zip(own, splits.values(), strict=True)
-            ]
-            row = next(row for row in own if row)
-            cost = [f"{row['fit_seconds']:.0f}", f"{row['ms']['median']:.1f}", f"{row['megabytes']:.2f}"]
-            paper = PAPER[name].get(method)
+    for method in dict.fromkeys(method for rows in scenes.values() for method in rows):
+        own = {name: rows.get(method) for name, rows in scenes.items()}
+        table.append(
+            [f"`{method}`", *(_score(r, bool(r) and r["psnr_db"]["median"] == best[n]) for n, r in own.items())]
+        )
+        if with_paper and any(method in PAPER[name] for name in scenes):
+            published = [PAPER[name][method] for name in scenes]
             table.append(
-                [
-                    f"{name} ({row['n_train']:,})",
-                    method,
-                    *scores,
-                    f"{row['steps']:,}" if row.get("steps") else "",
-                    *cost,
-                    f"{paper[0]:.2f} / {paper[1]:.3f} / {paper[2]:.4f}" if paper else "",
-                ]
+                [f"paper: {method.removesuffix('_paper')}", *(f"{a:.2f} / {b:.3f} / {c:.4f}" for a, b, c in published)]
             )
-    columns = ["scene (training spectra)", "method", *measured, "steps", "fit [s]", "ms a spectrum", "MB"]
-    return markdown([*columns, "paper, other spectra of a room of the same name"], table)
+    return markdown(["method", *scenes], table)
+
+
+def paper_scale_cost() -> str:
+    """Return seconds and size of the fits on the random split, from the least to the greatest scene."""
+    return _costs("paper_scale")
+
+
+def paper_scale_gpu_cost() -> str:
+    """Return seconds and size of the fits on a GPU."""
+    return _costs("paper_scale_gpu")
+
+
+def _costs(result: str) -> str:
+    by_method: dict[str, list[dict[str, Any]]] = {}
+    for scene in load(result)["scenes"].values():
+        for method, row in _with_all(scene, "random").items():
+            by_method.setdefault(method, []).append(row)
+
+    def of(values: list[float], digits: int = 0) -> str:
+        low, high = (f"{value:,.{digits}f}" for value in (min(values), max(values)))
+        return low if low == high else f"{low} to {high}"
+
+    table = [
+        [
+            f"`{method}`",
+            f"{rows[0]['steps']:,}" if rows[0].get("steps") else "",
+            of([row["fit_seconds"] for row in rows]),
+            of([row["ms"]["median"] for row in rows], 1),
+            of([row["megabytes"] for row in rows], 2),
+        ]
+        for method, rows in by_method.items()
+    ]
+    return markdown(["method", "steps", "fit [s]", "ms a spectrum", "MB"], table)
 
 
 def paper_scale_density() -> str:
