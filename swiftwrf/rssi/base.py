@@ -14,16 +14,19 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
+from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.dataset import Numbers
-from swiftwrf.data.rssi import Rssi
+from swiftwrf.data.rssi import Offsets, Rssi
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError, listed
+from swiftwrf.gp import Kernel
 from swiftwrf.models.base import FieldConfig, FitContext
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_positions
 from swiftwrf.rssi.floors import FloorAttenuation, estimate_floor_attenuation, receiver_floors
-from swiftwrf.runtime.options import Configured
+from swiftwrf.runtime.checkpoint import Header, Saved
+from swiftwrf.runtime.options import Configured, from_plain
 from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.threads import parallel_map
 
@@ -234,6 +237,45 @@ class RssiPredictor(Configured, Displayed, ABC):
         return f"{type(self).__name__}({fitted})"
 
 
+class SavedRssiPredictor(RssiPredictor, Saved):
+    """Base class of predictors with a field that one file stores.
+
+    Example:
+        >>> import swiftwrf
+        >>> issubclass(swiftwrf.RssiModel, SavedRssiPredictor), issubclass(swiftwrf.PairModel, SavedRssiPredictor)
+        (True, True)
+    """
+
+    origin: GeodeticOrigin | None
+    """latitude and longitude of x = y = 0, if the positions were projected from degrees"""
+    offsets: Offsets | None
+    """offsets that were removed from the training rows; predictions are of their reference"""
+    kernel: Kernel
+    """kernel of the field, lengths in [m]"""
+
+    def _header(self) -> Header:
+        """Return the plain values that files of all these predictors contain."""
+        return {
+            "options": asdict(self.config),
+            "origin": self.origin,
+            "offsets": self.offsets and asdict(self.offsets),
+            "attenuation": self.attenuation and asdict(self.attenuation),
+            "receiver_names": self.receiver_names,
+            "kernel": asdict(self.kernel),
+        }
+
+    @classmethod
+    def _of_header(cls, header: Header) -> Self:
+        """Return a predictor with these values, without its tensors."""
+        predictor = cls(from_plain(cls.config_type, header["options"]))
+        predictor.receiver_names = tuple(map(str, header["receiver_names"]))
+        predictor.origin = GeodeticOrigin(*map(float, header["origin"])) if header.get("origin") else None
+        predictor.attenuation = FloorAttenuation.from_plain(header.get("attenuation"))
+        predictor.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
+        predictor.kernel = Kernel(**header["kernel"])
+        return predictor
+
+
 def check_training(train: Rssi, pool: Rssi) -> None:
     """Refuse data that nothing can be fitted to.
 
@@ -252,6 +294,6 @@ def fingerprint(config: Any, train: Rssi, pool: Rssi) -> str:
     """Return a digest that identifies a fit by its configuration (a dataclass) and its measurements."""
     digest = hashlib.sha256(json.dumps([type(config).__name__, asdict(config), train.receiver_names]).encode())
     for data in (train, pool):
-        for tensor in (data.transmitter_position, data.receiver_position, data.rssi_dbm):
-            digest.update(tensor.contiguous().numpy().tobytes())
+        for tensor in (data.transmitter_position, data.receiver_position, data.rssi_dbm, data.session):
+            digest.update(b"" if tensor is None else tensor.contiguous().numpy().tobytes())
     return digest.hexdigest()

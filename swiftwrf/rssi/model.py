@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from statistics import NormalDist
@@ -20,13 +20,11 @@ from typing import TYPE_CHECKING, ClassVar, Self
 import torch
 from torch import Tensor
 
-from swiftwrf.data.coordinates import GeodeticOrigin
-from swiftwrf.data.rssi import Offsets, Rssi
+from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import InputError
-from swiftwrf.gp import GaussianProcess, Kernel, subsample
-from swiftwrf.rssi.base import Map, RssiFitContext, RssiPredictor, fingerprint, map_threads
+from swiftwrf.gp import GaussianProcess, subsample
+from swiftwrf.rssi.base import Map, RssiFitContext, SavedRssiPredictor, fingerprint, map_threads
 from swiftwrf.rssi.config import RssiConfig
-from swiftwrf.rssi.floors import FloorAttenuation
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.paper_head import HELD_OUT_FOLD, learn_receivers
@@ -36,8 +34,7 @@ from swiftwrf.rssi.regression import fit_receiver
 from swiftwrf.rssi.stacking import comparable, mixing_weights
 from swiftwrf.rssi.training import RssiTraining, prepare, representative_receivers
 from swiftwrf.runtime import checkpoint as files
-from swiftwrf.runtime.checkpoint import Header, Saved
-from swiftwrf.runtime.options import from_plain
+from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.session import Record, Session
 from swiftwrf.runtime.threads import single_thread
@@ -54,7 +51,7 @@ MIN_SCORES = 30  # held-out rows of a receiver below which the scores of all rec
 MAX_VARIANCE_POSITIONS = 200  # measured positions that determine where the field is known
 
 
-class RssiModel(RssiPredictor, Saved):
+class RssiModel(SavedRssiPredictor):
     """RSSI at fixed receivers for any position of the transmitter; predictions are differentiable in the position.
 
     Five held-out folds of the training rows determine the kernel, the presence of a field, the mixing weights and the scale
@@ -81,14 +78,8 @@ class RssiModel(RssiPredictor, Saved):
     name = "swiftwrf"
     config_type = RssiConfig
 
-    origin: GeodeticOrigin | None
-    """latitude and longitude of x = y = 0, if the positions were projected from degrees"""
-    offsets: Offsets | None
-    """offsets that were removed from the training rows; predictions are of their reference"""
     n_primitives: int
     """primitives a receiver; 0 if there is no field"""
-    kernel: Kernel
-    """kernel of the latent field, lengths in [m]"""
     mixing_weight: Tensor
     """weights (4, R) of the field and the three simpler predictors, contained in the tensors below, equal in all columns"""
     receiver: Tensor
@@ -329,25 +320,12 @@ class RssiModel(RssiPredictor, Saved):
         tensors = {name: getattr(self, name) for name in _shapes(0, 0)}
         if self._posterior is not None:
             tensors |= self._posterior.folded().state.tensors()
-        header = {
-            "options": asdict(self.config),
-            "origin": self.origin,
-            "offsets": self.offsets and asdict(self.offsets),
-            "attenuation": self.attenuation and asdict(self.attenuation),
-            "receiver_names": self.receiver_names,
-            "n_primitives": self.n_primitives,
-            "kernel": asdict(self.kernel),
-        }
-        return tensors, header
+        return tensors, self._header() | {"n_primitives": self.n_primitives}
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
-        model = cls(from_plain(RssiConfig, header["options"]))
-        model.receiver_names = tuple(map(str, header["receiver_names"]))
-        model.origin = GeodeticOrigin(*map(float, header["origin"])) if header.get("origin") else None
-        model.attenuation = FloorAttenuation.from_plain(header.get("attenuation"))
-        model.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
-        model.n_primitives, model.kernel = int(header["n_primitives"]), Kernel(**header["kernel"])
+        model = cls._of_header(header)
+        model.n_primitives = int(header["n_primitives"])
         shapes = _shapes(len(model.receiver_names), len(tensors["anchor"]))
         files.expect(tensors, shapes)
         for name in shapes:

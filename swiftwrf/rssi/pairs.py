@@ -10,7 +10,6 @@ known places are predicted, they depend on the place, by a ridge regression.
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import asdict
 from itertools import groupby
 from statistics import NormalDist
 from typing import ClassVar, NamedTuple, Self
@@ -18,8 +17,7 @@ from typing import ClassVar, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from swiftwrf.data.coordinates import GeodeticOrigin
-from swiftwrf.data.rssi import Offsets, Rssi
+from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, candidates
@@ -27,13 +25,11 @@ from swiftwrf.gp.process import N_NEIGHBOURS, local_weights
 from swiftwrf.models.base import FieldConfig
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import Neighbours, check_positions, distance
-from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiFitContext, RssiPredictor
-from swiftwrf.rssi.floors import FloorAttenuation
+from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiFitContext, RssiPredictor, SavedRssiPredictor
 from swiftwrf.rssi.model import LEVEL
 from swiftwrf.rssi.path_loss import PairPathLoss
 from swiftwrf.runtime import checkpoint as files
-from swiftwrf.runtime.checkpoint import Header, Saved
-from swiftwrf.runtime.options import from_plain
+from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import configuration
 
@@ -182,7 +178,7 @@ class Metric(NamedTuple):
 METRICS = (*(Metric(ratio) for ratio in RATIOS), Metric(reciprocal=True))
 
 
-class PairModel(PairPredictor, Saved):
+class PairModel(PairPredictor, SavedRssiPredictor):
     """A path-loss model in the distance of both ends, and a Gaussian process over both positions.
 
     A prediction conditions on the nearest 64 pairs (local Gaussian process). Lengths, noise, the ratio of the ends' lengths
@@ -198,14 +194,8 @@ class PairModel(PairPredictor, Saved):
     kind: ClassVar[str] = "rssi pair model"
     name = "pairs"
 
-    origin: GeodeticOrigin | None
-    """latitude and longitude of x = y = 0, if the positions were projected from degrees"""
-    offsets: Offsets | None
-    """offsets that were removed from the training rows; predictions are of their reference"""
     metric: Metric
     """how distances of both ends count"""
-    kernel: Kernel
-    """kernel of the field, lengths in [m]"""
     path_loss: PairPathLoss
     """path-loss model, of all receivers or of each place"""
     pair: Tensor
@@ -284,26 +274,13 @@ class PairModel(PairPredictor, Saved):
         own = {"receiver": self.receiver, "pair": self.pair, "residual": self.residual, "scale_db": self.scale_db}
         loss = self.path_loss
         tensors = own | {"path_loss": loss.shared, "place": loss.place, "correction": loss.correction}
-        header = {
-            "options": asdict(self.config),
-            "origin": self.origin,
-            "offsets": self.offsets and asdict(self.offsets),
-            "attenuation": self.attenuation and asdict(self.attenuation),
-            "receiver_names": self.receiver_names,
-            "metric": self.metric,
-            "kernel": asdict(self.kernel),
-        }
-        return tensors, header
+        return tensors, self._header() | {"metric": self.metric}
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
-        model = cls(from_plain(PairConfig, header["options"]))
-        model.receiver_names = tuple(map(str, header["receiver_names"]))
-        model.origin = GeodeticOrigin(*map(float, header["origin"])) if header.get("origin") else None
-        model.attenuation = FloorAttenuation.from_plain(header.get("attenuation"))
-        model.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
+        model = cls._of_header(header)
         ratio, reciprocal = header["metric"]
-        model.metric, model.kernel = Metric(float(ratio), bool(reciprocal)), Kernel(**header["kernel"])
+        model.metric = Metric(float(ratio), bool(reciprocal))
         # files of earlier versions have no places
         tensors = {"place": torch.zeros(0, 3).double(), "correction": torch.zeros(0, 2).double()} | tensors
         n_pairs, n_places = len(tensors["pair"]), len(tensors["place"])

@@ -97,13 +97,16 @@ def search_room(train: Spectra, config: GeometryConfig, progress: bool = False) 
     """
     evidence = _Evidence.of(train, config)
     with progress_bar(progress) as bar:
-        task = bar.add_task("finding the room", total=N_STARTS)
+        task = bar.add_task("finding the room", total=N_STARTS + len(SIGNS) + 1)
         some = _some(evidence.kept, config.positions, config.seed)
         rooms = find_rooms(some, config.reach, config.width, tick=lambda: bar.advance(task))
-    improved = [Search(evidence.more, config.reach, signs).improve(room) for signs, room in rooms]
-    found, (signs, searched) = min(zip(improved, rooms, strict=True), key=lambda item: item[0].score)
-    score = evidence.held_out_score(PlaneSet.of(searched))
-    return _completed(PlaneSet.of(found).refined(evidence.scene), signs, score, evidence, config)
+        improved = []
+        for signs, room in rooms:
+            improved.append(Search(evidence.more, config.reach, signs).improve(room))
+            bar.advance(task)
+        found, (signs, searched) = min(zip(improved, rooms, strict=True), key=lambda item: item[0].score)
+        score = evidence.held_out_score(PlaneSet.of(searched))
+        return _completed(PlaneSet.of(found).refined(evidence.scene), signs, score, evidence, config)
 
 
 @single_thread()
