@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from record import without_folders
+
 from tasks.metrics import RunMetrics
 from tasks.page.records import Records
 
@@ -15,7 +17,7 @@ from tasks.page.records import Records
 def collect(folder: Path, name: str) -> None:
     """Write command, environment, metrics and rooms of the run to `results/NAME.json`."""
     run: Records[RunMetrics] = Records(folder)
-    command = shlex.join(Path(word).name if "/" in word else word for word in shlex.split(run.config["command"]))
+    command = without_folders(shlex.split(run.config["command"]))
     content: dict[str, Any] = {"command": command, "environment": run.environment, "metrics": run.metrics}
     rooms = {
         file.stem.removeprefix("geometry-mix"): json.loads(file.read_text())
