@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from multiprocessing import forkserver, get_context
+from multiprocessing import get_context
 from multiprocessing.context import BaseContext
 
 SERVED = sys.platform == "linux"  # a fork of loaded libraries may crash on macOS, and Windows has none
@@ -21,7 +21,10 @@ def process_context() -> BaseContext:
 
 
 def preload(modules: Sequence[str]) -> None:
-    """Begin to load modules for the processes to come, where it is of use: on several cores and without torchrun."""
-    if SERVED and modules and (os.cpu_count() or 1) > 1 and "WORLD_SIZE" not in os.environ:
+    """Begin to load modules for the processes to come, where there will be some: with several threads, without torchrun."""
+    several = (os.cpu_count() or 1) > 1 and os.environ.get("OMP_NUM_THREADS") != "1" and "WORLD_SIZE" not in os.environ
+    if SERVED and modules and several:
+        from multiprocessing import forkserver
+
         forkserver.set_forkserver_preload(list(modules))
         forkserver.ensure_running()
