@@ -57,7 +57,8 @@ def test_processes_begin_with_the_modules_that_a_command_preloads():
         with process_context().Pool(1) as pool:
             print(pool.apply(exec, ("import sys; assert 'colorsys' in sys.modules; assert 'torch' not in sys.modules",)))
     """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    threads = os.environ | {"OMP_NUM_THREADS": "2"}
+    done = subprocess.run([sys.executable, "-c", code], env=threads, capture_output=True, text=True, check=False)
     assert (done.stdout, done.stderr) == ("None\n", "")
 
 
