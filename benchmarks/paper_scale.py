@@ -22,12 +22,10 @@ import torch
 import tyro
 from committed import RESULTS
 from comparison import MEAN, SHARES, milliseconds, weight
-from locating_aoa import KERNEL, quantiles
 from record import write_result
 from torch import Tensor
 
-from augment import Mixed, SyntheticPositions, withhold
-from swiftwrf import FitConfig, MatchedField, Spectra, SwiftWRF, load_spectra, make_model
+from swiftwrf import FitConfig, Spectra, SwiftWRF, load_spectra, make_model
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.choices import Moving
 from swiftwrf.comparison.dcgan import DcganSize
@@ -36,14 +34,12 @@ from swiftwrf.comparison.vae import VaeSize
 from swiftwrf.data.raytraced import ROOMS
 from swiftwrf.data.splits import validation_for
 from swiftwrf.gp import subsample
-from swiftwrf.metrics import angle_errors, l1, psnr, ssim, summary
+from swiftwrf.metrics import l1, psnr, ssim, summary
 from swiftwrf.models.base import FieldModel
 from swiftwrf.positions import Neighbours
 from swiftwrf.runtime.durable import write_text
-from tasks.aoa.context import ROOM_MODEL
-from tasks.aoa.estimators import make_estimator
 from tasks.aoa.experiment import run as run_aoa
-from tasks.aoa.options import AoaConfig, fraction_key
+from tasks.aoa.options import AoaConfig
 from tasks.environment import machine
 from tasks.scenes.options import ScenesConfig
 from tasks.scenes.run import run as trace
@@ -70,9 +66,6 @@ QUICK_DIVISOR = 20  # of the steps of a fit by gradient descent under --quick
 JUDGES = 200  # test spectra of a split, evenly chosen: a neural field takes seconds to predict one
 COUNTS, QUICK_COUNTS = (200, 500, 1000, 2000, 3000), (60, 120)  # training spectra
 TURBO = ("swiftwrf", "nerf2", "wrfgs", "hybrid")
-LOCATED_FRACTIONS = (0.1, 0.3, 0.5, 0.7, 1.0)  # measured fractions of the part `locating`
-MATCHED, NETWORK = "matched_field", "aann_kernel"
-WITH_SYNTHETIC = {f"{KERNEL}_with_{name}": name for name in ("swiftwrf", "hybrid")}  # at the withheld positions
 CPU = torch.device("cpu")
 Split = Literal["random", "block"]
 Row = dict[str, Any]
@@ -84,9 +77,9 @@ class Config:
     """folder of the scenes; those that are missing are traced (extra: raytrace)"""
     only: tuple[str, ...] = tuple(f"{room}-{moving}" for room, moving in SCENES)
     """scenes to measure"""
-    parts: tuple[Literal["scenes", "counts", "locating", "aoa"], ...] = ("scenes", "counts", "locating", "aoa")
-    """every method on every scene; with fewer training spectra; angle of arrival without and with networks. All but the
-    first on the first scene only"""
+    parts: tuple[Literal["scenes", "counts", "aoa"], ...] = ("scenes", "counts", "aoa")
+    """every method on every scene; with fewer training spectra; angle of arrival. All but the first on the first scene
+    only"""
     splits: tuple[Split, ...] = ("random", "block")
     """splits of the scenes"""
     methods: tuple[str, ...] = METHODS
@@ -126,8 +119,6 @@ def main(config: Config) -> None:
         for split in config.splits:
             train, test = data.split(split, config.seed)
             measure(config, work / f"{scene} {split}", train, test, split, first)
-            if first and split == "random" and "locating" in config.parts:
-                locate(work, train, test, config.seed)
         if first and "aoa" in config.parts and not config.quick:
             estimate_angles(config, folder, work / "aoa")
         write_result(name, gathered(work, name) | {"positions": positions, "height_m": HEIGHT_M, "seed": config.seed})
@@ -240,38 +231,6 @@ def row(model: FieldModel | None, train: Spectra, test: Spectra, state: Path, de
     return found | {"n_train": len(train), "n_test": len(test)}
 
 
-def locate(work: Path, train: Spectra, test: Spectra, seed: int) -> None:
-    """Measure the angular errors of the estimators, of the network only with all spectra, unless they are measured."""
-    test = test.subset(*subsample(torch.arange(len(test)), rows=JUDGES)).in_memory()
-    for fraction in LOCATED_FRACTIONS:
-        measured, withheld = withhold(train, fraction, seed)
-        for method in ("nearest_spectrum", KERNEL, *((*WITH_SYNTHETIC, MATCHED) if fraction < 1 else (NETWORK,))):
-            file = work / f"{fraction_key(fraction)} {method}.angles.json"
-            if file.exists():
-                continue
-            began = time.process_time()
-            estimate = directions(method, measured, withheld, test.spectrum, seed)
-            seconds = time.process_time() - began
-            errors: Row = {"n_measured": len(measured), "seconds": seconds}
-            errors |= {
-                f"{name}_deg": quantiles(error.rad2deg()) for name, error in angle_errors(estimate, test.label).items()
-            }
-            print(file.stem, f"{errors['great_circle_deg']['median']:.2f} degrees", flush=True)
-            write_text(file, json.dumps(errors))
-
-
-def directions(method: str, measured: Spectra, withheld: SyntheticPositions, spectrum: Tensor, seed: int) -> Tensor:
-    """Return the directions (n, 2) [rad] that an estimator fitted to measured spectra finds in spectra (n, H, W)."""
-    if method == MATCHED:
-        room = make_model(ROOM_MODEL, seed=seed).fit(measured)
-        return MatchedField(seed=seed).fit(measured, room=room).predict(spectrum)
-    train, name = Mixed.measured(measured), method
-    if method in WITH_SYNTHETIC:
-        model, name = make_model(WITH_SYNTHETIC[method], seed=seed).fit(measured), KERNEL
-        train = train.add(withheld, model.synthesize(withheld.position))
-    return make_estimator(name, seed=seed).fit(train).predict(spectrum)
-
-
 def estimate_angles(config: Config, folder: Path, out: Path) -> None:
     """Run turbo learning with the spectra of several field models, unless the run is finished."""
     stopped = out.with_name("aoa.partial")
@@ -285,7 +244,7 @@ def estimate_angles(config: Config, folder: Path, out: Path) -> None:
 def gathered(work: Path, name: str) -> Row:
     """Return all measured rows, and the rows of the committed result that were not measured again."""
     committed = RESULTS / f"{name}.json"
-    found: Row = {"described": {}, "scenes": {}, "locating": {}, "aoa": None}
+    found: Row = {"described": {}, "scenes": {}, "aoa": None}
     if committed.exists():
         found |= {key: value for key, value in json.loads(committed.read_text()).items() if key in found}
     found = copy.deepcopy(found)
@@ -296,9 +255,6 @@ def gathered(work: Path, name: str) -> Row:
         )
     for file in work.glob("*.scene.json"):
         found["described"][file.name.removesuffix(".scene.json")] = json.loads(file.read_text())
-    for file in work.glob("*.angles.json"):
-        fraction, method = file.name.removesuffix(".angles.json").split()
-        found["locating"].setdefault(fraction, {})[method] = json.loads(file.read_text())
     if (work / "aoa" / "metrics.json").exists():
         mixes = json.loads((work / "aoa" / "metrics.json").read_text())["mixes"]
         angles = ("elevation_deg", "azimuth_deg", "great_circle_deg")

@@ -206,31 +206,16 @@ def paper_scale_targets() -> str:
     return markdown(columns, table)
 
 
-def paper_scale_locating() -> str:
-    """Return the angular errors of the estimators without a network at each measured fraction."""
-    rows = [
-        [
-            f"{float(fraction):.0%} ({errors['n_measured']:,} spectra)",
-            method,
-            *(f"{errors[f'{angle}_deg']['median']:.2f}" for angle in ("elevation", "azimuth", "great_circle")),
-            f"{errors['great_circle_deg']['p90']:.2f}",
-            f"{errors['seconds']:.0f}",
-        ]
-        for fraction, methods in sorted(load("paper_scale")["locating"].items())
-        for method, errors in methods.items()
-    ]
-    columns = ["measured", "estimator", "elevation [deg]", "azimuth [deg]", "angular error [deg]"]
-    columns += ["90th percentile [deg]", "fit and estimates [s]"]
-    return markdown(columns, rows)
-
-
 def paper_scale_aoa() -> str:
-    """Return the median errors of the angle of arrival at each measured fraction."""
+    """Return the median errors of the angle of arrival at each measured fraction, the best of a fraction in bold."""
     rows = []
     for share, methods in (load("paper_scale")["aoa"] or {}).items():
+        best = min(methods, key=lambda name: methods[name]["great_circle_deg"]["median"])
         for name, errors in methods.items():
             paper = PAPER_TURBO.get(share, {}).get(name.removeprefix("turbo_"))
             cells = [interval(errors[angle]) for angle in ("elevation_deg", "azimuth_deg", "great_circle_deg")]
-            rows.append([f"{float(share):.0%}", name, *cells, " / ".join(map(str, paper)) if paper else ""])
-    columns = ["measured", "estimator", "elevation [deg]", "azimuth [deg]", "angular error [deg]"]
+            cells[-1] = f"**{cells[-1]}**" if name == best else cells[-1]
+            cells.append(f"{errors['great_circle_deg']['p90']:.2f}")
+            rows.append([f"{float(share):.0%}", f"`{name}`", *cells, " / ".join(map(str, paper)) if paper else ""])
+    columns = ["measured", "method", "elevation [deg]", "azimuth [deg]", "angular error [deg]", "90th percentile [deg]"]
     return markdown([*columns, "paper, other spectra: elevation / azimuth"], rows)

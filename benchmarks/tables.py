@@ -21,7 +21,6 @@ from paper_scale_tables import (
     paper_scale_density,
     paper_scale_gpu,
     paper_scale_gpu_cost,
-    paper_scale_locating,
     paper_scale_targets,
 )
 from rssi_tables import rssi_glance, rssi_heads, rssi_methods
@@ -320,7 +319,6 @@ TABLES = {
     "paper_scale_cost": paper_scale_cost,
     "paper_scale_counts": paper_scale_counts,
     "paper_scale_density": paper_scale_density,
-    "paper_scale_locating": paper_scale_locating,
     "paper_scale_gpu": paper_scale_gpu,
     "paper_scale_gpu_cost": paper_scale_gpu_cost,
     "paper_scale_targets": paper_scale_targets,
