@@ -207,15 +207,32 @@ def paper_scale_targets() -> str:
 
 
 def paper_scale_aoa() -> str:
-    """Return the median errors of the angle of arrival at each measured fraction, the best of a fraction in bold."""
-    rows = []
-    for share, methods in (load("paper_scale")["aoa"] or {}).items():
-        best = min(methods, key=lambda name: methods[name]["great_circle_deg"]["median"])
-        for name, errors in methods.items():
-            paper = PAPER_TURBO.get(share, {}).get(name.removeprefix("turbo_"))
-            cells = [interval(errors[angle]) for angle in ("elevation_deg", "azimuth_deg", "great_circle_deg")]
-            cells[-1] = f"**{cells[-1]}**" if name == best else cells[-1]
-            cells.append(f"{errors['great_circle_deg']['p90']:.2f}")
-            rows.append([f"{float(share):.0%}", f"`{name}`", *cells, " / ".join(map(str, paper)) if paper else ""])
-    columns = ["measured", "method", "elevation [deg]", "azimuth [deg]", "angular error [deg]", "90th percentile [deg]"]
-    return markdown([*columns, "paper, other spectra: elevation / azimuth"], rows)
+    """Return the angular errors of each method at each measured fraction."""
+
+    def cell(errors: dict[str, Any]) -> str:
+        return f"{interval(errors['great_circle_deg'])} / {errors['great_circle_deg']['p90']:.1f}"
+
+    shares = load("paper_scale")["aoa"] or {}
+    columns = [f"{float(share):.0%} measured" for share in shares]
+    return markdown(["method", *columns], [[name, *map(cell, cells)] for name, cells in _by_method(shares)])
+
+
+def paper_scale_angles() -> str:
+    """Return elevation and azimuth errors of each method at each measured fraction, and those of the paper."""
+
+    def cell(errors: dict[str, Any]) -> str:
+        return f"{errors['elevation_deg']['median']:.2f} / {errors['azimuth_deg']['median']:.2f}"
+
+    shares = load("paper_scale")["aoa"] or {}
+    rows = [[name, *map(cell, cells)] for name, cells in _by_method(shares)]
+    for name in PAPER_TURBO["0.1"]:
+        pairs = [PAPER_TURBO[share][name] for share in shares]
+        rows.append([f"paper: turbo_{name}", *(f"{elevation:.2f} / {azimuth:.2f}" for elevation, azimuth in pairs)])
+    return markdown(["method", *(f"{float(share):.0%} measured" for share in shares)], rows)
+
+
+def _by_method(shares: dict[str, Any]) -> list[tuple[str, list[dict[str, Any]]]]:
+    """Return each method with its errors at each measured fraction, the best at the first fraction first."""
+    first = next(iter(shares.values()), {})
+    names = sorted(first, key=lambda name: float(first[name]["great_circle_deg"]["median"]))
+    return [(f"`{name}`", [methods[name] for methods in shares.values()]) for name in names]

@@ -14,6 +14,7 @@ from locating_tables import locating_rssi, locating_spectra
 from measured_tables import measured_spectra
 from paper_scale_tables import (
     paper_scale,
+    paper_scale_angles,
     paper_scale_aoa,
     paper_scale_block,
     paper_scale_cost,
@@ -314,6 +315,7 @@ TABLES = {
     "comparison_counts": comparison_counts,
     "comparison_turbo": comparison_turbo,
     "paper_scale": paper_scale,
+    "paper_scale_angles": paper_scale_angles,
     "paper_scale_aoa": paper_scale_aoa,
     "paper_scale_block": paper_scale_block,
     "paper_scale_cost": paper_scale_cost,
