@@ -30,6 +30,18 @@ if TYPE_CHECKING:
 UNKNOWN = (float("nan"),) * 3  # position of a receiver
 
 
+def numbered(names: Tensor | Sequence[str | int]) -> Tensor:
+    """Return the number of each name in the order of first occurrence, int64 (n,); numbers of a tensor stay.
+
+    Example:
+        >>> numbered(["out", "back", "out"])
+        tensor([0, 1, 0])
+    """
+    if isinstance(names, Tensor):
+        return names.long()
+    return torch.from_numpy(pd.factorize(np.asarray(names, dtype=object))[0].astype(np.int64))
+
+
 @dataclass(frozen=True, eq=False)
 class Groups:
     """Groups of rows between which RSSI has constant offsets, e.g. devices or channels.
@@ -108,7 +120,7 @@ class Rssi(PositionedData):
         labels: Names of columns of the table that distinguish groups of rows.
         floors: Floors of the building, by height.
         receiver_moves: Whether the receivers are positions of one receiver that moves, too.
-        session: Session of measurements that each row is of, e.g. a walk or a day, int64 (n,).
+        session: Session of measurements that each row is of, e.g. a walk or a day: n names, or their numbers, int64 (n,).
         name: Name of the data set.
         details: index, named_splits, source and notes of `PositionedData`.
 
@@ -150,7 +162,7 @@ class Rssi(PositionedData):
         labels: tuple[str, ...] = (),
         floors: Floors | None = None,
         receiver_moves: bool = False,
-        session: Tensor | None = None,
+        session: Tensor | Sequence[str | int] | None = None,
         name: str = "rssi",
         **details: Any,
     ) -> None:
@@ -187,7 +199,7 @@ class Rssi(PositionedData):
             labels=labels,
             floors=floors,
             receiver_moves=receiver_moves,
-            session=session,
+            session=None if session is None else numbered(session),
         )
 
     @classmethod

@@ -12,9 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES, refusing_broken
 from swiftwrf.data.columns import (
@@ -72,7 +70,7 @@ class Survey(NamedTuple):
     n_rows: int  # of the table
     origin: GeodeticOrigin | None  # of positions in degrees
     group: list[str]  # of each row; empty if it was not asked for
-    session: Tensor | None  # of each row, if the table contains sessions, int64 (n,)
+    session: list[str] | None  # of each row, if the table contains sessions
     labels: tuple[str, ...]  # columns that distinguish groups of rows
     floors: Floors | None  # if the table contains them
     receiver_moves: bool  # receivers are positions of one that moves
@@ -206,7 +204,7 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
         places, notes = dict(zip(names, where.tolist(), strict=True)), notes + found
     origins = source.max(axis=1)[row]  # row of the table that each row is of
     groups = group.to_numpy()[origins].tolist() if options.offset_by else []
-    sessions = None if session is None else torch.from_numpy(pd.factorize(session.to_numpy()[origins])[0]).long()
+    sessions = None if session is None else session.to_numpy()[origins].tolist()
     labels = tuple(name for name in (*unused, roles.get("session")) if name and _distinguishes(table[name]))
     if labels and not options.offset_by:
         notes.append(f"rows differ in {listed(labels)}; tasks.inspect tests whether its values have constant offsets")

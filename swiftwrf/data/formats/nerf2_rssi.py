@@ -10,7 +10,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import torch
 from torch import Tensor
 
@@ -20,7 +19,7 @@ from swiftwrf.data.files import MAX_COORDINATE_M, digests, numbers, read_yaml
 from swiftwrf.data.fillers import NOT_DETECTED_DBM, check_powers, find_fillers, without_fillers
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
 from swiftwrf.data.receivers import read_receivers, unknown_positions
-from swiftwrf.data.rssi import SESSIONS, Rssi
+from swiftwrf.data.rssi import SESSIONS, Rssi, numbered
 from swiftwrf.data.splits import kept_splits, read_splits
 from swiftwrf.data.survey import read_frame
 from swiftwrf.errors import InputError, listed
@@ -91,7 +90,7 @@ def _sessions(file: Path, n: int) -> Tensor | None:
         return None
     if len(frame) != n:
         raise InputError(f"{file} has {len(frame)} rows, the RSSI {n}; they must match")
-    return torch.from_numpy(pd.factorize(text_of(frame[name]))[0]).long()
+    return numbered(text_of(frame[name]).tolist())
 
 
 def _is_raw(path: Path) -> bool:

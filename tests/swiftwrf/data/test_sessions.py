@@ -93,6 +93,14 @@ def test_sessions_of_a_table(long):
     assert Rssi.from_frame(table.rename(columns={"walk": "hour"}), columns={"session": "hour"}).session is not None
 
 
+def test_sessions_by_name():
+    names = ["monday", "tuesday"] * 10
+    data = Rssi([[-60.0]] * 20, torch.rand(20, 3), session=names)
+    assert data.session.tolist() == [0, 1] * 10
+    with pytest.raises(InputError, match="session has 2 rows"):
+        Rssi([[-60.0]] * 20, torch.rand(20, 3), session=names[:2])
+
+
 def test_kernel_is_chosen_again_without_sessions():
     model = RssiModel(validation="session").fit(of_sessions(n=60))
     assert len(model.with_chosen_kernel().anchor) == 60
