@@ -199,10 +199,11 @@ def folds(
         >>> folds(torch.rand(20, 3), "random", seed=0).bincount().tolist()
         [4, 4, 4, 4, 4]
     """
-    if validation == "session" and session is None:
-        raise InputError('validation="session" needs measurements with sessions, see docs/formats.md')
-    if validation == "session" and session is not None and len(session.unique()) > 1:
-        return _whole(session, number)
+    if validation == "session":
+        if session is None:
+            raise InputError('validation="session" needs measurements with sessions, see docs/formats.md')
+        if len(session.unique()) > 1:
+            return _whole(session, number)
     if validation == "block":
         return slabs(position, number)
     place = places(position, number)

@@ -93,7 +93,7 @@ class PairPredictor(RssiPredictor):
         row, column = train.detected.nonzero(as_tuple=True)
         self.receiver = train.receiver_position
         pair = torch.cat([train.transmitter_position[row], self.receiver[column]], dim=1)
-        session = train.session if train.session is None else train.session[row]
+        session = None if train.session is None else train.session[row]
         fold = folds(pair[:, :3], self.config.validation, self.config.seed, session=session)
         if self.config.new_places and len(self.receiver[column].unique(dim=0)) > 1:
             fold = folds(pair[:, 3:], "random", self.config.seed)

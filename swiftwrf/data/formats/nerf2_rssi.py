@@ -1,8 +1,7 @@
 """Reader of the NeRF2 layout for RSSI: a table of RSSI, positions with the same rows, and positions of the receivers.
 
 The files are gateway_rssi.csv, tx_pos.csv or rx_pos.csv, gateway_position.yml, and perhaps meta.csv with a column of
-sessions; or, as the BLE data of the paper are
-offered, rssi.csv, beacon_pos.csv and gateway_pos.csv.
+sessions; or, as the BLE data of the paper are offered, rssi.csv, beacon_pos.csv and gateway_pos.csv.
 """
 
 from __future__ import annotations
