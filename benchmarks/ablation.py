@@ -16,7 +16,7 @@ import torch
 import tyro
 from record import write_result
 
-from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, Spectra, fit, load_spectra, simulated_room
+from swiftwrf import AngularGrid, FitConfig, FitError, InputError, ModelConfig, Spectra, fit, load_spectra, simulated_room
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import l1, psnr, ssim, summary
 from swiftwrf.rssi import Map
@@ -132,7 +132,7 @@ def measure(train: Spectra, test: Spectra, case: Case) -> dict[str, Any]:
             drawn = fit(kept, replace(case.config, seed=seed), progress=False).synthesize(test.position)
             for key, score in (("ssim", ssim), ("psnr_db", psnr), ("l1", l1)):
                 scores[key].append(score(drawn, test.spectrum))
-    except InputError as error:
+    except (InputError, FitError) as error:
         return {"refusal": str(error)}
     result: dict[str, Any] = {key: summary(torch.stack(values).mean(dim=0)) for key, values in scores.items()}
     result["psnr_db"]["of_seeds"] = [float(values.median()) for values in scores["psnr_db"]]

@@ -50,11 +50,15 @@ __device__ __forceinline__ Place locate(float angle, const Axis& axis) {
     return place;
 }
 
-// A distance in columns, brought to at most half a turn. Adding and subtracting 1.5 * 2^23 rounds to a whole number
+// How many whole turns a distance in columns is away from at most half a turn. Adding and subtracting 1.5 * 2^23 rounds
 // without the conversion unit, which the exponentials keep busy.
-__device__ __forceinline__ float wrapped(float columns, float turn, float turns_per_column) {
+__device__ __forceinline__ float whole_turns(float columns, float turns_per_column) {
     const float shift = 12582912.0f;
-    return fmaf(-turn, fmaf(columns, turns_per_column, shift) - shift, columns);
+    return fmaf(columns, turns_per_column, shift) - shift;
+}
+
+__device__ __forceinline__ float wrapped(float columns, float turn, float turns_per_column) {
+    return fmaf(-turn, whole_turns(columns, turns_per_column), columns);
 }
 
 // A Cholesky factor in pixels.
@@ -131,6 +135,33 @@ extern "C" __global__ void __launch_bounds__(THREADS) find_reach(
 
 constexpr int ROW_STEP = LANES / TILE_COLUMNS;  // rows between two pixels of a thread
 constexpr int PIXELS = TILE_ROWS / ROW_STEP;    // of a thread
+constexpr float HALF_COLUMNS = 0.5f * (TILE_COLUMNS - 1), HALF_ROWS = 0.5f * (TILE_ROWS - 1);  // from the centre to the last
+
+// Adds `count` prepared primitives to the pixels of a thread, of which the first is (x, y) from the tile's centre.
+__device__ __forceinline__ void draw(
+    const float4 (*prepared)[2], int count, const bool any_wide, float x, float y, float turn, float least, float* re,
+    float* im) {
+#pragma unroll 2
+    for (int j = 0; j < count; ++j) {
+        const float4 c = prepared[j][0], r = prepared[j][1];
+        float u = fmaf(c.y, x, c.x), v = fmaf(r.x, y, fmaf(c.w, x, c.z));
+        if (any_wide) {
+            const float dx = x - r.w, turned = wrapped(dx, turn, 1.0f / turn) - dx;
+            u = fmaf(c.y, turned, u);
+            v = fmaf(c.w, turned, v);
+        }
+#pragma unroll
+        for (int k = 0; k < PIXELS; ++k) {
+            const float v_k = k ? fmaf(r.x, static_cast<float>(k * ROW_STEP), v) : v;
+            const float exponent = fmaf(-v_k, v_k, -u * u);
+            if (!(exponent < least)) {
+                const float kernel = exp2f(exponent);
+                re[k] = fmaf(r.y, kernel, re[k]);
+                im[k] = fmaf(r.z, kernel, im[k]);
+            }
+        }
+    }
+}
 
 extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
     const float2* __restrict__ mean,       // (B, N) azimuth, elevation [rad]
@@ -181,8 +212,10 @@ extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
         count = min(waiting, LANES);
         __syncwarp();
 
-        // Prepare: each thread one.
-        bool wide = false;
+        // Prepare: each thread one. Between the tile's corners u and v lie in intervals, and no kernel is larger than their
+        // least magnitudes allow; the slack is for rounding.
+        bool kept = false, wide = false;
+        float4 near = {}, rest = {};
         if (lane < count) {
             const size_t i = s_collected[warp][lane];
             const float2 angles = mean[first + i], psi = weight[first + i];
@@ -191,34 +224,27 @@ extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
             const Whitening w = whiten(l);
             const float dx = wrapped(azimuth.pixel - centre_column, turn, turns_per_column) + azimuth.beyond;
             const float dy = elevation.pixel - centre_row + elevation.beyond;
-            s_prepared[warp][lane][0] = make_float4(-w.s1 * dx, w.s1, fmaf(-w.s3, dy, -w.s21 * dx), w.s21);
-            s_prepared[warp][lane][1] = make_float4(w.s3, psi.x, psi.y, dx);
+            near = make_float4(-w.s1 * dx, w.s1, fmaf(-w.s3, dy, -w.s21 * dx), w.s21);
+            rest = make_float4(w.s3, psi.x, psi.y, dx);
+            const float u = fmaxf(fabsf(near.x) - HALF_COLUMNS * fabsf(w.s1), 0.0f);
+            const float v = fmaxf(fabsf(near.z) - HALF_COLUMNS * fabsf(w.s21) - HALF_ROWS * fabsf(w.s3), 0.0f);
             wide = !(reach_columns(l, cutoff.reach) < 0.5f * (turn - TILE_COLUMNS));
+            kept = wide || !(fmaf(u, u, v * v) > -1.001f * cutoff.least);
+        }
+        const unsigned keeping = __ballot_sync(WARP, kept);
+        if (kept) {
+            const int slot = __popc(keeping & ((1u << lane) - 1));
+            s_prepared[warp][slot][0] = near;
+            s_prepared[warp][slot][1] = rest;
         }
         // a tile may see a wide primitive from both directions
         const bool any_wide = __ballot_sync(WARP, wide);
         __syncwarp();
 
-        // Draw all of them.
-#pragma unroll 1
-        for (int j = 0; j < count; ++j) {
-            const float4 c = s_prepared[warp][j][0], r = s_prepared[warp][j][1];
-            float u = fmaf(c.y, x, c.x), v = fmaf(r.x, y, fmaf(c.w, x, c.z));
-            if (any_wide) {
-                const float dx = x - r.w, turned = wrapped(dx, turn, turns_per_column) - dx;
-                u = fmaf(c.y, turned, u);
-                v = fmaf(c.w, turned, v);
-            }
-#pragma unroll
-            for (int k = 0; k < PIXELS; ++k) {
-                const float v_k = k ? fmaf(r.x, static_cast<float>(k * ROW_STEP), v) : v;
-                const float exponent = fmaf(-v_k, v_k, -u * u);
-                if (!(exponent < cutoff.least)) {
-                    const float kernel = exp2f(exponent);
-                    re[k] = fmaf(r.y, kernel, re[k]);
-                    im[k] = fmaf(r.z, kernel, im[k]);
-                }
-            }
+        if (any_wide) {
+            draw(s_prepared[warp], __popc(keeping), true, x, y, turn, cutoff.least, re, im);
+        } else {
+            draw(s_prepared[warp], __popc(keeping), false, x, y, turn, cutoff.least, re, im);
         }
         waiting -= count;
         if (lane < waiting) s_collected[warp][lane] = s_collected[warp][LANES + lane];
@@ -248,103 +274,171 @@ extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
 
 // --------------------------------------------------------------------------------------------------------------- backward
 //
-// A group of 8, 16 or 32 threads gathers the gradient of one primitive at one position: it walks the box around the
-// footprint, columns over the threads, rows in a loop. With z the kernel times the derivative by it, the sums over the
-// footprint of z u, z v, z u^2, z u v, z v^2 give the gradients of mean and factor; u is constant in a column.
+// A block gathers the gradients of some primitives of one position, a thread those of one. The block goes over the grid in
+// patches, of which it keeps the incoming gradient in shared memory. A warp lists the columns of the patch that its primitives
+// reach, and each of its threads sums over one of them at a time, whatever primitive it belongs to. Sums of neighbouring
+// threads for the same primitive are then added and given to the primitive's own thread.
+//
+// With z the kernel times the derivative by it, the sums over the footprint of z u, z v, z u^2, z u v, z v^2 give the
+// gradients of mean and factor; u is constant in a column.
+
+constexpr int PATCH_COLUMNS = LANES, PATCH_ROWS = 96;  // one row after the other, so that columns have banks of their own
+constexpr int GATHERING_WARPS = 16, GATHERING_THREADS = GATHERING_WARPS * LANES;  // of a block, at most
+constexpr int ROWS_AT_ONCE = 4, SUMS = 7;
+
+// What a thread needs to know of a primitive.
+struct Prepared {
+    Whitening whitening;
+    float rows_per_v;
+    Place azimuth, elevation;
+    float2 weight;
+};
 
 __device__ __forceinline__ void gather(
     const float* __restrict__ grad, const float* __restrict__ phase,
     const float2* __restrict__ mean, const float* __restrict__ cholesky, const float2* __restrict__ weight,
     float2* __restrict__ d_mean, float* __restrict__ d_cholesky, float2* __restrict__ d_weight,
-    int n, int group, int cholesky_per_position, const Grid& grid, const Cutoff& cutoff) {
-    const int groups = THREADS / group, member = threadIdx.x % group;
-    const int blocks = (n + groups - 1) / groups;  // for a position
-    const int position = blockIdx.x / blocks, primitive = blockIdx.x % blocks * groups + threadIdx.x / group;
+    int n, int per_warp, int cholesky_per_position, const Grid& grid, const Cutoff& cutoff) {
+    __shared__ float2 s_grad[PATCH_ROWS + ROWS_AT_ONCE - 1][PATCH_COLUMNS];  // by the real and by the imaginary part
+    __shared__ Prepared s_prepared[GATHERING_WARPS][LANES];
+
+    const int warps = blockDim.x / LANES, warp = threadIdx.x / LANES, lane = threadIdx.x % LANES;
+    const int per_block = warps * per_warp, blocks = (n + per_block - 1) / per_block;  // for a position
+    const int position = blockIdx.x / blocks;
+    const int primitive = blockIdx.x % blocks * per_block + warp * per_warp + lane;
+    const bool mine = lane < per_warp && primitive < n;
     const size_t i = static_cast<size_t>(position) * n + primitive;
+    cholesky += 3 * (cholesky_per_position ? i : primitive);
+    const int plane = grid.n_elevation * grid.n_azimuth;
+    // the gradient by A = re + j im, itself or as the gradient by |A| times A / |A|
+    grad += static_cast<size_t>(phase ? 1 : 2) * plane * position;
+    if (phase) phase += static_cast<size_t>(2) * plane * position;
 
-    float3 l = make_float3(1.0f, 0.0f, 1.0f);
-    float d_re = 0, d_im = 0, z_u = 0, z_v = 0, z_uu = 0, z_uv = 0, z_vv = 0;
-    if (primitive < n) {
-        l = factor(cholesky + 3 * (cholesky_per_position ? i : primitive), grid);
+    float columns = -1e30f, rows = -1e30f;  // how far the thread's primitive reaches
+    if (mine) {
+        const float3 l = factor(cholesky, grid);
+        columns = reach_columns(l, cutoff.reach);
+        rows = reach_rows(l, cutoff.reach);
         const Whitening w = whiten(l);
-        const Place azimuth = locate(mean[i].x, grid.azimuth), elevation = locate(mean[i].y, grid.elevation);
-        const float2 psi = weight[i];
-        const int plane = grid.n_elevation * grid.n_azimuth;
-        // the gradient by A = re + j im, itself or as the gradient by |A| times A / |A|
-        grad += static_cast<size_t>(phase ? 1 : 2) * plane * position;
-        if (phase) phase += static_cast<size_t>(2) * plane * position;
+        s_prepared[warp][lane] = {
+            w, 1.0f / w.s3, locate(mean[i].x, grid.azimuth), locate(mean[i].y, grid.elevation), weight[i]};
+    }
+    __syncwarp();
+    const float turn = grid.n_azimuth, turns_per_column = 1.0f / turn;
+    // a patch may see a wide primitive from both directions
+    const bool wide = !(columns < 0.5f * (turn - PATCH_COLUMNS) - 1.0f);
 
-        // columns counted from the mean's, at most one turn; rows clipped to the grid
-        const float turn = grid.n_azimuth;
-        const float columns = fminf(reach_columns(l, cutoff.reach), 0.5f * turn), rows = reach_rows(l, cutoff.reach);
-        const int first_column = static_cast<int>(ceilf(azimuth.beyond - columns));
-        const int last_column =
-            min(static_cast<int>(floorf(azimuth.beyond + columns)), first_column + grid.n_azimuth - 1);
-        const int first_row =
-            static_cast<int>(fminf(fmaxf(elevation.pixel + ceilf(elevation.beyond - rows), 0.0f), 1.0f * grid.n_elevation));
-        const int last_row = static_cast<int>(
-            fmaxf(fminf(elevation.pixel + floorf(elevation.beyond + rows), grid.n_elevation - 1.0f), -1.0f));
-
-        int c = static_cast<int>(azimuth.pixel - turn * floorf(azimuth.pixel / turn)) + first_column + member;
-        c %= grid.n_azimuth;
-        c += c < 0 ? grid.n_azimuth : 0;
-        for (int column = first_column + member; column <= last_column; column += group) {
-            const float dx = column - azimuth.beyond;
-            const float u = w.s1 * dx, v_x = w.s21 * dx;
-            float dy = first_row - elevation.pixel - elevation.beyond;
-            float s_0 = 0, s_1 = 0, s_2 = 0;  // sums over the column of z, z v, z v^2
-            int at = first_row * grid.n_azimuth + c;
-#pragma unroll 2
-            for (int row = first_row; row <= last_row; ++row) {
-                const float g_re = phase ? grad[at] * phase[at] : grad[at];
-                const float g_im = phase ? grad[at] * phase[at + plane] : grad[at + plane];
-                const float v = fmaf(w.s3, dy, v_x);
-                const float exponent = fmaf(-v, v, -u * u);
-                if (!(exponent < cutoff.least)) {
-                    const float kernel = exp2f(exponent);
-                    const float z = kernel * fmaf(psi.x, g_re, psi.y * g_im);
-                    const float z_times_v = z * v;
-                    d_re = fmaf(kernel, g_re, d_re);
-                    d_im = fmaf(kernel, g_im, d_im);
-                    s_0 += z;
-                    s_1 += z_times_v;
-                    s_2 = fmaf(z_times_v, v, s_2);
+    float sum[SUMS] = {};
+    for (int patch_row = 0; patch_row < grid.n_elevation; patch_row += PATCH_ROWS)
+        for (int patch_column = 0; patch_column < grid.n_azimuth; patch_column += PATCH_COLUMNS) {
+            // List the columns: the thread's primitive has those from `begin` to `end` of the warp's list. From here on
+            // columns and rows count from the patch's first.
+            const int height = min(PATCH_ROWS, grid.n_elevation - patch_row);
+            const int width = min(PATCH_COLUMNS, grid.n_azimuth - patch_column);
+            int first = 0, begin = 0;
+            if (mine) {
+                const Place azimuth = s_prepared[warp][lane].azimuth, elevation = s_prepared[warp][lane].elevation;
+                const float half = PATCH_COLUMNS / 2, y = elevation.pixel - patch_row + elevation.beyond;
+                const float x = wrapped(azimuth.pixel - patch_column - half, turn, turns_per_column) + half;
+                int last = width - 1;
+                if (!wide) {
+                    first = static_cast<int>(fmaxf(x + ceilf(azimuth.beyond - columns), 0.0f));
+                    last = static_cast<int>(fminf(x + floorf(azimuth.beyond + columns), width - 1.0f));
                 }
-                dy += 1.0f;
-                at += grid.n_azimuth;
+                if (!(y + rows < 0.0f) && !(y - rows > height - 1.0f)) begin = max(last - first + 1, 0);
             }
-            z_u = fmaf(u, s_0, z_u);
-            z_v += s_1;
-            z_uu = fmaf(u * u, s_0, z_uu);
-            z_uv = fmaf(u, s_1, z_uv);
-            z_vv += s_2;
-            c += group;
-            while (c >= grid.n_azimuth) c -= grid.n_azimuth;
-        }
-    }
+            int end = begin;
+            for (int s = 1; s < LANES; s *= 2) {
+                const int before = __shfl_up_sync(WARP, end, s);
+                if (lane >= s) end += before;
+            }
+            begin = end - begin;
+            const int listed = __shfl_sync(WARP, end, LANES - 1);
 
-    for (int s = group / 2; s; s /= 2) {
-        d_re += __shfl_xor_sync(WARP, d_re, s);
-        d_im += __shfl_xor_sync(WARP, d_im, s);
-        z_u += __shfl_xor_sync(WARP, z_u, s);
-        z_v += __shfl_xor_sync(WARP, z_v, s);
-        z_uu += __shfl_xor_sync(WARP, z_uu, s);
-        z_uv += __shfl_xor_sync(WARP, z_uv, s);
-        z_vv += __shfl_xor_sync(WARP, z_vv, s);
-    }
-    if (primitive < n && member == 0) {
+            if (!__syncthreads_or(listed)) continue;
+#pragma unroll 2
+            for (int row = warp; row < height + ROWS_AT_ONCE - 1; row += warps) {
+                float2 g = make_float2(0.0f, 0.0f);
+                if (lane < width && row < height) {
+                    const int at = (patch_row + row) * grid.n_azimuth + patch_column + lane;
+                    g = phase ? make_float2(grad[at] * phase[at], grad[at] * phase[at + plane])
+                              : make_float2(grad[at], grad[at + plane]);
+                }
+                s_grad[row][lane] = g;
+            }
+            __syncthreads();
+
+            for (int from = 0; from < listed; from += LANES) {
+                const int entry = from + lane;
+                int owner = 0;  // the last primitive whose columns begin here or before
+                for (int s = LANES / 2; s; s /= 2)
+                    if (__shfl_sync(WARP, begin, owner + s) <= entry) owner += s;
+                const int column = entry + __shfl_sync(WARP, first - begin, owner);
+                const int segment_end = min(__shfl_sync(WARP, end, owner) - from, LANES);
+                const Prepared p = s_prepared[warp][owner];
+                const float x = patch_column + column - p.azimuth.pixel, y = p.elevation.pixel - patch_row;  // whole numbers
+                const float dx =
+                    fmaf(-turn, whole_turns(x - p.azimuth.beyond, turns_per_column), x) - p.azimuth.beyond;
+                const float u = p.whitening.s1 * dx, v_x = p.whitening.s21 * dx;
+
+                // rows in which v^2 <= -least - u^2, with slack for rounding; further ones count as 0
+                const float middle = p.elevation.beyond - v_x * p.rows_per_v;
+                const float reach = 1.001f * sqrtf(fmaxf(-cutoff.least - u * u, 0.0f)) * fabsf(p.rows_per_v);
+                const int top = static_cast<int>(fmaxf(y + ceilf(middle - reach), 0.0f));
+                const float lowest = entry < listed ? height - 1.0f : -1.0f;
+                const int bottom = static_cast<int>(fmaxf(fminf(y + floorf(middle + reach), lowest), -1.0f));
+                float re = 0, im = 0, s_1 = 0, s_2 = 0;  // sums of kernel times gradient, z v, z v^2
+                float dy = top - y - p.elevation.beyond;
+                for (int row = top; row <= bottom; row += ROWS_AT_ONCE) {
+                    const float v = fmaf(p.whitening.s3, dy, v_x);
+#pragma unroll
+                    for (int k = 0; k < ROWS_AT_ONCE; ++k) {
+                        const float2 g = s_grad[row + k][column];
+                        const float v_k = k ? fmaf(p.whitening.s3, static_cast<float>(k), v) : v;
+                        const float exponent = fmaf(-v_k, v_k, -u * u);
+                        const float kernel = exponent < cutoff.least ? 0.0f : exp2f(exponent);
+                        const float z_v = kernel * fmaf(p.weight.x, g.x, p.weight.y * g.y) * v_k;
+                        re = fmaf(kernel, g.x, re);
+                        im = fmaf(kernel, g.y, im);
+                        s_1 += z_v;
+                        s_2 = fmaf(z_v, v_k, s_2);
+                    }
+                    dy += ROWS_AT_ONCE;
+                }
+                const float s_0 = fmaf(p.weight.x, re, p.weight.y * im);
+                float part[SUMS] = {re, im, u * s_0, s_1, u * u * s_0, u * s_1, s_2};
+                for (int s = 1; s < LANES; s *= 2) {
+                    const bool same = lane + s < segment_end;
+#pragma unroll
+                    for (int k = 0; k < SUMS; ++k) {
+                        const float other = __shfl_down_sync(WARP, part[k], s);
+                        if (same) part[k] += other;
+                    }
+                }
+                const bool given = max(begin, from) < min(end, from + LANES);
+                const int segment = min(max(begin - from, 0), LANES - 1);
+#pragma unroll
+                for (int k = 0; k < SUMS; ++k) {
+                    const float whole = __shfl_sync(WARP, part[k], segment);
+                    if (given) sum[k] += whole;
+                }
+            }
+        }
+
+    if (mine) {
         // sums of first and second order in (u, v), in standard deviations: times sqrt(2 ln 2) and 2 ln 2
-        const float first = 1.1774100225154747f, second = 1.3862943611198906f;
+        const float3 l = factor(cholesky, grid);  // again, as there are few registers
+        const float one = 1.1774100225154747f, two = 1.3862943611198906f;
         const float u_x = grid.azimuth.scale / l.x, v_x = -l.y * u_x / l.z, v_y = grid.elevation.scale / l.z;  // per radian
-        d_weight[i] = make_float2(d_re, d_im);
-        d_mean[i] = make_float2(first * (u_x * z_u + v_x * z_v), first * v_y * z_v);
-        d_cholesky[3 * i] = second * (u_x * z_uu + v_x * z_uv);
-        d_cholesky[3 * i + 1] = second * v_y * z_uv;
-        d_cholesky[3 * i + 2] = second * v_y * z_vv;
+        d_weight[i] = make_float2(sum[0], sum[1]);
+        d_mean[i] = make_float2(one * (u_x * sum[2] + v_x * sum[3]), one * v_y * sum[3]);
+        d_cholesky[3 * i] = two * (u_x * sum[4] + v_x * sum[5]);
+        d_cholesky[3 * i + 1] = two * v_y * sum[5];
+        d_cholesky[3 * i + 2] = two * v_y * sum[6];
     }
 }
 
-extern "C" __global__ void __launch_bounds__(THREADS, 4) rasterize_backward(
+extern "C" __global__ void __launch_bounds__(GATHERING_THREADS, 2) rasterize_backward(
     const float* __restrict__ grad,      // (B, 2, n_elevation, n_azimuth), by A
     const float2* __restrict__ mean,     // (B, N)
     const float* __restrict__ cholesky,  // (N, 3) or (B, N, 3)
@@ -352,11 +446,11 @@ extern "C" __global__ void __launch_bounds__(THREADS, 4) rasterize_backward(
     float2* __restrict__ d_mean,         // (B, N)
     float* __restrict__ d_cholesky,      // (B, N, 3)
     float2* __restrict__ d_weight,       // (B, N)
-    int n, int group, int cholesky_per_position, Grid grid, Cutoff cutoff) {
-    gather(grad, nullptr, mean, cholesky, weight, d_mean, d_cholesky, d_weight, n, group, cholesky_per_position, grid, cutoff);
+    int n, int per_warp, int cholesky_per_position, Grid grid, Cutoff cutoff) {
+    gather(grad, nullptr, mean, cholesky, weight, d_mean, d_cholesky, d_weight, n, per_warp, cholesky_per_position, grid, cutoff);
 }
 
-extern "C" __global__ void __launch_bounds__(THREADS, 4) magnitude_backward(
+extern "C" __global__ void __launch_bounds__(GATHERING_THREADS, 2) magnitude_backward(
     const float* __restrict__ grad,      // (B, n_elevation, n_azimuth), by |A|
     const float* __restrict__ phase,     // (B, 2, n_elevation, n_azimuth): A / |A|, 0 where A is 0
     const float2* __restrict__ mean,     // (B, N)
@@ -365,6 +459,6 @@ extern "C" __global__ void __launch_bounds__(THREADS, 4) magnitude_backward(
     float2* __restrict__ d_mean,         // (B, N)
     float* __restrict__ d_cholesky,      // (B, N, 3)
     float2* __restrict__ d_weight,       // (B, N)
-    int n, int group, int cholesky_per_position, Grid grid, Cutoff cutoff) {
-    gather(grad, phase, mean, cholesky, weight, d_mean, d_cholesky, d_weight, n, group, cholesky_per_position, grid, cutoff);
+    int n, int per_warp, int cholesky_per_position, Grid grid, Cutoff cutoff) {
+    gather(grad, phase, mean, cholesky, weight, d_mean, d_cholesky, d_weight, n, per_warp, cholesky_per_position, grid, cutoff);
 }

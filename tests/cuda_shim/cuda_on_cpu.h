@@ -29,7 +29,7 @@ inline float3 make_float3(float x, float y, float z) { return {x, y, z}; }
 inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
 
 struct Index { unsigned x; };
-inline Index threadIdx, blockIdx;
+inline Index threadIdx, blockIdx, blockDim;
 
 namespace shim {
 
@@ -48,6 +48,8 @@ struct Fiber {
 
 inline std::vector<Fiber> fibers;
 inline std::vector<Barrier> warps;
+inline Barrier block;
+inline bool any;  // of the threads' votes
 inline std::vector<uint32_t> exchange;  // what each lane shows the others of its warp
 inline std::function<void()> body;
 inline ucontext_t scheduler;
@@ -78,6 +80,8 @@ inline void run_fiber() {
 inline void run_block(int threads) {
     fibers.resize(std::max<size_t>(fibers.size(), threads));
     warps.assign((threads + LANES - 1) / LANES, Barrier{LANES});
+    block = Barrier{threads};
+    blockDim.x = threads;
     exchange.assign(warps.size() * LANES, 0);
     for (int i = 0; i < threads; ++i) {
         Fiber& fiber = fibers[i];
@@ -127,12 +131,33 @@ void launch(void (*kernel)(Arguments...), unsigned blocks, int threads, void** a
 }  // namespace shim
 
 inline void __syncwarp() { shim::wait_for_warp(); }
+inline void __syncthreads() { shim::wait(shim::block); }
+
+inline int __syncthreads_or(int vote) {
+    if (vote) shim::any = true;
+    __syncthreads();
+    const int any = shim::any;
+    __syncthreads();
+    shim::any = false;
+    __syncthreads();
+    return any;
+}
 inline int __popc(unsigned bits) { return __builtin_popcount(bits); }
 inline int __ffs(unsigned bits) { return __builtin_ffs(bits); }
 
 template <class T>
-T __shfl_xor_sync(unsigned, T value, int mask) {
-    return shim::from_lane(value, shim::current % shim::LANES ^ mask);
+T __shfl_sync(unsigned, T value, int lane) {
+    return shim::from_lane(value, lane % shim::LANES);
+}
+
+template <class T>
+T __shfl_up_sync(unsigned, T value, int lanes) {
+    return shim::from_lane(value, max(shim::current % shim::LANES - lanes, 0));
+}
+
+template <class T>
+T __shfl_down_sync(unsigned, T value, int lanes) {
+    return shim::from_lane(value, min(shim::current % shim::LANES + lanes, shim::LANES - 1));
 }
 
 inline unsigned __ballot_sync(unsigned, bool vote) {
