@@ -16,7 +16,17 @@ import torch
 import tyro
 from record import write_result
 
-from swiftwrf import AngularGrid, FitConfig, FitError, InputError, ModelConfig, Spectra, fit, load_spectra, simulated_room
+from swiftwrf import (
+    AngularGrid,
+    FitConfig,
+    FitError,
+    InputError,
+    ModelConfig,
+    Spectra,
+    fit,
+    load_spectra,
+    simulated_room,
+)
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import l1, psnr, ssim, summary
 from swiftwrf.rssi import Map
@@ -112,7 +122,7 @@ def variants(default: FitConfig, gradient: FitConfig) -> dict[str, FitConfig]:
         "mean, response deform": model(gradient, components=("mean", "response")),
         "mean, attenuation deform": model(gradient, components=("mean", "attenuation")),
         "response, attenuation deform": model(gradient, components=("response", "attenuation")),
-        "per-primitive network": replace(network, rate=1e-2, deformation_rate=2e-3),
+        "per-primitive network": replace(network, deformation_rate=2e-3),
         "coarse stage of 15 %": replace(gradient, coarse_fraction=0.15),
         "coarse stage, then means stopped": replace(gradient, coarse_fraction=0.15, stop_mean=True),
         "annealed noise on positions": replace(gradient, smoothing=1.0, smoothing_steps=gradient.steps),

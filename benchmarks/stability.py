@@ -185,7 +185,7 @@ FITS: dict[str, Callable[[int], Spectra]] = {
     "coordinates in millimetres": lambda many: with_position(lambda p: p * 1e-3),
     "10 spectra": lambda many: room(10),
     "many spectra": room,
-    "learning rate ten times too large": lambda many: room(),
+    "learning rate thirty times too large": lambda many: room(),
 }
 
 
@@ -194,7 +194,7 @@ def fit_case(name: str, many: int, config: FitConfig | None = None) -> dict[str,
     train, config = FITS[name](many), config or FitConfig()
     if name.startswith("learning rate"):
         gradient = replace(config.model, n_primitives=24, components=("mean", "response", "attenuation", "cholesky"))
-        config = replace(config, model=gradient, steps=300, rate=10 * config.rate)
+        config = replace(config, model=gradient, steps=300, rate=30 * config.rate)
     result: dict[str, Any] = {"case": name, "n": len(train), "psnr_db": None, "mean_psnr_db": None, "refusal": None}
     began = time.perf_counter()
     try:

@@ -20,6 +20,9 @@ from swiftwrf.runtime.session import Record, Session, State
 
 Model = TypeVar("Model", bound=nn.Module)
 
+MAX_GROWTH = (
+    1.1  # of the loss of a fit that is not refused; each step has other spectra, and a few steps improve little
+)
 SAVED_VALUES = {"step": int, "seconds": float, "first_loss": float, "last_loss": float}  # attributes in a checkpoint
 
 
@@ -117,7 +120,7 @@ class Descent(ABC, Generic[Model]):
         """Take all steps, from the saved state if it belongs to this run, and save the state at each evaluation.
 
         Raises:
-            FitError: The loss ends above its first value.
+            FitError: The mean loss before the last evaluation is a tenth above that before the first.
         """
         if session.saved is not None and session.saved.header.get("run") == self.name:
             with refusing(f"{session.path} is no state that a fit can continue from"):
@@ -125,16 +128,19 @@ class Descent(ABC, Generic[Model]):
         steps = self.schedule.steps
         task = session.bar.add_task(self.name, total=steps, completed=self.step)
         began = time.perf_counter() - self.seconds
+        losses = []  # since the last evaluation; their mean depends less on the choice of spectra than one of them
         while self.step < steps:
-            loss = self.advance()
-            if self.step == 1:
-                self.first_loss = float(loss)
+            losses.append(self.advance())
             session.bar.update(task, completed=self.step)
             if self._evaluates_after(self.step):
+                loss = torch.stack(losses).mean()
+                losses.clear()
                 self.seconds, self.last_loss = time.perf_counter() - began, float(loss)
+                if math.isinf(self.first_loss):
+                    self.first_loss = self.last_loss
                 session.evaluated(self.record(loss), *self._state())
         session.bar.remove_task(task)
-        if self.last_loss > self.first_loss:  # also if the checkpoint is that of a completed run
+        if self.last_loss > MAX_GROWTH * self.first_loss:  # also if the checkpoint is that of a completed run
             raise FitError(
                 f"the fit ended with a loss of {self.last_loss:.3g}, worse than the {self.first_loss:.3g} it began with; "
                 f"{self._advice()}"

@@ -89,7 +89,7 @@ class FitConfig(FieldConfig):
     """fraction of the steps without deformation (the paper's coarse stage)"""
     batch: PositiveInt = 16
     """spectra per step"""
-    rate: PositiveFloat = 3e-2
+    rate: PositiveFloat = 1e-2
     """learning rate of primitives and coefficients; the basis of the low-rank deformation has half of it"""
     deformation_rate: PositiveFloat | None = None
     """learning rate of the paper's network; None takes `rate`"""
@@ -141,7 +141,6 @@ class FitConfig(FieldConfig):
             steps=110_000,
             coarse_fraction=1 / 11,
             batch=1,
-            rate=1e-2,
             deformation_rate=8e-3,
             smoothing=1.0,
             stop_mean=True,

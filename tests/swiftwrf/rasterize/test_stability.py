@@ -18,7 +18,7 @@ from swiftwrf.testing.scenes import random_scene
 
 REFUSED = {
     "a pixel that is not a number": "spectrum of training spectrum 3 is not finite; mend or leave it out",
-    "learning rate ten times too large": "try a learning rate below 0.3",
+    "learning rate thirty times too large": "try a learning rate below 0.3",
 }
 SMALL_FIT = FitConfig(model=ModelConfig(n_primitives=24))
 
