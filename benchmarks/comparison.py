@@ -1,14 +1,12 @@
 """Repeat the paper's comparison on public data: every method on every scene, few training spectra, and turbo learning.
 
 The hours of work can be stopped at any time: each measured row is kept in the folder `--work`, and unfinished fits and
-runs continue from their state. Rows of the committed result that were not measured again stay in the result, so that a
-scene can be added. With `--scheduler` the workers of a Dask cluster measure the rows; each row contains its machine,
-because seconds of different machines do not compare.
+runs continue from their state. With `--scheduler` the workers of a Dask cluster measure the rows; each row contains its
+machine, because seconds of different machines do not compare.
 """
 
 from __future__ import annotations
 
-import copy
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -20,7 +18,6 @@ from typing import Any, Literal
 import torch
 import tyro
 from committed import ROOT
-from committed import load as committed
 from record import write_result
 from synthesis import load
 from torch import Tensor
@@ -59,8 +56,6 @@ Table = dict[str, dict[str, dict[str, Row]]]  # by scene, number of training spe
 class Config:
     data: Path
     """the folder that holds s23-200, newrf-bedroom and newrf-office"""
-    scenes: tuple[Path, ...] = ()
-    """folders of further scenes, ray-traced rooms say, split at random"""
     only: tuple[str, ...] = ()
     """of the scenes, those whose name begins so; all unless given"""
     parts: tuple[Literal["scenes", "counts", "turbo"], ...] = ("scenes", "counts", "turbo")
@@ -87,12 +82,10 @@ def main(config: Config) -> None:
     if "turbo" in config.parts and not config.quick:
         train_networks(config)
     if config.quick:
-        write_result("comparison_quick", {"scenes": gathered(rows, {}), "seconds": time.perf_counter() - began})
+        write_result("comparison_quick", {"scenes": gathered(rows), "seconds": time.perf_counter() - began})
         return
-    earlier = committed("comparison")
-    result = {"scenes": gathered(rows, earlier["scenes"]), "turbo": turbo(config.work) or earlier["turbo"]}
-    write_result("comparison", result)
-    draw(result["scenes"])
+    write_result("comparison", {"scenes": gathered(rows), "turbo": turbo(config.work)})
+    draw(gathered(rows))
 
 
 def scenes(config: Config) -> Iterator[tuple[str, Spectra, str]]:
@@ -102,7 +95,6 @@ def scenes(config: Config) -> Iterator[tuple[str, Spectra, str]]:
     yield "simulated-room random", simulated_room(), "random"
     if not config.quick:
         yield "simulated-room receiver random", simulated_room(moving="receiver"), "random"
-    yield from ((f"{folder.name} random", load(folder), "random") for folder in config.scenes)
 
 
 def numbers(scene: str, everything: int, config: Config) -> list[int]:
@@ -181,9 +173,9 @@ def measure_away(job: Job, scene: tuple[Spectra, Spectra]) -> Row:
         return job.measure(*scene, Path(folder) / "fit.state")
 
 
-def gathered(rows: Path, earlier: Table) -> Table:
-    """Return all measured rows, and the earlier rows that were not measured again."""
-    found = copy.deepcopy(earlier)
+def gathered(rows: Path) -> Table:
+    """Return all measured rows."""
+    found: Table = {}
     for file in rows.glob("*.json"):
         scene, n, method = file.stem.rsplit(" ", 2)
         found.setdefault(scene, {}).setdefault(n, {})[method] = json.loads(file.read_text())

@@ -1,11 +1,11 @@
-"""Make the tables of both comparison pages, with the paper's numbers beside the measured ones."""
+"""Make the tables of docs/comparison.md, with the paper's numbers beside the measured ones."""
 
 from __future__ import annotations
 
-import statistics
 from typing import Any
 
 from committed import interval, load, markdown
+from score_tables import Rows, costs, scores
 
 # median PSNR [dB], median SSIM and mean L1 of the paper's table, on its own spectra of these scenes
 PAPER_SCENES = {
@@ -40,70 +40,18 @@ PAPER_TURBO = {
 }
 
 
-# scenes of each column of the table of methods
-SCENES = {
-    "s23-200, random": ("s23-200 random",),
-    "s23-200, block": ("s23-200 block",),
-    "newrf (2 rooms)": ("newrf-bedroom random", "newrf-office random"),
-    "ray-traced (3 rooms, 2 moving ends)": tuple(
-        f"{room}-{moving} random"
-        for room in ("bedroom", "conference", "office")
-        for moving in ("receiver", "transmitter")
-    ),
-    "built-in room (2 moving ends)": ("simulated-room random", "simulated-room receiver random"),
-}
-
-
-def comparison_methods() -> str:
-    """Return one row for each method, the best PSNR of a column in bold."""
-    scenes = {scene: next(iter(by_count.values())) for scene, by_count in load("comparison")["scenes"].items()}
-    names = list(scenes["s23-200 random"])
-    psnr = {
-        name: [
-            statistics.mean(scenes[scene][name]["psnr_db"]["median"] for scene in group) for group in SCENES.values()
-        ]
-        for name in names
-    }
-    best = [f"{max(values):.1f}" for values in zip(*psnr.values(), strict=True)]
-    rows = []
-    for name in names:
-        texts = [f"{own:.1f}" for own in psnr[name]]
-        cells = [f"**{own}**" if own == top else own for own, top in zip(texts, best, strict=True)]
-        fit, ms = (
-            statistics.median(value(methods[name]) for methods in scenes.values())
-            for value in (lambda row: row["fit_seconds"], lambda row: row["ms"]["median"])
-        )
-        rows.append(
-            [f"`{name}`", *cells, f"{fit:.0f}", f"{ms:.2f}", f"{scenes['s23-200 random'][name]['parameters']:,}"]
-        )
-    return markdown(["method", *SCENES, "fit [s]", "ms a spectrum", "parameters"], rows)
-
-
 def comparison() -> str:
-    """Return every method on every scene with all training spectra, the best PSNR of a scene in bold."""
-    rows = []
-    for scene, by_count in load("comparison")["scenes"].items():
-        n, methods = next(iter(by_count.items()))
-        best = max(row["psnr_db"]["median"] for row in methods.values())
-        for name, row in methods.items():
-            psnr = row["psnr_db"]["median"]
-            paper = PAPER_SCENES.get(scene.split()[0], {}).get(name)
-            rows.append(
-                [
-                    f"{scene} ({n})",
-                    name,
-                    f"**{psnr:.2f}**" if psnr == best else f"{psnr:.2f}",
-                    f"{row['ssim']['median']:.3f}",
-                    f"{row['l1']['mean']:.4f}",
-                    f"{row['fit_seconds']:.0f}",
-                    f"{row['ms']['median']:.2f}",
-                    f"{row['parameters']:,}",
-                    f"{row['megabytes']:.2f}",
-                    " / ".join(map(str, paper)) if paper else "",
-                ]
-            )
-    columns = ["scene, split (training spectra)", "method", "PSNR [dB]", "SSIM", "L1", "fit [s]", "ms a spectrum"]
-    return markdown([*columns, "parameters", "MB", "paper, other data: PSNR / SSIM / L1"], rows)
+    """Return the scores of every method on every scene with all training spectra, and those of the paper."""
+    return scores(_by_scene(), {scene: PAPER_SCENES.get(scene.split()[0], {}) for scene in _by_scene()})
+
+
+def comparison_cost() -> str:
+    """Return seconds and size of every method with all training spectra."""
+    return costs(_by_scene())
+
+
+def _by_scene() -> dict[str, Rows]:
+    return {scene: next(iter(by_count.values())) for scene, by_count in load("comparison")["scenes"].items()}
 
 
 def comparison_counts() -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 from committed import interval, load, markdown
 from comparison_tables import PAPER_TURBO
+from score_tables import Rows, costs, scores
 
 OURS = ("swiftwrf", "coarray", "geometry", "hybrid")
 PUBLISHED = ("nerf2", "wrfgs", "vae", "dcgan")
@@ -55,7 +56,6 @@ PAPER = {
         "swiftwrf_paper": (28.15, 0.9023, 0.0398),
     },
 }
-Rows = dict[str, dict[str, Any]]  # by method
 
 
 def _with_all(scene: dict[str, Any], split: str) -> Rows:
@@ -65,77 +65,34 @@ def _with_all(scene: dict[str, Any], split: str) -> Rows:
     return rows
 
 
-def _score(row: dict[str, Any] | None, best: bool = False) -> str:
-    if row is None:
-        return ""
-    psnr = f"{row['psnr_db']['median']:.2f}"
-    return f"{f'**{psnr}**' if best else psnr} / {row['ssim']['median']:.3f} / {row['l1']['mean']:.4f}"
-
-
 def paper_scale() -> str:
     """Return the scores of every method on the random split of every scene, and those of the paper."""
-    return _scores("paper_scale", "random", with_paper=True)
+    return scores(_by_scene("paper_scale", "random"), PAPER)
 
 
 def paper_scale_block() -> str:
     """Return the scores of every method on the block split of every scene."""
-    return _scores("paper_scale", "block", with_paper=False)
+    return scores(_by_scene("paper_scale", "block"), {})
 
 
 def paper_scale_gpu() -> str:
     """Return the scores of the fits by gradient descent on a GPU, and those of the paper."""
-    return _scores("paper_scale_gpu", "random", with_paper=True)
+    return scores(_by_scene("paper_scale_gpu", "random"), PAPER)
 
 
-def _scores(result: str, split: str, with_paper: bool) -> str:
-    """Return a row for each method and a column for each scene, the best PSNR of a scene in bold."""
-    scenes = {name: _with_all(scene, split) for name, scene in load(result)["scenes"].items() if split in scene}
-    best = {name: max(row["psnr_db"]["median"] for row in rows.values()) for name, rows in scenes.items()}
-    table = []
-    for method in dict.fromkeys(method for rows in scenes.values() for method in rows):
-        own = {name: rows.get(method) for name, rows in scenes.items()}
-        table.append(
-            [f"`{method}`", *(_score(r, bool(r) and r["psnr_db"]["median"] == best[n]) for n, r in own.items())]
-        )
-        if with_paper and any(method in PAPER[name] for name in scenes):
-            published = [PAPER[name][method] for name in scenes]
-            table.append(
-                [f"paper: {method.removesuffix('_paper')}", *(f"{a:.2f} / {b:.3f} / {c:.4f}" for a, b, c in published)]
-            )
-    return markdown(["method", *scenes], table)
+def _by_scene(result: str, split: str) -> dict[str, Rows]:
+    """Return the rows of each scene with all training spectra."""
+    return {name: _with_all(scene, split) for name, scene in load(result)["scenes"].items() if split in scene}
 
 
 def paper_scale_cost() -> str:
     """Return seconds and size of the fits on the random split, from the least to the greatest scene."""
-    return _costs("paper_scale")
+    return costs(_by_scene("paper_scale", "random"))
 
 
 def paper_scale_gpu_cost() -> str:
     """Return seconds and size of the fits on a GPU."""
-    return _costs("paper_scale_gpu")
-
-
-def _costs(result: str) -> str:
-    by_method: dict[str, list[dict[str, Any]]] = {}
-    for scene in load(result)["scenes"].values():
-        for method, row in _with_all(scene, "random").items():
-            by_method.setdefault(method, []).append(row)
-
-    def of(values: list[float], digits: int = 0) -> str:
-        low, high = (f"{value:,.{digits}f}" for value in (min(values), max(values)))
-        return low if low == high else f"{low} to {high}"
-
-    table = [
-        [
-            f"`{method}`",
-            f"{rows[0]['steps']:,}" if rows[0].get("steps") else "",
-            of([row["fit_seconds"] for row in rows]),
-            of([row["ms"]["median"] for row in rows], 1),
-            of([row["megabytes"] for row in rows], 2),
-        ]
-        for method, rows in by_method.items()
-    ]
-    return markdown(["method", "steps", "fit [s]", "ms a spectrum", "MB"], table)
+    return costs(_by_scene("paper_scale_gpu", "random"))
 
 
 def paper_scale_density() -> str:

@@ -39,67 +39,60 @@ def _at(fixed: list[dict[str, Any]], n: int) -> dict[str, Any]:
 
 
 def speed() -> str:
-    """Return every model on every scene, those on the Pareto front in bold."""
-    rows = []
+    """Return milliseconds a spectrum, held-out PSNR and seconds of the fit of every model on every scene."""
+    cells: Cells = {}
     for file in sorted(RESULTS.glob("speed_*.json")):
         content = json.loads(file.read_text())
-        points = {p["setting"]: (p["seconds"]["median"], p["held_out"]) for p in content["models"]}
-        front = pareto(points)
+        front = pareto({p["setting"]: (p["seconds"]["median"], p["held_out"]) for p in content["models"]})
         for point in content["models"]:
-            name = point["setting"]
-            rows.append(
-                [
-                    f"{content['data']} {content['split']}",
-                    f"**{name}**" if name in front else name,
-                    f"{point['seconds']['median'] * 1e3:.2f}",
-                    f"{point['psnr_db']:.2f}",
-                    f"{point['fit_seconds']:.1f}" if point["fit_seconds"] else "",
-                    f"{point['parameters']:,}" if "parameters" in point else "",
-                ]
-            )
-    return markdown(["scene, split", "setting", "ms a spectrum", "held-out PSNR [dB]", "fit [s]", "parameters"], rows)
+            text = f"{point['seconds']['median'] * 1e3:.2f} / {point['psnr_db']:.2f}"
+            text += f" / {point['fit_seconds']:.1f}" if point["fit_seconds"] else ""
+            _put(cells, point["setting"].partition(" (")[0], _scene(content), text, point["setting"] in front)
+    return _crossed("setting", cells)
 
 
 def networks() -> str:
-    """Return error and seconds of every estimator on every training set, those on the Pareto front in bold."""
-    rows = []
+    """Return the median error and the training time of every estimator on every training set."""
+    cells: Cells = {}
     for scene, trainings in load("networks")["scenes"].items():
         for training, entry in trainings.items():
-            what = training.partition(",")[0]
             methods = entry["methods"]
-            points = {
-                name: (method["seconds"]["train"], method["great_circle_deg"]["median"])
-                for name, method in methods.items()
-            }
+            points = {name: (m["seconds"]["train"], m["great_circle_deg"]["median"]) for name, m in methods.items()}
             front = pareto(points)
-            for name, method in methods.items():
-                error, change, seconds = method["great_circle_deg"], method["change"], method["seconds"]
-                rows.append(
-                    [
-                        f"{scene}, {what}, {entry['n_train']} spectra",
-                        f"**{name}**" if name in front else name,
-                        f"{error['median']:.2f} [{error['low']:.2f}, {error['high']:.2f}]",
-                        f"{change['change']:+.0%} [{change['low']:+.0%}, {change['high']:+.0%}]",
-                        f"{seconds['train']:.1f}",
-                        f"{seconds['estimate'] * 1e3:.1f}",
-                    ]
-                )
-    columns = ["scene, training set", "estimator", "held-out error [deg]", "against kernel_regression", "train [s]"]
-    return markdown([*columns, "ms a spectrum"], rows)
+            column = f"{scene}, {training.partition(',')[0]}, {entry['n_train']}"
+            for name, (seconds, error) in points.items():
+                _put(cells, name, column, f"{error:.2f} / {seconds:.0f}", name in front)
+    return _crossed("estimator", cells)
 
 
 def drawing() -> str:
-    """Return every rendering of the default model of each scene, those on the Pareto front in bold."""
-    rows = []
+    """Return milliseconds a spectrum and numerical error of the default model of each scene, in single precision."""
+    cells: Cells = {}
     for file in sorted(RESULTS.glob("speed_*.json")):
         content = json.loads(file.read_text())
-        own = [p for p in content["drawing"] if p["own_grid"]]
-        front = pareto({p["setting"]: (p["seconds"]["median"], p["numerical"]) for p in own})
+        own = [p for p in content["drawing"] if p["own_grid"] and "weights" not in p["setting"]]
         for p in own:
-            name = f"**{p['setting']}**" if p["setting"] in front else p["setting"]
-            cells = [f"{p['seconds']['median'] * 1e3:.2f}", f"{p['numerical']:.0e}", f"{p['held_out']:.4f}"]
-            rows.append([f"{content['data']} {content['split']}", name, *cells])
-    return markdown(["scene, split", "setting", "ms a spectrum", "RMS numerical", "RMS held-out"], rows)
+            text = f"{p['seconds']['median'] * 1e3:.2f} / {p['numerical']:.0e}"
+            _put(cells, p["setting"].rpartition(", ")[0], _scene(content), text, False)
+    return _crossed("setting", cells)
+
+
+Cells = dict[str, dict[str, str]]  # text by row and column
+
+
+def _scene(content: dict[str, Any]) -> str:
+    return f"{content['data']} {content['split']}"
+
+
+def _put(cells: Cells, row: str, column: str, text: str, bold: bool) -> None:
+    cells.setdefault(row, {})[column] = f"**{text}**" if bold else text
+
+
+def _crossed(what: str, cells: Cells) -> str:
+    """Return a table of rows and columns."""
+    columns = list(dict.fromkeys(column for row in cells.values() for column in row))
+    rows = [[name, *(row.get(column, "") for column in columns)] for name, row in cells.items()]
+    return markdown([what, *columns], rows)
 
 
 def gpu_rates() -> str:
@@ -166,13 +159,3 @@ def scaling_quality() -> str:
     names = [stage for stage, values in content["rows"][0]["stages"].items() if "psnr_db" in values]
     rows = [[f"{row['n']:,}", *(f"{row['stages'][name]['psnr_db']:.1f}" for name in names)] for row in content["rows"]]
     return markdown(["spectra", *names], rows)
-
-
-def busy() -> str:
-    """Return the seconds of a training step, idle and beside other work, by the busy-waiting time of threads."""
-    steps = {(row["spins"], row["neighbour"]): row["step_s"] for row in load("busy")["rows"]}
-    rows = [
-        [f"{spins:,}", f"{steps[spins, False]:.2f} s", f"{steps[spins, True]:.2f} s"]
-        for spins in dict.fromkeys(spins for spins, _ in steps)
-    ]
-    return markdown(["GOMP_SPINCOUNT", "idle", "beside a loop on one core"], rows)

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from committed import ROOT, aoa_shares, interval, load, markdown, turbo_condition
-from comparison_tables import comparison, comparison_counts, comparison_methods, comparison_turbo
+from comparison_tables import comparison, comparison_cost, comparison_counts, comparison_turbo
 from geometry import SIDES, WALLS, nearest
 from locating_tables import locating_rssi, locating_spectra
 from measured_tables import measured_spectra
@@ -26,7 +26,6 @@ from paper_scale_tables import (
 )
 from rssi_tables import rssi_glance, rssi_heads, rssi_methods
 from speed_tables import (
-    busy,
     drawing,
     gpu_rates,
     gpu_seconds,
@@ -286,7 +285,6 @@ TABLES = {
     "scaling": scaling,
     "scaling_quality": scaling_quality,
     "scaling_rssi": scaling_rssi,
-    "busy": busy,
     "gpu_rates": gpu_rates,
     "gpu_seconds": gpu_seconds,
     "gpu_targets": gpu_targets,
@@ -310,7 +308,7 @@ TABLES = {
     "networks": networks,
     "ablation": ablation,
     "comparison": comparison,
-    "comparison_methods": comparison_methods,
+    "comparison_cost": comparison_cost,
     "raytracing": raytracing,
     "comparison_counts": comparison_counts,
     "comparison_turbo": comparison_turbo,
