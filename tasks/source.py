@@ -13,7 +13,7 @@ from torch import Tensor
 from swiftwrf import AngularGrid, InputError, Rssi, Spectra
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import ReadOptions, read_rssi, read_spectra
-from swiftwrf.data.rssi import Offsets
+from swiftwrf.data.groups import Offsets
 from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
 from swiftwrf.datasets import fetch

@@ -17,8 +17,9 @@ from swiftwrf.data.coordinates import without_fix
 from swiftwrf.data.files import MAX_COORDINATE_M, digests, numbers, read_yaml
 from swiftwrf.data.fillers import NOT_DETECTED_DBM, check_powers, find_fillers, without_fillers
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
+from swiftwrf.data.groups import numbered
 from swiftwrf.data.receivers import read_receivers, unknown_positions
-from swiftwrf.data.rssi import SESSIONS, Rssi, numbered
+from swiftwrf.data.rssi import SESSIONS, Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
 from swiftwrf.data.survey import read_frame
 from swiftwrf.errors import InputError, listed

@@ -11,8 +11,9 @@ from swiftwrf.data.files import digests, lines_before_header
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.captures import holds_captures
 from swiftwrf.data.formats.nerf2_rssi import FILES as NERF2_FILES
+from swiftwrf.data.groups import Groups
 from swiftwrf.data.receivers import read_receivers
-from swiftwrf.data.rssi import Groups, Rssi
+from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
 from swiftwrf.data.survey import SEPARATORS, SUFFIXES, SurveyOptions, read_frame, read_survey
 from swiftwrf.errors import InputError
