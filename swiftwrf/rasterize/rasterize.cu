@@ -130,8 +130,8 @@ extern "C" __global__ void __launch_bounds__(THREADS) find_reach(
 // ---------------------------------------------------------------------------------------------------------------- forward
 //
 // A warp draws a tile, each of its threads four pixels of one column. It goes through the bits, collects the primitives that
-// reach the tile, and draws them 32 at a time: each thread prepares one of them, then all draw all 32. The order in which
-// primitives are collected follows from the bits alone.
+// reach the tile, and draws them 32 at a time: each thread prepares one of them and leaves it out if only the box around it
+// reaches the tile, then all draw all that are left. The order in which primitives are collected follows from the bits alone.
 
 constexpr int ROW_STEP = LANES / TILE_COLUMNS;  // rows between two pixels of a thread
 constexpr int PIXELS = TILE_ROWS / ROW_STEP;    // of a thread
@@ -384,7 +384,7 @@ __device__ __forceinline__ void gather(
                 // rows in which v^2 <= -least - u^2, with slack for rounding; further ones count as 0
                 const float middle = p.elevation.beyond - v_x * p.rows_per_v;
                 const float reach = 1.001f * sqrtf(fmaxf(-cutoff.least - u * u, 0.0f)) * fabsf(p.rows_per_v);
-                const int top = static_cast<int>(fmaxf(y + ceilf(middle - reach), 0.0f));
+                const int top = static_cast<int>(fminf(fmaxf(y + ceilf(middle - reach), 0.0f), height));
                 const float lowest = entry < listed ? height - 1.0f : -1.0f;
                 const int bottom = static_cast<int>(fmaxf(fminf(y + floorf(middle + reach), lowest), -1.0f));
                 float re = 0, im = 0, s_1 = 0, s_2 = 0;  // sums of kernel times gradient, z v, z v^2
