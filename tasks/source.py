@@ -102,15 +102,21 @@ def offset_notes(data: Rssi, config: OffsetSource) -> list[str]:
     ]
 
 
-def split_notes(train: Rssi, test: Rssi) -> list[str]:
-    """Return a note on rows that share positions, or none."""
+def split_notes(train: Rssi, test: Rssi, split: str) -> list[str]:
+    """Return notes on sessions and on rows that share positions."""
+    notes = []
+    if train.validation_for(split, test) == "session":
+        notes.append(
+            "the test rows are of other sessions than the training rows, so cross-validation holds out sessions"
+        )
     repeated = repeated_fraction(train.transmitter_position, test.transmitter_position)
-    if repeated > MAX_REPEATED:
-        return [f"this split tests look-up: {repeated:.0%} of the test rows are at positions of training rows"]
     position = torch.cat([train.transmitter_position, test.transmitter_position])
     n_places = len(position.unique(dim=0))
-    shared = f"{len(position)} rows are at {n_places} positions, each of which is in one part of the split"
-    return [shared] if n_places < len(position) and not repeated else []
+    if repeated > MAX_REPEATED:
+        notes.append(f"this split tests look-up: {repeated:.0%} of the test rows are at positions of training rows")
+    elif n_places < len(position) and not repeated:
+        notes.append(f"{len(position)} rows are at {n_places} positions, each of which is in one part of the split")
+    return notes
 
 
 def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model: str) -> tuple[Store, Spectra | None]:

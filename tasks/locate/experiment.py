@@ -156,7 +156,11 @@ class Results:
         return {
             "task": "locate",
             "data": data.name,
-            "notes": [*split_notes(train, test), *data.notes, *([train.offsets.note()] if train.offsets else [])],
+            "notes": [
+                *split_notes(train, test, self.experiment.split),
+                *data.notes,
+                *([train.offsets.note()] if train.offsets else []),
+            ],
             "split": self.experiment.split,
             "seed": self.experiment.seed,
             "n_train": len(train),

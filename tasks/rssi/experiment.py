@@ -53,7 +53,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     train, test = data.split(config.split, config.seed)
     if not bool((~test.rssi_dbm.isnan()).any()):
         raise InputError(f"split {config.split!r} of {data.name} has no test rows that detect these receivers")
-    notes = [*split_notes(train, test), *offset_notes(data, config), *data.notes]
+    notes = [*split_notes(train, test, config.split), *offset_notes(data, config), *data.notes]
     if (offsets := asked_offsets(pool, config)) is not None:
         train, pool = offsets.removed(train), offsets.removed(pool)
         notes.append(offsets.note())

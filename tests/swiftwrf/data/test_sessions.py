@@ -11,6 +11,7 @@ import torch
 from swiftwrf import InputError, Rssi, RssiModel, load_rssi, make_model, rssi_room, simulated_room
 from swiftwrf.data.splits import folds
 from swiftwrf.data.writing import write_rssi
+from tasks.source import split_notes
 
 SIZES = (50, 30, 40, 20, 10, 10)
 
@@ -48,6 +49,7 @@ def test_split_of_other_sessions_holds_out_sessions():
     data = replace(data, named_splits={"day": apart})
     train, test = data.split("day")
     assert train.validation_for("day", test) == "session"
+    assert "cross-validation holds out sessions" in split_notes(train, test, "day")[0]
     assert [data.split(name)[0].validation_for(name, data.split(name)[1]) for name in ("random", "block")] == [
         "random",
         "block",
