@@ -237,7 +237,6 @@ def hard_fits() -> str:
 PAPER = {
     "mean, response, attenuation deform": "0.9040 / 0.0417",
     "by gradient, all four deform": "0.7313 / 0.0777",
-    "default": "0.7313 / 0.0777 (all four deform)",
     "mean, response deform": "0.7618 / 0.0707",
     "mean, attenuation deform": "0.8930 / 0.0424",
     "response, attenuation deform": "0.8735 / 0.0474",
