@@ -44,14 +44,15 @@ def costs(scenes: dict[str, Rows]) -> str:
         low, high = (f"{value:,.{digits}f}" for value in (min(values), max(values)))
         return low if low == high else f"{low} to {high}"
 
+    steps = any("steps" in row for rows in by_method.values() for row in rows)
     table = [
         [
             f"`{method}`",
-            f"{rows[0]['steps']:,}" if rows[0].get("steps") else "",
+            *([f"{rows[0]['steps']:,}" if rows[0].get("steps") else ""] if steps else []),
             of([row["fit_seconds"] for row in rows]),
             of([row["ms"]["median"] for row in rows], 1),
             of([row["megabytes"] for row in rows], 2),
         ]
         for method, rows in by_method.items()
     ]
-    return markdown(["method", "steps", "fit [s]", "ms a spectrum", "MB"], table)
+    return markdown(["method", *(["steps"] if steps else []), "fit [s]", "ms a spectrum", "MB"], table)
