@@ -44,6 +44,8 @@ ALL = ("mean", "response", "attenuation", "cholesky")
 class Config:
     data: Path | None = None
     """folder with s23-200, newrf-bedroom and newrf-office. Defaults to the simulated room alone"""
+    large: Path | None = None
+    """folder of a scene of thousands of positions. It is measured alone and by regression alone, into ablation_large.json"""
     quick: bool = False
     """one seed, 150 steps a fit"""
     scheduler: str | None = None
@@ -61,23 +63,27 @@ class Case:
 
 def main(config: Config) -> None:
     """Run every variant on every scene and write `results/ablation.json`."""
-    if config.data is None:
-        scenes: dict[str, tuple[Spectra, str]] = {"simulated-room random": (simulated_room(), "random")}
+    scenes: dict[str, tuple[Path | None, Spectra, str]] = {}
+    if config.large is not None:
+        scenes[f"{config.large.name} random"] = config.large, load_spectra(config.large), "random"
+    elif config.data is None:
+        scenes["simulated-room random"] = None, simulated_room(), "random"
     else:
-        scenes = {f"{name} {split}": (load_spectra(config.data / name), split) for name, split in SCENES}
+        for name, split in SCENES:
+            scenes[f"{name} {split}"] = config.data / name, load_spectra(config.data / name), split
     began = time.perf_counter()
     with connected(config.scheduler, torch.device("cpu")) as cluster:
         parallel = cluster.map if cluster else map
         results = {name: study(name, *scene, config, parallel) for name, scene in scenes.items()}
         workers = {"workers": sorted(cluster.machines)} if cluster else {}
     seconds = time.perf_counter() - began
-    name = "ablation_quick" if config.quick else "ablation"
+    name = "ablation_large" if config.large else "ablation_quick" if config.quick else "ablation"
     seeds = SEEDS[:1] if config.quick else SEEDS
     write_result(name, {"seeds": seeds, "seconds": seconds, **workers, "scenes": results})
 
 
-def study(name: str, data: Spectra, split: str, config: Config, parallel: Map) -> dict[str, Any]:
-    """Return the scores of all variants on one scene."""
+def study(name: str, folder: Path | None, data: Spectra, split: str, config: Config, parallel: Map) -> dict[str, Any]:
+    """Return the scores of all variants on one scene, those of its folder at 0.5 degrees, too."""
     train, test = data.split(split)
     default = FitConfig(validation=validation_for(split))
     steps = 150 if config.quick else STEPS
@@ -93,13 +99,17 @@ def study(name: str, data: Spectra, split: str, config: Config, parallel: Map) -
             print(name, variant, in_words(found[variant]), flush=True)
         return found
 
-    cases = {variant: case(changed) for variant, changed in variants(default, gradient).items()}
+    cases = {
+        variant: case(changed)
+        for variant, changed in variants(default, gradient).items()
+        if not (config.large and changed.steps)
+    }
     for share in SHARES:
         kept = torch.randperm(len(train), generator=torch.Generator().manual_seed(0))[: round(share * len(train))]
         cases[f"{share:.0%} of the training spectra"] = case(default, kept.sort().values)
     results = scores(train, test, cases)
-    if data.array is not None and config.data is not None:  # ray paths can be seen at any resolution
-        fine = load_spectra(config.data / data.name, grid=AngularGrid.hemisphere(180, 720))
+    if data.array is not None and folder is not None:  # ray paths can be seen at any resolution
+        fine = load_spectra(folder, grid=AngularGrid.hemisphere(180, 720))
         results |= scores(*fine.split(split), {"seen at 0.5 degrees": case(default)})
     return {"n_train": len(train), "n_test": len(test), "steps": steps, "variants": results}
 
