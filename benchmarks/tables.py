@@ -250,7 +250,7 @@ PAPER = {
 
 def ablation() -> str:
     """Return median SSIM / mean L1 / median PSNR of every variant of the ablation on every scene."""
-    scenes = load("ablation")["scenes"]
+    scenes = load("ablation")["scenes"] | load("ablation_large")["scenes"]
     names = list(dict.fromkeys(name for scene in scenes.values() for name in scene["variants"]))
     rows = []
     for name in names:
