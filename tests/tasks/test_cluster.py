@@ -132,7 +132,6 @@ def test_the_comparison_has_the_same_rows(local, tmp_path, monkeypatch, small_pu
     monkeypatch.setattr(comparison, "LEARNT", ("vae",))
     monkeypatch.setattr(comparison, "write_result", lambda name, content: written.append(content["scenes"]))
     monkeypatch.setattr(comparison, "draw", lambda found: None)
-    monkeypatch.setattr(comparison, "committed", lambda name: {"scenes": {}, "turbo": {}})
     for address in (None, local.scheduler_address):
         work = tmp_path / ("here" if address is None else "there")
         comparison.main(comparison.Config(Path(), parts=("scenes",), work=work, scheduler=address))
