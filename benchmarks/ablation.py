@@ -63,14 +63,11 @@ class Case:
 
 def main(config: Config) -> None:
     """Run every variant on every scene and write `results/ablation.json`."""
-    scenes: dict[str, tuple[Path | None, Spectra, str]] = {}
+    scenes: dict[str, tuple[Path | None, str]] = {"simulated-room random": (None, "random")}
     if config.large is not None:
-        scenes[f"{config.large.name} random"] = config.large, load_spectra(config.large), "random"
-    elif config.data is None:
-        scenes["simulated-room random"] = None, simulated_room(), "random"
-    else:
-        for name, split in SCENES:
-            scenes[f"{name} {split}"] = config.data / name, load_spectra(config.data / name), split
+        scenes = {f"{config.large.name} random": (config.large, "random")}
+    elif config.data is not None:
+        scenes = {f"{name} {split}": (config.data / name, split) for name, split in SCENES}
     began = time.perf_counter()
     with connected(config.scheduler, torch.device("cpu")) as cluster:
         parallel = cluster.map if cluster else map
@@ -82,8 +79,9 @@ def main(config: Config) -> None:
     write_result(name, {"seeds": seeds, "seconds": seconds, **workers, "scenes": results})
 
 
-def study(name: str, folder: Path | None, data: Spectra, split: str, config: Config, parallel: Map) -> dict[str, Any]:
-    """Return the scores of all variants on one scene, those of its folder at 0.5 degrees, too."""
+def study(name: str, folder: Path | None, split: str, config: Config, parallel: Map) -> dict[str, Any]:
+    """Return the scores of all variants on the scene of a folder, or on the built-in room."""
+    data = load_spectra(folder) if folder else simulated_room()
     train, test = data.split(split)
     default = FitConfig(validation=validation_for(split))
     steps = 150 if config.quick else STEPS
@@ -108,7 +106,7 @@ def study(name: str, folder: Path | None, data: Spectra, split: str, config: Con
         kept = torch.randperm(len(train), generator=torch.Generator().manual_seed(0))[: round(share * len(train))]
         cases[f"{share:.0%} of the training spectra"] = case(default, kept.sort().values)
     results = scores(train, test, cases)
-    if data.array is not None and folder is not None:  # ray paths can be seen at any resolution
+    if data.array is not None and folder:  # ray paths can be seen at any resolution
         fine = load_spectra(folder, grid=AngularGrid.hemisphere(180, 720))
         results |= scores(*fine.split(split), {"seen at 0.5 degrees": case(default)})
     return {"n_train": len(train), "n_test": len(test), "steps": steps, "variants": results}

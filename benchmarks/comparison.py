@@ -84,8 +84,9 @@ def main(config: Config) -> None:
     if config.quick:
         write_result("comparison_quick", {"scenes": gathered(rows), "seconds": time.perf_counter() - began})
         return
-    write_result("comparison", {"scenes": gathered(rows), "turbo": turbo(config.work)})
-    draw(gathered(rows))
+    found = gathered(rows)
+    write_result("comparison", {"scenes": found, "turbo": turbo(config.work)})
+    draw(found)
 
 
 def scenes(config: Config) -> Iterator[tuple[str, Spectra, str]]:

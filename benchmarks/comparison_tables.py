@@ -42,7 +42,8 @@ PAPER_TURBO = {
 
 def comparison() -> str:
     """Return the scores of every method on every scene with all training spectra, and those of the paper."""
-    return scores(_by_scene(), {scene: PAPER_SCENES.get(scene.split()[0], {}) for scene in _by_scene()})
+    scenes = _by_scene()
+    return scores(scenes, {scene: PAPER_SCENES.get(scene.split()[0], {}) for scene in scenes})
 
 
 def comparison_cost() -> str:

@@ -20,7 +20,8 @@ from swiftwrf.rasterize.cuda_kernels import kernels
 THREADS_PER_BLOCK, WARPS_PER_BLOCK, THREADS_PER_WARP = 256, 8, 32
 TILE_COLUMNS, TILE_ROWS = 16, 8
 GATHERING_WARPS = 16
-SMALL = 1024  # primitives; measured on an H100
+
+SMALL = 1024  # number of primitives up to which half as many warps a block are faster, on an H100
 
 
 def field(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None) -> Tensor:

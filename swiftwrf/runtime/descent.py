@@ -20,9 +20,7 @@ from swiftwrf.runtime.session import Record, Session, State
 
 Model = TypeVar("Model", bound=nn.Module)
 
-MAX_GROWTH = (
-    1.1  # of the loss of a fit that is not refused; each step has other spectra, and a few steps improve little
-)
+MAX_GROWTH = 1.1  # of the loss of a fit that is not refused: steps have different spectra, and a few improve little
 SAVED_VALUES = {"step": int, "seconds": float, "first_loss": float, "last_loss": float}  # attributes in a checkpoint
 
 

@@ -37,7 +37,7 @@ def test_field_models_do_not_depend_on_the_origin(room, small_published, glances
 
 
 def test_swiftwrf_does_not_depend_on_the_origin(room):
-    small = FitConfig(model=ModelConfig(n_primitives=4, rank=2), steps=10, rate=3e-2, check_every=5)
+    small = FitConfig(model=ModelConfig(n_primitives=4, rank=2), steps=10, check_every=5)
     predicted = [
         SwiftWRF(small).fit(moved(room, shift)).predict(room.position[:5] + shift).mean for shift in (0.0, 1e7)
     ]
