@@ -120,7 +120,7 @@ def main(config: Config) -> None:
             train, test = data.split(split, config.seed)
             measure(config, work / f"{scene} {split}", train, test, split, first)
         if first and "aoa" in config.parts and not config.quick:
-            estimate_angles(config, folder, work / "aoa")
+            estimate_angles(config, folder, work)
         write_result(name, gathered(work, name) | {"positions": positions, "height_m": HEIGHT_M, "seed": config.seed})
 
 
@@ -231,14 +231,20 @@ def row(model: FieldModel | None, train: Spectra, test: Spectra, state: Path, de
     return found | {"n_train": len(train), "n_test": len(test)}
 
 
-def estimate_angles(config: Config, folder: Path, out: Path) -> None:
-    """Run turbo learning with the spectra of several field models, unless the run is finished."""
-    stopped = out.with_name("aoa.partial")
-    if not out.exists():
-        task = AoaConfig(
-            SHARES, str(folder), synthesizer=config.synthesizers, extra=0, repeats=config.repeats, out=str(out)
-        )
-        run_aoa(task, stopped if stopped.exists() else None)
+def estimate_angles(config: Config, folder: Path, work: Path) -> None:
+    """Run turbo learning with the spectra of several field models, unless the runs are finished.
+
+    Field models in closed form and those fitted by gradient descent have a run each: the same measured and test spectra.
+    """
+    by_gradient = tuple(name for name in config.synthesizers if name in BY_GRADIENT)
+    closed_form = tuple(name for name in config.synthesizers if name not in BY_GRADIENT)
+    for name, synthesizers in (("aoa", closed_form), ("aoa_by_gradient", by_gradient)):
+        out, stopped = work / name, work / f"{name}.partial"
+        if synthesizers and not out.exists():
+            task = AoaConfig(
+                SHARES, str(folder), synthesizer=synthesizers, extra=0, repeats=config.repeats, out=str(out)
+            )
+            run_aoa(task, stopped if stopped.exists() else None)
 
 
 def gathered(work: Path, name: str) -> Row:
@@ -255,13 +261,13 @@ def gathered(work: Path, name: str) -> Row:
         )
     for file in work.glob("*.scene.json"):
         found["described"][file.name.removesuffix(".scene.json")] = json.loads(file.read_text())
-    if (work / "aoa" / "metrics.json").exists():
-        mixes = json.loads((work / "aoa" / "metrics.json").read_text())["mixes"]
-        angles = ("elevation_deg", "azimuth_deg", "great_circle_deg")
-        found["aoa"] = {
-            share: {method: {angle: errors[angle] for angle in angles} for method, errors in mix["methods"].items()}
-            for share, mix in mixes.items()
-        }
+    angles = ("elevation_deg", "azimuth_deg", "great_circle_deg")
+    for file in sorted(work.glob("aoa*/metrics.json")):
+        found["aoa"] = found["aoa"] or {}
+        for share, mix in json.loads(file.read_text())["mixes"].items():
+            methods = found["aoa"].setdefault(share, {})
+            for method, errors in mix["methods"].items():
+                methods.setdefault(method, {angle: errors[angle] for angle in angles})
     order = [f"{room}-{moving}" for room, moving in SCENES]
     found["described"] = {scene: found["described"][scene] for scene in order if scene in found["described"]}
     found["scenes"] = {

@@ -35,7 +35,8 @@ from swiftwrf.models.base import FIXED_END
 from swiftwrf.models.swiftwrf.mlp import SkipMLP, encode
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
-MAX_SAMPLES_AT_ONCE = 2**19  # samples of the field evaluated at a time, which bounds the memory
+SAMPLES_AT_ONCE = {"cpu": 2**16, "cuda": 2**19}
+"""samples of the field evaluated at a time; a layer of more than 2**16 no longer fits into the caches of a processor"""
 
 
 @configuration
@@ -164,7 +165,8 @@ class NeRF2Network(LinkNetwork):
     def render(self, position: Tensor, grid: AngularGrid, generator: torch.Generator | None = None) -> Tensor:
         ends = self.link(position)
         direction = self.link.to_world(grid.direction.flatten(0, 1).to(position.device))
-        parts = chunks(len(direction), max(1, MAX_SAMPLES_AT_ONCE // (len(position) * self.size.samples)))
+        at_once = SAMPLES_AT_ONCE[direction.device.type] // (len(position) * self.size.samples)
+        parts = chunks(len(direction), max(1, at_once))
         return torch.cat([self(*ends, direction[None, part]) for part in parts], dim=1).reshape(-1, *grid.shape)
 
 
