@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import torch
 from pandas import DataFrame
 from torch import Tensor
 
-from swiftwrf.data.store import Store
-from swiftwrf.metrics import angle_errors, covered, l1, psnr, ssim
+from swiftwrf.metrics import angle_errors, covered
 from swiftwrf.models import FIELD_MODELS
 from tasks.aoa.condition import EVERYTHING, LOCATOR, Condition, MeasuredSubset, pooled, reference_of
 from tasks.aoa.context import ROOM_MODEL, Experiment
@@ -34,7 +33,6 @@ from tasks.steps import Step
 from tasks.summarise import averaged, paired_change, repeats_averaged
 from tasks.terminal import console, terminal
 
-SCORE = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
 EXAMPLE_QUANTILES = (
     1.0,
     0.8,
@@ -172,18 +170,16 @@ class Results:
             self.left_out[condition] = reason
 
     def _add_synthesis(self, step: Synthesis, value: Row) -> None:
-        spectra = step.test_spectra(self.run.folder)
-        for part, name in (("test", step.synthesizer), ("test_sample", f"{step.synthesizer} sample")):
-            if part in spectra:
-                key = step.subset.columns | {"synthesizer": name}
-                scores = {score: self._score(function, spectra[part]) for score, function in SCORE.items()}
-                self.synthesis += _rows(key, {"index": self.test.index} | scores)
-                trains = step.trains and part == "test"
-                self.synthesis_seconds.append(key | value["seconds"] | {"trains": trains})
+        for part, scores in value["scores"].items():
+            name = step.synthesizer if part == "test" else f"{step.synthesizer} sample"
+            key = step.subset.columns | {"synthesizer": name}
+            columns = {score: torch.tensor(values) for score, values in scores.items()}
+            self.synthesis += _rows(key, {"index": self.test.index} | columns)
+            self.synthesis_seconds.append(key | value["seconds"] | {"trains": step.trains and part == "test"})
         self.history += [step.subset.columns | {"synthesizer": step.synthesizer} | row for row in value["history"]]
         if step.subset.repeat == 0 and step.trains and step.subset.key not in self._examples:
             self._examples.add(step.subset.key)
-            self._write_examples(step.subset, step.synthesizer, spectra)
+            self._write_examples(step, torch.tensor(value["scores"]["test"]["psnr_db"]))
 
     def _add_suggestion(self, step: Suggestion, value: Row) -> None:
         name = f"suggested-mix{step.subset.key}"
@@ -193,21 +189,16 @@ class Results:
         names = {"measured": "measured", "suggested": "position", "left": "variance"}
         self.run.write_npz(f"{name}.npz", {array: tensors[key].numpy() for array, key in names.items()})
 
-    def _score(self, function: Callable[[Tensor, Tensor], Tensor], synthetic: Store) -> Tensor:
-        """Return the score of each spectrum at the test positions."""
-        pairs = zip(synthetic.batches(), self.test.store.batches(), strict=True)
-        return torch.cat([function(*pair) for pair in pairs])
-
-    def _write_examples(self, subset: MeasuredSubset, name: str, spectra: dict[str, Store]) -> None:
-        """Write measured and synthetic spectra at the test positions with given quantiles of the PSNR."""
+    def _write_examples(self, step: Synthesis, score: Tensor) -> None:
+        """Write measured and synthetic spectra at the test positions with given quantiles of their PSNR (n,)."""
+        spectra = step.test_spectra(self.run.folder)
         measured, synthetic = self.test.store, spectra["test"]
-        score = self._score(psnr, synthetic)
         order = score.argsort()
         chosen = order[[round(q * (len(order) - 1)) for q in EXAMPLE_QUANTILES]]
         examples = {
             "measured": as_bytes(measured[chosen]).numpy(),
             "synthetic": as_bytes(synthetic[chosen]).numpy(),
-            "synthesizer": name,
+            "synthesizer": step.synthesizer,
             "index": self.test.index[chosen].numpy(),
             "psnr_db": score[chosen].numpy(),
         }
@@ -216,7 +207,7 @@ class Results:
             examples["deviation"] = as_bytes(std[chosen]).numpy()
             triples = zip(synthetic.batches(), measured.batches(), std.batches(), strict=True)
             examples["coverage"] = float(torch.cat([covered(s, d, m) for s, m, d in triples]).mean())
-        self.run.write_npz(f"examples-mix{subset.key}.npz", examples)
+        self.run.write_npz(f"examples-mix{step.subset.key}.npz", examples)
 
     def summary(self, fraction: float) -> MixMetrics:
         """Return the numbers of metrics.json for one measured fraction."""

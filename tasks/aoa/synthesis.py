@@ -14,6 +14,7 @@ from torch import Tensor
 from augment import SyntheticPositions, synthetic_positions
 from swiftwrf import FitError, GeometryModel, InputError, Spectra, load
 from swiftwrf.data.store import Store
+from swiftwrf.metrics import l1, psnr, ssim
 from swiftwrf.models import FieldModel
 from swiftwrf.runtime.checkpoint import read, write
 from tasks.aoa.artifacts import save_artifacts
@@ -27,6 +28,8 @@ from tasks.run import Row
 from tasks.steps import Step
 
 KIND = "synthetic spectra"
+SCORE = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
+SCORED = ("test", "test_sample")  # parts of the synthetic spectra
 BATCH_POSITIONS = 4096  # spectra predicted before they are rounded: half a gigabyte of 90 x 360 pixels
 
 
@@ -206,9 +209,10 @@ class Synthesis(Step[Experiment]):
             "draw": time.perf_counter() - fitted,
         }
         write(folder / self.file, KIND, tensors, {})
+        scores = {part: _scores(tensors[part], experiment.test) for part in SCORED if part in tensors}
         if self.trains and self.subset.repeat == 0:
             save_artifacts(model, self.subset.key, measured, experiment.test, folder)
-        return {"history": history.records, "seconds": seconds}
+        return {"history": history.records, "seconds": seconds, "scores": scores}
 
     def _fitted(self, experiment: Experiment, measured: Spectra, history: _FitHistory, folder: Path) -> FieldModel:
         # models that are only compared are as small as in the choice
@@ -254,6 +258,12 @@ class _FitHistory:
         """Append a record; those of earlier sessions come first."""
         self.records.append(record)
         self.earlier = max(self.earlier, record.get("elapsed", 0.0) - (time.perf_counter() - self.began))
+
+
+def _scores(predicted: Tensor, test: Spectra) -> dict[str, Tensor]:
+    """Return the scores of predicted test spectra, (n,) each."""
+    pairs = list(zip(Store(predicted).batches(), test.store.batches(), strict=True))
+    return {name: torch.cat([function(*pair) for pair in pairs]) for name, function in SCORE.items()}
 
 
 def _as_bytes_at(position: Tensor, predict: Callable[[Tensor], Tensor]) -> Tensor:
