@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from committed import interval, load, markdown
@@ -164,32 +165,46 @@ def paper_scale_targets() -> str:
 
 
 def paper_scale_aoa() -> str:
-    """Return the angular errors of each method at each measured fraction."""
+    """Return the angular errors of each method at each measured fraction; only the network has all synthesizers."""
 
     def cell(errors: dict[str, Any]) -> str:
         return f"{interval(errors['great_circle_deg'])} / {errors['great_circle_deg']['p90']:.1f}"
 
-    shares = load("paper_scale")["aoa"] or {}
-    columns = [f"{float(share):.0%} measured" for share in shares]
-    return markdown(["method", *columns], [[name, *map(cell, cells)] for name, cells in _by_method(shares)])
+    def is_shown(method: str) -> bool:
+        return "_turbo_" not in method or method.endswith("_turbo_hybrid")
+
+    return _by_share(cell, is_shown)
 
 
 def paper_scale_angles() -> str:
-    """Return elevation and azimuth errors of each method at each measured fraction, and those of the paper."""
+    """Return elevation and azimuth errors of the network with each synthesizer, and those of the paper."""
 
     def cell(errors: dict[str, Any]) -> str:
         return f"{errors['elevation_deg']['median']:.2f} / {errors['azimuth_deg']['median']:.2f}"
 
-    shares = load("paper_scale")["aoa"] or {}
-    rows = [[name, *map(cell, cells)] for name, cells in _by_method(shares)]
+    def is_shown(method: str) -> bool:
+        return method.startswith(("measured_", "turbo_"))
+
+    shares = load("paper_scale")["aoa"]
+    paper = []
     for name in PAPER_TURBO["0.1"]:
         pairs = [PAPER_TURBO[share][name] for share in shares]
-        rows.append([f"paper: turbo_{name}", *(f"{elevation:.2f} / {azimuth:.2f}" for elevation, azimuth in pairs)])
-    return markdown(["method", *(f"{float(share):.0%} measured" for share in shares)], rows)
+        paper.append([f"paper: turbo_{name}", *(f"{elevation:.2f} / {azimuth:.2f}" for elevation, azimuth in pairs)])
+    return _by_share(cell, is_shown, paper)
 
 
-def _by_method(shares: dict[str, Any]) -> list[tuple[str, list[dict[str, Any]]]]:
-    """Return each method with its errors at each measured fraction, the best at the first fraction first."""
-    first = next(iter(shares.values()), {})
-    names = sorted(first, key=lambda name: float(first[name]["great_circle_deg"]["median"]))
-    return [(f"`{name}`", [methods[name] for methods in shares.values()]) for name in names]
+def _by_share(
+    cell: Callable[[dict[str, Any]], str], is_shown: Callable[[str], bool], further: Sequence[list[str]] = ()
+) -> str:
+    """Return the table of some methods at each measured fraction, the best at the first fraction first.
+
+    Args:
+        cell: Text of the errors of a method.
+        is_shown: Whether the table has a method.
+        further: Last rows.
+    """
+    shares = load("paper_scale")["aoa"]
+    first = next(iter(shares.values()))
+    names = sorted(filter(is_shown, first), key=lambda name: float(first[name]["great_circle_deg"]["median"]))
+    rows = [[f"`{name}`", *(cell(methods[name]) for methods in shares.values())] for name in names]
+    return markdown(["method", *(f"{float(share):.0%} measured" for share in shares)], [*rows, *further])

@@ -20,7 +20,8 @@ def pooled_weights(at_truth: Tensor, at_candidates: Tensor, log_volume: Tensor) 
         log p(x | y) = sum_k w_k l_k(x, y) - log sum_j V_j exp(sum_k w_k l_k(x_j, y)),    w_k >= 0
 
     The objective is concave in w (T. Heskes, "Selecting weighting factors in logarithmic opinion pools", 1998). One weight
-    below 1 tempers a likelihood that is too certain.
+    below 1 tempers a likelihood that is too certain. The true position is one more candidate, with the smallest mass:
+    where a search misses it, the density would otherwise rise with the weights without limit.
 
     Args:
         at_truth: Log-likelihoods at the true positions, (k, n).
@@ -30,10 +31,12 @@ def pooled_weights(at_truth: Tensor, at_candidates: Tensor, log_volume: Tensor) 
     Returns:
         Weights, float64 (k,).
     """
+    smallest = log_volume.masked_fill(log_volume.isinf(), torch.inf).amin(dim=1, keepdim=True)
+    volume = torch.cat([log_volume, smallest], dim=1).double()
+    values = torch.cat([at_candidates, at_truth[..., None]], dim=2)
     # relative to the best candidate: constants of each observation cancel
-    top = at_candidates.amax(dim=2)
-    truth = (at_truth - top).double()
-    candidates, volume = (at_candidates - top[..., None]).double(), log_volume.double()
+    top = values.amax(dim=2)
+    truth, candidates = (at_truth - top).double(), (values - top[..., None]).double()
 
     def loss(values: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         weight = torch.from_numpy(values)

@@ -134,12 +134,8 @@ class CoarrayLikelihood(SpectrumLikelihood):
         self.features = features
         self.distribution = ResidualDistribution.fit(residual, power)
 
-    def whitened(self, waves: PathWaves) -> Tensor:
-        """Return whitened predictions (m, F)."""
-        return self.features(waves) @ self.distribution.whitening
-
     def log_likelihood(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
-        away = self.whitened(waves) - observed.coarray @ self.distribution.whitening
+        away = (self.features(waves) - observed.coarray) @ self.distribution.whitening
         return self.distribution.log_density(away.square().sum(dim=1))
 
 

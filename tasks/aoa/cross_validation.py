@@ -33,7 +33,7 @@ from tasks.summarise import paired_change
 N_SYNTHETIC_CANDIDATES = (300, 1000, 3000)
 N_SYNTHETIC_COMPARED = 1000  # number of positions at which predicted means and samples are compared
 MAX_LOCATED = 60  # held-out spectra of a fold that are located
-FOLD_LOCATOR = MatchedFieldConfig(n_calibration=40, max_cells=100_000)  # half the time of the defaults
+FOLD_LOCATOR = MatchedFieldConfig(n_calibration=40, max_cells=100_000, spacing=0.2)  # half the time of the defaults
 Errors = NDArray[np.float64]
 _PREDICTING = threading.Lock()  # folds are computed side by side, but parallel loops of numba take one caller at a time
 

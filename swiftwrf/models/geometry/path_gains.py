@@ -99,6 +99,13 @@ class PathGains:
         process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True, prefix=PREFIX)
         return cls(process, len(geometry.image_sources()[0]), prior)
 
+    def averaged(self) -> PathGains:
+        """Return the mean of the fields, as one field."""
+        assert self.process.coefficient is not None
+        coefficient = self.process.coefficient.unflatten(1, (-1, 2 * self.n_paths)).mean(dim=1)
+        process = GaussianProcess(self.process.kernel, self.process.known, coefficient, exact=True)
+        return PathGains(process, self.n_paths, self.prior)
+
     def channel(self, geometry: GeometryModel, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Return the channel of each element in each field at positions (n, 3) [m], complex64 (n, F, K), as of F snapshots.
 

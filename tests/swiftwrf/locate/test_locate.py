@@ -10,6 +10,7 @@ import torch
 
 from swiftwrf import AngularGrid, InputError, load, rssi_room, simulated_room
 from swiftwrf.array.angles import angular_distance, to_direction
+from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.locate import MatchedField, Posterior, Region, RssiLocator
 from swiftwrf.locate.pool import pooled_weights
 from swiftwrf.locate.posterior import normalised
@@ -19,6 +20,7 @@ from swiftwrf.locate.rssi_likelihood import DetectionLikelihood, RssiMaps, Value
 from swiftwrf.locate.search import best_cells, refined
 from swiftwrf.locate.spectrum_likelihood import BOUNDS, PathStatistics, PathWaves, PhaseLikelihood, SpectrumFeatures
 from swiftwrf.models.geometry import GeometryModel, Plane
+from swiftwrf.models.geometry.path_gains import PathGains
 from swiftwrf.testing.rooms import mirror_room
 
 SMALL = {"n_best": 60, "n_background": 40, "n_split": 8, "spacing": 0.4, "n_calibration": 40}
@@ -128,6 +130,18 @@ def test_pooling_tempers_what_is_too_certain_and_drops_what_is_noise():
     assert weight[1] < 0.1
 
 
+def test_true_positions_that_a_search_misses_do_not_sharpen_the_posterior():
+    generator = torch.Generator().manual_seed(0)
+    x = torch.linspace(-4, 4, 200, dtype=torch.float64)
+    truth = torch.randn(400, 1, generator=generator, dtype=torch.float64)
+    std = 0.5
+    seen = truth + std * torch.randn(truth.shape, generator=generator, dtype=torch.float64)
+    at_candidates, at_truth = ((-((at - seen) ** 2) / (2 * std**2))[None] for at in (x.expand(400, -1), truth))
+    at_candidates[:, :100] -= 40  # a quarter of the observations has no candidate near the true position
+    prior = torch.full((400, 200), -math.log(200), dtype=torch.float64)
+    assert pooled_weights(at_truth[..., 0], at_candidates, prior)[0] == pytest.approx(1, rel=0.25)
+
+
 def test_residuals_with_outliers_have_heavy_tails():
     generator = torch.Generator().manual_seed(0)
     clean = torch.randn(400, 6, generator=generator)
@@ -146,13 +160,29 @@ def test_a_region_follows_a_path_and_fills_a_room():
     assert Region(room).is_near(Region(room).cells(500).position).double().mean() > 0.9
 
 
-def test_a_room_in_closed_form_is_located_to_a_millimetre(closed_form):
+def test_a_room_in_closed_form_is_located_to_two_millimetres(closed_form):
+    """Fits to 32 positions, which calibrate the weights, are not more exact."""
     _, test, locator = closed_form
     posterior = locator.locate(test.spectrum)
-    assert (posterior.median - test.position).norm(dim=1).median() < 1e-3
+    assert (posterior.median - test.position).norm(dim=1).median() < 2e-3
     angles = locator.direction(posterior)
     error = angular_distance(to_direction(*angles.unbind(-1)), to_direction(*test.label.unbind(-1)))
     assert error.rad2deg().median() < 0.05
+
+
+def test_few_cells_are_enough_where_path_gains_change_with_position():
+    spectra = simulated_room(n=300, seed=3, grid=AngularGrid.hemisphere(15, 60))
+    room, kernel = GeometryModel.of_planes(spectra, ROOM, order=1), Kernel(long=20.0, share=1.0, noise=1e-3)
+    normal = torch.randn(len(spectra), 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    value = 2 * torch.linalg.cholesky(kernel.covariance(spectra.position)) @ normal
+    gains = PathGains(GaussianProcess.regress(kernel, spectra.position, value, dtype=torch.float32), 4)
+    spectrum = room.array.spectrum(gains.channel(room, spectra.position), spectra.grid)
+    train, test = replace(spectra, store=type(spectra.store)(spectrum)).split()
+    few = {"n_best": 8, "n_background": 10, "n_split": 8, "spacing": 0.15, "n_calibration": 40}
+    locator = MatchedField(**few).fit(train, room=room)
+    error = (locator.locate(test.spectrum).median - test.position).norm(dim=1)
+    assert error.quantile(0.8) < 0.1
+    assert locator.inflation < 3
 
 
 def test_saved_locators_locate_alike(closed_form, floor, tmp_path):
