@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Annotated, Any, ClassVar, Self
 
 import torch
@@ -44,7 +45,7 @@ from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configurati
 FOLDS = 5
 MIN_SPECTRA = 15
 MAX_LOG_VARIANCE = 30.0  # of path gains in a file
-BATCH_OBSERVATIONS = 32  # searched at a time
+BATCH_OBSERVATIONS = 16  # searched at a time: their likelihoods at all cells are 26 MB at most
 BATCH_CANDIDATES = 2048  # whose waves are computed together: as many as a processor's cache holds
 FIRST_WEIGHTS = (0.05, 0.05, 0.3)  # of the likelihoods, before calibration
 
@@ -129,12 +130,15 @@ class _Screen:
         predicted = parallel_map(lambda some: features(PathWaves.at(room, some)), batches)
         return cls(torch.cat(predicted) @ distribution.whitening, distribution)
 
-    def misfit(self, coarray: Tensor) -> Tensor:
-        """Return the negative log-likelihoods (n, m) of observed co-array numbers (n, F)."""
+    @cached_property
+    def _squared(self) -> Tensor:
+        return self.whitened.square().sum(dim=1)
+
+    def log_likelihood(self, coarray: Tensor) -> Tensor:
+        """Return the log-likelihoods (n, m) of observed co-array numbers (n, F), up to a constant of each observation."""
         target = coarray @ self.distribution.whitening
-        distance = torch.addmm(self.whitened.square().sum(dim=1), target, self.whitened.T, alpha=-2)
-        distance = (distance + target.square().sum(dim=1, keepdim=True)).clamp_min(0)
-        return -self.distribution.log_density(distance)
+        distance = torch.addmm(self._squared, target, self.whitened.T, alpha=-2)
+        return self.distribution.log_density(distance.add_(target.square().sum(dim=1, keepdim=True)).clamp_min_(0))
 
 
 class MatchedField(Configured, Saved):
@@ -284,8 +288,8 @@ class MatchedField(Configured, Saved):
             def evaluate(position: Tensor, part: SpectrumFeatures = part) -> Tensor:
                 return likelihoods(position, part)
 
-            constant, varying = (screen.misfit(part.coarray) for screen in self._screens)
-            cells = best_cells(self.cells, constant + varying, config.n_best, config.n_background, generator)
+            constant, varying = (screen.log_likelihood(part.coarray) for screen in self._screens)
+            cells = best_cells(self.cells, constant.add_(varying).neg_(), config.n_best, config.n_background, generator)
             values = evaluate(cells.position)
             for _ in range(config.n_rounds):
                 cells, values = refined(cells, self._log_mass(cells, values), values, evaluate, config.n_split)

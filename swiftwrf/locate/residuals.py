@@ -53,7 +53,8 @@ def _log_density(distance: Tensor, f: int, degrees: float) -> Tensor:
     if math.isinf(degrees):
         return -distance / 2 - f / 2 * math.log(2 * math.pi)
     constant = math.lgamma((degrees + f) / 2) - math.lgamma(degrees / 2) - f / 2 * math.log(degrees * math.pi)
-    return constant - (degrees + f) / 2 * torch.log1p(distance / degrees)
+    # in place: a search has millions of distances
+    return (distance / degrees).log1p_().mul_(-(degrees + f) / 2).add_(constant)
 
 
 def _held_out_density(residual: Tensor, kept: Tensor, size: float, degrees: float) -> Tensor:
