@@ -267,7 +267,7 @@ def gathered(work: Path, name: str) -> Row:
         for share, mix in json.loads(file.read_text())["mixes"].items():
             methods = found["aoa"].setdefault(share, {})
             for method, errors in mix["methods"].items():
-                methods.setdefault(method, {angle: errors[angle] for angle in angles})
+                methods[method] = {angle: errors[angle] for angle in angles}
     order = [f"{room}-{moving}" for room, moving in SCENES]
     found["described"] = {scene: found["described"][scene] for scene in order if scene in found["described"]}
     found["scenes"] = {
