@@ -206,7 +206,5 @@ def _by_share(
     shares = load("paper_scale")["aoa"]
     first = next(iter(shares.values()))
     names = sorted(filter(is_shown, first), key=lambda name: float(first[name]["great_circle_deg"]["median"]))
-    rows = [
-        [f"`{name}`", *(cell(methods[name]) if name in methods else "" for methods in shares.values())] for name in names
-    ]
+    rows = [[f"`{name}`", *(cell(methods[name]) for methods in shares.values())] for name in names]
     return markdown(["method", *(f"{float(share):.0%} measured" for share in shares)], [*rows, *further])
