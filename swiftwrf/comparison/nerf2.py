@@ -35,8 +35,8 @@ from swiftwrf.models.base import FIXED_END
 from swiftwrf.models.swiftwrf.mlp import SkipMLP, encode
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
-SAMPLES_AT_ONCE = {"cpu": 2**16, "cuda": 2**19}
-"""samples of the field evaluated at a time; a layer of more than 2**16 no longer fits into the caches of a processor"""
+MAX_SAMPLES_AT_ONCE = 2**19  # samples of the field evaluated at a time, which bounds the memory
+MAX_SAMPLES_ON_CPU = 2**16  # the same on a CPU: layers of more samples leave its caches
 
 
 @configuration
@@ -165,8 +165,8 @@ class NeRF2Network(LinkNetwork):
     def render(self, position: Tensor, grid: AngularGrid, generator: torch.Generator | None = None) -> Tensor:
         ends = self.link(position)
         direction = self.link.to_world(grid.direction.flatten(0, 1).to(position.device))
-        at_once = SAMPLES_AT_ONCE[direction.device.type] // (len(position) * self.size.samples)
-        parts = chunks(len(direction), max(1, at_once))
+        samples = MAX_SAMPLES_ON_CPU if direction.device.type == "cpu" else MAX_SAMPLES_AT_ONCE
+        parts = chunks(len(direction), max(1, samples // (len(position) * self.size.samples)))
         return torch.cat([self(*ends, direction[None, part]) for part in parts], dim=1).reshape(-1, *grid.shape)
 
 

@@ -25,7 +25,7 @@ from torch.nn import functional
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.comparison.base import Config, Count, Training, descend
-from swiftwrf.comparison.nerf2 import SAMPLES_AT_ONCE, Field, NeRF2Size, received
+from swiftwrf.comparison.nerf2 import MAX_SAMPLES_ON_CPU, Field, NeRF2Size, received
 from swiftwrf.comparison.network import chunks, draw_parameters, restored
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.models.base import check_finite
@@ -152,7 +152,7 @@ class NeRF2Rssi(RssiPredictor, Saved):
     def _predict(self, position: Tensor) -> tuple[Tensor, None]:
         network = self.network
         rays = network.size.azimuths * network.size.elevations * network.size.samples * max(len(network.receiver), 1)
-        some = chunks(len(position), max(1, SAMPLES_AT_ONCE["cpu"] // rays))
+        some = chunks(len(position), max(1, MAX_SAMPLES_ON_CPU // rays))
         parts = [network(network.local(position[part])) for part in some]
         empty = torch.zeros(0, len(network.receiver))
         return check_finite(100 * (torch.cat([empty, *parts]).double() - 1)), None

@@ -123,13 +123,6 @@ class _Screen:
     whitened: Tensor
     distribution: ResidualDistribution
 
-    @classmethod
-    def of(cls, room: GeometryModel, features: Features, distribution: ResidualDistribution, cells: Cells) -> _Screen:
-        """Predict the co-array numbers at cells."""
-        batches = cells.position.split(BATCH_CANDIDATES)
-        predicted = parallel_map(lambda some: features(PathWaves.at(room, some)), batches)
-        return cls(torch.cat(predicted) @ distribution.whitening, distribution)
-
     @cached_property
     def _squared(self) -> Tensor:
         return self.whitened.square().sum(dim=1)
@@ -246,11 +239,15 @@ class MatchedField(Configured, Saved):
         self.likelihoods = self._likelihoods(self._fit)
         constant, varying = self.likelihoods.parts[:2]
         # the mean of the path gains takes an eighth of the time of all their fields, and ranks cells nearly alike
-        averaged = gain_features(self.room.array, self._fit.gains.averaged())
-        self._screens = [
-            _Screen.of(self.room, features, likelihood.distribution, self.cells)
-            for features, likelihood in ((constant.features, constant), (averaged, varying))
-        ]
+        features = constant.features, gain_features(self.room.array, self._fit.gains.averaged())
+        distributions = constant.distribution, varying.distribution
+
+        def whitened(position: Tensor) -> list[Tensor]:
+            waves = PathWaves.at(self.room, position)
+            return [part(waves) @ own.whitening for part, own in zip(features, distributions, strict=True)]
+
+        parts = zip(*parallel_map(whitened, self.cells.position.split(BATCH_CANDIDATES)), strict=True)
+        self._screens = [_Screen(torch.cat(part), own) for part, own in zip(parts, distributions, strict=True)]
 
     def _likelihoods(self, fit: _Fit, kept: Tensor | None = None) -> _Likelihoods:
         residual = self.residual if kept is None else self.residual[:, kept]

@@ -262,8 +262,9 @@ class _FitHistory:
 
 def _scores(predicted: Tensor, test: Spectra) -> dict[str, Tensor]:
     """Return the scores of predicted test spectra, (n,) each."""
-    pairs = list(zip(Store(predicted).batches(), test.store.batches(), strict=True))
-    return {name: torch.cat([function(*pair) for pair in pairs]) for name, function in SCORE.items()}
+    pairs = zip(Store(predicted).batches(), test.store.batches(), strict=True)
+    scored = [[function(*pair) for function in SCORE.values()] for pair in pairs]
+    return {name: torch.cat(parts) for name, parts in zip(SCORE, zip(*scored, strict=True), strict=True)}
 
 
 def _as_bytes_at(position: Tensor, predict: Callable[[Tensor], Tensor]) -> Tensor:
