@@ -8,11 +8,18 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from multiprocessing.context import BaseContext
+from typing import Any, TypeVar
 
+Result = TypeVar("Result")
+
+MAX_PROCESSES = 4  # of a map
 SERVED = sys.platform == "linux"  # a fork of loaded libraries may crash on macOS, and Windows has none
+
+_is_served = False
 
 
 def process_context() -> BaseContext:
@@ -23,8 +30,18 @@ def process_context() -> BaseContext:
 def preload(modules: Sequence[str]) -> None:
     """Begin to load modules for the processes to come, where there will be some: with several threads, without torchrun."""
     several = (os.cpu_count() or 1) > 1 and os.environ.get("OMP_NUM_THREADS") != "1" and "WORLD_SIZE" not in os.environ
+    global _is_served
     if SERVED and modules and several:
         from multiprocessing import forkserver
 
         forkserver.set_forkserver_preload(list(modules))
         forkserver.ensure_running()
+        _is_served = True
+
+
+def served_map(function: Callable[..., Result], *items: Iterable[Any]) -> list[Result]:
+    """Return the function of each item, like `map`, computed in forks of the server if `preload` started one, else here."""
+    if not _is_served:
+        return list(map(function, *items))
+    with ProcessPoolExecutor(min(os.cpu_count() or 1, MAX_PROCESSES), process_context()) as processes:
+        return list(processes.map(function, *items))

@@ -113,8 +113,26 @@ def located_folds(folds: Sequence[Fold]) -> dict[int, Fold]:
     return {number: folds[number] for number in range(0, len(folds), len(BLIND_FOLDS[0]))[: len(BLIND_FOLDS)]}
 
 
+def located_errors(fold: Fold, seed: int) -> Errors | None:
+    """Return the angular errors [deg] of matched-field processing on held-out spectra of a fold; None without a room.
+
+    Args:
+        fold: Model with a room and its spectra. At most 60 of the held-out spectra are located.
+        seed: Seed of the locator.
+    """
+    room = fold.model.room
+    if room is None or not room.planes:
+        return None
+    test = fold.test.subset(_located_rows(len(fold.test)))
+    try:
+        locator = MatchedField(FOLD_LOCATOR, seed=seed).fit(fold.train, room=room)
+    except (InputError, FitError):
+        return None
+    return _degrees(locator.predict(test.spectrum), test.label)
+
+
 def choose_estimator(
-    errors: Mapping[str, Sequence[Errors]], folds: Mapping[int, Fold], seed: int
+    errors: Mapping[str, Sequence[Errors]], located: Mapping[int, Errors | None]
 ) -> EstimatorChoiceMetrics:
     """Return the estimator with the smallest median error on held-out measured spectra.
 
@@ -123,34 +141,24 @@ def choose_estimator(
 
     Args:
         errors: Angular errors [deg] on the held-out spectra of each fold, by name of the method.
-        folds: `located_folds` of a field model that has a room. Empty without such a model.
-        seed: Seed of the locators.
+        located: `located_errors` by number of the fold. Empty without a field model that has a room.
     """
     compared = {name: np.concatenate(parts) for name, parts in errors.items()}
-    rows = {number: subsample(torch.arange(len(fold.test)), rows=MAX_LOCATED)[0] for number, fold in folds.items()}
-    located = parallel_map(lambda number: _located_errors(folds[number], rows[number], seed), folds)
-    if located and all(found is not None for found in located):
+    found = {number: own for number, own in located.items() if own is not None}
+    if found and len(found) == len(located):
         compared = {
-            name: np.concatenate([parts[number][some.numpy()] for number, some in rows.items()])
+            name: np.concatenate([parts[number][_located_rows(len(parts[number])).numpy()] for number in found])
             for name, parts in errors.items()
         }
-        compared[LOCATOR] = np.concatenate([found for found in located if found is not None])
+        compared[LOCATOR] = np.concatenate(list(found.values()))
     held_out = {name: float(np.median(values)) for name, values in compared.items()}
     best = min(held_out, key=lambda name: held_out[name])
     return {"name": best, "held_out_deg": held_out, "n_held_out": len(compared[best])}
 
 
-def _located_errors(fold: Fold, rows: Tensor, seed: int) -> Errors | None:
-    """Return the angular errors [deg] of matched-field processing on held-out spectra; None without a room."""
-    room = fold.model.room
-    if room is None or not room.planes:
-        return None
-    test = fold.test.subset(rows)
-    try:
-        locator = MatchedField(FOLD_LOCATOR, seed=seed).fit(fold.train, room=room)
-    except (InputError, FitError):
-        return None
-    return _degrees(locator.predict(test.spectrum), test.label)
+def _located_rows(n: int) -> Tensor:
+    """Return the numbers of those of n held-out spectra that are located."""
+    return subsample(torch.arange(n), rows=MAX_LOCATED)[0]
 
 
 def _errors(fold: Fold, n_synthetic: int, sampled: bool, seed: int) -> Errors:

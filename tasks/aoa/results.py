@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import numpy as np
 import torch
 from pandas import DataFrame
 from torch import Tensor
@@ -12,10 +13,11 @@ from swiftwrf.metrics import angle_errors, covered
 from swiftwrf.models import FIELD_MODELS
 from tasks.aoa.condition import EVERYTHING, LOCATOR, Condition, MeasuredSubset, pooled, reference_of
 from tasks.aoa.context import ROOM_MODEL, Experiment
+from tasks.aoa.cross_validation import choose_estimator
 from tasks.aoa.evaluation import Evaluation
 from tasks.aoa.locating import LEVEL, NO_PLANE, Locating
 from tasks.aoa.options import AUTO, fraction_key
-from tasks.aoa.steps import CrossValidation, EstimatorChoice
+from tasks.aoa.steps import CrossValidation, FoldLocating
 from tasks.aoa.suggestion import Suggestion
 from tasks.aoa.synthesis import RoomSearch, Synthesis, as_bytes
 from tasks.metrics import (
@@ -58,7 +60,7 @@ class Results:
         self.synthesis_seconds: list[Row] = []
         self.history: list[Row] = []
         self.chosen: dict[str, Row] = {}  # by measured fraction, of the first repeat
-        self.estimator_choice: dict[str, EstimatorChoiceMetrics] = {}  # by measured fraction, of the first repeat
+        self.located_folds: dict[str, dict[int, list[float] | None]] = {}  # errors by fold, in the same way
         self.left_out: dict[Condition, str] = {}  # conditions of matched-field processing, and why
         self._examples: set[str] = set()
         self._sentences: set[str] = set()
@@ -79,8 +81,8 @@ class Results:
         match step:
             case CrossValidation():
                 self.chosen.setdefault(step.subset.key, value)
-            case EstimatorChoice() if step.compared.subset.repeat == 0:
-                self.estimator_choice[step.compared.subset.key] = value["estimator_choice"]
+            case FoldLocating() if step.compared.subset.repeat == 0:
+                self.located_folds.setdefault(step.compared.subset.key, {})[step.number] = value["errors"]
             case Synthesis() if "refused" in value:
                 console.print(f"{step.synthesizer} is left out of the comparison: {value['refused']}")
             case Synthesis():
@@ -224,7 +226,7 @@ class Results:
             "counts": {condition.training_set: value["counts"] for condition, value in evaluated},
             "choice": chosen.get("choice"),
             "cross_validation": chosen.get("cross_validation"),
-            "estimator_choice": self.estimator_choice.get(fraction_key(fraction)),
+            "estimator_choice": self._estimator_choice(fraction),
             "synthesis": _synthesis_metrics(synthesis, fits),
             "methods": methods,
             "reference": reference,
@@ -236,6 +238,15 @@ class Results:
                 "train": sum(value["seconds"]["train"] for condition, value in evaluated if condition.is_network),
             },
         }
+
+    def _estimator_choice(self, fraction: float) -> EstimatorChoiceMetrics | None:
+        """Return the choice of the estimator by cross-validation. None if field models could not be compared."""
+        key = fraction_key(fraction)
+        if (chosen := self.chosen.get(key, {})).get("choice") is None:
+            return None
+        errors = {name: [np.array(fold) for fold in folds] for name, folds in chosen["errors"].items()}
+        located = self.located_folds.get(key, {})
+        return choose_estimator(errors, {n: None if own is None else np.array(own) for n, own in located.items()})
 
     def _method_metrics(self, fraction: float) -> tuple[dict[str, MethodMetrics], str]:
         """Return the metrics of each method, and the reference of changes."""

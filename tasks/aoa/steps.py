@@ -6,15 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from augment import Fold, choose_model
-from swiftwrf import GeometryModel, InputError, Spectra, load
+from swiftwrf import GeometryModel, InputError, load
 from swiftwrf.models import FIELD_MODELS
 from tasks.aoa.condition import EVERYTHING, STAND_IN, Condition, MeasuredSubset, Training, estimators, trainable
 from tasks.aoa.context import ROOM_MODEL, Experiment
-from tasks.aoa.cross_validation import choose_estimator, cross_validate, located_folds
+from tasks.aoa.cross_validation import cross_validate, located_errors, located_folds
 from tasks.aoa.evaluation import Evaluation
 from tasks.aoa.options import AUTO
 from tasks.aoa.synthesis import RoomSearch, syntheses
@@ -109,26 +108,27 @@ class CrossValidation(Step[Experiment]):
     def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
         named = [name for name in experiment.config.synthesizer if name != AUTO]
         followed = syntheses(experiment, self.subset, named or [value["choice"]["name"]], value["cross_validation"])
-        if value["choice"] is None:
-            return followed
-        return [*followed, EstimatorChoice(self, tuple(entry["file"] for entry in value["folds"].values()))]
+        located = [FoldLocating(self, int(number), entry["file"]) for number, entry in value.get("folds", {}).items()]
+        return [*followed, *located]
 
 
 @dataclass(frozen=True)
-class EstimatorChoice(Step[Experiment]):
-    """Choose the estimator by the errors on held-out measured spectra.
+class FoldLocating(Step[Experiment]):
+    """Locate held-out measured spectra of a fold, for the choice of the estimator.
 
     Args:
-        compared: Comparison of field models whose folds are used.
-        rooms: Files of the folds' rooms.
+        compared: Comparison of field models that has the fold.
+        number: Number of the fold.
+        room_file: File of the fold's room in the run's directory.
     """
 
     compared: CrossValidation
-    rooms: tuple[str, ...]
+    number: int
+    room_file: str
 
     @property
     def name(self) -> str:
-        return f"estimator-{self.compared.subset}"
+        return f"located-fold{self.number}-{self.compared.subset}"
 
     @property
     def title(self) -> str:
@@ -141,19 +141,15 @@ class EstimatorChoice(Step[Experiment]):
 
     @property
     def reads(self) -> tuple[str, ...]:
-        return (self.result, *self.rooms)
+        return (self.result, self.room_file)
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.compared.subset)
-        found = read_json(folder / self.result)["value"]
-
-        def part(index: list[int]) -> Spectra:
-            return measured.subset(torch.isin(measured.index, torch.tensor(index)).nonzero()[:, 0])
-
-        folds = {}
-        for number, entry in found["folds"].items():
-            room = load(folder / entry["file"])
-            assert isinstance(room, GeometryModel)
-            folds[int(number)] = Fold(room, part(entry["train"]), part(entry["test"]))
-        errors = {name: [np.array(fold) for fold in entry] for name, entry in found["errors"].items()}
-        return {"estimator_choice": choose_estimator(errors, folds, experiment.seed(self.compared.subset))}
+        entry = read_json(folder / self.result)["value"]["folds"][str(self.number)]
+        room = load(folder / self.room_file)
+        assert isinstance(room, GeometryModel)
+        train, test = (
+            measured.subset(torch.isin(measured.index, torch.tensor(entry[part])).nonzero()[:, 0])
+            for part in ("train", "test")
+        )
+        return {"errors": located_errors(Fold(room, train, test), experiment.seed(self.compared.subset))}

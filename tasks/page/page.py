@@ -15,6 +15,7 @@ from pandas import DataFrame
 from swiftwrf.runtime.durable import write_text
 from tasks.page.figures import as_svg, for_page
 from tasks.page.records import Metrics, Records
+from tasks.preload import served_map
 from tasks.records import write_table
 
 HALF = 84  # letters of a table that fit into half of the page
@@ -174,14 +175,15 @@ def write_page(folder: Path, page: Page) -> None:
     """Write the panels of each plot and its numbers into `figures/`, and `report.html` with the same panels inlined."""
     figures = folder / "figures"
     figures.mkdir(parents=True, exist_ok=True)
+    panels = {file: panel for plot in page.plots for file, panel in zip(plot.files, plot.panels, strict=True)}
+    captions = [plot.caption for plot in page.plots for _ in plot.files]
+    if len(panels) < len(captions):
+        raise ValueError("two figures have the same name; one would be shown in the other's place")
     inlined: dict[str, Markup] = {}
+    for file, svg in zip(panels, served_map(as_svg, panels.values(), captions), strict=True):
+        write_text(figures / f"{file}.svg", svg)
+        inlined[file] = Markup(for_page(svg, file))  # our own drawing; its texts are escaped in it
     for plot in page.plots:
-        for file, panel in zip(plot.files, plot.panels, strict=True):
-            if file in inlined:
-                raise ValueError(f"two figures are called {file}; one would be shown in the other's place")
-            svg = as_svg(panel, plot.caption)
-            write_text(figures / f"{file}.svg", svg)
-            inlined[file] = Markup(for_page(svg, file))  # our own drawing; its texts are escaped in it
         write_table(figures / f"{plot.name}.csv", plot.data.to_dict("records"))
     environment = Environment(
         loader=PackageLoader("tasks.page", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True

@@ -62,6 +62,20 @@ def test_processes_begin_with_the_modules_that_a_command_preloads():
     assert (done.stdout, done.stderr) == ("None\n", "")
 
 
+@pytest.mark.skipif(not SERVED, reason="processes are forks of a server on Linux alone")
+@pytest.mark.parametrize("modules", ["", "colorsys"])
+def test_a_map_is_computed_in_forks_of_the_server_if_there_is_one(modules):
+    code = f"""if __name__ == "__main__":
+        import os
+        from tasks.preload import preload, served_map
+        preload({modules!r}.split())
+        print(served_map(pow, [2, 3], [3, 2]), served_map(eval, ["__import__('os').getpid()"]) == [os.getpid()])
+    """
+    threads = os.environ | {"OMP_NUM_THREADS": "2"}
+    done = subprocess.run([sys.executable, "-c", code], env=threads, capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == (f"[8, 9] {not modules}\n", "")
+
+
 @pytest.mark.parametrize("processes", [1, 2])
 def test_a_budget_leaves_out_optional_steps_and_no_others(tmp_path, processes):
     steps = [Optional(1), Sum(2), Sum(3, (4,))]

@@ -77,7 +77,11 @@ class PhaseObservations:
 
     def few(self, most: int = N_POSITIONS) -> PhaseObservations:
         """Return at most `most` of the positions, evenly chosen, to score many rooms at."""
-        return self.subset(torch.linspace(0, len(self) - 1, min(most, len(self))).long())
+        return self.subset(self.few_rows(most))
+
+    def few_rows(self, most: int) -> Tensor:
+        """Return the numbers of at most `most` of the positions, evenly chosen."""
+        return torch.linspace(0, len(self) - 1, min(most, len(self))).long()
 
     def around(self, origin: Tensor) -> PhaseObservations:
         """Return the link in coordinates from an origin (3,) [m], rounded to a thousandth of a radian of phase.

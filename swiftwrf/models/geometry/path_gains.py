@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from scipy.linalg.blas import strmm
 from torch import Tensor
 
 from swiftwrf.errors import InputError
@@ -35,6 +36,7 @@ LEARNING_RATE = 0.2  # of Adam, on standard normal variables
 MAX_CHOICE = 200  # spectra that choose the prior
 MAX_ADVANTAGE = 3.0  # standard errors by which a choice must be behind to be given up before all folds are seen
 MIN_ERROR = 1e-6  # of squared co-array numbers, by rounding
+MIN_MODULUS = 1e-30  # of a field whose phase is taken
 HIGHEST_ORDER, MAX_PATHS = 3, 100  # of the image sources that may be added to those of the room
 
 PREFIX = "path_gains."  # of the names in a file
@@ -141,34 +143,82 @@ def paths(geometry: GeometryModel, scene: PhaseObservations) -> tuple[Tensor, Te
     return torch.cat([part.expand(-1, len(scene), -1) for part in wave]).transpose(0, 1), torch.cat(strength)
 
 
-@torch.enable_grad()
 def fit_path_gains(
     geometry: GeometryModel, scene: PhaseObservations, kernel: Kernel, name: PriorName = "loose"
 ) -> PathGains:
     """Fit path gains around several samples of their prior to the observed phases."""
-    prior, (wave, gain) = PRIORS[name], paths(geometry, scene)
-    std = torch.tensor(prior.std)
-    anchor = scene.moving.double()
-    root = torch.linalg.cholesky(kernel.covariance(anchor))
-    smooth = root.float()
-    sample = prior.sample_std * torch.randn(
-        len(scene), N_FIELDS, len(gain), 2, generator=torch.Generator().manual_seed(0)
-    )
-    normal = sample.clone().requires_grad_()
-    optimiser = torch.optim.Adam([normal], lr=LEARNING_RATE)
+    prior = PRIORS[name]
+    posterior = GainPosterior.of(geometry, scene, kernel, prior)
+    normal = posterior.sample.clone()
+    optimiser = torch.optim.Adam([normal], lr=LEARNING_RATE, fused=True)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, prior.steps)
     for _ in range(prior.steps):
-        change = std * (smooth @ normal.flatten(1)).view_as(normal)
-        field = (gain + torch.view_as_complex(change)) @ wave
-        missing = 1 - scene.coherence(field.transpose(0, 1))
-        loss = missing.sum() / prior.missing_scale + (normal - sample).square().sum() / 2
-        optimiser.zero_grad()
-        loss.backward()
+        normal.grad = posterior.gradient(normal)
         optimiser.step()
         schedule.step()
-    weight = torch.linalg.solve_triangular(root.T, normal.detach().flatten(1).double(), upper=True)
-    coefficient = (std * weight.float().view_as(normal)).flatten(1)
-    return PathGains(GaussianProcess(kernel, anchor, coefficient, exact=True), len(gain), name)
+    root, weighted = posterior.root.double(), (posterior.std * normal).flatten(1).double()
+    coefficient = torch.linalg.solve_triangular(root.T, weighted, upper=True).float()
+    return PathGains(GaussianProcess(kernel, scene.moving.double(), coefficient, exact=True), normal.shape[2], name)
+
+
+@dataclass(frozen=True)
+class GainPosterior:
+    """Negative logarithm of the posterior density of path gains, around samples of the prior.
+
+    Gains are a_i = gain_i + std (root @ z)_i with standard normal variables z. Up to a constant it is
+
+        sum_s (1 - c_s) / missing_scale + |z - sample|^2 / 2,    c_s = max_x |sum_k conj(x_sk) u_sk|^2 / K^2,
+
+    with the phases u = h / |h| of the field h = a w and both observed alternatives x. Its gradient is written out, because
+    automatic differentiation takes twice as long. It follows from du_k = j u_k Im(conj(u_k) dh_k) / |h_k|.
+
+    Args:
+        root: Cholesky factor of the kernel matrix, lower triangle, (n, n).
+        std: Prior standard deviation of a gain, real and imaginary part, (F, S, 2).
+        sample: Samples of the prior (n, F, S, 2).
+        wave: Waves of the paths, complex64 (n, S, K).
+        without: Field of the constant gains alone, complex64 (n, 1, K).
+        conjugate: Conjugate observed phases, complex64 (n, 2, K).
+        missing_scale: Twice the expected missing coherence of a spectrum.
+    """
+
+    root: Tensor
+    std: Tensor
+    sample: Tensor
+    wave: Tensor
+    without: Tensor
+    conjugate: Tensor
+    missing_scale: float
+
+    @classmethod
+    def of(cls, geometry: GeometryModel, scene: PhaseObservations, kernel: Kernel, prior: GainPrior) -> GainPosterior:
+        """Return the posterior of the gains of a room's paths, given the observed phases."""
+        wave, gain = paths(geometry, scene)
+        root = torch.linalg.cholesky(kernel.covariance(scene.moving.double())).float()
+        shape = len(scene), N_FIELDS, len(gain), 2
+        sample = prior.sample_std * torch.randn(shape, generator=torch.Generator().manual_seed(0))
+        without, conjugate = gain.to(wave.dtype)[None] @ wave, scene.channel.conj().resolve_conj()
+        std = torch.tensor(prior.std).expand(shape[1:]).contiguous()
+        return cls(root, std, sample, wave, without, conjugate, prior.missing_scale)
+
+    def gradient(self, normal: Tensor) -> Tensor:
+        """Return the derivatives with respect to the standard normal variables z, (n, F, S, 2)."""
+        change = self.std * self._times_root(normal)
+        field = self.without + torch.view_as_complex(change) @ self.wave
+        unit = field.sgn()
+        match = unit @ self.conjugate.mT
+        better = match.abs().argmax(-1, keepdim=True)
+        nearer = self.conjugate.gather(1, better.expand(-1, -1, field.shape[-1]))
+        across = (match.gather(2, better).conj() * nearer * unit).imag
+        scale = 2 / (self.missing_scale * field.shape[-1] ** 2)
+        slope = scale * across / field.abs().clamp_min_(MIN_MODULUS)
+        by_gain = torch.complex(-slope * unit.imag, slope * unit.real) @ self.wave.mH
+        return self._times_root(self.std * torch.view_as_real(by_gain), transposed=True) + (normal - self.sample)
+
+    def _times_root(self, values: Tensor, transposed: bool = False) -> Tensor:
+        """Return the product of the root, or its transpose, with values (n, ...); half the operations of a full matrix."""
+        product = strmm(1.0, self.root.numpy().T, values.flatten(1).numpy().T, side=1, trans_a=transposed)
+        return torch.from_numpy(product.T).view_as(values)
 
 
 @dataclass(frozen=True)

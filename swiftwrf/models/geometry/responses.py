@@ -46,6 +46,15 @@ class SteeringResponses:
                 double[i, j] = waves.unflatten(-1, (len(offset[i]), len(offset[j])))
         return cls(single, double)
 
+    def first(self, most: int | None) -> SteeringResponses:
+        """Return the waves at no more than the first offsets of each plane."""
+        double = {pair: waves[:, :, :most, :most] for pair, waves in self.double.items()}
+        return SteeringResponses([waves[:, :, :most] for waves in self.single], double)
+
+    def subset(self, rows: Tensor) -> SteeringResponses:
+        """Return the waves at some of the positions."""
+        return SteeringResponses([w[rows] for w in self.single], {pair: w[rows] for pair, w in self.double.items()})
+
     def at(self, rows: list[Tensor]) -> SteeringResponses:
         """Return the waves at the given offset numbers (A,) of each plane."""
         double = {(i, j): w.index_select(2, rows[i]).index_select(3, rows[j]) for (i, j), w in self.double.items()}

@@ -41,7 +41,11 @@ MAX_ALTERNATIVES = {2: 99, 3: 7, 4: 4}  # of each side, by the number of sides t
 SEARCH_ORDER = 2  # reflections of an image while planes move together
 N_MINIMA = 8  # of a scan, for each side
 N_REFINED = 8  # combinations of each kind of move
+N_SCANNED = 64  # positions that scans score planes at
+N_SCREENED = 24  # positions at which all combinations of a kind of move are scored
+N_RESCORED = 8  # times as many combinations as are wanted are scored at all positions
 MAX_MOVES = 20
+BEAM_STEPS = 3  # Levenberg-Marquardt steps after each plane of a beam; moves refine its rooms further
 
 
 @dataclass
@@ -81,6 +85,8 @@ class Search:
         self.step = 0.5 / scene.wavenumber
         self.offsets = [n + torch.arange(self.step, reach, self.step, dtype=torch.float64) for n in near]
         self.direct = batched(scene.wave(scene.transmitter))
+        self._scanned, self._screened = scene.few(N_SCANNED), scene.few_rows(N_SCREENED)
+        self._scanned_direct = batched(self._scanned.wave(self._scanned.transmitter))
 
     @cached_property
     def single(self) -> list[Tensor]:
@@ -90,14 +96,14 @@ class Search:
     def _waves(self, normal: Tensor, offset: Tensor) -> Tensor:
         """Return the waves of single reflections with gain 1, (n, 2 K, C), at offsets (C, 1)."""
         one = torch.ones(len(offset), 1)
-        return batched_field(self.scene, normal.expand(len(offset), 1, 3), offset, one, [(0,)])
+        return batched_field(self._scanned, normal.expand(len(offset), 1, 3), offset, one, [(0,)])
 
     def total(self, room: CandidateRoom, order: int) -> Tensor:
         """Return the field of a room with images up to an order, (n, 2 K, 1)."""
         if not room.offset:
-            return self.direct
+            return self._scanned_direct
         normal, offset, gain = room.tensors()
-        return self.direct + batched_field(self.scene, normal, offset, gain, sequences(normal[0], order))
+        return self._scanned_direct + batched_field(self._scanned, normal, offset, gain, sequences(normal[0], order))
 
     def scan(self, room: CandidateRoom, side: int, order: int) -> Tensor:
         """Return the scores (C,) over the offsets of a side, without the plane that the room has there."""
@@ -112,8 +118,8 @@ class Search:
             offset[:, own] = offsets
             gains = torch.tensor([gain if i == side else rest.gain[i] for i in sides]).expand(len(offsets), -1)
             normal = SIDES[sides].expand(len(offsets), -1, -1)
-            total += batched_field(self.scene, normal, offset, gains, chain)
-        return batched_score(self.scene, total)
+            total += batched_field(self._scanned, normal, offset, gains, chain)
+        return batched_score(self._scanned, total)
 
     def minima(self, room: CandidateRoom, side: int, order: int, top: int) -> list[tuple[float, float]]:
         """Return score and offset of the lowest local minima over the offsets of a side."""
@@ -155,7 +161,7 @@ class Search:
                 break
             best = sorted(pool.values(), key=lambda r: r.score)[: 3 * width]
             distinct: dict[tuple[tuple[int, int], ...], CandidateRoom] = {}
-            for r in self.refined(best, order):
+            for r in self.refined(best, order, BEAM_STEPS):
                 distinct.setdefault(r.key(2 * self.step), r)
             rooms = list(distinct.values())[:width]
         return rooms
@@ -184,17 +190,24 @@ class Search:
         return SteeringResponses.of(self.scene, SIDES, offset, gain, SEARCH_ORDER)
 
     def moves(self, alternatives: Alternatives, responses: SteeringResponses, k: int, keep: int) -> list[CandidateRoom]:
-        """Return the best rooms in which k sides take other alternatives, of which `MAX_ALTERNATIVES` are tried."""
+        """Return the best rooms in which k sides take other alternatives, of which `MAX_ALTERNATIVES` are tried.
+
+        All combinations are scored at few positions, and the best of them at all.
+        """
+        few, few_responses = self.scene.subset(self._screened), responses.subset(self._screened)
         pool: list[tuple[float, tuple[int, ...]]] = []
         for which in itertools.combinations(range(6), k):
+            base, moving = few_responses.moved(self.direct[self._screened], which)
+            screened = moving.first(MAX_ALTERNATIVES.get(k)).scores(few, base)
+            best = screened.flatten().argsort()[: N_RESCORED * keep].numpy()
+            number = np.unravel_index(best, screened.shape)
             base, moving = responses.moved(self.direct, which)
-            tried = [torch.arange(len(alternatives[i]))[: MAX_ALTERNATIVES.get(k)] for i in which]
-            value = moving.at(tried).scores(self.scene, base)
-            for index in value.flatten().argsort()[:keep]:
+            value = batched_score(self.scene, base + moving.of_choices([torch.from_numpy(n) for n in number]))
+            for index in value.argsort()[:keep].tolist():
                 choice = [0] * 6
-                for i, at in zip(which, np.unravel_index(int(index), value.shape), strict=True):
-                    choice[i] = int(at)
-                pool.append((float(value.flatten()[index]), tuple(choice)))
+                for i, at in zip(which, number, strict=True):
+                    choice[i] = int(at[index])
+                pool.append((float(value[index]), tuple(choice)))
         rooms = []
         for value_, choice_ in sorted(set(pool))[:keep]:
             picked = {i: alternatives[i][c] for i, c in enumerate(choice_) if alternatives[i][c][1] != 0}

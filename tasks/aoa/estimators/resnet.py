@@ -38,7 +38,9 @@ class Pointwise(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         rows, columns = self.stride
         pixels = x[:, :, ::rows, ::columns].permute(0, 2, 3, 1)
-        return functional.linear(pixels, self.weight.flatten(1)).permute(0, 3, 1, 2)
+        # of pixels with a stride, a product of more than two dimensions would copy the weights for each spectrum
+        product = functional.linear(pixels.flatten(0, 2), self.weight.flatten(1))
+        return product.reshape(*pixels.shape[:3], -1).permute(0, 3, 1, 2)
 
 
 class Neighbours(nn.Module):

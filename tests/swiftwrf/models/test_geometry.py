@@ -20,7 +20,15 @@ from swiftwrf.models.geometry.batched import batched, batched_field, batched_sco
 from swiftwrf.models.geometry.fit import _pruned, _with_weak_planes, _without_aliases, observe, split
 from swiftwrf.models.geometry.hybrid import HybridModel, fit_hybrid
 from swiftwrf.models.geometry.images import PhaseObservations, field, image_gain, images, mirror, sequences
-from swiftwrf.models.geometry.path_gains import PathGains, choose_prior, fit_path_gains, kernel_of
+from swiftwrf.models.geometry.path_gains import (
+    PRIORS,
+    GainPosterior,
+    PathGains,
+    choose_prior,
+    fit_path_gains,
+    kernel_of,
+    paths,
+)
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation, correlations, retrieve_phases
 from swiftwrf.models.geometry.planes import PlaneSet, refined
 from swiftwrf.models.geometry.refine import image_jacobian, phase_jacobian
@@ -245,6 +253,9 @@ def test_scores_of_combinations_are_those_of_their_rooms():
         torch.testing.assert_close(score[choice], scene.score(room.field(scene)), atol=1e-5, rtol=0)
         picked = batched_score(scene, direct + waves.of_choices([torch.tensor([c]) for c in choice]))
         torch.testing.assert_close(score[choice], picked[0], atol=1e-5, rtol=0)
+    some = torch.tensor([0, 5, 7])
+    few = waves.subset(some).first(2).scores(scene.subset(some), direct[some])
+    torch.testing.assert_close(few, waves.subset(some).scores(scene.subset(some), direct[some])[:, :2, :2, :, :2, :2])
 
 
 def test_a_room_of_a_search_is_extended_to_more_spectra_unless_it_does_not_explain_them(monkeypatch):
@@ -401,6 +412,26 @@ def with_path_gains(hybrid, path_gains):
     return other
 
 
+@pytest.mark.parametrize("prior", PRIORS.values(), ids=list(PRIORS))
+def test_the_gradient_of_path_gains_is_that_of_their_definition(prior):
+    data = mirror_room(SIX, n=30)
+    room = GeometryModel.of_planes(data, [Plane(n, o, gain=-0.6) for n, o in SIX.items()], order=1)
+    scene = observe(data)[0]
+    kernel = kernel_of(scene.moving)
+    posterior = GainPosterior.of(room, scene, kernel, prior)
+    generator = torch.Generator().manual_seed(1)
+    normal = torch.randn(posterior.sample.shape, generator=generator, requires_grad=True)
+
+    wave, gain = paths(room, scene)
+    root = torch.linalg.cholesky(kernel.covariance(scene.moving.double())).float()
+    change = torch.tensor(prior.std) * torch.einsum("mn,nfsc->mfsc", root, normal)
+    field = (gain + torch.view_as_complex(change)) @ wave
+    missing = 1 - scene.coherence(field.transpose(0, 1))
+    loss = missing.sum() / prior.missing_scale + (normal - posterior.sample).square().sum() / 2
+    (expected,) = torch.autograd.grad(loss, normal)
+    torch.testing.assert_close(posterior.gradient(normal.detach()), expected, rtol=1e-4, atol=1e-4)
+
+
 def test_path_gains_follow_a_shadow():
     """A wall that does not reflect to one half of the region: its amplitude is known where the phases determine it."""
     whole, bare = mirror_room(SIX, n=140), mirror_room({n: o for n, o in SIX.items() if n != (0, 0, 1)}, n=140)
@@ -528,9 +559,9 @@ def test_spectra_are_differentiable_in_the_position(moving):
         (model.predict(at).mean * weight).sum().backward()
         for axis in range(3):
             step = torch.zeros(3, dtype=torch.float64)
-            step[axis] = 5e-4
+            step[axis] = 1e-4
             ends = [(model.synthesize(position + sign * step) * weight).sum((1, 2)) for sign in (1, -1)]
-            torch.testing.assert_close(at.grad[:, axis], (ends[0] - ends[1]) / 1e-3, rtol=0.02, atol=1.0)
+            torch.testing.assert_close(at.grad[:, axis], (ends[0] - ends[1]) / 2e-4, rtol=0.02, atol=1.0)
 
 
 def test_room_predicts_any_grid(noisy, room):

@@ -206,24 +206,21 @@ def test_fractions_and_repeats_share_the_search_in_all_spectra(closed_form, tmp_
     assert own[subsets[3]] == [f"{LOCATOR}-mix1-r1"]
 
 
-def test_the_estimator_is_chosen_by_held_out_errors_alone(monkeypatch, closed_form):
+def test_the_estimator_is_chosen_by_held_out_errors_alone(closed_form):
     """Without a model that has a room, or with planes in one of two searches, it is not matched-field processing."""
     model = make_model("idw").fit(closed_form)
     folds = [Fold(model, closed_form, closed_form.subset(torch.arange(4))) for _ in range(4)]
     errors = {"kernel_regression": [np.full(4, 2.0)] * 4, "kernel_regression_turbo_idw": [np.full(4, 1.0)] * 4}
     compared = cross_validation.located_folds(folds)
     assert list(compared) == [0, 2]
-    for given in ({}, compared):
-        choice = cross_validation.choose_estimator(errors, given, seed=0)
+    without = {number: cross_validation.located_errors(fold, seed=0) for number, fold in compared.items()}
+    for located in ({}, without, {0: np.full(4, 0.1), 2: None}):
+        choice = cross_validation.choose_estimator(errors, located)
         assert choice["name"] == "kernel_regression_turbo_idw"
         assert choice["held_out_deg"] == {"kernel_regression": 2.0, "kernel_regression_turbo_idw": 1.0}
         assert choice["n_held_out"] == 16
-    located = iter([np.full(4, 0.1), None])
-    monkeypatch.setattr(cross_validation, "_located_errors", lambda *_: next(located))
-    assert LOCATOR not in cross_validation.choose_estimator(errors, compared, seed=0)["held_out_deg"]
     for error, chosen in ((0.1, LOCATOR), (1.5, "kernel_regression_turbo_idw")):
-        monkeypatch.setattr(cross_validation, "_located_errors", lambda *_, error=error: np.full(4, error))
-        choice = cross_validation.choose_estimator(errors, compared, seed=0)
+        choice = cross_validation.choose_estimator(errors, dict.fromkeys(compared, np.full(4, error)))
         assert (choice["name"], choice["n_held_out"]) == (chosen, 8)
 
 
