@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import itertools
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from swiftwrf.models.geometry.batched import batched_field, batched_score
 from swiftwrf.models.geometry.images import PhaseObservations, sequences
 
-MAX_INNER = 1000  # combinations that are scored at a time
+MAX_COMBINATIONS = 1000  # that are scored at a time
 
 
 @dataclass(frozen=True)
@@ -87,30 +87,41 @@ class SteeringResponses:
         return base, SteeringResponses(single, double)
 
     def scores(self, scene: PhaseObservations, base: Tensor) -> Tensor:
-        """Return the scores (A, B, ...) of all combinations of the planes' offsets, added to a field (n, 2 K, 1)."""
+        """Return the scores (A, B, ...) of all combinations of the planes' offsets, added to a field (n, 2 K, 1).
+
+        The planes are divided into two halves. Double reflections between them are a product with a matrix that selects the
+        offsets of the second half.
+        """
         size = [waves.shape[-1] for waves in self.single]
-        begin = next(i for i in range(len(size)) if math.prod(size[i:]) <= MAX_INNER or i == len(size) - 1)
-        outer, inner = range(begin), range(begin, len(size))
-        choices = list(itertools.product(*map(range, size[:begin])))
-        first = SteeringResponses(self.single[:begin], {p: w for p, w in self.double.items() if p[1] < begin})
-        fixed = base + first.of_choices(list(torch.tensor(choices, dtype=torch.int64).reshape(len(choices), begin).T))
-        among = torch.zeros(())
-        for i, j in itertools.combinations(inner, 2):
-            if (i, j) in self.double:
-                among = among + _spread(self.double[i, j], [i - begin, j - begin], len(inner))
+        half = len(size) // 2
+        first, second = range(half), range(half, len(size))
+        left, right = _combinations(size[:half]), _combinations(size[half:])
+        stay, move = base + self._among(first, left), self._among(second, right)
+        pairs = {j: [i for i in first if (i, j) in self.double] for j in second}
+        crossed = [j for j, some in pairs.items() if some]
+        chosen = [functional.one_hot(right[j - half], size[j]).T for j in crossed]
         found = []
-        for choice, stay in zip(choices, fixed.split(1, dim=-1), strict=True):
-            total = _spread(stay, [0], len(inner))
-            for axis, j in enumerate(inner):  # small sums first
-                beside = [self.double[i, j][..., choice[i], :] for i in outer if (i, j) in self.double]
-                total = total + _spread(sum(beside, start=self.single[j]), [axis], len(inner))
-            found.append(batched_score(scene, (total + among).flatten(2)))
+        for rows in torch.arange(left.shape[1]).split(max(1, MAX_COMBINATIONS // right.shape[1])):
+            total = stay.expand(-1, -1, left.shape[1])[:, :, rows, None] + move[:, :, None]
+            between = [sum(self.double[i, j].index_select(2, left[i, rows]) for i in pairs[j]) for j in crossed]
+            if len(second) > 1 and between:
+                between = [torch.cat(between, dim=-1) @ torch.cat(chosen).float()]
+            for waves in between:
+                total += waves
+            found.append(batched_score(scene, total.flatten(2)))
         return torch.cat(found).reshape(size)
 
+    def _among(self, planes: range, rows: Tensor) -> Tensor:
+        """Return the fields (n, 2 K, C) of some neighbouring planes alone, at the offset numbers (P, C)."""
+        double = {
+            (i - planes.start, j - planes.start): waves
+            for (i, j), waves in self.double.items()
+            if i in planes and j in planes
+        }
+        return SteeringResponses(self.single[planes.start : planes.stop], double).of_choices(list(rows))
 
-def _spread(waves: Tensor, axes: list[int], k: int) -> Tensor:
-    """Return waves (n, 2 K, A, [B]) with their last dimensions at the given ones of k dimensions."""
-    shape = [1] * k
-    for axis, size in zip(axes, waves.shape[2:], strict=True):
-        shape[axis] = size
-    return waves.reshape(*waves.shape[:2], *shape)
+
+def _combinations(size: list[int]) -> Tensor:
+    """Return the numbers (P, C) of all combinations of P choices from so many."""
+    grids = torch.meshgrid(*map(torch.arange, size), indexing="ij") if size else ()
+    return torch.stack([grid.flatten() for grid in grids]) if size else torch.zeros(0, 1, dtype=torch.int64)

@@ -251,4 +251,6 @@ def _gains_from_bfloat16(device: torch.device) -> bool:
     """Return True for devices that multiply in bfloat16: a third of the time there, slower elsewhere."""
     if device.type == "cuda":
         return bool(torch.cuda.is_bf16_supported())
-    return bool(torch.cpu.get_capabilities().get("avx512_bf16")) if hasattr(torch.cpu, "get_capabilities") else False
+    allowed = torch.backends.cpu.get_cpu_capability().startswith("AVX512")  # ATEN_CPU_CAPABILITY may exclude it
+    has_list = hasattr(torch.cpu, "get_capabilities")
+    return allowed and has_list and bool(torch.cpu.get_capabilities().get("avx512_bf16"))

@@ -58,7 +58,7 @@ def gain_sentence(fraction: FractionRecords) -> str:
     best = reference(fraction)
     parts = [
         f"{change_text(change)} against {other}"
-        f"{', the best one without synthetic spectra,' if other == best else ''} ({judgement(change)})"
+        f"{', the best one without synthetic spectra' if other == best else ''} ({judgement(change)})"
         for other, change in changes_of(fraction, method).items()
     ]
     if not parts:
