@@ -103,7 +103,10 @@ class SteeringResponses:
         found = []
         for rows in torch.arange(left.shape[1]).split(max(1, MAX_COMBINATIONS // right.shape[1])):
             total = stay.expand(-1, -1, left.shape[1])[:, :, rows, None] + move[:, :, None]
-            between = [sum(self.double[i, j].index_select(2, left[i, rows]) for i in pairs[j]) for j in crossed]
+            between = [
+                sum((self.double[i, j].index_select(2, left[i, rows]) for i in pairs[j]), start=torch.zeros(()))
+                for j in crossed
+            ]
             if len(second) > 1 and between:
                 between = [torch.cat(between, dim=-1) @ torch.cat(chosen).float()]
             for waves in between:
