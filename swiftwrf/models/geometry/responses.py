@@ -125,6 +125,6 @@ class SteeringResponses:
 
 
 def _combinations(size: list[int]) -> Tensor:
-    """Return the numbers (P, C) of all combinations of P choices from so many."""
+    """Return the numbers (P, C) of all combinations of P choices, each from size[p] numbers."""
     grids = torch.meshgrid(*map(torch.arange, size), indexing="ij") if size else ()
     return torch.stack([grid.flatten() for grid in grids]) if size else torch.zeros(0, 1, dtype=torch.int64)
