@@ -7,6 +7,7 @@ is a fork of that server.
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -16,7 +17,7 @@ from typing import Any, TypeVar
 
 Result = TypeVar("Result")
 
-MAX_PROCESSES = 4  # of a map
+MAX_PROCESSES = 4  # each holds the data and a copy of the libraries, a gigabyte with a network
 SERVED = sys.platform == "linux"  # a fork of loaded libraries may crash on macOS, and Windows has none
 
 _is_served = False
@@ -43,5 +44,7 @@ def served_map(function: Callable[..., Result], *items: Iterable[Any]) -> list[R
     """Return the function of each item, like `map`, computed in forks of the server if `preload` started one, else here."""
     if not _is_served:
         return list(map(function, *items))
-    with ProcessPoolExecutor(min(os.cpu_count() or 1, MAX_PROCESSES), process_context()) as processes:
+    number = min(os.cpu_count() or 1, MAX_PROCESSES)
+    ignored = signal.SIGINT, signal.SIG_IGN  # the run itself ends its processes
+    with ProcessPoolExecutor(number, process_context(), signal.signal, ignored) as processes:
         return list(processes.map(function, *items))

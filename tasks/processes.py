@@ -25,14 +25,13 @@ import torch
 from swiftwrf import FitError
 from swiftwrf.runtime.progress import silent
 from swiftwrf.runtime.threads import set_threads
-from tasks.preload import process_context
+from tasks.preload import MAX_PROCESSES, process_context
 from tasks.torchrun import process_count
 
 if TYPE_CHECKING:
     from tasks.steps import Step
 
 MAX_SECONDS_TO_END = 10.0  # from the signal to the end of a process
-MAX_PROCESSES = 4  # each holds the data and a copy of the libraries, a gigabyte with a network
 
 
 def number_of_processes(device: torch.device) -> int:

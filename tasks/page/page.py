@@ -175,10 +175,13 @@ def write_page(folder: Path, page: Page) -> None:
     """Write the panels of each plot and its numbers into `figures/`, and `report.html` with the same panels inlined."""
     figures = folder / "figures"
     figures.mkdir(parents=True, exist_ok=True)
-    panels = {file: panel for plot in page.plots for file, panel in zip(plot.files, plot.panels, strict=True)}
-    captions = [plot.caption for plot in page.plots for _ in plot.files]
-    if len(panels) < len(captions):
-        raise ValueError("two figures have the same name; one would be shown in the other's place")
+    panels: dict[str, Figure] = {}
+    for plot in page.plots:
+        for file, panel in zip(plot.files, plot.panels, strict=True):
+            if file in panels:
+                raise ValueError(f"two figures are called {file}; one would be shown in the other's place")
+            panels[file] = panel
+    captions = [plot.caption for plot in page.plots for _ in plot.panels]
     inlined: dict[str, Markup] = {}
     for file, svg in zip(panels, served_map(as_svg, panels.values(), captions), strict=True):
         write_text(figures / f"{file}.svg", svg)
