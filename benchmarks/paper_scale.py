@@ -12,6 +12,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -38,6 +39,7 @@ from swiftwrf.metrics import l1, psnr, ssim, summary
 from swiftwrf.models.base import FieldModel
 from swiftwrf.positions import Neighbours
 from swiftwrf.runtime.durable import write_text
+from swiftwrf.runtime.threads import set_threads
 from tasks.aoa.experiment import run as run_aoa
 from tasks.aoa.options import AoaConfig
 from tasks.environment import machine
@@ -244,7 +246,9 @@ def estimate_angles(config: Config, folder: Path, work: Path) -> None:
             task = AoaConfig(
                 SHARES, str(folder), synthesizer=synthesizers, extra=0, repeats=config.repeats, out=str(out)
             )
+            set_threads(os.cpu_count() or 1)  # the run has a process for each
             run_aoa(task, stopped if stopped.exists() else None)
+            set_threads(1)
 
 
 def gathered(work: Path, name: str) -> Row:

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import statistics
-from collections.abc import Callable, Sequence
 from typing import Any
 
 from committed import interval, load, markdown
-from comparison_tables import PAPER_TURBO
-from score_tables import Rows, costs, scores
+from score_tables import Rows, angles, by_fraction, costs, scores
 
-OURS = ("swiftwrf", "coarray", "geometry", "hybrid")
-PUBLISHED = ("nerf2", "wrfgs", "vae", "dcgan")
 # median PSNR [dB], median SSIM and mean L1 of the paper's table of scenes, on its own spectra of rooms of these names
 PAPER = {
     "conference-transmitter": {
@@ -127,43 +122,6 @@ def paper_scale_counts() -> str:
     return markdown(["scene, random split", "training spectra", "SSIM", "PSNR [dB]", "fit [s]", "MB"], rows)
 
 
-def paper_scale_targets() -> str:
-    """Return the comparisons on the random split that the targets name, and their means over the scenes."""
-    table, means = [], []
-    for name, scene in load("paper_scale")["scenes"].items():
-        rows = _with_all(scene, "random")
-        if "swiftwrf" not in rows:
-            continue
-        own = max((m for m in OURS if m in rows), key=lambda m: rows[m]["psnr_db"]["median"])
-        best, mine = rows[own], rows["swiftwrf"]
-        paper = PAPER[name]["swiftwrf_paper"]
-        means.append((best["psnr_db"]["median"], best["ssim"]["median"], *paper[:2]))
-        others = {m: rows[m] for m in PUBLISHED if m in rows}
-        other = max(others, key=lambda m: others[m]["psnr_db"]["median"], default="")
-        gp = rows.get("gp")
-        table.append(
-            [
-                name,
-                f"{best['psnr_db']['median']:.2f} / {best['ssim']['median']:.3f} ({own})",
-                f"{paper[0]:.2f} / {paper[1]:.3f}",
-                f"{mine['psnr_db']['median']:.2f} / {mine['ssim']['median']:.3f}",
-                f"{others[other]['psnr_db']['median']:.2f} / {others[other]['ssim']['median']:.3f} ({other})"
-                if other
-                else "",
-                f"{mine['psnr_db']['median'] - gp['psnr_db']['median']:+.2f}" if gp else "",
-                f"{mine['megabytes'] / gp['megabytes']:.1%}" if gp else "",
-                f"{mine['fit_seconds']:.0f}",
-            ]
-        )
-    mean = [statistics.fmean(column) for column in zip(*means, strict=True)]
-    table.append(
-        [f"mean of {len(means)}", f"{mean[0]:.2f} / {mean[1]:.3f}", f"{mean[2]:.2f} / {mean[3]:.3f}", *[""] * 5]
-    )
-    columns = ["scene, random split: PSNR [dB] / SSIM", "best of ours", "paper, other spectra", "swiftwrf"]
-    columns += ["best of the published methods", "swiftwrf against gp [dB]", "size against gp", "fit of swiftwrf [s]"]
-    return markdown(columns, table)
-
-
 def paper_scale_aoa() -> str:
     """Return the angular errors of each method at each measured fraction; only the network has all synthesizers."""
 
@@ -173,38 +131,9 @@ def paper_scale_aoa() -> str:
     def is_shown(method: str) -> bool:
         return "_turbo_" not in method or method.endswith("_turbo_hybrid")
 
-    return _by_share(cell, is_shown)
+    return by_fraction(load("paper_scale")["aoa"], "great_circle_deg", cell, is_shown)
 
 
 def paper_scale_angles() -> str:
     """Return elevation and azimuth errors of the network with each synthesizer, and those of the paper."""
-
-    def cell(errors: dict[str, Any]) -> str:
-        return f"{errors['elevation_deg']['median']:.2f} / {errors['azimuth_deg']['median']:.2f}"
-
-    def is_shown(method: str) -> bool:
-        return method.startswith(("measured_", "turbo_"))
-
-    shares = load("paper_scale")["aoa"]
-    paper = []
-    for name in PAPER_TURBO["0.1"]:
-        pairs = [PAPER_TURBO[share][name] for share in shares]
-        paper.append([f"paper: turbo_{name}", *(f"{elevation:.2f} / {azimuth:.2f}" for elevation, azimuth in pairs)])
-    return _by_share(cell, is_shown, paper)
-
-
-def _by_share(
-    cell: Callable[[dict[str, Any]], str], is_shown: Callable[[str], bool], further: Sequence[list[str]] = ()
-) -> str:
-    """Return the table of some methods at each measured fraction, the best at the first fraction first.
-
-    Args:
-        cell: Text of the errors of a method.
-        is_shown: Whether the table has a method.
-        further: Last rows.
-    """
-    shares = load("paper_scale")["aoa"]
-    first = next(iter(shares.values()))
-    names = sorted(filter(is_shown, first), key=lambda name: float(first[name]["great_circle_deg"]["median"]))
-    rows = [[f"`{name}`", *(cell(methods[name]) for methods in shares.values())] for name in names]
-    return markdown(["method", *(f"{float(share):.0%} measured" for share in shares)], [*rows, *further])
+    return angles(load("paper_scale")["aoa"])

@@ -27,11 +27,10 @@ def rssi_glance() -> str:
                 f"{difference:+.2f}, {_outcome(difference)}",
                 _interval(own["difference_db"]),
                 f"{own['coverage']:.0%}",
-                f"{own['seconds']['fit']:.1f} s",
             ]
         )
     columns = ["data, split", "training / test rows", "best baseline", "model", "difference of medians"]
-    return markdown([*columns, "mean difference [95 %]", "80 % interval covers", "fit"], rows)
+    return markdown([*columns, "mean difference [95 %]", "80 % interval covers"], rows)
 
 
 def rssi_methods() -> str:

@@ -4,10 +4,19 @@ from __future__ import annotations
 
 import re
 import statistics
-from dataclasses import replace
 from typing import Any
 
-from committed import ROOT, aoa_shares, interval, load, markdown, turbo_condition
+from committed import (
+    ROOT,
+    aoa_shares,
+    change,
+    change_text,
+    interval,
+    load,
+    markdown,
+    reference,
+    turbo_condition,
+)
 from comparison_tables import comparison, comparison_cost, comparison_counts, comparison_turbo
 from geometry import SIDES, WALLS, nearest
 from locating_tables import locating_rssi, locating_spectra
@@ -22,7 +31,6 @@ from paper_scale_tables import (
     paper_scale_density,
     paper_scale_gpu,
     paper_scale_gpu_cost,
-    paper_scale_targets,
 )
 from rssi_tables import rssi_glance, rssi_heads, rssi_methods
 from speed_tables import (
@@ -39,7 +47,7 @@ from speed_tables import (
 )
 from targets import aoa_targets, rssi_targets, synthesis_targets
 
-from tasks.aoa.condition import LOCATOR, Condition
+from tasks.aoa.condition import LOCATOR
 
 
 def synthesis() -> str:
@@ -54,31 +62,29 @@ def synthesis() -> str:
 
 
 def aoa() -> str:
-    """Return median angular errors of the conditions of each run."""
-    fixed = ("peak", "constant", "nearest_spectrum", "kernel_regression", "measured_only")
-    columns = [
-        "scene, split, moving end",
-        "measured",
-        *fixed,
-        "turbo",
-        "turbo, kernel_regression",
-        "measured_all",
-        "synthesizer",
-    ]
+    """Return median angular errors of each run, and what synthetic spectra change, with paired intervals."""
     rows = []
     for share, mix, result in aoa_shares():
-        metrics = result["metrics"]
-        scene = f"{metrics['data']}, {metrics['split']}, {metrics['moving']}"
-        methods, turbo = mix["methods"], turbo_condition(mix)
-        names = (*fixed, turbo.method, replace(turbo, estimator="kernel_regression").method, "measured_all")
-        cells = [interval(methods[name]["great_circle_deg"]) if name in methods else "" for name in names]
-        rows.append([scene, f"{float(share):.0%}", *cells, _synthesizer(turbo)])
+        metrics, methods = result["metrics"], mix["methods"]
+        turbo, best = turbo_condition(mix), reference(mix)
+        median = {name: f"{method['great_circle_deg']['median']:.2f}" for name, method in methods.items()}
+        synthesizer = f"{turbo.synthesizer}{', extra' if turbo.training == 'turbo_extra' else ''}"
+        rows.append(
+            [
+                f"{metrics['data']}, {metrics['split']}, {metrics['moving']}",
+                f"{float(share):.0%}",
+                f"{median[best]} `{best}`",
+                median["measured_only"],
+                median[turbo.method],
+                *(change_text(change(mix, turbo.method, other)) for other in ("measured_only", best)),
+                median.get(LOCATOR, ""),
+                median["measured_all"],
+                synthesizer,
+            ]
+        )
+    columns = ["scene, split, moving end", "measured", "best on measured spectra", "measured_only", "turbo"]
+    columns += ["against measured_only", "against the best", "matched field", "measured_all", "synthesizer"]
     return markdown(columns, rows)
-
-
-def _synthesizer(condition: Condition) -> str:
-    """Return the field model of a condition, and whether it predicted at further positions."""
-    return f"{condition.synthesizer}{', extra' if condition.training == 'turbo_extra' else ''}"
 
 
 def reliability() -> str:
@@ -145,19 +151,22 @@ def headline_rssi() -> str:
 
 
 def room() -> str:
-    """Return the errors of the planes that each run found, where the true ones are known."""
-    methods, rows = ("geometry", "hybrid", "coarray", "gp"), []
+    """Return the largest error of the planes that each run found, where the true ones are known."""
+    methods, rows = ("geometry", "hybrid", "coarray"), []
     for share, mix, result in aoa_shares():
         found, walls = result.get("geometry", {}).get(share), WALLS.get(result["metrics"]["data"])
         if found is None or walls is None:
             continue
-        own = [nearest(found["planes"], *wall) for wall in zip(SIDES, walls, strict=True)]
-        cells = [_millimetres(plane) for plane in own]
+        near = [nearest(found["planes"], *wall) for wall in zip(SIDES, walls, strict=True)]
+        errors = [plane["error_mm"] for plane in near if plane]
+        n = len(found["planes"])
         certain = sum(plane["certain"] for plane in found["planes"])
         scene = f"{result['metrics']['data']}, {result['metrics']['moving']}"
         quality = [f"{mix['synthesis'][s]['psnr_db']['median']:.1f}" for s in methods]
-        rows.append([scene, str(mix["n_measured"]), *cells, f"{certain} of {len(found['planes'])}", *quality])
-    return markdown(["scene, moving end", "spectra", *(f"{s} [mm]" for s in SIDES), "certain", *methods], rows)
+        cells = [f"{len(errors)} of {len(walls)}", f"{max(errors):.1f}", f"{certain} of {n}"]
+        rows.append([scene, str(mix["n_measured"]), *cells, *quality])
+    columns = ["scene, moving end", "spectra", "walls found", "largest error [mm]", "certain", *methods]
+    return markdown(columns, rows)
 
 
 def walls() -> str:
@@ -258,10 +267,8 @@ def ablation() -> str:
         for scene in scenes.values():
             scores = scene["variants"].get(name, {})
             if "ssim" in scores:
-                quality = (
-                    f"{scores['ssim']['median']:.3f} / {scores['l1']['mean']:.4f} / {scores['psnr_db']['median']:.1f}"
-                )
-                cells.append(f"{quality} / {scores['seconds']:.0f} s")
+                ssim, psnr = (scores[key]["median"] for key in ("ssim", "psnr_db"))
+                cells.append(f"{ssim:.3f} / {scores['l1']['mean']:.4f} / {psnr:.1f}")
             else:
                 cells.append(scores.get("refusal", ""))
         rows.append([name, *cells, PAPER.get(name, "")])
@@ -320,7 +327,6 @@ TABLES = {
     "paper_scale_density": paper_scale_density,
     "paper_scale_gpu": paper_scale_gpu,
     "paper_scale_gpu_cost": paper_scale_gpu_cost,
-    "paper_scale_targets": paper_scale_targets,
     "synthesis_targets": synthesis_targets,
     "aoa_targets": aoa_targets,
     "rssi_targets": rssi_targets,
