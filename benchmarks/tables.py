@@ -68,22 +68,22 @@ def aoa() -> str:
         metrics, methods = result["metrics"], mix["methods"]
         turbo, best = turbo_condition(mix), reference(mix)
         median = {name: f"{method['great_circle_deg']['median']:.2f}" for name, method in methods.items()}
-        synthesizer = f"{turbo.synthesizer}{', extra' if turbo.training == 'turbo_extra' else ''}"
         rows.append(
             [
                 f"{metrics['data']}, {metrics['split']}, {metrics['moving']}",
                 f"{float(share):.0%}",
+                median["peak"],
+                median["constant"],
                 f"{median[best]} `{best}`",
                 median["measured_only"],
                 median[turbo.method],
                 *(change_text(change(mix, turbo.method, other)) for other in ("measured_only", best)),
                 median.get(LOCATOR, ""),
                 median["measured_all"],
-                synthesizer,
             ]
         )
-    columns = ["scene, split, moving end", "measured", "best on measured spectra", "measured_only", "turbo"]
-    columns += ["against measured_only", "against the best", "matched field", "measured_all", "synthesizer"]
+    columns = ["scene, split, moving end", "measured", "peak", "constant", "best", "measured_only", "turbo"]
+    columns += ["against measured_only", "against the best", "matched field", "measured_all"]
     return markdown(columns, rows)
 
 
