@@ -82,8 +82,8 @@ def aoa() -> str:
                 median["measured_all"],
             ]
         )
-    columns = ["scene, split, moving end", "measured", "peak", "constant", "best", "measured_only", "turbo"]
-    columns += ["against measured_only", "against the best", "matched field", "measured_all"]
+    columns = ["scene, split, moving end", "measured", "peak", "constant", "best", "measured only", "turbo"]
+    columns += ["against measured only", "against the best", "matched field", "all measured"]
     return markdown(columns, rows)
 
 
