@@ -63,7 +63,7 @@ class Mixed:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of measured spectra, of synthetic spectra at withheld positions, and of those at further positions."""
+        """Number of measured spectra, of synthetic spectra at withheld positions, and of those at extra positions."""
         further = int((self.index == NO_INDEX).sum())
         synthetic = int(self.synthetic.sum())
         return {"measured": len(self) - synthetic, "withheld": synthetic - further, "further": further}

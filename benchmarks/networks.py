@@ -35,7 +35,7 @@ from tasks.run import Preset
 from tasks.summarise import error_summary, paired_change
 
 REFERENCE = "kernel_regression"  # estimator to which others are compared
-N_EXTRA = 3000  # further synthetic positions in rooms
+N_EXTRA = 3000  # extra synthetic positions in rooms
 Training = Literal["measured", "turbo", "all"]
 Row = dict[str, Any]
 Estimates = Iterator[tuple[str, Row, Tensor]]
@@ -107,7 +107,7 @@ def has_room(data: Spectra) -> bool:
 
 
 def synthesized(measured: Spectra, withheld: SyntheticPositions, name: str, seed: int) -> Mixed:
-    """Return measured and synthetic spectra, those at further positions where there is a room."""
+    """Return measured and synthetic spectra, those at extra positions where there is a room."""
     model = make_model(name, seed=seed, validation="random").fit(measured)
     mixed = mix(measured, withheld, model.synthesize(withheld.position))
     if not has_room(measured):

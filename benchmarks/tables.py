@@ -115,11 +115,12 @@ def headline() -> str:
         if share != "0.3":
             continue
         metrics, methods = result["metrics"], mix["methods"]
-        shown = ("peak", "measured_only", turbo_condition(mix).method, LOCATOR, "measured_all")
+        shown = ("peak", "constant", "measured_only", turbo_condition(mix).method, LOCATOR, "measured_all")
         cells = [interval(methods[name]["great_circle_deg"]) if name in methods else "" for name in shown]
         rows.append([f"{metrics['data']}, {metrics['split']}, {metrics['moving']} moves", *cells])
     columns = [
         "strongest peak",
+        "mean direction",
         "measured spectra only",
         "with synthetic spectra",
         "matched field",

@@ -68,3 +68,14 @@ class FitError(RuntimeError):
 
     def __init__(self, message: object) -> None:
         super().__init__(one_line(str(message)))
+
+
+def with_article(noun: str) -> str:
+    """Return a noun with its indefinite article.
+
+    Example:
+        >>> with_article("hybrid model"), with_article("inverse-distance model"), with_article("RSSI locator")
+        ('a hybrid model', 'an inverse-distance model', 'an RSSI locator')
+    """
+    spoken_as_vowel = noun.lower().startswith(("a", "e", "i", "o", "rssi"))
+    return f"{'an' if spoken_as_vowel else 'a'} {noun}"

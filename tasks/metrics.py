@@ -87,7 +87,7 @@ class GainMetrics(ChangeMetrics):
 
 
 class CrossValidationMetrics(TypedDict):
-    """Cross-validation of one field model: change of the error on held-out measured spectra by further synthetic spectra.
+    """Cross-validation of one field model: change of the error on held-out measured spectra by extra synthetic spectra.
 
     `gains` has every number that was compared, `rule` the number chosen on the other folds. Further positions
     are recommended if every number reduces the error; `helps` requires that the interval of `rule` excludes zero, too.

@@ -15,6 +15,7 @@ from tasks.metrics import ChangeMetrics, ErrorSummary
 
 MIN_ROWS = 10  # of a test, for an interval of differences
 N_BOOTSTRAP = 2000
+MAX_COVERAGE_ERROR = 0.05  # difference from the nominal coverage below which intervals count as calibrated
 MIN_RELEVANT = 0.02  # difference of mean errors, relative to them, below which methods are equal in practice
 MAX_SPREAD = 0.5  # of labels about their mean direction, relative to the error of the peaks, for a warning
 SMALLEST_ERROR = 1e-9  # degrees: a change is relative to at least this median
@@ -94,9 +95,34 @@ def verdict_of_difference(
         return f"On the same {rows} {name}'s mean error is lower than that of {other}: {interval}."
     if low > 0:
         return (
-            f"On the same {rows} {other} has the lower mean error: {name}'s differs by {interval}. Take {other} here."
+            f"On the same {rows} {other} has the lower mean error: {name}'s differs by {interval}. {other} is the best of "
+            "several on these rows, which favours it."
         )
     return f"On the same {rows} the errors of {name} and {other} do not differ significantly: {interval}."
+
+
+def coverage_warning(name: str, coverage: float, nominal: float, n_test: int) -> str:
+    """Return a warning if intervals or regions cover significantly more or less than they should, else nothing.
+
+    Args:
+        name: Name of the intervals in the sentence.
+        coverage: Fraction of the test values that they contain.
+        nominal: Probability that they are made for.
+        n_test: Number of independent test rows.
+
+    Example:
+        >>> coverage_warning("intervals", 0.87, 0.8, n_test=100)
+        ''
+        >>> coverage_warning("intervals", 0.6, 0.8, n_test=100)
+        'The 80 % intervals contain 60 % of the test values: they are too narrow here.'
+    """
+    two_deviations = 2 * math.sqrt(nominal * (1 - nominal) / n_test)
+    if abs(coverage - nominal) <= max(MAX_COVERAGE_ERROR, two_deviations):
+        return ""
+    size = "narrow" if coverage < nominal else "wide"
+    return (
+        f"The {100 * nominal:.0f} % {name} contain {100 * coverage:.0f} % of the test values: they are too {size} here."
+    )
 
 
 def fingerprinting(constant_deg: float, peak_deg: float) -> str:

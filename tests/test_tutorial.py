@@ -43,5 +43,5 @@ def test_every_block_runs(part, tmp_path, monkeypatch):
             mock.patch.object(PREDICTORS, "_registered", {name: PREDICTORS[name] for name in PREDICTORS_KEPT}),
         ):
             assert command_line(module, config, function, arguments) == 0, block
-        out = Path(arguments[arguments.index("--out") + 1])
+        out = Path(arguments[arguments.index("--out") + 1] if "--out" in arguments else arguments[-1])
         assert (out if out.suffix else out / "report.html").is_file()

@@ -278,8 +278,10 @@ class Rssi(PositionedData):
         if list(asked) == ["all"]:
             return self._detected_enough()
         columns = [receiver_row(self.receiver_names, name, self.name) for name in asked]
-        if not columns or len(set(columns)) < len(columns):
-            raise InputError(f"ask for each receiver once, got {' '.join(asked) or 'none'}")
+        if not columns:
+            raise InputError("no receiver is asked for; give names, numbers from 1, or all")
+        if len(set(columns)) < len(columns):
+            raise InputError(f"ask for each receiver once, got {' '.join(asked)}")
         for column in columns:
             count = int(self.detected[:, column].sum())
             if count < MIN_TRAINING:

@@ -16,7 +16,8 @@ from swiftwrf.array.angles import to_angles, to_direction
 from swiftwrf.array.planar import differences
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.spectra import Spectra, check_training, direction_of_link
-from swiftwrf.errors import InputError
+from swiftwrf.data.splits import places
+from swiftwrf.errors import InputError, with_article
 from swiftwrf.gp import subsample
 from swiftwrf.locate.pool import inflation, pooled_weights
 from swiftwrf.locate.posterior import Posterior, normalised
@@ -160,11 +161,13 @@ class MatchedField(Configured, Saved):
 
     kind: ClassVar[str] = "matched-field locator"
     config_type: ClassVar[type[MatchedFieldConfig]] = MatchedFieldConfig
+    fitted_attribute = "_fit"
     config: MatchedFieldConfig
 
     @property
     def room(self) -> GeometryModel:
         """Room whose paths the likelihoods use."""
+        self.check_fitted()
         return self._fit.room
 
     def fit(
@@ -193,12 +196,12 @@ class MatchedField(Configured, Saved):
                 f"matched-field processing needs {MIN_SPECTRA} spectra to hold a fifth of them out, got {len(train)}"
             )
         if room is not None and room.room is None:
-            raise InputError(f"a {room.kind} has no room to locate by; fit geometry or hybrid")
+            raise InputError(f"{with_article(room.kind)} has no room to locate by; fit geometry or hybrid")
         own = GeometryModel(seed=self.config.seed).fit(train, like=room, progress=progress)
         assert train.array is not None
         features = SpectrumFeatures.of(train.store.batches(), train.array, train.grid, self.config.seed)
         scene, rows = observe(train, GeometryConfig(seed=self.config.seed))
-        fold = torch.arange(len(train)) % FOLDS
+        fold = places(train.position, FOLDS) % FOLDS
         choice = choose_prior(own, scene, fold[rows]) if own.planes else PriorChoice(own, "loose", {})
         kernel = kernel_of(scene.moving)
         self.grid = train.grid
@@ -303,8 +306,9 @@ class MatchedField(Configured, Saved):
             spectrum: Magnitudes in [0, 1], tensor or array (n, n_elevation, n_azimuth) on the grid of the training spectra.
 
         Raises:
-            InputError: Spectra on another grid, or not finite.
+            InputError: Spectra on another grid, or not finite, or a locator that is not fitted.
         """
+        self.check_fitted()
         spectrum = torch.as_tensor(spectrum, dtype=torch.float32)
         if spectrum.dim() != 3 or tuple(spectrum.shape[1:]) != self.grid.shape:
             raise InputError(
@@ -335,6 +339,11 @@ class MatchedField(Configured, Saved):
         label = direction_of_link(at.reshape(-1, 3), room.fixed_position, room.rotation, room.moving, room.array)
         vectors = to_direction(*label.unbind(-1)).reshape(at.shape)
         return torch.stack(to_angles(posterior.direction(vectors)), dim=-1)
+
+    def __repr__(self) -> str:
+        if not self.is_fitted:
+            return f"{type(self).__name__}(not fitted)"
+        return f"{type(self).__name__}(fitted, {len(self.room.planes)} planes, {len(self.cells.position):,} cells)"
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """Return the fitted tensors by name, and plain values."""

@@ -84,6 +84,7 @@ class RssiLocator(Configured, Saved):
 
     kind: ClassVar[str] = "RSSI locator"
     config_type: ClassVar[type[RssiLocatorConfig]] = RssiLocatorConfig
+    fitted_attribute = "_maps"
     config: RssiLocatorConfig
 
     def fit(
@@ -208,8 +209,10 @@ class RssiLocator(Configured, Saved):
             rssi: RSSI at the receivers of the training rows, tensor or array (n, R) [dBm], NaN if not detected.
 
         Raises:
-            InputError: Another number of receivers, infinite values, or a row that no receiver detected.
+            InputError: Another number of receivers, infinite values, a row that no receiver detected, or a locator that is
+                not fitted.
         """
+        self.check_fitted()
         rssi = torch.as_tensor(rssi, dtype=torch.float64)
         if rssi.dim() != 2 or rssi.shape[1] != len(self.receiver_names):
             raise InputError(f"expected RSSI of shape (n, {len(self.receiver_names)}), got {tuple(rssi.shape)}")
@@ -239,6 +242,7 @@ class RssiLocator(Configured, Saved):
         Returns:
             RSSI (n, m, R) [dBm], NaN if not detected. A row whose packets are all lost keeps its strongest value.
         """
+        self.check_fitted()
         maps = RssiMaps.of(self.model.predict(position))
         mean, std = maps.mean.double(), maps.std.double()
         rssi = mean + std * self.values.sample((n, len(mean)), generator)
@@ -248,8 +252,14 @@ class RssiLocator(Configured, Saved):
         lost &= ~(strongest & lost.all(dim=2, keepdim=True))
         return rssi.masked_fill(lost, torch.nan)
 
+    def __repr__(self) -> str:
+        if not self.is_fitted:
+            return f"{type(self).__name__}(not fitted)"
+        return f"{type(self).__name__}(fitted, {len(self.receiver_names)} receivers, {len(self.cells.position)} cells)"
+
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """Return the fitted tensors by name, and plain values."""
+        self.check_fitted()
         tensors, header = self.model.state()
         own = {
             "known": self.fingerprints.position,

@@ -16,7 +16,7 @@ from swiftwrf.choices import FIELD_MODELS, Moving
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.spectra import Spectra, check_training
 from swiftwrf.data.splits import Validation
-from swiftwrf.errors import InputError
+from swiftwrf.errors import InputError, with_article
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.models.updatable import Updatable, bounding_box
 from swiftwrf.plotting import Displayed, extent
@@ -90,6 +90,7 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
 
     config_type: ClassVar[type[Any]] = FieldConfig
     """dataclass of the options"""
+    fitted_attribute = "grid"
     name: ClassVar[str]
     """name in the registry, on the command line and in reports"""
     requires: ClassVar[tuple[str, ...]] = ()
@@ -150,7 +151,7 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
         if lacking := self.lacking(train):
             raise InputError(f"{self.name} needs the {' and the '.join(lacking)}, which {train.name} does not describe")
         if like is not None and not self.accepts_like(like):
-            raise InputError(f"{self.name} cannot reuse the structure of a {like.kind}")
+            raise InputError(f"{self.name} cannot reuse the structure of {with_article(like.kind)}")
         self.grid, self.bounds = train.grid, bounding_box(train.position)
         try:
             self._fit(train, FitContext(like, torch.device(device), checkpoint, on_record, progress))
@@ -266,8 +267,7 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
         return check_positions(position).to(self.device)
 
     def _checked_grid(self, grid: AngularGrid | None) -> AngularGrid:
-        if not hasattr(self, "grid"):
-            raise InputError(f"this {self.kind} is not fitted; call fit first")
+        self.check_fitted()
         if grid is not None and grid != self.grid and not self.any_grid:
             raise InputError(f"{self.name} predicts spectra on the grid of its training spectra only")
         return grid or self.grid
@@ -347,7 +347,7 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
 
     def _facts(self) -> dict[str, str]:
         facts = {"model": self.kind}
-        if not hasattr(self, "grid"):
+        if not self.is_fitted:
             return facts | {"fitted": "no"}
         return facts | {
             "directions": f"{self.grid.shape[0]} x {self.grid.shape[1]}",
@@ -355,9 +355,7 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
         }
 
     def __repr__(self) -> str:
-        fitted = (
-            f"fitted, {self.grid.shape[0]} x {self.grid.shape[1]} directions" if hasattr(self, "grid") else "not fitted"
-        )
+        fitted = f"fitted, {self.grid.shape[0]} x {self.grid.shape[1]} directions" if self.is_fitted else "not fitted"
         return f"{type(self).__name__}({fitted})"
 
 
@@ -379,14 +377,19 @@ def make_model(name: str, preset: Preset = "quick", **options: Any) -> FieldMode
     Args:
         name: Name in the registry, e.g. "hybrid".
         preset: "quick", or "paper" for published settings; a model without published settings ignores it.
-        options: Options such as seed and validation. A model ignores options that it does not have.
+        options: Options such as seed and validation. A model ignores those that only other models have.
 
     Raises:
-        InputError: An unknown name, or a value outside its range.
+        InputError: An unknown name, an option that no model has, or a value outside its range.
 
     Example:
         >>> make_model("idw", seed=3).config.seed
         3
     """
     model_type: type[FieldModel] = FIELD_MODELS[name]
+    for option in options:
+        if not model_type.has_option(option) and not any(
+            FIELD_MODELS[other].has_option(option) for other in FIELD_MODELS
+        ):
+            raise InputError(f"no field model has an option {option!r}")
     return model_type.with_known(preset, options)

@@ -78,8 +78,8 @@ class Prediction(Labelled, Displayed):
         def span(values: Tensor | None) -> str:
             if values is None or not values.numel():
                 return "none"
-            low, high = (float(end) for end in values.detach().aminmax())
-            return f"{low:.4g} to {high:.4g}"
+            low, high = (f"{float(end):.4g}" for end in values.detach().aminmax())
+            return low if low == high else f"{low} to {high}"
 
         return {"shape": f"{tuple(self.mean.shape)}", "mean": span(self.mean), "std": span(self.std)}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from copy import copy
 from typing import ClassVar, Self
 
@@ -24,6 +25,10 @@ class Updatable:
     kind: ClassVar[str]
     grid: AngularGrid
     bounds: Tensor
+
+    @abstractmethod
+    def check_fitted(self) -> None:
+        """Raise InputError if the model is not fitted."""
 
     @single_thread()
     def update(self, new: Spectra) -> Self:
@@ -86,21 +91,20 @@ class Updatable:
 
     def _copy(self) -> Self:
         """Return a copy that shares all tensors."""
-        if not hasattr(self, "grid"):
-            raise InputError(f"this {self.kind} is not fitted; call fit first")
+        self.check_fitted()
         return copy(self)
 
     def _update(self, new: Spectra) -> None:
         """Add checked spectra to this copy."""
-        raise InputError(f"a {self.kind} cannot be updated; fit it again to all spectra")
+        raise InputError(f"{self.kind}: cannot be updated; fit it again to all spectra")
 
     def _forget(self, rows: Tensor) -> None:
         """Remove training spectra from this copy."""
-        raise InputError(f"a {self.kind} cannot forget single spectra; fit it again to the others")
+        raise InputError(f"{self.kind}: cannot forget single spectra; fit it again to the others")
 
     def _age(self, correlation: float) -> None:
         """Lower the weight of the training spectra of this copy."""
-        raise InputError(f"a {self.kind} cannot weigh earlier spectra less; fit it again to the new ones")
+        raise InputError(f"{self.kind}: cannot weigh earlier spectra less; fit it again to the new ones")
 
 
 def bounding_box(position: Tensor) -> Tensor:

@@ -92,6 +92,7 @@ class RssiPredictor(Configured, Displayed, ABC):
     batch_size: ClassVar[int] = 512
     """positions evaluated at a time, few enough to stay in the processor's cache"""
 
+    fitted_attribute = "receiver_names"
     receiver_names: tuple[str, ...]
     """names of the receivers, set by `fit`"""
     attenuation: FloorAttenuation | None = None
@@ -225,17 +226,14 @@ class RssiPredictor(Configured, Displayed, ABC):
         """Predict the RSSI at least where it is measured, with shapes of `predict` at the positions of the data."""
         return self.predict(data.transmitter_position)
 
-    def check_fitted(self) -> None:
-        """Raise InputError if the predictor is not fitted."""
-        if not hasattr(self, "receiver_names"):
-            raise InputError(f"this {type(self).__name__} is not fitted; call fit first")
-
     def _facts(self) -> dict[str, str]:
         return {"model": self.name, "receivers": listed(getattr(self, "receiver_names", ())) or "not fitted"}
 
     def __repr__(self) -> str:
-        fitted = f"fitted, {len(self.receiver_names)} receivers" if hasattr(self, "receiver_names") else "not fitted"
-        return f"{type(self).__name__}({fitted})"
+        if not self.is_fitted:
+            return f"{type(self).__name__}(not fitted)"
+        n = len(self.receiver_names)
+        return f"{type(self).__name__}(fitted, {n} {'receiver' if n == 1 else 'receivers'})"
 
 
 class SavedRssiPredictor(RssiPredictor, Saved):

@@ -313,6 +313,7 @@ class RssiModel(SavedRssiPredictor):
             >>> fit_rssi(swiftwrf.rssi_room(n=60)).plot("receiver03").get_title()
             'predicted RSSI of receiver03'
         """
+        self.check_fitted()
         return RssiMap.predict(self, height=height_m).plot(receiver, ax)
 
     def state(self) -> tuple[dict[str, Tensor], Header]:

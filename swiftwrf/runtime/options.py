@@ -17,7 +17,8 @@ class Configured:
 
     Args:
         config: Options as one object. Defaults to those of the preset.
-        preset: "quick" for the defaults, sized for a desktop; "paper" for the settings of the model's publication.
+        preset: "quick" for the defaults, sized for a desktop; "paper" for the settings of the model's publication, if it has
+            one.
         options: Single options, which replace those of `config`.
 
     Raises:
@@ -26,6 +27,8 @@ class Configured:
 
     config_type: ClassVar[type[Any]]
     """dataclass of the options"""
+    fitted_attribute: ClassVar[str]
+    """name of an attribute that only a fitted model has"""
 
     @checked
     def __init__(self, config: Any = None, *, preset: Preset = "quick", **options: Any) -> None:
@@ -34,17 +37,32 @@ class Configured:
         if unknown:
             raise InputError(f"{type(self).__name__} has no option {unknown[0]!r}; it has {', '.join(known)}")
         if config is None:
-            self.config = (self.config_type.paper if preset == "paper" else self.config_type)(**options)
+            published = getattr(self.config_type, "paper", self.config_type)
+            self.config = (published if preset == "paper" else self.config_type)(**options)
         elif isinstance(config, self.config_type):
             self.config = replace(config, **options)
         else:
             raise InputError(f"{type(self).__name__} takes a {self.config_type.__name__}, got {type(config).__name__}")
 
+    @property
+    def is_fitted(self) -> bool:
+        """True after `fit`, and for a model that was loaded."""
+        return hasattr(self, self.fitted_attribute)
+
+    def check_fitted(self) -> None:
+        """Raise InputError if the model is not fitted."""
+        if not self.is_fitted:
+            raise InputError(f"this {type(self).__name__} is not fitted; call fit first")
+
+    @classmethod
+    def has_option(cls, name: str) -> bool:
+        """Return True if the constructor takes an option of this name."""
+        return name in {field.name for field in fields(cls.config_type)}
+
     @classmethod
     def with_known(cls, preset: Preset, options: Mapping[str, Any]) -> Self:
         """Return a model with those of the options that it has."""
-        known = {field.name for field in fields(cls.config_type)}
-        return cls(preset=preset, **{option: value for option, value in options.items() if option in known})
+        return cls(preset=preset, **{name: value for name, value in options.items() if cls.has_option(name)})
 
 
 def from_plain(config_type: type[Any], options: Mapping[str, Any]) -> Any:

@@ -57,9 +57,9 @@ class Condition:
     Args:
         estimator: Name of the estimator.
         training: Training set. "measured": the measured spectra. "turbo": these and synthetic spectra at the withheld
-            positions. "turbo_extra": these and synthetic spectra at further positions. "all": all spectra, measured.
+            positions. "turbo_extra": these and synthetic spectra at extra positions. "all": all spectra, measured.
         synthesizer: Name of the field model of the synthetic spectra, empty without any.
-        n_synthetic: Number of further synthetic positions.
+        n_synthetic: Number of extra synthetic positions.
         measured_fraction: Fraction of the training spectra that is measured.
         repeat: Number of the repeat.
 
@@ -100,13 +100,13 @@ class Condition:
         """Training set in words."""
         match self.training:
             case "measured":
-                return "measured alone"
+                return "measured only"
             case "all":
-                return "everything measured"
+                return "all measured"
             case "turbo":
                 return f"with synthetic spectra ({self.synthesizer})"
             case "turbo_extra":
-                return f"with {self.n_synthetic:,} further synthetic spectra ({self.synthesizer})"
+                return f"with {self.n_synthetic:,} extra synthetic spectra ({self.synthesizer})"
 
     @property
     def subset(self) -> MeasuredSubset:
@@ -214,14 +214,14 @@ def reference_of(conditions: Mapping[str, Condition], error: Mapping[str, float]
 def pooled(results: list[tuple[Condition, Value]], auto: bool) -> list[tuple[Condition, Value]]:
     """Return results such that every condition with synthetic spectra has all repeats of its measured fraction.
 
-    A repeat stands for a user, who chooses a field model and the number of further positions by cross-validation. Where
-    repeats chose differently, the choices of all repeats become one condition. The network is trained with further positions
+    A repeat stands for a user, who chooses a field model and the number of extra positions by cross-validation. Where
+    repeats chose differently, the choices of all repeats become one condition. The network is trained with extra positions
     or without them, other estimators both ways.
 
     Args:
         results: Results by condition.
         auto: Whether the repeats choose their field model. Their choices then become the condition `turbo_auto`. Otherwise
-            `turbo_NAME_extra` contains the result without further positions of those repeats that were advised against them.
+            `turbo_NAME_extra` contains the result without extra positions of those repeats that were advised against them.
     """
     trainings: dict[tuple[float, str], dict[int, set[tuple[str, str]]]] = {}
     for condition, _ in results:
@@ -253,7 +253,7 @@ def terms() -> dict[str, str]:
         "measured_only": "lower reference: trained on the measured spectra alone",
         "measured_all": "upper reference: trained on all training spectra, measured",
         "turbo_NAME": "trained on the measured spectra and on spectra that NAME predicts at the withheld positions",
-        "turbo_NAME_extra": "turbo_NAME with synthetic spectra at further positions, their number by --extra",
+        "turbo_NAME_extra": "turbo_NAME with synthetic spectra at extra positions, their number by --extra",
         "turbo_auto": "the choice of each repeat by cross-validation, where repeats chose differently",
         **{name: label.meaning for name, label in labels.labels(ESTIMATORS, labels.ESTIMATORS).items()},
         LOCATOR: labels.ESTIMATORS[LOCATOR].meaning,

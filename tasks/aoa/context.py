@@ -28,7 +28,7 @@ class Experiment:
         config: Options of the run.
         train: Training spectra of the split.
         test: Test spectra of the split.
-        n_synthetic: Largest number of further synthetic positions.
+        n_synthetic: Largest number of extra synthetic positions.
         device: Device to compute on.
     """
 
@@ -62,8 +62,8 @@ class Experiment:
         return has_room and not (name == RAYTRACE and self.config.scene is not None)
 
     def n_extra(self, validation: CrossValidationMetrics | None) -> int:
-        """Return the number of further synthetic positions of a field model that trains estimators."""
-        # by default only where held-out measured spectra gain from further positions
+        """Return the number of extra synthetic positions of a field model that trains estimators."""
+        # by default only where held-out measured spectra gain from extra positions
         wanted = self.config.extra is not None or bool(validation and validation["recommended_n_synthetic"])
         return self.n_synthetic if wanted else 0
 

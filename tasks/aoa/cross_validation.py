@@ -45,7 +45,7 @@ class CrossValidation:
     Args:
         metrics: Values for metrics.json.
         measured_only: Angular errors [deg] on the held-out spectra of each fold, trained on measured spectra alone.
-        turbo: The same with synthetic spectra, their number chosen on the other folds. Empty without further positions.
+        turbo: The same with synthetic spectra, their number chosen on the other folds. Empty without extra positions.
     """
 
     metrics: CrossValidationMetrics

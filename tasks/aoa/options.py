@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 AUTO = "auto"  # --synthesizer: the field model that cross-validation chooses
 RAYTRACE = "raytrace"  # the field model that takes --scene
 PAPER_FRACTIONS = (0.1, 0.3, 0.5, 0.7)
-DEFAULT_EXTRA = 3000  # further synthetic positions where cross-validation recommends some
+DEFAULT_EXTRA = 3000  # extra synthetic positions where cross-validation recommends some
 
 
 @command_options
@@ -52,7 +52,7 @@ class AoaConfig(SpectraSource, Output):
     """room of tasks.scenes or Mitsuba scene (FILE.xml) for --synthesizer raytrace, in the coordinates of the data (default:
     the room that it estimates from the spectra)"""
     extra: int | None = None
-    """number of further synthetic positions in the region of the measured ones (default: 3000 if cross-validation on the
+    """number of extra synthetic positions in the region of the measured ones (default: 3000 if cross-validation on the
     measured spectra shows a gain, else none; none with --preset paper)"""
     suggest: int = 0
     """number of positions to suggest for the next measurements, those that reduce the uncertainty over the region most"""
@@ -153,7 +153,7 @@ def check_data(data: Spectra, config: AoaConfig) -> None:
 
 
 def n_synthetic(data: Spectra, config: AoaConfig) -> int:
-    """Return the largest number of further synthetic positions.
+    """Return the largest number of extra synthetic positions.
 
     Raises:
         InputError: --extra asks for some, but the direction at other positions is unknown.

@@ -120,13 +120,13 @@ class RoomSearch(Step[Experiment]):
 
 @dataclass(frozen=True)
 class Synthesis(Step[Experiment]):
-    """Predict spectra by one field model at test, withheld and further positions.
+    """Predict spectra by one field model at test, withheld and extra positions.
 
     Args:
         subset: Measured spectra.
         synthesizer: Name of the field model.
         trains: Whether its spectra train estimators. Otherwise it predicts at the test positions alone, for comparison.
-        n_synthetic: Number of further synthetic positions.
+        n_synthetic: Number of extra synthetic positions.
         sampled: Train with samples in place of means.
         room: Search for the room that the model reuses, if any.
         room_seconds: Time of that search [s], which counts as part of the fit.

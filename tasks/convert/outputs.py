@@ -10,6 +10,7 @@ from swiftwrf import FieldModel, InputError, Prediction, RssiModel, load
 from swiftwrf.data.labelled import Labelled, write_mat
 from swiftwrf.data.rasters import Cells, write_geojson, write_geotiff, write_world_file
 from swiftwrf.data.receivers import read_places
+from swiftwrf.errors import with_article
 from swiftwrf.locate import RssiLocator
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.runtime.checkpoint import Saved
@@ -36,7 +37,7 @@ def saved_model(source: Path) -> FieldModel | RssiModel | None:
     model: Saved = load(file)
     model = model.model if isinstance(model, RssiLocator) else model
     if not isinstance(model, FieldModel | RssiModel):
-        raise InputError(f"{file} holds a {model.kind}, which predicts neither spectra nor RSSI")
+        raise InputError(f"{file} holds {with_article(model.kind)}, which predicts neither spectra nor RSSI")
     return model
 
 

@@ -13,11 +13,11 @@ from tasks.options import SpectraSource, command_options
 class EstimateConfig(SpectraSource):
     """Directions from spectra, by an estimator that `python -m tasks.aoa` trained and left in its run's directory.
 
-    Example: python -m tasks.estimate runs/aoa/first/aann-mix0.3.safetensors DIR
+    Example: python -m tasks.estimate runs/aoa/first/aann_kernel-mix0.3.safetensors DIR
     """
 
     estimator: Annotated[str, tyro.conf.Positional]
-    """file of the estimator, e.g. runs/aoa/first/aann-mix0.3.safetensors or matched_field-mix0.3.safetensors"""
+    """file of the estimator, e.g. runs/aoa/first/aann_kernel-mix0.3.safetensors or matched_field-mix0.3.safetensors"""
     source: Annotated[str, tyro.conf.Positional]
     """measurements of any format that tasks.aoa takes, or spectra of unknown positions: a .npy file (n, elevations,
     azimuths) of magnitudes in [0, 1]"""

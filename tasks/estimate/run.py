@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 
 from swiftwrf import InputError, load
+from swiftwrf.errors import with_article
 from swiftwrf.locate import MatchedField
 from swiftwrf.metrics import angle_errors
 from tasks.aoa.estimators import SavedEstimator
@@ -26,7 +27,9 @@ def run(config: EstimateConfig) -> None:
     check_new_table(out)
     estimator = load(config.estimator)
     if not isinstance(estimator, SavedEstimator | MatchedField):
-        raise InputError(f"{config.estimator} holds a {estimator.kind}; give an estimator that tasks.aoa trained")
+        raise InputError(
+            f"{config.estimator} holds {with_article(estimator.kind)}; give an estimator that tasks.aoa trained"
+        )
     store, known = observed_spectra(config.source, reading(config), estimator.grid, "estimator")
     estimate = torch.cat([estimator.predict(part) for part in store.batches()])
     columns = {"azimuth_deg": estimate[:, 0].rad2deg(), "elevation_deg": estimate[:, 1].rad2deg()}
@@ -37,5 +40,8 @@ def run(config: EstimateConfig) -> None:
     index = torch.arange(len(store)) if known is None else known.index
     rows = zip(index.tolist(), *(column.tolist() for column in columns.values()), strict=True)
     write_table(out, rounded(dict(zip(("index", *columns), row, strict=True)) for row in rows))
-    error = f", median error {columns['great_circle_deg'].median():.2f} degrees" if known is not None else ""
+    error = ""
+    if known is not None:
+        median = columns["great_circle_deg"].median()
+        error = f", median error {median:.2f} degrees, too low if these spectra trained the estimator"
     print(f"{len(store)} directions{error}: {out}")

@@ -38,7 +38,7 @@ def page(data: Spectra | Rssi, kind: str, findings: Findings, source: str) -> Pa
     """Return the page: findings and figures of what was read from a source."""
     rows = [[finding.level, finding.text] for finding in findings.sentences]
     warnings = [finding.text for finding in findings.sentences if finding.level == "warning"]
-    table = Table(["", ""], rows, strong=frozenset(["warning"]), long=True)
+    table = Table(["level", "finding"], rows, strong=frozenset(["warning"]), long=True)
     plan, *plots = _rssi(data) if isinstance(data, Rssi) else _spectra(data)
     position = data.transmitter_position if isinstance(data, Rssi) else data.position
     extent = " x ".join(f"{side:.2f}" for side in (position.amax(dim=0) - position.amin(dim=0)).tolist())
@@ -76,7 +76,7 @@ def _spectra(data: Spectra) -> list[Plot]:
 
 
 def _rssi(data: Rssi) -> list[Plot]:
-    return [_floor(data), *([_against_distance(data)] if data.located else []), _heard(data)]
+    return [_floor(data), *([_against_distance(data)] if data.located else []), _detected(data)]
 
 
 def _places(position: Tensor, **columns: Tensor) -> DataFrame:
@@ -192,13 +192,13 @@ def _against_distance(data: Rssi) -> Plot:
     return Plot("path-loss", [figure], "RSSI against the distance from the receiver.", table)
 
 
-def _heard(data: Rssi) -> Plot:
-    share = (~data.rssi_dbm.isnan()).double().mean(dim=0)
-    order = share.argsort(descending=True)[:MAX_RECEIVERS].tolist()
+def _detected(data: Rssi) -> Plot:
+    fraction = (~data.rssi_dbm.isnan()).double().mean(dim=0)
+    order = fraction.argsort(descending=True)[:MAX_RECEIVERS].tolist()
     names = [figures.short(data.receiver_names[i]) for i in order]
     figure, ax = figures.panel(max(4.0, 0.3 * len(order) + 2), 3)
-    ax.bar(np.arange(len(order)), share[order].numpy(), color=DOTS)
-    ax.set(xticks=range(len(order)), xticklabels=names, ylabel="share detected", ylim=(0, 1))
+    ax.bar(np.arange(len(order)), fraction[order].numpy(), color=DOTS)
+    ax.set(xticks=range(len(order)), xticklabels=names, ylabel="fraction of rows", ylim=(0, 1))
     ax.tick_params(axis="x", labelrotation=60)
-    table = DataFrame({"receiver": data.receiver_names, "share_heard": share.numpy()})
+    table = DataFrame({"receiver": data.receiver_names, "fraction_detected": fraction.numpy()})
     return Plot("detected", [figure], "Fraction of the rows in which each receiver detected the transmitter.", table)

@@ -17,7 +17,7 @@ from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.formats import RSSI_FORMATS, read
 from swiftwrf.data.store import Store
 from swiftwrf.data.survey import SUFFIXES, first_rows, has_positions, read_frame
-from swiftwrf.errors import listed
+from swiftwrf.errors import listed, with_article
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
 from swiftwrf.locate.track import joined
 from swiftwrf.metrics import angle_errors
@@ -49,7 +49,8 @@ def write_positions(config: LocateConfig) -> None:
         columns = _of_spectra(model, config, config.source)
     else:
         raise InputError(
-            f"{config.model} holds a {model.kind}, which locates nothing; give {RssiLocator.kind!r} or {MatchedField.kind!r}"
+            f"{config.model} holds {with_article(model.kind)}, which locates nothing; give {RssiLocator.kind!r} or "
+            f"{MatchedField.kind!r}"
         )
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     write_table(out, rounded(dict(zip(columns, row, strict=True)) for row in rows))
@@ -57,7 +58,7 @@ def write_positions(config: LocateConfig) -> None:
     error = ""
     if "position_error_m" in columns:
         values["median_error_m"] = float(columns["position_error_m"].median())
-        error = f", median error {values['median_error_m']:.2f} m"
+        error = f", median error {values['median_error_m']:.2f} m, too low if these rows trained the locator"
     terminal.page(values, f"{values['n_positions']} positions{error}: {out}")
 
 

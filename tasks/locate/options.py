@@ -42,7 +42,7 @@ class LocateConfig(SpectraSource, OffsetSource, Output):
     rx: tuple[str, ...] = ("all",)
     """receivers: names, numbers counted from 1, or all"""
     track: float | None = None
-    """rows of SOURCE are a walk: smooths its positions by this typical speed [m/s], or [m] a row without a column of time"""
+    """rows of SOURCE are a walk: smooths its positions by this typical speed [m/s]. Rows without times are 1 s apart"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
     cells: int = 4000

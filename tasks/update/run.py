@@ -11,6 +11,7 @@ import torch
 from swiftwrf import FieldModel, InputError, Rssi, Spectra, load
 from swiftwrf.data import ReadOptions, Snapshots
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
+from swiftwrf.errors import with_article
 from swiftwrf.online import Follower, MonitorConfig
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime import checkpoint
@@ -105,7 +106,9 @@ def _model(path: str) -> FieldModel | RssiModel:
     model = load(path)
     if isinstance(model, RssiModel) or (isinstance(model, FieldModel) and model.updates):
         return model
-    raise InputError(f"{path} holds a {model.kind}, which cannot be updated; fit it again to all measurements")
+    raise InputError(
+        f"{path} holds {with_article(model.kind)}, which cannot be updated; fit it again to all measurements"
+    )
 
 
 def _training(config: UpdateConfig, options: ReadOptions, model: FieldModel | RssiModel) -> Spectra | Rssi | None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from swiftwrf import InputError, Rssi, load
+from swiftwrf.errors import with_article
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator
 from swiftwrf.locate.rssi import UNDETECTED_BELOW_DB
 from swiftwrf.positions import nearest
@@ -214,7 +215,9 @@ class SpectrumLocating:
         """
         locator = load(self._file)
         if not isinstance(locator, MatchedField):
-            raise InputError(f"{self._file} holds a {locator.kind}, expected a {MatchedField.kind}")
+            raise InputError(
+                f"{self._file} holds {with_article(locator.kind)}, expected {with_article(MatchedField.kind)}"
+            )
         return locator
 
     def located(self, spectrum: Tensor, truth: Tensor) -> Located:

@@ -10,6 +10,7 @@ import torch
 
 from augment import withhold
 from swiftwrf import FIELD_MODELS, FieldModel, InputError, RssiModel, Spectra, load
+from swiftwrf.errors import with_article
 from swiftwrf.locate import RssiLocator
 from swiftwrf.runtime.checkpoint import Saved, refusing
 from tasks.aoa.artifacts import model_file
@@ -71,7 +72,7 @@ def _saved_model(file: Path) -> SpectraView | RssiView:
 
 def _field_model(model: Saved) -> FieldModel:
     if not isinstance(model, FieldModel):
-        raise InputError(f"a {model.kind} cannot be shown; {EXPECTED}")
+        raise InputError(f"{with_article(model.kind)} cannot be shown; {EXPECTED}")
     return model
 
 
@@ -134,7 +135,7 @@ def _locate_run(folder: Path, content: Row) -> RssiView:
         raise InputError(f"{folder} holds no model: it has no {LOCATOR}; the run did not end")
     locator = load(file)
     if not isinstance(locator, RssiLocator):
-        raise InputError(f"{file} holds a {locator.kind}, expected a {RssiLocator.kind}")
+        raise InputError(f"{file} holds {with_article(locator.kind)}, expected {with_article(RssiLocator.kind)}")
     with refusing(f"the records in {folder} are not those of a run"):
         config = configured(LocateConfig, content["config"], folder)
         try:
@@ -161,6 +162,6 @@ def _rssi_run(folder: Path) -> RssiView:
         raise InputError(f"{folder} holds no model: it has no {MODEL}; the run did not end, or is of an older version")
     model = load(file)
     if not isinstance(model, RssiModel):
-        raise InputError(f"{file} holds a {model.kind}, expected a {RssiModel.kind}")
+        raise InputError(f"{file} holds {with_article(model.kind)}, expected {with_article(RssiModel.kind)}")
     with refusing(f"the maps in {folder} are not those of a run"), np.load(folder / "maps.npz") as stored:
         return RssiView(folder.name, model, MeasuredFloor.from_run(dict(stored)), folder=folder)

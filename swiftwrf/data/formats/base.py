@@ -119,7 +119,7 @@ def read(path: str | Path, options: ReadOptions, *registries: Registry[Format[An
             what the format refuses.
     """
     source = Path(path)
-    known = ", ".join(name for registry in registries for name in registry)
+    known = ", ".join(dict.fromkeys(name for registry in registries for name in registry))
     if not os.path.isdir(source) and not os.path.isfile(source):  # Path.is_dir raises for a name that is too long
         raise InputError(f"{source} is not a folder or file; expected measurements (formats: {known})")
     try:
@@ -145,8 +145,7 @@ def _find(source: Path, known: str, registries: tuple[Registry[Any], ...]) -> tu
     readers = [(name, registry[name]()) for registry in registries for name in registry]
     found = [(name, reader) for name, reader in readers if reader.recognises(source)]
     if not found:
-        kinds = " or ".join(registry.kind for registry in registries)
-        raise InputError(f"{source} holds no {kinds} that is known ({known}); docs/formats.md describes them")
+        raise InputError(f"{source} is in none of the known formats ({known}); docs/formats.md describes them")
     if len(found) > 1:
         names = " and ".join(name for name, _ in found)
         raise InputError(f"{source} holds several formats ({names}); keep one in the folder, or name the file itself")

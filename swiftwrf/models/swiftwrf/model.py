@@ -76,6 +76,7 @@ class SwiftWRF(ProcessModel):
         Raises:
             InputError: A model that was not fitted by regression, or by an earlier version.
         """
+        self.check_fitted()
         deformation = self.field.deformation
         if not isinstance(deformation, LowRankDeformation) or deformation.field.value is None:
             raise InputError("only a regression can be updated, by the version that saved it; fit the model again")

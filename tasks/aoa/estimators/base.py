@@ -97,7 +97,13 @@ class SavedEstimator(Estimator, Saved):
     """
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
-        """Return the fitted tensors by name, and plain values."""
+        """Return the fitted tensors by name, and plain values.
+
+        Raises:
+            InputError: An estimator that is not fitted.
+        """
+        if not hasattr(self, "grid"):
+            raise InputError(f"this {type(self).__name__} is not fitted; call fit first")
         tensors, header = self._state()
         return tensors, header | {"config": asdict(self.config), "grid": asdict(self.grid)}
 

@@ -88,8 +88,7 @@ def compared(fractions: list[FractionRecords]) -> tuple[Table, Plot]:
     for fraction in fractions:
         methods = {name: fraction.mix["methods"][name]["great_circle_deg"] for name in essential(fraction)}
         every.append(Compared(fraction.scene, methods, {}))
-    first = fractions[0]
-    shown = ["peak", reference(first), turbo_method(first), "measured_all"]
+    shown = [*BASELINES, *map(reference, fractions), *map(turbo_method, fractions), LOCATOR, "measured_all"]
     conditions = [condition for fraction in fractions for condition in fraction.conditions.values()]
-    names = [name for name in dict.fromkeys([*shown, "constant"]) if any(name in one.errors for one in every)]
+    names = [name for name in dict.fromkeys(shown) if any(name in one.errors for one in every)]
     return comparison(every, palette(conditions), names, "deg", "angular error")

@@ -49,7 +49,7 @@ def results_section(fraction: FractionRecords) -> Section:
     )
     table = Table(columns, rows, caption, frozenset(BASELINES))
     parts = [[name, *(str(n) for n in counts.values())] for name, counts in fraction.mix["counts"].items()]
-    origin = Table(["training set", "measured", "withheld positions", "further positions"], parts, "Spectra by origin.")
+    origin = Table(["training set", "measured", "withheld positions", "extra positions"], parts, "Spectra by origin.")
     part = estimator_section(fraction)
     return Section(
         "", paragraphs, [table, *gain_table(fraction), origin], [_cdf(fraction)], parts=[part] if part else []

@@ -25,7 +25,7 @@ FIXED, MEASURED, IMAGE = "#cf4a4a", "#3a7fd5", "#d1620f"
 
 
 def _cross_validations(fraction: FractionRecords) -> dict[str, CrossValidationMetrics]:
-    """Return the cross-validation of each field model, if it has further positions. Older runs have the chosen one alone."""
+    """Return the cross-validation of each field model, if it has extra positions. Older runs have the chosen one alone."""
     validation: dict[str, Any] = dict(fraction.mix["cross_validation"] or {})
     choice = fraction.mix["choice"]
     if "stand_in" in validation and choice is not None:
@@ -41,7 +41,7 @@ def cross_validation_sentences(fraction: FractionRecords) -> list[str]:
         how = "chosen on other held-out spectra" if validation.get("rule") else "chosen on the same spectra"
         found = (
             f"Cross-validation inside the measured fraction ({validation['n_held_out']} spectra held out, "
-            f"{validation['stand_in']} as stand-in for the network): spectra "
+            f"{validation['stand_in']} in place of the network): spectra "
             f"{'sampled' if validation['sampled'] else 'predicted'} by {name} at synthetic positions change the "
             f"median error by {rule['change']:+.0%} [{rule['low']:+.0%}, {rule['high']:+.0%}], from "
             f"{validation['measured_only_deg']:.2f} to {rule['median_deg']:.2f} degrees, with their number {how}. "
@@ -68,7 +68,7 @@ def _best_and_rule(validation: CrossValidationMetrics) -> tuple[GainMetrics, Cha
 
 
 def choice_section(fraction: FractionRecords) -> Section | None:
-    """Return the comparison of the field models, and the gain over the number of further positions."""
+    """Return the comparison of the field models, and the gain over the number of extra positions."""
     choice = fraction.mix["choice"]
     if choice is None:
         return None
@@ -107,7 +107,7 @@ def _gain(fraction: FractionRecords, name: str, validation: CrossValidationMetri
             ax.fill_between(at, *_band(gains), color=colour, alpha=0.15, linewidth=0)
     ax.axhline(0, color=figures.RULE, linewidth=1)
     ax.set_xlim(0, 1.02 * max(ends))
-    ax.set(xlabel="further positions with synthetic spectra", ylabel="change of the median error [%]")
+    ax.set(xlabel="extra positions with synthetic spectra", ylabel="change of the median error [%]")
     figures.end_labels(ax)
     caption = (
         f"Held-out measured spectra, {validation['stand_in']} trained on the other measured spectra and on spectra by "

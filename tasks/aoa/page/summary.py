@@ -66,9 +66,10 @@ def conclusion(fraction: FractionRecords) -> str:
     turbo = turbo_method(fraction)
     best = reference(fraction)
     if change := changes_of(fraction, turbo).get(best):
+        without = "that uses neither them nor the room" if LOCATOR in medians else "without them"
         sentences.append(
             f"With synthetic spectra {learner(fraction)} changes the median error by {change_text(change)} against {best}, "
-            f"the best estimator without them: {judgement(change)}."
+            f"the best estimator {without}: {judgement(change)}."
         )
     else:
         sentences.append(

@@ -8,14 +8,13 @@ from tasks.claim import LOCATOR
 from tasks.metrics import LocateMetrics
 from tasks.page.page import Number, Plot, Summary
 from tasks.page.records import Records, notes
-from tasks.summarise import verdict_of_difference
+from tasks.summarise import coverage_warning, verdict_of_difference
 from tasks.terminal import Answer
 
 LocateRecords = Records[LocateMetrics]
 OWN = "posterior"  # the localizer that all others are compared with
 NEIGHBOURS = ("knn", "knn_difference")
 LEVEL = 0.8  # probability of the credible regions in the summary
-MAX_COVERAGE_ERROR = 0.05  # difference from the nominal coverage above which the report warns
 
 
 def summary(run: LocateRecords, picture: Plot) -> Summary:
@@ -68,10 +67,8 @@ def _next_steps(run: LocateRecords) -> list[str]:
         f"Locate new observations: `python -m tasks.locate {run.path}/{LOCATOR} SOURCE`.",
     ]
     coverage = run.metrics["calibration"][str(LEVEL)]
-    if abs(coverage - LEVEL) > MAX_COVERAGE_ERROR:
-        steps.append(
-            "The credible regions are not calibrated on these rows; take their radii as a ranking, not as a promise."
-        )
+    if warning := coverage_warning("credible regions", coverage, LEVEL, run.metrics["n_test"]):
+        steps.append(warning)
     if run.metrics["split"] == "random":
         steps.append("Run `--split block`: it shows the error in a region where nothing was measured.")
     return steps

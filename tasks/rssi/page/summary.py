@@ -8,12 +8,11 @@ from pandas import DataFrame
 from tasks.metrics import RssiMetrics
 from tasks.page.maps import inside
 from tasks.page.records import Records
-from tasks.summarise import verdict_of_difference
+from tasks.summarise import coverage_warning, verdict_of_difference
 from tasks.terminal import Answer
 
 RssiRecords = Records[RssiMetrics]
 MIN_RATIO = 1.2  # of the widest interval inside to the median one, for which more positions are proposed
-MAX_COVERAGE_ERROR = 0.05  # difference from the nominal coverage above which the report warns
 
 
 def answer(run: RssiRecords) -> Answer:
@@ -57,10 +56,8 @@ def next_steps(run: RssiRecords) -> list[str]:
     steps.append(
         f"Predict anywhere: `swiftwrf.load('{run.path}/model.safetensors').predict(positions)`, with intervals."
     )
-    if abs(interval["coverage"] - interval["nominal"]) > MAX_COVERAGE_ERROR:
-        steps.append(
-            "The intervals are not calibrated on these rows; take their widths as a ranking, not as a promise."
-        )
+    if warning := coverage_warning("intervals", interval["coverage"], interval["nominal"], run.metrics["n_test"]):
+        steps.append(warning)
     if pairs and run.metrics["split"] != "place":
         steps.append("Run `--split place`: it shows the error of a receiver at positions where it measured nothing.")
     elif run.metrics["split"] == "random":

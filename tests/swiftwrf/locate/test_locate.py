@@ -236,6 +236,25 @@ def test_unknown_options_are_refused(locator):
         locator(cells=4)
 
 
+def test_spectra_at_one_position_are_held_out_together():
+    train = simulated_room(n=40, seed=3, grid=AngularGrid.hemisphere(15, 60))
+    twice = train.subset(torch.arange(len(train)).repeat_interleave(2))
+    room = GeometryModel.of_planes(train, ROOM)
+    once, repeated = (MatchedField(**SMALL).fit(some, room=room).residual for some in (train, twice))
+    # those of path gains that follow the position, which a spectrum at the same position would lower
+    assert repeated[1].norm(dim=1).median() == pytest.approx(float(once[1].norm(dim=1).median()), rel=0.1)
+
+
+@pytest.mark.parametrize("locator", [MatchedField, RssiLocator])
+def test_a_locator_that_is_not_fitted_is_refused(locator, tmp_path):
+    unfitted = locator(preset="paper")  # there are no published settings
+    assert repr(unfitted) == f"{locator.__name__}(not fitted)"
+    with pytest.raises(InputError, match="call fit first"):
+        unfitted.locate(torch.zeros(1, 12))
+    with pytest.raises(InputError, match="call fit first"):
+        unfitted.save(tmp_path / "locator.safetensors")
+
+
 def test_missing_values_count_as_missing():
     maps = RssiMaps(torch.tensor([[-60.0, -70.0, -80.0]]), torch.full((1, 3), 2.0))
     likelihood = ValueLikelihood(torch.eye(3, dtype=torch.float64), math.inf)

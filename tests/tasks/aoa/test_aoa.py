@@ -646,7 +646,7 @@ def test_the_room_is_searched_once_for_all_models_with_one(room, glances, tmp_pa
 
 
 def test_cross_validation_is_that_of_each_field_model(small):
-    """A model without cross-validation adds no further positions by default."""
+    """A model without cross-validation adds no extra positions by default."""
     given = AoaConfig((0.5,), synthesizer=("idw", "gp", "vae"))
     train, test = small.split("random", 0)
     data = context.Experiment(given, train, test, 3000, torch.device("cpu"))

@@ -49,7 +49,7 @@ def test_the_choices_of_all_repeats_are_one_condition():
     found = pooled(given, auto=True)
     methods = {condition.method for condition, _ in found}
     assert methods == {"measured_only", "turbo_auto", "kernel_regression_turbo_auto"}
-    assert values(found, "turbo_auto") == [1, 12]  # with further positions if there are some
+    assert values(found, "turbo_auto") == [1, 12]  # with extra positions if there are some
     assert values(found, "kernel_regression_turbo_auto") == [2, 13]
     assert values(found, "measured_only") == [0, 10]
 
