@@ -44,7 +44,7 @@ def _missed(value: float, target: str, unit: str, larger_is_better: bool) -> lis
     return [] if short < 0.5 * 10**-digits else [f"{short:.{digits}f} {unit}".strip()]
 
 
-def _verdict(missed: Sequence[str]) -> str:
+def _state(missed: Sequence[str]) -> str:
     return f"missed by {' and '.join(missed)}" if missed else "met"
 
 
@@ -56,7 +56,7 @@ def synthesis_targets() -> str:
         scores = scenes[scene]["synthesizers"]["swiftwrf"]
         own = {name: scores[name]["median"] for name in ("ssim", "psnr_db")}
         missed = _missed(own["ssim"], ssim, "(SSIM)", True) + _missed(own["psnr_db"], psnr, "dB", True)
-        rows.append([scene, f"{ssim} / {psnr}", f"{own['ssim']:.3f} / {own['psnr_db']:.1f}", _verdict(missed)])
+        rows.append([scene, f"{ssim} / {psnr}", f"{own['ssim']:.3f} / {own['psnr_db']:.1f}", _state(missed)])
     return markdown(["scene, split", "target", "swiftwrf", ""], rows)
 
 
@@ -80,7 +80,7 @@ def aoa_targets() -> str:
         target += ", below everything measured" if share in below_all else ""
         if target:
             who = f"{scene}, {metrics['moving']} moves"
-            rows.append([who, f"{float(share):.0%}", target, change_text(found), _verdict(missed)])
+            rows.append([who, f"{float(share):.0%}", target, change_text(found), _state(missed)])
     return markdown(["scene, split", "measured", "target against measured_only", "measured", ""], rows)
 
 
@@ -91,5 +91,5 @@ def rssi_targets() -> str:
     for scene, (median, p90) in RSSI.items():
         own = found[scene]["methods"]["swiftwrf"]["abs_error_db"]
         missed = _missed(own["median"], median, "dB (median)", False) + _missed(own["p90"], p90, "dB (90 %)", False)
-        rows.append([scene, f"{median} / {p90}", f"{own['median']:.2f} / {own['p90']:.1f}", _verdict(missed)])
+        rows.append([scene, f"{median} / {p90}", f"{own['median']:.2f} / {own['p90']:.1f}", _state(missed)])
     return markdown(["data, split", "target", "swiftwrf", ""], rows)

@@ -71,7 +71,7 @@ def paired_difference(errors: DataFrame, method: str, other: str) -> tuple[float
     return mean, float(low), float(high)
 
 
-def verdict_of_difference(
+def comparison_sentence(
     errors: DataFrame, method: str, other: str, *, name: str, unit: str, rows: str, n_test: int
 ) -> str:
     """Return one sentence that compares the mean errors of two methods.

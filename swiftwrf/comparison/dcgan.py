@@ -84,10 +84,10 @@ class Discriminator(nn.Module):
     def __init__(self, grid: AngularGrid, width: int, encoded: int) -> None:
         super().__init__()
         self.features, features = encoder(grid, width, inputs=1, norm=nn.BatchNorm2d)
-        self.verdict = nn.Linear(features + encoded, 1)
+        self.head = nn.Linear(features + encoded, 1)
 
     def forward(self, spectrum: Tensor, encoded: Tensor) -> Tensor:
-        logit: Tensor = self.verdict(torch.cat([self.features(spectrum[:, None]), encoded], dim=-1))
+        logit: Tensor = self.head(torch.cat([self.features(spectrum[:, None]), encoded], dim=-1))
         return logit[:, 0]
 
 

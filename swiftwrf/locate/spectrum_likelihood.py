@@ -50,8 +50,8 @@ class SpectrumFeatures:
         numbers = coarray_numbers(spectra, array, grid)
         channel, _ = retrieve_phases(numbers, array, seed)
         opposite = array.opposite
-        twins = [channel] if opposite is None else [channel, channel.conj()[:, opposite]]
-        return cls(real_parts(numbers), torch.stack(twins, dim=1).to(torch.complex64))
+        aliases = [channel] if opposite is None else [channel, channel.conj()[:, opposite]]
+        return cls(real_parts(numbers), torch.stack(aliases, dim=1).to(torch.complex64))
 
     def subset(self, rows: Tensor) -> SpectrumFeatures:
         """Return the features of some of the spectra."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.data import Rssi, Spectra
-from swiftwrf.positions import distance
+from swiftwrf.rssi import fit_path_loss, log_distance
 from tasks.inspect.findings.base import Findings
 from tasks.inspect.findings.positions import nearest
 from tasks.page import figures
@@ -177,19 +177,22 @@ def _floor(data: Rssi) -> Plot:
 
 def _against_distance(data: Rssi) -> Plot:
     figure, ax = figures.panel(6, 3.6)
-    apart = distance(data.transmitter_position, data.receiver_position)
-    for c, name in enumerate(data.receiver_names[:MAX_RECEIVERS]):
-        ax.plot(apart[:, c], data.rssi_dbm[:, c], ".", markersize=2, label=figures.short(name))
+    located = data.receiver_located
+    log10, rssi = log_distance(data.transmitter_position, data.receiver_position[located]), data.rssi_dbm[:, located]
+    ax.plot((10**log10).flatten(), rssi.flatten(), ".", markersize=2, color=DOTS, alpha=0.5)
+    model, ends = fit_path_loss(log10, rssi, shared=True), torch.stack(log10[~rssi.isnan()].aminmax())
+    ax.plot(10**ends, model.level + model.slope * ends, color="black", linewidth=1.5)
     ax.set(xlabel="distance from the receiver [m]", ylabel="RSSI [dBm]", xscale="log")
-    row, column = (~data.rssi_dbm.isnan()).nonzero(as_tuple=True)
+    row, column = (~rssi.isnan()).nonzero(as_tuple=True)
     table = DataFrame(
         {
-            "receiver": np.array(data.receiver_names)[column.numpy()],
-            "distance_m": apart[row, column].numpy(),
-            "rssi_dbm": data.rssi_dbm[row, column].numpy(),
+            "receiver": np.array(data.receiver_names)[located.numpy()][column.numpy()],
+            "distance_m": (10 ** log10[row, column]).numpy(),
+            "rssi_dbm": rssi[row, column].numpy(),
         }
     )
-    return Plot("path-loss", [figure], "RSSI against the distance from the receiver.", table)
+    caption = "RSSI against the distance from the receiver. The line is a path-loss model of all receivers."
+    return Plot("path-loss", [figure], caption, table)
 
 
 def _detected(data: Rssi) -> Plot:

@@ -47,11 +47,11 @@ def cross_validation_sentences(fraction: FractionRecords) -> list[str]:
             f"{validation['measured_only_deg']:.2f} to {rule['median_deg']:.2f} degrees, with their number {how}. "
             f"The best number is {best['n_synthetic']}."
         )
-        texts.append(f"{found} {_verdict(validation)}")
+        texts.append(f"{found} {_advice(validation)}")
     return texts
 
 
-def _verdict(validation: CrossValidationMetrics) -> str:
+def _advice(validation: CrossValidationMetrics) -> str:
     """Return in one sentence whether turbo learning helps by a field model."""
     if validation["helps"]:
         return f"Turbo learning helps here: use --extra {validation['recommended_n_synthetic']} with this fraction."

@@ -15,7 +15,7 @@ def inspect(data: Spectra | Snapshots | Rssi, options: ReadOptions) -> tuple[Fin
     """Return the findings, and the spectra of snapshots."""
     findings = Findings()
     for note in data.notes:
-        findings.say(f"{note[0].upper()}{note[1:]}.")
+        findings.add(f"{note[0].upper()}{note[1:]}.")
     if isinstance(data, Rssi):
         check_rssi(data, findings)
         return findings, data

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-Level = Literal["is", "warning"]
+Level = Literal["fact", "warning"]
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,9 @@ class Findings:
     sentences: list[Finding] = field(default_factory=list)
     numbers: dict[str, Any] = field(default_factory=dict)
 
-    def say(self, text: str, **numbers: Any) -> None:
+    def add(self, text: str, **numbers: Any) -> None:
         """Add a fact."""
-        self.sentences.append(Finding("is", text))
+        self.sentences.append(Finding("fact", text))
         self.numbers |= numbers
 
     def warn(self, text: str, **numbers: Any) -> None:

@@ -39,7 +39,7 @@ def check_peaks(
         _say_behind(data, report, findings)
     linear = data.array is not None and data.array.axis is not None
     by = ", by the angle to the array's axis" if linear else ""
-    say = findings.say if frame in ("fits", "in part") else findings.warn
+    say = findings.add if frame in ("fits", "in part") else findings.warn
     say(
         f"Peaks are {report.angle_deg:.1f} degrees beside the line of sight (median{by}){text}.",
         peak_to_line_of_sight_deg=report.angle_deg,
@@ -109,6 +109,6 @@ def _say_behind(data: Spectra, report: FrameReport, findings: Findings) -> None:
     where = "of the positions lie" if data.moving == "transmitter" else "of the positions have the transmitter"
     text = f"{report.behind:.0%} {where} behind the array, and their directions are folded to its front"
     if report.behind > 1 - MIN_BEHIND:
-        findings.say(f"{text}.")
+        findings.add(f"{text}.")
     else:
         findings.warn(f"{text}: two places share one label.")

@@ -23,7 +23,7 @@ def check_positions(position: Tensor, findings: Findings, wavelength: float | No
     ranges = ", ".join(
         f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", low.tolist(), high.tolist(), strict=True)
     )
-    findings.say(f"{len(position)} positions, {ranges} m.", n=len(position), extent_m=extent)
+    findings.add(f"{len(position)} positions, {ranges} m.", n=len(position), extent_m=extent)
     if max(extent) > MAX_EXTENT_M:
         findings.warn(f"Positions extend over {max(extent):.0f} m; are they metres?")
     flat = [axis for axis, size in zip("xyz", extent, strict=True) if size < 1e-9]
@@ -35,19 +35,19 @@ def check_positions(position: Tensor, findings: Findings, wavelength: float | No
     _, times = position.unique(dim=0, return_counts=True)
     same = int(times[times > 1].sum())
     if same:
-        findings.say(f"{same} positions occur more than once; the split random keeps each place in one part.")
+        findings.add(f"{same} positions occur more than once; the split random keeps each place in one part.")
     middle = float(near.median())
     findings.numbers["nearest_m"] = middle
     if wavelength is None:
-        findings.say(f"The nearest other position is {middle:.3f} m away (median).")
+        findings.add(f"The nearest other position is {middle:.3f} m away (median).")
         return
     waves = middle / wavelength
     findings.numbers["nearest_wavelengths"] = waves
     text = f"The nearest other position is {middle:.3f} m, {waves:.2f} wavelengths away (median)"
     if waves <= SMOOTH:
-        findings.say(f"{text}: interpolation between positions will work.")
+        findings.add(f"{text}: interpolation between positions will work.")
     elif waves <= ROUGH:
-        findings.say(f"{text}: interpolation will work in part; half a wavelength is the limit.")
+        findings.add(f"{text}: interpolation will work in part; half a wavelength is the limit.")
     else:
         findings.warn(f"{text}: interpolators see no fringes between such positions; geometry needs none.")
 
@@ -74,10 +74,10 @@ def nearest(position: Tensor) -> tuple[Tensor, Tensor]:
     return some, apart.amin(dim=1)
 
 
-def say_splits(data: Spectra | Snapshots | Rssi, findings: Findings) -> None:
+def add_splits(data: Spectra | Snapshots | Rssi, findings: Findings) -> None:
     """Report the splits that came with the measurements."""
     for name, (train, test) in data.named_splits.items():
-        findings.say(f"Split {name}: {len(train)} for training, {len(test)} for testing.")
+        findings.add(f"Split {name}: {len(train)} for training, {len(test)} for testing.")
         position = data.transmitter_position if isinstance(data, Rssi) else data.position
         if (repeated := repeated_fraction(position[train], position[test])) > MAX_REPEATED:
             findings.warn(f"Split {name} tests look-up: {repeated:.0%} of its test rows are at training positions.")

@@ -13,7 +13,7 @@ from swiftwrf.diagnostics.path_loss import check_path_loss
 from swiftwrf.errors import listed
 from swiftwrf.rssi import estimate_offsets
 from tasks.inspect.findings.base import Findings
-from tasks.inspect.findings.positions import check_positions, say_splits
+from tasks.inspect.findings.positions import add_splits, check_positions
 
 MAX_LEVEL_DBM = 10.0  # at 1 m, which no usual transmitter reaches
 MIN_EXPLAINED, MIN_SPREAD_DB = 0.15, 1.0  # of offsets that are proposed
@@ -24,11 +24,11 @@ def check_rssi(data: Rssi, findings: Findings) -> None:
     detected = data.detected
     share = float(detected.double().mean())
     low, high = float(data.rssi_dbm[detected].min()), float(data.rssi_dbm[detected].max())
-    findings.say(
+    findings.add(
         f"{len(data)} rows of RSSI at {len(data.receiver_names)} receivers, {share:.0%} detected, {low:g} to {high:g} dBm.",
         kind="rssi",
         receivers=len(data.receiver_names),
-        heard_share=share,
+        detected_fraction=share,
     )
     check_positions(data.transmitter_position, findings)
     count = detected.sum(dim=0)
@@ -37,7 +37,7 @@ def check_rssi(data: Rssi, findings: Findings) -> None:
         findings.warn(f"Receivers that detected fewer than {MIN_TRAINING} rows, too few to fit a model: {listed(few)}.")
     _columns(data, detected, findings)
     _path_loss(data, findings)
-    say_splits(data, findings)
+    add_splits(data, findings)
 
 
 def propose_offsets(data: Rssi, findings: Findings) -> None:
@@ -92,9 +92,9 @@ def _columns(data: Rssi, detected: Tensor, findings: Findings) -> None:
 def _path_loss(data: Rssi, findings: Findings) -> None:
     report = check_path_loss(data.columns(data.receiver_located.nonzero()[:, 0].tolist()))
     if report is None:
-        findings.say("The receivers' positions are unknown, so there is no path-loss model; other predictors work.")
+        findings.add("The receivers' positions are unknown, so there is no path-loss model; other predictors work.")
         return
-    findings.say(
+    findings.add(
         f"Path-loss models explain {report.explained:.0%} of the variance of RSSI: {report.level_dbm:.0f} dBm at 1 m, "
         f"exponent {report.exponent:.1f}.",
         law_explained=report.explained,

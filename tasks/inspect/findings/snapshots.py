@@ -15,7 +15,7 @@ def check_snapshots(data: Snapshots, findings: Findings) -> None:
     """Report number, spacing and times of snapshots."""
     count, elements = data.channel.shape[1:]
     spacing = data.array.spacing_wavelengths
-    findings.say(
+    findings.add(
         f"{len(data)} array snapshots of {count} subcarriers or packets x {elements} elements, {spacing:.2f} wavelengths "
         f"apart, at {data.array.frequency_hz / 1e9:.4g} GHz.",
         snapshots=count,
@@ -28,7 +28,7 @@ def check_snapshots(data: Snapshots, findings: Findings) -> None:
         )
     if data.time is not None and len(data) > 1:
         step = data.time.diff()
-        findings.say(
+        findings.add(
             f"Taken over {float(data.time.max() - data.time.min()):.1f} s, {float(step.median()):.3f} s apart (median)."
         )
         if bool((step < 0).any()):
@@ -40,7 +40,7 @@ def check_calibration(data: Snapshots, findings: Findings) -> None:
     try:
         found = calibrate(data)
     except InputError as error:
-        findings.say(f"No calibration: {error}.")
+        findings.add(f"No calibration: {error}.")
         return
     gain = f"from {found.before:.0%} to {found.after:.0%} of the received power, at held-out positions"
     text = f"a calibration of phases and orientation changes the part along the line of sight {gain}"
@@ -51,4 +51,4 @@ def check_calibration(data: Snapshots, findings: Findings) -> None:
             calibration=found.to_json(),
         )
     else:
-        findings.say(f"The array needs no calibration: {text}.", calibration=found.to_json())
+        findings.add(f"The array needs no calibration: {text}.", calibration=found.to_json())

@@ -8,7 +8,7 @@ from tasks.claim import LOCATOR
 from tasks.metrics import LocateMetrics
 from tasks.page.page import Number, Plot, Summary
 from tasks.page.records import Records, notes
-from tasks.summarise import coverage_warning, verdict_of_difference
+from tasks.summarise import comparison_sentence, coverage_warning
 from tasks.terminal import Answer
 
 LocateRecords = Records[LocateMetrics]
@@ -58,7 +58,7 @@ def conclusion(run: LocateRecords) -> str:
     error = {name: entry["position_error_m"]["median"] for name, entry in run.metrics["overall"].items() if name != OWN}
     best = min(error, key=lambda name: error[name])
     n_test = run.metrics["n_test"]
-    return verdict_of_difference(by_method(run), OWN, best, name="the posterior", unit="m", rows="rows", n_test=n_test)
+    return comparison_sentence(by_method(run), OWN, best, name="the posterior", unit="m", rows="rows", n_test=n_test)
 
 
 def _next_steps(run: LocateRecords) -> list[str]:

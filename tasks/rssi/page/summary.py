@@ -8,7 +8,7 @@ from pandas import DataFrame
 from tasks.metrics import RssiMetrics
 from tasks.page.maps import inside
 from tasks.page.records import Records
-from tasks.summarise import coverage_warning, verdict_of_difference
+from tasks.summarise import comparison_sentence, coverage_warning
 from tasks.terminal import Answer
 
 RssiRecords = Records[RssiMetrics]
@@ -44,7 +44,7 @@ def conclusion(run: RssiRecords) -> str:
     best = best_baseline(run)
     n_test = run.metrics["n_test"]
     own, name = model_of(run), title(run)
-    return verdict_of_difference(by_method(run), own, best, name=name, unit="dB", rows="pairs", n_test=n_test)
+    return comparison_sentence(by_method(run), own, best, name=name, unit="dB", rows="pairs", n_test=n_test)
 
 
 def next_steps(run: RssiRecords) -> list[str]:

@@ -83,9 +83,9 @@ def test_repeats_do_not_narrow_the_interval_of_a_gain():
 
 
 @pytest.mark.parametrize(
-    ("change", "low", "verdict"), [(0.2, -0.1, "met"), (0.2, 0.1, "missed by 10%"), (0.2, None, "missed by 20%")]
+    ("change", "low", "state"), [(0.2, -0.1, "met"), (0.2, 0.1, "missed by 10%"), (0.2, None, "missed by 20%")]
 )
-def test_never_worse_is_decided_by_the_interval(monkeypatch, change, low, verdict):
+def test_never_worse_is_decided_by_the_interval(monkeypatch, change, low, state):
     """Results of earlier versions have no interval. There the change itself decides."""
     angle = {"median": 1.0, "low": 0.9, "high": 1.1}
     methods = {
@@ -101,7 +101,7 @@ def test_never_worse_is_decided_by_the_interval(monkeypatch, change, low, verdic
     monkeypatch.setattr(targets, "aoa_shares", lambda: [("0.3", mix, {"metrics": metrics})])
     row = targets.aoa_targets().splitlines()[-1]
     assert "| never worse |" in row
-    assert row.endswith(f"| {verdict} |")
+    assert row.endswith(f"| {state} |")
 
 
 def test_the_report_states_gain_interval_and_judgement(aoa_run):
