@@ -1,4 +1,4 @@
-"""SwiftWRF: a measured wireless radiance field, known everywhere.
+"""Predict spatial spectra and RSSI at positions without measurements.
 
 data = swiftwrf.load_spectra(folder)
 train, test = data.split("block")

@@ -21,7 +21,7 @@ def check_positions(position: Any) -> Tensor:
     """Return positions (tensor, array or list) as float64 (n, 3) [m].
 
     Raises:
-        InputError: another shape, or not finite.
+        InputError: Another shape, or not finite.
 
     Example:
         >>> check_positions([[0, 1, 2]])
@@ -39,23 +39,26 @@ def check_positions(position: Any) -> Tensor:
 
 
 def frame(position: Tensor) -> tuple[Tensor, Tensor]:
-    """Centre (3,) and half the longest side () of the box around positions (n, 3) [m], float64."""
+    """Return centre (3,) and half the longest side () of the box around positions (n, 3) [m], float64."""
     low, high = position.double().min(dim=0).values, position.double().max(dim=0).values
     half = (high - low).max() / 2
     return (low + high) / 2, half if half > 0 else torch.ones_like(half)
 
 
 def normalise(position: Tensor, centre: Tensor, scale: Tensor | float) -> Tensor:
-    """Positions (n, 3) [m] in a frame, float32."""
+    """Return positions (n, 3) [m] in the frame of a centre [m] and a scale [m], float32."""
     return ((position.double() - centre) / scale).clamp(-MAX_NORMALISED, MAX_NORMALISED).float()
 
 
 def distance(a: Tensor, b: Tensor) -> Tensor:
-    """Distances between positions (n, 3) and (m, 3), (n, m), in their unit.
+    """Return the distances (n, m) between positions (n, 3) and (m, 3), in their unit, at most 1e15.
 
-    From differences, never from products: torch's fast way loses close pairs to rounding, all the more the farther the
-    origin is (map coordinates lie thousands of kilometres from it). Farther than 1e15 counts as that: an infinite distance
-    would give weights of inf / inf.
+    They follow from differences. Products, which are faster, round the distances of close pairs away if the origin is far,
+    as that of map coordinates. An infinite distance would give weights of inf / inf.
+
+    Example:
+        >>> distance(torch.zeros(1, 3), torch.tensor([[3.0, 4.0, 0.0]]))
+        tensor([[5.]])
     """
     apart: Tensor
     if a.is_cuda:  # cdist would start a block of threads for each pair
@@ -100,7 +103,7 @@ class Neighbours:
         self._tree = cKDTree(self._known.numpy()) if len(known) > MIN_TREE_POSITIONS else None
 
     def __call__(self, position: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        """Distances from positions (n, 3) to the k nearest, ascending, float64, and the numbers of those, (n, k)."""
+        """Return the distances from positions (n, 3) to the k nearest, ascending, float64, and their indices, (n, k)."""
         position = position.detach().double().cpu()
         if self._tree is not None:
             apart, number = self._tree.query(position.numpy(), k=range(1, k + 1))
@@ -111,5 +114,10 @@ class Neighbours:
 
 
 def nearest(position: Tensor, known: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """Distances from positions (n, 3) to the k nearest of known ones (m, 3), ascending, and the numbers of those, (n, k)."""
+    """Return the distances (n, k) from positions (n, 3) to the k nearest known ones (m, 3), ascending, and their indices.
+
+    Example:
+        >>> nearest(torch.zeros(1, 3), torch.eye(3) * torch.tensor([1.0, 2.0, 3.0]), k=2)[1]
+        tensor([[0, 1]])
+    """
     return Neighbours(known)(position, k)

@@ -140,7 +140,7 @@ def _shorten_waits() -> None:
     """Let threads wait for each other a tenth as long before they sleep, unless the user has set it.
 
     By default threads that share a loop wait busily for milliseconds. If other work uses the same cores, that makes the
-    steps of a network eight times slower (benchmarks/busy.py). libgomp reads the variable when torch is loaded.
+    steps of a network up to eight times slower. libgomp reads the variable when torch is loaded.
     """
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", "30000")

@@ -105,7 +105,7 @@ def _escaped(value: Any) -> Any:
 def rounded(rows: Iterable[Row]) -> list[Row]:
     """Return the rows of a table for people, with numbers rounded by the units at the end of the columns' names.
 
-    Metres have 3 decimals, dB and dBm 2, degrees 4, latitudes and longitudes 7. Magnitudes have 4 significant digits.
+    Metres have 3 decimals, dB and dBm 2, degrees 4, latitudes and longitudes 8. Magnitudes have 4 significant digits.
 
     Example:
         >>> rounded([{"rssi_dbm": -200 / 3, "x_m": 1 / 3, "magnitude": 2 / 3000}])

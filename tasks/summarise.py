@@ -23,12 +23,12 @@ SHORTEST = 1e-5  # seconds: what took less is drawn here, for logarithmic axes h
 
 
 def error_summary(values: ArrayLike) -> ErrorSummary:
-    """Median, 90th percentile, mean, interval of the median and number of the finite values."""
+    """Return median, 90th percentile, mean, interval of the median and number of the finite values."""
     return cast(ErrorSummary, summary(values))
 
 
 def repeats_averaged(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, ErrorSummary]]:
-    """Summary of each column under each value of `by`.
+    """Return a summary of each column for each value of `by`.
 
     Repeats of a test sample (rows of one `index`) are averaged first: they are not independent, and the interval must not
     shrink with their number.
@@ -39,12 +39,12 @@ def repeats_averaged(table: DataFrame, by: str, columns: Sequence[str]) -> dict[
 
 
 def grouped(table: DataFrame, by: Sequence[str], column: str) -> dict[tuple[str, ...], ErrorSummary]:
-    """Summary of a column under each combination of values of `by` that occurs."""
+    """Return a summary of a column for each combination of values of `by` that occurs."""
     return {key: error_summary(part) for key, part in table.groupby(list(by), sort=False)[column]}
 
 
 def averaged(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Mean of each column under each value of `by`."""
+    """Return the mean of each column for each value of `by`."""
     means: dict[str, dict[str, float]] = table.groupby(by, sort=False)[list(columns)].mean().to_dict("index")
     return means
 

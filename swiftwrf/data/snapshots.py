@@ -154,7 +154,9 @@ def check_spacing(file: Path, array: PlanarArray) -> None:
         InputError: One element only, or neighbours outside 0.01 to 20 wavelengths.
     """
     if len(array.element) < 2:
-        raise InputError(f"{file} describes an array of one element, which sees no directions; at least 2 are needed")
+        raise InputError(
+            f"{file} describes an array of one element, which resolves no directions; at least 2 are needed"
+        )
     apart, (low, high) = array.spacing_wavelengths, SPACING_WAVELENGTHS
     if not low <= apart <= high:
         raise InputError(

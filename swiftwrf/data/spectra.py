@@ -291,7 +291,7 @@ def direction_of_link(
 
 
 def check_pixels(name: str, n: int, grid: AngularGrid) -> None:
-    """Refuse more spectra than a measurement has.
+    """Raise InputError if there are more pixels than any measurement has.
 
     Raises:
         InputError: The spectra exceed 2^34 pixels, or 2^29 pixels at more than 2^20 pixels each.

@@ -121,7 +121,7 @@ class Store:
 
 
 def too_many(shape: tuple[int, int, int]) -> bool:
-    """Return True if spectra (n, H, W) exceed any measurement, so that their size is an error."""
+    """Return True if spectra (n, H, W) have more pixels than any measurement has."""
     pixels, each = math.prod(shape), math.prod(shape[1:])
     return pixels > MAX_FILE_PIXELS or (pixels > MAX_MEMORY_PIXELS and each > MAX_FINE_PIXELS)
 

@@ -20,8 +20,8 @@ class Kernel:
 
         k(r) = share exp(-r / long) + (1 - share) (1 + sqrt(3) r / short) exp(-sqrt(3) r / short)
 
-    The long part (Matern 1/2) carries the rough field between rooms' positions, the short one (Matern 3/2) follows a path
-    that is sampled densely.
+    The long part (Matern 1/2) models a rough field between positions that are wavelengths apart, the short one (Matern 3/2)
+    a path that is sampled densely.
 
     Args:
         long: Correlation length of the rough part, in the unit of the positions.
@@ -45,9 +45,12 @@ class Kernel:
     vertical: float = 1.0
 
     def __post_init__(self) -> None:
-        finite = all(map(math.isfinite, (self.long, self.short, self.share, self.noise)))
-        if not (finite and self.long > 0 and self.short > 0 and 0 <= self.share <= 1 and self.noise >= 0):
-            raise InputError(f"a kernel needs lengths above 0, a share in [0, 1] and a noise from 0, got {self}")
+        finite = all(map(math.isfinite, (self.long, self.short, self.share, self.noise, self.vertical)))
+        positive = min(self.long, self.short, self.vertical) > 0
+        if not (finite and positive and 0 <= self.share <= 1 and self.noise >= 0):
+            raise InputError(
+                f"a kernel needs lengths and a vertical factor above 0, a share in [0, 1] and a noise from 0, got {self}"
+            )
 
     @property
     def correlation_length(self) -> float:

@@ -25,7 +25,7 @@ SMALL = 1024  # number of primitives up to which half as many warps a block are 
 
 
 def field(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None) -> Tensor:
-    """Return real and imaginary part of the field, (B, 2, n_elevation, n_azimuth); see `operators.rasterize`."""
+    """Return real and imaginary part of the field, (B, 2, n_elevation, n_azimuth); see `operators.field`."""
     rendered = mean.new_empty(mean.shape[0], 2, *grid.shape)
     _render(mean, cholesky, weight, grid, cutoff, rendered, None)
     return rendered

@@ -81,7 +81,7 @@ def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
 
 
 def _residual_precision(covariance: Tensor, distance: Tensor) -> Tensor:
-    """Return the precision of noisy values with covariance (m, m), once level and slope over log10 distance are free."""
+    """Return the precision of noisy values with covariance (m, m) after a fit of level and slope over log10 distance."""
     precision = torch.linalg.inv(covariance)
     free = torch.stack([torch.ones_like(distance), distance], dim=1)
     weighted = precision @ free

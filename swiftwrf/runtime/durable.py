@@ -41,7 +41,7 @@ def sync(path: Path) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary file beside `path` to be written in the block; it takes the place of `path` if nothing was raised."""
+    """Yield a temporary file beside `path`, which replaces `path` at the end of the block unless it raises."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         yield temporary
@@ -52,17 +52,17 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Writes a file, or leaves the old one."""
+    """Write a file; an error leaves the old one."""
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 
 
 def write_text(path: Path, content: str) -> None:
-    """Writes a file in UTF-8, or leaves the old one."""
+    """Write a file in UTF-8; an error leaves the old one."""
     write_bytes(path, content.encode())
 
 
 def rename(source: Path, target: Path) -> None:
-    """Gives a file or directory another name in the same directory, for good."""
+    """Rename a file or directory within its directory, and wait until the disk has it."""
     os.replace(source, target)
     sync(target.parent)

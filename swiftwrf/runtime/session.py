@@ -40,7 +40,7 @@ class Session:
         saved: State of the interrupted run, if the checkpoint exists.
         losses: Held-out losses of completed runs by name.
         records: Records of all evaluations, including those of the checkpoint.
-        earlier: Seconds that the checkpoint has taken.
+        earlier: Seconds of the fit up to the checkpoint.
 
     Raises:
         InputError: The checkpoint is damaged or belongs to another fit.

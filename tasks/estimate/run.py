@@ -18,7 +18,7 @@ from tasks.source import observed_spectra, reading
 
 
 def run(config: EstimateConfig) -> None:
-    """Writes a row a spectrum: azimuth and elevation [deg] and, where positions are known, the truth and the error.
+    """Write one row for each spectrum: azimuth and elevation [deg] and, where positions are known, the truth and the error.
 
     Raises:
         InputError: no such estimator, spectra that cannot be read or are not like those it was trained on, or `out` exists.

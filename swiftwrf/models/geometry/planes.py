@@ -45,7 +45,7 @@ class RoomEstimate:
     """Planes of a room with their uncertainty.
 
     Args:
-        planes: PlaneSet, an empty list if none explains the spectra.
+        planes: Planes, an empty list if none explains the spectra.
         order: Highest number of reflections of an image source.
         score_held_out: 1 - correlation of predicted and observed co-array coefficients of the training spectra that were
             held out from the first stage of the search.

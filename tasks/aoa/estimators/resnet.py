@@ -11,7 +11,7 @@ from torch import distributed as dist
 from torch.nn import functional
 from torch.nn.parallel import DistributedDataParallel
 
-FEATURES = 2048  # that the network sees in a spectrum, behind its last convolution
+FEATURES = 2048  # of a spectrum, behind the last convolution
 
 
 class CircularConv(nn.Module):

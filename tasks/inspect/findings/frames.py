@@ -36,11 +36,11 @@ def check_peaks(
         return "unknown"
     frame, text = _error(data, report, snapshots) or _without_error(report)
     if frame != "explained":
-        _say_behind(data, report, findings)
+        _add_behind(data, report, findings)
     linear = data.array is not None and data.array.axis is not None
     by = ", by the angle to the array's axis" if linear else ""
-    say = findings.add if frame in ("fits", "in part") else findings.warn
-    say(
+    add = findings.add if frame in ("fits", "in part") else findings.warn
+    add(
         f"Peaks are {report.angle_deg:.1f} degrees beside the line of sight (median{by}){text}.",
         peak_to_line_of_sight_deg=report.angle_deg,
         agreement=report.agreement,
@@ -102,7 +102,7 @@ def _without_error(report: FrameReport) -> tuple[Frame, str]:
     )
 
 
-def _say_behind(data: Spectra, report: FrameReport, findings: Findings) -> None:
+def _add_behind(data: Spectra, report: FrameReport, findings: Findings) -> None:
     """Report lines of sight behind a planar array, whose directions are folded to its front."""
     if report.behind < MIN_BEHIND:
         return
