@@ -4,7 +4,7 @@ from swiftwrf.gp.choice import choose_kernel, choose_rank, inner_products, most_
 from swiftwrf.gp.field import SmoothField
 from swiftwrf.gp.kernel import Kernel, candidates
 from swiftwrf.gp.pca import Components, principal_components
-from swiftwrf.gp.process import GaussianProcess, LeaveGroupOut, dense_weights, held_out
+from swiftwrf.gp.process import GaussianProcess, LeaveGroupOut, dense_weights, held_out, held_out_neighbours
 
 __all__ = [
     "Components",
@@ -17,6 +17,7 @@ __all__ = [
     "choose_rank",
     "dense_weights",
     "held_out",
+    "held_out_neighbours",
     "inner_products",
     "most_informative",
     "principal_components",

@@ -248,6 +248,34 @@ def dense_weights(number: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     return rows, weight.new_zeros(len(weight), len(rows)).scatter(1, column, weight)
 
 
+def held_out_neighbours(
+    kernel: Kernel, position: Tensor, fold: Tensor, rows: Tensor
+) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """Yield how the nearest rows of other folds predict some rows, for each fold of theirs.
+
+    Args:
+        kernel: Kernel of a process with mean 0.
+        position: Positions (n, 3).
+        fold: Number of the group that each row is held out with, (n,).
+        rows: Row numbers (m,).
+
+    Yields:
+        Row numbers (b,) of one fold, row numbers (r,) of the values that predict them, weights float64 (b, r), and
+        variances of the noisy values, float64 (b,).
+
+    Example:
+        >>> position = torch.linspace(0, 1, 20, dtype=torch.float64)[:, None] * torch.ones(3)
+        >>> parts = held_out_neighbours(Kernel(noise=0.01), position, torch.arange(20) % 2, torch.arange(4))
+        >>> [(own.tolist(), len(others), weight.shape) for own, others, weight, _ in parts]
+        [([0, 2], 10, torch.Size([2, 10])), ([1, 3], 10, torch.Size([2, 10]))]
+    """
+    for number in fold[rows].unique():
+        own, others = rows[fold[rows] == number], (fold != number).nonzero()[:, 0]
+        near, weight, variance = GaussianProcess(kernel, position[others], exact=False)._local(position[own])
+        used, dense = dense_weights(near, weight)
+        yield own, others[used], dense, variance + kernel.noise
+
+
 class LeaveGroupOut:
     """Prediction of a group of rows from all other rows without another fit.
 

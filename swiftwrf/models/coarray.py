@@ -170,6 +170,8 @@ class CoarrayModel(ProcessModel):
         target = torch.cat([score, (offset - offset.mean()).double()], dim=1)
         self.process = GaussianProcess.regress(kernel, train.position, target)
         self.array, self.offset = array, offset.mean()[None]
+        value = self.process.value
+        self._set_spread(train, fold, lambda rows: value[rows], lambda score, _: self._spectra(score, self.grid))
 
     def _values(self, new: Spectra) -> Tensor:
         if self.component is None:
@@ -197,7 +199,8 @@ class CoarrayModel(ProcessModel):
         return spectrum.reshape(-1, *grid.shape)
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
-        return self._spectra(self.process.mean(position).float(), grid), None
+        mean = self._spectra(self.process.mean(position).float(), grid)
+        return mean, self._std(position, grid) if with_std else None
 
     def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
         score = self.process.mean(position).float()
@@ -211,7 +214,7 @@ class CoarrayModel(ProcessModel):
         tensors |= {"offset": self.offset, "form": self.form, "element": self.array.element}
         if self.component is not None:
             tensors["component"] = self.component
-        return tensors, header | {"wavelength": self.array.wavelength}
+        return tensors | self._spread_state(), header | {"wavelength": self.array.wavelength}
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         self.array = PlanarArray(tensors["element"], header["wavelength"])
@@ -220,6 +223,7 @@ class CoarrayModel(ProcessModel):
         form = (1 + 2 * len(differences(self.array)), n_scores, n_scores)
         expect(tensors, {"offset": (1,), "form": form})
         self.offset, self.form = tensors["offset"].float(), tensors["form"].float()
+        self._restore_spread(tensors)
         self.component = tensors.get("component")
         if self.component is not None:
             expect(tensors, {"component": (n_scores, *_coarse(Store(torch.zeros(1, *self.grid.shape))).shape[1:])})

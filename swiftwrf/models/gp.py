@@ -39,6 +39,12 @@ class GPModel(ProcessModel, MemoryModel):
         super()._fit(train, context)
         fold = folds(train.position, self.config.validation, self.config.seed)
         self._prepare(_without_values(choose_kernel(train.position, train.store, fold), train.position))
+        self._set_spread(
+            train,
+            fold,
+            lambda rows: (self.store[rows] - self._mean).flatten(1),
+            lambda change, _: self._mean + change.reshape(-1, *self.grid.shape),
+        )
 
     def _prepare(self, process: GaussianProcess) -> None:
         """Precompute what predictions share: mean, and differences from the mean, if they are few."""
@@ -74,7 +80,8 @@ class GPModel(ProcessModel, MemoryModel):
         return weight.float() @ change
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
-        return self._mean + self._mean_change(position).reshape(-1, *grid.shape), None
+        mean = self._mean + self._mean_change(position).reshape(-1, *grid.shape)
+        return mean, self._std(position, grid) if with_std else None
 
     def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
         variance, n = self.process.variance(position), len(self._change)
@@ -85,12 +92,14 @@ class GPModel(ProcessModel, MemoryModel):
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         tensors, header = self.process.state()
-        return super()._state()[0] | {name: tensors[name] for name in tensors if name == "correlation"}, header
+        kept = {name: tensors[name] for name in tensors if name == "correlation"}
+        return super()._state()[0] | kept | self._spread_state(), header
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         super()._restore(tensors, header)
         none = {"coefficient": torch.zeros(len(self.position), 0)}
         self._prepare(GaussianProcess.from_state(tensors | none, header, torch.float64))
+        self._restore_spread(tensors)
 
 
 def _without_values(kernel: Kernel, position: Tensor) -> GaussianProcess:

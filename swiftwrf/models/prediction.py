@@ -27,7 +27,8 @@ class Prediction(Labelled, Displayed):
 
     Args:
         mean: Predictive mean, e.g. magnitudes (n, n_elevation, n_azimuth) or RSSI (n, R) [dBm].
-        std: Predictive standard deviation of one measurement, of the same shape. None if the model has none.
+        std: Predictive standard deviation of one measurement, of the same shape. None if the model has none: of
+            spectra, `swiftwrf` by regression, `gp`, `coarray` and `hybrid` have one.
         position: Positions of the predictions, (n, 3) [m]. `predict` of every model sets it.
         grid: Directions of predicted spectra.
         receiver_names: Names of the receivers of predicted RSSI.

@@ -103,6 +103,12 @@ class HybridModel(ProcessModel):
         else:
             self.mixing_weight = 1.0
         self.process = GaussianProcess.regress(kernel, train.position, score, exact=True, dtype=torch.float32)
+        mean, component = self.component[0], self.component[1:]
+
+        def spectrum(held_out: Tensor, rows: Tensor) -> Tensor:
+            return (mean + held_out @ component + self.mixing_weight * known[rows]).reshape(-1, *self.grid.shape)
+
+        self._set_spread(train, fold, lambda rows: score[rows], spectrum)
 
     def _fit_path_gains(self, train: Spectra, fold: Tensor, like: HybridModel | None) -> Tensor:
         """Fit the path gains; return the spectra (n, H, W) that the paths predict with each fold held out from the gains."""
@@ -171,7 +177,7 @@ class HybridModel(ProcessModel):
         return spectrum + self.mixing_weight * self._paths(position, generator) if self.mixing_weight else spectrum
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
-        return self._total(position), None
+        return self._total(position), self._std(position, grid) if with_std else None
 
     def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
         return self._total(position, generator)
@@ -180,7 +186,7 @@ class HybridModel(ProcessModel):
         parts = [self.room._state(), self.process.state()]
         if self.path_gains is not None:
             parts.append(self.path_gains.state())
-        tensors, own = {"component": self.component}, {"mixing_weight": self.mixing_weight}
+        tensors, own = {"component": self.component} | self._spread_state(), {"mixing_weight": self.mixing_weight}
         for some, header in parts:
             tensors |= some
             own |= header
@@ -191,6 +197,7 @@ class HybridModel(ProcessModel):
         self.process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True)
         n_scores, pixels = tensors["coefficient"].shape[-1], self.grid.shape[0] * self.grid.shape[1]
         expect(tensors, {"component": (1 + n_scores, pixels)})
+        self._restore_spread(tensors)
         check_value("mixing_weight", header["mixing_weight"], Fraction)
         self.mixing_weight, self.component, self.path_gains = (
             header["mixing_weight"],

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import pytest
 import torch
+from small import glances
 
-from swiftwrf import AngularGrid, FitConfig, FitError, InputError, ModelConfig, Spectra, SwiftWRF, fit
+from swiftwrf import AngularGrid, FitConfig, FitError, InputError, ModelConfig, Spectra, SwiftWRF, fit, make_model
 from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store
 from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel
@@ -161,14 +162,35 @@ def test_regression_is_the_same_at_any_number_of_threads(room):
         torch.testing.assert_close(two[name], value, atol=1e-5, rtol=1e-5, equal_nan=True, msg=name)
 
 
-def test_standard_deviations_are_calibrated(built_in_room):
+@pytest.mark.parametrize("name", ["swiftwrf", "gp", "coarray", "hybrid"])
+def test_standard_deviations_are_calibrated(built_in_room, name):
     """75 to 85 % of the pixels of unseen spectra lie within 1.28 standard deviations; these grow with the distance."""
     train, test = built_in_room
-    model = fit(train)
+    with glances():
+        model = make_model(name).fit(train)
     found = model.predict(test.position)
     assert 0.75 < covered(found.mean, found.std, test.spectrum).mean() < 0.85
     near, far = (model.predict(position).std for position in (train.position, test.position + 100))
     assert near.mean() < found.std.mean() < far.mean()
+
+
+@pytest.mark.parametrize("name", ["gp", "coarray"])
+def test_standard_deviations_follow_updates_and_another_kernel(built_in_room, name):
+    train, test = built_in_room
+    first = make_model(name).fit(train.subset(torch.arange(60)))
+    both = first.update(train.subset(torch.arange(60, len(train))))
+    before, after = (model.predict(test.position).std.mean() for model in (first, both))
+    assert after < before
+    found = both.with_chosen_kernel().predict(test.position)
+    assert 0.7 < covered(found.mean, found.std, test.spectrum).mean() < 0.9
+
+
+def test_standard_deviations_on_another_grid_are_those_of_the_nearest_directions(built_in_room):
+    train, test = built_in_room
+    model = make_model("coarray").fit(train)
+    own, fine = (model.predict(test.position, grid).std for grid in (None, AngularGrid.hemisphere(30, 120)))
+    assert fine.shape == (len(test), 30, 120)
+    torch.testing.assert_close(fine[:, 1::2, ::2], own)
 
 
 def test_a_fit_by_gradient_descent_has_no_standard_deviation(room):
