@@ -34,6 +34,7 @@ Method = Callable[[PlanarArray, Tensor, int], Tensor]  # (array, covariance (n, 
 
 POINTS_PER_BEAM = 8  # of the search, along the width of a beam of the whole array
 NEWTON_STEPS = 12
+EDGE = 1e-9  # distance of direction cosines from the unit circle within which they are on it
 ALTERNATIONS = 8  # over all sources, of alternating projection
 MIN_NORM = 1e-2  # of a steering vector outside the span of the others, squared, relative to its norm
 MAX_ESPRIT_SHIFT = 0.51  # wavelengths, beyond which phases are ambiguous, not only near the plane or the axis
@@ -276,7 +277,24 @@ class _Quotient:
         return (self.numerator @ basis / norm.clamp_min(least)).where(norm > least, 0)
 
     def refine(self, cosine: Tensor) -> Tensor:
-        """Return local maxima from direction cosines (n, m, d), by Newton steps of at most one grid step."""
+        """Return local maxima from direction cosines (n, m, d), by Newton steps of at most one grid step.
+
+        Elements half a wavelength apart do not distinguish the two ends of an axis on the grid. A maximum at the edge is
+        refined from the opposite end, too, and the larger one is returned.
+        """
+        found = self._ascended(cosine)
+        is_edge = found.norm(dim=-1) > 1 - EDGE
+        if not bool(is_edge.any()):
+            return found
+        opposite = self._ascended(-cosine)
+        is_larger = self._value(opposite) > self._value(found)
+        return torch.where((is_edge & is_larger)[..., None], opposite, found)
+
+    def _value(self, cosine: Tensor) -> Tensor:
+        norm = self._derivatives(self.denominator, cosine)[0]
+        return self._derivatives(self.numerator, cosine)[0] / norm.clamp_min(MIN_NORM * self.elements)
+
+    def _ascended(self, cosine: Tensor) -> Tensor:
         for _ in range(NEWTON_STEPS):
             value, gradient, hessian = self._derivatives(self.numerator, cosine)
             norm, norm_gradient, norm_hessian = self._derivatives(self.denominator, cosine)

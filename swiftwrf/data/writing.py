@@ -125,13 +125,14 @@ def write_deepmimo(paths: PropagationPaths, folder: Path) -> None:
     distance = (paths.transmitter - paths.receiver).norm(dim=1)
     away = (paths.length / distance[paths.owner] - 1).abs()
     direct = paths.line_of_sight[paths.owner] & (away < DIRECT_TOLERANCE)
-    azimuth, elevation = to_angles(paths.direction)
+    azimuth, _ = to_angles(paths.direction)
+    zenith = paths.direction[:, 2].clamp(-1, 1).acos()  # beyond 90 degrees for paths from below
     columns = {
         "power": 20 * paths.gain.abs().log10(),
         "phase": paths.gain.angle().rad2deg(),
         "delay": paths.length / LIGHT_SPEED,
         "aoa_az": azimuth.rad2deg(),
-        "aoa_el": 90 - elevation.rad2deg(),
+        "aoa_el": zenith.rad2deg(),
         "inter": torch.where(direct, 0.0, torch.nan),
     }
     first = paths.count.cumsum(0) - paths.count

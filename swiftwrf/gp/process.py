@@ -251,7 +251,7 @@ def dense_weights(number: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 def held_out_neighbours(
     kernel: Kernel, position: Tensor, fold: Tensor, rows: Tensor
 ) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """Yield how the nearest rows of other folds predict some rows, for each fold of theirs.
+    """Yield how the nearest rows of other folds predict some rows, fold by fold.
 
     Args:
         kernel: Kernel of a process with mean 0.

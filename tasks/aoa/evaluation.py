@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from augment import Mixed, mix
-from tasks.aoa.condition import Condition, MeasuredSubset
+from tasks.aoa.condition import MEASURED_STAND_IN, STAND_IN, Condition, MeasuredSubset
 from tasks.aoa.context import Experiment
 from tasks.aoa.estimators import SavedEstimator, make_estimator
 from tasks.aoa.options import AUTO
@@ -64,17 +64,23 @@ class Evaluation(Step[Experiment]):
         estimator.fit(train, device=experiment.device)
         fitted = time.perf_counter()
         estimate = estimator.estimate(experiment.test)
-        if isinstance(estimator, SavedEstimator) and self._is_saved(experiment):
-            estimator.save(folder / f"{name}-mix{self.subset.key}.safetensors")
+        if isinstance(estimator, SavedEstimator) and (file := self._saved_as(experiment)):
+            estimator.save(folder / f"{file}-mix{self.subset.key}.safetensors")
         seconds = {"train": fitted - began, "estimate": time.perf_counter() - fitted}
         return {"estimate": estimate, "seconds": seconds, "history": estimator.history, "counts": train.counts}
 
-    def _is_saved(self, experiment: Experiment) -> bool:
-        """Return True for the condition that a user would choose: with all spectra of the first field model."""
-        if self.synthesis is None or self.subset.repeat:
-            return False
+    def _saved_as(self, experiment: Experiment) -> str:
+        """Return the file name of a condition that a user may choose, empty for the others.
+
+        These have all spectra of the first field model, or are the measured-only candidate of the cross-validation.
+        """
+        if self.subset.repeat:
+            return ""
+        if self.synthesis is None:
+            return MEASURED_STAND_IN if self.condition.method == STAND_IN else ""
         first = experiment.config.synthesizer[0] in (AUTO, self.synthesis.synthesizer)
-        return first and self.condition.n_synthetic == self.synthesis.n_synthetic
+        is_complete = self.condition.n_synthetic == self.synthesis.n_synthetic
+        return self.condition.estimator if first and is_complete else ""
 
     def _training_set(self, experiment: Experiment, folder: Path) -> Mixed:
         if self.condition.training == "all":

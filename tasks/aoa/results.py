@@ -244,9 +244,22 @@ class Results:
         key = fraction_key(fraction)
         if (chosen := self.chosen.get(key, {})).get("choice") is None:
             return None
-        errors = {name: [np.array(fold) for fold in folds] for name, folds in chosen["errors"].items()}
+        errors = {
+            self._pooled_name(name, fraction): [np.array(fold) for fold in folds]
+            for name, folds in chosen["errors"].items()
+        }
         located = self.located_folds.get(key, {})
+        if not any(c.estimator == LOCATOR and c.measured_fraction == fraction for c, _ in self.pooled):
+            located = {}  # its fit to all measured spectra was refused
         return choose_estimator(errors, {n: None if own is None else np.array(own) for n, own in located.items()})
+
+    def _pooled_name(self, method: str, fraction: float) -> str:
+        """Return the name under which `pooled` has a method of the first repeat."""
+        own = [condition for condition, _ in self.pooled if condition.measured_fraction == fraction]
+        if any(condition.method == method for condition in own):
+            return method
+        (stand_in,) = (c for c, _ in self.evaluated if c.measured_fraction == fraction and c.method == method)
+        return next(c.method for c in own if c.is_turbo and c.estimator == stand_in.estimator)
 
     def _method_metrics(self, fraction: float) -> tuple[dict[str, MethodMetrics], str]:
         """Return the metrics of each method, and the reference of changes."""

@@ -16,6 +16,9 @@ from swiftwrf.runtime.checkpoint import read, write
 from tasks.aoa.estimators.aann import AANN
 from tasks.aoa.estimators.aann_kernel import AANNKernel
 from tasks.aoa.estimators.kernel_regression import KernelRegression
+from tasks.aoa.page.records import FractionRecords
+from tasks.aoa.page.summary import next_steps
+from tasks.page.records import Records
 
 GRID = AngularGrid.hemisphere(8, 32)
 
@@ -105,9 +108,8 @@ def test_estimators_of_earlier_versions_open(small, tmp_path, present, former):
 
 def test_a_run_keeps_the_estimator_that_saw_most(finished):
     files = sorted(file.name for file in finished.glob("*.safetensors"))
-    assert files == [
-        "kernel_regression-mix0.5.safetensors"
-    ]  # the network of these runs is a stand-in that cannot be saved
+    # the network of these runs is a stand-in that cannot be saved
+    assert files == ["kernel_regression-mix0.5.safetensors", "kernel_regression_measured_only-mix0.5.safetensors"]
     assert "kernel_regression-mix0.5.safetensors" in (finished / "report.html").read_text()
     estimator = load(finished / "kernel_regression-mix0.5.safetensors")
     errors = pd.read_csv(finished / "errors.csv")
@@ -115,6 +117,17 @@ def test_a_run_keeps_the_estimator_that_saw_most(finished):
     test = simulated_room(n=30, grid=GRID).subset(torch.tensor(own["index"].tolist()))
     estimate = estimator.predict(test.spectrum).rad2deg().numpy()
     np.testing.assert_allclose(estimate, own[["estimate_azimuth_deg", "estimate_elevation_deg"]], atol=1e-3)
+
+
+def test_the_estimator_that_a_run_recommends_is_the_one_that_cross_validation_chose(finished):
+    fraction = FractionRecords.of(Records(finished))[0]
+    recommended = {}
+    for name in ("kernel_regression", "kernel_regression_turbo_nearest_extra"):
+        fraction.mix["estimator_choice"] = {"name": name, "held_out_deg": {name: 1.0}, "n_held_out": 9}
+        (step,) = (text for text in next_steps(fraction) if text.startswith("Take"))
+        recommended[name] = load(step.split("tasks.estimate ")[1].split(" SOURCE")[0])
+    alone, turbo = recommended.values()
+    assert len(alone.state()[0]["known"]) < len(turbo.state()[0]["known"])
 
 
 def test_directions_of_measured_and_unknown_positions(finished, small, tmp_path, capsys):

@@ -284,6 +284,16 @@ def test_deepmimo_folders_come_back(paths, tmp_path):
     assert (found.moving, found.notes) == ("receiver", ())
 
 
+def test_deepmimo_folders_contain_paths_from_below(tmp_path):
+    receiver = torch.tensor([[1.0, 1.0, 2.0], [4.0, 3.0, 2.2]])
+    below = ShoeboxRoom(frequency_hz=FREQUENCY, boxes=()).paths(torch.tensor([[3.0, 2.5, 0.4]]), receiver)
+    write_deepmimo(below, tmp_path)
+    found, expected = load_spectra(tmp_path, grid=GRID), below.spectra("made", grid=GRID)
+    torch.testing.assert_close(found.spectrum, expected.spectrum, atol=1e-6, rtol=0)
+    with np.load(next(tmp_path.glob("aoa_el*.npz"))) as angles:
+        assert (angles["aoa_el"][:, 0] > 90).all()  # the direct paths
+
+
 def test_deepmimo_folders_are_made_of_ray_paths(paths, tmp_path, capsys):
     corner = paths.receiver[paths.owner] + paths.direction
     made = replace(paths, corner=corner[:, None])

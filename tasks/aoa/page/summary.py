@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tasks.aoa.condition import LOCATOR
+from tasks.aoa.condition import LOCATOR, MEASURED_STAND_IN, STAND_IN
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.former import FORMER_NAMES
 from tasks.aoa.page.gains import change_text, changes_of, gain_sentence, judgement, learner, reference, turbo_method
@@ -111,7 +111,7 @@ def next_steps(fraction: FractionRecords) -> list[str]:
     files = {
         file.name.removesuffix(f"-mix{key}.safetensors") for file in fraction.run.folder.glob(f"*-mix{key}.safetensors")
     }
-    estimators = files & {*ESTIMATORS, *FORMER_NAMES, LOCATOR}
+    estimators = files & {*ESTIMATORS, *FORMER_NAMES, LOCATOR, MEASURED_STAND_IN}
     steps = []
     if files - estimators:
         steps.append(f"Explore the spectra: `python -m tasks.view {path}`.")
@@ -144,9 +144,11 @@ def next_steps(fraction: FractionRecords) -> list[str]:
 
 
 def _file_of(fraction: FractionRecords, method: str, kept: set[str]) -> str:
-    """Return the kept estimator of a method, empty if no file is of it: files are trained as the run recommends."""
+    """Return the kept estimator of a method, empty if no file is of it."""
     condition = fraction.conditions.get(method)
     if condition is None:
         return ""
+    if method == STAND_IN:
+        return MEASURED_STAND_IN if MEASURED_STAND_IN in kept else ""
     names = [condition.estimator, *(old for old, new in FORMER_NAMES.items() if new == condition.estimator)]
     return next((name for name in names if name in kept), "")

@@ -90,6 +90,22 @@ def test_directions_from_everywhere_and_of_a_linear_array(method):
         torch.testing.assert_close(method(array, channel)[:, 0], folded, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_the_two_ends_of_an_axis_are_distinguished(method):
+    """Elements exactly half a wavelength apart, sources 6 to 26 degrees from the axis."""
+    wavelength = SQUARE.wavelength
+    for elements in (2, 3, 4):
+        array = PlanarArray.grid(1, elements, wavelength / 2, 299792458 / wavelength)
+        angle = torch.arange(6, 28, 4.0).double().deg2rad()
+        direction = torch.stack([angle.cos(), 0 * angle, angle.sin()], dim=1)
+        direction = torch.cat([direction, direction * torch.tensor([-1, 1, 1])])
+        generator = torch.Generator().manual_seed(elements)
+        amplitude = torch.randn(len(direction), 40, 1, dtype=torch.complex128, generator=generator)
+        channel = torch.exp(1j * array.phase(direction))[:, None] * amplitude
+        channel = channel + 0.003 * torch.randn(channel.shape, dtype=torch.complex128, generator=generator)
+        assert angular_distance(method(array, channel)[:, 0], direction).max() < math.radians(5)
+
+
 def test_the_strongest_source_comes_first_and_missing_ones_are_nan():
     weak, strong = unit(0.5, 0.3), unit(-0.4, -0.2)
     both = received(SQUARE, torch.stack([weak, strong]), n=1, snapshots=200, noise=0.1)[1]

@@ -51,16 +51,35 @@ def test_the_interval_of_a_change_covers_the_truth_as_often_as_it_says():
     assert covered >= 52  # 95 % of 60 are 57
 
 
-def metrics_of(errors, repeats=1):
-    """Return the metrics of conditions with these elevation errors [deg] at the test positions."""
+def results_of(errors):
+    """Return the results of conditions with these elevation errors [deg] at the test positions."""
     room = simulated_room(n=20)
     found = Results(SimpleNamespace(test=room, train=room, config=AoaConfig((0.3,)), lacking={}), SimpleNamespace())
-    for repeat in range(repeats):
-        for condition, error in errors.items():
-            off = torch.stack([torch.zeros(20), torch.as_tensor(error)], dim=1).double().deg2rad()
-            value = {"estimate": (room.label - off).tolist(), "seconds": {"train": 1.0, "estimate": 1.0}, "history": []}
-            found.add(Evaluation(replace(condition, repeat=repeat)), value)
-    return found._method_metrics(0.3)
+    for condition, error in errors.items():
+        off = torch.stack([torch.zeros(20), torch.as_tensor(error)], dim=1).double().deg2rad()
+        value = {"estimate": (room.label - off).tolist(), "seconds": {"train": 1.0, "estimate": 1.0}, "history": []}
+        found.add(Evaluation(condition), value)
+    return found
+
+
+def metrics_of(errors, repeats=1):
+    """Return the metrics of conditions with these elevation errors [deg] at the test positions."""
+    repeated = {replace(c, repeat=repeat): error for repeat in range(repeats) for c, error in errors.items()}
+    return results_of(repeated)._method_metrics(0.3)
+
+
+def test_the_chosen_estimator_is_named_as_in_the_results_where_repeats_choose_other_field_models():
+    alone = Condition("kernel_regression", "measured", measured_fraction=0.3)
+    first, second = (
+        replace(alone, training="turbo", synthesizer=name, repeat=k) for k, name in enumerate(("gp", "idw"))
+    )
+    found = results_of(dict.fromkeys((alone, replace(alone, repeat=1), first, second), np.ones(20)))
+    folds = {alone.method: [[2.0, 3.0]], first.method: [[1.0, 1.0]]}
+    found.chosen["0.3"] = {"choice": {"name": "gp"}, "errors": folds}
+    found.located_folds["0.3"] = {0: [0.1, 0.1]}  # the locator itself was refused
+    choice = found._estimator_choice(0.3)
+    assert choice["name"] == "kernel_regression_turbo_auto"
+    assert choice["name"] in found._method_metrics(0.3)[0]
 
 
 def test_the_reference_of_a_gain_is_the_best_estimator_without_synthetic_spectra():
