@@ -25,6 +25,7 @@ import swiftwrf
 from swiftwrf.plotting import mark_direction, polar_spectrum
 from swiftwrf.rssi.maps import RssiMap
 from tasks.page.figures import as_svg
+from tasks.page.maps import corners_of, hatch
 
 FOLDER = Path(__file__).parent.parent / "docs" / "figures"
 INK, TRAIN, TEST, SYNTHETIC = (
@@ -178,11 +179,12 @@ def result(data: Path) -> Figure:
     column = walks.receiver_names.index(RECEIVER)
     probability = norm.sf(THRESHOLD_DBM, chart.mean[0], chart.std[0])
     left, right = maps.subplots(1, 2)
-    image = _image(left, chart, chart.mean[0], {"vmin": -85, "vmax": -45}, "RSSI [dBm]")
+    known = walks.transmitter_position.numpy()
+    image = _image(left, chart, chart.mean[0], known, {"vmin": -85, "vmax": -45}, "RSSI [dBm]")
     x, y, _ = walks.transmitter_position[::3].T.numpy()
     left.scatter(x, y, c=walks.rssi_dbm[::3, column], s=9, norm=image.norm, edgecolors="white", linewidths=0.3)
     left.set_title("RSSI of one receiver: predicted, and measured (dots)")
-    _image(right, chart, probability, {"vmin": 0, "vmax": 1, "cmap": "cividis"}, "probability")
+    _image(right, chart, probability, known, {"vmin": 0, "vmax": 1, "cmap": "cividis"}, "probability")
     right.set_title(f"probability that a measurement exceeds {THRESHOLD_DBM} dBm")
     train, test = swiftwrf.load_spectra(data / "s23-200").split("random")
     predicted = swiftwrf.SwiftWRF().fit(train).predict(test.position).mean
@@ -194,9 +196,12 @@ def result(data: Path) -> Figure:
     return figure
 
 
-def _image(axes: Axes, chart: RssiMap, values: np.ndarray, style: dict[str, Any], label: str) -> AxesImage:
-    box = (*chart.x[[0, -1]].tolist(), *chart.y[[0, -1]].tolist())
-    image = axes.imshow(values, origin="lower", extent=box, **style)
+def _image(
+    axes: Axes, chart: RssiMap, values: np.ndarray, known: np.ndarray, style: dict[str, Any], label: str
+) -> AxesImage:
+    """Draw a map, hatched outside of the measured positions."""
+    image = axes.imshow(values, origin="lower", extent=corners_of(chart.x, chart.y), **style)
+    hatch(axes, chart.x, chart.y, known)
     axes.figure.colorbar(image, ax=axes, label=label)
     axes.set(xlabel="x [m]", ylabel="y [m]")
     return image

@@ -131,11 +131,14 @@ class RssiLocator(Configured, Saved):
         model = RssiModel(validation=self.config.validation, seed=self.config.seed).fit(train.subset(kept))
         return _Part(out, kept, model, RssiMaps.of(model.predict(train.transmitter_position[out])))
 
-    def _likelihoods(self, train: Rssi, parts: list[_Part]) -> tuple[ValueLikelihood, DetectionLikelihood, int, Tensor]:
+    def _likelihoods(
+        self, train: Rssi, parts: list[_Part], max_neighbours: int
+    ) -> tuple[ValueLikelihood, DetectionLikelihood, int, Tensor]:
         """Fit the distributions to held-out folds: of values, of detections, and of the error of k nearest neighbours."""
         rssi = torch.cat([train.rssi_dbm[part.out] for part in parts])
         mean, std = (torch.cat([getattr(part.maps, name) for part in parts]) for name in ("mean", "std"))
-        errors = {k: self._neighbour_errors(train, parts, k) for k in NEIGHBOUR_COUNTS if k < len(rssi) / 2}
+        counts = [k for k in NEIGHBOUR_COUNTS if k < len(rssi) / 2 and k <= max_neighbours]
+        errors = {k: self._neighbour_errors(train, parts, k) for k in counts}
         k = min(errors, key=lambda k: float(errors[k].norm(dim=1).median()))
         scale = (errors[k].abs().quantile(0.6, dim=0).square() + max(self.cells.edge_m, MIN_SCALE_M) ** 2).sqrt()
         values = ValueLikelihood.fit((rssi.float() - mean) / std)
@@ -156,7 +159,7 @@ class RssiLocator(Configured, Saved):
         return FingerprintLikelihood(train.transmitter_position[rows], filled, self.floor_dbm, k, scale_m)
 
     def _fit_likelihoods(self, train: Rssi, parts: list[_Part]) -> None:
-        self.values, self.detections, k, scale = self._likelihoods(train, parts)
+        self.values, self.detections, k, scale = self._likelihoods(train, parts, _fewest_kept(parts))
         self.fingerprints = self._fingerprints(train, torch.arange(len(train)), k, scale)
 
     def _calibrate(self, train: Rssi, parts: list[_Part]) -> None:
@@ -167,7 +170,9 @@ class RssiLocator(Configured, Saved):
         truth, values, positions = [], [], []
         share = min(1.0, self.config.n_calibration / len(train))
         for number, part in enumerate(parts):
-            value, detection, k, scale = self._likelihoods(train, parts[:number] + parts[number + 1 :])
+            value, detection, k, scale = self._likelihoods(
+                train, parts[:number] + parts[number + 1 :], _fewest_kept(parts)
+            )
             fingerprints = self._fingerprints(train, part.kept, k, scale)
             some = torch.linspace(0, len(part.out) - 1, max(1, round(share * len(part.out)))).long()
             rssi, at = train.rssi_dbm[part.out[some]], train.transmitter_position[part.out[some]]
@@ -310,3 +315,8 @@ class RssiLocator(Configured, Saved):
             raise InputError(f"inflation must be a number above 0, got {locator.inflation}")
         locator._maps = RssiMaps.of(locator.model.predict(locator.cells.position))
         return locator
+
+
+def _fewest_kept(parts: list[_Part]) -> int:
+    """Return the smallest number of rows that are trained on while a fold is held out."""
+    return min(len(part.kept) for part in parts)

@@ -84,16 +84,18 @@ def fit_shared_path_loss(distance: Tensor, rssi: Tensor, located: Tensor, applie
         applied: The same for the R receivers that the model is for. Defaults to `located`.
 
     Returns:
-        The model of each receiver, of shape (R,). Without measurements of one kind, the model of the other kind.
+        The model of each receiver, of shape (R,). Without measurements of one kind, that of the other kind. Receivers of
+        unknown position then have the mean level.
 
     Example:
         >>> distance, rssi = torch.tensor([[0.0, 0.0], [1.0, 0.0]]), torch.tensor([[-40.0, -70.0], [-60.0, -70.0]])
         >>> fit_shared_path_loss(distance, rssi, torch.tensor([True, False])).slope
         tensor([-20.,   0.])
     """
-    models = [fit_path_loss(distance[:, kind], rssi[:, kind], shared=True) for kind in (located, ~located)]
-    every = fit_path_loss(distance, rssi, shared=True)
-    own, others = (model.where(~model.level.isnan(), every) for model in models)
+    own, others = (fit_path_loss(distance[:, kind], rssi[:, kind], shared=True) for kind in (located, ~located))
+    own = own.where(~own.level.isnan(), fit_path_loss(distance, rssi, shared=True))
+    mean = rssi.nanmean().reshape(1)
+    others = others.where(~others.level.isnan(), PathLoss(mean, torch.zeros_like(mean)))
     is_located = located if applied is None else applied
     return PathLoss(*(a.expand(len(is_located)).where(is_located, b) for a, b in zip(own, others, strict=True)))
 

@@ -14,6 +14,20 @@ HATCH = "#555b66"
 Corners = tuple[float, float, float, float]  # x0, x1, y0, y1 [m]
 
 
+def corners_of(x: NDArray[Any], y: NDArray[Any]) -> Corners:
+    """Return the corners x0, x1, y0, y1 of a picture from the centres of its columns and rows.
+
+    A single row is as high as a column is wide.
+
+    Example:
+        >>> corners_of(np.array([0.0, 2.0]), np.array([5.0]))
+        (-1.0, 3.0, 4.0, 6.0)
+    """
+    steps = [float(line[1] - line[0]) for line in (x, y) if len(line) > 1] or [1.0]
+    dx, dy = steps[0] / 2, steps[-1] / 2
+    return float(x[0]) - dx, float(x[-1]) + dx, float(y[0]) - dy, float(y[-1]) + dy
+
+
 def inside(position: ArrayLike, known: ArrayLike) -> NDArray[np.bool_]:
     """Return whether positions lie inside the convex hull of known ones, in plan.
 
@@ -72,7 +86,7 @@ def draw(
         known: Measured positions (n, 2 or 3) [m].
         plan: Image of the floor and its corners x0, x1, y0, y1 [m], drawn below.
     """
-    extent = (float(x[0]), float(x[-1]), float(y[0]), float(y[-1]))
+    extent = corners_of(x, y)
     if plan is not None:
         axes.imshow(plan[0], extent=plan[1], aspect="equal", zorder=0)
     low, high = limits

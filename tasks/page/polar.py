@@ -28,7 +28,7 @@ def spectra(images: dict[str, NDArray[Any]], title: str, truth: Direction | None
     Azimuth runs counter-clockwise from the right. Magnitudes have the fixed scales of `SCALES`.
 
     Args:
-        images: Values (n_elevation, n_azimuth) from elevation 0 up, by kind: keys of `SCALES`.
+        images: Values (n_elevation, n_azimuth) of a hemisphere whose last row is the zenith, by kind: keys of `SCALES`.
         title: Title of the panel.
         truth: True direction, a cross. The ring is the peak of each magnitude.
     """
@@ -39,8 +39,9 @@ def spectra(images: dict[str, NDArray[Any]], title: str, truth: Direction | None
     for ax, (kind, image) in zip(axes, images.items(), strict=False):
         colours, low, high = SCALES[kind]
         n_elevation, n_azimuth = image.shape
-        azimuth = np.linspace(0, 2 * np.pi, n_azimuth + 1)
-        radius = np.linspace(90, 0, n_elevation + 1)  # angle from the zenith [deg]
+        step = 2 * np.pi / n_azimuth
+        azimuth = (np.arange(n_azimuth + 1) - 0.5) * step  # edges of the pixels
+        radius = np.maximum(90 - 90 * (np.arange(n_elevation + 1) + 0.5) / n_elevation, 0)  # from the zenith [deg]
         drawn = ax.pcolormesh(azimuth, radius, image, cmap=colours, vmin=low, vmax=high, rasterized=True)
         ax.set(yticks=(), ylim=(0, 90), xticks=np.deg2rad((0, 90, 180, 270)))
         ax.tick_params(labelsize=LABEL, pad=-2)
@@ -48,7 +49,7 @@ def spectra(images: dict[str, NDArray[Any]], title: str, truth: Direction | None
         ax.set_title(kind, fontsize=9)
         if kind in ("measured", "predicted"):
             row, column = np.unravel_index(np.argmax(image), image.shape)
-            at = (azimuth[column] + azimuth[1] / 2, 90 - 90 * (row + 0.5) / n_elevation)
+            at = (column * step, 90 - 90 * (row + 1) / n_elevation)
             _mark(ax, at, "o", PEAK)
             if truth is not None:
                 _mark(ax, (np.deg2rad(truth[0]), 90 - truth[1]), "x", TRUTH)

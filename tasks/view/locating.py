@@ -20,13 +20,13 @@ from swiftwrf.locate.rssi import UNDETECTED_BELOW_DB
 from swiftwrf.positions import nearest
 from tasks.locate.localizers import BATCH_ROWS
 from tasks.locate.steps import MAP_PIXELS, in_plan
+from tasks.page.maps import Corners, corners_of
 from tasks.records import as_table, rounded
 
 LEVELS = (0.5, 0.8)  # probabilities of the credible regions that are shown
 N_POSITIONS = 300  # of the map of expected errors
 MIN_MASS = 1e-3  # of a pixel, relative to the largest; less is transparent
 N_DRAWS = 16  # simulated rows at each of them
-Corners = tuple[float, float, float, float]  # x0, x1, y0, y1 [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +46,7 @@ class PlanMap:
     @property
     def corners(self) -> Corners:
         """Corners of the picture of all cells. A single row is as high as a column is wide."""
-        steps = [float(line[1] - line[0]) for line in (self.x, self.y) if len(line) > 1] or [1.0]
-        dx, dy = steps[0], steps[-1]
-        x0, x1, y0, y1 = self.x[0] - dx / 2, self.x[-1] + dx / 2, self.y[0] - dy / 2, self.y[-1] + dy / 2
-        return float(x0), float(x1), float(y0), float(y1)
+        return corners_of(self.x, self.y)
 
     def at(self, x: float, y: float) -> float:
         """Return the value of the cell at a position [m], nan outside of the grid."""

@@ -21,10 +21,11 @@ from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.rssi import LEVEL
 from tasks.page import figures, maps
 from tasks.page.floor_plan import FloorPlan
+from tasks.page.maps import Corners
 from tasks.records import as_table, rounded
 from tasks.rssi.page.maps import MAX_WIDTH_DB
 from tasks.view.drawing import PlanProjection
-from tasks.view.locating import Corners, RssiLocating
+from tasks.view.locating import RssiLocating
 
 CELLS = 120  # of a map, along its longer side
 RECEIVER_COLOURS, N_RECEIVER_COLOURS = "tab20", 20

@@ -7,14 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from matplotlib.text import Text
 from pandas import DataFrame
 
+from swiftwrf import AngularGrid
 from tasks import labels
 from tasks.aoa.page.records import CHOSEN, LOWER_REFERENCE, UPPER_REFERENCE
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, write_page
 from tasks.page.palette import Palette
+from tasks.page.polar import spectra
 from tasks.records import read_table
 
 
@@ -111,3 +114,20 @@ def test_every_colour_of_a_curve_stands_out_in_light_and_dark():
 def test_two_figures_of_one_name_are_refused(tmp_path):
     with pytest.raises(ValueError, match="same"):
         write_page(tmp_path, page(Section("", plots=[plot("same"), plot("same")])))
+
+
+def test_pixels_of_a_spectrum_lie_at_their_directions():
+    """The ring of the peak is at the true direction of a spectrum that has its peak there."""
+    grid = AngularGrid.hemisphere(15, 60)
+    image = torch.zeros(grid.shape)
+    image[9, 15] = 1
+    azimuth, elevation = grid.peak_direction(image[None])[0].rad2deg().tolist()
+    (axes, *_) = spectra({"measured": image.numpy()}, "", (azimuth, elevation)).axes
+    ring, cross = (
+        {tuple(np.round(line.get_xydata()[0], 6)) for line in axes.lines if line.get_marker() == m} for m in "ox"
+    )
+    assert ring == cross
+    (mesh,) = axes.collections
+    corner = mesh.get_coordinates()  # (rows + 1, columns + 1, 2)
+    centre = corner[9:11, 15:17].mean(axis=(0, 1))
+    np.testing.assert_allclose(centre, next(iter(ring)), atol=1e-5)

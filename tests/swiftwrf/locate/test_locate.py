@@ -236,6 +236,12 @@ def test_unknown_options_are_refused(locator):
         locator(cells=4)
 
 
+def test_sessions_of_unequal_length_can_be_held_out():
+    rows = replace(rssi_room(n=130), session=torch.tensor([0] * 120 + [1] * 5 + [2] * 5))
+    locator = RssiLocator(validation="session", n_cells=200).fit(rows)
+    assert locator.locate(rows.rssi_dbm[:3]).median.isfinite().all()
+
+
 def test_spectra_at_one_position_are_held_out_together():
     train = simulated_room(n=40, seed=3, grid=AngularGrid.hemisphere(15, 60))
     twice = train.subset(torch.arange(len(train)).repeat_interleave(2))

@@ -458,6 +458,16 @@ def test_refuses():
         RssiModel().state()
 
 
+def test_a_receiver_that_is_nowhere_and_detects_nothing_has_the_mean_level():
+    data = rssi_room(n=60)
+    position, rssi = data.receiver_position.clone(), data.rssi_dbm.clone()
+    position[0], rssi[:, 0] = torch.nan, torch.nan
+    train = replace(data, receiver_position=position, rssi_dbm=rssi)
+    found = fit_rssi(train).predict(train.transmitter_position).mean[:, 0]
+    assert found.std() < 0.1
+    assert float(found.mean()) == pytest.approx(float(rssi.nanmean()), abs=1)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
