@@ -48,6 +48,7 @@ PAPER_RECEIVERS = 4  # receivers that the paper's head is learnt for together, w
 FIELD_ALONE = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)  # mixing weights
 SHRINKAGE = 0.05  # of the mixing weights towards the field, by nested cross-validation in the training rows
 MIN_SCORES = 30  # held-out rows of a receiver below which the scores of all receivers scale its standard deviation
+BINNED = 0.01  # relative difference of variances beyond which a row is the mean of several measurements
 MAX_VARIANCE_POSITIONS = 200  # measured positions that determine where the field is known
 
 
@@ -235,7 +236,8 @@ class RssiModel(SavedRssiPredictor):
     def with_chosen_kernel(self, without: Tensor | None = None) -> Self:
         """Return the model fitted again to all rows that it has learnt, with kernel, noise and mixing weights chosen again.
 
-        The rows follow from their residuals. Attenuation of floors and offsets stay as fitted.
+        The rows follow from their residuals. Attenuation of floors and offsets stay as fitted. Rows that were averaged in
+        location bins are bins here, so that the scatter of single measurements is unknown: standard deviations stay, too.
 
         Args:
             without: Numbers of rows that are forgotten first, in the order in which the model received them, int64. Defaults
@@ -266,6 +268,10 @@ class RssiModel(SavedRssiPredictor):
         validation = "block" if self.config.validation == "session" else self.config.validation
         model = type(self)(replace(self.config, validation=validation)).fit(rows)
         model.attenuation, model.offsets = self.attenuation, self.offsets
+        state = posterior.state
+        # a mean of several measurements has a smaller variance than one measurement
+        if bool(((state.variance > 0) & (state.variance < (1 - BINNED) * state.noise_variance)).any()):
+            model.field_db, model.noise_db = self.field_db, self.noise_db
         return model
 
     def _checked_posterior(self) -> RssiPosterior:
