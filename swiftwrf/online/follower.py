@@ -92,6 +92,11 @@ class Follower:
         self._recent: list[Spectra] = []
         self._waiting: list[Spectra | Rssi] = []  # of a geometry, for its next update
 
+    @property
+    def is_waiting(self) -> bool:
+        """True if measurements wait for the next update of the model, which geometry makes with every 10 spectra."""
+        return bool(self._waiting)
+
     def step(self, new: Spectra | Rssi) -> Step:
         """Score one measurement, test it for a change, and learn it.
 

@@ -116,7 +116,8 @@ class Monitor:
     def state(self) -> dict[str, Any]:
         """Return reference, regions and sums as plain values."""
         sums = {"value": self.cusum.value.tolist(), "since": self.cusum.since.tolist(), "count": self.cusum.count}
-        return {"reference": self.reference.tolist(), "centre": self.centre.tolist(), "cusum": sums}
+        known = {"reference": self.reference.tolist(), "centre": self.centre.tolist()}
+        return known | {"cusum": sums, "threshold": self.threshold}
 
     def continued(self, state: dict[str, Any]) -> Monitor:
         """Return this monitor with the regions and sums of a `state`."""
@@ -125,6 +126,8 @@ class Monitor:
             torch.tensor(state[name], dtype=torch.float64) for name in ("reference", "centre")
         )
         monitor.cusum = Cusum(torch.tensor(sums["value"]).double(), torch.tensor(sums["since"]), int(sums["count"]))
+        n_series = len(monitor.cusum.value)
+        monitor.threshold = float(state.get("threshold") or alarm_threshold(self.config.false_alarm_rate, n_series))
         return monitor
 
     def describe(self, alarm: Alarm) -> str:

@@ -263,6 +263,8 @@ class ObstacleMonitor:
         tensors = {
             "low": self.standing.low,
             "high": self.standing.high,
+            "candidates_low": self.candidates.low,
+            "candidates_high": self.candidates.high,
             **{name: getattr(self, name) for name in names},
         }
         return {"count": self.count, "armed": self.armed, **{name: tensor.tolist() for name, tensor in tensors.items()}}
@@ -270,8 +272,14 @@ class ObstacleMonitor:
     def continued(self, state: dict[str, Any]) -> ObstacleMonitor:
         """Return this monitor, made without training spectra, with the obstacles, weights and sums of a `state`."""
         monitor = copy(self)
-        low, high = (torch.tensor(state[end], dtype=torch.float64).reshape(-1, 3) for end in ("low", "high"))
-        monitor.standing = Boxes(low, high)
+
+        def boxes(low: str, high: str) -> Boxes:
+            return Boxes(*(torch.tensor(state[end], dtype=torch.float64).reshape(-1, 3) for end in (low, high)))
+
+        monitor.standing = boxes("low", "high")
+        if "candidates_low" in state:  # the room of the model has grown since the test began
+            monitor.candidates = boxes("candidates_low", "candidates_high")
+            monitor.threshold = self.threshold + math.log(len(monitor.candidates) / len(self.candidates))
         monitor.count, monitor.armed = int(state["count"]), bool(state["armed"])
         monitor.weight, monitor.value = torch.tensor(state["weight"]), torch.tensor(state["value"])
         monitor.since = torch.tensor(state["since"], dtype=torch.int64)

@@ -85,7 +85,8 @@ def follow(config: UpdateConfig) -> None:
             continue
         print(answer(follower.count, new, before, step), flush=True)
         record.append(folder, record.add(follower.count - 1, step, follower.obstacles))
-        _save(follower, file, {"source": source, "lines": str(number)})
+        if not follower.is_waiting:  # after a kill, lines since the last update are answered again
+            _save(follower, file, {"source": source, "lines": str(number)})
     claim.release()
 
 

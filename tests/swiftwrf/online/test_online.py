@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from swiftwrf import AngularGrid, GeometryModel, RssiModel, load, make_model
+from swiftwrf import AngularGrid, GeometryModel, HybridModel, RssiModel, load, make_model
 from swiftwrf.data.simulated import rssi_room, simulated_room
 from swiftwrf.data.simulated.room import ShoeboxRoom
 from swiftwrf.data.writing import write_rssi
@@ -286,6 +286,22 @@ def test_a_follower_of_a_room_continues_its_test_for_obstacles():
         one.obstacles.observe(changed.subset(torch.arange(6, 12)))
     torch.testing.assert_close(again.obstacles.value, follower.obstacles.value)
     assert len(again.obstacles.standing) == len(follower.obstacles.standing)
+
+
+def test_a_follower_continues_after_the_model_has_grown():
+    """New positions lie outside of those that the tests began with."""
+    data = simulated_room(n=80, grid=AngularGrid.hemisphere(8, 32))
+    order = data.position[:, 0].argsort()
+    train, new = data.subset(order[:50]), data.subset(order[50:65])
+    room = GeometryModel.of_planes(train, [Plane((0.0, 0.0, -1.0), offset_m=0.0, gain=-0.6)])
+    follower = Follower(HybridModel().fit(train, like=room), train)
+    for row in range(len(new)):
+        follower.step(new.subset(torch.tensor([row])))
+    again = Follower(follower.model)
+    again.resume(json.loads(json.dumps(follower.state())))
+    assert again.monitor.threshold == follower.monitor.threshold
+    assert again.obstacles.threshold == pytest.approx(follower.obstacles.threshold)
+    torch.testing.assert_close(again.obstacles.boxes.low, follower.obstacles.boxes.low)
 
 
 def test_a_box_that_the_training_spectra_do_not_exclude_raises_no_alarm():
