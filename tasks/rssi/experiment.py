@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,12 +48,13 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     device = choose_device("cpu" if config.device == "auto" else config.device)
     plan = _read_floor_plan(config)
     whole = _load(config)
-    data, (pool, _) = whole.receivers(config.rx), whole.split(config.split, config.seed)
+    data = whole.receivers(config.rx)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
     train, test = data.split(config.split, config.seed)
     if not bool((~test.rssi_dbm.isnan()).any()):
         raise InputError(f"split {config.split!r} of {data.name} has no test rows that detect these receivers")
+    pool = pool_of(whole, train, test, config)
     notes = [*split_notes(train, test, config.split), *offset_notes(data, config), *data.notes]
     if (offsets := asked_offsets(pool, config)) is not None:
         train, pool = offsets.removed(train), offsets.removed(pool)
@@ -99,6 +101,17 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
 def _load(config: RssiTaskConfig) -> Rssi:
     measured = measured_rssi(config.data, config)
     return rssi_room(seed=config.seed) if measured is None else measured
+
+
+def pool_of(whole: Rssi, train: Rssi, test: Rssi, config: RssiTaskConfig) -> Rssi:
+    """Return the training rows at every receiver, without those that a split by place holds out."""
+    if config.split != PLACE or PLACE in whole.named_splits:
+        return whole.split(config.split, config.seed)[0]
+    is_held_out = test.detected.any(dim=0)
+    held_out = {name for name, out in zip(test.receiver_names, is_held_out.tolist(), strict=True) if out}
+    kept = torch.tensor([name not in held_out for name in whole.receiver_names])
+    rows = torch.isin(whole.index, train.index)
+    return replace(whole, rssi_dbm=whole.rssi_dbm.where(kept, torch.nan)).subset(rows)
 
 
 def _read_floor_plan(config: RssiTaskConfig) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from tasks.command_line import command_line
 from tasks.labels import PREDICTORS as LABELS
 from tasks.report.run import merge
 from tasks.rssi import experiment
+from tasks.rssi.options import RssiTaskConfig
 from tasks.rssi.page.summary import where_next
 from tasks.rssi.predictors import PREDICTORS, make_predictor
 from tasks.rssi.predictors.blend import Blend, BlendConfig
@@ -300,3 +301,16 @@ def test_an_interval_of_one_width_sends_nobody_to_measure():
     assert where_next(run).startswith("Measure around x = 3.0 m, y = 2.0 m")
     maps["measured_position"] = corners[[0, 1, 2]]  # x = 3, y = 2 is outside now
     assert "x = 3.0 m, y = 2.0 m" not in where_next(run)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_receivers_that_a_split_by_place_holds_out_are_not_in_the_pool(seed):
+    whole = rssi_room(n=120)
+    data = whole.receivers([str(number) for number in range(7, 13)])
+    train, test = data.split("place", seed)
+    pool = experiment.pool_of(whole, train, test, RssiTaskConfig(rx=("all",), split="place", seed=seed))
+    held_out = [name for name, out in zip(test.receiver_names, test.detected.any(dim=0), strict=True) if out]
+    assert held_out
+    assert not pool.detected[:, [pool.receiver_names.index(name) for name in held_out]].any()
+    assert torch.equal(pool.transmitter_position, train.transmitter_position)
+    assert int(pool.detected.any(dim=0).sum()) == len(whole.receiver_names) - len(held_out)
