@@ -132,10 +132,15 @@ class Region:
             ]
             offset = torch.cartesian_prod(*lines).reshape(-1, len(half))
         position = centre + offset @ axes
+        log_mass = self.log_mass(position)
+        return Cells(position, log_mass, step[:, None] * axes, torch.zeros_like(log_mass))
+
+    def log_mass(self, position: Tensor) -> Tensor:
+        """Return the logarithm of the prior mass of cells of equal size with centres (m, 3) [m], (m,)."""
         near = self.is_near(position)
         mass = torch.full((len(position),), self.outside / len(position), dtype=torch.float64)
         mass[near] += (1 - self.outside) / max(int(near.sum()), 1)
-        return Cells(position, (mass / mass.sum()).log(), step[:, None] * axes, torch.zeros_like(mass))
+        return (mass / mass.sum()).log()
 
 
 def outside_mass(regions: list[Region], positions: list[Tensor]) -> float:

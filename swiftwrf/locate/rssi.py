@@ -165,9 +165,9 @@ class RssiLocator(Configured, Saved):
     def _calibrate(self, train: Rssi, parts: list[_Part]) -> None:
         """Choose the weights of the likelihoods by the posterior density at held-out positions.
 
-        The distributions of each fold are fitted to the other folds.
+        The distributions of each fold are fitted to the other folds, and so is the prior over positions.
         """
-        truth, values, positions = [], [], []
+        truth, values, positions, masses = [], [], [], []
         share = min(1.0, self.config.n_calibration / len(train))
         for number, part in enumerate(parts):
             value, detection, k, scale = self._likelihoods(
@@ -194,15 +194,16 @@ class RssiLocator(Configured, Saved):
                 return torch.stack([value.double() for value in parts])
 
             values.append(all_of(maps, self.cells.position, rssi))
+            prior = Region(train.transmitter_position[part.kept], self.region.margin, self.region.outside)
+            masses.append(prior.log_mass(self.cells.position).expand(len(rssi), -1))
             own = RssiMaps(part.maps.mean[some], part.maps.std[some])
             positions.append(at)
             truth.append(all_of(own, at, rssi).diagonal(dim1=1, dim2=2))
-        candidates, position = torch.cat(values, dim=1), torch.cat(positions)
-        volume = self.cells.log_volume.expand(candidates.shape[1], -1)
+        candidates, position, volume = torch.cat(values, dim=1), torch.cat(positions), torch.cat(masses)
         self.weight = pooled_weights(torch.cat(truth, dim=1), candidates, volume)
         generator = torch.Generator().manual_seed(self.config.seed)
         rows = torch.randperm(len(position), generator=generator)[:MAX_INFLATION_ROWS]
-        log_mass = torch.einsum("k,knm->nm", self.weight, candidates[:, rows]) + self.cells.log_volume
+        log_mass = torch.einsum("k,knm->nm", self.weight, candidates[:, rows]) + volume[rows]
         held_out = Posterior(self.cells.position[None], normalised(log_mass), self.cells.edge_m)
         self.inflation = inflation(held_out, position[rows])
 
