@@ -45,7 +45,7 @@ def comparison_counts() -> str:
 
 
 def _ssim(row: dict[str, Any] | None) -> str:
-    return "" if row is None else f"{row['ssim']['median']:.3f} [{row['ssim']['low']:.3f}, {row['ssim']['high']:.3f}]"
+    return "" if row is None else f"{row['ssim']['median']:.3f}"
 
 
 def comparison_turbo() -> str:
