@@ -21,7 +21,7 @@ def locating_spectra() -> str:
     columns = [
         "scene",
         "measured",
-        "draws",
+        "random choices",
         "kernel regression [deg]",
         "matched field [deg]",
         "position [m]",

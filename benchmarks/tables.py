@@ -166,7 +166,7 @@ def room() -> str:
         quality = [f"{mix['synthesis'][s]['psnr_db']['median']:.1f}" for s in methods]
         cells = [f"{len(errors)} of {len(walls)}", f"{max(errors):.1f}", f"{certain} of {n}"]
         rows.append([scene, str(mix["n_measured"]), *cells, *quality])
-    columns = ["scene, moving end", "spectra", "walls found", "largest error [mm]", "certain", *methods]
+    columns = ["scene, moving end", "spectra", "walls found", "largest error [mm]", "identifiable", *methods]
     return markdown(columns, rows)
 
 
@@ -182,7 +182,7 @@ def walls() -> str:
         quality = [f"{found['psnr_db'][name]['median']:.1f}" for name in ("geometry", "hybrid")]
         what = f"{scene}, {moving.removeprefix('moving ')}, {draw}"
         rows.append([what, str(found["positions"]), *cells, certain, *quality, f"{found['cpu_seconds']:.0f} s"])
-    columns = ["scene, moving end", "spectra", *(f"{side} [mm]" for side in SIDES), "certain ones within 3 deviations"]
+    columns = ["scene, moving end", "spectra", *(f"{side} [mm]" for side in SIDES), "identifiable ones within 3 deviations"]
     return markdown([*columns, "geometry", "hybrid", "processor time"], rows)
 
 
@@ -202,7 +202,7 @@ def random_rooms() -> str:
             f"{seconds:.0f} s",
         ]
         rows.append([kind, noise, *cells])
-    return markdown(["gains", "phase noise", "rooms", "planes", "certain", "of them wrong", "processor time"], rows)
+    return markdown(["gains", "phase noise", "rooms", "planes", "identifiable", "of them wrong", "processor time"], rows)
 
 
 def _millimetres(plane: dict[str, Any] | None) -> str:
@@ -285,7 +285,7 @@ def raytracing() -> str:
         certain = sum(plane["certain"] for plane in result["planes"])
         traced = result["traced"]
         rows.append([scene, f"{traced['paths_per_position']:.0f}", *cells, f"{certain} of {len(result['planes'])}"])
-    return markdown(["scene, moving end", "paths a position", *scores, "planes certain"], rows)
+    return markdown(["scene, moving end", "paths a position", *scores, "identifiable planes"], rows)
 
 
 TABLES = {
