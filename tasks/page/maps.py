@@ -53,8 +53,10 @@ def inside(position: ArrayLike, known: ArrayLike) -> NDArray[np.bool_]:
 
 def hatch(axes: Axes, x: NDArray[Any], y: NDArray[Any], known: ArrayLike) -> None:
     """Hatch the cells of a map with centres x (W,) and y (H,) [m] that lie outside of the known positions (n, 2 or 3)."""
-    outside = ~inside(np.stack(np.meshgrid(x, y), axis=-1), known)
-    if outside.any() and min(outside.shape) > 1:
+    outside = np.pad(~inside(np.stack(np.meshgrid(x, y), axis=-1), known), 1, mode="edge")
+    x0, x1, y0, y1 = corners_of(x, y)
+    x, y = np.concatenate([[x0], x, [x1]]), np.concatenate([[y0], y, [y1]])
+    if outside.any():
         with np.errstate(all="ignore"):
             drawn = axes.contourf(
                 x, y, outside.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"], zorder=2

@@ -109,8 +109,9 @@ class Maps:
     def _panel(self, values: NDArray[Any], kind: str, title: str, receiver: int | None, width: float = 4.6) -> Figure:
         """Draw one map, with the measurements of a receiver, or with all receivers for None."""
         a = self.arrays
-        shape = np.ptp(a["y"]) / max(np.ptp(a["x"]), 1e-9)
-        figure, ax = figures.panel(width, 0.7 + (width - 1.2) * float(np.clip(shape, 0.4, 1.6)))
+        x0, x1, y0, y1 = maps.corners_of(a["x"], a["y"])
+        shape = (y1 - y0) / (x1 - x0)
+        figure, ax = figures.panel(width, 0.8 + (width - 1.2) * float(np.clip(shape, 0.4, 1.6)))
         limits, colours = ((0.0, MAX_WIDTH_DB), "magma") if kind == "width" else (self._limits, "viridis")
         if kind == "predicted" and receiver is None:
             limits = (float(values.min()), float(values.max()))

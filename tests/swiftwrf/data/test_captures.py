@@ -162,7 +162,7 @@ def test_captures_of_one_antenna_receive_no_direction(tmp_path):
 
 def test_a_table_of_positions_is_no_survey(tmp_path):
     write_captures(tmp_path)
-    with pytest.raises(InputError, match="no format of RSSI"):
+    with pytest.raises(InputError, match="none of the known formats"):
         load_rssi(tmp_path)
 
 

@@ -149,7 +149,7 @@ def test_commands_take_names_where_there_is_no_such_folder(served, tmp_path, cap
     assert json.loads((tmp_path / "a" / "inspect.json").read_text())["kind"] == "RSSI"
     (tmp_path / "toy").mkdir()
     assert inspected("toy", "--out", "b") == 2
-    assert "holds no format" in said(capsys)
+    assert "is in none of the known formats" in said(capsys)
 
 
 def test_every_source_is_pinned_and_has_a_licence():
