@@ -56,7 +56,9 @@ def next_steps(run: RssiRecords) -> list[str]:
     steps.append(
         f"Predict anywhere: `swiftwrf.load('{run.path}/model.safetensors').predict(positions)`, with intervals."
     )
-    if warning := coverage_warning("intervals", interval["coverage"], interval["nominal"], run.metrics["n_test"]):
+    # the receivers of a row are not independent
+    n_test = min(run.metrics["n_test"], run.metrics["overall"][model_of(run)]["abs_error_db"]["n"])
+    if warning := coverage_warning("intervals", interval["coverage"], interval["nominal"], n_test):
         steps.append(warning)
     if pairs and run.metrics["split"] != "place":
         steps.append("Run `--split place`: it shows the error of a receiver at positions where it measured nothing.")
