@@ -182,7 +182,12 @@ def walls() -> str:
         quality = [f"{found['psnr_db'][name]['median']:.1f}" for name in ("geometry", "hybrid")]
         what = f"{scene}, {moving.removeprefix('moving ')}, {draw}"
         rows.append([what, str(found["positions"]), *cells, certain, *quality, f"{found['cpu_seconds']:.0f} s"])
-    columns = ["scene, moving end", "spectra", *(f"{side} [mm]" for side in SIDES), "identifiable ones within 3 deviations"]
+    columns = [
+        "scene, moving end",
+        "spectra",
+        *(f"{side} [mm]" for side in SIDES),
+        "identifiable ones within 3 deviations",
+    ]
     return markdown([*columns, "geometry", "hybrid", "processor time"], rows)
 
 
@@ -202,7 +207,9 @@ def random_rooms() -> str:
             f"{seconds:.0f} s",
         ]
         rows.append([kind, noise, *cells])
-    return markdown(["gains", "phase noise", "rooms", "planes", "identifiable", "of them wrong", "processor time"], rows)
+    return markdown(
+        ["gains", "phase noise", "rooms", "planes", "identifiable", "of them wrong", "processor time"], rows
+    )
 
 
 def _millimetres(plane: dict[str, Any] | None) -> str:

@@ -92,6 +92,20 @@ def covered(mean: Tensor, std: Tensor, measured: Tensor) -> Tensor:
     return ((mean - measured).abs() <= NORMAL_80 * std).float().mean(dim=(-2, -1))
 
 
+def std_factor(score: Tensor) -> float:
+    """Return the factor of standard deviations with which 80 % intervals contain 80 % of the values.
+
+    Args:
+        score: Absolute errors in standard deviations, of any shape.
+
+    Example:
+        >>> errors = torch.randn(100, 100, generator=torch.Generator().manual_seed(0)).abs()
+        >>> round(std_factor(errors / 0.5), 1)  # standard deviations of 0.5 are half as large as they should be
+        2.0
+    """
+    return float(np.quantile(score.numpy(), 0.8)) / NORMAL_80
+
+
 def angle_errors(estimate: Tensor, truth: Tensor) -> dict[str, Tensor]:
     """Return absolute errors (n,) [rad] of azimuth (modulo 2 pi) and elevation, and the angular error (great-circle).
 

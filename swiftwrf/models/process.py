@@ -14,7 +14,6 @@ from abc import abstractmethod
 from collections.abc import Callable
 from typing import Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,11 +23,10 @@ from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, held_out_neighbours, subsample
-from swiftwrf.metrics import NORMAL_80
+from swiftwrf.metrics import std_factor
 from swiftwrf.models.base import FieldModel
 from swiftwrf.runtime.checkpoint import expect
 
-COVERAGE = 0.8  # fraction of held-out pixels in the interval that calibrates the standard deviation
 MAX_HELD_OUT = 100  # training spectra that determine the spread
 SHRINKAGE_SPECTRA = 5.0  # weight of the mean over directions in the spread of each one, in spectra
 MIN_STD = 1e-6  # of magnitudes, which are in [0, 1]
@@ -110,7 +108,7 @@ class ProcessModel(FieldModel):
         square = score.square()
         total = square.sum(dim=0) + SHRINKAGE_SPECTRA * square.mean()
         spread = (total / (len(score) + SHRINKAGE_SPECTRA)).sqrt().clamp_min(MIN_STD)
-        self.spread = spread * float(np.quantile((score / spread).numpy(), COVERAGE)) / NORMAL_80
+        self.spread = spread * std_factor(score / spread)
 
     def _std(self, position: Tensor, grid: AngularGrid) -> Tensor | None:
         """Return the standard deviation (b, H, W) of measurements at positions (b, 3) [m]."""

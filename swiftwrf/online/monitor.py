@@ -116,8 +116,7 @@ class Monitor:
     def state(self) -> dict[str, Any]:
         """Return reference, regions and sums as plain values."""
         sums = {"value": self.cusum.value.tolist(), "since": self.cusum.since.tolist(), "count": self.cusum.count}
-        known = {"reference": self.reference.tolist(), "centre": self.centre.tolist()}
-        return known | {"cusum": sums, "threshold": self.threshold}
+        return {"reference": self.reference.tolist(), "centre": self.centre.tolist(), "cusum": sums}
 
     def continued(self, state: dict[str, Any]) -> Monitor:
         """Return this monitor with the regions and sums of a `state`."""
@@ -126,8 +125,7 @@ class Monitor:
             torch.tensor(state[name], dtype=torch.float64) for name in ("reference", "centre")
         )
         monitor.cusum = Cusum(torch.tensor(sums["value"]).double(), torch.tensor(sums["since"]), int(sums["count"]))
-        n_series = len(monitor.cusum.value)
-        monitor.threshold = float(state.get("threshold") or alarm_threshold(self.config.false_alarm_rate, n_series))
+        monitor.threshold = alarm_threshold(self.config.false_alarm_rate, len(monitor.cusum.value))
         return monitor
 
     def describe(self, alarm: Alarm) -> str:

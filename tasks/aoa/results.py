@@ -11,7 +11,7 @@ from torch import Tensor
 
 from swiftwrf.metrics import angle_errors, covered
 from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.condition import EVERYTHING, LOCATOR, Condition, MeasuredSubset, pooled, reference_of
+from tasks.aoa.condition import EVERYTHING, LOCATOR, STAND_IN, Condition, MeasuredSubset, pooled, reference_of
 from tasks.aoa.context import ROOM_MODEL, Experiment
 from tasks.aoa.cross_validation import choose_estimator
 from tasks.aoa.evaluation import Evaluation
@@ -254,12 +254,11 @@ class Results:
         return choose_estimator(errors, {n: None if own is None else np.array(own) for n, own in located.items()})
 
     def _pooled_name(self, method: str, fraction: float) -> str:
-        """Return the name under which `pooled` has a method of the first repeat."""
+        """Return the name under which `pooled` has a method of the stand-in in the first repeat."""
         own = [condition for condition, _ in self.pooled if condition.measured_fraction == fraction]
         if any(condition.method == method for condition in own):
             return method
-        (stand_in,) = (c for c, _ in self.evaluated if c.measured_fraction == fraction and c.method == method)
-        return next(c.method for c in own if c.is_turbo and c.estimator == stand_in.estimator)
+        return next((c.method for c in own if c.is_turbo and c.estimator == STAND_IN), method)
 
     def _method_metrics(self, fraction: float) -> tuple[dict[str, MethodMetrics], str]:
         """Return the metrics of each method, and the reference of changes."""

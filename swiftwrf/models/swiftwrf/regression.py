@@ -12,14 +12,13 @@ import math
 from dataclasses import replace
 from functools import cached_property
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.gp import Kernel, SmoothField, held_out, principal_components, subsample
-from swiftwrf.metrics import NORMAL_80
+from swiftwrf.metrics import std_factor
 from swiftwrf.models.swiftwrf.config import FitConfig, ModelConfig
 from swiftwrf.models.swiftwrf.deformation import COMPONENTS, Deformation
 from swiftwrf.models.swiftwrf.deformation.low_rank import LowRankDeformation
@@ -41,7 +40,6 @@ MIN_VARIANCE = 1e-9  # fraction of the variance below which a principal componen
 MARGIN = 0.5  # spacings by which the first means lie below the horizon
 FILL_EVERY = 16  # one primitive in this number starts at the largest residual
 PEAK_WIDTH = 1.5  # its initial standard deviation, in pixels
-COVERAGE = 0.8  # fraction of held-out pixels in the interval that calibrates the standard deviation
 
 
 class Regression:
@@ -113,7 +111,7 @@ class Regression:
         predicted, variance = self._held_out(self.some, kernel)
         prior = _render(response, kernel).square().sum(dim=0).clamp_min(1e-12)
         miss = (predicted - self.some.spectrum).abs() / (variance[:, None, None] * prior).sqrt()
-        return float(np.quantile(miss, COVERAGE)) / NORMAL_80
+        return std_factor(miss)
 
     def _shaped(self, n: int, steps: int) -> Primitives:
         """Return n primitives with fitted shapes, fitted once for each number of steps."""

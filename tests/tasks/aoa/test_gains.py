@@ -70,10 +70,11 @@ def metrics_of(errors, repeats=1):
 
 def test_the_chosen_estimator_is_named_as_in_the_results_where_repeats_choose_other_field_models():
     alone = Condition("kernel_regression", "measured", measured_fraction=0.3)
-    first, second = (
-        replace(alone, training="turbo", synthesizer=name, repeat=k) for k, name in enumerate(("gp", "idw"))
+    first, *others = (
+        replace(alone, training="turbo", synthesizer=name, repeat=k) for k, name in enumerate(("gp", "idw", "gp"))
     )
-    found = results_of(dict.fromkeys((alone, replace(alone, repeat=1), first, second), np.ones(20)))
+    measured = [replace(alone, repeat=k) for k in range(3)]
+    found = results_of(dict.fromkeys((*measured, first, *others), np.ones(20)))
     folds = {alone.method: [[2.0, 3.0]], first.method: [[1.0, 1.0]]}
     found.chosen["0.3"] = {"choice": {"name": "gp"}, "errors": folds}
     found.located_folds["0.3"] = {0: [0.1, 0.1]}  # the locator itself was refused
