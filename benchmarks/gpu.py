@@ -24,7 +24,21 @@ from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 from augment import Mixed
-from swiftwrf import AngularGrid, FitConfig, ModelConfig, fit, fit_coarray, simulated_room
+from swiftwrf import (
+    AngularGrid,
+    FitConfig,
+    GeometryModel,
+    MatchedField,
+    ModelConfig,
+    Spectra,
+    fit,
+    fit_coarray,
+    make_model,
+    simulated_room,
+)
+from swiftwrf.data.simulated.room import ShoeboxRoom
+from swiftwrf.models.geometry.planes import Plane
+from swiftwrf.online import prequential
 from swiftwrf.rasterize import rasterize_magnitude
 from tasks.aoa.estimators.aann import AANN, AANNConfig
 from tasks.run import choose_device
@@ -43,7 +57,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Config:
-    part: tyro.conf.Positional[Literal["rates", "training", "coarray", "profile", "draw"]]
+    part: tyro.conf.Positional[Literal["rates", "training", "coarray", "update", "locating", "profile", "draw"]]
     """what to measure; draw measures nothing and is what a profiler looks at"""
     out: Path = RESULTS
     """folder of the result"""
@@ -145,6 +159,50 @@ def coarray(config: Config, device: torch.device) -> Row:
     return {"grid": grid.shape, "threads": torch.get_num_threads(), "synthesize_per_s": found}
 
 
+def update(config: Config, device: torch.device) -> Row:
+    """Return the milliseconds in which fitted models predict, score and learn a spectrum, one at a time."""
+    n, new = (30, 5) if config.quick else (1000, 50)
+    rows = []
+    for name, where in (("swiftwrf", torch.device("cpu")), ("swiftwrf", device), ("coarray", torch.device("cpu"))):
+        if rows and where == torch.device(rows[-1]["device"]) and name == rows[-1]["model"]:
+            continue  # there is no GPU
+        data = scene_of(n + new, config)
+        model = make_model(name).fit(data.subset(torch.arange(n)), device=where)
+        further = data.subset(torch.arange(n, n + new))
+        prequential(model, further)  # compiles
+        seconds = timed(lambda model=model, further=further: prequential(model, further), where)
+        rows.append({"model": name, "device": where.type, "n": n, "ms_per_spectrum": 1e3 * seconds / new})
+        print(rows[-1], flush=True)
+    return {"grid": data.grid.shape, "threads": torch.get_num_threads(), "rows": rows}
+
+
+def locating(config: Config, device: torch.device) -> Row:
+    """Return the seconds of matched-field processing in a known room, on the CPU of the machine."""
+    n, new = (20, 4) if config.quick else (120, 64)
+    data, room = scene_of(n + new, config), ShoeboxRoom()
+    train, test = data.subset(torch.arange(n)), data.subset(torch.arange(n, n + new))
+    ends = zip(torch.eye(3).tolist(), room.size, strict=True)
+    walls = [
+        Plane(tuple(sign * x for x in axis), offset_m=max(0.0, sign * size), gain=room.reflection)
+        for axis, size in ends
+        for sign in (-1, 1)
+    ]
+    known = GeometryModel.of_planes(train, walls)
+    locator = MatchedField(spacing=0.5 if config.quick else 0.1)
+    seconds = {"fit": timed(lambda: locator.fit(train, room=known), device)}
+    found = []
+    seconds["spectrum"] = timed(lambda: found.append(locator.locate(test.spectrum)), device) / new
+    error = (found[0].median - test.position).norm(dim=1).median()
+    print(seconds, f"{float(error):.3f} m", flush=True)
+    return {"n_train": n, "threads": torch.get_num_threads(), "seconds": seconds, "median_error_m": float(error)}
+
+
+def scene_of(n: int, config: Config) -> Spectra:
+    """Spectra of the built-in room."""
+    grid, _, _ = sizes(config)
+    return simulated_room(n=n, grid=grid)
+
+
 def profiled(config: Config, device: torch.device) -> Row:
     """Return the rendering time by kernel, and the fraction of the exponential and memory bounds that is reached."""
     grid, numbers, batches = sizes(config)
@@ -222,7 +280,15 @@ def draw(config: Config, device: torch.device) -> None:
         rasterize_magnitude(*inputs, grid, "auto", CUTOFF)
 
 
-PARTS = {"rates": rates, "training": training, "coarray": coarray, "profile": profiled, "draw": draw}
+PARTS = {
+    "rates": rates,
+    "training": training,
+    "coarray": coarray,
+    "update": update,
+    "locating": locating,
+    "profile": profiled,
+    "draw": draw,
+}
 
 if __name__ == "__main__":
     main(tyro.cli(Config))

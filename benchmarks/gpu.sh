@@ -50,12 +50,14 @@ else
   size=(--device cpu --quick)
 fi
 
-part tests 180 "$python" -m pytest -m cuda -p no:cacheprovider tests/swiftwrf/rasterize tests/benchmarks/test_gpu_benchmark.py
+part tests 180 "$python" -m pytest -m cuda -p no:cacheprovider tests/swiftwrf tests/benchmarks/test_gpu_benchmark.py tests/tasks/aoa
 part rasterize 150 "$python" benchmarks/rasterize.py "${size[@]}" --seconds 0.1 --out "$folder"
 part rates 90 "$python" benchmarks/gpu.py rates "${size[@]}" --out "$folder"
 part profile 90 "$python" benchmarks/gpu.py profile "${size[@]}" --out "$folder"
 part training 120 "$python" benchmarks/gpu.py training "${size[@]}" --out "$folder"
-part coarray 30 "$python" benchmarks/gpu.py coarray "${size[@]}" --out "$folder"
+for name in coarray update locating; do
+  part "$name" 60 "$python" benchmarks/gpu.py "$name" "${size[@]}" --out "$folder"
+done
 if command -v compute-sanitizer >/dev/null; then
   for tool in racecheck initcheck synccheck; do # memcheck is one of the tests
     part "$tool" 60 compute-sanitizer --tool "$tool" --error-exitcode 1 \

@@ -155,7 +155,7 @@ class TrainedModel(FieldModel):
     @property
     def fixed_end(self) -> tuple[Tensor, Tensor, Moving] | None:
         link = self.network.link if isinstance(self.network, LinkNetwork) else None
-        return None if link is None else (link.fixed, link.rotation, link.moving)
+        return None if link is None else (link.fixed.cpu(), link.rotation.cpu(), link.moving)
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         return self.network.render(position, grid), None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -80,9 +82,16 @@ class SmoothField(nn.Module):
 
     @cached_property
     def process(self) -> GaussianProcess:
-        """Process of a regression, computed at first use, when the anchors are on their device."""
+        """Process of a regression, computed at first use on the device of the anchors."""
         assert self.value is not None
         return GaussianProcess.regress(self.kernel, self.anchor, self.value, correlation=self.correlation)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        before = self.anchor
+        moved: Self = super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        if self.anchor is not before:
+            self.__dict__.pop("process", None)
+        return moved
 
     def variance(self, position: Tensor) -> Tensor:
         """Return the posterior variance of the functions at positions (B, 3), relative to k(0) = 1, (B,)."""

@@ -237,12 +237,15 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
 
     @property
     def fixed_end(self) -> tuple[Tensor, Tensor, Moving] | None:
-        """Position of the fixed end (3,) [m], rotation of the array (3, 3) and moving end; None if the model lacks them."""
+        """Position of the fixed end (3,) [m], rotation of the array (3, 3), both on the CPU, and moving end.
+
+        None if the model lacks them.
+        """
         room = self.room
         return None if room is None else (room.fixed_position, room.rotation, room.moving)
 
     def region(self) -> Tensor:
-        """Return positions (n, 3) [m] around which the model was fitted.
+        """Return positions (n, 3) [m] around which the model was fitted, on the CPU.
 
         Defaults to centre and corners of the box around the training positions. Models that store the training positions
         return these.
@@ -282,6 +285,10 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
             parts = [evaluate(some) for some in position.split(batch)]
             stds = [std for _, std in parts if std is not None]
             return check_finite(torch.cat([mean for mean, _ in parts])), torch.cat(stds) if stds else None
+        if 0 < len(position) <= batch:
+            with torch.no_grad():
+                mean, std = evaluate(position)
+            return check_finite(mean.float()), None if std is None else std.float()
         out = torch.empty(len(position), *grid.shape, device=position.device)
         spread: Tensor | None = None
         with torch.no_grad():
@@ -365,7 +372,7 @@ def check_finite(spectrum: Tensor) -> Tensor:
     Raises:
         InputError: The parameters are so large that their sums overflow.
     """
-    if not bool(spectrum.detach().isfinite().all()):
+    if not bool(spectrum.detach().sum().isfinite()):
         raise InputError("the model predicts values that are not finite; its parameters overflow, so fit it again")
     return spectrum
 

@@ -76,7 +76,7 @@ class ProcessModel(FieldModel):
             True
         """
         model = self._copy() if without is None else self.forget(without)
-        position, before = model.process.known, model.process.kernel
+        position, before = model.process.known.cpu(), model.process.kernel
         fold = folds(position, self.config.validation, self.config.seed)
         model._set_process(model.process.with_kernel(choose_kernel(position, model._weighted_values(), fold)))
         if model.spread is not None:

@@ -38,7 +38,7 @@ def adapted(before: ProcessModel, after: Spectra) -> tuple[ProcessModel, float]:
         for number in parts.unique() if len(after) > 1 else ():
             out = after.subset(parts == number)
             predicted = model.update(after.subset(parts != number)).synthesize(out.position)
-            scores.append(psnr(predicted, out.spectrum))
+            scores.append(psnr(predicted.cpu(), out.spectrum))
         return float(torch.cat(scores).mean()) if scores else 0.0
 
     best = max(CORRELATIONS, key=lambda correlation: held_out(before.aged(correlation)))

@@ -79,7 +79,7 @@ def score(model: FieldModel | RssiPredictor, new: Spectra | Rssi) -> Scores:
 
 
 def _of_spectra(model: FieldModel, new: Spectra) -> Scores:
-    predicted, measured = model.predict(new.position), new.store[:]
+    predicted, measured = model.predict(new.position), new.store[:].to(model.device)
     error = (measured - predicted.mean).square().mean(dim=(1, 2)).sqrt().double()
     expected = torch.ones_like(error)
     if isinstance(model, ProcessModel):
@@ -88,7 +88,7 @@ def _of_spectra(model: FieldModel, new: Spectra) -> Scores:
     if predicted.std is not None:
         low, high = predicted.interval(LEVEL)
         covered = ((low <= measured) & (measured <= high)).double().mean(dim=(1, 2))
-    return Scores(new.position, error, (error / expected)[:, None], covered)
+    return Scores(new.position, error.cpu(), (error / expected)[:, None].cpu(), covered.cpu())
 
 
 def _of_rssi(model: RssiPredictor, new: Rssi) -> Scores:

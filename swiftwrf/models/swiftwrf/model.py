@@ -102,18 +102,18 @@ class SwiftWRF(ProcessModel):
         return self.process.kernel.scaled(float(self.field.scale))
 
     def _process_position(self, position: Tensor) -> Tensor:
-        return self.field.normalise(position)
+        return self.field.normalise(position.to(self.device))
 
     def _values(self, new: Spectra) -> Tensor:
         work = new.at_most(self.config.max_azimuths)
         projection = self._cached("projection", work.grid, self.field.projection)
-        return (work.store[:] - projection[0]).flatten(1) @ projection[1:].flatten(1).T
+        return (work.store[:].to(projection) - projection[0]).flatten(1) @ projection[1:].flatten(1).T
 
     def _weighted_values(self) -> Tensor:
         projection = self._cached("projection", self.grid, self.field.projection)[1:]
         inverse_norm = projection.flatten(1).norm(dim=1)  # of the components, which are orthogonal
         weighted: Tensor = self.process.value / inverse_norm
-        return weighted
+        return weighted.cpu()
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         field, x = self.field, self.field.normalise(position)
@@ -138,7 +138,8 @@ class SwiftWRF(ProcessModel):
     def region(self) -> Tensor:
         if not isinstance(self.field.deformation, LowRankDeformation):
             return super().region()
-        return self.field.deformation.field.anchor.double() * self.field.scale + self.field.centre
+        known = self.field.deformation.field.anchor.double() * self.field.scale + self.field.centre
+        return known.cpu()
 
     def _cached(self, quantity: str, grid: AngularGrid, compute: Callable[[AngularGrid], Tensor]) -> Tensor:
         """Return a quantity of grid, primitives and their basis, from the cache if all are unchanged."""

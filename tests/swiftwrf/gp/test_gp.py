@@ -173,3 +173,10 @@ def test_suggested_positions_beat_random_ones(generator):
     torch.testing.assert_close(left[-1], remaining(chosen), atol=1e-5, rtol=1e-4)
     random = [remaining(torch.randperm(200, generator=generator)[:8]) for _ in range(20)]
     assert left[-1] < min(random)
+
+
+def test_a_field_that_moves_computes_its_process_there():
+    position = torch.rand(20, 3)
+    field = SmoothField.regress(position, Kernel(noise=1e-3), position.sum(dim=1, keepdim=True))
+    assert field.process is field.cpu().process
+    assert field.to("meta").process.known.device.type == "meta"

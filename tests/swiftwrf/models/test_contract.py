@@ -23,16 +23,22 @@ NOT_DIFFERENTIABLE = {
     "raytrace": "its paths come from a ray tracer that gives no gradients",
 }
 STEP_M = 1e-3  # of finite differences
+ON_GPU = {"swiftwrf", "nerf2", "wrfgs", "vae", "dcgan"}  # the other models stay on the CPU
 every = pytest.mark.parametrize("name", list(FIELD_MODELS))
 
 
+@pytest.fixture(scope="module", params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+def device(request):
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def fitted(room):
+def fitted(room, device):
     """Fitted models by name, each fitted once, in their smallest size."""
     with ExitStack() as patches:
         patches.enter_context(small.small_published())
         patches.enter_context(small.glances())
-        yield cache(lambda name: make_model(name, **OPTIONS.get(name, {})).fit(room))
+        yield cache(lambda name: make_model(name, **OPTIONS.get(name, {})).fit(room, device=device))
 
 
 @pytest.fixture
@@ -55,11 +61,13 @@ def test_a_model_describes_itself(name):
 
 
 @every
-def test_fit_returns_the_model(fitted, name):
+def test_fit_returns_the_model(fitted, device, name):
     model = fitted(name)
     assert type(model) is FIELD_MODELS[name]
     assert repr(model) == f"{type(model).__name__}(fitted, 15 x 60 directions)"
-    assert model.device == torch.device("cpu")
+    assert model.device.type == (device if name in ON_GPU else "cpu")
+    assert model.region().device.type == "cpu"
+    assert model.fixed_end is None or model.fixed_end[0].device.type == "cpu"
     assert not any(parameter.requires_grad for parameter in model.parameters())
 
 
@@ -107,10 +115,11 @@ def test_a_saved_model_predicts_the_same(fitted, position, tmp_path, name):
     assert type(again) is type(model)
     assert again.config == model.config
     found, expected = again.predict(position), model.predict(position)
-    torch.testing.assert_close(found.mean, expected.mean, atol=1e-6, rtol=0)
+    tolerance = 1e-6 if model.device.type == "cpu" else 1e-4  # a file is loaded to the CPU
+    torch.testing.assert_close(found.mean, expected.mean.cpu(), atol=tolerance, rtol=0)
     assert (found.std is None) == (expected.std is None)
     if found.std is not None:
-        torch.testing.assert_close(found.std, expected.std)
+        torch.testing.assert_close(found.std, expected.std.cpu())
 
 
 @every
@@ -120,7 +129,7 @@ def test_gradients_are_those_of_finite_differences_in_metres(fitted, room, posit
     weight = torch.rand(room.grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
     def total(at):
-        return (model.predict(at).mean.double() * weight).sum(dim=(1, 2))
+        return (model.predict(at).mean.double().cpu() * weight).sum(dim=(1, 2))
 
     if name in NOT_DIFFERENTIABLE:
         assert not model.predict(position).mean.requires_grad

@@ -699,6 +699,17 @@ def test_coarray_needs_the_array_and_takes_it_from_the_command_line(small, tmp_p
     assert model.synthesize(small.position[:2]).shape == (2, 10, 40)
 
 
+@pytest.mark.cuda
+def test_whole_run_on_a_gpu(small, small_published, tmp_path):
+    trained = ("swiftwrf", "nerf2", "wrfgs", "vae", "dcgan")
+    options = ("--mix", 0.5, "--extra", 10, "--device", "cuda", "--out", tmp_path / "run")
+    assert run(*options, "--synthesizer", *trained) == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())["mixes"]["0.5"]
+    assert {f"turbo_{name}_extra" for name in trained} <= set(metrics["methods"])
+    assert set(trained) <= set(metrics["synthesis"])
+    assert load(tmp_path / "run" / "model-mix0.5.safetensors").device.type == "cpu"
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_cuda_without_a_gpu(small, tmp_path, capsys):
     assert run("--mix", 0.5, "--device", "cuda", "--out", tmp_path / "run") == 2
