@@ -50,7 +50,7 @@ else
   size=(--device cpu --quick)
 fi
 
-part tests 180 "$python" -m pytest -m cuda -p no:cacheprovider tests/swiftwrf tests/benchmarks/test_gpu_benchmark.py tests/tasks/aoa
+part tests 240 "$python" -m pytest -m cuda -p no:cacheprovider tests/swiftwrf tests/benchmarks/test_gpu_benchmark.py tests/tasks/aoa
 part rasterize 150 "$python" benchmarks/rasterize.py "${size[@]}" --seconds 0.1 --out "$folder"
 part rates 90 "$python" benchmarks/gpu.py rates "${size[@]}" --out "$folder"
 part profile 90 "$python" benchmarks/gpu.py profile "${size[@]}" --out "$folder"

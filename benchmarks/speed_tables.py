@@ -122,6 +122,17 @@ def gpu_seconds() -> str:
     return markdown(["fit", "seconds"], [[name, f"{s:.1f}"] for name, s in load("gpu_training")["seconds"].items()])
 
 
+def gpu_single() -> str:
+    """Return milliseconds for one spectrum on a machine with a GPU."""
+    learning, locating = load("gpu_update"), load("gpu_locating")
+    rows = [
+        [f"score and learn, `{row['model']}` of {row['n']:,}", row["device"], f"{row['ms_per_spectrum']:.1f}"]
+        for row in learning["rows"]
+    ]
+    rows.append(["locate, `matched_field`", "cpu", f"{1e3 * locating['seconds']['spectrum']:.1f}"])
+    return markdown(["one spectrum", "device", "milliseconds"], rows)
+
+
 def scaling() -> str:
     """Return processor seconds and peak memory of each stage at each size, and the growth to the largest size."""
     content = load("scaling")
