@@ -24,6 +24,7 @@ from swiftwrf.plotting import MARK, plan
 from swiftwrf.runtime.validation import checked
 
 SESSIONS = "meta.csv"  # file of the NeRF2 layout with a row for each measurement
+SURVEY = "survey.yml"  # file of the toolkit's own layout with properties of all measurements
 PLACE, MIN_PLACES = "place", 5  # split by receiver, a fifth of which is held out
 if TYPE_CHECKING:
     import matplotlib.axes

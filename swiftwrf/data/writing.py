@@ -18,7 +18,7 @@ from swiftwrf.array.angles import AngularGrid, to_angles
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.data.fillers import NOT_DETECTED_DBM
 from swiftwrf.data.paths import PropagationPaths
-from swiftwrf.data.rssi import SESSIONS, Rssi
+from swiftwrf.data.rssi import SESSIONS, SURVEY, Rssi
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.store import write_npy
 from swiftwrf.errors import InputError
@@ -60,7 +60,10 @@ def write_spectra(data: Spectra, folder: Path) -> None:
 
 
 def write_rssi(data: Rssi, folder: Path) -> None:
-    """Write tx_pos.csv, gateway_rssi.csv, the splits, meta.csv with sessions, and gateway_position.yml with known receivers.
+    """Write tx_pos.csv, gateway_rssi.csv, the splits, and what else is known of the measurements.
+
+    That is meta.csv with sessions, gateway_position.yml with positions of receivers, and survey.yml with the origin of the
+    coordinates, the floors, and whether the receiver moves.
 
     Measurements of exactly -100 dBm, which the layout uses for not detected, are written as -99.99.
 
@@ -78,6 +81,15 @@ def write_rssi(data: Rssi, folder: Path) -> None:
         write_text(folder / "gateway_position.yml", yaml.safe_dump(places, sort_keys=False, allow_unicode=True))
     if data.session is not None:
         write_text(folder / SESSIONS, "\n".join(["session", *map(str, data.session.tolist()), ""]))
+    survey: dict[str, Any] = {}
+    if data.origin is not None:
+        survey["origin"] = list(data.origin)
+    if data.floors is not None:
+        survey["floors"] = dict(zip(data.floors.names, data.floors.height_m, strict=True))
+    if data.receiver_moves:
+        survey["receiver_moves"] = True
+    if survey:
+        write_text(folder / SURVEY, yaml.safe_dump(survey, sort_keys=False, allow_unicode=True))
     _write_splits(data.named_splits, folder, first=0)
 
 

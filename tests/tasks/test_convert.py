@@ -25,7 +25,10 @@ from test_calibration import spoilt
 from swiftwrf import AngularGrid, InputError, load_rssi, load_spectra, simulated_room
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import ReadOptions
+from swiftwrf.data.coordinates import GeodeticOrigin
+from swiftwrf.data.floors import Floors
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
+from swiftwrf.data.rssi import SURVEY
 from swiftwrf.data.writing import write_rssi, write_spectra
 
 GRID = ("--grid", 24, 96)
@@ -87,6 +90,19 @@ def test_names_and_values_that_the_layout_has_signs_for(tmp_path):
     assert back.receiver_names == data.receiver_names
     assert torch.equal(back.receiver_position, data.receiver_position)
     assert back.rssi_dbm[0, 0] == -99.99
+
+
+def test_origin_floors_and_a_moving_receiver_come_back(tmp_path):
+    data = replace(
+        load_rssi(write_survey(tmp_path / "a")),
+        origin=GeodeticOrigin(48.1234567, -11.5),
+        floors=Floors(("0", "1, 2"), (1.0, 5.25)),
+        receiver_moves=True,
+    )
+    write_rssi(data, tmp_path)
+    back = load_rssi(tmp_path)
+    assert (back.origin, back.floors, back.receiver_moves) == (data.origin, data.floors, True)
+    assert SURVEY in back.source
 
 
 def test_moving_receivers_and_splits_come_back(tmp_path):

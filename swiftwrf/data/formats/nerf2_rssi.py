@@ -1,25 +1,28 @@
 """Reader of the NeRF2 layout for RSSI: a table of RSSI, positions with the same rows, and positions of the receivers.
 
 The files are gateway_rssi.csv, tx_pos.csv or rx_pos.csv, gateway_position.yml, and perhaps meta.csv with a column of
-sessions; or, as the BLE data of the paper are offered, rssi.csv, beacon_pos.csv and gateway_pos.csv.
+sessions and survey.yml with properties of all measurements; or, as the BLE data of the paper are offered, rssi.csv,
+beacon_pos.csv and gateway_pos.csv.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from swiftwrf.data.columns import column_of, column_of_numbers, text_of
-from swiftwrf.data.coordinates import without_fix
+from swiftwrf.data.coordinates import GeodeticOrigin, without_fix
 from swiftwrf.data.files import MAX_COORDINATE_M, digests, numbers, read_yaml
 from swiftwrf.data.fillers import NOT_DETECTED_DBM, check_powers, find_fillers, without_fillers
+from swiftwrf.data.floors import Floors
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
 from swiftwrf.data.groups import numbered
 from swiftwrf.data.receivers import read_receivers, unknown_positions
-from swiftwrf.data.rssi import SESSIONS, Rssi
+from swiftwrf.data.rssi import SESSIONS, SURVEY, Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
 from swiftwrf.data.survey import read_frame
 from swiftwrf.errors import InputError, listed
@@ -68,6 +71,9 @@ class Nerf2Rssi(Format[Rssi]):
             )
         meta = path / SESSIONS
         session = _sessions(meta, len(rssi)) if meta.is_file() else None
+        survey = path / SURVEY
+        properties = _properties(survey) if survey.is_file() else {}
+        stated = (positions, table, receivers, session is not None and meta, properties and survey)
         return Rssi(
             rssi[row],
             position[row],
@@ -77,8 +83,9 @@ class Nerf2Rssi(Format[Rssi]):
             index=row,
             named_splits=kept_splits(read_splits(path, len(rssi), first=0), row, len(rssi)),
             session=None if session is None else session[row],
-            source=digests([f for f in (positions, table, receivers, session is not None and meta) if f], path),
+            source=digests([file for file in stated if file], path),
             notes=(*notes, *missing, *unknown),
+            **properties,
         )
 
 
@@ -91,6 +98,30 @@ def _sessions(file: Path, n: int) -> Tensor | None:
     if len(frame) != n:
         raise InputError(f"{file} has {len(frame)} rows, the RSSI {n}; they must match")
     return numbered(text_of(frame[name]).tolist())
+
+
+def _properties(file: Path) -> dict[str, Any]:
+    """Return the origin of the coordinates, the floors, and whether the receiver moves, as far as a file states them."""
+    content = read_yaml(file)
+    found: dict[str, Any] = {}
+    if unknown := content.keys() - {"origin", "floors", "receiver_moves"}:
+        raise InputError(f"{file} states {listed(sorted(unknown))}; it holds origin, floors and receiver_moves only")
+    if "origin" in content:
+        degrees = numbers(content["origin"], 2)
+        if degrees is None or abs(degrees[0]) > 90 or abs(degrees[1]) > 180:
+            raise InputError(f"{file}: origin must be latitude and longitude in degrees, got {content['origin']}")
+        found["origin"] = GeodeticOrigin(*degrees)
+    if "floors" in content:
+        floors = content["floors"]
+        heights = numbers([*floors.values()], len(floors)) if isinstance(floors, dict) else None
+        if not heights or list(heights) != sorted(set(heights)):
+            raise InputError(f"{file}: floors must be names with ascending heights [m], got {floors}")
+        found["floors"] = Floors(tuple(floors), heights)
+    if "receiver_moves" in content:
+        if content["receiver_moves"] not in ("true", "false"):
+            raise InputError(f"{file}: receiver_moves must be true or false, got {content['receiver_moves']}")
+        found["receiver_moves"] = content["receiver_moves"] == "true"
+    return found
 
 
 def _is_raw(path: Path) -> bool:

@@ -65,6 +65,11 @@ WRONG = {
     "two places of one name": (_write("gateway_position.yml", "a: [0, 0, 1]\na: [1, 1, 1]\n"), "'a' twice"),
     "place of two numbers": (_write("gateway_position.yml", "a: [0, 0]\nb: [1, 1]\nc: [1, 2]\n"), "3 finite numbers"),
     "nan positions": (_write("tx_pos.csv", "x,y,z\n" + "nan,1,1\n" * N), "needs 3 finite numbers"),
+    "origin": (_write("survey.yml", "origin: [91, 0]"), "latitude and longitude"),
+    "floors": (_write("survey.yml", "floors: {up: 4, down: 1}"), "ascending"),
+    "one number of floors": (_write("survey.yml", "floors: 3"), "names with ascending heights"),
+    "moving receiver": (_write("survey.yml", "receiver_moves: perhaps"), "true or false"),
+    "unknown property": (_write("survey.yml", "storeys: 3"), "states storeys"),
     "index out of range": (
         lambda f: [_write(f"{part}_index.txt", text)(f) for part, text in (("train", "0\n"), ("test", "15\n"))],
         "expected 0 to 14",
