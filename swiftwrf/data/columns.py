@@ -111,6 +111,22 @@ def parsed(column: pd.Series) -> tuple[Floats, NDArray[np.bool_]]:
     return np.where(empty, np.nan, values), np.isnan(values) & ~empty
 
 
+def seconds(column: pd.Series) -> Floats:
+    """Return times [s] since the first cell, of numbers [s] or dates; nan where a cell is neither.
+
+    Example:
+        >>> seconds(pd.Series(["2024-01-01 10:00:00", "2024-01-01 10:01:00", "noon"]))
+        array([ 0., 60., nan])
+    """
+    values = np.full(len(column), np.nan)
+    if column.dtype.kind != "M":
+        values = parsed(column)[0]
+    if np.isnan(values).all():
+        date = pd.to_datetime(column, errors="coerce", utc=True, format="mixed")
+        values = (date - date.min()).dt.total_seconds().to_numpy(np.float64)
+    return values - values[0] if len(values) and np.isfinite(values[0]) else values
+
+
 def is_rssi(column: pd.Series) -> bool:
     """Return True if most cells are received powers or fillers, whatever the number of these."""
     values, text = parsed(column)

@@ -23,7 +23,7 @@ from swiftwrf.errors import InputError, listed
 from swiftwrf.plotting import MARK, plan
 from swiftwrf.runtime.validation import checked
 
-SESSIONS = "meta.csv"  # file of the NeRF2 layout with a row for each measurement
+META = "meta.csv"  # file of the NeRF2 layout with a row for each measurement
 SURVEY = "survey.yml"  # file of the toolkit's own layout with properties of all measurements
 PLACE, MIN_PLACES = "place", 5  # split by receiver, a fifth of which is held out
 if TYPE_CHECKING:
@@ -48,6 +48,7 @@ class Rssi(PositionedData):
         floors: Floors of the building, by height.
         receiver_moves: Whether the receivers are positions of one receiver that moves, too.
         session: Session of measurements that each row is of, e.g. a walk or a day: n names, or their numbers, int64 (n,).
+        time: Time of each measurement [s], (n,), nan where unknown.
         name: Name of the data set.
         details: index, named_splits, source and notes of `PositionedData`.
 
@@ -72,8 +73,9 @@ class Rssi(PositionedData):
     floors: Floors | None
     receiver_moves: bool
     session: Tensor | None
+    time: Tensor | None
 
-    row_fields: ClassVar[tuple[str, ...]] = ("transmitter_position", "rssi_dbm", "index", "groups", "session")
+    row_fields: ClassVar[tuple[str, ...]] = ("transmitter_position", "rssi_dbm", "index", "groups", "session", "time")
 
     @checked
     def __init__(
@@ -90,6 +92,7 @@ class Rssi(PositionedData):
         floors: Floors | None = None,
         receiver_moves: bool = False,
         session: Tensor | Sequence[str | int] | None = None,
+        time: Numbers | None = None,
         name: str = "rssi",
         **details: Any,
     ) -> None:
@@ -127,6 +130,7 @@ class Rssi(PositionedData):
             floors=floors,
             receiver_moves=receiver_moves,
             session=None if session is None else numbered(session),
+            time=None if time is None else torch.as_tensor(time, dtype=torch.float64),
         )
 
     @classmethod
@@ -180,6 +184,7 @@ class Rssi(PositionedData):
             floors=survey.floors,
             receiver_moves=survey.receiver_moves,
             session=survey.session,
+            time=survey.time,
             name=name,
             index=survey.row,
             notes=survey.notes,

@@ -23,6 +23,7 @@ from swiftwrf.data.columns import (
     is_coordinate,
     is_rssi,
     parsed,
+    seconds,
     text_of,
 )
 from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin, degrees_in, without_fix
@@ -71,6 +72,7 @@ class Survey(NamedTuple):
     origin: GeodeticOrigin | None  # of positions in degrees
     group: list[str]  # of each row; empty if it was not asked for
     session: list[str] | None  # of each row, if the table contains sessions
+    time: Floats | None  # of each row [s], nan where a cell is no time, if the table contains times
     labels: tuple[str, ...]  # columns that distinguish groups of rows
     floors: Floors | None  # if the table contains them
     receiver_moves: bool  # receivers are positions of one that moves
@@ -110,26 +112,6 @@ def frame_of(label: object, text: str) -> pd.DataFrame:
 def has_positions(table: pd.DataFrame, columns: Mapping[str, str]) -> bool:
     """Return True if a column of a table holds positions, by its name or by the names of columns given by role."""
     return any(column_of(table, role, columns) is not None for role in ("x", "y", *GEODETIC.values()))
-
-
-def first_rows(table: pd.DataFrame, columns: Mapping[str, str], offset_by: str | None = None) -> NDArray[np.int64]:
-    """Return the first row in the table of each row of RSSI: packets of a long table share rows of RSSI.
-
-    Args:
-        table: Survey table, with or without positions.
-        columns: Names of columns that are not recognised, by role.
-        offset_by: Column with the group of each row.
-    """
-    receiver, time = (column_of(table, role, columns) for role in ("receiver", "time"))
-    if receiver is None:
-        return np.arange(len(table))
-    roles = ("x", "y", "z", "longitude", "latitude", "floor")
-    keys = {role: name for role in roles if (name := column_of(table, role, columns)) is not None}
-    coordinate = pd.DataFrame({role: column_of_numbers("the table", table, name) for role, name in keys.items()})
-    if offset_by is not None:
-        coordinate["group"] = text_of(table[offset_by])
-    row = _row_of_packet(coordinate, text_of(table[receiver]), None if time is None else text_of(table[time]))
-    return np.unique(row, return_index=True)[1]
 
 
 def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> Survey:
@@ -205,14 +187,29 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
     origins = source.max(axis=1)[row]  # row of the table that each row is of
     groups = group.to_numpy()[origins].tolist() if options.offset_by else []
     sessions = None if session is None else session.to_numpy()[origins].tolist()
+    time = seconds(table[roles["time"]].iloc[origins]) if "time" in roles else None
     labels = tuple(name for name in (*unused, roles.get("session")) if name and _distinguishes(table[name]))
     if labels and not options.offset_by:
         notes.append(f"rows differ in {listed(labels)}; tasks.inspect tests whether its values have constant offsets")
     moves = bool(end or options.transmitter)
     if moves and not end:
         notes.append(f"both ends move; {len(names)} positions of column {options.transmitter[0]} count as receivers")
-    counts = (row, len(omitted))
-    return Survey(names, rssi, position, *counts, origin, groups, sessions, labels, floors, moves, places, tuple(notes))
+    return Survey(
+        receiver_names=names,
+        rssi_dbm=rssi,
+        position=position,
+        row=row,
+        n_rows=len(omitted),
+        origin=origin,
+        group=groups,
+        session=sessions,
+        time=time,
+        labels=labels,
+        floors=floors,
+        receiver_moves=moves,
+        receiver_position=places,
+        notes=tuple(notes),
+    )
 
 
 def _pools(label: object, table: pd.DataFrame, roles: dict[str, str], names: list[str], by: str) -> list[str]:

@@ -18,7 +18,7 @@ from swiftwrf.array.angles import AngularGrid, to_angles
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.data.fillers import NOT_DETECTED_DBM
 from swiftwrf.data.paths import PropagationPaths
-from swiftwrf.data.rssi import SESSIONS, SURVEY, Rssi
+from swiftwrf.data.rssi import META, SURVEY, Rssi
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.store import write_npy
 from swiftwrf.errors import InputError
@@ -62,8 +62,8 @@ def write_spectra(data: Spectra, folder: Path) -> None:
 def write_rssi(data: Rssi, folder: Path) -> None:
     """Write tx_pos.csv, gateway_rssi.csv, the splits, and what else is known of the measurements.
 
-    That is meta.csv with sessions, gateway_position.yml with positions of receivers, and survey.yml with the origin of the
-    coordinates, the floors, and whether the receiver moves.
+    That is meta.csv with sessions and times, gateway_position.yml with positions of receivers, and survey.yml with the
+    origin of the coordinates, the floors, and whether the receiver moves.
 
     Measurements of exactly -100 dBm, which the layout uses for not detected, are written as -99.99.
 
@@ -79,8 +79,11 @@ def write_rssi(data: Rssi, folder: Path) -> None:
         known = zip(data.receiver_names, data.receiver_position.tolist(), data.receiver_located.tolist(), strict=True)
         places = {name: position for name, position, is_located in known if is_located}
         write_text(folder / "gateway_position.yml", yaml.safe_dump(places, sort_keys=False, allow_unicode=True))
-    if data.session is not None:
-        write_text(folder / SESSIONS, "\n".join(["session", *map(str, data.session.tolist()), ""]))
+    of_rows = {"session": data.session, "time": data.time}
+    columns = {name: values.tolist() for name, values in of_rows.items() if values is not None}
+    if columns:
+        rows = (",".join(map(repr, row)) for row in zip(*columns.values(), strict=True))
+        write_text(folder / META, "\n".join([",".join(columns), *rows, ""]))
     survey: dict[str, Any] = {}
     if data.origin is not None:
         survey["origin"] = list(data.origin)

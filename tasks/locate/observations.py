@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import pandas as pd
 import torch
 from torch import Tensor
 
 from swiftwrf import InputError, Rssi, Spectra, load
 from swiftwrf.data import ReadOptions
-from swiftwrf.data.columns import column_of
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.formats import RSSI_FORMATS, read
 from swiftwrf.data.store import Store
-from swiftwrf.data.survey import SUFFIXES, first_rows, has_positions, read_frame
+from swiftwrf.data.survey import SUFFIXES, has_positions, read_frame
 from swiftwrf.errors import listed, with_article
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
 from swiftwrf.locate.track import joined
@@ -84,11 +82,10 @@ def _of_rssi(locator: RssiLocator, config: LocateConfig, source: str) -> Columns
         raise InputError(f"no receiver of {config.model} detected the transmitter in any row of {source}")
     if not bool(kept.all()):
         console.print(f"{data.name}: rows that no receiver detected are left out: {int((~kept).sum())}")
-    posteriors: Iterable[Posterior] = map(locator.locate, data.rssi_dbm[kept].split(BATCH_ROWS))
-    if config.track is not None:
-        time = _times(source, options, data.index)
-        posteriors = _tracked(posteriors, time[kept], config.track)
     data = data.subset(kept)
+    posteriors: Iterable[Posterior] = map(locator.locate, data.rssi_dbm.split(BATCH_ROWS))
+    if config.track is not None:
+        posteriors = _tracked(posteriors, _times(source, data), config.track)
     columns = _located(posteriors, data.index, data.transmitter_position if is_known else None)
     degrees = degree_columns(origin, torch.stack([columns["x_m"], columns["y_m"]], dim=1).numpy())
     return columns | {name: torch.from_numpy(values.copy()) for name, values in degrees.items()}
@@ -177,44 +174,18 @@ def _direction_errors(direction: Tensor, known: Spectra | None) -> Columns:
     return {"truth_azimuth_deg": truth[:, 0], "truth_elevation_deg": truth[:, 1], "great_circle_deg": error}
 
 
-def _times(source: str, options: ReadOptions, index: Tensor) -> Tensor:
-    """Return the times (n,) [s] of rows of RSSI in a file, given by number: one second a row without a column of time."""
-    file = Path(source)
-    if file.is_file() and file.suffix.lower() in SUFFIXES:
-        time = row_times(source, read_frame(file), options.columns or {}, options.offset_by)
-        if time is not None:
-            return time[index]
-    return index.double()
-
-
-def row_times(
-    label: str, frame: pd.DataFrame, columns: Mapping[str, str], offset_by: str | None = None
-) -> Tensor | None:
-    """Return the time since the first row [s] for each row of the RSSI in a survey table. None without a column of time.
-
-    Args:
-        label: Name of the table, for messages.
-        frame: Survey table, wide or long. Times are numbers [s] or dates.
-        columns: Names of columns that are not recognised, by role.
-        offset_by: Column with the group of each row.
+def _times(source: str, data: Rssi) -> Tensor:
+    """Return the times (n,) [s] of rows of RSSI: one second a row of the file without a column of times.
 
     Raises:
-        InputError: A cell that is no time.
+        InputError: A row without time.
     """
-    frame = frame.set_axis([str(name).strip() for name in frame.columns], axis=1)
-    name = column_of(frame, "time", columns)
-    if name is None:
-        return None
-    cells = frame[name]
-    numbers = pd.to_numeric(cells, errors="coerce") if cells.dtype.kind != "M" else pd.Series(float("nan"), cells.index)
-    if numbers.isna().all():
-        dates = pd.to_datetime(cells, errors="coerce", utc=True, format="mixed")
-        numbers = (dates - dates.iloc[0]).dt.total_seconds()
-    if numbers.isna().any():
-        row = int(numbers.isna().to_numpy().argmax())
-        raise InputError(f"{label} row {row + 1}, column {name}: {cells.iloc[row]!r} is no time [s] or date")
-    time = (numbers - numbers.iloc[0]).to_numpy(dtype="float64")
-    return torch.from_numpy(time[first_rows(frame, columns, offset_by)])
+    if data.time is None:
+        return data.index.double()
+    missing = data.time.isnan()
+    if bool(missing.any()):
+        raise InputError(f"{source} row {int(data.index[missing][0]) + 1} has no time [s] or date, which --track needs")
+    return data.time
 
 
 def _tracked(posteriors: Iterable[Posterior], time: Tensor, speed_m_s: float) -> Iterator[Posterior]:

@@ -92,15 +92,19 @@ def test_names_and_values_that_the_layout_has_signs_for(tmp_path):
     assert back.rssi_dbm[0, 0] == -99.99
 
 
-def test_origin_floors_and_a_moving_receiver_come_back(tmp_path):
+def test_what_is_known_of_the_measurements_comes_back(tmp_path):
     data = replace(
         load_rssi(write_survey(tmp_path / "a")),
         origin=GeodeticOrigin(48.1234567, -11.5),
         floors=Floors(("0", "1, 2"), (1.0, 5.25)),
         receiver_moves=True,
+        session=torch.arange(40) // 20,
+        time=torch.arange(40).double() / 3,
     )
     write_rssi(data, tmp_path)
     back = load_rssi(tmp_path)
+    assert torch.equal(back.session, data.session)
+    assert torch.equal(back.time, data.time)
     assert (back.origin, back.floors, back.receiver_moves) == (data.origin, data.floors, True)
     assert SURVEY in back.source
 

@@ -1,8 +1,8 @@
 """Reader of the NeRF2 layout for RSSI: a table of RSSI, positions with the same rows, and positions of the receivers.
 
-The files are gateway_rssi.csv, tx_pos.csv or rx_pos.csv, gateway_position.yml, and perhaps meta.csv with a column of
-sessions and survey.yml with properties of all measurements; or, as the BLE data of the paper are offered, rssi.csv,
-beacon_pos.csv and gateway_pos.csv.
+The files are gateway_rssi.csv, tx_pos.csv or rx_pos.csv, gateway_position.yml, and perhaps meta.csv with columns of
+sessions and times, and survey.yml with properties of all measurements; or, as the BLE data of the paper are offered,
+rssi.csv, beacon_pos.csv and gateway_pos.csv.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from swiftwrf.data.columns import column_of, column_of_numbers, text_of
+from swiftwrf.data.columns import column_of, column_of_numbers, seconds, text_of
 from swiftwrf.data.coordinates import GeodeticOrigin, without_fix
 from swiftwrf.data.files import MAX_COORDINATE_M, digests, numbers, read_yaml
 from swiftwrf.data.fillers import NOT_DETECTED_DBM, check_powers, find_fillers, without_fillers
@@ -22,7 +22,7 @@ from swiftwrf.data.floors import Floors
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
 from swiftwrf.data.groups import numbered
 from swiftwrf.data.receivers import read_receivers, unknown_positions
-from swiftwrf.data.rssi import SESSIONS, SURVEY, Rssi
+from swiftwrf.data.rssi import META, SURVEY, Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
 from swiftwrf.data.survey import read_frame
 from swiftwrf.errors import InputError, listed
@@ -69,11 +69,11 @@ class Nerf2Rssi(Format[Rssi]):
             missing.append(
                 "the receiver moves; RSSI is reciprocal, so it counts as the transmitter and the others as receivers"
             )
-        meta = path / SESSIONS
-        session = _sessions(meta, len(rssi)) if meta.is_file() else None
+        meta = path / META
+        of_rows: dict[str, Any] = _of_rows(meta, len(rssi)) if meta.is_file() else {}
         survey = path / SURVEY
         properties = _properties(survey) if survey.is_file() else {}
-        stated = (positions, table, receivers, session is not None and meta, properties and survey)
+        stated = (positions, table, receivers, of_rows and meta, properties and survey)
         return Rssi(
             rssi[row],
             position[row],
@@ -82,22 +82,25 @@ class Nerf2Rssi(Format[Rssi]):
             receiver_position=receiver_position,
             index=row,
             named_splits=kept_splits(read_splits(path, len(rssi), first=0), row, len(rssi)),
-            session=None if session is None else session[row],
             source=digests([file for file in stated if file], path),
             notes=(*notes, *missing, *unknown),
             **properties,
+            **{name: values[row] for name, values in of_rows.items()},
         )
 
 
-def _sessions(file: Path, n: int) -> Tensor | None:
-    """Return the session of each of n rows (n,), by the column of sessions if there is one."""
+def _of_rows(file: Path, n: int) -> dict[str, Tensor]:
+    """Return session and time of each of n rows, (n,), as far as a table has these columns."""
     frame = read_frame(file)
-    name = column_of(frame, "session", {})
-    if name is None:
-        return None
-    if len(frame) != n:
+    session, time = (column_of(frame, role, {}) for role in ("session", "time"))
+    found: dict[str, Tensor] = {}
+    if session is not None:
+        found["session"] = numbered(text_of(frame[session]).tolist())
+    if time is not None:
+        found["time"] = torch.from_numpy(seconds(frame[time]))
+    if found and len(frame) != n:
         raise InputError(f"{file} has {len(frame)} rows, the RSSI {n}; they must match")
-    return numbered(text_of(frame[name]).tolist())
+    return found
 
 
 def _properties(file: Path) -> dict[str, Any]:

@@ -73,6 +73,7 @@ class SurveyTable(Format[Rssi]):
             floors=survey.floors,
             receiver_moves=survey.receiver_moves,
             session=survey.session,
+            time=survey.time,
             index=survey.row,
             named_splits=kept_splits(splits, torch.from_numpy(survey.row), survey.n_rows),
             source=digests([file, *([receivers] if receivers.is_file() else [])], file.parent),

@@ -7,13 +7,12 @@ import pandas as pd
 import pytest
 import torch
 
-from swiftwrf import InputError, rssi_room
+from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.locate import Posterior, RssiLocator, smoothed, track
 from swiftwrf.locate.posterior import normalised
 from swiftwrf.locate.track import joined
 from tasks.command_line import command_line
 from tasks.locate import experiment
-from tasks.locate.observations import row_times
 from tasks.locate.options import LocateConfig
 
 STEP_M, NOISE_M = 0.4, 1.5
@@ -136,20 +135,42 @@ def test_other_speeds_and_times_are_refused(time, speed, message):
         smoothed(posterior, None if time is None else torch.tensor(time), speed)
 
 
+def locate(*arguments):
+    return command_line("tasks.locate", LocateConfig, experiment.run, [str(a) for a in arguments])
+
+
+def times(table, **options):
+    time = Rssi.from_frame(table, **options).time
+    return None if time is None else time.tolist()
+
+
 def test_times_of_the_rows_of_a_table():
-    wide = pd.DataFrame({"time": ["2", "3.5", "7"], "hall": ["-50", "-60", "-55"]})
-    assert row_times("t", wide, {}).tolist() == [0.0, 1.5, 5.0]
-    dates = wide.assign(time=["2024-01-01 10:00:00", "2024-01-01 10:00:01", "2024-01-01 10:01:00"])
-    assert row_times("t", dates, {}).tolist() == [0.0, 1.0, 60.0]
-    long = pd.DataFrame({"receiver": ["a", "b", "a", "a"], "time": [1, 1, 2, 2], "rssi": [-50, -60, -55, -56]})
-    assert row_times("t", long, {}).tolist() == [0.0, 1.0, 1.0]
-    located = long.assign(pos_x=[1, 1, 2, 2], pos_y=[0, 0, 0, 0], time=[4, 4, 6, 6])
-    assert row_times("t", located, {}).tolist() == [0.0, 2.0, 2.0]
-    assert row_times("t", wide.rename(columns={"time": "clock"}), {}) is None
-    assert row_times("t", wide.rename(columns={"time": "clock"}), {"time": "clock"}).tolist() == [0.0, 1.5, 5.0]
-    for cell in ("noon", ""):
-        with pytest.raises(InputError, match="no time"):
-            row_times("t", wide.assign(time=["2", cell, "7"]), {})
+    wide = pd.DataFrame({"x": range(3), "y": 0, "time": ["2", "3.5", "7"], "hall": ["-50", "-60", "-55"]})
+    assert times(wide) == [0.0, 1.5, 5.0]
+    assert times(wide.assign(time=[f"2024-01-01 10:{second}" for second in ("00:00", "00:01", "01:00")])) == [0, 1, 60]
+    assert times(wide.rename(columns={"time": "clock"})) is None
+    assert times(wide.rename(columns={"time": "clock"}), columns={"time": "clock"}) == [0.0, 1.5, 5.0]
+    assert torch.isnan(torch.tensor(times(wide.assign(time=["2", "noon", "7"])))).tolist() == [False, True, False]
+
+
+def test_packets_of_one_row_have_its_time():
+    long = pd.DataFrame(
+        {"receiver": ["a", "b", "a", "a"], "time": [1, 1, 2, 2], "rssi": [-50, -60, -55, -56], "x": 0, "y": 0}
+    )
+    assert times(long) == [0.0, 1.0, 1.0]
+    assert times(long.assign(time=[4, 4, 6, 6], x=[1, 1, 2, 2])) == [0.0, 2.0, 2.0]
+    apart = long.assign(session=["p", "q", "q", "q"], floor=[0, 1, 1, 1])
+    assert times(apart) == [0.0, 0.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize("cell", ["noon", ""])
+def test_walks_without_a_time_are_refused(cell, tmp_path, capsys):
+    data = rssi_room(n=60)
+    RssiLocator(n_cells=300).fit(data).save(tmp_path / "locator")
+    table = pd.DataFrame(data.rssi_dbm[:3].numpy(), columns=list(data.receiver_names)).assign(time=["2", cell, "7"])
+    table.to_csv(tmp_path / "walk.csv", index=False)
+    assert locate(tmp_path / "locator", tmp_path / "walk.csv", "--track", 1, "--out", tmp_path / "out.csv") == 2
+    assert "row 2 has no time" in capsys.readouterr().err
 
 
 def test_positions_of_a_walk(tmp_path, capsys):
@@ -161,10 +182,6 @@ def test_positions_of_a_walk(tmp_path, capsys):
     row = data.rssi_dbm[7] + 6 * torch.randn(10, 12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     table = pd.DataFrame(row.clamp(-149, 0).numpy(), columns=list(data.receiver_names)).assign(time=np.arange(10) / 10)
     table.to_csv(tmp_path / "walk.csv", index=False)
-
-    def locate(*arguments):
-        return command_line("tasks.locate", LocateConfig, experiment.run, [str(a) for a in arguments])
-
     assert locate(file, tmp_path / "walk.csv", "--out", tmp_path / "alone.csv") == 0
     assert locate(file, tmp_path / "walk.csv", "--track", 0.1, "--out", tmp_path / "tracked.csv") == 0
     alone, tracked = (pd.read_csv(tmp_path / name) for name in ("alone.csv", "tracked.csv"))
