@@ -130,8 +130,9 @@ class AngularGrid:
 
     def peak_direction(self, spectrum: Tensor) -> Tensor:
         """Return azimuth and elevation (n, 2) [rad] of the largest magnitude of spectra (n, n_elevation, n_azimuth)."""
-        pixel = spectrum.flatten(1).argmax(dim=1)
-        return torch.stack([self.azimuth[pixel % self.n_azimuth], self.elevation[pixel // self.n_azimuth]], dim=-1)
+        pixel = spectrum.flatten(1).argmax(dim=1).cpu()
+        angles = torch.stack([self.azimuth[pixel % self.n_azimuth], self.elevation[pixel // self.n_azimuth]], dim=-1)
+        return angles.to(spectrum.device)
 
 
 def _even_step(values: list[float], name: str) -> float:

@@ -49,7 +49,7 @@ class Store:
     """
 
     def __init__(self, values: Tensor, rows: Tensor | None = None, factor: int = 1) -> None:
-        self.values, self.rows, self.factor = values, rows, factor
+        self.values, self.rows, self.factor = values.cpu(), rows, factor
 
     def __len__(self) -> int:
         return len(self.values if self.rows is None else self.rows)

@@ -309,7 +309,7 @@ class MatchedField(Configured, Saved):
             InputError: Spectra on another grid, or not finite, or a locator that is not fitted.
         """
         self.check_fitted()
-        spectrum = torch.as_tensor(spectrum, dtype=torch.float32)
+        spectrum = torch.as_tensor(spectrum, dtype=torch.float32, device="cpu")
         if spectrum.dim() != 3 or tuple(spectrum.shape[1:]) != self.grid.shape:
             raise InputError(
                 f"expected spectra of shape (n, {self.grid.shape[0]}, {self.grid.shape[1]}), got {tuple(spectrum.shape)}"

@@ -219,7 +219,7 @@ class RssiLocator(Configured, Saved):
                 not fitted.
         """
         self.check_fitted()
-        rssi = torch.as_tensor(rssi, dtype=torch.float64)
+        rssi = torch.as_tensor(rssi, dtype=torch.float64, device="cpu")
         if rssi.dim() != 2 or rssi.shape[1] != len(self.receiver_names):
             raise InputError(f"expected RSSI of shape (n, {len(self.receiver_names)}), got {tuple(rssi.shape)}")
         if bool(rssi.isinf().any()):

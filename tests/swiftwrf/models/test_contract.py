@@ -14,7 +14,7 @@ import pytest
 import small
 import torch
 
-from swiftwrf import FIELD_MODELS, AngularGrid, FieldModel, InputError, ModelConfig, load, make_model
+from swiftwrf import FIELD_MODELS, AngularGrid, FieldModel, InputError, ModelConfig, Spectra, load, make_model
 from swiftwrf.models.base import ARRAY, FIXED_END
 
 OPTIONS = {"swiftwrf": {"model": ModelConfig(n_primitives=24)}}
@@ -242,3 +242,14 @@ def test_a_model_of_another_package_is_listed_fitted_and_loaded(tmp_path):
 
     run(USE)
     assert run(OPEN) == "outside_mean"
+
+
+def test_predictions_of_each_device_are_drawn_tabulated_and_stored(fitted, position):
+    model = fitted("swiftwrf")
+    found = model.predict(position)
+    assert model.plot(position[0]).name == "polar"
+    assert len(found.to_frame()) == 3
+    peak = model.grid.peak_direction(found.mean)
+    assert peak.device == found.mean.device
+    stored = Spectra(found.mean, position, grid=model.grid)
+    assert torch.equal(model.grid.peak_direction(stored.spectrum), peak.cpu())
