@@ -266,9 +266,12 @@ def gathered(work: Path, name: str) -> Row:
     for file in work.glob("*.scene.json"):
         found["described"][file.name.removesuffix(".scene.json")] = json.loads(file.read_text())
     angles = ("elevation_deg", "azimuth_deg", "great_circle_deg")
-    for file in sorted(work.glob("aoa*/metrics.json")):
+    runs = [json.loads(file.read_text()) for file in sorted(work.glob("aoa*/metrics.json"), reverse=True)]
+    for run in sorted(
+        runs, key=lambda run: int(run["repeats"])
+    ):  # of methods in several runs, the one with most repeats
         found["aoa"] = found["aoa"] or {}
-        for share, mix in json.loads(file.read_text())["mixes"].items():
+        for share, mix in run["mixes"].items():
             methods = found["aoa"].setdefault(share, {})
             for method, errors in mix["methods"].items():
                 methods[method] = {angle: errors[angle] for angle in angles}

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import cast
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pandas import DataFrame, Series
 
 from swiftwrf.metrics import summary
@@ -27,15 +27,46 @@ def error_summary(values: ArrayLike) -> ErrorSummary:
     return cast(ErrorSummary, summary(values))
 
 
-def repeats_averaged(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, ErrorSummary]]:
-    """Return a summary of each column for each value of `by`.
+def summaries(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, ErrorSummary]]:
+    """Return a summary of each column over all test rows and repeats, for each value of `by`.
 
-    Repeats of a test sample (rows of one `index`) are averaged first: they are not independent, and the interval must not
-    shrink with their number.
+    Args:
+        table: A row for each value of `by`, `repeat` and `index`, the test row.
+        by: Column of names.
+        columns: Columns of errors.
     """
-    means = table.groupby([by, "index"], sort=False)[list(columns)].mean()
-    groups = means.groupby(level=by, sort=False)
-    return {str(name): {column: error_summary(part[column]) for column in columns} for name, part in groups}
+    return {
+        str(name): {column: repeated_summary(by_repeat(part, column)) for column in columns}
+        for name, part in table.groupby(by, sort=False)
+    }
+
+
+def by_repeat(table: DataFrame, column: str) -> NDArray[np.float64]:
+    """Return a column with a row for each test row and a column for each repeat, (n, repeats)."""
+    values: NDArray[np.float64] = table.pivot(index="index", columns="repeat", values=column).to_numpy(np.float64)
+    return values
+
+
+def repeated_summary(values: NDArray[np.float64]) -> ErrorSummary:
+    """Return the summary of all values (n, repeats), with the number of test rows.
+
+    Repeats of a test row are not independent, so they do not narrow the interval of the median as independent values would
+    (quantiles in cluster samples: R. S. Woodruff, JASA 47, 1952).
+
+    Example:
+        >>> once = np.arange(100.0)[:, None]
+        >>> found = repeated_summary(np.repeat(once, 3, axis=1))
+        >>> found["median"], found["n"], (found["low"], found["high"])
+        (49.5, 100, (40.0, 59.0))
+    """
+    found = error_summary(values.ravel())
+    rows = values[np.isfinite(values).any(axis=1)]
+    if values.shape[1] > 1 and len(rows):
+        below = np.nanmean(np.where(np.isnan(rows), np.nan, rows <= found["median"]), axis=1)
+        margin = 1.96 * below.std() / math.sqrt(len(rows))
+        low, high = np.nanquantile(rows, (max(0.0, 0.5 - margin), min(1.0, 0.5 + margin))).tolist()
+        found = {**found, "low": low, "high": high}
+    return {**found, "n": len(rows)}
 
 
 def grouped(table: DataFrame, by: Sequence[str], column: str) -> dict[tuple[str, ...], ErrorSummary]:
@@ -147,12 +178,12 @@ def fingerprinting(constant_deg: float, peak_deg: float) -> str:
 def paired_change(before: ArrayLike, after: ArrayLike) -> ChangeMetrics:
     """Return the median of `after`, its change relative to the median of `before`, and the change's 95 % interval.
 
-    The interval is a bootstrap over test rows. Both errors of a row are resampled together, so that differences between rows
-    do not widen it.
+    The interval is a bootstrap over test rows. All errors of a row are resampled together, so that differences between rows
+    do not widen it, and repeats do not narrow it.
 
     Args:
-        before: Errors (n,). Repeats of a test row are averaged first, because they are not independent.
-        after: Errors (n,) of the same rows.
+        before: Errors (n,) of test rows, or (n, repeats).
+        after: Errors of the same rows and repeats.
 
     Example:
         >>> change = paired_change([1.0, 2.0, 3.0], [0.5, 1.0, 1.5])
@@ -161,7 +192,8 @@ def paired_change(before: ArrayLike, after: ArrayLike) -> ChangeMetrics:
     """
     first, second = np.asarray(before, dtype=float), np.asarray(after, dtype=float)
     rows = np.random.default_rng(0).integers(len(first), size=(N_BOOTSTRAP, len(first)))
-    ratio = np.median(second[rows], axis=1) / np.maximum(np.median(first[rows], axis=1), SMALLEST_ERROR)
+    reference, changed = (np.median(x[rows].reshape(N_BOOTSTRAP, -1), axis=1) for x in (first, second))
+    ratio = changed / np.maximum(reference, SMALLEST_ERROR)
     low, high = np.percentile(ratio - 1, (2.5, 97.5))
     median = float(np.median(second))
     change = median / max(float(np.median(first)), SMALLEST_ERROR) - 1

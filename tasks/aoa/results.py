@@ -32,7 +32,7 @@ from tasks.metrics import (
 )
 from tasks.run import Row, Run
 from tasks.steps import Step
-from tasks.summarise import averaged, paired_change, repeats_averaged
+from tasks.summarise import averaged, by_repeat, paired_change, summaries
 from tasks.terminal import console, terminal
 
 EXAMPLE_QUANTILES = (
@@ -268,14 +268,14 @@ class Results:
         seconds = averaged(
             DataFrame([c.columns | value["seconds"] for c, value in own]), "method", ("train", "estimate")
         )
-        summaries = repeats_averaged(errors, "method", ANGLES)
+        found = summaries(errors, "method", ANGLES)
         reference = reference_of(
-            conditions, {name: entry["great_circle_deg"]["median"] for name, entry in summaries.items()}
+            conditions, {name: entry["great_circle_deg"]["median"] for name, entry in found.items()}
         )
         changes = _changes(errors, conditions, reference)
         metrics = {
             method: {**conditions[method].description, **entry, "changes": changes[method], "seconds": seconds[method]}
-            for method, entry in summaries.items()
+            for method, entry in found.items()
         }
         return metrics, reference  # type: ignore[return-value]
 
@@ -292,13 +292,13 @@ class Results:
         shares = averaged(rows, "method", ("covered", "ambiguous"))
         return {
             method: {
-                "position_error_m": summaries["error_m"],
+                "position_error_m": entry["error_m"],
                 "coverage_80": shares[method]["covered"],
                 "ambiguous": shares[method]["ambiguous"],
                 "weights": weights[method],
                 "seconds": seconds[method],
             }
-            for method, summaries in repeats_averaged(rows, "method", ("error_m",)).items()
+            for method, entry in summaries(rows, "method", ("error_m",)).items()
         }
 
 
@@ -306,7 +306,7 @@ def _changes(
     errors: DataFrame, conditions: dict[str, Condition], reference: str
 ) -> dict[str, dict[str, ChangeMetrics]]:
     """Return the changes of the angular error by synthetic spectra of each method, by the method that it is compared to."""
-    error = errors.groupby(["method", "index"])["great_circle_deg"].mean()  # repeats of a position are not independent
+    error = {method: by_repeat(part, "great_circle_deg") for method, part in errors.groupby("method")}
     compared = {
         method: [other for other in dict.fromkeys((condition.measured_only.method, reference)) if other in conditions]
         if condition.is_turbo
@@ -322,8 +322,8 @@ def _changes(
 def _synthesis_metrics(scores: DataFrame, seconds: DataFrame) -> dict[str, SynthesisMetrics]:
     spent = averaged(seconds, "synthesizer", ("fit", "synthesize"))
     return {
-        name: {**summaries, "seconds": spent[name]}  # type: ignore[typeddict-item]
-        for name, summaries in repeats_averaged(scores, "synthesizer", SCORES).items()
+        name: {**entry, "seconds": spent[name]}  # type: ignore[typeddict-item]
+        for name, entry in summaries(scores, "synthesizer", SCORES).items()
     }
 
 

@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 import targets
 import torch
+from pandas import DataFrame
 
 from swiftwrf import simulated_room
+from swiftwrf.metrics import median_interval
 from tasks.aoa.condition import LOCATOR, Condition
 from tasks.aoa.evaluation import Evaluation
 from tasks.aoa.options import AoaConfig
@@ -24,7 +26,7 @@ from tasks.aoa.page.summary import summary
 from tasks.aoa.results import Results
 from tasks.page.records import Records
 from tasks.report.run import merge
-from tasks.summarise import paired_change
+from tasks.summarise import error_summary, paired_change, repeated_summary, summaries
 
 MEASURED = Condition("aann_kernel", "measured", measured_fraction=0.3)
 TURBO = replace(MEASURED, training="turbo", synthesizer="gp")
@@ -49,6 +51,33 @@ def test_the_interval_of_a_change_covers_the_truth_as_often_as_it_says():
         change = paired_change(before, generator.gamma(2, size=80))
         covered += change["low"] <= 0 <= change["high"]
     assert covered >= 52  # 95 % of 60 are 57
+
+
+def test_a_median_over_repeats_is_that_of_all_errors():
+    """One error of three is large, of another repeat in each row."""
+    rows = np.arange(60)
+    table = DataFrame([(row, repeat, 30.0 if repeat == row % 3 else 0.1) for row in rows for repeat in range(3)])
+    found = summaries(table.set_axis(["index", "repeat", "error"], axis=1).assign(method="a"), "method", ["error"])
+    assert found["a"]["error"]["median"] == 0.1
+    assert found["a"]["error"]["n"] == 60
+
+
+def test_the_interval_of_a_median_over_repeats_covers_the_truth_as_often_as_it_says():
+    """Errors of repeats that differ less from each other than rows do."""
+    generator = np.random.default_rng(2)
+    covered = alike = 0
+    for _ in range(200):
+        values = generator.normal(size=(80, 1)) + generator.normal(size=(80, 3)) / 2
+        found = repeated_summary(values)
+        covered += found["low"] <= 0 <= found["high"]
+        alike += median_interval(values.ravel())[0] <= 0 <= median_interval(values.ravel())[1]
+    assert covered >= 182  # 95 % of 200 are 190
+    assert alike < 182
+
+
+def test_one_repeat_has_the_interval_of_independent_values():
+    values = np.random.default_rng(3).gamma(2, size=(50, 1))
+    assert repeated_summary(values) == error_summary(values.ravel())
 
 
 def results_of(errors):
