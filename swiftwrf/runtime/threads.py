@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import cached_property
 from typing import TypeVar
 
 import torch
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController, threadpool_limits
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -23,7 +24,34 @@ class _Users:
         self.lock, self.active, self.original = threading.Lock(), 0, 0
 
 
-_users = _Users()
+class _LinearAlgebra:
+    """Users that keep the linear algebra of NumPy and SciPy at one thread. It has one number for the whole process."""
+
+    def __init__(self) -> None:
+        self.lock, self.active = threading.Lock(), 0
+
+    @cached_property
+    def libraries(self) -> ThreadpoolController:
+        import scipy.linalg  # noqa: F401  # loads the libraries, which the controller would miss later
+
+        return ThreadpoolController().select(user_api="blas")
+
+    @contextmanager
+    def single_thread(self) -> Iterator[None]:
+        with self.lock:
+            if self.active == 0:
+                self.limits = self.libraries.limit(limits=1)
+            self.active += 1
+        try:
+            yield
+        finally:
+            with self.lock:
+                self.active -= 1
+                if self.active == 0:
+                    self.limits.restore_original_limits()
+
+
+_users, _linear_algebra = _Users(), _LinearAlgebra()
 _workers: ContextVar[int | None] = ContextVar("workers", default=None)  # of `parallel_map` inside `single_thread`
 
 
@@ -71,14 +99,16 @@ def threads_kept() -> Iterator[None]:
 
 @contextmanager
 def single_thread() -> Iterator[None]:
-    """Use one thread for many small tensor operations; also a decorator. `parallel_map` inside still uses all threads.
+    """Use one thread for many small operations of tensors and arrays; also a decorator.
+
+    `parallel_map` inside still uses all threads.
 
     Threads synchronise after every operation. If an operation takes microseconds and other work shares the machine, most
     of the time is spent waiting: up to ten times the time of one thread.
     """
     token = _workers.set(_workers.get() or torch.get_num_threads())
     try:
-        with threads_kept():
+        with threads_kept(), _linear_algebra.single_thread():
             torch.set_num_threads(1)
             yield
     finally:
@@ -95,5 +125,5 @@ def parallel_map(function: Callable[[Item], Result], items: Iterable[Item]) -> l
         [1, 2]
     """
     workers = _workers.get() or torch.get_num_threads()
-    with single_thread(), threadpool_limits(1), ThreadPoolExecutor(workers) as threads:
+    with single_thread(), ThreadPoolExecutor(workers) as threads:
         return list(threads.map(function, items))

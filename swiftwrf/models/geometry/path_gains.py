@@ -27,6 +27,7 @@ from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation
 from swiftwrf.models.geometry.planes import advantage
 from swiftwrf.runtime.checkpoint import Header
+from swiftwrf.runtime.threads import parallel_map, single_thread
 from swiftwrf.runtime.validation import check_value
 
 EXTENT_PER_LENGTH = 4  # extent of the region over the correlation length of gains
@@ -143,6 +144,7 @@ def paths(geometry: GeometryModel, scene: PhaseObservations) -> tuple[Tensor, Te
     return torch.cat([part.expand(-1, len(scene), -1) for part in wave]).transpose(0, 1), torch.cat(strength)
 
 
+@single_thread()
 def fit_path_gains(
     geometry: GeometryModel, scene: PhaseObservations, kernel: Kernel, name: PriorName = "loose"
 ) -> PathGains:
@@ -236,6 +238,7 @@ class PriorChoice:
     fits: dict[int, PathGains]
 
 
+@single_thread()
 def choose_prior(geometry: GeometryModel, scene: PhaseObservations, fold: Tensor) -> PriorChoice:
     """Return the order of the image sources and the prior that predict held-out spectra best.
 
@@ -257,10 +260,14 @@ def choose_prior(geometry: GeometryModel, scene: PhaseObservations, fold: Tensor
     left = list(range(len(candidates)))
     for number in fold.unique().tolist():
         kept, held = (scene.subset(rows.nonzero()[:, 0]) for rows in (fold != number, fold == number))
-        for row in left:
+
+        def fitted(row: int, kept: PhaseObservations = kept) -> PathGains:
             room, name = candidates[row]
-            fits[row][number] = fit_path_gains(room, kept, kernel, name)
-            error[row].append(_error(fits[row][number], room, held))
+            return fit_path_gains(room, kept, kernel, name)
+
+        for row, gains in zip(left, parallel_map(fitted, left), strict=True):
+            fits[row][number] = gains
+            error[row].append(_error(gains, candidates[row][0], held))
         so_far = {row: torch.cat(error[row]) for row in left}
         best = min(left, key=lambda row: float(so_far[row].mean()))
         # one held-out position has no standard error, and gives nothing up

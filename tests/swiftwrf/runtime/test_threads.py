@@ -6,7 +6,9 @@ import threading
 from collections.abc import Iterator
 
 import pytest
+import scipy.linalg  # noqa: F401  # loads its library
 import torch
+from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from swiftwrf.runtime.threads import parallel_map, single_thread, threads_kept
 
@@ -15,8 +17,14 @@ from swiftwrf.runtime.threads import parallel_map, single_thread, threads_kept
 def four_threads() -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(4)
-    yield
+    with threadpool_limits(4, user_api="blas"):
+        yield
     torch.set_num_threads(before)
+
+
+def of_linear_algebra() -> set[int]:
+    """Return the numbers of threads of the linear algebra of NumPy and SciPy."""
+    return {library["num_threads"] for library in ThreadpoolController().select(user_api="blas").info()}
 
 
 def in_a_new_thread() -> int:
@@ -50,13 +58,18 @@ def test_users_of_several_threads_may_overlap():
     for thread in threads:
         thread.join()
     assert in_a_new_thread() == 4
+    assert of_linear_algebra() == {4}
 
 
 def test_users_may_be_nested():
     with single_thread():
         with threads_kept():
             torch.set_num_threads(3)
+        with single_thread():
+            assert of_linear_algebra() == {1}
         assert torch.get_num_threads() == 1
+        assert of_linear_algebra() == {1}
+    assert of_linear_algebra() == {4}
     assert torch.get_num_threads() == 4
 
 
