@@ -162,15 +162,12 @@ def coarray(config: Config, device: torch.device) -> Row:
 def update(config: Config, device: torch.device) -> Row:
     """Return the milliseconds in which fitted models predict, score and learn a spectrum, one at a time."""
     n, new = (30, 5) if config.quick else (1000, 50)
-    rows = []
-    for name, where in (("swiftwrf", torch.device("cpu")), ("swiftwrf", device), ("coarray", torch.device("cpu"))):
-        if rows and where == torch.device(rows[-1]["device"]) and name == rows[-1]["model"]:
-            continue  # there is no GPU
-        data = scene_of(n + new, config)
-        model = make_model(name).fit(data.subset(torch.arange(n)), device=where)
-        further = data.subset(torch.arange(n, n + new))
+    data, cpu, rows = scene_of(n + new, config), torch.device("cpu"), []
+    train, further = data.subset(torch.arange(n)), data.subset(torch.arange(n, n + new))
+    for name, where in dict.fromkeys([("swiftwrf", cpu), ("swiftwrf", device), ("coarray", cpu)]):
+        model = make_model(name).fit(train, device=where)
         prequential(model, further)  # compiles
-        seconds = timed(lambda model=model, further=further: prequential(model, further), where)
+        seconds = timed(partial(prequential, model, further), where)
         rows.append({"model": name, "device": where.type, "n": n, "ms_per_spectrum": 1e3 * seconds / new})
         print(rows[-1], flush=True)
     return {"grid": data.grid.shape, "threads": torch.get_num_threads(), "rows": rows}
