@@ -9,6 +9,8 @@ from committed import RESULTS, load, markdown
 
 from tasks.summarise import pareto
 
+DEVICES = {"cpu": "CPU", "cuda": "GPU"}
+
 
 def size() -> str:
     """Return the size that the fit chose beside the best of all sizes."""
@@ -126,10 +128,10 @@ def gpu_single() -> str:
     """Return milliseconds for one spectrum on a machine with a GPU."""
     learning, locating = load("gpu_update"), load("gpu_locating")
     rows = [
-        [f"score and learn, `{row['model']}` of {row['n']:,}", row["device"], f"{row['ms_per_spectrum']:.1f}"]
+        [f"score and learn, `{row['model']}` of {row['n']:,}", DEVICES[row["device"]], f"{row['ms_per_spectrum']:.1f}"]
         for row in learning["rows"]
     ]
-    rows.append(["locate, `matched_field`", "cpu", f"{1e3 * locating['seconds']['spectrum']:.1f}"])
+    rows.append(["locate, `matched_field`", DEVICES["cpu"], f"{1e3 * locating['seconds']['spectrum']:.1f}"])
     return markdown(["one spectrum", "device", "milliseconds"], rows)
 
 
