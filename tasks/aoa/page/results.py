@@ -43,9 +43,11 @@ def results_section(fraction: FractionRecords) -> Section:
             f"For orientation: the paper reports medians of {elevation} (elevation) and {azimuth} degrees (azimuth) at this "
             "fraction, on its own 6,123 spectra and an unnamed split; the numbers are not comparable with these."
         )
+    count = fraction.run.metrics["repeats"]
+    repeats = f" and {count} repeats" if count > 1 else ""
     caption = (
-        "Median error with its 95 % interval over the test spectra. `peak` and `constant` need no training: others must "
-        "beat them. Near the zenith azimuth errors are large without meaning; the angle is the angular error."
+        f"Median error over the test spectra{repeats}, with its 95 % interval. `peak` and `constant` need no training: "
+        "others must beat them. Near the zenith azimuth errors are large without meaning; the angle is the angular error."
     )
     table = Table(columns, rows, caption, frozenset(BASELINES))
     parts = [[name, *(str(n) for n in counts.values())] for name, counts in fraction.mix["counts"].items()]
