@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from threadpoolctl import ThreadpoolController
 
 from swiftwrf import AngularGrid, InputError, load, simulated_room
 from swiftwrf.array.planar import PlanarArray
@@ -410,6 +411,28 @@ def with_path_gains(hybrid, path_gains):
     other = copy(hybrid)
     other.path_gains = path_gains
     return other
+
+
+def test_path_gains_are_fitted_with_one_thread(monkeypatch):
+    """Several threads wait for each other after each of many small products: 24 s in place of 7 s on two cores."""
+    found, gradient = set(), GainPosterior.gradient
+
+    def recorded(posterior, normal):
+        blas = (library["num_threads"] for library in ThreadpoolController().select(user_api="blas").info())
+        found.update({torch.get_num_threads(), *blas})
+        return gradient(posterior, normal)
+
+    data = simulated_room(n=20, grid=AngularGrid.hemisphere(8, 32))
+    room = GeometryModel.of_planes(data, [Plane((0.0, 0.0, -1.0), offset_m=0.0, gain=-0.6)])
+    scene, _ = observe(data)
+    monkeypatch.setattr(GainPosterior, "gradient", recorded)
+    before = torch.get_num_threads()
+    torch.set_num_threads(4)
+    try:
+        fit_path_gains(room, scene, Kernel())
+    finally:
+        torch.set_num_threads(before)
+    assert found == {1}
 
 
 @pytest.mark.parametrize("prior", PRIORS.values(), ids=list(PRIORS))
