@@ -267,9 +267,8 @@ def gathered(work: Path, name: str) -> Row:
         found["described"][file.name.removesuffix(".scene.json")] = json.loads(file.read_text())
     angles = ("elevation_deg", "azimuth_deg", "great_circle_deg")
     runs = [json.loads(file.read_text()) for file in sorted(work.glob("aoa*/metrics.json"), reverse=True)]
-    for run in sorted(
-        runs, key=lambda run: int(run["repeats"])
-    ):  # of methods in several runs, the one with most repeats
+    # a method that several runs contain is that of the run with most repeats
+    for run in sorted(runs, key=lambda run: int(run["repeats"])):
         found["aoa"] = found["aoa"] or {}
         for share, mix in run["mixes"].items():
             methods = found["aoa"].setdefault(share, {})

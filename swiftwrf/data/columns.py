@@ -118,9 +118,7 @@ def seconds(column: pd.Series) -> Floats:
         >>> seconds(pd.Series(["2024-01-01 10:00:00", "2024-01-01 10:01:00", "noon"]))
         array([ 0., 60., nan])
     """
-    values = np.full(len(column), np.nan)
-    if column.dtype.kind != "M":
-        values = parsed(column)[0]
+    values = np.full(len(column), np.nan) if column.dtype.kind == "M" else parsed(column)[0]
     if np.isnan(values).all():
         date = pd.to_datetime(column, errors="coerce", utc=True, format="mixed")
         values = (date - date.min()).dt.total_seconds().to_numpy(np.float64)

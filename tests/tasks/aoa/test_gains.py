@@ -62,7 +62,7 @@ def test_a_median_over_repeats_is_that_of_all_errors():
     assert found["a"]["error"]["n"] == 60
 
 
-def test_the_interval_of_a_median_over_repeats_covers_the_truth_as_often_as_it_says():
+def test_intervals_over_repeats_contain_the_true_median_at_the_stated_rate():
     """Errors of repeats that differ less from each other than rows do."""
     generator = np.random.default_rng(2)
     covered = alike = 0
