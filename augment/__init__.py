@@ -1,12 +1,24 @@
 """Turbo learning: measured spectra, and synthetic spectra at positions without a measurement, in one training set."""
 
-from swiftwrf.runtime.lazy import lazy_imports
+from typing import TYPE_CHECKING
 
-with lazy_imports(globals()):
+from swiftwrf.runtime.lazy import import_lazily
+
+if TYPE_CHECKING:
     from augment.choose import Fold, ModelChoice, choose_model
     from augment.mix import Mixed, mix, withhold
     from augment.positions import SyntheticPositions, sample_positions, synthetic_positions
     from augment.suggest import Suggestion, suggest
+
+import_lazily(
+    __name__,
+    {
+        "augment.choose": ("Fold", "ModelChoice", "choose_model"),
+        "augment.mix": ("Mixed", "mix", "withhold"),
+        "augment.positions": ("SyntheticPositions", "sample_positions", "synthetic_positions"),
+        "augment.suggest": ("Suggestion", "suggest"),
+    },
+)
 
 __all__ = [
     "Fold",

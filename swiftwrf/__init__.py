@@ -9,9 +9,11 @@ spectrum = model.predict(test.position).mean
 Gaussian Splatting for Efficient Wireless Radiance Field Rendering", 2025.
 """
 
-from swiftwrf.runtime.lazy import lazy_imports
+from typing import TYPE_CHECKING
 
-with lazy_imports(globals()):
+from swiftwrf.runtime.lazy import import_lazily
+
+if TYPE_CHECKING:
     from swiftwrf import comparison, datasets
     from swiftwrf.array.angles import AngularGrid, ArrayPose
     from swiftwrf.choices import FIELD_MODELS
@@ -24,10 +26,34 @@ with lazy_imports(globals()):
     from swiftwrf.models.coarray import CoarrayModel, fit_coarray, project
     from swiftwrf.models.geometry import GeometryModel, HybridModel, fit_geometry, fit_hybrid
     from swiftwrf.models.prediction import Prediction
-    from swiftwrf.models.swiftwrf import FitConfig, ModelConfig, SwiftWRF, fit
+    from swiftwrf.models.swiftwrf import FitConfig, ModelConfig, SwiftWRF
+    from swiftwrf.models.swiftwrf.model import fit
     from swiftwrf.rasterize import rasterize, rasterize_magnitude
     from swiftwrf.rssi import PairModel, RssiConfig, RssiModel, fit_rssi
     from swiftwrf.runtime.checkpoint import load
+
+import_lazily(
+    __name__,
+    {
+        "swiftwrf": ("comparison", "datasets"),
+        "swiftwrf.array.angles": ("AngularGrid", "ArrayPose"),
+        "swiftwrf.choices": ("FIELD_MODELS",),
+        "swiftwrf.data": ("Rssi", "Snapshots", "Spectra", "load_rssi", "load_snapshots", "load_spectra"),
+        "swiftwrf.data.simulated": ("rssi_room", "simulated_room"),
+        "swiftwrf.diagnostics.calibration": ("Calibration", "calibrate"),
+        "swiftwrf.errors": ("FitError", "InputError"),
+        "swiftwrf.locate": ("MatchedField", "Posterior", "RssiLocator"),
+        "swiftwrf.models.base": ("FieldModel", "make_model"),
+        "swiftwrf.models.coarray": ("CoarrayModel", "fit_coarray", "project"),
+        "swiftwrf.models.geometry": ("GeometryModel", "HybridModel", "fit_geometry", "fit_hybrid"),
+        "swiftwrf.models.prediction": ("Prediction",),
+        "swiftwrf.models.swiftwrf": ("FitConfig", "ModelConfig", "SwiftWRF"),
+        "swiftwrf.models.swiftwrf.model": ("fit",),
+        "swiftwrf.rasterize": ("rasterize", "rasterize_magnitude"),
+        "swiftwrf.rssi": ("PairModel", "RssiConfig", "RssiModel", "fit_rssi"),
+        "swiftwrf.runtime.checkpoint": ("load",),
+    },
+)
 
 __all__ = [
     "FIELD_MODELS",

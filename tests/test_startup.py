@@ -85,6 +85,18 @@ print(int(not callable(swiftwrf.rasterize) or not callable(augment.mix)), file=s
     assert imported(code)[0] == 0
 
 
+def test_other_threads_import_as_usual_while_a_package_starts():
+    code = """
+import builtins, sys
+eager, unchanged = builtins.__import__, []
+sys.setprofile(lambda *_: unchanged.append(builtins.__import__ is eager))
+import swiftwrf, augment
+sys.setprofile(None)
+print(int(not all(unchanged)), file=sys.stderr)
+"""
+    assert imported(code) == (0, [])
+
+
 @pytest.mark.parametrize(
     ("registry", "known"),
     [(FIELD_MODELS, labels.FIELD_MODELS), (BEAMFORMERS, labels.BEAMFORMERS), (PREDICTORS, labels.PREDICTORS)],

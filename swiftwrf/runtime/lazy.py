@@ -1,33 +1,19 @@
 """Packages whose members are imported at first use, so that importing the package loads neither torch nor SciPy.
 
-The `__init__` of such a package holds usual import statements, which type checkers and editors read as they stand:
-
-    with lazy_imports(globals()):
-        from swiftwrf.models import SwiftWRF
-
-The statement binds nothing. The module is imported when `SwiftWRF` is first read from the package (PEP 562).
+Type checkers and editors read the usual import statements, in a block `if TYPE_CHECKING`.
 """
 
 from __future__ import annotations
 
-import builtins
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from types import ModuleType
 from typing import Any
 
 
-class _Name:
-    """Stands for every member of a module whose import is postponed."""
-
-    def __getattr__(self, name: str) -> None:
-        return None
-
-
 class _LazyPackage(ModuleType):
-    """A package that imports its members at first use."""
+    """A package that imports its members at first use (PEP 562)."""
 
     lazy: dict[str, str]  # module by name of the member
 
@@ -48,34 +34,13 @@ class _LazyPackage(ModuleType):
         return sorted({*self.__dict__, *self.lazy})
 
 
-@contextmanager
-def lazy_imports(namespace: dict[str, Any]) -> Iterator[None]:
-    """Postpone the statements `from MODULE import NAME, ...` in the block until a name is used.
+def import_lazily(package: str, members: Mapping[str, Sequence[str]]) -> None:
+    """Postpone the imports of a package until a name is read from it.
 
     Args:
-        namespace: `globals()` of the `__init__` of a package.
+        package: `__name__` of the package.
+        members: Names by the module that defines them; submodules by the package.
     """
-    package = sys.modules[namespace["__name__"]]
-    eager, members = builtins.__import__, {}
-
-    def postpone(
-        module: str,
-        globals: Mapping[str, Any] | None = None,
-        locals: Mapping[str, Any] | None = None,
-        names: Sequence[str] | None = (),
-        level: int = 0,
-    ) -> Any:
-        if globals is not namespace:  # another thread imports
-            return eager(module, globals, locals, names or (), level)
-        members.update(dict.fromkeys(names or (), module))
-        return _Name()
-
-    builtins.__import__ = postpone  # type: ignore[assignment]  # returns what stands for a module
-    try:
-        yield
-    finally:
-        builtins.__import__ = eager
-    for name in members:
-        del namespace[name]
-    package.__dict__["lazy"] = members
-    package.__class__ = _LazyPackage
+    module = sys.modules[package]
+    module.__dict__["lazy"] = {name: source for source, names in members.items() for name in names}
+    module.__class__ = _LazyPackage

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from swiftwrf.runtime.lazy import lazy_imports
+from swiftwrf.runtime.lazy import import_lazily
 from swiftwrf.runtime.registry import Registry
 
 if TYPE_CHECKING:
     from swiftwrf.rssi import RssiPredictor
-
-with lazy_imports(globals()):
     from tasks.rssi.predictors.base import make_predictor
+
+import_lazily(__name__, {"tasks.rssi.predictors.base": ("make_predictor",)})
 
 PREDICTORS: Registry[RssiPredictor] = Registry(
     "predictor",
