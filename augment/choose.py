@@ -53,7 +53,7 @@ class Fold:
     test: Spectra
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ModelChoice:
     """Result of `choose_model`.
 
@@ -62,19 +62,28 @@ class ModelChoice:
         psnr_db: Trimmed mean of the PSNR over held-out measured spectra [dB] of each candidate.
         seconds: Time of the cross-validation of each candidate [s]. A shared search counts for each model that uses it.
         folds: Scored folds of each candidate.
+        left_out: Reason for each candidate that could not be fitted.
 
     Example:
         >>> import swiftwrf
         >>> measured = swiftwrf.simulated_room(n=40, grid=swiftwrf.AngularGrid.hemisphere(10, 40))
         >>> choice = choose_model(measured, ("nearest",))
-        >>> choice.name, len(choice.folds["nearest"]) > 1
-        ('nearest', True)
+        >>> choice
+        <ModelChoice: nearest, PSNR nearest ... dB>
+        >>> len(choice.folds["nearest"]) > 1
+        True
     """
 
     name: str
     psnr_db: dict[str, float]
     seconds: dict[str, float]
     folds: dict[str, list[Fold]]
+    left_out: dict[str, str]
+
+    def __repr__(self) -> str:
+        scores = ", ".join(f"{name} {psnr_db:.2f} dB" for name, psnr_db in self.psnr_db.items())
+        reasons = "".join(f"; without {name}: {reason}" for name, reason in self.left_out.items())
+        return f"<ModelChoice: {self.name}, PSNR {scores}{reasons}>"
 
 
 def candidates(data: Spectra) -> list[str]:
@@ -108,10 +117,11 @@ def choose_model(
         validation: Rule by which the spectra are divided into folds.
         seed: Seed of the folds and of the fits.
         device: Device to compute on.
-        options: Further options of the models, see `swiftwrf.models.make_model`.
+        options: Further options of the candidates. Each candidate takes those that it has.
 
     Raises:
-        InputError: Fewer than 11 spectra, a value that is not finite, or no candidate that can be fitted.
+        InputError: Fewer than 11 spectra, a value that is not finite, an unknown name, an option that no candidate has, or
+            no candidate that can be fitted.
 
     Example:
         >>> import swiftwrf
@@ -120,34 +130,45 @@ def choose_model(
         ['idw', 'nearest']
     """
     check_training(measured)
+    names = candidates(measured) if names is None else tuple(names)
+    types = {name: FIELD_MODELS[name] for name in names}
+    for option in options:
+        if not any(model_type.supported({option: options[option]}) for model_type in types.values()):
+            raise InputError(f"none of the candidates {', '.join(types)} has an option {option!r}; leave it out")
     fold, blind_folds = _blind_folds(measured, validation, seed)
     options |= {"validation": validation, "seed": seed}
     searched: list[list[tuple[FieldModel, float]]] = [[] for _ in blind_folds]
     psnr_db: dict[str, float] = {}
     found: dict[str, list[Fold]] = {}
     seconds: dict[str, float] = {}
-    for name in candidates(measured) if names is None else names:
+    left_out: dict[str, str] = {}
+    for name, model_type in types.items():
         scored, score, spent = [], [], 0.0
+        own = model_type.supported(options)
         try:
             for blind, models in zip(blind_folds, searched, strict=True):
-                structure, searching = _structure(name, measured, _without(fold, *blind), models, device, options)
-                spent += searching
+                structure = None
+                if model_type.searches:
+                    structure, searching = _structure(name, measured, _without(fold, *blind), models, device, own)
+                    spent += searching
                 for number in blind:
                     train, test = _split(measured, fold, number)
                     began = time.perf_counter()
-                    model = make_model(name, **options).fit(train, like=structure, device=device)
+                    model = make_model(name, **own).fit(train, like=structure, device=device)
                     predicted = model.synthesize(test.position).cpu()
                     spent += time.perf_counter() - began
                     scored.append(Fold(model, train, test))
                     score.append(psnr(predicted, test.spectrum))
-        except (InputError, FitError):  # a model that cannot be fitted here is no candidate
+        except (InputError, FitError) as error:
+            left_out[name] = str(error)
             continue
         psnr_db[name] = float(trim_mean(torch.cat(score).numpy(), TRIMMED_FRACTION))
         found[name], seconds[name] = scored, spent
     if not psnr_db:
-        raise InputError(f"no field model can be fitted to {len(measured)} measured spectra of {measured.name}")
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
+        raise InputError(f"no field model can be fitted to {len(measured)} spectra of {measured.name} ({reasons})")
     best = max(psnr_db, key=lambda name: psnr_db[name])
-    return ModelChoice(best, psnr_db, seconds, found)
+    return ModelChoice(best, psnr_db, seconds, found, left_out)
 
 
 def _blind_folds(measured: Spectra, validation: Validation, seed: int) -> tuple[Tensor, tuple[tuple[int, ...], ...]]:

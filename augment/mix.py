@@ -15,7 +15,7 @@ from swiftwrf.data.splits import MIN_TRAINING, random_rows
 from swiftwrf.data.store import Store
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Mixed:
     """A training set for an estimator of the direction.
 
@@ -32,8 +32,8 @@ class Mixed:
         >>> measured, withheld = withhold(swiftwrf.simulated_room(n=40), 0.5, seed=0)
         >>> model = swiftwrf.make_model("nearest").fit(measured)
         >>> train = mix(measured, withheld, model.synthesize(withheld.position))
-        >>> len(train), int(train.synthetic.sum())
-        (40, 20)
+        >>> train
+        <Mixed: 20 measured and 20 synthetic spectra of 30 x 120 directions>
     """
 
     stores: tuple[Store, ...]
@@ -45,6 +45,10 @@ class Mixed:
 
     def __len__(self) -> int:
         return len(self.label)
+
+    def __repr__(self) -> str:
+        n, (rows, columns) = int(self.synthetic.sum()), self.grid.shape
+        return f"<Mixed: {len(self) - n} measured and {n} synthetic spectra of {rows} x {columns} directions>"
 
     @property
     def spectrum(self) -> Tensor:

@@ -206,7 +206,7 @@ def row(method: str, train: Spectra, test: Spectra, split: str, quick: bool, sta
         def synthesize(position: Tensor) -> Tensor:
             return mean.repeat(len(position), 1, 1)
     else:
-        model = make_model(method, validation=validation_for(split))
+        model = make_model(method, **FIELD_MODELS[method].supported({"validation": validation_for(split)}))
         if quick and getattr(model.config, "steps", 0):
             model = type(model)(model.config, steps=model.config.steps // QUICK_DIVISOR)
         model.fit(train, checkpoint=state, on_record=on_record)

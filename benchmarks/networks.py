@@ -108,7 +108,7 @@ def has_room(data: Spectra) -> bool:
 
 def synthesized(measured: Spectra, withheld: SyntheticPositions, name: str, seed: int) -> Mixed:
     """Return measured and synthetic spectra, those at extra positions where there is a room."""
-    model = make_model(name, seed=seed, validation="random").fit(measured)
+    model = make_model(name, seed=seed).fit(measured)
     mixed = mix(measured, withheld, model.synthesize(withheld.position))
     if not has_room(measured):
         return mixed

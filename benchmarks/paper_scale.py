@@ -26,7 +26,7 @@ from comparison import MEAN, SHARES, milliseconds, weight
 from record import write_result
 from torch import Tensor
 
-from swiftwrf import FitConfig, Spectra, SwiftWRF, load_spectra, make_model
+from swiftwrf import FIELD_MODELS, FitConfig, Spectra, SwiftWRF, load_spectra, make_model
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.choices import Moving
 from swiftwrf.comparison.dcgan import DcganSize
@@ -190,9 +190,9 @@ def built(method: str, split: Split, config: Config) -> FieldModel | None:
         smaller = replace(paper.model, n_primitives=n_primitives)
         model: FieldModel = SwiftWRF(replace(paper, model=smaller, **sizes, **options))
     elif config.device == "cuda" and method in BY_GRADIENT:
-        model = make_model(method, "paper", **ON_GPU[method], **options)
+        model = make_model(method, "paper", **ON_GPU[method], **FIELD_MODELS[method].supported(options))
     else:
-        model = make_model(method, **options)
+        model = make_model(method, **FIELD_MODELS[method].supported(options))
     steps = getattr(model.config, "steps", 0)
     if steps and (config.steps or config.quick):
         model = type(model)(replace(model.config, steps=config.steps or steps // QUICK_DIVISOR))

@@ -72,11 +72,12 @@ class MethodMetrics(TypedDict):
 
 
 class ChoiceMetrics(TypedDict):
-    """Chosen field model; trimmed mean PSNR [dB] on held-out measured spectra and seconds of each candidate."""
+    """Chosen field model; trimmed mean PSNR [dB] and seconds of each candidate; reasons why others could not be fitted."""
 
     name: str
     psnr_db: dict[str, float]
     seconds: dict[str, float]
+    left_out: dict[str, str]
 
 
 class GainMetrics(ChangeMetrics):

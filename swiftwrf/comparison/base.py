@@ -14,8 +14,7 @@ from annotated_types import Ge, Le, Lt
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.choices import Moving
-from swiftwrf.comparison.network import LinkNetwork, Network, restored
+from swiftwrf.comparison.network import Network, restored
 from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.models.base import FieldModel, FitContext
 from swiftwrf.runtime.checkpoint import Header
@@ -151,11 +150,6 @@ class TrainedModel(FieldModel):
 
     def parameters(self) -> Iterable[Tensor]:
         return self.network.parameters()
-
-    @property
-    def fixed_end(self) -> tuple[Tensor, Tensor, Moving] | None:
-        link = self.network.link if isinstance(self.network, LinkNetwork) else None
-        return None if link is None else (link.fixed.cpu(), link.rotation.cpu(), link.moving)
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         return self.network.render(position, grid), None

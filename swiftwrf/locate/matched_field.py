@@ -39,7 +39,7 @@ from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.path_gains import PathGains, PriorChoice, choose_prior, fit_path_gains, kernel_of
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
-from swiftwrf.runtime.options import Configured
+from swiftwrf.runtime.options import Configured, all_or_nothing
 from swiftwrf.runtime.threads import parallel_map
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 
@@ -170,6 +170,7 @@ class MatchedField(Configured, Saved):
         self.check_fitted()
         return self._fit.room
 
+    @all_or_nothing
     def fit(
         self,
         train: Spectra,
@@ -188,7 +189,7 @@ class MatchedField(Configured, Saved):
             progress: Show a progress bar on a terminal.
 
         Raises:
-            InputError: Too few spectra, or a property of the data that is missing.
+            InputError: Too few spectra, a property of the data that is missing, or a room of another link.
         """
         check_training(train)
         if len(train) < MIN_SPECTRA:
@@ -198,8 +199,7 @@ class MatchedField(Configured, Saved):
         if room is not None and room.room is None:
             raise InputError(f"{with_article(room.kind)} has no room to locate by; fit geometry or hybrid")
         own = GeometryModel(seed=self.config.seed).fit(train, like=room, progress=progress)
-        assert train.array is not None
-        features = SpectrumFeatures.of(train.store.batches(), train.array, train.grid, self.config.seed)
+        features = SpectrumFeatures.of(train.store.batches(), own.array, train.grid, self.config.seed)
         scene, rows = observe(train, GeometryConfig(seed=self.config.seed))
         fold = places(train.position, FOLDS) % FOLDS
         choice = choose_prior(own, scene, fold[rows]) if own.planes else PriorChoice(own, "loose", {})

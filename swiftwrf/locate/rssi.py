@@ -20,7 +20,7 @@ from swiftwrf.locate.region import Region, outside_mass
 from swiftwrf.locate.rssi_likelihood import DetectionLikelihood, FingerprintLikelihood, RssiMaps, ValueLikelihood
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
-from swiftwrf.runtime.options import Configured
+from swiftwrf.runtime.options import Configured, all_or_nothing
 from swiftwrf.runtime.progress import progress as tracked
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 
@@ -87,6 +87,7 @@ class RssiLocator(Configured, Saved):
     fitted_attribute = "_maps"
     config: RssiLocatorConfig
 
+    @all_or_nothing
     def fit(
         self,
         train: Rssi,
@@ -99,15 +100,18 @@ class RssiLocator(Configured, Saved):
 
         Args:
             train: Measured rows, at least 10.
-            model: Radio maps fitted to the same rows. Fitted by default.
+            model: Radio maps fitted to rows at the same receivers. Fitted by default.
             region: Prior over positions. Defaults to the neighbourhood of the training positions, with the mass outside from
                 held-out ones.
             progress: Show a progress bar on a terminal.
 
         Raises:
-            InputError: Too few rows or positions.
+            InputError: Too few rows or positions, or a model of other receivers.
         """
         config = self.config
+        if model is not None:
+            model.check_measurements(train)
+            train = train.about(model.origin)
         self.receiver_names = train.receiver_names
         self.model = model or RssiModel(validation=config.validation, seed=config.seed).fit(train)
         known, rssi = train.transmitter_position, train.rssi_dbm

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
+from copy import copy
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -14,16 +15,17 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.choices import FIELD_MODELS, Moving
 from swiftwrf.data.dataset import Numbers
-from swiftwrf.data.spectra import Spectra, check_training
+from swiftwrf.data.spectra import Spectra, check_spectra, check_training
 from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError, with_article
+from swiftwrf.models.link import Link
 from swiftwrf.models.prediction import Prediction
-from swiftwrf.models.updatable import Updatable, bounding_box
 from swiftwrf.plotting import Displayed, extent
 from swiftwrf.positions import check_positions
 from swiftwrf.runtime.checkpoint import Header, Saved
-from swiftwrf.runtime.options import Configured, Preset, from_plain
+from swiftwrf.runtime.options import Configured, Preset, all_or_nothing, from_plain
 from swiftwrf.runtime.session import Record
+from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import NonNegativeInt, checked, configuration
 
 if TYPE_CHECKING:
@@ -49,11 +51,6 @@ class FieldConfig:
     seed: NonNegativeInt = 0
     """seed of everything random"""
 
-    @classmethod
-    def paper(cls, **changes: Any) -> FieldConfig:
-        """Return the settings of the model's publication; the defaults, for a model without published settings."""
-        return cls(**changes)
-
 
 @dataclass(frozen=True)
 class FitContext:
@@ -65,8 +62,12 @@ class FitContext:
     on_record: Callable[[Record], None] | None = None
     progress: bool = False
 
+    def __post_init__(self) -> None:
+        if self.checkpoint is not None and not Path(self.checkpoint).parent.is_dir():
+            raise InputError(f"the folder of the checkpoint {self.checkpoint} does not exist; create it")
 
-class FieldModel(Configured, Saved, Updatable, Displayed):
+
+class FieldModel(Configured, Saved, Displayed):
     """Base class of all field models.
 
     A subclass sets `name`, `kind` and `config_type`, and implements `_fit`, `_predict`, `state` and `_restore`. Options are
@@ -95,8 +96,12 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
     """name in the registry, on the command line and in reports"""
     requires: ClassVar[tuple[str, ...]] = ()
     """properties of the data that the model needs: ARRAY, FIXED_END"""
+    searches: ClassVar[bool] = False
+    """whether `fit` searches a structure that it can reuse from another model"""
     samples: ClassVar[bool] = False
     """whether `sample` is available"""
+    updates: ClassVar[bool] = False
+    """whether `update` is available; other models must be fitted again"""
     slow: ClassVar[bool] = False
     """whether a fit takes minutes, so that it is compared only on request"""
     any_grid: ClassVar[bool] = False
@@ -108,9 +113,11 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
     """grid of the training spectra, set by `fit`"""
     bounds: Tensor
     """corners of the box around the training positions, float64 (2, 3) [m], set by `fit`"""
+    link: Link
+    """link of the training spectra, set by `fit`"""
 
     @classmethod
-    def lacking(cls, data: Spectra) -> list[str]:
+    def lacking(cls, data: Spectra | Link) -> list[str]:
         """Return the requirements of the model that the data do not meet."""
         known = {
             ARRAY: data.array is not None,
@@ -121,8 +128,9 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
     @classmethod
     def accepts_like(cls, model: FieldModel) -> bool:
         """Return True if `fit` can reuse the structure of this fitted model."""
-        return type(model) is cls
+        return cls.searches and type(model) is cls
 
+    @all_or_nothing
     def fit(
         self,
         train: Spectra,
@@ -133,32 +141,36 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
         on_record: Callable[[Record], None] | None = None,
         progress: bool = False,
     ) -> Self:
-        """Fit the model to measured spectra and return it.
+        """Fit the model to measured spectra and return it. A fit that fails leaves the model as it was.
 
         Args:
             train: Training spectra, at least 10.
-            like: Fitted model of the same scene whose structure (planes, number of primitives) is reused, not searched.
+            like: Fitted model of the same link whose structure (planes, number of primitives) is reused, not searched.
+                Options that state the structure take precedence.
             device: Device to compute on.
             checkpoint: File for the state of a long fit. If it exists, the fit continues from it.
             on_record: Called with each evaluation: stage, steps, loss, seconds.
             progress: Show a progress bar on a terminal.
 
         Raises:
-            InputError: Too few spectra, values that are not finite, a missing requirement, or a checkpoint of another fit.
+            InputError: Too few spectra, values that are not finite, a missing requirement, a `like` of another link, or a
+                checkpoint of another fit or in a folder that does not exist.
             FitError: The loss diverged.
         """
+        context = FitContext(like, torch.device(device), checkpoint, on_record, progress)
         check_training(train)
-        if lacking := self.lacking(train):
-            raise InputError(f"{self.name} needs the {' and the '.join(lacking)}, which {train.name} does not describe")
+        self._check_described(train)
         if like is not None and not self.accepts_like(like):
             raise InputError(f"{self.name} cannot reuse the structure of {with_article(like.kind)}")
-        self.grid, self.bounds = train.grid, bounding_box(train.position)
-        try:
-            self._fit(train, FitContext(like, torch.device(device), checkpoint, on_record, progress))
-        except BaseException:
-            del self.grid  # the model counts as not fitted
-            raise
+        if like is not None:
+            like.link.check(train)
+        self.grid, self.bounds, self.link = train.grid, bounding_box(train.position), Link.from_spectra(train)
+        self._fit(train, context)
         return self
+
+    def _check_described(self, data: Spectra) -> None:
+        if lacking := self.lacking(data):
+            raise InputError(f"{self.name} needs the {' and the '.join(lacking)}, which {data.name} does not describe")
 
     @abstractmethod
     def _fit(self, train: Spectra, context: FitContext) -> None:
@@ -230,6 +242,92 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
                 lambda some: (self._sample(some, grid, generator).clamp(0, 1), None), self._checked(position), grid
             )[0]
 
+    @single_thread()
+    def update(self, new: Spectra) -> Self:
+        """Return the model with more training spectra, by an update of its factorisation. This model stays as it is.
+
+        The result equals a fit to all spectra with the same kernel, noise and components. The planes of a room are refined
+        and not searched, which needs 10 new positions.
+
+        Args:
+            new: Spectra of the same link on the grid of the training spectra, any number.
+
+        Raises:
+            InputError: A model that must be fitted again, or as `check_measurements`.
+
+        Example:
+            >>> import swiftwrf
+            >>> data = swiftwrf.simulated_room(n=50)
+            >>> model = swiftwrf.make_model("coarray").fit(data.subset(torch.arange(40)))
+            >>> model.update(data.subset(torch.arange(40, 50))).process.known.shape
+            torch.Size([50, 3])
+        """
+        self.check_measurements(new)
+        model = self._copy()
+        if len(new):
+            model.bounds = bounding_box(torch.cat([self.bounds, new.position]))
+            model._update(new)
+        return model
+
+    def check_measurements(self, new: Spectra) -> None:
+        """Refuse spectra that were not measured as the training spectra.
+
+        Raises:
+            InputError: Another grid or link than that of the training spectra, or a spectrum that is not finite.
+        """
+        if new.grid != self._checked_grid(None):
+            raise InputError(
+                f"{new.name} has another grid than the training spectra; give spectra of {self.grid.shape}"
+            )
+        self._check_described(new)
+        self.link.check(new)
+        check_spectra(new)
+
+    def forget(self, rows: Tensor) -> Self:
+        """Return the model without some of its training spectra; see `update`.
+
+        Args:
+            rows: Numbers of training spectra, in the order in which the model received them, int64.
+
+        Raises:
+            InputError: A model that must be fitted again, or a number outside the range.
+        """
+        model = self._copy()
+        model._forget(rows)
+        return model
+
+    def aged(self, correlation: float) -> Self:
+        """Return the model after a change of the scene, for which earlier spectra count less than new ones.
+
+        Args:
+            correlation: Correlation of the fields before and after the change, above 0 and at most 1.
+
+        Raises:
+            InputError: A model that must be fitted again, or a correlation outside the range.
+        """
+        if not 0 < correlation <= 1:
+            raise InputError(f"correlation must be above 0 and at most 1, got {correlation}")
+        model = self._copy()
+        model._age(correlation)
+        return model
+
+    def _copy(self) -> Self:
+        """Return a copy that shares all tensors."""
+        self.check_fitted()
+        return copy(self)
+
+    def _update(self, new: Spectra) -> None:
+        """Add checked spectra to this copy."""
+        raise InputError(f"{self.kind}: cannot be updated; fit it again to all spectra")
+
+    def _forget(self, rows: Tensor) -> None:
+        """Remove training spectra from this copy."""
+        raise InputError(f"{self.kind}: cannot forget single spectra; fit it again to the others")
+
+    def _age(self, correlation: float) -> None:
+        """Lower the weight of the training spectra of this copy."""
+        raise InputError(f"{self.kind}: cannot weigh earlier spectra less; fit it again to the new ones")
+
     @property
     def room(self) -> swiftwrf.models.geometry.model.GeometryModel | None:
         """Room that the model found or uses; None for models without one."""
@@ -239,10 +337,10 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
     def fixed_end(self) -> tuple[Tensor, Tensor, Moving] | None:
         """Position of the fixed end (3,) [m], rotation of the array (3, 3), both on the CPU, and moving end.
 
-        None if the model lacks them.
+        None if the training spectra do not describe them.
         """
-        room = self.room
-        return None if room is None else (room.fixed_position, room.rotation, room.moving)
+        position, rotation = self.link.fixed_position, self.link.rotation
+        return None if position is None or rotation is None else (position, rotation, self.link.moving)
 
     def region(self) -> Tensor:
         """Return positions (n, 3) [m] around which the model was fitted, on the CPU.
@@ -308,17 +406,21 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
         """
         grid = self._checked_grid(None)
         tensors, header = self._state()
-        return tensors, {"options": asdict(self.config), "grid": asdict(grid), "bounds": self.bounds.tolist()} | header
+        described = {"grid": asdict(grid), "bounds": self.bounds.tolist(), "link": self.link.to_json()}
+        return tensors, {"options": asdict(self.config)} | described | header
 
     @abstractmethod
     def _state(self) -> tuple[dict[str, Tensor], Header]:
-        """Return the fitted tensors by name, and plain values beside options and grid."""
+        """Return the fitted tensors by name, and plain values beside options, grid and link."""
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         model = cls(cls._restored_config(header.get("options", {})))
         model.grid = AngularGrid(**header["grid"])
         model.bounds = bounding_box(torch.tensor(header["bounds"], dtype=torch.float64))
+        model.link = Link.from_json(header["link"])
+        if lacking := cls.lacking(model.link):
+            raise InputError(f"the {' and the '.join(lacking)} are missing")
         model._restore(tensors, header)
         return model
 
@@ -366,6 +468,12 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
         return f"{type(self).__name__}({fitted})"
 
 
+def bounding_box(position: Tensor) -> Tensor:
+    """Return the lower and upper corner (2, 3) of the box around positions (n, 3) [m]."""
+    position = check_positions(position)
+    return torch.stack([position.amin(dim=0), position.amax(dim=0)])
+
+
 def check_finite(spectrum: Tensor) -> Tensor:
     """Return the spectra unchanged if they are finite.
 
@@ -379,24 +487,19 @@ def check_finite(spectrum: Tensor) -> Tensor:
 
 @checked
 def make_model(name: str, preset: Preset = "quick", **options: Any) -> FieldModel:
-    """Return a field model by its name, with those of the options that it has.
+    """Return a field model by its name.
 
     Args:
         name: Name in the registry, e.g. "hybrid".
-        preset: "quick", or "paper" for published settings; a model without published settings ignores it.
-        options: Options such as seed and validation. A model ignores those that only other models have.
+        preset: "quick", or "paper" for published settings.
+        options: Options of the model.
 
     Raises:
-        InputError: An unknown name, an option that no model has, or a value outside its range.
+        InputError: An unknown name, an option or preset that the model does not have, or a value outside its range.
 
     Example:
         >>> make_model("idw", seed=3).config.seed
         3
     """
     model_type: type[FieldModel] = FIELD_MODELS[name]
-    for option in options:
-        if not model_type.has_option(option) and not any(
-            FIELD_MODELS[other].has_option(option) for other in FIELD_MODELS
-        ):
-            raise InputError(f"no field model has an option {option!r}")
-    return model_type.with_known(preset, options)
+    return model_type(preset=preset, **options)

@@ -24,6 +24,7 @@ from swiftwrf.data.store import Store
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, choose_kernel, principal_components
 from swiftwrf.models.base import ARRAY, FitContext
+from swiftwrf.models.link import Linked
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.runtime.checkpoint import Header, expect, refusing, restore
 from swiftwrf.runtime.progress import progress_bar
@@ -87,7 +88,7 @@ def _offset(flat: Tensor, functions: Tensor, inverse: Tensor) -> Tensor:
     return least.clamp_min(0)[:, None]
 
 
-class CoarrayModel(ProcessModel):
+class CoarrayModel(Linked, ProcessModel):
     """A Gaussian process in the linear space of the squared spectra that the array can produce.
 
     The process predicts the mean magnitude between the positions; its square, projected, gives the co-array coefficients. A
@@ -108,7 +109,6 @@ class CoarrayModel(ProcessModel):
     any_grid = True
     batch = 32  # spectra that stay in the processor's cache
 
-    array: PlanarArray
     process: GaussianProcess
     """process of the K component scores and the offset"""
     offset: Tensor
@@ -128,7 +128,6 @@ class CoarrayModel(ProcessModel):
         return self.process.known
 
     def _fit(self, train: Spectra, context: FitContext) -> None:
-        assert train.array is not None
         owner = fingerprint(train, self.config.validation, self.config.seed)
         kept = context.checkpoint
         if kept is not None and kept.exists():
@@ -143,7 +142,7 @@ class CoarrayModel(ProcessModel):
             began = time.perf_counter()
             with progress_bar(context.progress) as bar:
                 bar.add_task("co-array model", total=1)
-                self._solve(train, train.array)
+                self._solve(train)
             seconds = time.perf_counter() - began
             if kept is not None:
                 self.save(kept, {"fit": owner, "seconds": repr(seconds)})
@@ -151,7 +150,8 @@ class CoarrayModel(ProcessModel):
             context.on_record({"stage": "final", "seconds": seconds, "elapsed": seconds})
 
     @single_thread()
-    def _solve(self, train: Spectra, array: PlanarArray) -> None:
+    def _solve(self, train: Spectra) -> None:
+        array = self.array
         functions = basis(array, train.grid, torch.float32)
         inverse = _inverse(array, train.grid).float()
         parts = list(train.store.parts())
@@ -169,7 +169,7 @@ class CoarrayModel(ProcessModel):
         kernel = choose_kernel(train.position, train.store, fold)
         target = torch.cat([score, (offset - offset.mean()).double()], dim=1)
         self.process = GaussianProcess.regress(kernel, train.position, target)
-        self.array, self.offset = array, offset.mean()[None]
+        self.offset = offset.mean()[None]
         value = self.process.value
         self._set_spread(train, fold, lambda rows: value[rows], lambda score, _: self._spectra(score, self.grid))
 
@@ -211,13 +211,12 @@ class CoarrayModel(ProcessModel):
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         tensors, header = self.process.state()
-        tensors |= {"offset": self.offset, "form": self.form, "element": self.array.element}
+        tensors |= {"offset": self.offset, "form": self.form}
         if self.component is not None:
             tensors["component"] = self.component
-        return tensors | self._spread_state(), header | {"wavelength": self.array.wavelength}
+        return tensors | self._spread_state(), header
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        self.array = PlanarArray(tensors["element"], header["wavelength"])
         self.process = GaussianProcess.from_state(tensors, header, torch.float64)
         n_scores = tensors["coefficient"].shape[-1]
         form = (1 + 2 * len(differences(self.array)), n_scores, n_scores)

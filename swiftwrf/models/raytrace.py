@@ -8,15 +8,14 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.array.planar import PlanarArray
-from swiftwrf.choices import Moving
 from swiftwrf.data.raytraced import Material, Scene, Surface, Tracing, open_scene, sionna, trace
 from swiftwrf.data.raytraced.surfaces import rectangle
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext
 from swiftwrf.models.geometry import GeometryConfig, GeometryModel
-from swiftwrf.runtime.checkpoint import Header, expect
-from swiftwrf.runtime.validation import check_value, configuration
+from swiftwrf.models.link import Linked
+from swiftwrf.runtime.checkpoint import Header
+from swiftwrf.runtime.validation import configuration
 
 EXTENT = 10.0  # half the side of an unbounded wall, in distances of the farthest known point from the fixed end
 MAX_DISTANCE_M = 1e4  # from the fixed end; beyond, single precision loses the phase
@@ -32,7 +31,7 @@ class RaytraceConfig(GeometryConfig):
     """name of a built-in room or a scene file; by default the room is estimated from the spectra"""
 
 
-class RaytraceModel(FieldModel):
+class RaytraceModel(Linked, FieldModel):
     """Paths by the laws of reflection between vertically polarised isotropic ends, traced by Sionna RT.
 
     A given scene is used as it is, without any fit. Planes of an estimated room become lossless half spaces whose reflection
@@ -43,13 +42,10 @@ class RaytraceModel(FieldModel):
     kind = "ray-tracing model"
     config_type = RaytraceConfig
     requires = (ARRAY, FIXED_END)
+    searches = True
     slow = True
     any_grid = True
 
-    array: PlanarArray
-    rotation: Tensor
-    fixed_position: Tensor
-    moving: Moving
     progress: bool = False
     """whether `predict` shows a progress bar on a terminal"""
 
@@ -62,19 +58,9 @@ class RaytraceModel(FieldModel):
         """Room that is traced; None if a scene is given."""
         return self._room
 
-    @property
-    def fixed_end(self) -> tuple[Tensor, Tensor, Moving]:
-        return self.fixed_position, self.rotation, self.moving
-
     def _fit(self, train: Spectra, context: FitContext) -> None:
         sionna()  # refuses before a room is searched
-        assert train.array is not None
-        assert train.rotation is not None
-        assert train.fixed_position is not None
-        self.array, self.rotation = train.array, train.rotation
-        self.fixed_position, self.moving = train.fixed_position, train.moving
-        self.progress = context.progress
-        self._room = None
+        self.progress, self._room = context.progress, None
         if self.config.scene is None:
             like = context.like if context.like and context.like.room else None
             search = {option.name: getattr(self.config, option.name) for option in fields(GeometryConfig)}
@@ -112,19 +98,10 @@ class RaytraceModel(FieldModel):
         return spectrum, None
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
-        if self._room is not None:
-            return self._room._state()
-        tensors = {"element": self.array.element, "rotation": self.rotation, "fixed_position": self.fixed_position}
-        return tensors, {"wavelength": self.array.wavelength, "moving": self.moving}
+        return ({}, {}) if self._room is None else self._room._state()
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        expect(tensors, {"rotation": (3, 3), "fixed_position": (3,)})
-        check_value("moving", header["moving"], Moving)
-        self.array = PlanarArray(tensors["element"], header["wavelength"])
-        self.rotation, self.fixed_position = tensors["rotation"].double(), tensors["fixed_position"].double()
-        self.moving, self._room = header["moving"], None
-        if self.config.scene is None:
-            self._room = GeometryModel.within(self, tensors, header)
+        self._room = GeometryModel.within(self, tensors, header) if self.config.scene is None else None
         self._build()
 
 

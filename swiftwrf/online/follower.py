@@ -64,7 +64,7 @@ class Follower:
         config: Options of the test.
 
     Raises:
-        InputError: A model without `update`.
+        InputError: A model without `update`, or training spectra of another link than that of the model.
 
     Example:
         >>> import swiftwrf

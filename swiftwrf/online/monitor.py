@@ -93,6 +93,8 @@ class Monitor:
         """
         if isinstance(model, RssiModel):
             return cls(model.region(), model.receiver_names, None, config)
+        if isinstance(train, Spectra):
+            model.check_measurements(train)
         reference = held_out_scores(model, train).innovation[:, 0] if isinstance(train, Spectra) else None
         return cls(model.region(), (), reference, config)
 

@@ -62,7 +62,7 @@ def score(model: FieldModel | RssiPredictor, new: Spectra | Rssi) -> Scores:
     """Return the scores of measurements that a model has not learnt.
 
     Raises:
-        InputError: As `predict`.
+        InputError: As `check_measurements` and `predict`.
 
     Example:
         >>> import swiftwrf
@@ -73,8 +73,10 @@ def score(model: FieldModel | RssiPredictor, new: Spectra | Rssi) -> Scores:
     with torch.no_grad():
         if isinstance(model, RssiPredictor):
             assert isinstance(new, Rssi)
+            model.check_measurements(new)
             return _of_rssi(model, new)
         assert isinstance(new, Spectra)
+        model.check_measurements(new)
         return _of_spectra(model, new)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from copy import copy
@@ -15,7 +16,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.coordinates import GeodeticOrigin
-from swiftwrf.data.dataset import Numbers
+from swiftwrf.data.dataset import Numbers, to_tensor
 from swiftwrf.data.groups import Offsets
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
@@ -27,13 +28,14 @@ from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_positions
 from swiftwrf.rssi.floors import FloorAttenuation, estimate_floor_attenuation, receiver_floors
 from swiftwrf.runtime.checkpoint import Header, Saved
-from swiftwrf.runtime.options import Configured, from_plain
+from swiftwrf.runtime.options import Configured, all_or_nothing, from_plain
 from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.threads import parallel_map
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 ITEMS_PER_THREAD = 4  # between two results that are kept: starting threads costs milliseconds
 RECEIVER_POSITIONS = "positions of the receivers"
+RECEIVER_TOLERANCE_M = 0.01  # between two positions of one receiver
 
 
 def map_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
@@ -68,7 +70,7 @@ class RssiPredictor(Configured, Displayed, ABC):
 
     Args:
         config: Options as one object. Defaults to those of the preset.
-        preset: "quick" for the defaults; "paper" for the published settings, if there are any.
+        preset: "quick" for the defaults; "paper" for the published settings.
         options: Single options, which replace those of `config`.
 
     Raises:
@@ -95,6 +97,12 @@ class RssiPredictor(Configured, Displayed, ABC):
     fitted_attribute = "receiver_names"
     receiver_names: tuple[str, ...]
     """names of the receivers, set by `fit`"""
+    receiver_position: Tensor
+    """positions of the receivers, float64 (R, 3) [m], nan where unknown, set by `fit`"""
+    origin: GeodeticOrigin | None
+    """latitude and longitude of x = y = 0, if the positions were projected from degrees, set by `fit`"""
+    offsets: Offsets | None
+    """offsets that were removed from the training rows, set by `fit`; predictions are of their reference"""
     attenuation: FloorAttenuation | None = None
     """attenuation of the floors between transmitter and receiver, set by `fit` if the data have floors"""
 
@@ -110,6 +118,7 @@ class RssiPredictor(Configured, Displayed, ABC):
             return f"{cls.name} needs the {RECEIVER_POSITIONS}, which {data.name} does not describe"
         return ""
 
+    @all_or_nothing
     def fit(
         self,
         train: Rssi,
@@ -121,7 +130,7 @@ class RssiPredictor(Configured, Displayed, ABC):
         on_record: Callable[[Record], None] | None = None,
         progress: bool = False,
     ) -> Self:
-        """Fit the predictor to measured RSSI and return it.
+        """Fit the predictor to measured RSSI and return it. A fit that fails leaves the predictor as it was.
 
         Args:
             train: Training rows, at least 10 measurements in all. Missing values (nan) are ignored.
@@ -136,14 +145,15 @@ class RssiPredictor(Configured, Displayed, ABC):
 
         Raises:
             InputError: Too few measurements, values that are not finite, a missing requirement, a pool of other rows, or a
-                checkpoint of another fit.
+                checkpoint of another fit or in a folder that does not exist.
             FitError: The fit diverged.
         """
         pool = pool or train
         check_training(train, pool)
         if lacking := self.lacking(train):
             raise InputError(lacking)
-        self.attenuation = None
+        self.receiver_names, self.receiver_position = tuple(map(str, train.receiver_names)), train.receiver_position
+        self.origin, self.offsets, self.attenuation = train.origin, train.offsets, None
         if train.floors is not None:
             self.attenuation = estimate_floor_attenuation(train, pool)
             pool = replace(self.attenuation, receiver_floor=tuple(receiver_floors(pool).tolist())).removed(pool)
@@ -151,7 +161,6 @@ class RssiPredictor(Configured, Displayed, ABC):
         where = torch.device(device)
         context = RssiFitContext(None, where, checkpoint, on_record, progress, pool=pool, parallel=parallel)
         self._fit(train, context)
-        self.receiver_names = tuple(map(str, train.receiver_names))
         return self
 
     def update(self, new: Rssi) -> Self:
@@ -163,7 +172,7 @@ class RssiPredictor(Configured, Displayed, ABC):
             new: Rows at the receivers of the training rows, in the same frame, any number.
 
         Raises:
-            InputError: A predictor that must be fitted again, or rows at other receivers.
+            InputError: A predictor that must be fitted again, or as `check_measurements`.
 
         Example:
             >>> import swiftwrf
@@ -172,18 +181,34 @@ class RssiPredictor(Configured, Displayed, ABC):
             >>> len(model.update(data.subset(torch.arange(50, 60))).anchor)
             60
         """
-        self.check_fitted()
-        if tuple(map(str, new.receiver_names)) != self.receiver_names:
-            raise InputError(
-                f"{new.name} has the receivers {listed(new.receiver_names)}, but the predictor was fitted to "
-                f"{listed(self.receiver_names)}; give the same ones in this order"
-            )
+        self.check_measurements(new)
         predictor = copy(self)
         if self.attenuation is not None:
             new = self.attenuation.removed(new)
         if len(new):
             predictor._update(new)
         return predictor
+
+    def check_measurements(self, data: Rssi) -> None:
+        """Refuse rows at other receivers than those of the training rows. Unknown positions are not compared.
+
+        Raises:
+            InputError: Other names, another order, or a receiver more than 1 cm from its position in the training rows.
+        """
+        self.check_fitted()
+        if tuple(map(str, data.receiver_names)) != self.receiver_names:
+            raise InputError(
+                f"{data.name} has the receivers {listed(data.receiver_names)}, but the predictor was fitted to "
+                f"{listed(self.receiver_names)}; give the same ones in this order"
+            )
+        position = data.about(self.origin).receiver_position
+        apart = (position - self.receiver_position).norm(dim=1).nan_to_num(0.0)
+        if len(moved := (apart > RECEIVER_TOLERANCE_M).nonzero()[:, 0]):
+            name, metres = self.receiver_names[int(moved[0])], float(apart[moved[0]])
+            raise InputError(
+                f"{data.name} has receiver {name} {metres:.3g} m away from its position in the rows that the predictor was "
+                "fitted to; fit a predictor to rows with the receivers at these positions"
+            )
 
     def _update(self, new: Rssi) -> None:
         """Add checked rows to this copy."""
@@ -223,7 +248,12 @@ class RssiPredictor(Configured, Displayed, ABC):
         return Prediction(mean, std, position, receiver_names=self.receiver_names)
 
     def predict_detected(self, data: Rssi) -> Prediction:
-        """Predict the RSSI at least where it is measured, with shapes of `predict` at the positions of the data."""
+        """Predict the RSSI at least where it is measured, with shapes of `predict` at the positions of the data.
+
+        Raises:
+            InputError: As `check_measurements`.
+        """
+        self.check_measurements(data)
         return self.predict(data.transmitter_position)
 
     def _facts(self) -> dict[str, str]:
@@ -245,10 +275,6 @@ class SavedRssiPredictor(RssiPredictor, Saved):
         (True, True)
     """
 
-    origin: GeodeticOrigin | None
-    """latitude and longitude of x = y = 0, if the positions were projected from degrees"""
-    offsets: Offsets | None
-    """offsets that were removed from the training rows; predictions are of their reference"""
     kernel: Kernel
     """kernel of the field, lengths in [m]"""
 
@@ -260,6 +286,7 @@ class SavedRssiPredictor(RssiPredictor, Saved):
             "offsets": self.offsets and asdict(self.offsets),
             "attenuation": self.attenuation and asdict(self.attenuation),
             "receiver_names": self.receiver_names,
+            "receiver_position": [None if math.isnan(at[0]) else at for at in self.receiver_position.tolist()],
             "kernel": asdict(self.kernel),
         }
 
@@ -268,6 +295,10 @@ class SavedRssiPredictor(RssiPredictor, Saved):
         """Return a predictor with these values, without its tensors."""
         predictor = cls(from_plain(cls.config_type, header["options"]))
         predictor.receiver_names = tuple(map(str, header["receiver_names"]))
+        known = header["receiver_position"]
+        shape, located = (len(predictor.receiver_names), 3), torch.tensor([at is not None for at in known])
+        position = to_tensor("receiver_position", [at or [0.0] * 3 for at in known], torch.float64, shape)
+        predictor.receiver_position = position.where(located[:, None], torch.nan)
         predictor.origin = GeodeticOrigin(*map(float, header["origin"])) if header.get("origin") else None
         predictor.attenuation = FloorAttenuation.from_plain(header.get("attenuation"))
         predictor.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None

@@ -83,8 +83,6 @@ class RssiModel(SavedRssiPredictor):
     """primitives a receiver; 0 if there is no field"""
     mixing_weight: Tensor
     """weights (4, R) of the field and the three simpler predictors, contained in the tensors below, equal in all columns"""
-    receiver: Tensor
-    """positions of the receivers, float64 (R, 3) [m]"""
     centre: Tensor
     """centre of the measured positions, float64 (3,) [m]"""
     level: Tensor
@@ -177,10 +175,8 @@ class RssiModel(SavedRssiPredictor):
         def mixed(own: Tensor, baselines: Tensor) -> Tensor:
             return (weight * torch.cat([own[None], baselines])).sum(dim=0)
 
-        self.origin, self.offsets = train.origin, train.offsets
         self.n_primitives, self.kernel, self.mixing_weight = training.n_primitives, training.kernel, weight
-        # an unknown position has no effect: slope and directivity are 0
-        self.receiver, self.centre = train.receiver_position.double().nan_to_num(0.0), training.centre
+        self.centre = training.centre
         self.level = mixed(found["level"], training.baselines.level)
         self.slope = mixed(found["slope"], training.baselines.slope)
         self.directivity = (weight[0][:, None] * found["directivity"]).float()
@@ -196,11 +192,15 @@ class RssiModel(SavedRssiPredictor):
                 prior_slope=training.prior_mean.slope,
                 field_variance=training.field_db.square(),
                 noise_variance=training.noise_db.square(),
-                located=train.receiver_located.double(),
             )
             self._posterior = self._posterior_of(state)
         self.field_db, self.noise_db = (scale * training.field_db).float(), (scale * training.noise_db).float()
         self._precompute()
+
+    @property
+    def receiver(self) -> Tensor:
+        """Positions of the receivers, float64 (R, 3) [m]. Unknown ones are 0; their slope and directivity are 0, too."""
+        return self.receiver_position.nan_to_num(0.0)
 
     def region(self) -> Tensor:
         """Return the positions (n, 3) [m] of the location bins."""
@@ -218,7 +218,7 @@ class RssiModel(SavedRssiPredictor):
         return GaussianProcess(self.kernel, subsample(self.anchor.double(), rows=MAX_VARIANCE_POSITIONS)[0])
 
     def _posterior_of(self, state: FitState) -> RssiPosterior:
-        table, receiver = HeadTable(self.rendered), self.receiver - self.centre
+        table, receiver = HeadTable(self.rendered), self.receiver_position - self.centre
         return RssiPosterior(state, self.anchor, receiver, self.kernel, table, self.config.huber)
 
     @single_thread()
@@ -260,7 +260,7 @@ class RssiModel(SavedRssiPredictor):
         rows = Rssi(
             posterior.rssi[kept],
             self.region()[kept],
-            receiver_position=self.receiver.where(posterior.state.located[:, None] > 0, torch.nan),
+            receiver_position=self.receiver_position,
             receiver_names=self.receiver_names,
             origin=self.origin,
         )
@@ -379,7 +379,6 @@ def _shapes(n_receivers: int, n_anchors: int) -> dict[str, tuple[int, ...]]:
     per_receiver = dict.fromkeys(("level", "slope", "field_db", "noise_db"), (n_receivers,))
     return per_receiver | {
         "mixing_weight": (4, n_receivers),
-        "receiver": (n_receivers, 3),
         "centre": (3,),
         "directivity": (n_receivers, N_HARMONICS),
         "anchor": (n_anchors, 3),

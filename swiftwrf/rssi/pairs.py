@@ -67,9 +67,6 @@ class PairPredictor(RssiPredictor):
     config_type = PairConfig
     requires_receiver_position = True
 
-    receiver: Tensor
-    """positions of the receivers, float64 (R, 3) [m]"""
-
     @classmethod
     def lacking(cls, data: Rssi) -> str:
         """Return a sentence if the position of a receiver is unknown, or an empty text."""
@@ -91,17 +88,16 @@ class PairPredictor(RssiPredictor):
 
     def _fit(self, train: Rssi, context: RssiFitContext) -> None:
         row, column = train.detected.nonzero(as_tuple=True)
-        self.receiver = train.receiver_position
-        pair = torch.cat([train.transmitter_position[row], self.receiver[column]], dim=1)
+        pair = torch.cat([train.transmitter_position[row], train.receiver_position[column]], dim=1)
         session = None if train.session is None else train.session[row]
         fold = folds(pair[:, :3], self.config.validation, self.config.seed, session=session)
-        if self.config.new_places and len(self.receiver[column].unique(dim=0)) > 1:
+        if self.config.new_places and len(pair[:, 3:].unique(dim=0)) > 1:
             fold = folds(pair[:, 3:], "random", self.config.seed)
         self._fit_pairs(pair, train.rssi_dbm[row, column], fold)
 
     def _predict(self, position: Tensor) -> tuple[Tensor, Tensor | None]:
-        n, r = len(position), len(self.receiver)
-        pair = torch.cat([position.repeat_interleave(r, dim=0), self.receiver.repeat(n, 1)], dim=1)
+        n, r = len(position), len(self.receiver_position)
+        pair = torch.cat([position.repeat_interleave(r, dim=0), self.receiver_position.repeat(n, 1)], dim=1)
         mean, std = self._batches(pair)
         return mean.reshape(n, r), None if std is None else std.reshape(n, r)
 
@@ -112,9 +108,9 @@ class PairPredictor(RssiPredictor):
 
     def predict_detected(self, data: Rssi) -> Prediction:
         """Predict the RSSI where it is measured; nan elsewhere, which saves time where a row has few receivers."""
-        self.check_fitted()
+        self.check_measurements(data)
         row, column = data.detected.nonzero(as_tuple=True)
-        found = self.predict_pairs(data.transmitter_position[row], self.receiver[column])
+        found = self.predict_pairs(data.transmitter_position[row], self.receiver_position[column])
 
         def spread(values: Tensor) -> Tensor:
             return torch.full(data.rssi_dbm.shape, torch.nan).double().index_put((row, column), values.double())
@@ -205,10 +201,6 @@ class PairModel(PairPredictor, SavedRssiPredictor):
     scale_db: Tensor
     """calibrated standard deviation of the field far from all measurements, float64 (1,) [dB]"""
 
-    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
-        self.origin, self.offsets = train.origin, train.offsets
-        super()._fit(train, context)
-
     @single_thread()
     def _fit_pairs(self, pair: Tensor, rssi: Tensor, fold: Tensor) -> None:
         self.path_loss = PairPathLoss.fit(pair, rssi, not self.config.new_places)
@@ -271,7 +263,7 @@ class PairModel(PairPredictor, SavedRssiPredictor):
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         self.check_fitted()
-        own = {"receiver": self.receiver, "pair": self.pair, "residual": self.residual, "scale_db": self.scale_db}
+        own = {"pair": self.pair, "residual": self.residual, "scale_db": self.scale_db}
         loss = self.path_loss
         tensors = own | {"path_loss": loss.shared, "place": loss.place, "correction": loss.correction}
         return tensors, self._header() | {"metric": self.metric}
@@ -285,7 +277,6 @@ class PairModel(PairPredictor, SavedRssiPredictor):
         tensors = {"place": torch.zeros(0, 3).double(), "correction": torch.zeros(0, 2).double()} | tensors
         n_pairs, n_places = len(tensors["pair"]), len(tensors["place"])
         shapes = {
-            "receiver": (len(model.receiver_names), 3),
             "pair": (n_pairs, 6),
             "residual": (n_pairs,),
             "scale_db": (1,),

@@ -44,7 +44,6 @@ class FitState:
         prior_slope: Its slope, (R,) [dB a decade].
         field_variance: Prior variance of the latent field, (R,) [dB^2].
         noise_variance: Variance of one measurement, (R,) [dB^2].
-        located: 1 where the position of the receiver is known, else 0, (R,).
     """
 
     dual: Tensor
@@ -54,7 +53,6 @@ class FitState:
     prior_slope: Tensor
     field_variance: Tensor
     noise_variance: Tensor
-    located: Tensor
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors by their names in files."""
@@ -125,7 +123,7 @@ class RssiPosterior:
     Args:
         state: State of the fit.
         anchor: Positions of its bins less the centre, (n, 3) [m].
-        receiver: Positions of the receivers less the centre, (R, 3) [m].
+        receiver: Positions of the receivers less the centre, (R, 3) [m], nan where unknown.
         kernel: Kernel of the latent field.
         table: Heads of the receivers.
         huber: See `RssiConfig`.
@@ -134,8 +132,7 @@ class RssiPosterior:
     def __init__(
         self, state: FitState, anchor: Tensor, receiver: Tensor, kernel: Kernel, table: HeadTable, huber: float
     ) -> None:
-        self.state, self.anchor, self.kernel = state, anchor.double(), kernel
-        self.receiver = receiver.where(state.located[:, None] > 0, torch.nan)
+        self.state, self.anchor, self.receiver, self.kernel = state, anchor.double(), receiver, kernel
         self.table, self.huber = table, huber
         self.new = NewRows.none(len(receiver), len(anchor))
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import fields, is_dataclass, replace
-from typing import Any, ClassVar, Literal, Self, get_type_hints
+from functools import wraps
+from typing import Any, ClassVar, Literal, TypeVar, cast, get_type_hints
 
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.validation import checked
 
 Preset = Literal["quick", "paper"]
+Fit = TypeVar("Fit", bound=Callable[..., Any])
 
 
 class Configured:
@@ -17,12 +20,11 @@ class Configured:
 
     Args:
         config: Options as one object. Defaults to those of the preset.
-        preset: "quick" for the defaults, sized for a desktop; "paper" for the settings of the model's publication, if it has
-            one.
+        preset: "quick" for the defaults, sized for a desktop; "paper" for the settings of the model's publication.
         options: Single options, which replace those of `config`.
 
     Raises:
-        InputError: An unknown option, or a value outside its range.
+        InputError: An unknown option, a preset that the model does not have, or a value outside its range.
     """
 
     config_type: ClassVar[type[Any]]
@@ -37,8 +39,9 @@ class Configured:
         if unknown:
             raise InputError(f"{type(self).__name__} has no option {unknown[0]!r}; it has {', '.join(known)}")
         if config is None:
-            published = getattr(self.config_type, "paper", self.config_type)
-            self.config = (published if preset == "paper" else self.config_type)(**options)
+            if not self.supported({"preset": preset}):
+                raise InputError(f"{type(self).__name__} has no published settings; leave preset='paper' out")
+            self.config = (self.config_type.paper if preset == "paper" else self.config_type)(**options)
         elif isinstance(config, self.config_type):
             self.config = replace(config, **options)
         else:
@@ -55,14 +58,22 @@ class Configured:
             raise InputError(f"this {type(self).__name__} is not fitted; call fit first")
 
     @classmethod
-    def has_option(cls, name: str) -> bool:
-        """Return True if the constructor takes an option of this name."""
-        return name in {field.name for field in fields(cls.config_type)}
+    def supported(cls, options: Mapping[str, Any]) -> dict[str, Any]:
+        """Return those of the options, `preset` among them, that the constructor takes."""
+        known = {field.name for field in fields(cls.config_type)}
+        preset = options.get("preset") == "quick" or hasattr(cls.config_type, "paper")
+        return {name: value for name, value in options.items() if name in known or (name == "preset" and preset)}
 
-    @classmethod
-    def with_known(cls, preset: Preset, options: Mapping[str, Any]) -> Self:
-        """Return a model with those of the options that it has."""
-        return cls(preset=preset, **{name: value for name, value in options.items() if cls.has_option(name)})
+
+def all_or_nothing(fit: Fit) -> Fit:
+    """Return a method `fit` that fits a copy, whose state the object takes over when the fit has succeeded."""
+
+    @wraps(fit)
+    def fit_copy(self: Any, *arguments: Any, **options: Any) -> Any:
+        vars(self).update(vars(fit(copy(self), *arguments, **options)))
+        return self
+
+    return cast(Fit, fit_copy)
 
 
 def from_plain(config_type: type[Any], options: Mapping[str, Any]) -> Any:

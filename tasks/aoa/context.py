@@ -49,7 +49,8 @@ class Experiment:
     def make_model(self, name: str, subset: MeasuredSubset, preset: Preset = "quick") -> FieldModel:
         """Return a field model that is not fitted."""
         # validation at random: withheld positions lie among the measured ones, whatever the split of the test
-        return make_model(name, preset, seed=self.seed(subset), validation="random", scene=self.config.scene)
+        options = {"preset": preset, "seed": self.seed(subset), "validation": "random", "scene": self.config.scene}
+        return make_model(name, **FIELD_MODELS[name].supported(options))
 
     @property
     def candidates(self) -> list[str]:

@@ -87,7 +87,12 @@ class CrossValidation(Step[Experiment]):
         errors |= {turbo.method: first.turbo} if first.turbo else {}
         with_room = next((found for found in choice.folds.values() if found[0].model.room is not None), [])
         return {
-            "choice": {"name": choice.name, "psnr_db": choice.psnr_db, "seconds": choice.seconds},
+            "choice": {
+                "name": choice.name,
+                "psnr_db": choice.psnr_db,
+                "seconds": choice.seconds,
+                "left_out": choice.left_out,
+            },
             "cross_validation": {name: entry.metrics for name, entry in validation.items()},
             "errors": errors,
             "folds": {number: self._keep(fold, number, folder) for number, fold in located_folds(with_room).items()},

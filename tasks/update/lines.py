@@ -85,17 +85,7 @@ def measurement(line: str, number: int, model: FieldModel | RssiModel) -> Rssi |
         position, value = [[float(x) for x in content["position"]]], content[needed]
         if isinstance(model, RssiModel):
             return _rssi(position, value, model)
-        room = model.room
-        return Spectra(
-            [value],
-            position,
-            grid=model.grid,
-            array=room.array if room is not None else getattr(model, "array", None),
-            moving="transmitter" if room is None else room.moving,
-            fixed_position=None if room is None else room.fixed_position,
-            rotation=None if room is None else room.rotation,
-            name=f"line {number}",
-        )
+        return Spectra([value], position, grid=model.grid, name=f"line {number}", **vars(model.link))
     except InputError as error:
         raise InputError(f"line {number}: {error}") from None
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:

@@ -178,6 +178,10 @@ def test_choice_takes_the_best_on_held_out_spectra():
     assert "geometry" in candidates(TRAIN)
     assert not set(PUBLISHED) & set(candidates(TRAIN))  # they take minutes
     assert not {"geometry", "hybrid", "coarray"} & set(candidates(replace(TRAIN, array=None)))
+    with pytest.raises(InputError, match="unknown field model 'foo'; choose from"):
+        choose_model(TRAIN, ("gp", "foo"))
+    with pytest.raises(InputError, match="none of the candidates nearest, gp has an option 'width'"):
+        choose_model(TRAIN, ("nearest", "gp"), width=3)
     spectrum = TRAIN.spectrum.clone()
     spectrum[5, 2, 3] = torch.nan
     with pytest.raises(InputError, match="spectrum of training spectrum 5 is not finite"):
@@ -190,6 +194,8 @@ def spied():
     fits = []
 
     class Spy(Recorder):
+        searches = True
+
         def _fit(self, train, context):
             super()._fit(train, context)
             structure = context.like.structure if context.like else train
@@ -246,6 +252,22 @@ def test_models_with_a_room_share_its_search(glances, monkeypatch):
     assert len(searched) == 2  # one for each pair of folds
     held_out = {name: [rows_of(fold.test) for fold in scored] for name, scored in choice.folds.items()}
     assert held_out["hybrid"] == held_out["geometry"]
+
+
+def test_candidates_that_cannot_be_fitted_are_returned_with_the_reason():
+    bare = replace(TRAIN, array=None)
+    chosen = choose_model(bare, ("gp", "coarray"))
+    assert chosen.left_out == {"coarray": "coarray needs the array, which simulated-room does not describe"}
+    assert "without coarray: coarray needs the array" in repr(chosen)
+    assert len(repr(chosen)) < 200
+    with pytest.raises(InputError, match="no field model can be fitted .*coarray needs the array"):
+        choose_model(bare, ("coarray",))
+
+
+def test_models_without_a_structure_are_fitted_once_for_each_scored_fold():
+    with spied() as fits, mock.patch.object(FIELD_MODELS["spy"], "searches", new=False):
+        choose_model(TRAIN, ("spy",))
+    assert len(fits) == 4
 
 
 def test_too_few_spectra_for_a_choice_are_refused():

@@ -53,6 +53,7 @@ class HybridModel(ProcessModel):
     kind = "hybrid model"
     config_type = GeometryConfig
     requires = (ARRAY, FIXED_END)
+    searches = True
     samples = True
     batch = 256
 

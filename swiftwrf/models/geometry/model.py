@@ -10,12 +10,10 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.array.planar import PlanarArray
-from swiftwrf.choices import Moving
 from swiftwrf.data.spectra import Spectra, check_training, fingerprint
 from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
-from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext
+from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext, bounding_box
 from swiftwrf.models.geometry.fit import (
     MAX_ORDER,
     GeometryConfig,
@@ -28,15 +26,14 @@ from swiftwrf.models.geometry.fit import (
 from swiftwrf.models.geometry.images import PhaseObservations, image_gain, images
 from swiftwrf.models.geometry.planes import Plane, PlaneSet, RoomEstimate
 from swiftwrf.models.geometry.sample import Residual, sample_field
-from swiftwrf.models.updatable import bounding_box
+from swiftwrf.models.link import Link, Linked
 from swiftwrf.runtime.checkpoint import Header, expect
-from swiftwrf.runtime.validation import check_value
 
 MAX_PLANES = 64  # of a room in a file
 MAX_DISTANCE_M = 1e7  # from the fixed end; beyond, rounding destroys the phases
 
 
-class GeometryModel(FieldModel):
+class GeometryModel(Linked, FieldModel):
     """Image sources of the fixed end in mirror planes that are estimated from the spectra.
 
     A sample moves the planes within their standard deviations (once for every 256 positions), hides paths, and adds diffuse
@@ -54,18 +51,12 @@ class GeometryModel(FieldModel):
     kind = "geometry model"
     config_type = GeometryConfig
     requires = (ARRAY, FIXED_END)
+    searches = True
     samples = True
     updates = True
     any_grid = True
     batch = 256
 
-    array: PlanarArray
-    rotation: Tensor
-    """rotation from array to world coordinates (3, 3)"""
-    fixed_position: Tensor
-    """position of the fixed end (3,) [m]"""
-    moving: Moving
-    """end that moves"""
     estimate: RoomEstimate
     """planes with their uncertainty"""
     fingerprint: str
@@ -84,6 +75,9 @@ class GeometryModel(FieldModel):
             planes: Planes of the room.
             order: Highest number of reflections of an image source.
 
+        Raises:
+            InputError: Spectra that do not describe array, rotation and fixed end.
+
         Example:
             >>> import swiftwrf
             >>> floor = Plane((0.0, 0.0, -1.0), offset_m=0.0, gain=-0.6)
@@ -92,8 +86,8 @@ class GeometryModel(FieldModel):
         """
         certain = torch.diag(torch.tensor([(plane.std_mm / 1000) ** 2 for plane in planes], dtype=torch.float64))
         model, estimate = cls(), RoomEstimate(planes, order, 0.0, 0.0, "given planes", certain, Residual())
-        model.grid, model.bounds = link.grid, bounding_box(link.position)
-        model._set_link(link)
+        model._check_described(link)
+        model.grid, model.bounds, model.link = link.grid, bounding_box(link.position), Link.from_spectra(link)
         model.estimate, model.fingerprint = estimate, ""
         return model
 
@@ -101,20 +95,12 @@ class GeometryModel(FieldModel):
     def within(cls, model: FieldModel, tensors: dict[str, Tensor], header: Header) -> Self:
         """Return the room that a saved model of another kind contains."""
         room = cls()
-        room.grid, room.bounds = model.grid, model.bounds
+        room.grid, room.bounds, room.link = model.grid, model.bounds, model.link
         room._restore(tensors, header)
         return room
 
-    def _set_link(self, link: Spectra) -> None:
-        assert link.array is not None
-        assert link.rotation is not None
-        assert link.fixed_position is not None
-        self.array, self.rotation = link.array, link.rotation
-        self.fixed_position, self.moving = link.fixed_position, link.moving
-
     def _fit(self, train: Spectra, context: FitContext) -> None:
         owner, known = fingerprint(train), context.like.room if context.like else None
-        self._set_link(train)
         if known is None:
             self.estimate = search_room(train, self.config, context.progress)
         elif known.fingerprint == owner:
@@ -150,12 +136,12 @@ class GeometryModel(FieldModel):
             True
         """
         check_training(train)
+        self.link.check(train)
         estimate = extend_room(self.tensors(), train, is_new, self.config)
         if estimate is None:
             return None
         model = copy(self)
         model.grid, model.bounds = train.grid, bounding_box(train.position)
-        model._set_link(train)
         model.estimate, model.fingerprint = estimate, fingerprint(train)
         return model
 
@@ -250,15 +236,12 @@ class GeometryModel(FieldModel):
         return torch.stack([(low + high) / 2, low, high])
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
-        link = {"element": self.array.element, "rotation": self.rotation, "fixed_position": self.fixed_position}
         header = self.to_json() | {
-            "wavelength": self.array.wavelength,
-            "moving": self.moving,
             "conclusion": self.conclusion,
             "residual": asdict(self.estimate.residual),
             "fingerprint": self.fingerprint,
         }
-        return link | {"covariance": self.estimate.covariance}, header
+        return {"covariance": self.estimate.covariance}, header
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         planes, order = header["planes"], header["order"]
@@ -267,11 +250,8 @@ class GeometryModel(FieldModel):
                 f"a room has at most {MAX_PLANES} planes and paths of 0 to {MAX_ORDER} reflections, got {len(planes)} and "
                 f"{order}"
             )
-        expect(tensors, {"rotation": (3, 3), "fixed_position": (3,), "covariance": (len(planes), len(planes))})
-        self.array = PlanarArray(tensors["element"], header["wavelength"])
-        self.rotation, self.fixed_position = tensors["rotation"].double(), tensors["fixed_position"].double()
-        check_value("moving", header["moving"], Moving)
-        self.moving, self.fingerprint = header["moving"], str(header["fingerprint"])
+        expect(tensors, {"covariance": (len(planes), len(planes))})
+        self.fingerprint = str(header["fingerprint"])
         self.estimate = RoomEstimate(
             planes=[Plane(**{**plane, "normal": tuple(plane["normal"])}) for plane in planes],
             order=order,

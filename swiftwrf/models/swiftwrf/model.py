@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from copy import copy
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -17,7 +17,7 @@ from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, SmoothField
 from swiftwrf.models.base import FitContext
 from swiftwrf.models.process import ProcessModel
-from swiftwrf.models.swiftwrf.config import FitConfig, ModelConfig
+from swiftwrf.models.swiftwrf.config import FitConfig
 from swiftwrf.models.swiftwrf.deformation.low_rank import LowRankDeformation
 from swiftwrf.models.swiftwrf.field import DeformableGaussians
 from swiftwrf.models.swiftwrf.fit import MAX_PRIMITIVES, fit_field
@@ -50,6 +50,7 @@ class SwiftWRF(ProcessModel):
     name = "swiftwrf"
     kind = "swiftwrf model"
     config_type = FitConfig
+    searches = True
     any_grid = True
 
     field: DeformableGaussians
@@ -57,9 +58,9 @@ class SwiftWRF(ProcessModel):
 
     def _fit(self, train: Spectra, context: FitContext) -> None:
         config: FitConfig = self.config
-        if isinstance(context.like, SwiftWRF):
+        if isinstance(context.like, SwiftWRF) and config.model.n_primitives == "auto":
             n = min(context.like.field.config.size[0], MAX_PRIMITIVES)
-            config = FitConfig(validation=config.validation, seed=config.seed, model=ModelConfig(n_primitives=n))
+            config = replace(config, model=replace(config.model, n_primitives=n))
         self._take(fit_field(train, config, context))
 
     def _take(self, field: DeformableGaussians) -> None:

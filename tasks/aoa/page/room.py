@@ -86,9 +86,10 @@ def choice_section(fraction: FractionRecords) -> Section | None:
     name = choice["name"]
     meaning = labels.labels(FIELD_MODELS, labels.FIELD_MODELS, [name])
     text = f"{name} predicts held-out measured spectra best" + (f": {meaning[name].meaning}." if meaning else ".")
+    reasons = [f"{name} could not be fitted: {reason}." for name, reason in choice.get("left_out", {}).items()]
     plots = [_gain(fraction, *item) for item in _cross_validations(fraction).items()]
     return Section(
-        "Which field model, and does it help?", [text, *cross_validation_sentences(fraction)], [table], plots
+        "Which field model, and does it help?", [text, *reasons, *cross_validation_sentences(fraction)], [table], plots
     )
 
 

@@ -27,4 +27,4 @@ def make_predictor(name: str, preset: Preset = "quick", **options: Any) -> RssiP
         True
     """
     predictor_type: type[RssiPredictor] = PREDICTORS[name]
-    return predictor_type.with_known(preset, options)
+    return predictor_type(**predictor_type.supported({"preset": preset} | options))

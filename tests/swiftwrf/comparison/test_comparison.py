@@ -327,7 +327,7 @@ def test_same_seed_same_model_and_interruptions_do_not_show(room, tmp_path, name
 @every
 def test_the_paper_preset_has_the_publications_settings(name):
     config = type(PUBLISHED[name])
-    assert make_model(name, preset="paper", seed=3, validation="block").config == config.paper(seed=3)
+    assert make_model(name, preset="paper", seed=3).config == config.paper(seed=3)
     assert make_model(name, seed=3).config == config(seed=3)
 
 

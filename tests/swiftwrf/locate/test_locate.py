@@ -253,7 +253,7 @@ def test_spectra_at_one_position_are_held_out_together():
 
 @pytest.mark.parametrize("locator", [MatchedField, RssiLocator])
 def test_a_locator_that_is_not_fitted_is_refused(locator, tmp_path):
-    unfitted = locator(preset="paper")  # there are no published settings
+    unfitted = locator()
     assert repr(unfitted) == f"{locator.__name__}(not fitted)"
     with pytest.raises(InputError, match="call fit first"):
         unfitted.locate(torch.zeros(1, 12))

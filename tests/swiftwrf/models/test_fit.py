@@ -221,6 +221,15 @@ def test_a_fit_like_another_keeps_its_number_of_primitives(room):
     assert again.field.config.n_primitives == 24
 
 
+def test_options_take_precedence_over_a_fit_like_another(room):
+    first = fit(room, FitConfig(model=ModelConfig(n_primitives=24)))
+    asked = ModelConfig(n_primitives=8, axis_aligned=True, rank=3)
+    again = SwiftWRF(steps=3, check_every=1, model=asked).fit(room, like=first)
+    assert again.field.config == again.config.model == asked
+    searched = SwiftWRF(model=ModelConfig(axis_aligned=True, rank=3)).fit(room, like=first)
+    assert searched.field.config == replace(asked, n_primitives=24)
+
+
 @pytest.mark.parametrize(
     ("losses", "found", "tried"),
     [

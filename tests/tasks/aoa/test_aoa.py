@@ -619,11 +619,11 @@ def test_models_for_comparison_are_always_quick(small, monkeypatch):
     data = context.Experiment(given, train, test, 0, torch.device("cpu"))
     made = []
     monkeypatch.setattr(
-        context, "make_model", lambda name, preset, **options: made.append((name, preset)) or mock.Mock()
+        context, "make_model", lambda name, **options: made.append((name, options.get("preset"))) or mock.Mock()
     )
     for synthesis in synthesizing.syntheses(data, MeasuredSubset(0.5), ["idw"], {}):
         synthesis._fitted(data, train, synthesizing._FitHistory(), Path())
-    assert made == [("idw", "paper"), ("gp", "quick"), ("coarray", "quick")]
+    assert made == [("idw", None), ("gp", "quick"), ("coarray", "quick")]
 
 
 def test_the_room_is_searched_once_for_all_models_with_one(room, glances, tmp_path, monkeypatch):

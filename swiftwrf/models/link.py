@@ -1,0 +1,137 @@
+"""The link over which the training spectra of a model were measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor, float64, tensor
+
+from swiftwrf.array.planar import PlanarArray
+from swiftwrf.choices import Moving
+from swiftwrf.data.dataset import to_tensor
+from swiftwrf.data.spectra import Spectra
+from swiftwrf.errors import InputError
+from swiftwrf.runtime.validation import check_value
+
+LENGTH_TOLERANCE_WAVELENGTHS = 1e-3  # between fixed ends, elements and wavelengths of one link
+LENGTH_TOLERANCE_M = 1e-3  # between fixed ends where the wavelength is unknown
+ROTATION_TOLERANCE = 1e-4  # between the matrices of one orientation
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """The ends of a link and its array. Values that the spectra do not describe are None.
+
+    Args:
+        moving: End that moves. The array is at the receiver.
+        fixed_position: Position of the fixed end, float64 (3,) [m].
+        rotation: Rotation from array to world coordinates, float64 (3, 3).
+        array: Antenna array with its carrier.
+
+    Example:
+        >>> import swiftwrf
+        >>> link = Link.from_spectra(swiftwrf.simulated_room(n=10))
+        >>> link.check(swiftwrf.simulated_room(n=20, seed=1))
+        >>> link.check(swiftwrf.simulated_room(n=20, moving="receiver"))
+        Traceback (most recent call last):
+        swiftwrf.errors.InputError: simulated-room was measured over another link than ...
+    """
+
+    moving: Moving
+    fixed_position: Tensor | None
+    rotation: Tensor | None
+    array: PlanarArray | None
+
+    @classmethod
+    def from_spectra(cls, data: Spectra) -> Link:
+        """Return the link that spectra describe."""
+        return cls(data.moving, data.fixed_position, data.rotation, data.array)
+
+    @classmethod
+    def from_json(cls, plain: dict[str, Any]) -> Link:
+        """Return the link that `to_json` describes."""
+        check_value("moving", plain["moving"], Moving)
+        fixed_position, rotation, array = (plain[name] for name in ("fixed_position", "rotation", "array"))
+        return cls(
+            plain["moving"],
+            None if fixed_position is None else to_tensor("fixed_position", fixed_position, float64, (3,)),
+            None if rotation is None else to_tensor("rotation", rotation, float64, (3, 3)),
+            array and PlanarArray(tensor(array["element"], dtype=float64), array["wavelength"]),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the link as plain values."""
+        return {
+            "moving": self.moving,
+            "fixed_position": None if self.fixed_position is None else self.fixed_position.tolist(),
+            "rotation": None if self.rotation is None else self.rotation.tolist(),
+            "array": self.array and {"element": self.array.element.tolist(), "wavelength": self.array.wavelength},
+        }
+
+    def check(self, data: Spectra) -> None:
+        """Refuse spectra of another link. Values that one of both does not describe are not compared.
+
+        Lengths may differ by 0.001 wavelengths (by 1 mm if the wavelength is unknown), elements of the rotation by 0.0001.
+
+        Raises:
+            InputError: Another moving end, fixed position, rotation or array.
+        """
+        found, array = [], self.array or data.array
+        length = LENGTH_TOLERANCE_WAVELENGTHS * array.wavelength if array else LENGTH_TOLERANCE_M
+        if data.moving != self.moving:
+            found.append(f"the {data.moving} moves and not the {self.moving}")
+        if _differ(self.fixed_position, data.fixed_position, length):
+            found.append(
+                f"the fixed end is at {_metres(data.fixed_position)} and not at {_metres(self.fixed_position)}"
+            )
+        if _differ(self.rotation, data.rotation, ROTATION_TOLERANCE):
+            found.append("the array has another orientation")
+        if self.array and data.array:
+            same_carrier = abs(data.array.wavelength - self.array.wavelength) <= length
+            if not same_carrier or _differ(self.array.element, data.array.element, length):
+                found.append(f"the array has other elements or another carrier ({data.array.summary})")
+        if found:
+            raise InputError(
+                f"{data.name} was measured over another link than the training spectra: {', '.join(found)}; "
+                "give spectra of the same link or fit another model"
+            )
+
+
+class Linked:
+    """Base class of models whose training spectra must describe the link."""
+
+    link: Link
+
+    @property
+    def array(self) -> PlanarArray:
+        """Antenna array with its carrier."""
+        assert self.link.array is not None
+        return self.link.array
+
+    @property
+    def rotation(self) -> Tensor:
+        """Rotation from array to world coordinates, float64 (3, 3)."""
+        assert self.link.rotation is not None
+        return self.link.rotation
+
+    @property
+    def fixed_position(self) -> Tensor:
+        """Position of the fixed end, float64 (3,) [m]."""
+        assert self.link.fixed_position is not None
+        return self.link.fixed_position
+
+    @property
+    def moving(self) -> Moving:
+        """End that moves."""
+        return self.link.moving
+
+
+def _differ(known: Tensor | None, other: Tensor | None, tolerance: float) -> bool:
+    if known is None or other is None:
+        return False
+    return known.shape != other.shape or bool((known - other).abs().max() > tolerance)
+
+
+def _metres(position: Tensor | None) -> str:
+    return "" if position is None else f"({', '.join(f'{x:.6g}' for x in position.tolist())}) m"

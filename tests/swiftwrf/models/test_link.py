@@ -1,0 +1,148 @@
+"""A model is applied to measurements of the link that it was fitted to, and to no other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from swiftwrf import (
+    GeometryModel,
+    HybridModel,
+    InputError,
+    MatchedField,
+    PairModel,
+    Rssi,
+    RssiLocator,
+    RssiModel,
+    load,
+    make_model,
+    rssi_room,
+    simulated_room,
+)
+from swiftwrf.array.planar import PlanarArray
+from swiftwrf.models.geometry import Plane
+from swiftwrf.online import Follower, score
+
+FLOOR = rssi_room(n=100)
+QUARTER = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+OTHER_LINKS = {
+    "the receiver moves and not the transmitter": {"moving": "receiver"},
+    r"the fixed end is at \(1, 2, 3\) m and not at \(0.1": {"fixed_position": torch.tensor([1.0, 2, 3]).double()},
+    "the array has another orientation": {"rotation": QUARTER},
+    "other elements or another carrier": {"array": PlanarArray.square(4, 5.2e9)},
+}
+other_links = pytest.mark.parametrize(("says", "change"), OTHER_LINKS.items(), ids=["end", "place", "pose", "array"])
+
+
+def given_room(data):
+    return GeometryModel.of_planes(data, [Plane((0.0, 0.0, -1.0), 0.0, -0.6)])
+
+
+@pytest.fixture(scope="module")
+def models(room):
+    known = given_room(room)
+    closed_form = [make_model(name).fit(room) for name in ("gp", "coarray")]
+    return [*closed_form, known, HybridModel().fit(room, like=known)]
+
+
+@other_links
+def test_spectra_of_another_link_are_refused(room, models, tmp_path, says, change):
+    """By updates, scores and followers, also of a saved model."""
+    other = replace(room, **change)
+    for model in models:
+        model.save(tmp_path / "model")
+        for same in (model, load(tmp_path / "model")):
+            for use in (same.update, lambda new, same=same: score(same, new)):
+                with pytest.raises(InputError, match=says):
+                    use(other)
+        assert len(score(model, replace(room, rotation=room.rotation + 1e-6)))
+    with pytest.raises(InputError, match=says):
+        Follower(models[0], other)
+
+
+@other_links
+def test_a_structure_of_another_link_is_refused(room, says, change):
+    other = given_room(replace(room, **change))
+    says = says.replace("receiver", "end").replace("transmitter", "end") if "moving" in change else "another link"
+    for fit in (GeometryModel().fit, HybridModel().fit):
+        with pytest.raises(InputError, match="another link"):
+            fit(room, like=other)
+    with pytest.raises(InputError, match="another link"):
+        MatchedField(spacing=0.5).fit(room, room=other)
+
+
+def test_what_spectra_do_not_describe_is_not_compared(room, models):
+    bare = replace(room, rotation=None, fixed_position=None)
+    assert len(models[0].update(bare).position) == 2 * len(room)
+    with pytest.raises(InputError, match="geometry needs the fixed end"):
+        models[2].update(bare)
+    assert models[0].fixed_end is not None
+
+
+@pytest.mark.parametrize("predictor", [RssiModel, PairModel])
+def test_rows_at_other_receivers_are_refused(tmp_path, predictor):
+    RssiModel().fit(FLOOR)
+    model = predictor().fit(FLOOR)
+    model.save(tmp_path / "model")
+    model = load(tmp_path / "model")
+    moved = replace(FLOOR, receiver_position=FLOOR.receiver_position.flip(0))
+    for other, says in (
+        (FLOOR.columns([*range(12)][::-1]), "give the same ones in this order"),
+        (FLOOR.columns([0, 1, 2]), "give the same ones in this order"),
+        (moved, "receiver01 .* m away from its position"),
+    ):
+        with pytest.raises(InputError, match=says):
+            model.update(other)
+        with pytest.raises(InputError, match=says):
+            model.predict_detected(other)
+        if predictor is RssiModel:
+            with pytest.raises(InputError, match=says):
+                RssiLocator(n_cells=500).fit(other, model=model)
+
+
+def test_unknown_positions_of_receivers_are_not_compared(tmp_path):
+    unlocated = Rssi(FLOOR.rssi_dbm, FLOOR.transmitter_position, receiver_names=FLOOR.receiver_names)
+    model = RssiModel().fit(unlocated)
+    model.save(tmp_path / "model")
+    again = load(tmp_path / "model")
+    assert again.receiver_position.isnan().all()
+    new = FLOOR.subset(torch.arange(5))
+    torch.testing.assert_close(again.update(new).level, model.update(new).level)
+
+
+@pytest.mark.parametrize(
+    ("model", "data", "options"),
+    [
+        (make_model("coarray"), simulated_room(n=20), {}),
+        (RssiModel(), FLOOR, {}),
+        (RssiLocator(n_cells=100), FLOOR, {"model": RssiModel()}),
+        (MatchedField(spacing=0.5), simulated_room(n=20), {"room": make_model("nearest")}),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_a_fit_that_fails_leaves_the_model_as_it_was(model, data, options, tmp_path, monkeypatch):
+    model.fitted_before = True
+    if not options:
+        model.fit(data)
+        options = {"checkpoint": tmp_path / "none" / "state"}
+        monkeypatch.setattr(type(model), "_fit", lambda *_: pytest.fail("the fit was begun"))
+    before = dict(vars(model))
+    with pytest.raises(InputError):
+        model.fit(data, **options)
+    assert vars(model) == before
+
+
+@pytest.mark.parametrize("end", [RuntimeError, KeyboardInterrupt])
+def test_an_interrupted_fit_leaves_the_model_as_it_was(room, end):
+    model = make_model("swiftwrf", steps=4, model=replace(make_model("swiftwrf").config.model, n_primitives=8))
+    model.fit(room)
+    expected = model.synthesize(room.position)
+
+    def stop(record):
+        raise end
+
+    with pytest.raises(end):
+        model.fit(room.subset(torch.arange(20)), on_record=stop)
+    assert torch.equal(model.synthesize(room.position), expected)
