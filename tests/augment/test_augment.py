@@ -260,7 +260,7 @@ def test_candidates_that_cannot_be_fitted_are_returned_with_the_reason():
     assert chosen.left_out == {"coarray": "coarray needs the array, which simulated-room does not describe"}
     assert "without coarray: coarray needs the array" in repr(chosen)
     assert len(repr(chosen)) < 200
-    with pytest.raises(InputError, match="no field model can be fitted .*coarray needs the array"):
+    with pytest.raises(InputError, match=r"no field model can be fitted .*coarray needs the array"):
         choose_model(bare, ("coarray",))
 
 

@@ -596,9 +596,6 @@ def test_room_predicts_any_grid(noisy, room):
 @pytest.mark.parametrize(
     "name",
     [
-        "element",
-        "rotation",
-        "fixed_position",
         "covariance",
         "position",
         "coefficient",
@@ -612,9 +609,28 @@ def test_states_of_wrong_sizes_are_refused(hybrid, name, tmp_path):
     some = PathGains(GaussianProcess(kernel, known, torch.zeros(len(known), 2 * 25 * 2)), 25)
     tensors, header = with_path_gains(hybrid, some).state()
     HybridModel.from_state(tensors, header)
-    cut = tensors[name][:, :1] if name == "element" else tensors[name][:-1]
-    write(tmp_path / "model", HybridModel.kind, tensors | {name: cut}, header)
+    write(tmp_path / "model", HybridModel.kind, tensors | {name: tensors[name][:-1]}, header)
     with pytest.raises(InputError):
+        load(tmp_path / "model")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"moving": "nothing"},
+        {"fixed_position": [0.0, 1.0]},
+        {"fixed_position": None},
+        {"rotation": [[1.0, 0.0, 0.0]]},
+        {"rotation": None},
+        {"array": {"element": [[0.0], [1.0]], "wavelength": 0.1}},
+        {"array": {"element": [[0.0, 0.0]], "wavelength": float("nan")}},
+        {"array": None},
+    ],
+)
+def test_a_link_that_cannot_be_used_is_refused(room, change, tmp_path):
+    tensors, header = room.state()
+    write(tmp_path / "model", GeometryModel.kind, tensors, header | {"link": header["link"] | change})
+    with pytest.raises(InputError, match="geometry model that can be used"):
         load(tmp_path / "model")
 
 

@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from swiftwrf import (
+    FieldModel,
+    FitError,
     GeometryModel,
     HybridModel,
     InputError,
@@ -19,7 +21,6 @@ from swiftwrf import (
     load,
     make_model,
     rssi_room,
-    simulated_room,
 )
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.models.geometry import Plane
@@ -65,12 +66,13 @@ def test_spectra_of_another_link_are_refused(room, models, tmp_path, says, chang
 @other_links
 def test_a_structure_of_another_link_is_refused(room, says, change):
     other = given_room(replace(room, **change))
-    says = says.replace("receiver", "end").replace("transmitter", "end") if "moving" in change else "another link"
-    for fit in (GeometryModel().fit, HybridModel().fit):
+    for fit in (
+        lambda: GeometryModel().fit(room, like=other),
+        lambda: HybridModel().fit(room, like=other),
+        lambda: MatchedField(spacing=0.5).fit(room, room=other),
+    ):
         with pytest.raises(InputError, match="another link"):
-            fit(room, like=other)
-    with pytest.raises(InputError, match="another link"):
-        MatchedField(spacing=0.5).fit(room, room=other)
+            fit()
 
 
 def test_what_spectra_do_not_describe_is_not_compared(room, models):
@@ -83,7 +85,6 @@ def test_what_spectra_do_not_describe_is_not_compared(room, models):
 
 @pytest.mark.parametrize("predictor", [RssiModel, PairModel])
 def test_rows_at_other_receivers_are_refused(tmp_path, predictor):
-    RssiModel().fit(FLOOR)
     model = predictor().fit(FLOOR)
     model.save(tmp_path / "model")
     model = load(tmp_path / "model")
@@ -113,25 +114,36 @@ def test_unknown_positions_of_receivers_are_not_compared(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("model", "data", "options"),
+    ("model", "last_step"),
     [
-        (make_model("coarray"), simulated_room(n=20), {}),
-        (RssiModel(), FLOOR, {}),
-        (RssiLocator(n_cells=100), FLOOR, {"model": RssiModel()}),
-        (MatchedField(spacing=0.5), simulated_room(n=20), {"room": make_model("nearest")}),
+        (make_model("coarray"), "_set_spread"),
+        (RssiModel(), "_assemble"),
+        (RssiLocator(n_cells=100), "_calibrate"),
+        (MatchedField(spacing=1.0, n_rounds=1), "_calibrate"),
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_a_fit_that_fails_leaves_the_model_as_it_was(model, data, options, tmp_path, monkeypatch):
-    model.fitted_before = True
-    if not options:
-        model.fit(data)
-        options = {"checkpoint": tmp_path / "none" / "state"}
-        monkeypatch.setattr(type(model), "_fit", lambda *_: pytest.fail("the fit was begun"))
+def test_a_fit_that_fails_leaves_the_model_as_it_was(room, model, last_step, monkeypatch):
+    data = room if isinstance(model, MatchedField | FieldModel) else FLOOR
+    options = {"room": given_room(room)} if isinstance(model, MatchedField) else {}
+    model.fit(data, **options)
     before = dict(vars(model))
-    with pytest.raises(InputError):
+
+    def fail(*_):
+        raise FitError("not now")
+
+    monkeypatch.setattr(type(model), last_step, fail)
+    with pytest.raises(FitError):
         model.fit(data, **options)
-    assert vars(model) == before
+    assert vars(model).keys() == before.keys()
+    assert all(vars(model)[name] is before[name] for name in before)
+
+
+@pytest.mark.parametrize(("model", "data"), [(make_model("coarray"), None), (RssiModel(), FLOOR)])
+def test_a_checkpoint_in_no_folder_is_refused_before_the_fit(room, model, data, tmp_path, monkeypatch):
+    monkeypatch.setattr(type(model), "_fit", lambda *_: pytest.fail("the fit was begun"))
+    with pytest.raises(InputError, match=r"folder of the checkpoint .* does not exist; create it"):
+        model.fit(data or room, checkpoint=tmp_path / "none" / "state")
 
 
 @pytest.mark.parametrize("end", [RuntimeError, KeyboardInterrupt])
