@@ -10,7 +10,7 @@ from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import dense_weights, inner_products, squared_errors, subsample
 from swiftwrf.models.base import FitContext
-from swiftwrf.models.nearest import MemoryModel
+from swiftwrf.models.nearest import MemoryModel, in_order
 from swiftwrf.positions import distance, nearest
 from swiftwrf.runtime.checkpoint import Header
 
@@ -36,6 +36,7 @@ class IDWModel(MemoryModel):
     """number of neighbours"""
 
     def _fit(self, train: Spectra, context: FitContext) -> None:
+        train = in_order(train)
         super()._fit(train, context)
         (rows,) = subsample(torch.arange(len(train)), rows=MAX_CHOICE_SPECTRA)
         fold = folds(train.position, self.config.validation, self.config.seed)[rows]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
@@ -38,6 +40,12 @@ class MemoryModel(FieldModel):
         self.position, self.store = tensors["position"].double(), Store(tensors["spectrum"])
 
 
+def in_order(train: Spectra) -> Spectra:
+    """Return the spectra by ascending position, and power where positions repeat, so that ties do not follow the rows."""
+    power = torch.cat([part.flatten(1).double().square().sum(dim=1) for part in train.store.batches()])
+    return train.subset(torch.from_numpy(np.lexsort([power.numpy(), *train.position.T.numpy()])))
+
+
 class NearestModel(MemoryModel):
     """The spectrum of the nearest measured position, a baseline that dense positions make hard to beat.
 
@@ -50,6 +58,9 @@ class NearestModel(MemoryModel):
 
     name = "nearest"
     kind = "nearest-spectrum model"
+
+    def _fit(self, train: Spectra, context: FitContext) -> None:
+        super()._fit(in_order(train), context)
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         return self.store[nearest(position, self.position, 1)[1][:, 0]], None
