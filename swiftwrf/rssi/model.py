@@ -93,8 +93,6 @@ class RssiModel(SavedRssiPredictor):
     """float64 (R,) [dB a decade]"""
     slope_std: Tensor
     """standard deviation of the slope, float64 (R,) [dB a decade]"""
-    middle: Tensor
-    """mean log10 distance of the measurements, about which the slope is uncertain, float64 (R,)"""
     directivity: Tensor
     """coefficients of the harmonics, (R, 8) [dB]"""
     anchor: Tensor
@@ -205,8 +203,7 @@ class RssiModel(SavedRssiPredictor):
             self._posterior = self._posterior_of(state)
         noise_db = (scale * training.noise_db).clamp_min(rounding_std(measured))
         self.field_db, self.noise_db = (scale * training.field_db).float(), noise_db.float()
-        # level and slope of the other two predictors are those of all receivers, or need no slope
-        self.slope_std, self.middle = weight[:2].sum(dim=0) * found["slope_std"], found["middle"]
+        self.slope_std = weight[:2].sum(dim=0) * found["slope_std"]  # only two predictors have the receiver's slope
         self._precompute()
 
     def region(self) -> Tensor:
@@ -221,13 +218,11 @@ class RssiModel(SavedRssiPredictor):
         self._process = self._variance_process()
 
     def _variance_process(self) -> GaussianProcess:
-        """Return the process of few of the measured positions, which determine the standard deviation.
-
-        Its values (n, R) are log10 distances: the slope is uncertain where these do not determine the distance.
-        """
+        """Return the process of centred log10 distances (n, R) at few measured positions, which determine the variance."""
         known = subsample(self.anchor.double(), rows=MAX_VARIANCE_POSITIONS)[0]
         distance = log_distance(known + self.centre, self.receiver)
-        return GaussianProcess.regress(self.kernel, known, distance - self.middle, exact=True)
+        self._middle = distance.mean(dim=0)
+        return GaussianProcess.regress(self.kernel, known, distance - self._middle)
 
     def _posterior_of(self, state: FitState) -> RssiPosterior:
         table, receiver = HeadTable(self.rendered), self.receiver - self.centre
@@ -312,8 +307,8 @@ class RssiModel(SavedRssiPredictor):
         mean = path_loss.float() + torch.einsum("brh,rh->br", bearing, self.directivity)
         mean = mean + self.mixing_weight[0].float() * head
         variance = self.field_db.square() * self._process.variance(offset).float()[:, None]
-        unlike = distance - self.middle - self._process.mean(offset)
-        trend = (self.slope_std * unlike).square().float()  # of kriging with a trend
+        # as of kriging with a trend: the slope is uncertain beyond the distances of the measurements
+        trend = (self.slope_std * (distance - self._middle - self._process.mean(offset))).square().float()
         return mean, (self.noise_db.square() + variance + trend).sqrt()
 
     def plot(
@@ -391,7 +386,7 @@ def fit_rssi(
 
 def _shapes(n_receivers: int, n_anchors: int) -> dict[str, tuple[int, ...]]:
     """Return the shape of every saved tensor."""
-    per_receiver = dict.fromkeys(("level", "slope", "slope_std", "middle", "field_db", "noise_db"), (n_receivers,))
+    per_receiver = dict.fromkeys(("level", "slope", "slope_std", "field_db", "noise_db"), (n_receivers,))
     return per_receiver | {
         "mixing_weight": (4, n_receivers),
         "receiver": (n_receivers, 3),

@@ -9,7 +9,6 @@ known places are predicted, they depend on the place, by a ridge regression.
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from itertools import groupby
 from statistics import NormalDist
@@ -223,7 +222,7 @@ class PairModel(PairPredictor, SavedRssiPredictor):
         choices = [choice for metric in METRICS for choice in self._judged(metric, fold, sample, held_out)]
         _, self.metric, self.kernel, score = min(choices, key=lambda choice: choice[0])
         scale = score.quantile(LEVEL)[None] / NormalDist().inv_cdf((1 + LEVEL) / 2)
-        self.scale_db = scale.clamp_min(rounding_std(rssi) / math.sqrt(self.kernel.noise))
+        self.scale_db = scale.clamp_min(rounding_std(rssi) / self.kernel.noise**0.5)
         self._precompute()
 
     def _residuals_without(self, rssi: Tensor, fold: Tensor, sample: Tensor) -> dict[int, Tensor]:

@@ -44,10 +44,8 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
         Tensors by name, with R = 1.
 
         - level (R,) [dBm], slope (R,) [dB a decade] and directivity (R, 8) [dB].
-        - prior_level and prior_slope (R,), the path-loss model that the fit starts from. A receiver whose RSSI would rise
-          with the distance has slope 0, and no regressor of the distance.
-        - slope_std (R,), the posterior standard deviation of the slope [dB a decade], and middle (R,), the mean log10
-          distance of the detected bins.
+        - prior_level and prior_slope (R,), where the fit starts; slope 0 and no regressor of distance if RSSI rises with it.
+        - slope_std (R,), the posterior standard deviation of the slope [dB a decade].
         - coefficient (R, n) of the kernel to the bins, whose sum is the latent field [dB].
         - dual, tangent and variance (R, n). See `posterior.FitState`.
         - rendered fields of the heads (R, 2, 2, directions).
@@ -68,18 +66,18 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
         position = data.position[detected].to(device)
         covariance = variance * data.kernel(position, position)
         noise_db = (data.noise_db[some] / data.count[detected, some][:, 0].sqrt()).to(device)
-        table = HeadTable(data.rendered[some].to(device))
+        rest = covariance, noise_db, HeadTable(data.rendered[some].to(device)), config.huber
 
         def solved(prior: PathLoss) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-            residual = (rssi - prior(distance)[:, 0])[detected].to(device)
-            return solve(residual, feature[detected].to(device), covariance, noise_db, table, config.huber)
+            residual = rssi - prior(distance)[:, 0]
+            return solve(residual[detected].to(device), feature[detected].to(device), *rest)
 
         try:
             *found, factor = solved(prior_mean)
             along = feature[detected, 1].to(device)
             spread *= (1 - along @ torch.cholesky_solve(along[:, None], factor)[:, 0]).clamp(0, 1).sqrt().cpu()
-            slope = float(prior_mean.slope + PATH_LOSS_STD_DB * (found[0] @ along).cpu())
-            if bool(along.any()) and (slope > 0 or not float(prior_mean.slope)):
+            start = float(prior_mean.slope)
+            if bool(along.any()) and (start == 0 or start + PATH_LOSS_STD_DB * float(found[0] @ along) > 0):
                 prior_mean, feature[:, 1] = PathLoss(rssi.nanmean().reshape(1), torch.zeros(1).double()), 0.0
                 *found, factor = solved(prior_mean)
             error[detected] = fold_errors(factor, found[0], data.fold[detected].to(device)).cpu()
@@ -95,7 +93,6 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
         "prior_level": prior_mean.level,
         "prior_slope": prior_mean.slope,
         "slope_std": (PATH_LOSS_STD_DB * spread).clamp_max(MAX_SLOPE_STD_DB)[None],
-        "middle": distance[detected if len(detected) else slice(None)].mean()[None],
         "directivity": linear[None, 2:],
         "coefficient": variance * (tangent * dual)[None],
         "dual": dual[None],

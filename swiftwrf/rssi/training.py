@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -18,7 +17,7 @@ from swiftwrf.rssi.head import Head, render
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, fit_shared_path_loss, log_distance
 from swiftwrf.runtime.threads import single_thread
 
-MAX_STEP_DB = 1.0  # of the values that a receiver reports
+MAX_STEP_DB = 1.0  # of the values that a receiver reports: nearly all report whole decibels
 PAPER_LEVEL_DBM = -100.0  # of the paper's head where nothing is received
 # variance of a packet relative to the variance of the field: fading is as large as shadowing
 RELATIVE_NOISE_VARIANCES = (0.3, 1.0, 2.0, 3.0)
@@ -138,17 +137,11 @@ def prepare(train: Rssi, pool: Rssi, config: RssiConfig, like: RssiTraining | No
 
 
 def rounding_std(rssi: Tensor) -> float:
-    """Return the standard deviation [dB] of the rounding error of RSSI (..., R) [dBm], the least of a prediction.
+    """Return the standard deviation of the rounding error of RSSI [dBm], the least of a prediction [dB].
 
-    It is the step over sqrt(12) (B. Widrow, 1956), with the least difference of two values as the step, at most 1 dB:
-    nearly all receivers report whole decibels. Constant values have this step, too.
-
-    Example:
-        >>> round(rounding_std(torch.tensor([-60.0, -60.0, -59.5])), 3)
-        0.144
+    The step of the values is their least difference, at most 1 dB, which is also that of constant values.
     """
-    steps = rssi[~rssi.isnan()].unique().diff()
-    return min([MAX_STEP_DB, *steps.tolist()]) / math.sqrt(12)
+    return min([MAX_STEP_DB, *rssi[~rssi.isnan()].unique().diff().tolist()]) / 12**0.5
 
 
 def representative_receivers(pool: Rssi) -> Rssi:

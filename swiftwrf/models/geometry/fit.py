@@ -284,11 +284,9 @@ def observe(train: Spectra, config: GeometryConfig | None = None) -> tuple[Phase
     assert train.fixed_position is not None
     if len(train.position.unique(dim=0)) < MIN_TRAINING:
         raise InputError(f"the positions of {train.name} are fewer than {MIN_TRAINING} different ones")
-    farthest = float(torch.cat([train.position, train.fixed_position[None]]).abs().max())
-    if farthest > MAX_COORDINATE_M:
+    if (farthest := float(train.position.abs().max())) > MAX_COORDINATE_M:
         raise InputError(
-            f"the coordinates of {train.name} go up to {farthest:.3g} m, where rounding destroys the phases of paths; give "
-            f"metres below {MAX_COORDINATE_M:g}"
+            f"positions of {train.name} up to {farthest:.3g} m have no phases by rounding; give a near origin"
         )
     channel, error = retrieve_phases(correlations(train), train.array, config.seed)
     solved = (error < MAX_PHASE_ERROR).nonzero()[:, 0]
@@ -378,9 +376,8 @@ def _with_further_planes(
             gains = torch.cat([room.gain, torch.full((1, 1), FURTHER_GAIN * sign)], dim=1)
             wider.append(PlaneSet(normals, offsets, gains, room.order))
         wider = sorted(refined(wider, some, 8, tilt=True), key=lambda r: float(some.score(r.field(some))))
-        if not wider:
-            break
-        if advantage(some.coherence(wider[0].field(some)), some.coherence(room.field(some))) < PROMISING_SIGNIFICANCE:
+        now = some.coherence(room.field(some))
+        if not wider or advantage(some.coherence(wider[0].field(some)), now) < PROMISING_SIGNIFICANCE:
             break
         wider = [r for other in wider[:2] for r in (other, *sign_alternatives(scene, other))]
         wider = refined(wider, some, 20, tilt=True)

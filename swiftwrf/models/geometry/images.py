@@ -22,7 +22,7 @@ from swiftwrf.models.geometry.chain import ElementChain
 MAX_COSINE = 0.02  # of two planes that count as perpendicular; above 1 - MAX_COSINE**2 they count as parallel
 ROUNDING_RAD = 1e-3  # of phase, to which positions are rounded in a search
 N_POSITIONS = 36  # that many rooms are scored at
-MAX_DISTANCE_M = 1e7  # from the fixed end; beyond, rounding destroys the phases
+MAX_DISTANCE_M = 1e7  # from the fixed end; beyond, only the direction counts, because rounding destroys the phases
 MIN_LENGTH_M = 1e-6  # of a path, whose amplitude is finite also between ends at one place
 
 Sequence = tuple[int, ...]
@@ -54,10 +54,7 @@ class PhaseObservations:
     def of(
         cls, position: Tensor, fixed: Tensor, moving: Moving, array: PlanarArray, rotation: Tensor, channel: Tensor
     ) -> PhaseObservations:
-        """Return the link of a moving end (n, 3) [m] and a fixed end (3,) [m], with a channel (n, K) of modulus 1.
-
-        Beyond 10,000 km only the direction counts.
-        """
+        """Return the link of a moving end (n, 3) [m] and a fixed end (3,) [m], with a channel (n, K) of modulus 1."""
         away = position - fixed
         size = away.abs().amax(dim=1, keepdim=True)
         position = torch.where(size > MAX_DISTANCE_M, fixed + MAX_DISTANCE_M * (away / size), position)

@@ -219,7 +219,7 @@ class Search:
         return rooms
 
     def aliases(self, room: CandidateRoom) -> Alternatives:
-        """Return (offset, gain) of each side's present plane and of its phase aliases up to two periods away."""
+        """Return (offset, gain) of each side's present plane, wherever it is, and of its aliases up to two periods away."""
         found = []
         for side in range(6):
             if side not in room.offset:
@@ -229,7 +229,6 @@ class Search:
             normal, offset, _ = one.tensors()
             period = phase_period_m(self.scene, normal, offset, 0)
             steps = [room.offset[side] + m * period for m in (0, -1, 1, -2, 2)]
-            # the plane itself stays: refinement may have moved it into the region
             found.append([(o, room.gain[side]) for o in steps if o == steps[0] or o >= self.near[side]])
         return found
 
