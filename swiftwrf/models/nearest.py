@@ -23,7 +23,10 @@ class MemoryModel(FieldModel):
     """training spectra (n, H, W)"""
 
     def _fit(self, train: Spectra, context: FitContext) -> None:
-        self.position, self.store = train.position, train.store
+        # by position, then power, so that ties of distances do not depend on the order of the rows
+        power = torch.cat([part.flatten(1).double().square().sum(dim=1) for part in train.store.batches()])
+        order = torch.from_numpy(np.lexsort([power.numpy(), *train.position.T.numpy()]))
+        self.position, self.store = train.position[order], train.store.subset(order)
 
     def region(self) -> Tensor:
         return self.position
@@ -40,12 +43,6 @@ class MemoryModel(FieldModel):
         self.position, self.store = tensors["position"].double(), Store(tensors["spectrum"])
 
 
-def in_order(train: Spectra) -> Spectra:
-    """Return the spectra by ascending position, and power where positions repeat, so that ties do not follow the rows."""
-    power = torch.cat([part.flatten(1).double().square().sum(dim=1) for part in train.store.batches()])
-    return train.subset(torch.from_numpy(np.lexsort([power.numpy(), *train.position.T.numpy()])))
-
-
 class NearestModel(MemoryModel):
     """The spectrum of the nearest measured position, a baseline that dense positions make hard to beat.
 
@@ -58,9 +55,6 @@ class NearestModel(MemoryModel):
 
     name = "nearest"
     kind = "nearest-spectrum model"
-
-    def _fit(self, train: Spectra, context: FitContext) -> None:
-        super()._fit(in_order(train), context)
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         return self.store[nearest(position, self.position, 1)[1][:, 0]], None
