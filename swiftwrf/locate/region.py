@@ -91,8 +91,9 @@ class Region:
     @cached_property
     def _box(self) -> tuple[Tensor, Tensor, Tensor]:
         """Centre (3,), axes (d, 3) along which the positions extend, and half the extent along each (d,) [m]."""
-        middle = self.known.mean(dim=0)
-        _, size, axes = torch.linalg.svd(self.known - middle, full_matrices=False)
+        away = self.known - self.known[0]  # exactly 0 if all positions are one
+        middle = self.known[0] + away.mean(dim=0)
+        _, size, axes = torch.linalg.svd(away - away.mean(dim=0), full_matrices=False)
         extended = size > FLAT * size[0].clamp_min(1e-12)
         # a region in all three dimensions is a box along the coordinates, as rooms are
         axes = torch.eye(3, dtype=torch.float64) if bool(extended.sum() == 3) else axes[extended]

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 ARRAY, FIXED_END = "array", "fixed end"  # requirements that a model can declare
 CPU = torch.device("cpu")
+MIN_STD = 1 / 255  # of a measured magnitude: a quantisation step of the 8-bit images that spectra are stored in
 
 
 @configuration
@@ -214,7 +215,7 @@ class FieldModel(Configured, Saved, Displayed):
 
         def evaluate(some: Tensor) -> tuple[Tensor, Tensor | None]:
             mean, std = self._predict(some, grid, with_std)
-            return mean.clamp(0, 1), std
+            return mean.clamp(0, 1), None if std is None else std.clamp_min(MIN_STD)
 
         position = self._checked(position)
         mean, std = self._in_batches(evaluate, position, grid)

@@ -36,7 +36,7 @@ class GPModel(ProcessModel, MemoryModel):
     samples = True
 
     def _fit(self, train: Spectra, context: FitContext) -> None:
-        super()._fit(train, context)
+        self.position, self.store = train.position, train.store
         fold = folds(train.position, self.config.validation, self.config.seed)
         self._prepare(_without_values(choose_kernel(train.position, train.store, fold), train.position))
         self._set_spread(

@@ -38,11 +38,10 @@ class IDWModel(MemoryModel):
     def _fit(self, train: Spectra, context: FitContext) -> None:
         super()._fit(train, context)
         (rows,) = subsample(torch.arange(len(train)), rows=MAX_CHOICE_SPECTRA)
-        fold = folds(train.position, self.config.validation, self.config.seed)[rows]
+        fold = folds(self.position, self.config.validation, self.config.seed)[rows]
         candidates = [k for k in NEIGHBOUR_CANDIDATES if k <= len(rows) - int(fold.bincount().max())]
-        some = train.subset(rows)
-        gram = inner_products(some.spectrum)
-        self.k = min(candidates, key=lambda k: _held_out_loss(k, some.position, gram, fold))
+        position, gram = self.position[rows], inner_products(self.store[rows])
+        self.k = min(candidates, key=lambda k: _held_out_loss(k, position, gram, fold))
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         rows, weight = dense_weights(*weights(position, self.position, self.k))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
@@ -21,7 +23,10 @@ class MemoryModel(FieldModel):
     """training spectra (n, H, W)"""
 
     def _fit(self, train: Spectra, context: FitContext) -> None:
-        self.position, self.store = train.position, train.store
+        # by position, then power, so that ties of distances do not depend on the order of the rows
+        power = torch.cat([part.flatten(1).double().square().sum(dim=1) for part in train.store.batches()])
+        order = torch.from_numpy(np.lexsort([power.numpy(), *train.position.T.numpy()]))
+        self.position, self.store = train.position[order], train.store.subset(order)
 
     def region(self) -> Tensor:
         return self.position

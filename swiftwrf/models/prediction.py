@@ -87,6 +87,8 @@ class Prediction(Labelled, Displayed):
     def interval(self, level: float = 0.8) -> tuple[Tensor, Tensor]:
         """Return the lower and upper end of the central interval that contains a measurement with probability `level`.
 
+        Intervals of spectra are clipped to [0, 1], the range of magnitudes.
+
         Raises:
             InputError: The model has no standard deviation, or the level is outside (0, 1).
         """
@@ -95,7 +97,8 @@ class Prediction(Labelled, Displayed):
         if not 0 < level < 1:
             raise InputError(f"level must be between 0 and 1, got {level}")
         half = NormalDist().inv_cdf((1 + level) / 2) * self.std
-        return self.mean - half, self.mean + half
+        low, high = self.mean - half, self.mean + half
+        return (low, high) if self.grid is None else (low.clamp_min(0), high.clamp_max(1))
 
     def to_frame(self) -> pd.DataFrame:
         """Return a table: a row for each position and receiver, or for each spectrum with its largest magnitude.

@@ -32,7 +32,7 @@ from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
 from swiftwrf.rssi.posterior import FitState, RssiPosterior
 from swiftwrf.rssi.regression import fit_receiver
 from swiftwrf.rssi.stacking import comparable, mixing_weights
-from swiftwrf.rssi.training import RssiTraining, prepare, representative_receivers
+from swiftwrf.rssi.training import RssiTraining, prepare, representative_receivers, rounding_std
 from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.progress import progress_bar
@@ -89,6 +89,8 @@ class RssiModel(SavedRssiPredictor):
     """RSSI at 1 m, float64 (R,) [dBm]"""
     slope: Tensor
     """float64 (R,) [dB a decade]"""
+    slope_std: Tensor
+    """standard deviation of the slope, float64 (R,) [dB a decade]"""
     directivity: Tensor
     """coefficients of the harmonics, (R, 8) [dB]"""
     anchor: Tensor
@@ -188,13 +190,15 @@ class RssiModel(SavedRssiPredictor):
                 dual=found["dual"].T,
                 tangent=found["tangent"].T,
                 variance=found["variance"].T,
-                prior_level=training.prior_mean.level,
-                prior_slope=training.prior_mean.slope,
+                prior_level=found["prior_level"],
+                prior_slope=found["prior_slope"],
                 field_variance=training.field_db.square(),
                 noise_variance=training.noise_db.square(),
             )
             self._posterior = self._posterior_of(state)
-        self.field_db, self.noise_db = (scale * training.field_db).float(), (scale * training.noise_db).float()
+        noise_db = (scale * training.noise_db).clamp_min(rounding_std(measured))
+        self.field_db, self.noise_db = (scale * training.field_db).float(), noise_db.float()
+        self.slope_std = weight[:2].sum(dim=0) * found["slope_std"]  # only two predictors have the receiver's slope
         self._precompute()
 
     @property
@@ -214,8 +218,11 @@ class RssiModel(SavedRssiPredictor):
         self._process = self._variance_process()
 
     def _variance_process(self) -> GaussianProcess:
-        """Return the process of few of the measured positions, which determine the standard deviation."""
-        return GaussianProcess(self.kernel, subsample(self.anchor.double(), rows=MAX_VARIANCE_POSITIONS)[0])
+        """Return the process of centred log10 distances (n, R) at few measured positions, which determine the variance."""
+        known = subsample(self.anchor.double(), rows=MAX_VARIANCE_POSITIONS)[0]
+        distance = log_distance(known + self.centre, self.receiver)
+        self._middle = distance.mean(dim=0)
+        return GaussianProcess.regress(self.kernel, known, distance - self._middle)
 
     def _posterior_of(self, state: FitState) -> RssiPosterior:
         table, receiver = HeadTable(self.rendered), self.receiver_position - self.centre
@@ -293,13 +300,16 @@ class RssiModel(SavedRssiPredictor):
                 f"a position is {farthest:.3g} m away from the measurements; at most {MAX_DISTANCE_M:g} m make sense"
             )
         local = offset.float()
-        path_loss = self.level + self.slope * log_distance(position, self.receiver)
+        distance = log_distance(position, self.receiver)
+        path_loss = self.level + self.slope * distance
         bearing = harmonics(local, (self.receiver - self.centre).float())
         head = self._table(self.kernel(local, self.anchor) @ self.coefficient)[0] - self._offset
         mean = path_loss.float() + torch.einsum("brh,rh->br", bearing, self.directivity)
         mean = mean + self.mixing_weight[0].float() * head
-        variance = self._process.variance(offset).float()
-        return mean, (self.noise_db.square() + self.field_db.square() * variance[:, None]).sqrt()
+        variance = self.field_db.square() * self._process.variance(offset).float()[:, None]
+        # as of kriging with a trend: the slope is uncertain beyond the distances of the measurements
+        trend = (self.slope_std * (distance - self._middle - self._process.mean(offset))).square().float()
+        return mean, (self.noise_db.square() + variance + trend).sqrt()
 
     def plot(
         self, receiver: str | None = None, height_m: float | None = None, ax: matplotlib.axes.Axes | None = None
@@ -376,7 +386,7 @@ def fit_rssi(
 
 def _shapes(n_receivers: int, n_anchors: int) -> dict[str, tuple[int, ...]]:
     """Return the shape of every saved tensor."""
-    per_receiver = dict.fromkeys(("level", "slope", "field_db", "noise_db"), (n_receivers,))
+    per_receiver = dict.fromkeys(("level", "slope", "slope_std", "field_db", "noise_db"), (n_receivers,))
     return per_receiver | {
         "mixing_weight": (4, n_receivers),
         "centre": (3,),

@@ -28,6 +28,7 @@ from swiftwrf.positions import Neighbours, check_positions, distance
 from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiFitContext, RssiPredictor, SavedRssiPredictor
 from swiftwrf.rssi.model import LEVEL
 from swiftwrf.rssi.path_loss import PairPathLoss
+from swiftwrf.rssi.training import rounding_std
 from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.threads import single_thread
@@ -212,7 +213,8 @@ class PairModel(PairPredictor, SavedRssiPredictor):
         held_out = self._residuals_without(rssi, fold, sample)
         choices = [choice for metric in METRICS for choice in self._judged(metric, fold, sample, held_out)]
         _, self.metric, self.kernel, score = min(choices, key=lambda choice: choice[0])
-        self.scale_db = score.quantile(LEVEL)[None] / NormalDist().inv_cdf((1 + LEVEL) / 2)
+        scale = score.quantile(LEVEL)[None] / NormalDist().inv_cdf((1 + LEVEL) / 2)
+        self.scale_db = scale.clamp_min(rounding_std(rssi) / self.kernel.noise**0.5)
         self._precompute()
 
     def _residuals_without(self, rssi: Tensor, fold: Tensor, sample: Tensor) -> dict[int, Tensor]:

@@ -37,6 +37,7 @@ def learn_receivers(some: slice, data: RssiTraining, config: RssiConfig, device:
     return {
         "level": data.prior_mean.level[some],
         "slope": data.prior_mean.slope[some],
+        "slope_std": torch.zeros(len(rendered), dtype=torch.float64),
         "directivity": torch.zeros(len(rendered), N_HARMONICS, dtype=torch.float64),
         "coefficient": torch.linalg.solve_triangular(root.T, white.double() * data.field_db[some], upper=True).T,
         "rendered": rendered,

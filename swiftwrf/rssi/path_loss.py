@@ -53,7 +53,7 @@ class PathLoss(NamedTuple):
 
     Args:
         level: RSSI at 1 m, float64 (..., R) or (..., 1) [dBm].
-        slope: -10 times the path-loss exponent, of the same shape [dB a decade].
+        slope: -10 times the path-loss exponent, of the same shape [dB a decade]. A fitted exponent is at least 0.
 
     Example:
         >>> model = PathLoss(torch.tensor([-40.0]), torch.tensor([-20.0]))
@@ -103,6 +103,8 @@ def fit_shared_path_loss(distance: Tensor, rssi: Tensor, located: Tensor, applie
 def fit_path_loss(distance: Tensor, rssi: Tensor, *, shared: bool = False) -> PathLoss:
     """Fit the path-loss model by least squares (Rappaport, "Wireless Communications", 2nd ed., 2002, section 4.9).
 
+    The path-loss exponent is at least 0: a model whose RSSI rises with the distance rises without limit beyond the data.
+
     Args:
         distance: log10 of the distances [m], (n, R).
         rssi: Measurements (n, R) [dBm], nan where not detected.
@@ -126,7 +128,7 @@ def fit_path_loss(distance: Tensor, rssi: Tensor, *, shared: bool = False) -> Pa
     middle, centre = mean(rssi), mean(distance)
     offset = distance - centre
     variance = mean(offset.square())
-    slope = (mean(offset * (rssi - middle)) / variance).where(variance > 1e-12, 0.0)
+    slope = (mean(offset * (rssi - middle)) / variance).where(variance > 1e-12, 0.0).clamp_max(0.0)
     return PathLoss((middle - slope * centre).reshape(-1), slope.reshape(-1))
 
 
@@ -169,7 +171,8 @@ class PairPathLoss:
         normal = normal.index_add(0, row, own[:, :, None] * own[:, None])
         residual = rssi - shared[0] - shared[1] * apart
         right = torch.zeros(len(place), 2, dtype=torch.float64).index_add(0, row, own * residual[:, None])
-        level, slope = torch.linalg.solve(normal, right).unbind(dim=1)
+        slope = torch.linalg.solve(normal, right)[:, 1].clamp_max(-shared[1])  # the sum of both slopes is at most 0
+        level = (right[:, 0] - normal[:, 0, 1] * slope) / normal[:, 0, 0]
         return cls(shared, place, torch.stack([level - slope * centre, slope], dim=1))
 
     @cached_property

@@ -41,7 +41,7 @@ class FitState:
         tangent: Slope of each head at the latent field, (n, R); 0 where not detected.
         variance: Variance of the noise over the weight, (n, R) [dB^2]; 0 where not detected.
         prior_level: Path-loss model that the fit started from, RSSI at 1 m, (R,) [dBm].
-        prior_slope: Its slope, (R,) [dB a decade].
+        prior_slope: Its slope, (R,) [dB a decade]. A receiver of slope 0 has no regressor of the distance.
         field_variance: Prior variance of the latent field, (R,) [dB^2].
         noise_variance: Variance of one measurement, (R,) [dB^2].
     """
@@ -164,6 +164,7 @@ class RssiPosterior:
     def _regressors(self, position: Tensor) -> Tensor:
         """Return the scaled regressors of level, slope and directivity at positions (m, 3), float64 (R, m, k)."""
         distance, bearing = log_distance(position, self.receiver), harmonics(position, self.receiver)
+        distance = distance * (self.state.prior_slope < 0)
         feature = torch.cat([torch.ones_like(distance)[..., None], distance[..., None], bearing], dim=-1)
         return (feature * FEATURE_SCALE_DB).transpose(0, 1)
 

@@ -21,6 +21,7 @@ from swiftwrf.rssi.training import RssiTraining
 from swiftwrf.runtime.threads import single_thread
 
 PATH_LOSS_STD_DB = 30.0  # prior of level and slope about their least squares: as good as none
+MAX_SLOPE_STD_DB = 10.0  # of a slope: path-loss exponents of 2 to 6 (Rappaport 2002, table 4.2) scatter no more
 DIRECTIVITY_STD_DB = 2.0  # prior of each harmonic of a receiver's antenna and surroundings
 # prior standard deviation of each coefficient that the regressors of level, slope and directivity are scaled by
 FEATURE_SCALE_DB = torch.tensor([PATH_LOSS_STD_DB] * 2 + [DIRECTIVITY_STD_DB] * N_HARMONICS, dtype=torch.float64)
@@ -43,6 +44,8 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
         Tensors by name, with R = 1.
 
         - level (R,) [dBm], slope (R,) [dB a decade] and directivity (R, 8) [dB].
+        - prior_level and prior_slope (R,), where the fit starts; slope 0 and no regressor of distance if RSSI rises with it.
+        - slope_std (R,), the posterior standard deviation of the slope [dB a decade].
         - coefficient (R, n) of the kernel to the bins, whose sum is the latent field [dB].
         - dual, tangent and variance (R, n). See `posterior.FitState`.
         - rendered fields of the heads (R, 2, 2, directions).
@@ -56,21 +59,27 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
     distance, bearing = log_distance(data.position, receiver), harmonics(data.position, receiver)[:, 0]
     detected = (~rssi.isnan()).nonzero()[:, 0]
     feature = torch.cat([torch.ones_like(distance), distance, bearing], dim=1) * FEATURE_SCALE_DB
-    residual = rssi - prior_mean(distance)[:, 0]
-    error, linear = torch.zeros_like(rssi), torch.zeros_like(FEATURE_SCALE_DB)
+    error, linear, spread = torch.zeros_like(rssi), torch.zeros_like(FEATURE_SCALE_DB), distance.any().double()
     dual, tangent, noise = (torch.zeros_like(rssi) for _ in range(3))
     variance = float(data.field_db[some]) ** 2
     if len(detected):
         position = data.position[detected].to(device)
+        covariance = variance * data.kernel(position, position)
+        noise_db = (data.noise_db[some] / data.count[detected, some][:, 0].sqrt()).to(device)
+        rest = covariance, noise_db, HeadTable(data.rendered[some].to(device)), config.huber
+
+        def solved(prior: PathLoss) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+            residual = rssi - prior(distance)[:, 0]
+            return solve(residual[detected].to(device), feature[detected].to(device), *rest)
+
         try:
-            *found, factor = solve(
-                residual[detected].to(device),
-                feature[detected].to(device),
-                variance * data.kernel(position, position),
-                (data.noise_db[some] / data.count[detected, some][:, 0].sqrt()).to(device),
-                HeadTable(data.rendered[some].to(device)),
-                config.huber,
-            )
+            *found, factor = solved(prior_mean)
+            along = feature[detected, 1].to(device)
+            spread *= (1 - along @ torch.cholesky_solve(along[:, None], factor)[:, 0]).clamp(0, 1).sqrt().cpu()
+            start = float(prior_mean.slope)
+            if bool(along.any()) and (start == 0 or start + PATH_LOSS_STD_DB * float(found[0] @ along) > 0):
+                prior_mean, feature[:, 1] = PathLoss(rssi.nanmean().reshape(1), torch.zeros(1).double()), 0.0
+                *found, factor = solved(prior_mean)
             error[detected] = fold_errors(factor, found[0], data.fold[detected].to(device)).cpu()
         except torch.linalg.LinAlgError as reason:  # type: ignore[attr-defined]
             raise FitError(
@@ -81,6 +90,9 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
     return {
         "level": prior_mean.level + linear[0],
         "slope": prior_mean.slope + linear[1],
+        "prior_level": prior_mean.level,
+        "prior_slope": prior_mean.slope,
+        "slope_std": (PATH_LOSS_STD_DB * spread).clamp_max(MAX_SLOPE_STD_DB)[None],
         "directivity": linear[None, 2:],
         "coefficient": variance * (tangent * dual)[None],
         "dual": dual[None],

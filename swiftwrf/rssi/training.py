@@ -17,6 +17,7 @@ from swiftwrf.rssi.head import Head, render
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, fit_shared_path_loss, log_distance
 from swiftwrf.runtime.threads import single_thread
 
+MAX_STEP_DB = 1.0  # of the values that a receiver reports: nearly all report whole decibels
 PAPER_LEVEL_DBM = -100.0  # of the paper's head where nothing is received
 # variance of a packet relative to the variance of the field: fading is as large as shadowing
 RELATIVE_NOISE_VARIANCES = (0.3, 1.0, 2.0, 3.0)
@@ -133,6 +134,14 @@ def prepare(train: Rssi, pool: Rssi, config: RssiConfig, like: RssiTraining | No
         baselines=baselines,
         baseline_held_out=held_out,
     )
+
+
+def rounding_std(rssi: Tensor) -> float:
+    """Return the standard deviation of the rounding error of RSSI [dBm], the least of a prediction [dB].
+
+    The step of the values is their least difference, at most 1 dB, which is also that of constant values.
+    """
+    return min([MAX_STEP_DB, *rssi[~rssi.isnan()].unique().diff().tolist()]) / 12**0.5
 
 
 def representative_receivers(pool: Rssi) -> Rssi:

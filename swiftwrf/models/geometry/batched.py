@@ -26,7 +26,7 @@ def batched_field(
     ray = (images(scene, normal, offset, sequence) - scene.receiver).permute(3, 1, 2, 0).float().contiguous()
     strength = image_gain(gain, sequence)[..., None] * visibility(scene, normal, offset, sequence)
     strength = strength.permute(1, 2, 0)
-    size = max(1, BATCH_WAVES // ray[0, 0].numel())
+    size = max(1, BATCH_WAVES // max(1, ray[0, 0].numel()))  # there may be no candidates
     total = torch.zeros(())
     for some, part in zip(ray.split(size, dim=1), strength.split(size), strict=True):
         total = total + torch.view_as_real(scene.waves(some, part)).sum(1)

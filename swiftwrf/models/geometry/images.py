@@ -22,6 +22,8 @@ from swiftwrf.models.geometry.chain import ElementChain
 MAX_COSINE = 0.02  # of two planes that count as perpendicular; above 1 - MAX_COSINE**2 they count as parallel
 ROUNDING_RAD = 1e-3  # of phase, to which positions are rounded in a search
 N_POSITIONS = 36  # that many rooms are scored at
+MAX_DISTANCE_M = 1e7  # from the fixed end; beyond, only the direction counts, because rounding destroys the phases
+MIN_LENGTH_M = 1e-6  # of a path, whose amplitude is finite also between ends at one place
 
 Sequence = tuple[int, ...]
 
@@ -53,6 +55,9 @@ class PhaseObservations:
         cls, position: Tensor, fixed: Tensor, moving: Moving, array: PlanarArray, rotation: Tensor, channel: Tensor
     ) -> PhaseObservations:
         """Return the link of a moving end (n, 3) [m] and a fixed end (3,) [m], with a channel (n, K) of modulus 1."""
+        away = position - fixed
+        size = away.abs().amax(dim=1, keepdim=True)
+        position = torch.where(size > MAX_DISTANCE_M, fixed + MAX_DISTANCE_M * (away / size), position)
         transmitter, receiver = (position, fixed[None]) if moving == "transmitter" else (fixed[None], position)
         wavenumber = 2 * math.pi / array.wavelength
         element = wavenumber * array.element.double() @ rotation[:, :2].T.double()
@@ -95,7 +100,7 @@ class PhaseObservations:
     def wave(self, source: Tensor) -> Tensor:
         """Return the wave exp(-j k d) / d of sources (..., n or 1, 3) [m] at each element, complex64 (..., n, K)."""
         ray = (source - self.receiver).float()
-        length = ray.norm(dim=-1, keepdim=True)
+        length = ray.norm(dim=-1, keepdim=True).clamp_min(MIN_LENGTH_M)
         return spherical((ray / length) @ self.element.T - self.wavenumber * length, length)
 
     def waves(self, ray: Tensor, amplitude: Tensor) -> Tensor:
@@ -108,10 +113,10 @@ class PhaseObservations:
         Returns:
             Waves, complex64 (K, ...).
         """
-        length = ray.square().sum(0).sqrt()  # the norm over a first dimension is slow
+        length = ray.square().sum(0).sqrt().clamp_min(MIN_LENGTH_M)  # the norm over a first dimension is slow
         unit, amplitude = ray / length, amplitude / length
         wave = self.chain.phasors(unit.flatten(1), amplitude.flatten(), -self.wavenumber * length.flatten())
-        return wave.reshape(-1, *length.shape)
+        return wave.reshape(len(self.element), *length.shape)
 
     def coherence(self, field: Tensor) -> Tensor:
         """Return |x^H h|^2 / K^2 of the observed and the given phases, (..., n, K) to (..., n), in [0, 1].

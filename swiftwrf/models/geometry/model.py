@@ -30,7 +30,6 @@ from swiftwrf.models.link import Link, Linked
 from swiftwrf.runtime.checkpoint import Header, expect
 
 MAX_PLANES = 64  # of a room in a file
-MAX_DISTANCE_M = 1e7  # from the fixed end; beyond, rounding destroys the phases
 
 
 class GeometryModel(Linked, FieldModel):
@@ -192,10 +191,7 @@ class GeometryModel(Linked, FieldModel):
         return sample_field(scene, room.normal, room.offset, room.gain, room.sequence, covariance, residual, generator)
 
     def scene(self, position: Tensor) -> PhaseObservations:
-        """Return the link at positions (n, 3) [m], without observations. Beyond 10,000 km only the direction counts."""
-        away = position - self.fixed_position
-        size = away.abs().amax(dim=1, keepdim=True)
-        position = torch.where(size > MAX_DISTANCE_M, self.fixed_position + MAX_DISTANCE_M * (away / size), position)
+        """Return the link at positions (n, 3) [m], without observations."""
         nothing = torch.ones(len(position), len(self.array.element), dtype=torch.complex64)
         return PhaseObservations.of(position, self.fixed_position, self.moving, self.array, self.rotation, nothing)
 

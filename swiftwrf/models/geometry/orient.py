@@ -42,10 +42,10 @@ def candidates(scene: PhaseObservations, base: Tensor, reach: float, top: int) -
     both = torch.cat([scene.transmitter, scene.receiver])
     rows = (scene.moving - scene.moving.mean(0)).norm(dim=1).argsort()[:N_NEAR]
     near, base = scene.subset(rows), batched(base[rows])
-    distance = (
-        torch.arange(MIN_DISTANCE_RAD, reach * scene.wavenumber, DISTANCE_STEP_RAD, dtype=torch.float64)
-        / scene.wavenumber
-    )
+    farthest = max(reach * scene.wavenumber, MIN_DISTANCE_RAD)
+    distance = torch.arange(MIN_DISTANCE_RAD, farthest, DISTANCE_STEP_RAD, dtype=torch.float64) / scene.wavenumber
+    if not len(distance):
+        return []
 
     def of_normals(normal: Tensor) -> list[tuple[float, Tensor, float, float]]:
         found = []

@@ -81,9 +81,11 @@ class Search:
         self.scene, self.reach, self.signs = scene, reach, signs
         self.usual: list[float] = (usual * signs).tolist()
         both = torch.cat([scene.transmitter, scene.receiver])
-        near = (both @ SIDES.T).amax(0)
+        self.near: list[float] = (both @ SIDES.T).amax(0).tolist()  # least offset of each side
         self.step = 0.5 / scene.wavenumber
-        self.offsets = [n + torch.arange(self.step, reach, self.step, dtype=torch.float64) for n in near]
+        self.offsets = [
+            n + torch.arange(self.step, max(reach, self.step), self.step, dtype=torch.float64) for n in self.near
+        ]
         self.direct = batched(scene.wave(scene.transmitter))
         self._scanned, self._screened = scene.few(N_SCANNED), scene.few_rows(N_SCREENED)
         self._scanned_direct = batched(self._scanned.wave(self._scanned.transmitter))
@@ -217,7 +219,7 @@ class Search:
         return rooms
 
     def aliases(self, room: CandidateRoom) -> Alternatives:
-        """Return (offset, gain) of each side's present plane and of its phase aliases up to two periods away."""
+        """Return (offset, gain) of each side's present plane, wherever it is, and of its aliases up to two periods away."""
         found = []
         for side in range(6):
             if side not in room.offset:
@@ -226,9 +228,8 @@ class Search:
             one = CandidateRoom(0.0, {side: room.offset[side]}, room.gain)
             normal, offset, _ = one.tensors()
             period = phase_period_m(self.scene, normal, offset, 0)
-            low = float(self.offsets[side][0])
             steps = [room.offset[side] + m * period for m in (0, -1, 1, -2, 2)]
-            found.append([(o, room.gain[side]) for o in steps if o >= low - self.step])
+            found.append([(o, room.gain[side]) for o in steps if o == steps[0] or o >= self.near[side]])
         return found
 
     def improve(self, room: CandidateRoom) -> CandidateRoom:

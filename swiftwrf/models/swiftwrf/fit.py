@@ -105,7 +105,7 @@ def doubling_search(loss: Callable[[int], float], first: int, last: int, patienc
     losses: dict[int, float] = {}
     size, lowest, without_gain = first, math.inf, 0
     while size <= last and without_gain < patience:
-        losses[size] = loss(size)
+        losses[size] = max(loss(size), 0.0)  # rounding may leave less
         without_gain = 0 if losses[size] < (1 - MIN_GAIN) * lowest else without_gain + 1
         lowest = min(lowest, losses[size])
         size *= 2

@@ -12,6 +12,7 @@ from tasks.inspect.findings.base import Findings
 
 MAX_POSITIONS = 3000  # whose neighbours are searched
 SMOOTH, ROUGH = 0.25, 0.5  # wavelengths between neighbours: below, fields are smooth; above, fringes are lost
+SPARSE = 2.0  # wavelengths between neighbours, beyond which a search for a room finds few of its planes or none
 MAX_END_OFFSET = 1e-3  # of normalised coordinates from the ends of their interval
 MAX_EXTENT_M = 1000.0  # beyond, coordinates may be millimetres or pixels
 
@@ -49,7 +50,8 @@ def check_positions(position: Tensor, findings: Findings, wavelength: float | No
     elif waves <= ROUGH:
         findings.add(f"{text}: interpolation will work in part; half a wavelength is the limit.")
     else:
-        findings.warn(f"{text}: interpolators see no fringes between such positions; geometry needs none.")
+        geometry = "geometry needs none" if waves <= SPARSE else "geometry finds few planes, if any"
+        findings.warn(f"{text}: interpolators see no fringes between such positions; {geometry}.")
 
 
 def normalised(position: Tensor) -> str:
