@@ -9,7 +9,11 @@ spectrum = model.predict(test.position).mean
 Gaussian Splatting for Efficient Wireless Radiance Field Rendering", 2025.
 """
 
+from importlib.metadata import version
+
 from swiftwrf.runtime.lazy import lazy_imports
+
+__version__ = version("swiftwrf-tasks")
 
 with lazy_imports(globals()):
     from swiftwrf import comparison, datasets

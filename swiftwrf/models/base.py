@@ -24,6 +24,7 @@ from swiftwrf.positions import check_positions
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.options import Configured, Preset, from_plain
 from swiftwrf.runtime.session import Record
+from swiftwrf.runtime.threads import to_device
 from swiftwrf.runtime.validation import NonNegativeInt, checked, configuration
 
 if TYPE_CHECKING:
@@ -154,7 +155,7 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
             raise InputError(f"{self.name} cannot reuse the structure of {with_article(like.kind)}")
         self.grid, self.bounds = train.grid, bounding_box(train.position)
         try:
-            self._fit(train, FitContext(like, torch.device(device), checkpoint, on_record, progress))
+            self._fit(train, FitContext(like, to_device(device), checkpoint, on_record, progress))
         except BaseException:
             del self.grid  # the model counts as not fitted
             raise

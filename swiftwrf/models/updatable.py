@@ -14,6 +14,7 @@ from swiftwrf.data.spectra import Spectra, check_spectra
 from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions
 from swiftwrf.runtime.threads import single_thread
+from swiftwrf.runtime.validation import checked
 
 
 class Updatable:
@@ -31,6 +32,7 @@ class Updatable:
         """Raise InputError if the model is not fitted."""
 
     @single_thread()
+    @checked
     def update(self, new: Spectra) -> Self:
         """Return the model with more training spectra, by an update of its factorisation. This model stays as it is.
 

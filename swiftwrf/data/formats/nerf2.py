@@ -25,7 +25,6 @@ from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.choices import Moving
 from swiftwrf.data.archives import array_header, array_names, read_arrays, read_rows, refusing_broken
 from swiftwrf.data.files import (
-    MAX_COORDINATE_M,
     check_carrier,
     digests,
     number,
@@ -94,10 +93,10 @@ def _read_gateway(file: Path) -> dict[str, Any]:
 
 def _read_pose(file: Path, gateway: dict[str, Any]) -> ArrayPose:
     position, orientation = numbers(gateway.get("position"), 3), numbers(gateway.get("orientation"), 4)
-    if position is None or orientation is None or max(map(abs, position)) > MAX_COORDINATE_M:
+    if position is None or orientation is None:
         raise InputError(
-            f"{file}: the gateway needs a position of 3 numbers [m], at most {MAX_COORDINATE_M:g}, and an orientation "
-            f"(x, y, z, w) of 4, got {gateway.get('position')} and {gateway.get('orientation')}"
+            f"{file}: the gateway needs a position of 3 numbers [m] and an orientation (x, y, z, w) of 4, got "
+            f"{gateway.get('position')} and {gateway.get('orientation')}"
         )
     try:
         return ArrayPose(position, orientation)  # type: ignore[arg-type]  # the lengths are checked

@@ -10,12 +10,13 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.archives import array_names, read_arrays
-from swiftwrf.data.files import MAX_COORDINATE_M, check_carrier, digests
+from swiftwrf.data.files import check_carrier, digests
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.spectra import GRID, Spectra, check_pixels
 from swiftwrf.data.splits import read_splits
 from swiftwrf.errors import InputError
+from swiftwrf.positions import check_positions
 
 SHAPES = {  # of n receivers and P paths
     "transmitter_position": ("n", 3),
@@ -115,10 +116,7 @@ def _check_physics(file: Path, arrays: dict[str, Tensor]) -> None:
     """Refuse values from which no spectra or labels follow."""
     check_carrier(file, float(arrays["frequency_hz"]))
     for name in ("transmitter_position", "receiver_position", "last_point"):
-        if float(arrays[name].abs().max()) > MAX_COORDINATE_M:
-            raise InputError(
-                f"{file}: {name} holds a coordinate beyond {MAX_COORDINATE_M:g} m; give metres from a nearer origin"
-            )
+        check_positions(arrays[name], f"{file}: {name}")
     receiver = arrays["receiver_position"]
     same = ((arrays["transmitter_position"] - receiver).norm(dim=1) < MIN_DISTANCE_M).nonzero()
     if len(same):

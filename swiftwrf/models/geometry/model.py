@@ -14,10 +14,8 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.choices import Moving
 from swiftwrf.data.spectra import Spectra, check_training, fingerprint
 from swiftwrf.data.splits import Validation
-from swiftwrf.errors import InputError
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext
 from swiftwrf.models.geometry.fit import (
-    MAX_ORDER,
     GeometryConfig,
     extend_room,
     observe,
@@ -32,7 +30,6 @@ from swiftwrf.models.updatable import bounding_box
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.validation import check_value
 
-MAX_PLANES = 64  # of a room in a file
 MAX_DISTANCE_M = 1e7  # from the fixed end; beyond, rounding destroys the phases
 
 
@@ -82,7 +79,10 @@ class GeometryModel(FieldModel):
         Args:
             link: Any spectra of the scene, for array, rotation, fixed end and grid.
             planes: Planes of the room.
-            order: Highest number of reflections of an image source.
+            order: Highest number of reflections of an image source, at most 4.
+
+        Raises:
+            InputError: As `Plane` and `RoomEstimate`.
 
         Example:
             >>> import swiftwrf
@@ -262,11 +262,6 @@ class GeometryModel(FieldModel):
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         planes, order = header["planes"], header["order"]
-        if type(order) is not int or not 0 <= order <= MAX_ORDER or len(planes) > MAX_PLANES:
-            raise InputError(  # the number of image sources is that of the planes to the power of the order
-                f"a room has at most {MAX_PLANES} planes and paths of 0 to {MAX_ORDER} reflections, got {len(planes)} and "
-                f"{order}"
-            )
         expect(tensors, {"rotation": (3, 3), "fixed_position": (3,), "covariance": (len(planes), len(planes))})
         self.array = PlanarArray(tensors["element"], header["wavelength"])
         self.rotation, self.fixed_position = tensors["rotation"].double(), tensors["fixed_position"].double()

@@ -130,9 +130,9 @@ WRONG = {
     ),
     "other elements": (
         lambda: Snapshots(torch.ones(5, 3).cfloat(), torch.rand(5, 3), array=PlanarArray.square(2, 1e9), pose=FACING_X),
-        r"channel must have shape \(5, n, 4\)",
+        r"channel must have shape \(5, 4\)",
     ),
-    "infinite RSSI": (lambda: Rssi([[-math.inf]], [[0, 0, 0]]), "RSSI must be finite"),
+    "infinite RSSI": (lambda: Rssi([[-math.inf]], [[0, 0, 0]]), "rssi_dbm must be finite, or nan"),
     "RSSI of others": (lambda: Rssi([[-50.0]] * 3, torch.rand(4, 3)), "4 positions, but rssi_dbm has 3 rows"),
     "one name for two": (
         lambda: Rssi([[-50.0, -60]], [[0, 0, 0]], receiver_names=["a", "a"]),
@@ -140,7 +140,7 @@ WRONG = {
     ),
     "half a place": (
         lambda: Rssi([[-50.0, -60]], [[0, 0, 0]], receiver_position=[[0, 0, 0], [0, 0, math.nan]]),
-        "for each receiver finite ones or nan",
+        "all nan where it is unknown; row 1",
     ),
 }
 

@@ -103,7 +103,7 @@ REFUSED = {
     ),
     "carrier in GHz": ({"frequency_hz": 2.4}, "carrier in Hz"),
     "carrier of a list": ({"frequency_hz": np.full(3, FREQUENCY)}, "one number"),
-    "times of others": ({"time": np.zeros(3)}, "time must have one value"),
+    "times of others": ({"time": np.zeros(3)}, "time has 3 rows"),
     "complex positions": ({"position": np.ones((120, 3), complex)}, "expected real"),
 }
 
