@@ -98,14 +98,15 @@ class PositionedData(Labelled, Displayed):
             (10, [4, 29])
         """
         try:
-            number = torch.arange(len(self))[rows]
-        except (IndexError, TypeError, ValueError, RuntimeError):
-            number = torch.empty(0, 0)
-        if number.dim() != 1:
+            found = np.arange(len(self))[rows.cpu().numpy() if isinstance(rows, Tensor) else rows]
+        except (IndexError, TypeError, ValueError):
+            found = None
+        if found is None or found.ndim != 1:
             raise InputError(
                 f"rows of {self.name} must be a list of numbers below {len(self)}, a mask of that length or a slice, "
                 f"got {rows!r}"
             )
+        number = torch.from_numpy(found.copy())
         values = {field: getattr(self, field) for field in self.row_fields}
         kept: dict[str, Any] = {
             f: v[number] if isinstance(v, Tensor) else v.subset(number) for f, v in values.items() if v is not None
