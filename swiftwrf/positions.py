@@ -38,7 +38,12 @@ def to_tensor(
         tensor([[0., 1., 2.]], dtype=torch.float64)
     """
     try:
-        tensor = value.detach().cpu() if isinstance(value, Tensor) else torch.from_numpy(np.array(value))
+        if isinstance(value, Tensor):
+            tensor = value.detach().cpu()
+        else:
+            array = np.asarray(value)
+            is_wide = array.dtype.kind == "u" and array.itemsize > 1  # torch does not compute with these
+            tensor = torch.from_numpy(array.astype(np.float64 if is_wide else array.dtype.newbyteorder("=")))
     except (TypeError, ValueError, RuntimeError):
         raise InputError(f"{name} must be numbers of equal rows, got {type(value).__name__}") from None
     if tensor.dim() != len(shape) or any(e not in (None, size) for e, size in zip(shape, tensor.shape, strict=True)):
@@ -56,8 +61,9 @@ def to_tensor(
         raise InputError(f"{name} must be {expected}, got {tensor[lost][0].item()}")
     bad = ~cast.isfinite() & ~(cast.isnan() & missing)
     if bool(bad.any()):
+        row = int(bad.nonzero()[0, 0]) if shape else 0
         also = ", or nan where it is unknown" if missing else ""
-        raise InputError(f"{name} must be finite{also}; row {int(bad.nonzero()[0, 0])}, counted from 0, is not")
+        raise InputError(f"{name} must be finite{also}; row {row}, counted from 0, is not")
     return cast
 
 

@@ -216,9 +216,8 @@ class ArrayPose:
     orientation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        if (len(self.position), len(self.orientation)) != (3, 4) or not all(
-            math.isfinite(x) for x in (*self.position, *self.orientation)
-        ):
+        sizes = len(self.position), len(self.orientation)
+        if sizes != (3, 4) or not all(map(math.isfinite, (*self.position, *self.orientation))):
             raise InputError(
                 f"the array's position {self.position} and orientation {self.orientation} must be 3 and 4 finite numbers"
             )

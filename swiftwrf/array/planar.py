@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Annotated
 
 import torch
-from annotated_types import Ge, Le
+from annotated_types import Ge, Gt, Le, Lt
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, folded_to_front, to_angles, to_direction
@@ -53,9 +53,7 @@ class PlanarArray:
         object.__setattr__(self, "element", to_tensor("element", self.element, torch.float64, (None, 2)))
         if not 1 <= len(self.element) <= MAX_ELEMENTS:
             raise InputError(f"an array has 1 to {MAX_ELEMENTS} elements at positions (K, 2), got {len(self.element)}")
-        check_value("wavelength", self.wavelength, PositiveFloat)
-        if self.wavelength == math.inf:
-            raise InputError("the carrier of an array needs a finite wavelength [m], got inf")
+        check_value("wavelength", self.wavelength, Annotated[float, Gt(0), Lt(math.inf)])
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, PlanarArray) and self._content == other._content

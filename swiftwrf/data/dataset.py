@@ -181,11 +181,6 @@ def to_rotation(value: Numbers) -> Tensor:
 
     Raises:
         InputError: As `to_tensor`, or columns that are no right-handed set of unit vectors at right angles.
-
-    Example:
-        >>> to_rotation(2 * torch.eye(3))
-        Traceback (most recent call last):
-        swiftwrf.errors.InputError: rotation must be a rotation matrix ...
     """
     rotation = to_tensor("rotation", value, torch.float64, (3, 3))
     error = float((rotation.T @ rotation - torch.eye(3)).abs().max())

@@ -129,7 +129,9 @@ class Spectra(PositionedData):
                 )
         elif fixed_position is not None and rotation is not None:
             if bool((same := (position == fixed_position).all(dim=1)).any()):
-                raise InputError(f"position {int(same.nonzero()[0])} is that of the fixed end, so it has no direction")
+                raise InputError(
+                    f"position {int(same.nonzero()[0])} of {name} is that of the fixed end, so it has no direction"
+                )
             label = direction_of_link(position, fixed_position, rotation, moving, array)
         else:
             label = torch.full((len(position), 2), torch.nan, dtype=torch.float64)

@@ -126,11 +126,8 @@ def _tables(folder: Path, pair: str) -> tuple[dict[str, Floats], Floats, Floats]
     if len(shape) != 2 or 0 in shape or any(values.shape != shape for values in arrays.values()):
         shapes = ", ".join(f"{key} {values.shape}" for key, values in arrays.items())
         raise InputError(f"{folder}: the paths of pair {pair} must all have shape (receivers, paths), got {shapes}")
-    if receiver.shape != (shape[0], 3) or transmitter.shape != (3,):
-        raise InputError(
-            f"{folder}: expected rx_pos ({shape[0]}, 3) and tx_pos (3,), got {receiver.shape} and {transmitter.shape}"
-        )
-    check_positions(np.vstack([receiver, transmitter]), f"{folder}: positions of pair {pair}")
+    check_positions(receiver, f"{folder}: rx_pos of pair {pair}", (shape[0], 3))
+    check_positions(transmitter, f"{folder}: tx_pos of pair {pair}", (3,))
     return arrays, receiver, transmitter
 
 

@@ -58,11 +58,6 @@ def snapshots_of(
     Raises:
         InputError: An array that is invalid, or arrays that do not match.
     """
-    for array_name, values in arrays.items():
-        if array_name != "csi" and values.dtype.kind == "c":
-            raise InputError(f"{source}: {array_name} holds complex numbers, expected real ones")
-        if not np.isfinite(values).all():
-            raise InputError(f"{source}: {array_name} holds a value that is not finite; leave that row out")
     arrays, reversed_axes = _turned_round(_without_unit_axes(arrays))
     position, array = check_positions(arrays["position"], f"{source}: position"), array_of(source, arrays)
     n, folder, pose = len(position), files[0].parent, _pose(source, arrays)
@@ -155,13 +150,8 @@ def _pose(file: Path, arrays: Arrays) -> ArrayPose:
             f"{file}: array_orientation has 3 numbers; Euler angles leave their order open, so give the unit quaternion "
             "(x, y, z, w) that turns array into world coordinates"
         )
-    if position.shape != (3,) or orientation.shape != (4,):
-        raise InputError(
-            f"{file}: expected array_position of shape (3,) in metres and array_orientation of shape (4,), got "
-            f"{position.shape} and {orientation.shape}"
-        )
     try:
-        return ArrayPose(tuple(map(float, position)), tuple(map(float, orientation)))  # type: ignore[arg-type]
+        return ArrayPose(tuple(position.flatten().tolist()), tuple(orientation.flatten().tolist()))  # type: ignore[arg-type]
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
 

@@ -38,11 +38,6 @@ class Plane:
 
     Raises:
         InputError: A normal that is no unit vector, or a number that is not finite.
-
-    Example:
-        >>> Plane((0.0, 0.0, -2.0), offset_m=0.0, gain=-0.6)
-        Traceback (most recent call last):
-        swiftwrf.errors.InputError: the normal of a plane must be a unit vector, got (0.0, 0.0, -2.0) ...
     """
 
     normal: tuple[float, float, float]

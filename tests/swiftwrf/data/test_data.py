@@ -79,7 +79,7 @@ WRONG = {
     "infinite": (_positions("inf,1,1"), "row 11, counted from 0"),
     "text": (_positions("here,1,1"), "row 12 holds text"),
     "short row": (_positions("1,1"), "row 12 has 2 values"),
-    "at the gateway": (_positions("0,0,0"), "equal to the gateway's"),
+    "at the gateway": (_positions("0,0,0"), "position 11 of .* is that of the fixed end"),
     "more positions than images": (_write("tx_pos.csv", "x,y,z\n" + "1,1,1\n" * 13), "12 images, but there are 13"),
     "no images": (lambda f: [p.unlink() for p in (f / "spectrum").iterdir()], "0 images"),
     "a gap in the numbers": (
@@ -163,8 +163,8 @@ def test_the_end_with_more_positions_moves(tmp_path):
     ("changes", "says"),
     [
         ({"gain": None}, "lacks gain"),
-        ({"gain": np.ones(5, np.complex64)}, "gain has shape"),
-        ({"gain": np.full(6, np.nan, np.complex64)}, "not finite"),
+        ({"gain": np.ones(5, np.complex64)}, "gain must have shape"),
+        ({"gain": np.full(6, np.nan, np.complex64)}, "gain must be finite"),
         ({"path_count": np.array([0, 2, 2, 1, 1], np.int32)}, "at least one path"),
         ({"frequency_hz": np.float64(-1)}, "frequency_hz"),
         ({"last_point": np.array([object()] * 6)}, "plain numbers"),
