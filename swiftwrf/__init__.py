@@ -9,9 +9,12 @@ spectrum = model.predict(test.position).mean
 Gaussian Splatting for Efficient Wireless Radiance Field Rendering", 2025.
 """
 
+from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 from swiftwrf.runtime.lazy import import_lazily
+
+__version__ = version("swiftwrf-tasks")
 
 if TYPE_CHECKING:
     from swiftwrf import comparison, datasets

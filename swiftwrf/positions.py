@@ -1,4 +1,4 @@
-"""Positions, the frame they are normalised in, and the distances between them."""
+"""Numbers and positions that a user gives, the frame positions are normalised in, and the distances between them."""
 
 from __future__ import annotations
 
@@ -11,31 +11,91 @@ from torch import Tensor
 
 from swiftwrf.errors import InputError
 
+MAX_COORDINATE_M = 1e9  # of a position: beyond, float64 does not resolve a wavelength
 MAX_COORDINATE = 1e15
 MAX_NORMALISED = 1e6  # normalised: beyond, all is equally far, and float32 must not overflow
 BISECTIONS = 20  # of the edge of cells, which find it to a millionth of the extent
 MIN_TREE_POSITIONS = 2000  # known positions from which on a tree finds the nearest ones faster than all distances do
 
 
-def check_positions(position: Any) -> Tensor:
-    """Return positions (tensor, array or list) as float64 (n, 3) [m].
+def to_tensor(
+    name: str, value: Any, dtype: torch.dtype, shape: tuple[int | None, ...], missing: bool = False
+) -> Tensor:
+    """Return numbers as a tensor on the CPU without gradient. Casts that lose more than digits are refused.
+
+    Args:
+        name: Name of the value, for the message.
+        value: Tensor, array, list or table.
+        dtype: Type of the tensor.
+        shape: Expected shape. None stands for any size.
+        missing: Whether nan is allowed, for a value that is unknown.
 
     Raises:
-        InputError: Another shape, or not finite.
+        InputError: No numbers, another shape, masked values, another kind of number, or a number that is not finite.
+
+    Example:
+        >>> to_tensor("position", [[0, 1, 2]], torch.float64, (None, 3))
+        tensor([[0., 1., 2.]], dtype=torch.float64)
+    """
+    try:
+        if isinstance(value, Tensor):
+            tensor = value.detach().cpu()
+        else:
+            array = np.asarray(value)
+            is_wide = array.dtype.kind == "u" and array.itemsize > 1  # torch does not compute with these
+            tensor = torch.from_numpy(array.astype(np.float64 if is_wide else array.dtype.newbyteorder("=")))
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(f"{name} must be numbers of equal rows, got {type(value).__name__}") from None
+    if tensor.dim() != len(shape) or any(e not in (None, size) for e, size in zip(shape, tensor.shape, strict=True)):
+        expected = ", ".join("n" if size is None else str(size) for size in shape)
+        raise InputError(f"{name} must have shape ({expected}), got {tuple(tensor.shape)}")
+    if np.ma.is_masked(value):
+        raise InputError(f"{name} has masked values, which are no numbers; leave them out or fill them: filled()")
+    if tensor.is_complex() and not dtype.is_complex:
+        raise InputError(f"{name} must be real, got complex numbers; if they are amplitudes, give magnitudes: abs()")
+    if (dtype.is_complex and not tensor.is_complex()) or (tensor.dtype == torch.bool != dtype):
+        raise InputError(f"{name} must be {str(dtype).removeprefix('torch.')} numbers, got {tensor.dtype}")
+    cast = tensor.to(dtype)
+    if not (dtype.is_floating_point or dtype.is_complex) and bool((lost := cast != tensor).any()):
+        expected = "True or False" if dtype == torch.bool else "whole numbers"
+        raise InputError(f"{name} must be {expected}, got {tensor[lost][0].item()}")
+    bad = ~cast.isfinite() & ~(cast.isnan() & missing)
+    if bool(bad.any()):
+        row = int(bad.nonzero()[0, 0]) if shape else 0
+        also = ", or nan where it is unknown" if missing else ""
+        raise InputError(f"{name} must be finite{also}; row {row}, counted from 0, is not")
+    return cast
+
+
+def check_positions(
+    position: Any, name: str = "positions", shape: tuple[int | None, ...] = (None, 3), missing: bool = False
+) -> Tensor:
+    """Return positions (tensor, array or list) as float64 (n, 3) [m], on their device and with their gradient.
+
+    Args:
+        position: Positions, (n, 3) [m].
+        name: Name of the positions, for the message.
+        shape: Expected shape, e.g. (3,) for one position.
+        missing: Whether a position may be unknown, all nan.
+
+    Raises:
+        InputError: Another shape, no real numbers, or a coordinate that is not finite or beyond 1e9 m.
 
     Example:
         >>> check_positions([[0, 1, 2]])
         tensor([[0., 1., 2.]], dtype=torch.float64)
     """
-    try:
-        tensor = position if isinstance(position, Tensor) else torch.from_numpy(np.array(position))
-    except (TypeError, ValueError, RuntimeError):
-        raise InputError(f"positions must be numbers of shape (n, 3), got {type(position).__name__}") from None
-    if tensor.dim() != 2 or tensor.shape[1] != 3:
-        raise InputError(f"positions must have shape (n, 3), got {tuple(tensor.shape)}")
-    if not tensor.isfinite().all():
-        raise InputError("positions must be finite numbers [m]")
-    return tensor.double()
+    checked = to_tensor(name, position, torch.float64, shape, missing)
+    rows = checked.reshape(-1, checked.shape[-1])
+    usable = (rows.abs() <= MAX_COORDINATE_M).all(dim=1) | rows.isnan().all(dim=1)
+    if not bool(usable.all()):
+        row = int((~usable).nonzero()[0])
+        unknown = ", or all nan where it is unknown" if missing else ""
+        raise InputError(
+            f"{name} must be finite numbers [m], at most {MAX_COORDINATE_M:g}{unknown}; row {row}, counted from 0, is "
+            f"{rows[row].tolist()}"
+        )
+    return position.double() if isinstance(position, Tensor) else checked
 
 
 def frame(position: Tensor) -> tuple[Tensor, Tensor]:

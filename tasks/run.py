@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from swiftwrf import InputError
 from swiftwrf.runtime.options import Preset
+from swiftwrf.runtime.threads import to_device
 from tasks.directory import Run
 from tasks.records import Row
 from tasks.terminal import console
@@ -18,13 +18,12 @@ def choose_device(name: str) -> torch.device:
     Raises:
         InputError: There is no GPU, or there are fewer GPUs than processes of torchrun.
     """
-    if name == "cuda" and not torch.cuda.is_available():
-        raise InputError("--device cuda needs an NVIDIA GPU that torch can use, and there is none; use --device cpu")
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
-    if name == "cuda":
+    device = to_device(name)
+    if device.type == "cuda":
         check_gpus()
-    return torch.device(name)
+    return device
 
 
 __all__ = ["Preset", "Row", "Run", "choose_device", "console"]

@@ -11,14 +11,18 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, Le
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from swiftwrf.errors import InputError
+from swiftwrf.runtime.validation import checked
 
 MAX_GRID_PIXELS = 2**24  # of one spectrum
+Size = Annotated[int, Ge(2), Le(MAX_GRID_PIXELS)]
 
 
 @dataclass(frozen=True)
@@ -76,8 +80,13 @@ class AngularGrid:
         return cls(math.radians(rows[0]), math.radians(row_step), len(rows), math.radians(columns[0]), len(columns))
 
     @classmethod
-    def hemisphere(cls, n_elevation: int, n_azimuth: int) -> AngularGrid:
-        """Return the grid of that size whose last row is at elevation 90 degrees, the layout of the NeRF2 spectra."""
+    @checked
+    def hemisphere(cls, n_elevation: Size, n_azimuth: Size) -> AngularGrid:
+        """Return the grid of that size whose last row is at elevation 90 degrees, the layout of the NeRF2 spectra.
+
+        Raises:
+            InputError: A size that is no whole number from 2 on, or too many pixels.
+        """
         step = 90 / n_elevation
         return cls.degrees(
             elevation=[step * (row + 1) for row in range(n_elevation)],
@@ -207,8 +216,11 @@ class ArrayPose:
     orientation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        if not all(math.isfinite(x) for x in (*self.position, *self.orientation)):
-            raise InputError(f"the array's position {self.position} and orientation {self.orientation} must be finite")
+        sizes = len(self.position), len(self.orientation)
+        if sizes != (3, 4) or not all(map(math.isfinite, (*self.position, *self.orientation))):
+            raise InputError(
+                f"the array's position {self.position} and orientation {self.orientation} must be 3 and 4 finite numbers"
+            )
         length = math.hypot(*self.orientation)
         if abs(length - 1) > 1e-3:
             raise InputError(

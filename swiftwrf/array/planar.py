@@ -5,15 +5,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, Gt, Le, Lt
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, folded_to_front, to_angles, to_direction
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.choices import BEAMFORMERS
 from swiftwrf.errors import InputError
+from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.cache import cached_tensors
+from swiftwrf.runtime.validation import PositiveFloat, check_value, checked
 
 LIGHT_SPEED = 299_792_458.0  # [m / s]
 MAX_ELEMENTS = 4096  # of an array: the co-array grows with their square
@@ -21,6 +25,7 @@ MAX_BASIS_VALUES = 2**28  # of the co-array's basis functions on a grid: 2 GiB
 LAG_TOLERANCE_WAVELENGTHS = 1e-6  # closer differences of element positions are one
 OPPOSITE_TOLERANCE_WAVELENGTHS = 1e-2  # between an element and the mirror image of another one
 LINE_TOLERANCE_WAVELENGTHS = 1e-2  # between the elements of a linear array and their line
+Side = Annotated[int, Ge(1), Le(MAX_ELEMENTS)]
 BATCH_SPECTRA, MAX_ELEMENT_PAIRS = 256, 2**24  # in double precision at a time
 
 
@@ -29,11 +34,12 @@ class PlanarArray:
     """Antenna elements in the plane z = 0 of the array's coordinates.
 
     Args:
-        element: Positions of the K elements, float64 (K, 2) [m].
+        element: Positions of the K elements, (K, 2) [m], stored as float64.
         wavelength: Wavelength of the carrier [m].
 
     Raises:
-        InputError: Elements of another shape, none or more than 4096 of them, or a number that is not finite.
+        InputError: Elements of another shape, none or more than 4096 of them, a number that is not finite, or a
+            wavelength that is not above 0.
 
     Example:
         >>> PlanarArray.grid(2, 8, spacing=0.06, frequency_hz=2.4e9)
@@ -44,14 +50,10 @@ class PlanarArray:
     wavelength: float
 
     def __post_init__(self) -> None:
-        shape = tuple(self.element.shape)
-        if len(shape) != 2 or shape[1] != 2 or not 1 <= shape[0] <= MAX_ELEMENTS:
-            raise InputError(f"an array has 1 to {MAX_ELEMENTS} elements at positions (K, 2), got shape {shape}")
-        if not bool(self.element.isfinite().all()) or not 0 < self.wavelength < math.inf:
-            raise InputError(
-                "an array's elements need finite positions [m] and its carrier a wavelength above 0 m, got "
-                f"{self.wavelength}"
-            )
+        object.__setattr__(self, "element", to_tensor("element", self.element, torch.float64, (None, 2)))
+        if not 1 <= len(self.element) <= MAX_ELEMENTS:
+            raise InputError(f"an array has 1 to {MAX_ELEMENTS} elements at positions (K, 2), got {len(self.element)}")
+        check_value("wavelength", self.wavelength, Annotated[float, Gt(0), Lt(math.inf)])
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, PlanarArray) and self._content == other._content
@@ -77,17 +79,30 @@ class PlanarArray:
         return LIGHT_SPEED / self.wavelength
 
     @classmethod
-    def square(cls, side: int, frequency_hz: float, spacing: float | None = None) -> PlanarArray:
-        """Return side x side elements, the first at the origin, `spacing` [m] apart. Defaults to half a wavelength."""
+    @checked
+    def square(cls, side: Side, frequency_hz: PositiveFloat, spacing: PositiveFloat | None = None) -> PlanarArray:
+        """Return side x side elements, the first at the origin, `spacing` [m] apart. Defaults to half a wavelength.
+
+        Raises:
+            InputError: No elements or too many, or a frequency or spacing that is not above 0.
+
+        Example:
+            >>> PlanarArray.square(4, frequency_hz=2.4e9)
+            <PlanarArray: 16 elements at 2.4 GHz>
+        """
         wavelength = LIGHT_SPEED / frequency_hz
         steps = torch.arange(side, dtype=torch.float64) * (spacing or wavelength / 2)
         return cls(torch.cartesian_prod(steps, steps), wavelength)
 
     @classmethod
-    def grid(cls, rows: int, columns: int, spacing: float, frequency_hz: float) -> PlanarArray:
+    @checked
+    def grid(cls, rows: Side, columns: Side, spacing: PositiveFloat, frequency_hz: PositiveFloat) -> PlanarArray:
         """Return rows x columns elements, `spacing` [m] apart and centred on the origin.
 
         Columns ascend along x and rows along y. Element r * columns + c is that of row r and column c.
+
+        Raises:
+            InputError: As `square`.
         """
         y, x = (spacing * (torch.arange(n, dtype=torch.float64) - (n - 1) / 2) for n in (rows, columns))
         return cls(torch.cartesian_prod(y, x).flip(1), LIGHT_SPEED / frequency_hz)

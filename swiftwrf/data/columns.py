@@ -29,6 +29,11 @@ ROLES = {  # names of columns, in lower case with underscores
     "receiver": re.compile("receiver(?:_(?:name|id))?|rx|gateway|ap|bssid|mac|sensor|anchor"),
     "rssi": re.compile("(?:rssi?|rsrp|signal|power)(?:_dbm)?|rss_dbm|dbm"),
 }
+EPOCH_UNITS = (  # of times since 1970 by their size, from the year 1973 on
+    ("milliseconds", 1e3, 1e11, 1e14),
+    ("microseconds", 1e6, 1e14, 1e17),
+    ("nanoseconds", 1e9, 1e17, 1e20),
+)
 GEODETIC = {"x": "longitude", "y": "latitude"}  # that take the place of x and y
 
 
@@ -111,18 +116,28 @@ def parsed(column: pd.Series) -> tuple[Floats, NDArray[np.bool_]]:
     return np.where(empty, np.nan, values), np.isnan(values) & ~empty
 
 
-def seconds(column: pd.Series) -> Floats:
-    """Return times [s] since the first cell, of numbers [s] or dates; nan where a cell is neither.
+def seconds(column: pd.Series) -> tuple[Floats, list[str]]:
+    """Return times [s] since the first cell, nan where a cell is no time, and a note on their unit.
+
+    Cells are dates or numbers [s]. Numbers as large as milliseconds, microseconds or nanoseconds since 1970 are these.
 
     Example:
         >>> seconds(pd.Series(["2024-01-01 10:00:00", "2024-01-01 10:01:00", "noon"]))
-        array([ 0., 60., nan])
+        (array([ 0., 60., nan]), [])
+        >>> seconds(pd.Series([1_700_000_000_000, 1_700_000_000_500], name="time"))
+        (array([0. , 0.5]), ['column time counts milliseconds since 1970, which are converted to seconds'])
     """
+    notes = []
     values = np.full(len(column), np.nan) if column.dtype.kind == "M" else parsed(column)[0]
     if np.isnan(values).all():
         date = pd.to_datetime(column, errors="coerce", utc=True, format="mixed")
         values = (date - date.min()).dt.total_seconds().to_numpy(np.float64)
-    return values - values[0] if len(values) and np.isfinite(values[0]) else values
+    size = np.nanmedian(values) if np.isfinite(values).any() else 0.0
+    for unit, factor, low, high in EPOCH_UNITS:
+        if low <= size < high:
+            values = values / factor
+            notes.append(f"column {column.name} counts {unit} since 1970, which are converted to seconds")
+    return values - values[0] if len(values) and np.isfinite(values[0]) else values, notes
 
 
 def is_rssi(column: pd.Series) -> bool:

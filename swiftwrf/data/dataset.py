@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -16,9 +16,13 @@ from swiftwrf.data.labelled import Labelled, Variable, position_coordinates
 from swiftwrf.data.splits import choose_split
 from swiftwrf.errors import InputError
 from swiftwrf.plotting import Displayed, extent
+from swiftwrf.positions import check_positions, to_tensor
+from swiftwrf.runtime.validation import NonNegativeInt, checked
 
 Numbers = Any  # a tensor, array, list or table of numbers
+Rows = Any  # numbers of rows (tensor, array or list), a mask, or a slice
 Data = TypeVar("Data", bound="PositionedData")
+ROTATION_TOLERANCE = 1e-3  # of the products of its columns, from rounding
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -76,19 +80,50 @@ class PositionedData(Labelled, Displayed):
     def __len__(self) -> int:
         return len(self._position)
 
-    def subset(self: Data, rows: Tensor) -> Data:
+    def subset(self: Data, rows: Rows) -> Data:
         """Return the given rows in the given order, without the splits that are named for the whole set.
 
+        `data[rows]` is the same.
+
         Args:
-            rows: Row numbers, int64, or a mask, bool (n,).
+            rows: Row numbers (tensor, array or list), a mask, bool (n,), or a slice. -1 is the last row.
+
+        Raises:
+            InputError: A row that does not exist, or a mask of another length.
+
+        Example:
+            >>> import swiftwrf
+            >>> data = swiftwrf.rssi_room(n=30)
+            >>> len(data[:10]), data.subset([4, -1]).index.tolist()
+            (10, [4, 29])
         """
+        try:
+            found = np.arange(len(self))[rows.cpu().numpy() if isinstance(rows, Tensor) else rows]
+        except (IndexError, TypeError, ValueError):
+            found = None
+        if found is None or found.ndim != 1:
+            raise InputError(
+                f"rows of {self.name} must be a list of numbers below {len(self)}, a mask of that length or a slice, "
+                f"got {rows!r}"
+            )
+        number = torch.from_numpy(found.copy())
         values = {field: getattr(self, field) for field in self.row_fields}
         kept: dict[str, Any] = {
-            f: v[rows] if isinstance(v, Tensor) else v.subset(rows) for f, v in values.items() if v is not None
+            f: v[number] if isinstance(v, Tensor) else v.subset(number) for f, v in values.items() if v is not None
         }
-        return replace(self, **kept, named_splits={})
+        return self.derived(**kept, named_splits={})
 
-    def split(self: Data, name: str = "random", seed: int = 0) -> tuple[Data, Data]:
+    __getitem__ = subset
+
+    def derived(self: Data, **fields: Any) -> Data:
+        """Return a copy with other values of some fields, which follow from checked ones and are not checked again."""
+        found: Data = object.__new__(type(self))
+        for field, value in (vars(self) | fields).items():
+            object.__setattr__(found, field, value)
+        return found
+
+    @checked
+    def split(self: Data, name: str = "random", seed: NonNegativeInt = 0) -> tuple[Data, Data]:
         """Return the training and the test part.
 
         Args:
@@ -96,7 +131,7 @@ class PositionedData(Labelled, Displayed):
             seed: Seed of the random and of the block split.
 
         Raises:
-            InputError: An unknown name, or fewer than 10 training rows.
+            InputError: An unknown name, another seed than a whole number, or fewer than 10 training rows.
         """
         train, test = choose_split(name, seed, self._position, self.named_splits, self.name)
         return self.subset(train), self.subset(test)
@@ -136,38 +171,22 @@ class PositionedData(Labelled, Displayed):
         raise NotImplementedError
 
 
-def to_tensor(name: str, value: Numbers, dtype: torch.dtype, shape: tuple[int | None, ...]) -> Tensor:
-    """Return finite numbers as a tensor on the CPU.
-
-    Args:
-        name: Name of the value, for the message.
-        value: Tensor, array, list or table.
-        dtype: Type of the tensor.
-        shape: Expected shape. None stands for any size.
-
-    Raises:
-        InputError: No numbers, another shape, or a number that is not finite.
-
-    Example:
-        >>> to_tensor("position", [[0, 1, 2]], torch.float64, (None, 3))
-        tensor([[0., 1., 2.]], dtype=torch.float64)
-    """
-    try:
-        tensor = value.detach().cpu() if isinstance(value, Tensor) else torch.from_numpy(np.array(value))
-    except (TypeError, ValueError, RuntimeError):
-        raise InputError(f"{name} must be numbers of equal rows, got {type(value).__name__}") from None
-    if tensor.dim() != len(shape) or any(e not in (None, size) for e, size in zip(shape, tensor.shape, strict=True)):
-        expected = ", ".join("n" if size is None else str(size) for size in shape)
-        raise InputError(f"{name} must have shape ({expected}), got {tuple(tensor.shape)}")
-    if not bool(tensor.isfinite().all()):
-        raise InputError(f"{name} must be finite; row {int((~tensor.isfinite()).nonzero()[0, 0])} is not")
-    return tensor.to(dtype)
+def to_positions(name: str, value: Numbers, shape: tuple[int | None, ...] = (None, 3), missing: bool = False) -> Tensor:
+    """Return positions as `check_positions`, on the CPU and without gradient."""
+    return check_positions(value, name, shape, missing).detach().cpu()
 
 
-def to_positions(name: str, value: Numbers) -> Tensor:
-    """Return positions as float64 (n, 3) [m].
+def to_rotation(value: Numbers) -> Tensor:
+    """Return a matrix that rotates array into world coordinates as float64 (3, 3).
 
     Raises:
-        InputError: As `to_tensor`.
+        InputError: As `to_tensor`, or columns that are no right-handed set of unit vectors at right angles.
     """
-    return to_tensor(name, value, torch.float64, (None, 3))
+    rotation = to_tensor("rotation", value, torch.float64, (3, 3))
+    error = float((rotation.T @ rotation - torch.eye(3)).abs().max())
+    if error > ROTATION_TOLERANCE or float(rotation.det()) < 0:
+        raise InputError(
+            "rotation must be a rotation matrix (orthonormal, determinant 1), got "
+            f"{rotation.tolist()}; a pose=ArrayPose(position, quaternion) gives one"
+        )
+    return rotation

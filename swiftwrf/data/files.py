@@ -20,9 +20,9 @@ from torch import Tensor
 
 from swiftwrf.choices import CARRIERS_HZ
 from swiftwrf.errors import InputError
+from swiftwrf.positions import check_positions
 
 MAX_TEXT_BYTES = 2**28  # a million rows of positions take a tenth of it
-MAX_COORDINATE_M = 1e9  # beyond, float64 does not resolve a wavelength
 MAX_PREAMBLE_LINES = 20  # before the header of a table
 DECIMAL_COMMA = re.compile(r"^(\s*[+-]?\d+),(\d+\s*)$")
 PLAIN_TAGS = {
@@ -232,14 +232,7 @@ def read_positions(file: Path) -> Tensor:
         InputError: As `read_table`, or a coordinate that is not finite or beyond 1e9 m.
     """
     _, position = read_table(file, ["x", "y", "z"])
-    bad = (~(position.abs() <= MAX_COORDINATE_M)).any(dim=1).nonzero()  # nan compares false, so it is bad too
-    if len(bad):
-        row = int(bad[0])
-        raise InputError(
-            f"{file} row {row + 1} is {position[row].tolist()}; positions must be finite numbers [m], at most "
-            f"{MAX_COORDINATE_M:g}"
-        )
-    return position
+    return check_positions(position, f"positions of {file}")
 
 
 def check_carrier(file: Path, frequency_hz: float) -> None:

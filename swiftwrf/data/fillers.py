@@ -100,23 +100,19 @@ def without_fillers(rssi: Floats, fillers: list[float]) -> tuple[Floats, list[st
     return np.where(filled, np.nan, rssi), notes
 
 
-def check_powers(
-    label: object, rssi: Floats, receivers: Sequence[str], fillers: list[float], source: NDArray[np.int64]
-) -> None:
-    """Refuse RSSI (n, R) that is neither received power nor filler.
+def check_powers(label: object, rssi: Floats, receivers: Sequence[str], source: NDArray[np.int64]) -> None:
+    """Refuse RSSI (n, R) that is no received power.
 
     Args:
         label: Name of the table, for messages.
-        rssi: Values, (n, R) [dBm].
+        rssi: Values, (n, R) [dBm], nan where not detected.
         receivers: R names.
-        fillers: Values that stand for not detected.
         source: Row of each value in the table, counted from 0, (n, R) or (n, 1).
 
     Raises:
         InputError: The first such value, with its row and receiver.
     """
-    allowed = np.isnan(rssi) | np.isneginf(rssi) | np.isin(rssi, fillers)
-    bad = ~((rssi >= MIN_RSSI_DBM) & (rssi <= MAX_RSSI_DBM)) & ~allowed
+    bad = (rssi < MIN_RSSI_DBM) | (rssi > MAX_RSSI_DBM)
     if not bad.any():
         return
     rows = np.broadcast_to(source, rssi.shape)
@@ -124,5 +120,5 @@ def check_powers(
     value = rssi[row, column]
     raise InputError(
         f"{label} row {rows[row, column] + 1}, receiver {receivers[column]}: {value:g} dBm is no received power; expected "
-        f"{MIN_RSSI_DBM:g} to {MAX_RSSI_DBM:g}; if it stands for not detected, give --filler {value:g}"
+        f"{MIN_RSSI_DBM:g} to {MAX_RSSI_DBM:g}; if it stands for not detected, give nan or --filler {value:g}"
     )

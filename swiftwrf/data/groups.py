@@ -84,7 +84,7 @@ class Offsets:
 
     def removed(self, data: Rssi) -> Rssi:
         """Return the data as the reference group would have measured them."""
-        return replace(data, rssi_dbm=data.rssi_dbm - self.of(data)[:, None], offsets=self)
+        return data.derived(rssi_dbm=data.rssi_dbm - self.of(data)[:, None], offsets=self)
 
     def note(self) -> str:
         """Return a sentence with all offsets."""

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from swiftwrf.data.columns import GEODETIC, column_of, column_of_numbers
 from swiftwrf.data.coordinates import GeodeticOrigin
-from swiftwrf.data.files import MAX_COORDINATE_M
 from swiftwrf.data.survey import read_frame
 from swiftwrf.errors import InputError, listed
+from swiftwrf.positions import check_positions
 
 MAX_FROM_ORIGIN_DEG = 2.0  # of receivers in degrees
 
@@ -41,9 +41,7 @@ def read_receivers(file: Path, names: list[str], origin: GeodeticOrigin | None =
     position = _positions(file, table, origin, "receiver,x,y,z")
     given = np.flatnonzero(~np.isnan(position[:, :2]).all(axis=1))
     position, listed_names = position[given], [listed_names[row] for row in given]
-    if not (np.abs(position) <= MAX_COORDINATE_M).all():
-        raise InputError(f"{file} needs 3 finite numbers [m], at most {MAX_COORDINATE_M:g}, for each receiver")
-    place = dict(zip(listed_names, position.tolist(), strict=True))
+    place = dict(zip(listed_names, check_positions(position, f"positions of {file}").tolist(), strict=True))
     unknown = [name for name in names if name not in place]
     if len(unknown) == len(names):
         raise InputError(f"{file} has none of the receivers ({listed(names)}); there are {listed(listed_names)}")
@@ -61,10 +59,7 @@ def read_places(file: Path, origin: GeodeticOrigin | None = None) -> Tensor:
     Raises:
         InputError: A column that is missing, or a position that is not usable.
     """
-    position = _positions(file, read_frame(file), origin, "x,y,z")
-    if not (np.abs(position) <= MAX_COORDINATE_M).all():
-        raise InputError(f"{file} needs 3 finite numbers [m], at most {MAX_COORDINATE_M:g}, for each position")
-    return torch.from_numpy(position)
+    return check_positions(_positions(file, read_frame(file), origin, "x,y,z"), f"positions of {file}")
 
 
 def _positions(file: Path, table: pd.DataFrame, origin: GeodeticOrigin | None, header: str) -> NDArray[np.float64]:

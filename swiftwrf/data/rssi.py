@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
 
 from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin
 from swiftwrf.data.dataset import Numbers, PositionedData, to_positions
+from swiftwrf.data.fillers import check_powers
 from swiftwrf.data.floors import Floors
 from swiftwrf.data.groups import Groups, Offsets, numbered
 from swiftwrf.data.labelled import Variable, position_coordinates, receiver_coordinates
@@ -21,7 +22,8 @@ from swiftwrf.data.splits import MIN_TRAINING, Validation, random_split, validat
 from swiftwrf.data.survey import SurveyOptions, read_survey
 from swiftwrf.errors import InputError, listed
 from swiftwrf.plotting import MARK, plan
-from swiftwrf.runtime.validation import checked
+from swiftwrf.positions import to_tensor
+from swiftwrf.runtime.validation import NonNegativeInt, checked
 
 META = "meta.csv"  # file of the NeRF2 layout with a row for each measurement
 SURVEY = "survey.yml"  # file of the toolkit's own layout with properties of all measurements
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     import matplotlib.axes
 
 UNKNOWN = (float("nan"),) * 3  # position of a receiver
+NO_NAME = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")  # line breaks, controls, halves of characters
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -53,7 +56,7 @@ class Rssi(PositionedData):
         details: index, named_splits, source and notes of `PositionedData`.
 
     Raises:
-        InputError: A length that does not match, or an infinite number.
+        InputError: A length that does not match, a name that is no text, or a value that is no RSSI or position.
 
     Example:
         >>> data = Rssi([[-60.0, float("nan")]] * 20, torch.rand(20, 3), receiver_names=["hall", "office"])
@@ -97,31 +100,25 @@ class Rssi(PositionedData):
         **details: Any,
     ) -> None:
         position = to_positions("transmitter_position", transmitter_position)
-        rssi = rssi_dbm if isinstance(rssi_dbm, Tensor) else torch.from_numpy(np.array(rssi_dbm, dtype=np.float64))
-        if rssi.dim() != 2:
-            raise InputError(f"rssi_dbm must have shape (n, receivers), got {tuple(rssi.shape)}")
-        if bool(rssi.isinf().any()):
-            raise InputError(f"{name}: RSSI must be finite [dBm], or nan where a receiver detected nothing")
+        rssi = to_tensor("rssi_dbm", rssi_dbm, torch.float64, (None, None), missing=True)
         count = rssi.shape[1]
-        names = tuple(receiver_names or (f"receiver{number}" for number in range(1, count + 1)))
+        default = (f"receiver{number}" for number in range(1, count + 1))
+        names = tuple(default if receiver_names is None else receiver_names)
+        if isinstance(receiver_names, str) or not all(map(_is_name, names)):
+            raise InputError(
+                f"{name}: receiver_names must be a list of texts, none empty or with line breaks, got {receiver_names!r}"
+            )
         if len(names) != count or len(set(names)) < count:
             raise InputError(
                 f"{name} has {count} receivers, but the names {listed(names)}; give each receiver one of its own"
             )
-        places = torch.full((count, 3), torch.nan, dtype=torch.float64)
-        if receiver_position is not None:
-            places = torch.as_tensor(receiver_position, dtype=torch.float64)
-        if places.shape != (count, 3) or not bool((places.isfinite().all(dim=1) | places.isnan().all(dim=1)).all()):
-            raise InputError(
-                f"receiver_position must hold ({count}, 3) numbers [m], for each receiver finite ones or nan, got shape "
-                f"{tuple(places.shape)}"
-            )
+        places = torch.full((count, 3), torch.nan) if receiver_position is None else receiver_position
         super().__init__(
             name,
             **details,
-            rssi_dbm=rssi.double(),
+            rssi_dbm=rssi,
             transmitter_position=position,
-            receiver_position=places,
+            receiver_position=to_positions("receiver_position", places, (count, 3), missing=True),
             receiver_names=names,
             origin=origin,
             groups=groups,
@@ -130,8 +127,9 @@ class Rssi(PositionedData):
             floors=floors,
             receiver_moves=receiver_moves,
             session=None if session is None else numbered(session),
-            time=None if time is None else torch.as_tensor(time, dtype=torch.float64),
+            time=None if time is None else to_tensor("time", time, torch.float64, (None,), missing=True),
         )
+        check_powers(name, rssi.numpy(), names, self.index.numpy()[:, None])
 
     @classmethod
     def from_frame(
@@ -224,7 +222,8 @@ class Rssi(PositionedData):
         position = moved(self.transmitter_position)
         return replace(self, transmitter_position=position, receiver_position=places, origin=origin)
 
-    def split(self, name: str = "random", seed: int = 0) -> tuple[Rssi, Rssi]:
+    @checked
+    def split(self, name: str = "random", seed: NonNegativeInt = 0) -> tuple[Rssi, Rssi]:
         """Return the training and the test part.
 
         Args:
@@ -361,3 +360,7 @@ class Rssi(PositionedData):
     def _summary(self) -> str:
         share = float(self.detected.double().mean()) if len(self) else 0.0
         return f"{len(self)} rows at {len(self.receiver_names)} receivers, {share:.0%} detected"
+
+
+def _is_name(name: object) -> bool:
+    return isinstance(name, str) and bool(name.strip()) and not NO_NAME.search(name)

@@ -6,16 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, ArrayPose
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.dataset import Numbers, PositionedData, to_positions, to_tensor
+from swiftwrf.data.dataset import Numbers, PositionedData, to_positions, to_rotation
 from swiftwrf.data.labelled import Variable
 from swiftwrf.data.spectra import GRID, Spectra, array_spectra, check_pixels
 from swiftwrf.errors import InputError, ranges
+from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.validation import checked
 
 NULL_TOLERANCE = 1e-3  # relative difference between values of a null subcarrier
@@ -78,18 +80,18 @@ class Snapshots(PositionedData):
         if fixed_position is None or rotation is None:
             raise InputError(f"{name} needs the pose of the array: pose=ArrayPose(position, orientation)")
         position = to_positions("position", position)
-        channel = torch.as_tensor(channel)
         shape = (len(position), None, len(array.element))
-        channel = to_tensor("channel", channel[:, None] if channel.dim() == 2 else channel, torch.complex64, shape)
+        several = np.ndim(channel) == 3
+        channel = to_tensor("channel", channel, torch.complex64, shape if several else shape[::2])
         free = torch.ones(len(position)) if line_of_sight is None else line_of_sight
         super().__init__(
             name,
             **details,
-            channel=channel,
+            channel=channel if several else channel[:, None],
             position=position,
             array=array,
-            fixed_position=to_tensor("fixed_position", fixed_position, torch.float64, (3,)),
-            rotation=to_tensor("rotation", rotation, torch.float64, (3, 3)),
+            fixed_position=to_positions("fixed_position", fixed_position, (3,)),
+            rotation=to_rotation(rotation),
             line_of_sight=to_tensor("line_of_sight", free, torch.bool, (None,)),
             time=None if time is None else to_tensor("time", time, torch.float64, (None,)),
         )

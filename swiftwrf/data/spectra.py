@@ -17,13 +17,14 @@ from swiftwrf.array.angles import AngularGrid, ArrayPose, to_angles
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray, folded_angles
 from swiftwrf.choices import Moving
-from swiftwrf.data.dataset import Numbers, PositionedData, to_positions, to_tensor
+from swiftwrf.data.dataset import Numbers, PositionedData, to_positions, to_rotation
 from swiftwrf.data.labelled import Variable
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.data.store import BATCH_PIXELS, MAX_MEMORY_PIXELS, Store, stored, too_many
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
 from swiftwrf.plotting import mark_direction, polar_spectrum
+from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.validation import checked
 
 if TYPE_CHECKING:
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
 DIRECTION = ("elevation", "azimuth")  # names of the dimensions of a spectrum
 MAGNITUDE_TOLERANCE = 1e-6  # beyond [0, 1], from rounding
+MAX_LABEL = (
+    torch.tensor([math.tau, math.pi / 2], dtype=torch.float64) + 1e-6
+)  # azimuth and elevation [rad], with rounding
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -113,19 +117,24 @@ class Spectra(PositionedData):
             rotation = pose.rotation
             fixed_position = pose.position if moving == "transmitter" else fixed_position
         if fixed_position is not None:
-            fixed_position = to_tensor("fixed_position", fixed_position, torch.float64, (3,))
+            fixed_position = to_positions("fixed_position", fixed_position, (3,))
         if rotation is not None:
-            rotation = to_tensor("rotation", rotation, torch.float64, (3, 3))
+            rotation = to_rotation(rotation)
         if label is not None:
-            label = torch.as_tensor(label, dtype=torch.float64)
+            label = to_tensor("label", label, torch.float64, (None, 2), missing=True)
+            if bool((bad := (label.abs() > MAX_LABEL).any(dim=1)).any()):
+                raise InputError(
+                    "label must be azimuth up to 2 pi and elevation up to pi / 2 [rad], got "
+                    f"{label[bad][0].tolist()}; convert degrees by deg2rad"
+                )
         elif fixed_position is not None and rotation is not None:
             if bool((same := (position == fixed_position).all(dim=1)).any()):
-                raise InputError(f"position {int(same.nonzero()[0])} is that of the fixed end, so it has no direction")
+                raise InputError(
+                    f"position {int(same.nonzero()[0])} of {name} is that of the fixed end, so it has no direction"
+                )
             label = direction_of_link(position, fixed_position, rotation, moving, array)
         else:
             label = torch.full((len(position), 2), torch.nan, dtype=torch.float64)
-        if label.dim() != 2 or label.shape[1] != 2:
-            raise InputError(f"label must have shape ({len(position)}, 2), got {tuple(label.shape)}")
         free = torch.ones(len(position)) if line_of_sight is None else line_of_sight
         super().__init__(
             name,
@@ -316,11 +325,12 @@ def coarsening(shape: Sequence[int], max_azimuths: int, least_rows: int = 1) -> 
     return next((factor for factor in factors if all(size % factor == 0 for size in shape)), 1)
 
 
+@checked
 def check_training(train: Spectra) -> None:
     """Refuse spectra that no model can be fitted to.
 
     Raises:
-        InputError: Fewer than 10 spectra, or a spectrum that is not finite.
+        InputError: No spectra, fewer than 10 spectra, or a spectrum that is not finite.
     """
     if len(train) < MIN_TRAINING:
         raise InputError(f"a fit needs at least {MIN_TRAINING} spectra, got {len(train)}")

@@ -22,11 +22,12 @@ from torch import Tensor
 
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES
-from swiftwrf.data.files import MAX_COORDINATE_M, check_carrier, digests, read_text
+from swiftwrf.data.files import check_carrier, digests, read_text
 from swiftwrf.data.formats.base import Format, ReadOptions
 from swiftwrf.data.snapshots import Snapshots, check_spacing, round_trip_array, without_null
 from swiftwrf.data.tfrecords import records
 from swiftwrf.errors import InputError
+from swiftwrf.positions import MAX_COORDINATE_M
 
 SUFFIX = ".tfrecords"
 SUBCARRIERS = 64  # kept of each measurement, evenly spaced: more do not improve directions

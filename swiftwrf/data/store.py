@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from swiftwrf.errors import InputError
-from swiftwrf.runtime.durable import cache_folder, replacing
+from swiftwrf.runtime.durable import cache_folder, refusing_unwritable, replacing
 from swiftwrf.runtime.progress import progress_bar
 
 MIN_FILE_SPECTRA = 20_000  # from which on spectra are stored in a file
@@ -152,15 +152,10 @@ def stored(
     owner = hashlib.sha256(f"{key()} {shape} {dtype}".encode()).hexdigest()
     file = cache_folder() / f"spectra-{owner}.npy"
     if (found := _mapped(file, shape, dtype)) is None:
-        try:
+        with refusing_unwritable(file.parent):
             file.parent.mkdir(parents=True, exist_ok=True)
             _prune(file.parent)
             _write(file, shape, dtype, make)
-        except OSError as error:
-            raise InputError(
-                f"{shape[0]} spectra are kept in {file.parent}, which cannot be written ({error.strerror}); set "
-                "XDG_CACHE_HOME to another directory"
-            ) from None
         found = _mapped(file, shape, dtype)
     assert found is not None
     return Store(found)

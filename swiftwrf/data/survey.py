@@ -28,11 +28,12 @@ from swiftwrf.data.columns import (
 )
 from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin, degrees_in, without_fix
 from swiftwrf.data.ends import as_receivers, transmitter_columns
-from swiftwrf.data.files import MAX_COORDINATE_M, cells_of, lines_before_header, read_cells
+from swiftwrf.data.files import cells_of, lines_before_header, read_cells
 from swiftwrf.data.fillers import check_powers, find_fillers, without_fillers
 from swiftwrf.data.floors import STOREY_M, Floors, floors_of, height_of_floors
 from swiftwrf.data.pooling import pool_names, pooled
 from swiftwrf.errors import InputError, listed
+from swiftwrf.positions import check_positions
 
 Floats = NDArray[np.float64]
 SUFFIXES = (".csv", ".parquet")
@@ -151,8 +152,8 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
     if unused:
         notes.append(f"columns that are not used: {listed(unused)}")
     fillers = find_fillers(rssi) if options.filler is None else list(options.filler)
-    check_powers(label, rssi, names, fillers, source)
     rssi, found = without_fillers(rssi, fillers)
+    check_powers(label, rssi, names, source)
     if options.pool_by is not None:
         n_radios, pools = len(names), _pools(label, table, roles, names, options.pool_by)
         names, rssi = pooled(rssi, pools)
@@ -164,6 +165,7 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
     if omitted.all():
         raise InputError(f"{label} has no row with a position; {missing[0]}")
     row = np.flatnonzero(~omitted)
+    check_positions(coordinate[row].reshape(-1, 3), f"positions of {label}")
     position, origin = _in_metres(label, roles, coordinate[row].reshape(-1, 3), options.coordinates)
     position = position.reshape(len(row), -1)
     floors = None
@@ -187,7 +189,8 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
     origins = source.max(axis=1)[row]  # row of the table that each row is of
     groups = group.to_numpy()[origins].tolist() if options.offset_by else []
     sessions = None if session is None else session.to_numpy()[origins].tolist()
-    time = seconds(table[roles["time"]].iloc[origins]) if "time" in roles else None
+    time, found = seconds(table[roles["time"]].iloc[origins]) if "time" in roles else (None, [])
+    notes += found
     labels = tuple(name for name in (*unused, roles.get("session")) if name and _distinguishes(table[name]))
     if labels and not options.offset_by:
         notes.append(f"rows differ in {listed(labels)}; tasks.inspect tests whether its values have constant offsets")
@@ -255,15 +258,7 @@ def _coordinates(label: object, table: pd.DataFrame, roles: dict[str, str]) -> t
     else:
         z = np.zeros(len(table))
         notes.append("there is no height, so z is 0 m everywhere")
-    coordinate = np.stack([x, y, z], axis=1)
-    bad = np.argwhere(np.abs(coordinate) > MAX_COORDINATE_M)
-    if len(bad):
-        row, axis = bad[0]
-        raise InputError(
-            f"{label} row {row + 1} has no usable {'xyz'[axis]} ({coordinate[row, axis]:g}); positions must be finite "
-            f"numbers [m], at most {MAX_COORDINATE_M:g}"
-        )
-    return coordinate, notes
+    return np.stack([x, y, z], axis=1), notes
 
 
 def _in_metres(

@@ -16,7 +16,7 @@ import pandas as pd
 from swiftwrf.data import Rssi, Spectra, load_rssi, load_spectra
 from swiftwrf.datasets.sources import DATA_SETS, DataSet
 from swiftwrf.errors import InputError
-from swiftwrf.runtime.durable import cache_folder, rename, write_text
+from swiftwrf.runtime.durable import cache_folder, refusing_unwritable, rename, write_text
 
 FOLDER = "SWIFTWRF_DATA"  # environment variable with a folder of converted data sets
 PAGE = "README.md"
@@ -43,7 +43,8 @@ def fetch(name: str) -> Path:
         name: Name in `catalogue()`.
 
     Raises:
-        InputError: An unknown name, pooch is not installed, or a file that cannot be downloaded or has another checksum.
+        InputError: An unknown name, pooch is not installed, a file that cannot be downloaded or has another checksum, or
+            a cache that cannot be written.
 
     Example:
         >>> fetch("nowhere")
@@ -57,7 +58,8 @@ def fetch(name: str) -> Path:
         return Path(given) / name
     folder = cache_folder() / "datasets" / name
     if not folder.is_dir():
-        _convert(name, DATA_SETS[name], folder)
+        with refusing_unwritable(folder.parent):
+            _convert(name, DATA_SETS[name], folder)
     return folder
 
 
@@ -98,6 +100,8 @@ def _download(name: str, data: DataSet) -> Path:
         try:
             source.fetch(file)
         except (OSError, ValueError) as error:  # no connection or no such file; another checksum
+            if getattr(error, "errno", None) is not None:  # of the cache: those of requests have no number
+                raise
             reason = "its checksum differs" if isinstance(error, ValueError) else "it cannot be downloaded"
             raise InputError(
                 f"data set {name}: {reason}: {source.get_url(file)}; put the file at {folder / file}"

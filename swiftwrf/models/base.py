@@ -25,7 +25,7 @@ from swiftwrf.positions import check_positions
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.options import Configured, Preset, all_or_nothing, from_plain
 from swiftwrf.runtime.session import Record
-from swiftwrf.runtime.threads import single_thread
+from swiftwrf.runtime.threads import single_thread, to_device
 from swiftwrf.runtime.validation import NonNegativeInt, checked, configuration
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ class FieldModel(Configured, Saved, Displayed):
                 checkpoint of another fit or in a folder that does not exist.
             FitError: The loss diverged.
         """
-        context = FitContext(like, torch.device(device), checkpoint, on_record, progress)
+        context = FitContext(like, to_device(device), checkpoint, on_record, progress)
         check_training(train)
         self._check_described(train)
         if like is not None and not self.accepts_like(like):
@@ -244,6 +244,7 @@ class FieldModel(Configured, Saved, Displayed):
             )[0]
 
     @single_thread()
+    @checked
     def update(self, new: Spectra) -> Self:
         """Return the model with more training spectra, by an update of its factorisation. This model stays as it is.
 

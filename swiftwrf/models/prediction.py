@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import pandas as pd
+from annotated_types import Gt, Lt
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -16,6 +17,7 @@ from swiftwrf.data.labelled import Labelled, Variable, position_coordinates, rec
 from swiftwrf.data.spectra import DIRECTION, direction_coordinates
 from swiftwrf.errors import InputError
 from swiftwrf.plotting import Displayed, plan, polar_spectrum
+from swiftwrf.runtime.validation import checked
 
 if TYPE_CHECKING:
     import matplotlib.axes
@@ -84,7 +86,8 @@ class Prediction(Labelled, Displayed):
 
         return {"shape": f"{tuple(self.mean.shape)}", "mean": span(self.mean), "std": span(self.std)}
 
-    def interval(self, level: float = 0.8) -> tuple[Tensor, Tensor]:
+    @checked
+    def interval(self, level: Annotated[float, Gt(0), Lt(1)] = 0.8) -> tuple[Tensor, Tensor]:
         """Return the lower and upper end of the central interval that contains a measurement with probability `level`.
 
         Intervals of spectra are clipped to [0, 1], the range of magnitudes.
@@ -94,9 +97,7 @@ class Prediction(Labelled, Displayed):
         """
         if self.std is None:
             raise InputError("this model predicts no standard deviation, so there is no interval")
-        if not 0 < level < 1:
-            raise InputError(f"level must be between 0 and 1, got {level}")
-        half = NormalDist().inv_cdf((1 + level) / 2) * self.std
+        half = -NormalDist().inv_cdf((1 - level) / 2) * self.std  # finite for every level below 1
         low, high = self.mean - half, self.mean + half
         return (low, high) if self.grid is None else (low.clamp_min(0), high.clamp_max(1))
 

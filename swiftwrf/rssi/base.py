@@ -30,7 +30,8 @@ from swiftwrf.rssi.floors import FloorAttenuation, estimate_floor_attenuation, r
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.options import Configured, all_or_nothing, from_plain
 from swiftwrf.runtime.session import Record
-from swiftwrf.runtime.threads import parallel_map
+from swiftwrf.runtime.threads import parallel_map, to_device
+from swiftwrf.runtime.validation import checked
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 ITEMS_PER_THREAD = 4  # between two results that are kept: starting threads costs milliseconds
@@ -158,11 +159,11 @@ class RssiPredictor(Configured, Displayed, ABC):
             self.attenuation = estimate_floor_attenuation(train, pool)
             pool = replace(self.attenuation, receiver_floor=tuple(receiver_floors(pool).tolist())).removed(pool)
             train = self.attenuation.removed(train)
-        where = torch.device(device)
-        context = RssiFitContext(None, where, checkpoint, on_record, progress, pool=pool, parallel=parallel)
+        context = RssiFitContext(None, to_device(device), checkpoint, on_record, progress, pool=pool, parallel=parallel)
         self._fit(train, context)
         return self
 
+    @checked
     def update(self, new: Rssi) -> Self:
         """Return the predictor with more training rows, by an update of its factorisation. This one stays as it is.
 
@@ -306,11 +307,12 @@ class SavedRssiPredictor(RssiPredictor, Saved):
         return predictor
 
 
+@checked
 def check_training(train: Rssi, pool: Rssi) -> None:
     """Refuse data that nothing can be fitted to.
 
     Raises:
-        InputError: Fewer than 10 measurements in all, or a pool of other rows.
+        InputError: No RSSI, fewer than 10 measurements in all, or a pool of other rows.
     """
     detected = int(train.detected.sum())
     if detected < MIN_TRAINING:

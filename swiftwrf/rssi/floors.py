@@ -9,7 +9,7 @@ linear in the number of floors.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Self
 
 import torch
@@ -63,7 +63,7 @@ class FloorAttenuation:
 
     def removed(self, data: Rssi) -> Rssi:
         """Return the data as if all links were within a floor."""
-        return replace(data, rssi_dbm=data.rssi_dbm - self.of(data.transmitter_position))
+        return data.derived(rssi_dbm=data.rssi_dbm - self.of(data.transmitter_position))
 
 
 def estimate_floor_attenuation(train: Rssi, pool: Rssi | None = None) -> FloorAttenuation:

@@ -139,7 +139,7 @@ def load(path: str | Path) -> Saved:
         ...     swiftwrf.load(folder + "/model.safetensors")
         NearestModel(fitted, 30 x 120 directions)
     """
-    with suppress(OSError, SafetensorError), safe_open(path, framework="pt") as file:
+    with suppress(OSError, SafetensorError, TypeError), safe_open(path, framework="pt") as file:
         if (file.metadata() or {}).get("kind") not in Saved.kinds:
             _import_kinds()
     return restore(path, *Saved.kinds)[0]

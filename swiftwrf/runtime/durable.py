@@ -13,13 +13,33 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from swiftwrf.errors import InputError
+
 # directories without read permission, directories on Windows, network file systems that cannot fsync a directory
 UNSUPPORTED = {errno.EACCES, errno.EPERM, errno.EINVAL, errno.ENOTSUP}
 
 
 def cache_folder() -> Path:
-    """Return the folder of files that can be recomputed: `$XDG_CACHE_HOME/swiftwrf`, or `~/.cache/swiftwrf`."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "swiftwrf"
+    """Return the folder of files that can be recomputed: `$XDG_CACHE_HOME/swiftwrf`, or `~/.cache/swiftwrf`.
+
+    Raises:
+        InputError: The user has no home directory.
+    """
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "swiftwrf"
+    except RuntimeError:
+        raise InputError("there is no home directory for the cache; set XDG_CACHE_HOME to a directory") from None
+
+
+@contextmanager
+def refusing_unwritable(folder: Path) -> Iterator[None]:
+    """Raise InputError if a folder of the cache cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"{folder} of the cache cannot be written ({error.strerror}); set XDG_CACHE_HOME to another directory"
+        ) from None
 
 
 def sync(path: Path) -> None:

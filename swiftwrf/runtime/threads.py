@@ -1,4 +1,4 @@
-"""The number of threads of computations."""
+"""The device and the number of threads of computations."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from typing import TypeVar
 
 import torch
 from threadpoolctl import ThreadpoolController, threadpool_limits
+
+from swiftwrf.errors import InputError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -53,6 +55,25 @@ class _LinearAlgebra:
 
 _users, _linear_algebra = _Users(), _LinearAlgebra()
 _workers: ContextVar[int | None] = ContextVar("workers", default=None)  # of `parallel_map` inside `single_thread`
+
+
+def to_device(device: torch.device | str) -> torch.device:
+    """Return the device of that name.
+
+    Raises:
+        InputError: Another name, or a GPU that does not exist.
+
+    Example:
+        >>> to_device("cpu")
+        device(type='cpu')
+    """
+    try:
+        found = torch.device(device)
+    except (RuntimeError, TypeError):
+        raise InputError(f"device must be a device of torch, cpu or cuda, got {device!r}") from None
+    if found.type == "cuda" and (found.index or 0) >= torch.cuda.device_count():
+        raise InputError(f"device {found} needs an NVIDIA GPU that torch can use, and there is none; choose cpu")
+    return found
 
 
 def set_threads(number: int) -> None:

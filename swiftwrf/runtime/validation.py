@@ -104,7 +104,7 @@ def _described(annotation: Any) -> str:
             f"a tuple of {_described(arguments[0])}" if arguments[-1] is ... else f"a tuple of {len(arguments)} values"
         )
     if isinstance(annotation, type) and is_dataclass(annotation):
-        return f"a {annotation.__name__}"
+        return f"an instance of {annotation.__name__}"
     names = {int: "a whole number", float: "a number", bool: "True or False", str: "a text", type(None): "None"}
     return names.get(annotation, getattr(annotation, "__name__", str(annotation)))
 

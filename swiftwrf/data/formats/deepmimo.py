@@ -28,11 +28,12 @@ from numpy.typing import NDArray
 from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.data.archives import read_arrays
-from swiftwrf.data.files import MAX_COORDINATE_M, check_carrier, digests, read_text
+from swiftwrf.data.files import check_carrier, digests, read_text
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.spectra import GRID, Spectra, check_pixels
 from swiftwrf.errors import InputError
+from swiftwrf.positions import check_positions
 
 Floats = NDArray[np.float64]
 KEYS = ("power", "phase", "delay", "aoa_az", "aoa_el")
@@ -125,12 +126,8 @@ def _tables(folder: Path, pair: str) -> tuple[dict[str, Floats], Floats, Floats]
     if len(shape) != 2 or 0 in shape or any(values.shape != shape for values in arrays.values()):
         shapes = ", ".join(f"{key} {values.shape}" for key, values in arrays.items())
         raise InputError(f"{folder}: the paths of pair {pair} must all have shape (receivers, paths), got {shapes}")
-    if receiver.shape != (shape[0], 3) or transmitter.shape != (3,):
-        raise InputError(
-            f"{folder}: expected rx_pos ({shape[0]}, 3) and tx_pos (3,), got {receiver.shape} and {transmitter.shape}"
-        )
-    if not (np.abs(receiver) <= MAX_COORDINATE_M).all() or not (np.abs(transmitter) <= MAX_COORDINATE_M).all():
-        raise InputError(f"{folder}: positions of pair {pair} must be finite numbers [m], at most {MAX_COORDINATE_M:g}")
+    check_positions(receiver, f"{folder}: rx_pos of pair {pair}", (shape[0], 3))
+    check_positions(transmitter, f"{folder}: tx_pos of pair {pair}", (3,))
     return arrays, receiver, transmitter
 
 

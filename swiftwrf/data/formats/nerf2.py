@@ -25,7 +25,6 @@ from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.choices import Moving
 from swiftwrf.data.archives import array_header, array_names, read_arrays, read_rows, refusing_broken
 from swiftwrf.data.files import (
-    MAX_COORDINATE_M,
     check_carrier,
     digests,
     number,
@@ -41,6 +40,7 @@ from swiftwrf.data.spectra import Spectra, check_pixels
 from swiftwrf.data.splits import read_splits
 from swiftwrf.data.store import BATCH_PIXELS, MAX_FINE_PIXELS, MAX_MEMORY_PIXELS, Store, stored, too_many
 from swiftwrf.errors import InputError
+from swiftwrf.positions import to_tensor
 
 
 @SPECTRA_FORMATS.register("nerf2")
@@ -67,8 +67,6 @@ class Nerf2(Format[Spectra]):
         moving: Moving = "transmitter" if tables[0].name == "tx_pos.csv" else "receiver"
         position = read_positions(tables[0])
         store, line_of_sight, read = _read_spectra(path, len(position))
-        if bool((position == torch.tensor(pose.position, dtype=torch.float64)).all(dim=1).any()):
-            raise InputError(f"{tables[0]} has a position equal to the gateway's, from which there is no direction")
         return Spectra(
             store=store,
             position=position,
@@ -94,10 +92,10 @@ def _read_gateway(file: Path) -> dict[str, Any]:
 
 def _read_pose(file: Path, gateway: dict[str, Any]) -> ArrayPose:
     position, orientation = numbers(gateway.get("position"), 3), numbers(gateway.get("orientation"), 4)
-    if position is None or orientation is None or max(map(abs, position)) > MAX_COORDINATE_M:
+    if position is None or orientation is None:
         raise InputError(
-            f"{file}: the gateway needs a position of 3 numbers [m], at most {MAX_COORDINATE_M:g}, and an orientation "
-            f"(x, y, z, w) of 4, got {gateway.get('position')} and {gateway.get('orientation')}"
+            f"{file}: the gateway needs a position of 3 numbers [m] and an orientation (x, y, z, w) of 4, got "
+            f"{gateway.get('position')} and {gateway.get('orientation')}"
         )
     try:
         return ArrayPose(position, orientation)  # type: ignore[arg-type]  # the lengths are checked
@@ -130,10 +128,9 @@ def _read_spectra(folder: Path, n: int) -> tuple[Store, Tensor, dict[str, str]]:
         return spectrum, free, {"spectrum/*.png": digest}
     file = arrays[0]
     if file.suffix == ".npz" and "line_of_sight" in array_names(file):
-        seen = read_arrays(file, ["line_of_sight"])["line_of_sight"]
-        if seen.shape != (n,) or seen.dtype.kind != "b":
-            raise InputError(f"{file}: line_of_sight must be {n} truth values, got {seen.dtype} of shape {seen.shape}")
-        free = torch.from_numpy(seen.copy())
+        free = to_tensor(
+            f"{file}: line_of_sight", read_arrays(file, ["line_of_sight"])["line_of_sight"], torch.bool, (n,)
+        )
     digest = sha256(file)
     return _read_values(file, n, digest), free, {file.name: digest}
 

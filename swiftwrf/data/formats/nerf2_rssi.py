@@ -16,8 +16,8 @@ from torch import Tensor
 
 from swiftwrf.data.columns import column_of, column_of_numbers, seconds, text_of
 from swiftwrf.data.coordinates import GeodeticOrigin, without_fix
-from swiftwrf.data.files import MAX_COORDINATE_M, digests, numbers, read_yaml
-from swiftwrf.data.fillers import NOT_DETECTED_DBM, check_powers, find_fillers, without_fillers
+from swiftwrf.data.files import digests, numbers, read_yaml
+from swiftwrf.data.fillers import NOT_DETECTED_DBM, find_fillers, without_fillers
 from swiftwrf.data.floors import Floors
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
 from swiftwrf.data.groups import numbered
@@ -53,15 +53,14 @@ class Nerf2Rssi(Format[Rssi]):
             raise InputError(f"{positions} must start with the header x,y,z, got {','.join(places.columns)}")
         position = np.stack([column_of_numbers(positions, places, axis) for axis in AXES], axis=1)
         omitted, missing = without_fix(position)
-        if omitted.all() or (np.abs(position) > MAX_COORDINATE_M).any():
-            raise InputError(f"{positions} needs 3 finite numbers [m], at most {MAX_COORDINATE_M:g}, in each row")
+        if omitted.all():
+            raise InputError(f"{positions} needs 3 finite numbers [m] in each row")
         if len(frame) != len(places):
             raise InputError(
                 f"{path}: {table.name} has {len(frame)} rows, {positions.name} {len(places)}; they must match"
             )
         rssi = np.stack([column_of_numbers(table, frame, name) for name in names], axis=1)
         fillers = sorted({NOT_DETECTED_DBM, *find_fillers(rssi)}) if options.filler is None else list(options.filler)
-        check_powers(table, rssi, names, fillers, np.arange(len(rssi))[:, None])
         rssi, notes = without_fillers(rssi, fillers)
         row = torch.from_numpy(~omitted).nonzero()[:, 0]
         receiver_position, unknown = _receiver_positions(receivers, names)
@@ -70,7 +69,7 @@ class Nerf2Rssi(Format[Rssi]):
                 "the receiver moves; RSSI is reciprocal, so it counts as the transmitter and the others as receivers"
             )
         meta = path / META
-        of_rows: dict[str, Any] = _of_rows(meta, len(rssi)) if meta.is_file() else {}
+        of_rows, units = _of_rows(meta, len(rssi)) if meta.is_file() else ({}, [])
         survey = path / SURVEY
         properties = _properties(survey) if survey.is_file() else {}
         stated = (positions, table, receivers, of_rows and meta, properties and survey)
@@ -83,24 +82,26 @@ class Nerf2Rssi(Format[Rssi]):
             index=row,
             named_splits=kept_splits(read_splits(path, len(rssi), first=0), row, len(rssi)),
             source=digests([file for file in stated if file], path),
-            notes=(*notes, *missing, *unknown),
+            notes=(*notes, *missing, *unknown, *units),
             **properties,
             **{name: values[row] for name, values in of_rows.items()},
         )
 
 
-def _of_rows(file: Path, n: int) -> dict[str, Tensor]:
-    """Return session and time of each of n rows, (n,), as far as a table has these columns."""
+def _of_rows(file: Path, n: int) -> tuple[dict[str, Any], list[str]]:
+    """Return session and time of each of n rows, (n,), as far as a table has these columns, and a note on times."""
     frame = read_frame(file)
     session, time = (column_of(frame, role, {}) for role in ("session", "time"))
-    found: dict[str, Tensor] = {}
+    found: dict[str, Any] = {}
+    notes: list[str] = []
     if session is not None:
         found["session"] = numbered(text_of(frame[session]).tolist())
     if time is not None:
-        found["time"] = torch.from_numpy(seconds(frame[time]))
+        values, notes = seconds(frame[time])
+        found["time"] = torch.from_numpy(values)
     if found and len(frame) != n:
         raise InputError(f"{file} has {len(frame)} rows, the RSSI {n}; they must match")
-    return found
+    return found, notes
 
 
 def _properties(file: Path) -> dict[str, Any]:
@@ -159,10 +160,9 @@ def _receiver_positions(file: Path | None, names: list[str]) -> tuple[Tensor | N
     for number, name in enumerate(names):
         if name in content:
             position = numbers(content[name], 3)
-            if position is None or max(map(abs, position)) > MAX_COORDINATE_M:
+            if position is None:
                 raise InputError(
-                    f"{file}: receiver {name!r} needs a position of 3 finite numbers [m], at most {MAX_COORDINATE_M:g}, got "
-                    f"{content[name]}"
+                    f"{file}: receiver {name!r} needs a position of 3 finite numbers [m], got {content[name]}"
                 )
             found[number] = torch.tensor(position, dtype=torch.float64)
     return found, unknown_positions(unknown)

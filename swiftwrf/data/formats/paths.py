@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.archives import array_names, read_arrays
-from swiftwrf.data.files import MAX_COORDINATE_M, check_carrier, digests
+from swiftwrf.data.files import check_carrier, digests
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.spectra import GRID, Spectra, check_pixels
 from swiftwrf.data.splits import read_splits
 from swiftwrf.errors import InputError
+from swiftwrf.positions import check_positions, to_tensor
 
 SHAPES = {  # of n receivers and P paths
     "transmitter_position": ("n", 3),
@@ -27,7 +27,7 @@ SHAPES = {  # of n receivers and P paths
     "frequency_hz": (),
 }
 LENGTH = "length"  # of each path [m], optional
-TYPES = {"gain": np.complex128, "path_count": np.int64, "line_of_sight": np.bool_}  # others: float64
+TYPES = {"gain": torch.complex128, "path_count": torch.int64, "line_of_sight": torch.bool}  # others: float64
 MIN_DISTANCE_M = 1e-9  # between two points
 MAX_GAIN = 1e100  # sums of larger ones overflow
 
@@ -95,18 +95,8 @@ def _read(file: Path, grid: AngularGrid) -> dict[str, Tensor]:
     sizes = {"n": n, "P": sum(count.tolist())}
     tensors = {}
     for name, symbols in (SHAPES | dict.fromkeys({LENGTH} & {*arrays}, ("P",))).items():
-        array, shape = arrays[name], tuple(sizes.get(str(symbol), symbol) for symbol in symbols)
-        if array.shape != shape:
-            raise InputError(
-                f"{file}: {name} has shape {array.shape}, but path_count ({n} receivers, {sizes['P']} paths) calls for "
-                f"{shape}"
-            )
-        bad = np.argwhere(~np.isfinite(array))
-        if len(bad):
-            raise InputError(f"{file}: {name} holds a value that is not finite at row {bad[0, :1].tolist()}")
-        if array.dtype.kind == "c" and name != "gain":
-            raise InputError(f"{file}: {name} holds complex numbers, expected real ones")
-        tensors[name] = torch.from_numpy(array.astype(TYPES.get(name, np.float64)))
+        shape = tuple(sizes.get(str(symbol), symbol) for symbol in symbols)
+        tensors[name] = to_tensor(f"{file}: {name}", arrays[name], TYPES.get(name, torch.float64), shape)
     _check_physics(file, tensors)
     return tensors
 
@@ -115,10 +105,7 @@ def _check_physics(file: Path, arrays: dict[str, Tensor]) -> None:
     """Refuse values from which no spectra or labels follow."""
     check_carrier(file, float(arrays["frequency_hz"]))
     for name in ("transmitter_position", "receiver_position", "last_point"):
-        if float(arrays[name].abs().max()) > MAX_COORDINATE_M:
-            raise InputError(
-                f"{file}: {name} holds a coordinate beyond {MAX_COORDINATE_M:g} m; give metres from a nearer origin"
-            )
+        check_positions(arrays[name], f"{file}: {name}")
     receiver = arrays["receiver_position"]
     same = ((arrays["transmitter_position"] - receiver).norm(dim=1) < MIN_DISTANCE_M).nonzero()
     if len(same):

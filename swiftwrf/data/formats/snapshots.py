@@ -12,11 +12,12 @@ from torch import Tensor
 from swiftwrf.array.angles import ArrayPose
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import ARCHIVES, Arrays, array_names, read_arrays
-from swiftwrf.data.files import MAX_COORDINATE_M, check_carrier, digests
+from swiftwrf.data.files import check_carrier, digests
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
 from swiftwrf.data.snapshots import Snapshots, check_spacing, round_trip_array, without_null
 from swiftwrf.data.splits import read_splits
 from swiftwrf.errors import InputError
+from swiftwrf.positions import check_positions
 
 REQUIRED_ARRAYS = ("csi", "position", "frequency_hz", "array_position", "array_orientation")
 OPTIONAL = ("element_position", "rows", "columns", "spacing_m", "line_of_sight", "time")
@@ -57,13 +58,8 @@ def snapshots_of(
     Raises:
         InputError: An array that is invalid, or arrays that do not match.
     """
-    for array_name, values in arrays.items():
-        if array_name != "csi" and values.dtype.kind == "c":
-            raise InputError(f"{source}: {array_name} holds complex numbers, expected real ones")
-        if not np.isfinite(values).all():
-            raise InputError(f"{source}: {array_name} holds a value that is not finite; leave that row out")
     arrays, reversed_axes = _turned_round(_without_unit_axes(arrays))
-    position, array = _points(source, arrays, "position", 3), array_of(source, arrays)
+    position, array = check_positions(arrays["position"], f"{source}: position"), array_of(source, arrays)
     n, folder, pose = len(position), files[0].parent, _pose(source, arrays)
     raw = _channel(source, arrays["csi"], n, len(array.element))
     raw, null = without_null(raw, options.drop_null)
@@ -79,8 +75,8 @@ def snapshots_of(
         name=name or folder.resolve().name,
         named_splits=read_splits(folder, n, first=1) if options.every in (None, 1) else None,
         source=digests(files, folder),
-        line_of_sight=_one_each(source, arrays, "line_of_sight", n),
-        time=_one_each(source, arrays, "time", n),
+        line_of_sight=arrays.get("line_of_sight"),
+        time=arrays.get("time"),
         notes=(*notes, *reversed_axes, *null, *turned),
     )
     return data if options.every in (None, 1) else data.subset(torch.arange(0, n, options.every))
@@ -120,29 +116,6 @@ def _turned_round(arrays: Arrays) -> tuple[Arrays, tuple[str, ...]]:
     return arrays | turned, ("axes are in reverse order, as MATLAB and Octave write HDF5; they are turned round",)
 
 
-def _points(file: Path, arrays: Arrays, name: str, columns: int) -> Tensor:
-    """Return points, float64 (n, columns) [m]."""
-    values = arrays[name]
-    if values.ndim != 2 or values.shape[1] != columns or len(values) == 0:
-        raise InputError(f"{file}: {name} must have shape (n, {columns}) in metres, got {values.shape}")
-    if float(np.abs(values).max()) > MAX_COORDINATE_M:
-        raise InputError(
-            f"{file}: {name} holds a coordinate beyond {MAX_COORDINATE_M:g} m; give metres from a nearer origin"
-        )
-    return torch.from_numpy(values.astype(np.float64))
-
-
-def _one_each(file: Path, arrays: Arrays, name: str, n: int) -> Tensor | None:
-    """Return one number a position, float64 (n,), None if the file has none."""
-    if name not in arrays:
-        return None
-    if arrays[name].shape != (n,):
-        raise InputError(
-            f"{file}: {name} must have one value for each of the {n} positions, got shape {arrays[name].shape}"
-        )
-    return torch.from_numpy(arrays[name].astype(np.float64))
-
-
 def _channel(file: Path, csi: NDArray[np.generic], n: int, elements: int) -> Tensor:
     """Return channels, complex128 (n, S, K)."""
     if csi.dtype.kind != "c":
@@ -177,13 +150,8 @@ def _pose(file: Path, arrays: Arrays) -> ArrayPose:
             f"{file}: array_orientation has 3 numbers; Euler angles leave their order open, so give the unit quaternion "
             "(x, y, z, w) that turns array into world coordinates"
         )
-    if position.shape != (3,) or orientation.shape != (4,) or float(np.abs(position).max()) > MAX_COORDINATE_M:
-        raise InputError(
-            f"{file}: expected array_position of shape (3,) in metres, at most {MAX_COORDINATE_M:g}, and array_orientation "
-            f"of shape (4,), got {position.shape} and {orientation.shape}"
-        )
     try:
-        return ArrayPose(tuple(map(float, position)), tuple(map(float, orientation)))  # type: ignore[arg-type]
+        return ArrayPose(tuple(position.flatten().tolist()), tuple(orientation.flatten().tolist()))  # type: ignore[arg-type]
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
 
@@ -214,7 +182,7 @@ def array_of(file: Path, arrays: Arrays) -> PlanarArray:
 def _plane(file: Path, arrays: Arrays, wavelength: float) -> Tensor:
     """Return the positions of the elements in their plane, (K, 2) [m]."""
     columns = 2 if arrays["element_position"].shape[1:] == (2,) else 3
-    element = _points(file, arrays, "element_position", columns)
+    element = check_positions(arrays["element_position"], f"{file}: element_position", (None, columns))
     if columns == 3 and float((height := element[:, 2]).max() - height.min()) > MAX_HEIGHT_WAVELENGTHS * wavelength:
         raise InputError(
             f"{file}: element_position spreads {float(height.max() - height.min()):.3g} m along z; give the elements in "

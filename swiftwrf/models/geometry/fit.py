@@ -20,6 +20,7 @@ from swiftwrf.models.geometry.images import PhaseObservations
 from swiftwrf.models.geometry.orient import FURTHER_GAIN, candidates
 from swiftwrf.models.geometry.phase_retrieval import correlations, retrieve_phases
 from swiftwrf.models.geometry.planes import (
+    MAX_ORDER,
     MIN_MISSING,
     PlaneSet,
     RoomEstimate,
@@ -51,7 +52,6 @@ MAX_ALIAS_STEPS = 3  # times that planes move to other phase aliases
 FURTHER_SIGNIFICANCE = 4.0  # standard errors for a plane of any orientation, of which far more are tried
 PROMISING_SIGNIFICANCE = 1.0  # standard errors by which one must be better after a few steps to be refined further
 MAX_FURTHER_TRIED = 8  # candidates of any orientation that are refined
-MAX_ORDER = 4  # reflections of an image source
 MIN_SEARCHED = 50  # spectra of a search whose room is extended; searches in fewer end at phase aliases more often
 MAX_MISSING_RATIO = 1.4  # of the missing coherence of new spectra and of those of a search, geometric means
 N_FINAL = 400  # positions of the last moves of a search; fewer do not separate planes from aliases in furnished rooms

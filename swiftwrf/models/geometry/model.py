@@ -15,7 +15,6 @@ from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext, bounding_box
 from swiftwrf.models.geometry.fit import (
-    MAX_ORDER,
     GeometryConfig,
     extend_room,
     observe,
@@ -29,7 +28,7 @@ from swiftwrf.models.geometry.sample import Residual, sample_field
 from swiftwrf.models.link import Link, Linked
 from swiftwrf.runtime.checkpoint import Header, expect
 
-MAX_PLANES = 64  # of a room in a file
+MAX_DISTANCE_M = 1e7  # from the fixed end; beyond, rounding destroys the phases
 
 
 class GeometryModel(Linked, FieldModel):
@@ -72,10 +71,10 @@ class GeometryModel(Linked, FieldModel):
         Args:
             link: Any spectra of the scene, for array, rotation, fixed end and grid.
             planes: Planes of the room.
-            order: Highest number of reflections of an image source.
+            order: Highest number of reflections of an image source, at most 4.
 
         Raises:
-            InputError: Spectra that do not describe array, rotation and fixed end.
+            InputError: As `RoomEstimate`, or spectra that do not describe array, rotation and fixed end.
 
         Example:
             >>> import swiftwrf
@@ -241,11 +240,6 @@ class GeometryModel(Linked, FieldModel):
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         planes, order = header["planes"], header["order"]
-        if type(order) is not int or not 0 <= order <= MAX_ORDER or len(planes) > MAX_PLANES:
-            raise InputError(  # the number of image sources is that of the planes to the power of the order
-                f"a room has at most {MAX_PLANES} planes and paths of 0 to {MAX_ORDER} reflections, got {len(planes)} and "
-                f"{order}"
-            )
         expect(tensors, {"covariance": (len(planes), len(planes))})
         self.fingerprint = str(header["fingerprint"])
         self.estimate = RoomEstimate(

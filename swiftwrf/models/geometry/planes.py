@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from annotated_types import Ge, Le
 from torch import Tensor
 
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.errors import InputError
 from swiftwrf.models.geometry.images import PhaseObservations, Sequence, field, phase_period_m, sequences
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation
 from swiftwrf.models.geometry.refine import refine
 from swiftwrf.models.geometry.sample import Residual
 from swiftwrf.models.geometry.search import SIDES, CandidateRoom
-from swiftwrf.runtime.validation import NonNegativeFloat, configuration
+from swiftwrf.runtime.validation import NonNegativeFloat, check_value, configuration
 
 PLANE_TENSORS = ("normal", "offset", "gain")  # of a `PlaneSet`
+MAX_PLANES, MAX_ORDER = 64, 4  # of a room, whose image sources number MAX_PLANES^MAX_ORDER at most
+NORMAL_TOLERANCE = 1e-6  # of the length of a normal, from rounding
 MIN_MISSING = 1e-5  # missing coherence by rounding of spectra and phases
 
 
@@ -31,6 +35,9 @@ class Plane:
         gain: Reflection gain (amplitude) with its sign.
         std_mm: Standard deviation of the offset [mm].
         certain: No alternative offset explains the spectra nearly as well, and held-out spectra need the plane.
+
+    Raises:
+        InputError: A normal that is no unit vector, or a number that is not finite.
     """
 
     normal: tuple[float, float, float]
@@ -38,6 +45,17 @@ class Plane:
     gain: float
     std_mm: NonNegativeFloat = 0.0
     certain: bool = True
+
+    def check(self) -> None:
+        """Refuse a normal of another length and infinite numbers."""
+        length = math.hypot(*self.normal)
+        if abs(length - 1) > NORMAL_TOLERANCE:
+            raise InputError(
+                f"the normal of a plane must be a unit vector, got {self.normal} of length {length:.6g}; divide normal and "
+                "offset_m by it"
+            )
+        if not (math.isfinite(self.offset_m) and math.isfinite(self.gain)):
+            raise InputError(f"offset and gain of a plane must be finite, got {self.offset_m} m and {self.gain}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +71,9 @@ class RoomEstimate:
         conclusion: Result in one sentence.
         covariance: Covariance of the offsets (P, P) [m^2].
         residual: Statistics of the prediction error, for samples.
+
+    Raises:
+        InputError: More than 64 planes, or an order outside 0 to 4.
     """
 
     planes: list[Plane]
@@ -62,6 +83,10 @@ class RoomEstimate:
     conclusion: str
     covariance: Tensor
     residual: Residual
+
+    def __post_init__(self) -> None:
+        check_value("order", self.order, Annotated[int, Ge(0), Le(MAX_ORDER)])
+        check_value("the number of planes", len(self.planes), Annotated[int, Le(MAX_PLANES)])
 
     def to_json(self) -> dict[str, Any]:
         """Return the planes (normal . x = offset in world coordinates), order and scores as plain values."""

@@ -106,7 +106,7 @@ CHANGES = {
     "a file twice": ("positions.csv", "file,x,y,z\nwalk0.dat,1,2,3\nwalk0.dat,2,2,3\n", "names walk0.dat twice"),
     "a file missing": ("positions.csv", "file,x,y,z\nwalk99.dat,1,2,3\n", "row 1 must name a capture"),
     "another kind": ("positions.csv", "file,x,y,z\narray.yml,1,2,3\n", "row 1 must name a capture"),
-    "an empty cell": ("positions.csv", "file,x,y,z\nwalk0.dat,1,,3\n", "not finite"),
+    "an empty cell": ("positions.csv", "file,x,y,z\nwalk0.dat,1,,3\n", "position must be finite"),
     "text": ("positions.csv", "file,x,y,z\nwalk0.dat,1,two,3\n", "not a number"),
     "at the array": ("positions.csv", "file,x,y,z\nwalk0.dat,0,2,1\n", "equal to array_position"),
     "an empty capture": ("walk0.dat", b"", "no packet"),

@@ -28,6 +28,7 @@ from swiftwrf.array import planar
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import load_snapshots
 from swiftwrf.data.formats import SPECTRA_FORMATS
+from swiftwrf.data.groups import Groups, Offsets
 from swiftwrf.data.raytraced import Tracing
 from swiftwrf.data.simulated.room import ShoeboxRoom
 from swiftwrf.data.splits import folds
@@ -130,17 +131,68 @@ WRONG = {
     ),
     "other elements": (
         lambda: Snapshots(torch.ones(5, 3).cfloat(), torch.rand(5, 3), array=PlanarArray.square(2, 1e9), pose=FACING_X),
-        r"channel must have shape \(5, n, 4\)",
+        r"channel must have shape \(5, 4\)",
     ),
-    "infinite RSSI": (lambda: Rssi([[-math.inf]], [[0, 0, 0]]), "RSSI must be finite"),
+    "infinite RSSI": (lambda: Rssi([[-math.inf]], [[0, 0, 0]]), "rssi_dbm must be finite, or nan"),
     "RSSI of others": (lambda: Rssi([[-50.0]] * 3, torch.rand(4, 3)), "4 positions, but rssi_dbm has 3 rows"),
     "one name for two": (
         lambda: Rssi([[-50.0, -60]], [[0, 0, 0]], receiver_names=["a", "a"]),
         "2 receivers, but the names",
     ),
+    "complex spectra": (lambda: Spectra(ROOM.spectrum + 0j, ROOM.position), "spectra must be real"),
+    "masked spectra": (lambda: Spectra(np.ma.masked_less(ROOM.spectrum, 0.1), ROOM.position), "has masked values"),
+    "spectra of truth values": (lambda: Spectra(ROOM.spectrum > 0.5, ROOM.position), "must be float32 numbers"),
+    "complex positions": (lambda: Spectra(ROOM.spectrum, ROOM.position + 0j), "position must be real"),
+    "a position far away": (
+        lambda: Spectra(ROOM.spectrum, 1e9 * ROOM.position),
+        "position must be .* at most 1e.09; row 0",
+    ),
+    "a far end": (
+        lambda: Spectra(ROOM.spectrum, ROOM.position, fixed_position=(0, 0, 1e300)),
+        "fixed_position must be .* at most 1e.09",
+    ),
+    "partly visible": (lambda: replace(ROOM, line_of_sight=[0.3] * 24), "line_of_sight must be True or False, got 0.3"),
+    "labels in degrees": (lambda: replace(ROOM, label=torch.full((24, 2), 200.0)), "convert degrees by deg2rad"),
+    "infinite labels": (lambda: replace(ROOM, label=torch.full((24, 2), math.inf)), "label must be finite, or nan"),
+    "half an index": (lambda: replace(ROOM, index=torch.arange(24) + 0.5), "index must be whole numbers, got 0.5"),
+    "a stretched rotation": (lambda: replace(ROOM, rotation=2 * torch.eye(3)), "must be a rotation matrix"),
+    "a mirrored rotation": (lambda: replace(ROOM, rotation=-torch.eye(3)), "must be a rotation matrix"),
+    "real channels": (
+        lambda: Snapshots(torch.ones(5, 4), torch.rand(5, 3), array=PlanarArray.square(2, 1e9), pose=FACING_X),
+        "channel must be complex64 numbers",
+    ),
+    "channels beyond their type": (
+        lambda: Snapshots(np.full((5, 4), 1e300j), torch.rand(5, 3), array=PlanarArray.square(2, 1e9), pose=FACING_X),
+        "channel must be finite",
+    ),
+    "path loss for RSSI": (lambda: Rssi([[-50.0], [60.0]], torch.rand(2, 3)), "row 2, receiver receiver1: 60 dBm"),
+    "RSSI of a filler": (lambda: Rssi([[-99999.0]], torch.rand(1, 3)), "-99999 dBm is no received power"),
+    "RSSI of truth values": (lambda: Rssi([[True]], torch.rand(1, 3)), "rssi_dbm must be float64 numbers"),
+    "complex RSSI": (lambda: Rssi([[-50j]], torch.rand(1, 3)), "rssi_dbm must be real"),
+    "masked RSSI": (lambda: Rssi(np.ma.masked_values([[-50.0, 100.0]], 100.0), torch.rand(1, 3)), "has masked values"),
+    "far RSSI": (lambda: Rssi([[-50.0]], [[0, 0, 2e9]]), "transmitter_position must be .* at most 1e.09"),
+    "a far receiver": (
+        lambda: Rssi([[-50.0]], [[0, 0, 0]], receiver_position=[[2e9, 0, 0]]),
+        "receiver_position must be .* at most 1e.09",
+    ),
+    "complex receivers": (
+        lambda: Rssi([[-50.0]], [[0, 0, 0]], receiver_position=[[1j, 0, 0]]),
+        "receiver_position must be real",
+    ),
+    "an infinite time": (lambda: Rssi([[-50.0]], [[0, 0, 0]], time=[math.inf]), "time must be finite, or nan"),
+    "names in one text": (lambda: Rssi([[-50.0, -60]], [[0, 0, 0]], receiver_names="ab"), "must be a list of texts"),
+    "an empty name": (lambda: Rssi([[-50.0]], [[0, 0, 0]], receiver_names=[" "]), "must be a list of texts"),
+    "a number as name": (lambda: Rssi([[-50.0]], [[0, 0, 0]], receiver_names=[1]), "must be a list of texts"),
+    "two lines as name": (lambda: Rssi([[-50.0]], [[0, 0, 0]], receiver_names=["a\r\nb"]), "must be a list of texts"),
+    "half a seed": (lambda: ROOM.split("block", 0.5), "seed must be a whole number at least 0, got 0.5"),
+    "a seed of text": (lambda: rssi_room(n=20).split(seed="a"), "seed must be a whole number"),
+    "a row beyond the last": (lambda: ROOM.subset([24]), "rows of simulated-room must be a list of numbers below 24"),
+    "a mask of others": (lambda: ROOM.subset(torch.ones(10, dtype=torch.bool)), "a mask of that length"),
+    "half a row": (lambda: ROOM[[0.5]], "a list of numbers below 24"),
+    "one row": (lambda: ROOM[3], "must be a list of numbers"),
     "half a place": (
         lambda: Rssi([[-50.0, -60]], [[0, 0, 0]], receiver_position=[[0, 0, 0], [0, 0, math.nan]]),
-        "for each receiver finite ones or nan",
+        "all nan where it is unknown; row 1",
     ),
 }
 
@@ -150,6 +202,49 @@ def test_refuses_arrays(name):
     make, says = WRONG[name]
     with pytest.raises(InputError, match=says):
         make()
+
+
+@pytest.mark.parametrize(
+    ("rows", "numbers"),
+    [
+        (slice(3), [0, 1, 2]),
+        ([5, -1], [5, 23]),
+        (np.array([4, 2]), [4, 2]),
+        (torch.arange(24) > 21, [22, 23]),
+        ([False] * 23 + [True], [23]),
+        ([], []),
+    ],
+)
+@pytest.mark.parametrize("data", [ROOM, rssi_room(n=24)], ids=["spectra", "RSSI"])
+def test_rows_by_slice_list_and_mask(data, rows, numbers):
+    assert data[rows].index.tolist() == data.subset(rows).index.tolist() == numbers
+    assert len(data[rows]) == len(numbers)
+
+
+def test_data_hold_no_gradient():
+    position = torch.rand(20, 3, requires_grad=True)
+    rssi = torch.full((20, 1), -50.0, requires_grad=True)
+    data = Rssi(rssi, position, receiver_position=position[:1].detach())
+    assert not data.rssi_dbm.requires_grad
+    assert not data.transmitter_position.requires_grad
+    assert not Spectra(torch.rand(20, 9, 36, requires_grad=True), position).spectrum.requires_grad
+
+
+def test_corrected_rssi_may_leave_the_range_of_received_powers():
+    offsets = Offsets("device", "a", {"b": -60.0}, 0.5)
+    data = Rssi([[-20.0], [-20.0]], torch.rand(2, 3), groups=Groups.of("device", ["a", "b"]))
+    assert offsets.removed(data).subset([1]).rssi_dbm.tolist() == [[40.0]]
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"), [("seconds", 1), ("milliseconds", 10**3), ("microseconds", 10**6), ("nanoseconds", 10**9)]
+)
+def test_times_since_1970_are_seconds_whatever_they_count(unit, factor):
+    steps = range(0, 8, 2)
+    table = pd.DataFrame({"timestamp": [(1_700_000_000 + step) * factor for step in steps], "x": steps, "y": 0, "z": 1})
+    data = Rssi.from_frame(table.assign(hall=[-50, -51, -52, -53]))
+    assert data.time.tolist() == pytest.approx([*steps], abs=1e-5)
+    assert any(unit in note for note in data.notes) == (factor > 1)
 
 
 def test_rssi_from_a_table_and_back():
@@ -191,6 +286,16 @@ def test_tables_and_one_line_of_a_data_set():
         (lambda: load_spectra("x", every=0), "every must be"),
         (lambda: load_snapshots("x", station=-1), "station must be"),
         (lambda: Tracing(order=-1), "order must be"),
+        (lambda: PlanarArray.square(0, 1e9), "side must be a whole number at least 1"),
+        (lambda: PlanarArray.square(4, 0), "frequency_hz must be a number above 0"),
+        (lambda: PlanarArray.square(4, 1e9, spacing=-1.0), "spacing must be a number above 0"),
+        (lambda: PlanarArray.grid(2.5, 2, 0.1, 1e9), "rows must be a whole number"),
+        (lambda: PlanarArray.grid(2, 2, 0.0, 1e9), "spacing must be a number above 0"),
+        (lambda: PlanarArray([[0.0, 1j]], 1.0), "element must be real"),
+        (lambda: PlanarArray([[0.0, 0.0]], "1 m"), "wavelength must be a number above 0"),
+        (lambda: AngularGrid.hemisphere(10, 40.0), "n_azimuth must be a whole number"),
+        (lambda: AngularGrid.hemisphere(0, 40), "n_elevation must be a whole number at least 2"),
+        (lambda: ArrayPose((0.0, 1.0)), "must be 3 and 4 finite numbers"),
         (lambda: ShoeboxRoom(size=(0.0, 1.0, 1.0)), "size must be"),
     ],
 )

@@ -84,7 +84,7 @@ REFUSED = {
     "other elements": (_csi(lambda c: c[..., :9]), "16 elements"),
     "other rows": (_csi(lambda c: c[:50]), "for 120 positions"),
     "silent": (_csi(lambda c: c * (np.arange(120) != 7)[:, None, None]), "row 7 has no power"),
-    "not finite": (_csi(lambda c: c + np.nan), "not finite"),
+    "not finite": (_csi(lambda c: c + np.nan), "no power, or more than numbers hold"),
     "no csi": ({"csi": None}, "lacks csi"),
     "no pose": ({"array_orientation": None}, "lacks array_orientation"),
     "Euler angles": ({"array_orientation": np.zeros(3)}, "Euler angles"),
@@ -103,8 +103,8 @@ REFUSED = {
     ),
     "carrier in GHz": ({"frequency_hz": 2.4}, "carrier in Hz"),
     "carrier of a list": ({"frequency_hz": np.full(3, FREQUENCY)}, "one number"),
-    "times of others": ({"time": np.zeros(3)}, "time must have one value"),
-    "complex positions": ({"position": np.ones((120, 3), complex)}, "expected real"),
+    "times of others": ({"time": np.zeros(3)}, "time has 3 rows"),
+    "complex positions": ({"position": np.ones((120, 3), complex)}, "position must be real"),
 }
 
 

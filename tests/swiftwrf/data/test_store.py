@@ -23,6 +23,7 @@ from swiftwrf.metrics import psnr
 from swiftwrf.models import coarray, idw, make_model
 from swiftwrf.models.geometry import fit_hybrid, hybrid
 from swiftwrf.positions import distance, nearest
+from swiftwrf.runtime.durable import cache_folder
 
 N = 30
 BYTES = torch.arange(N * 4 * 8, dtype=torch.int64).remainder(256).to(torch.uint8).reshape(N, 4, 8)
@@ -297,3 +298,13 @@ def test_a_fit_is_the_same_in_memory_and_in_a_file(cache, monkeypatch):
     position = few.position[:5]
     drawn = [fit_coarray(data, progress=False).synthesize(position) for data in (many, few)]
     torch.testing.assert_close(*drawn, atol=1e-5, rtol=0)
+
+
+def test_a_user_without_home_directory_is_told_of_the_variable(monkeypatch):
+    def home():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr("pathlib.Path.home", home)
+    with pytest.raises(InputError, match=r"no home directory .* set XDG_CACHE_HOME"):
+        cache_folder()

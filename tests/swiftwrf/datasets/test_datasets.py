@@ -103,6 +103,12 @@ def test_the_folder_of_converted_data_comes_first(served, tmp_path, monkeypatch)
     assert datasets.fetch("toy") == tmp_path / "cache" / "swiftwrf" / "datasets" / "toy"
 
 
+def test_a_cache_that_cannot_be_written_is_named(served, tmp_path):
+    (tmp_path / "cache").write_text("a file in the place of the folder")
+    with pytest.raises(InputError, match=r"cannot be written .*set XDG_CACHE_HOME"):
+        datasets.fetch("toy")
+
+
 def test_another_checksum_is_refused(served, tmp_path):
     (tmp_path / "server" / "anchors.csv").write_text("id,x,y,z\n1,0,0,0\n")
     with pytest.raises(InputError, match="its checksum differs: http://127"):

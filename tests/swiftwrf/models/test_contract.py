@@ -14,6 +14,7 @@ import pytest
 import small
 import torch
 
+import swiftwrf
 from swiftwrf import FIELD_MODELS, AngularGrid, FieldModel, InputError, ModelConfig, Spectra, load, make_model
 from swiftwrf.models.base import ARRAY, FIXED_END
 
@@ -257,3 +258,38 @@ def test_predictions_of_each_device_are_drawn_tabulated_and_stored(fitted, posit
     assert peak.device == found.mean.device
     stored = Spectra(found.mean, position, grid=model.grid)
     assert torch.equal(model.grid.peak_direction(stored.spectrum), peak.cpu())
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda spectra, rssi: swiftwrf.fit(rssi), "train must be an instance of Spectra, got <Rssi"),
+        (lambda spectra, rssi: make_model("gp").fit(None), "train must be an instance of Spectra, got None"),
+        (lambda spectra, rssi: make_model("gp").fit(spectra).update(rssi), "new must be an instance of Spectra"),
+        (lambda spectra, rssi: swiftwrf.fit_rssi(spectra), "train must be an instance of Rssi, got <Spectra"),
+        (lambda spectra, rssi: swiftwrf.RssiModel().fit(rssi).update(spectra), "new must be an instance of Rssi"),
+        (lambda spectra, rssi: make_model("gp").fit(spectra).predict(spectra), "positions must be numbers"),
+        (lambda spectra, rssi: make_model("gp").fit(spectra).predict(torch.zeros(1, 3) + 0j), "positions must be real"),
+        (
+            lambda spectra, rssi: make_model("gp").fit(spectra).predict([[2e9, 0, 0]]),
+            "positions must be .* at most 1e.09",
+        ),
+        (lambda spectra, rssi: swiftwrf.load(None), "None is not a readable safetensors file"),
+        (lambda spectra, rssi: make_model("gp").fit(spectra, device="gpu"), "device must be .* got 'gpu'"),
+        (lambda spectra, rssi: make_model("gp").fit(spectra, device="cuda:99"), "cuda:99 needs an NVIDIA GPU"),
+        (lambda spectra, rssi: swiftwrf.RssiModel().fit(rssi, device="cuda:99"), "cuda:99 needs an NVIDIA GPU"),
+        (
+            lambda spectra, rssi: make_model("gp").fit(spectra).predict(spectra.position).interval("0.8"),
+            "level must be",
+        ),
+        (lambda spectra, rssi: make_model("gp").fit(spectra).predict(spectra.position).interval(1.0), "level must be"),
+    ],
+)
+def test_mistakes_of_newcomers_end_in_a_sentence(call, says):
+    with pytest.raises(InputError, match=says):
+        call(swiftwrf.simulated_room(n=12, grid=AngularGrid.hemisphere(9, 36)), swiftwrf.rssi_room(n=20))
+
+
+def test_intervals_of_any_level_below_1_are_finite():
+    low, high = swiftwrf.Prediction(torch.zeros(1), torch.ones(1)).interval(0.9999999999999999)
+    assert 8 < float(high) == -float(low) < 9

@@ -213,7 +213,7 @@ def test_products_of_kernels_are_the_rasterized_spectra(room):
         ({"batch": 0}, "batch must be a whole number at least 1"),
         ({"rate": -1}, "rate must be a number above 0"),
         ({"ssim_weight": 2}, "ssim_weight must be"),
-        ({"model": 3}, "model must be a ModelConfig"),
+        ({"model": 3}, "model must be an instance of ModelConfig"),
         ({"preset": "Paper"}, "preset must be 'quick' or 'paper'"),
         ({"presets": "paper"}, "no option 'presets'"),
     ],

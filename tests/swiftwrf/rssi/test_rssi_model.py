@@ -30,7 +30,7 @@ def path_loss_only(n=60, noise=0.0, level=-50.0, exponent=2.0, seed=0):
     position = torch.rand(n, 3, generator=generator, dtype=torch.float64) * torch.tensor([10.0, 10.0, 1.0])
     clean = level - 10 * exponent * log_distance(position, receiver)
     rssi = clean + noise * torch.randn(n, 3, generator=generator)
-    return Rssi(rssi, position, receiver_position=receiver, receiver_names="abc", name="path loss")
+    return Rssi(rssi, position, receiver_position=receiver, receiver_names=list("abc"), name="path loss")
 
 
 def with_field(n=150, noise=0.5, seed=0):
@@ -428,7 +428,6 @@ def test_a_receiver_detected_in_one_slab_only():
         lambda d: d.transmitter_position.fill_(3.0),  # all at one place
         lambda d: d.rssi_dbm.fill_(-70.0),
         lambda d: d.transmitter_position.copy_(d.receiver_position[0]),  # on the receiver
-        lambda d: d.rssi_dbm[5].fill_(1e6),
     ],
 )
 def test_degenerate_data_give_finite_predictions(spoil):
@@ -440,15 +439,15 @@ def test_degenerate_data_give_finite_predictions(spoil):
 def test_refuses():
     data = path_loss_only()
     model = fit_rssi(data)
-    with pytest.raises(InputError, match="must be finite numbers"):
+    with pytest.raises(InputError, match="positions must be finite"):
         model.predict(torch.tensor([[0.0, 0.0, float("nan")]]))
-    with pytest.raises(InputError, match="at most 1e\\+09 m"):
+    with pytest.raises(InputError, match="at most 1e\\+09"):
         model.predict(torch.tensor([[1e20, 0.0, 0.0]]))
     assert both(model.predict(torch.tensor([[1e8, 0.0, 0.0]]))).isfinite().all()
     assert model.predict(torch.empty(0, 3)).mean.shape == (0, 3)
     with pytest.raises(InputError, match="detected in 0 training rows"):
         fit_rssi(replace(data, rssi_dbm=data.rssi_dbm * torch.nan))
-    with pytest.raises(InputError, match="RSSI must be finite"):
+    with pytest.raises(InputError, match="rssi_dbm must be finite"):
         fit_rssi(replace(data, rssi_dbm=data.rssi_dbm * torch.inf))
     with pytest.raises(InputError, match="same rows"):
         fit_rssi(data, pool=path_loss_only(seed=1))

@@ -42,7 +42,7 @@ def path_loss_only(n=60, noise=0.0, level=-50.0, exponent=2.0, seed=0):
     position = torch.rand(n, 3, generator=generator, dtype=torch.float64) * torch.tensor([10.0, 10.0, 1.0])
     clean = level - 10 * exponent * torch.cdist(position, receiver).log10()
     rssi = clean + noise * torch.randn(n, 3, generator=generator)
-    return Rssi(rssi, position, receiver_position=receiver, receiver_names="abc", name="path loss")
+    return Rssi(rssi, position, receiver_position=receiver, receiver_names=list("abc"), name="path loss")
 
 
 @pytest.mark.parametrize("name", [n for n in PREDICTORS if n.startswith(("mri", "gp"))])
