@@ -22,8 +22,8 @@ from swiftwrf.data.writing import write_spectra
 from tasks.aoa.options import AoaConfig
 from tasks.command import COMMANDS
 from tasks.directory import Run
+from tasks.environment import number_of_processes
 from tasks.preload import SERVED
-from tasks.processes import number_of_processes
 from tasks.steps import Budget, computed
 
 HERE = Path(__file__).parents[1]
@@ -32,8 +32,8 @@ STEPS = [Sum(1, (3, 4)), Sum(2), Sum(1, (5,))]  # the third is the first one, an
 
 def results(folder, steps, processes, budget=None):
     arrived = []
-    with Run("aoa", str(folder), "", AoaConfig(mix=(0.5,)), torch.device("cpu"), {}) as run:
-        found = list(computed(run, steps, 10, None, processes, lambda step, value: arrived.append(step.name), budget))
+    with Run("aoa", str(folder), "", AoaConfig(mix=(0.5,)), torch.device("cpu"), {}, None, processes) as run:
+        found = list(computed(run, steps, 10, None, lambda step, value: arrived.append(step.name), budget))
         run.finish({}, lambda folder, metrics: None)
     return found, arrived
 
@@ -117,7 +117,7 @@ def test_one_process_with_one_thread_on_a_gpu_and_with_torchrun():
     with mock.patch("torch.get_num_threads", return_value=16):
         assert number_of_processes(torch.device("cpu")) == 4
         assert number_of_processes(torch.device("cuda")) == 1
-        with mock.patch("tasks.processes.process_count", return_value=2):
+        with mock.patch("tasks.environment.process_count", return_value=2):
             assert number_of_processes(torch.device("cpu")) == 1
 
 
