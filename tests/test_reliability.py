@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 from contextlib import suppress
@@ -50,6 +51,14 @@ def _interrupt(*_):
 
 def _files(folder):
     return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+def test_a_report_without_out_is_new_each_time(finished, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for time in ("first", "second"):
+        monkeypatch.setattr("tasks.report.run.stamp", lambda time=time: time)
+        assert run("report", finished) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "report: runs/report/second/report.html"
 
 
 @pytest.mark.parametrize("damage", ["", "{", "[1]", '{"value": null}'])
@@ -279,13 +288,8 @@ def test_the_commit_is_that_of_this_project_and_names_every_change(tmp_path, mon
     (tmp_path / "notes.md").write_text("no code")
     assert environment._commit() == clean
     found = set()
-    for file, content in (
-        (own, "a = 1"),
-        (own, "a = 2"),
-        (own.with_name("new.py"), "b = 1"),
-        (own.with_name("new.py"), "b = 2"),
-    ):
-        file.write_text(content)
+    for name, content in (("environment.py", "1"), ("environment.py", "2"), ("new.py", "1"), ("new.py", "2")):
+        own.with_name(name).write_text(content)
         found.add(environment._commit())
     assert len(found) == 4
     assert all(re.fullmatch(f"{clean}-dirty-[0-9a-f]{{12}}", text) for text in found)
