@@ -57,11 +57,6 @@ def new_directory(out: Path, what: str) -> Iterator[Path]:
             shutil.rmtree(unfinished)
 
 
-def check_new_table(out: Path) -> None:
-    """Refuse the place of a table that a command is to write, as `check_new_file`."""
-    check_new_file(out, "--out ")
-
-
 def check_new_file(out: Path, option: str = "") -> None:
     """Refuse the place of a file that a command is to write.
 
@@ -89,10 +84,7 @@ class Run:
         source: SHA-256 of everything that the run reads, by name. A resumed run must find the same input.
         resume: Directory of an interrupted run to continue. Each process takes the number of threads of its beginning.
         processes: Number of processes that compute the steps, each with its share of the threads. None for that of
-            `number_of_processes`.
-
-    Attributes:
-        processes: The number of processes.
+            `number_of_processes`, which becomes the attribute.
 
     Raises:
         InputError: `out` exists already, another process works in it, or the run began with other input, libraries or code.

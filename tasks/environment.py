@@ -52,15 +52,10 @@ def command(task: str, *arguments: str) -> str:
 
 
 def number_of_processes(device: torch.device, asked: int | None = None, threads: int = 1) -> int:
-    """Return the number of processes of this machine that compute the steps of a run.
-
-    Args:
-        device: Device of the computation. On a GPU and with torchrun the number is 1.
-        asked: Number that the user asks for. Defaults to as many as the threads of this process allow, at most 4.
-        threads: Number of threads of each process.
+    """Return the number of processes for the steps of a run: `asked`, or up to 4 that share the threads of this process.
 
     Raises:
-        InputError: The user asks for several on a GPU or with torchrun.
+        InputError: Several on a GPU or with torchrun, where the number is 1.
     """
     if device.type == "cpu" and process_count() == 1:
         return asked or min(max(1, torch.get_num_threads() // threads), MAX_PROCESSES)

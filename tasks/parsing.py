@@ -26,7 +26,7 @@ MAX_CONFIG_BYTES = 2**20
 
 @dataclass(frozen=True, kw_only=True)
 class General(Options):
-    """Options of every command. They are listed in the help and read before all others."""
+    """Options of every command, `resume` of those whose runs can be continued. They are read before all others."""
 
     group: ClassVar[str] = "general"
 
@@ -34,18 +34,12 @@ class General(Options):
     """FILE.yaml or FILE.json with options by name, e.g. the config.json of a run; options of the command line win"""
     verbose: bool = False
     """print what is read and computed, with times"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Resumable(General):
-    """Options of every command whose runs can be continued."""
-
     resume: str | None = None
     """continue the interrupted run DIR.partial; only --scheduler, --processes and options of the output may be given"""
 
 
 def general_options(arguments: Sequence[str]) -> tuple[Namespace, list[str]]:
-    """Return the options of `Resumable` on a command line, and the other arguments.
+    """Return the options of `General` on a command line, and the other arguments.
 
     Raises:
         InputError: One of them is given twice or lacks its value.
@@ -106,10 +100,12 @@ def parse(
 def _grouped(config_type: type[Options], defaults: Mapping[str, Any]) -> type[Any]:
     """Return a dataclass with a field for each group of options, in the order of the help, and with these defaults."""
     groups: dict[str, list[Any]] = {}
-    for source in (config_type, Resumable if config_type.resumable else General):
+    for source in (config_type, General):
         hints = get_type_hints(source, include_extras=True)
         bases = [base for base in source.__mro__ if issubclass(base, Options)]
         for option in fields(source):
+            if option.name == "resume" and not config_type.resumable:
+                continue
             owner = next(base for base in bases if option.name in inspect.get_annotations(base))
             group = "command" if owner is config_type else owner.group
             if option.default is MISSING and tyro.conf.Positional not in get_args(hints[option.name])[1:]:

@@ -58,7 +58,5 @@ def served_map(function: Callable[..., Result], *items: Iterable[Any]) -> list[R
         return list(map(function, *items))
     number = min(os.cpu_count() or 1, MAX_PROCESSES)
     ignored = signal.SIGINT, signal.SIG_IGN  # the run itself ends its processes
-    with ProcessPoolExecutor(number, process_context(), signal.signal, ignored) as processes:
-        with without_main():
-            results = processes.map(function, *items)
-        return list(results)
+    with ProcessPoolExecutor(number, process_context(), signal.signal, ignored) as processes, without_main():
+        return list(processes.map(function, *items))

@@ -47,10 +47,9 @@ class LocalProcesses:
 
     def __init__(self, number: int, folder: Path, content: Path) -> None:
         self.slots: float = number
-        self._folder = folder
+        self._context = (torch.get_num_threads(), folder, content)
+        self._pool = ProcessPoolExecutor(number, process_context(), _begin)
         self._started: dict[int, BaseProcess] = {}
-        start = (torch.get_num_threads(), folder, content)
-        self._pool = ProcessPoolExecutor(number, process_context(), _begin, start)
 
     def submit(self, step: Step[Any]) -> Future[Any]:
         """Begin a step in a process.
@@ -58,11 +57,8 @@ class LocalProcesses:
         Raises:
             FitError: A process ended.
         """
-        try:
-            with without_main():
-                future = self._pool.submit(_compute, step)
-        except BrokenProcessPool:
-            raise self._lost() from None
+        with self._explaining(), without_main():
+            future = self._pool.submit(_compute, step, *self._context)
         self._started |= self._pool._processes  # the user's program may have other children
         return future
 
@@ -74,22 +70,24 @@ class LocalProcesses:
             Exception: The exception of the step.
         """
         future = next(iter(wait(pending, return_when=FIRST_COMPLETED).done))
-        try:
+        with self._explaining():
             return future, *future.result()
-        except BrokenProcessPool:
-            raise self._lost() from None
 
-    def _lost(self) -> FitError:
-        """Return the error of a process that ended, with the reason. The others are terminated."""
-        codes = [process.exitcode for process in self._started.values()]
-        code = next((code for code in (-signal.SIGKILL, *codes) if code and code in codes), 0)
-        reason = f"ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-        if code == -signal.SIGKILL:
-            reason = "was killed, probably because memory was short"
-        return FitError(
-            f"a process of the run {reason}; continue with one process: "
-            f"swiftwrf resume {shlex.quote(str(self._folder))} --processes 1"
-        )
+    @contextmanager
+    def _explaining(self) -> Iterator[None]:
+        """Raise FitError with the reason if a process ended. The pool terminates the others."""
+        try:
+            yield
+        except BrokenProcessPool:
+            codes = [process.exitcode for process in self._started.values()]
+            code = next((code for code in (-signal.SIGKILL, *codes) if code and code in codes), 0)
+            reason = f"ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+            if code == -signal.SIGKILL:
+                reason = "was killed, probably because memory was short"
+            raise FitError(
+                f"a process of the run {reason}; continue with one process: "
+                f"swiftwrf resume {shlex.quote(str(self._context[1]))} --processes 1"
+            ) from None
 
     def close(self) -> None:
         """End the processes, whatever they compute."""
@@ -113,24 +111,11 @@ def local_processes(number: int, folder: Path, context: object) -> Iterator[Loca
         content.unlink(missing_ok=True)
 
 
-_folder = Path()
-_content = Path()
-_threads = 1
-
-
-def _begin(threads: int, folder: Path, content: Path) -> None:
+def _begin() -> None:
     """Prepare a process."""
-    global _content, _folder, _threads
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run itself ends its processes
     threading.Thread(target=_end_with_the_run, daemon=True).start()
     silent()
-    _threads, _folder, _content = threads, folder, content
-
-
-@cache
-def _context() -> Any:
-    """Return the context of the steps. It is read by the first step, whose exception says why it cannot be."""
-    return pickle.loads(_content.read_bytes())
 
 
 def _end_with_the_run() -> None:
@@ -139,9 +124,15 @@ def _end_with_the_run() -> None:
     os._exit(1)
 
 
-def _compute(step: Step[Any]) -> tuple[Any, float]:
+@cache
+def _read(content: Path) -> Any:
+    """Return the context of the steps. Each process reads it once, in a step, whose exception says why it cannot be read."""
+    return pickle.loads(content.read_bytes())
+
+
+def _compute(step: Step[Any], threads: int, folder: Path, content: Path) -> tuple[Any, float]:
     """Return the values of a step and its seconds."""
-    context = _context()
-    set_threads(_threads)  # after the libraries of the step are loaded, so that it reaches all of them
+    context = _read(content)
+    set_threads(threads)  # after the libraries of the step are loaded, so that it reaches all of them
     began = time.perf_counter()
-    return step.compute(context, _folder), time.perf_counter() - began
+    return step.compute(context, folder), time.perf_counter() - began

@@ -19,7 +19,7 @@ from swiftwrf.errors import listed, with_article
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
 from swiftwrf.locate.track import joined
 from swiftwrf.metrics import angle_errors
-from tasks.directory import check_new_table
+from tasks.directory import check_new_file
 from tasks.environment import stamp
 from tasks.locate.localizers import BATCH_ROWS
 from tasks.locate.options import LocateConfig
@@ -41,7 +41,7 @@ def write_positions(config: LocateConfig) -> None:
     assert config.model is not None
     assert config.source is not None
     out = Path(config.out or f"positions-{stamp()}.csv")
-    check_new_table(out)
+    check_new_file(out, "--out ")
     model = load(config.model)
     if isinstance(model, RssiLocator):
         columns = _of_rssi(model, config, config.source)
