@@ -48,7 +48,7 @@ COMMANDS = {
     "scenes": Command("trace ray paths in a room (extra: raytrace)", "ScenesConfig"),
     "view": Command("show a fitted field in the browser (extra: view)", "ViewConfig"),
 }
-RESUME = "continue an interrupted run: swiftwrf resume DIR.partial [--scheduler ADDRESS]"
+RESUME = "continue an interrupted run: swiftwrf resume DIR.partial [--scheduler ADDRESS] [--processes N]"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -99,7 +99,7 @@ def run_command(name: str, options: Sequence[str], program: str | None = None) -
 
 def _resume(options: Sequence[str]) -> int:
     if not options or options[0].startswith("-"):
-        print(f"usage: swiftwrf resume DIR.partial [--scheduler ADDRESS]\n\n{RESUME}")
+        print(f"usage: swiftwrf resume DIR.partial [OPTIONS]\n\n{RESUME}")
         return 0 if options[:1] in (["-h"], ["--help"]) else 2
     _shorten_waits()
     from swiftwrf.errors import InputError
@@ -121,9 +121,9 @@ def _execute(name: str, options: Sequence[str], program: str | None) -> None:
 
     command = COMMANDS[name]
 
-    def task(*arguments: Any) -> None:
-        preload(command.preloaded)
-        import_module(f"tasks.{name}.{command.module}").run(*arguments)
+    def task(config: Any, *folder: Any) -> None:
+        preload(command.preloaded if getattr(config, "processes", None) != 1 else ())
+        import_module(f"tasks.{name}.{command.module}").run(config, *folder)
 
     execute(f"tasks.{name}", getattr(import_module(f"tasks.{name}.options"), command.options), task, options, program)
 

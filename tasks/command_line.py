@@ -13,13 +13,13 @@ from typing import TypeVar
 
 from swiftwrf.errors import FitError, InputError, one_line
 from tasks.options import OUTPUT, Options
-from tasks.parsing import parse
-from tasks.records import Row
+from tasks.parsing import file_options, general_options, parse
+from tasks.records import strict
 from tasks.resume import saved_config
 from tasks.terminal import terminal
 
 Config = TypeVar("Config", bound=Options)
-VERBOSE = "--verbose"
+CHANGING = ("scheduler", "processes", *OUTPUT)  # options of a run that may change when it is resumed
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 BROKEN_PIPE = 141  # exit code that shells show for a process ended by SIGPIPE
 
@@ -104,7 +104,7 @@ def execute(
     """Parse a command line and run the task.
 
     A resumable task takes a second argument, the directory to resume or None. For such a task `--resume DIR` takes the
-    configuration of an interrupted run. `--scheduler ADDRESS` continues it on a cluster, and options of `Output` may follow.
+    configuration of an interrupted run. Only the options in `CHANGING` may be given with it.
 
     Args:
         name: Module of the task, e.g. tasks.aoa.
@@ -116,45 +116,23 @@ def execute(
     Raises:
         InputError: Wrong options, or the error of the task.
     """
-    folder, verbose = None, VERBOSE in arguments
-    arguments = [option for option in arguments if option != VERBOSE]
-    match arguments:
-        case ["--resume", *_] if not config_type.resumable:
-            raise InputError(f"a run of {name} cannot be resumed; start it again")
-        case ["--resume", *options]:
-            folder, changed = _resumed(options)
-            config = configured(config_type, saved_config(folder, name.removeprefix("tasks.")) | changed, folder)
-        case _:
-            if any(option.partition("=")[0] == "--resume" for option in arguments):
-                raise InputError(
-                    "--resume DIR.partial comes first, because it takes the options of the run that it continues"
-                )
-            config = parse(config_type, arguments, program or f"python -m {name}")
+    general, others = general_options(arguments)
+    program, folder = program or f"python -m {name}", None
+    if general.resume is None:
+        saved = file_options(Path(general.config)) if general.config else None
+        config = parse(config_type, others, program, saved, general.config)
+    elif not config_type.resumable:
+        raise InputError(f"a run of {name} cannot be resumed; start it again")
+    else:
+        folder = Path(general.resume)
+        saved = saved_config(folder, name.removeprefix("tasks."))
+        saved = {key: value for key, value in saved.items() if key not in CHANGING}
+        config = parse(config_type, others, program, saved, folder)
+        changed = [key for key, value in saved.items() if strict(getattr(config, key)) != value]
+        if changed or general.config:
+            flag = changed[0].replace("_", "-") if changed else "config"
+            allowed = ", ".join(f"--{key}" for key in CHANGING)
+            raise InputError(f"--{flag} cannot change the run that --resume continues; only {allowed} can")
     config.check()
-    with terminal.of(config, verbose):
+    with terminal.of(config, general.verbose):
         task(*((config, folder) if config_type.resumable else (config,)))
-
-
-def _resumed(options: Sequence[str]) -> tuple[Path, Row]:
-    """Return the directory after `--resume`, and the options that may change."""
-    shown = {name: True for name in OUTPUT if f"--{name}" in options}
-    match [option for option in options if option.removeprefix("--") not in shown]:
-        case [folder]:
-            return Path(folder), {"scheduler": None, **shown}
-        case [folder, "--scheduler", address]:
-            return Path(folder), {"scheduler": address, **shown}
-    raise InputError(
-        "--resume takes one directory, --scheduler to use a cluster, and --open, --quiet, --json; no other option can change"
-    )
-
-
-def configured(config_type: type[Config], values: Row, folder: Path) -> Config:
-    """Return the configuration that a run has kept as plain values.
-
-    Raises:
-        InputError: The values are of another version of the command.
-    """
-    try:
-        return config_type(**{key: tuple(v) if isinstance(v, list) else v for key, v in values.items()})
-    except TypeError as error:
-        raise InputError(f"{folder} was begun by another version of this command ({error}); start a new run") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import secrets
 import shlex
@@ -10,7 +11,6 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from swiftwrf import InputError
 from swiftwrf.runtime.durable import rename
 from swiftwrf.runtime.threads import set_threads
 from tasks.claim import CONFIG, ENVIRONMENT, LOCK, STEPS, Claim
-from tasks.environment import environment, invocation, now
+from tasks.environment import environment, invocation, now, number_of_processes, stamp
 from tasks.options import plain
 from tasks.records import Row, read_json, strict, write_json, write_npz, write_table
 from tasks.resume import PARTIAL, digest
@@ -42,24 +42,19 @@ def new_directory(out: Path, what: str) -> Iterator[Path]:
     Raises:
         InputError: `out` exists already, or another process made it in the meantime.
     """
-    if out.exists() or not out.name:
+    if os.path.lexists(out) or not out.name:
         raise InputError(f"{out} exists already and {what} is never overwritten; choose another directory")
     out.parent.mkdir(parents=True, exist_ok=True)
     unfinished = out.with_name(f".{out.name}.{secrets.token_hex(4)}")
     unfinished.mkdir()
     try:
         yield unfinished
-        if out.exists():
+        if os.path.lexists(out):
             raise InputError(f"another process made {out} in the meantime; choose another directory")
         rename(unfinished, out)
     finally:
         if unfinished.exists():
             shutil.rmtree(unfinished)
-
-
-def check_new_table(out: Path) -> None:
-    """Refuse the place of a table that a command is to write, as `check_new_file`."""
-    check_new_file(out, "--out ")
 
 
 def check_new_file(out: Path, option: str = "") -> None:
@@ -68,7 +63,7 @@ def check_new_file(out: Path, option: str = "") -> None:
     Raises:
         InputError: `out` exists already, or its folder does not exist.
     """
-    if out.exists():
+    if os.path.lexists(out):
         raise InputError(f"{option}{out} exists already and is never overwritten; choose another")
     if not out.parent.is_dir():
         raise InputError(f"{option}{out} lies in {out.parent}, which is no directory")
@@ -87,7 +82,9 @@ class Run:
         config: Dataclass of plain values.
         device: Device of the computation.
         source: SHA-256 of everything that the run reads, by name. A resumed run must find the same input.
-        resume: Directory of an interrupted run to continue. It takes the number of threads of its beginning.
+        resume: Directory of an interrupted run to continue. Each process takes the number of threads of its beginning.
+        processes: Number of processes that compute the steps, each with its share of the threads. None for that of
+            `number_of_processes`, which becomes the attribute.
 
     Raises:
         InputError: `out` exists already, another process works in it, or the run began with other input, libraries or code.
@@ -102,12 +99,13 @@ class Run:
         device: torch.device,
         source: dict[str, str],
         resume: Path | None = None,
+        processes: int | None = 1,
     ) -> None:
         if resume is not None:
             self.final = resume.with_name(resume.name.removesuffix(PARTIAL))
         else:
             label = re.sub(r"[^\w.,=-]+", "_", label, flags=re.ASCII)[:MAX_LABEL]
-            self.final = Path(out) if out else Path("runs") / task / f"{datetime.now():%Y%m%d-%H%M%S}-{label}"
+            self.final = Path(out) if out else Path("runs") / task / f"{stamp()}-{label}"
         if not self.final.name:
             raise InputError(f"--out {out} has no name of its own; give a new directory, e.g. runs/{task}/first")
         self.folder = self.final.with_name(self.final.name + PARTIAL)
@@ -117,25 +115,28 @@ class Run:
             self._refuse_existing()  # another process may have finished it before the claim
             (self.folder / STEPS).mkdir(exist_ok=True)
             if resume is None:
-                self._begin(task, config, device, source)
+                self._begin(task, config, device, source, processes)
             else:
-                self._go_on(device, source)
+                self._go_on(device, source, processes)
         except BaseException:
             self._claim.discard_if_empty()
             raise
 
     def _refuse_existing(self) -> None:
-        if self.final.exists():
+        if os.path.lexists(self.final):
             raise InputError(f"{self.final} exists already and a run is never overwritten; choose another --out")
 
-    def _begin(self, task: str, config: Any, device: torch.device, source: dict[str, str]) -> None:
-        set_threads(torch.get_num_threads())  # the same call as in a resumed run
+    def _begin(
+        self, task: str, config: Any, device: torch.device, source: dict[str, str], processes: int | None
+    ) -> None:
+        self.processes = number_of_processes(device, processes)
+        set_threads(max(1, torch.get_num_threads() // self.processes))
         values = plain(config)
-        self._environment = environment(device, source) | {"config_sha256": digest(values)}
+        self._environment = environment(device, source, self.processes) | {"config_sha256": digest(values)}
         self.write_json(ENVIRONMENT, self._environment)
         self.write_json(CONFIG, {"task": task, "command": invocation(task), "config": values})
 
-    def _go_on(self, device: torch.device, source: dict[str, str]) -> None:
+    def _go_on(self, device: torch.device, source: dict[str, str], processes: int | None) -> None:
         self._environment = read_json(self.path(ENVIRONMENT))
         before = self._environment.get("input_sha256")
         if before != source:
@@ -145,9 +146,11 @@ class Run:
                 f"the input has changed since {self.folder} began ({', '.join(changed)}); restore it or start a new run"
             )
         threads = self._environment.get("threads")
-        if isinstance(threads, int) and 1 <= threads <= 1024:  # they are part of the seed
-            set_threads(threads)
-        here = environment(device, source)
+        if not isinstance(threads, int) or not 1 <= threads <= 1024:
+            threads = torch.get_num_threads()
+        self.processes = number_of_processes(device, processes, threads)
+        set_threads(threads)  # they are part of the seed
+        here = environment(device, source, self.processes)
         versions, own = _versions(self._environment), _versions(here)
         if versions != own:
             other = ", ".join(f"{name} {version}" for name, version in versions.items() if own.get(name) != version)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 import shlex
@@ -15,7 +16,16 @@ from typing import Any
 
 import torch
 
+from swiftwrf import InputError
+from tasks.preload import MAX_PROCESSES
 from tasks.torchrun import process_count
+
+CODE = ("swiftwrf", "augment", "tasks")  # packages whose files decide the results of a run
+
+
+def stamp() -> str:
+    """Return the local time, for names of new files and directories."""
+    return f"{datetime.now():%Y%m%d-%H%M%S}"
 
 
 def now() -> str:
@@ -28,14 +38,37 @@ def invocation(task: str) -> str:
     program, *arguments = sys.argv
     if Path(program).stem == "swiftwrf":
         return shlex.join(["swiftwrf", *arguments])
+    return command(task, *arguments)
+
+
+def command(task: str, *arguments: str) -> str:
+    """Return the command line of a task, quoted for a shell.
+
+    Example:
+        >>> command("view", "my run")
+        "python -m tasks.view 'my run'"
+    """
     return shlex.join(["python", "-m", f"tasks.{task}", *arguments])
 
 
-def environment(device: torch.device, source: dict[str, str]) -> dict[str, Any]:
-    """Return code, versions, machine and input of a run.
+def number_of_processes(device: torch.device, asked: int | None = None, threads: int = 1) -> int:
+    """Return the number of processes for the steps of a run: `asked`, or up to 4 that share the threads of this process.
 
-    The numbers of threads and processes belong to the seed: they decide the order in which sums are added, and a training
-    turns the last bit of a sum into degrees.
+    Raises:
+        InputError: Several on a GPU or with torchrun, where the number is 1.
+    """
+    if device.type == "cpu" and process_count() == 1:
+        return asked or min(max(1, torch.get_num_threads() // threads), MAX_PROCESSES)
+    if (asked or 1) > 1:
+        raise InputError(f"--processes {asked} is for steps on the CPU without torchrun; leave it out")
+    return 1
+
+
+def environment(device: torch.device, source: dict[str, str], processes: int = 1) -> dict[str, Any]:
+    """Return code, versions, machine and input of a run that computes its steps in this number of processes.
+
+    The number of threads of a process belongs to the seed, and so does the number of processes of torchrun: they decide the
+    order in which sums are added, and a training turns the last bit of a sum into degrees.
     """
     return {
         "commit": _commit(),
@@ -44,7 +77,7 @@ def environment(device: torch.device, source: dict[str, str]) -> dict[str, Any]:
         "packages": packages(),
         "device": machine(device),
         "threads": torch.get_num_threads(),
-        "processes": process_count(),
+        "processes": max(processes, process_count()),
         "input_sha256": source,
         "start": now(),
     }
@@ -57,13 +90,20 @@ def packages() -> dict[str, str]:
 
 
 def _commit() -> str | None:
-    """Return the commit of the code, marked if files differ from it. None if the code is in no repository of its own."""
-    own = Path(__file__)
-    describe = ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+    """Return the commit of the code, with a digest of its changes. None if the code is in no repository of its own."""
+    root = Path(__file__).parents[1]
+
+    def git(*arguments: str) -> bytes:
+        return subprocess.run(["git", *arguments], cwd=root, capture_output=True, check=True).stdout
+
     with suppress(OSError, subprocess.CalledProcessError):
-        for command in (["git", "ls-files", "--error-unmatch", own.name], describe):
-            done = subprocess.run(command, cwd=own.parent, capture_output=True, text=True, check=True)
-        return done.stdout.strip()
+        git("ls-files", "--error-unmatch", "tasks/environment.py")
+        commit = git("describe", "--always", "--abbrev=12", "--exclude=*").decode().strip()
+        changes = git("diff", "HEAD", "--binary", "--", *CODE)
+        new = git("ls-files", "-z", "--others", "--exclude-standard", "--", *(f"{package}/*.py" for package in CODE))
+        for name in filter(None, new.split(b"\0")):
+            changes += name + (root / os.fsdecode(name)).read_bytes()
+        return f"{commit}-dirty-{hashlib.sha256(changes).hexdigest()[:12]}" if changes else commit
     return None
 
 

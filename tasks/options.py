@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import MISSING, Field, asdict, dataclass, fields
+from inspect import get_annotations
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, dataclass_transform
 from unicodedata import category
 
@@ -212,20 +213,17 @@ class OffsetSource(TableSource):
         Raises:
             InputError: Such an option, but no data.
         """
-        for option in (*fields(TableSource), *fields(OffsetSource)):
-            if data is None and getattr(self, option.name) != option.default:
-                raise InputError(f"--{option.name.replace('_', '-')} is for measured RSSI; give it with --data")
+        if data is None and (names := given(self, TableSource, OffsetSource)):
+            raise InputError(f"--{names[0]} is for measured RSSI; give it with --data")
 
 
-def given(config: SpectraSource) -> list[str]:
-    """Return the names of the options of reading spectra that are set.
+def given(config: Options, *groups: type[Options]) -> list[str]:
+    """Return the names of the options that are set, of those that these classes add to their bases.
 
     Example:
-        >>> given(SpectraSource(every=2))
-        ['every']
+        >>> given(SpectraSource(every=2, drop_null=True), SpectraSource)
+        ['every', 'drop-null']
     """
-    return [
-        option.name.replace("_", "-")
-        for option in fields(SpectraSource)
-        if getattr(config, option.name) != option.default
-    ]
+    default = {option.name: option.default for option in fields(config)}
+    names = [name for group in groups for name in get_annotations(group) if name in default]
+    return [name.replace("_", "-") for name in names if getattr(config, name) != default[name]]

@@ -9,10 +9,12 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from multiprocessing import get_context
 from multiprocessing.context import BaseContext
+from types import ModuleType
 from typing import Any, TypeVar
 
 Result = TypeVar("Result")
@@ -26,6 +28,16 @@ _is_served = False
 def process_context() -> BaseContext:
     """Return the context in which processes are started."""
     return get_context("forkserver" if SERVED else "spawn")
+
+
+@contextmanager
+def without_main() -> Iterator[None]:
+    """Start processes that do not import the `__main__` of this one, a script that may lack a main guard."""
+    own, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = own
 
 
 def preload(modules: Sequence[str]) -> None:
@@ -46,5 +58,5 @@ def served_map(function: Callable[..., Result], *items: Iterable[Any]) -> list[R
         return list(map(function, *items))
     number = min(os.cpu_count() or 1, MAX_PROCESSES)
     ignored = signal.SIGINT, signal.SIG_IGN  # the run itself ends its processes
-    with ProcessPoolExecutor(number, process_context(), signal.signal, ignored) as processes:
+    with ProcessPoolExecutor(number, process_context(), signal.signal, ignored) as processes, without_main():
         return list(processes.map(function, *items))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import shlex
 import signal
 import threading
 import time
@@ -15,9 +16,10 @@ from collections.abc import Collection, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import active_children, parent_process
+from functools import cache
+from multiprocessing import parent_process
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -25,8 +27,8 @@ import torch
 from swiftwrf import FitError
 from swiftwrf.runtime.progress import silent
 from swiftwrf.runtime.threads import set_threads
-from tasks.preload import MAX_PROCESSES, process_context
-from tasks.torchrun import process_count
+from tasks.claim import STEPS
+from tasks.preload import process_context, without_main
 
 if TYPE_CHECKING:
     from tasks.steps import Step
@@ -34,14 +36,8 @@ if TYPE_CHECKING:
 MAX_SECONDS_TO_END = 10.0  # from the signal to the end of a process
 
 
-def number_of_processes(device: torch.device) -> int:
-    """Return the number of processes that compute the steps of a run: 1 on a GPU, with torchrun and with one thread."""
-    alone = device.type != "cpu" or process_count() > 1
-    return 1 if alone else min(torch.get_num_threads(), MAX_PROCESSES)
-
-
 class LocalProcesses:
-    """Processes that compute steps in the directory of a run.
+    """Processes that compute steps in the directory of a run, each with the number of threads of this process.
 
     Args:
         number: Number of processes.
@@ -51,64 +47,75 @@ class LocalProcesses:
 
     def __init__(self, number: int, folder: Path, content: Path) -> None:
         self.slots: float = number
-        threads = max(1, torch.get_num_threads() // number)
-        self._pool = ProcessPoolExecutor(number, process_context(), _begin, (threads, folder, content))
+        self._context = (torch.get_num_threads(), folder, content)
+        self._pool = ProcessPoolExecutor(number, process_context(), _begin)
+        self._started: dict[int, BaseProcess] = {}
 
     def submit(self, step: Step[Any]) -> Future[Any]:
-        """Begin a step in a process."""
-        return self._pool.submit(_compute, step)
+        """Begin a step in a process.
+
+        Raises:
+            FitError: A process ended.
+        """
+        with self._explaining(), without_main():
+            future = self._pool.submit(_compute, step, *self._context)
+        self._started |= self._pool._processes  # the user's program may have other children
+        return future
 
     def next(self, pending: Collection[Future[Any]]) -> tuple[Future[Any], Any, float]:
         """Wait for one of the steps and return it with its values and its seconds.
 
         Raises:
-            FitError: A process was killed.
+            FitError: A process ended.
             Exception: The exception of the step.
         """
         future = next(iter(wait(pending, return_when=FIRST_COMPLETED).done))
-        try:
+        with self._explaining():
             return future, *future.result()
+
+    @contextmanager
+    def _explaining(self) -> Iterator[None]:
+        """Raise FitError with the reason if a process ended. The pool terminates the others."""
+        try:
+            yield
         except BrokenProcessPool:
+            codes = [process.exitcode for process in self._started.values()]
+            code = next((code for code in (-signal.SIGKILL, *codes) if code and code in codes), 0)
+            reason = f"ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+            if code == -signal.SIGKILL:
+                reason = "was killed, probably because memory was short"
             raise FitError(
-                "a process of the run was killed, probably because memory was short; continue with one process by "
-                "OMP_NUM_THREADS=1 swiftwrf resume DIR.partial"
+                f"a process of the run {reason}; continue with one process: "
+                f"swiftwrf resume {shlex.quote(str(self._context[1]))} --processes 1"
             ) from None
 
     def close(self) -> None:
         """End the processes, whatever they compute."""
         self._pool.shutdown(wait=False, cancel_futures=True)
-        children = active_children()
-        for process in children:
+        for process in self._started.values():
             process.terminate()
-        for process in children:
+        for process in self._started.values():
             process.join(MAX_SECONDS_TO_END)
 
 
 @contextmanager
 def local_processes(number: int, folder: Path, context: object) -> Iterator[LocalProcesses]:
     """Start processes that compute steps in a directory, and end them on exit."""
-    with TemporaryDirectory(prefix="swiftwrf-") as temporary:
-        content = Path(temporary) / "context"
-        content.write_bytes(pickle.dumps(context))
-        processes = LocalProcesses(number, folder, content)
-        try:
-            yield processes
-        finally:
-            processes.close()
+    content = folder / STEPS / ".context"  # the end of the run removes it, even if this process is killed
+    content.write_bytes(pickle.dumps(context))
+    processes = LocalProcesses(number, folder, content)
+    try:
+        yield processes
+    finally:
+        processes.close()
+        content.unlink(missing_ok=True)
 
 
-_context: Any = None
-_folder = Path()
-_threads = 1
-
-
-def _begin(threads: int, folder: Path, content: Path) -> None:
+def _begin() -> None:
     """Prepare a process."""
-    global _context, _folder, _threads
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run itself ends its processes
     threading.Thread(target=_end_with_the_run, daemon=True).start()
     silent()
-    _threads, _folder, _context = threads, folder, pickle.loads(content.read_bytes())
 
 
 def _end_with_the_run() -> None:
@@ -117,8 +124,15 @@ def _end_with_the_run() -> None:
     os._exit(1)
 
 
-def _compute(step: Step[Any]) -> tuple[Any, float]:
+@cache
+def _read(content: Path) -> Any:
+    """Return the context of the steps. Each process reads it once, in a step, whose exception says why it cannot be read."""
+    return pickle.loads(content.read_bytes())
+
+
+def _compute(step: Step[Any], threads: int, folder: Path, content: Path) -> tuple[Any, float]:
     """Return the values of a step and its seconds."""
-    set_threads(_threads)  # after the libraries of the step are loaded, so that it reaches all of them
+    context = _read(content)
+    set_threads(threads)  # after the libraries of the step are loaded, so that it reaches all of them
     began = time.perf_counter()
-    return step.compute(_context, _folder), time.perf_counter() - began
+    return step.compute(context, folder), time.perf_counter() - began

@@ -86,14 +86,14 @@ def as_table(rows: Iterable[Row]) -> str:
     r"""Return the text of a comma-separated table with the keys of the rows as columns.
 
     Example:
-        >>> as_table([{"receiver": "=1+1", "rssi_dbm": -60.5}])
-        "receiver,rssi_dbm\r\n'=1+1,-60.5\r\n"
+        >>> as_table([{"receiver": "=1+1", "@home": -60.5}])
+        "receiver,'@home\r\n'=1+1,-60.5\r\n"
     """
     import pandas as pd
 
     rows = list(rows)
     columns = dict.fromkeys(key for row in rows for key in row)
-    cells = {name: pd.Series([_escaped(row.get(name)) for row in rows], dtype=object) for name in columns}
+    cells = {_escaped(name): pd.Series([_escaped(row.get(name)) for row in rows], dtype=object) for name in columns}
     table: str = pd.DataFrame(cells).to_csv(index=False, lineterminator="\r\n")
     return table
 

@@ -115,18 +115,16 @@ def computed(
     steps: Iterable[Step[Context]],
     context: Context,
     cluster: Cluster | None,
-    processes: int = 1,
     arrived: Arrived[Context] = lambda step, value: None,
     budget: Budget | None = None,
 ) -> Iterator[tuple[Step[Context], Row]]:
     """Yield each step with its result, followed by the steps that follow from it.
 
     Args:
-        run: Run that keeps the results. A kept result is not computed again.
+        run: Run that keeps the results, and has the number of processes. A kept result is not computed again.
         steps: The first steps.
         context: Data and configuration that all steps share.
         cluster: Cluster that computes the steps in parallel.
-        processes: Number of processes of this machine that compute the steps. With 1 they are computed in this process.
         arrived: Called with each step and its result as soon as it arrives, in any order.
         budget: Time within which optional steps must end. Steps that are left out are yielded with the reason as their
             result, which is not kept.
@@ -137,10 +135,10 @@ def computed(
     steps, budget = list(steps), budget or Budget()
     if cluster is not None:
         _compute_on(_ClusterWorkers(cluster, run, context), run, steps, context, arrived, budget)
-    elif processes > 1:
-        with local_processes(processes, run.folder, context) as local:
+    elif run.processes > 1:
+        with local_processes(run.processes, run.folder, context) as local:
             _compute_on(local, run, steps, context, arrived, budget)
-    yield from _computed_here(run, steps, context, None if cluster or processes > 1 else arrived, budget)
+    yield from _computed_here(run, steps, context, None if cluster or run.processes > 1 else arrived, budget)
 
 
 def _computed_here(

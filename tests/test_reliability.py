@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 from contextlib import suppress
@@ -50,6 +51,14 @@ def _interrupt(*_):
 
 def _files(folder):
     return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+def test_a_report_without_out_is_new_each_time(finished, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for time in ("first", "second"):
+        monkeypatch.setattr("tasks.report.run.stamp", lambda time=time: time)
+        assert run("report", finished) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "report: runs/report/second/report.html"
 
 
 @pytest.mark.parametrize("damage", ["", "{", "[1]", '{"value": null}'])
@@ -262,14 +271,28 @@ def test_whole_numbers_stay_whole_where_other_rows_have_none(tmp_path):
     assert (tmp_path / "t.csv").read_text().splitlines() == ["step,loss", "1,", ",0.5"]
 
 
-def test_the_commit_is_that_of_this_project(tmp_path, monkeypatch):
+def test_the_commit_is_that_of_this_project_and_names_every_change(tmp_path, monkeypatch):
     """Not that of a user's repository in which the package is installed."""
     git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b.c"]
+    own = tmp_path / "tasks" / "environment.py"
+    own.parent.mkdir()
+    own.write_text("")
     subprocess.run([*git, "init", "--quiet"], check=True)
     subprocess.run([*git, "commit", "--quiet", "--allow-empty", "--message", "empty"], check=True)
-    (tmp_path / "environment.py").write_text("")
-    monkeypatch.setattr(environment, "__file__", str(tmp_path / "environment.py"))
+    monkeypatch.setattr(environment, "__file__", str(own))
     assert environment._commit() is None
+    subprocess.run([*git, "add", "."], check=True)
+    subprocess.run([*git, "commit", "--quiet", "--message", "code"], check=True)
+    clean = environment._commit()
+    assert re.fullmatch("[0-9a-f]{12}", clean)
+    (tmp_path / "notes.md").write_text("no code")
+    assert environment._commit() == clean
+    found = set()
+    for name, content in (("environment.py", "1"), ("environment.py", "2"), ("new.py", "1"), ("new.py", "2")):
+        own.with_name(name).write_text(content)
+        found.add(environment._commit())
+    assert len(found) == 4
+    assert all(re.fullmatch(f"{clean}-dirty-[0-9a-f]{{12}}", text) for text in found)
 
 
 @pytest.mark.filterwarnings("error:constrained_layout")

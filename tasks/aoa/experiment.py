@@ -22,7 +22,6 @@ from tasks.cluster import connected
 from tasks.metrics import AoaMetrics
 from tasks.page.page import reporting
 from tasks.page.records import Records
-from tasks.processes import number_of_processes
 from tasks.run import Run, choose_device
 from tasks.source import located, reading
 from tasks.steps import Budget, Step, computed
@@ -60,12 +59,12 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
     label = f"mix{'_'.join(map(fraction_key, config.mix))}-s{config.seed}"
     with (
         connected(config.scheduler, device) as cluster,
-        Run("aoa", config.out, label, config, device, source, resume) as directory,
+        Run("aoa", config.out, label, config, device, source, resume, 1 if cluster else config.processes) as directory,
     ):
         results = Results(experiment, directory)
         with terminal.progress():
-            processes, budget = number_of_processes(device), Budget(config.budget)
-            for step, value in computed(directory, steps, experiment, cluster, processes, results.show, budget):
+            budget = Budget(config.budget)
+            for step, value in computed(directory, steps, experiment, cluster, results.show, budget):
                 results.add(step, value)
         results.write()
         metrics: AoaMetrics = {

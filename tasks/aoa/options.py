@@ -67,6 +67,9 @@ class AoaConfig(SpectraSource, Output):
     left out"""
     scheduler: str | None = None
     """address of a Dask scheduler whose workers compute the steps of the run (extra: cluster)"""
+    processes: int | None = None
+    """processes of this machine that compute the steps, a gigabyte of memory each (default: one a thread, at most 4; one on
+    a GPU)"""
     seed: int = 0
     """seed of everything random"""
     out: str | None = None
@@ -101,8 +104,10 @@ class AoaConfig(SpectraSource, Output):
             raise InputError(f"--mix takes measured fractions in (0, 1], got {_listed(self.mix) or 'none'}")
         if len(set(self.mix)) < len(self.mix):
             raise InputError(f"--mix names a fraction twice: {_listed(self.mix)}")
-        if given(self) and self.data is None:
-            raise InputError(f"--{given(self)[0]} is an option of the reader; give it with --data")
+        if self.data is None and (names := given(self, SpectraSource)):
+            raise InputError(f"--{names[0]} is an option of the reader; give it with --data")
+        if self.processes is not None and (self.processes < 1 or self.scheduler is not None):
+            raise InputError(f"--processes takes a number from 1, without --scheduler, got {self.processes}")
         if self.budget is not None and not self.budget > 0:
             raise InputError(f"--budget takes a time in seconds above 0, got {self.budget:g}")
         if self.repeats < 1:

@@ -21,5 +21,5 @@ class EstimateConfig(SpectraSource):
     source: Annotated[str, tyro.conf.Positional]
     """measurements of any format that tasks.aoa takes, or spectra of unknown positions: a .npy file (n, elevations,
     azimuths) of magnitudes in [0, 1]"""
-    out: str = "directions.csv"
-    """table to write; must not exist"""
+    out: str | None = None
+    """table to write; must not exist (default: a new directions-TIME.csv)"""

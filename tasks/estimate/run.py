@@ -11,7 +11,8 @@ from swiftwrf.errors import with_article
 from swiftwrf.locate import MatchedField
 from swiftwrf.metrics import angle_errors
 from tasks.aoa.estimators import SavedEstimator
-from tasks.directory import check_new_table
+from tasks.directory import check_new_file
+from tasks.environment import stamp
 from tasks.estimate.options import EstimateConfig
 from tasks.records import rounded, write_table
 from tasks.source import observed_spectra, reading
@@ -23,8 +24,8 @@ def run(config: EstimateConfig) -> None:
     Raises:
         InputError: no such estimator, spectra that cannot be read or are not like those it was trained on, or `out` exists.
     """
-    out = Path(config.out)
-    check_new_table(out)
+    out = Path(config.out or f"directions-{stamp()}.csv")
+    check_new_file(out, "--out ")
     estimator = load(config.estimator)
     if not isinstance(estimator, SavedEstimator | MatchedField):
         raise InputError(

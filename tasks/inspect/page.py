@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-
 import numpy as np
 import torch
 from matplotlib.axes import Axes
@@ -14,6 +12,7 @@ from torch import Tensor
 from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.data import Rssi, Spectra
 from swiftwrf.rssi import fit_path_loss, log_distance
+from tasks.environment import command
 from tasks.inspect.findings.base import Findings
 from tasks.inspect.findings.positions import nearest
 from tasks.page import figures
@@ -47,10 +46,9 @@ def page(data: Spectra | Rssi, kind: str, findings: Findings, source: str) -> Pa
         Number(str(len(data)), f"measurements, read as {kind}"),
         Number(f"{extent} m", "extent of the positions, x by y by z"),
     ]
-    task = "rssi --rx all" if isinstance(data, Rssi) else "aoa --mix 0.3"
-    source = shlex.quote(source)
-    mend = [f"Correct the warnings and inspect again: `python -m tasks.inspect {source}`."] if warnings else []
-    steps = [*mend, f"Go on with `python -m tasks.{task} --data {source}`."]
+    task = ("rssi", "--rx", "all") if isinstance(data, Rssi) else ("aoa", "--mix", "0.3")
+    mend = [f"Correct the warnings and inspect again: `{command('inspect', source)}`."] if warnings else []
+    steps = [*mend, f"Go on with `{command(*task, '--data', source)}`."]
     meaning = warnings or ["Nothing looks wrong. Errors that the files alone do not reveal remain possible."]
     conclusion = _fingerprinting(data) if isinstance(data, Spectra) else ""
     return Page(

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
 
 from swiftwrf.data import Rssi, Snapshots
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
 from tasks.directory import new_directory
+from tasks.environment import stamp
 from tasks.inspect.findings import inspect
 from tasks.inspect.findings.rssi import propose_offsets
 from tasks.inspect.options import InspectConfig
@@ -26,7 +26,7 @@ def run(config: InspectConfig) -> None:
         InputError: Measurements that cannot be read.
     """
     source, options = located(config.source), reading(config)
-    out = Path(config.out) if config.out else Path("runs") / "inspect" / f"{datetime.now():%Y%m%d-%H%M%S}"
+    out = Path(config.out) if config.out else Path("runs") / "inspect" / stamp()
     with new_directory(out, "an inspection") as folder:
         data = read(source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
         kind = "RSSI" if isinstance(data, Rssi) else "array snapshots" if isinstance(data, Snapshots) else "spectra"

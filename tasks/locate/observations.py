@@ -19,9 +19,11 @@ from swiftwrf.errors import listed, with_article
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
 from swiftwrf.locate.track import joined
 from swiftwrf.metrics import angle_errors
-from tasks.directory import check_new_table
+from tasks.directory import check_new_file
+from tasks.environment import stamp
 from tasks.locate.localizers import BATCH_ROWS
-from tasks.locate.options import SPECTRA, TABLE, LocateConfig
+from tasks.locate.options import LocateConfig
+from tasks.options import SpectraSource, given
 from tasks.records import Row, rounded, write_table
 from tasks.source import located, observed_spectra, reading
 from tasks.terminal import console, terminal
@@ -38,8 +40,8 @@ def write_positions(config: LocateConfig) -> None:
     """
     assert config.model is not None
     assert config.source is not None
-    out = Path(config.out or TABLE)
-    check_new_table(out)
+    out = Path(config.out or f"positions-{stamp()}.csv")
+    check_new_file(out, "--out ")
     model = load(config.model)
     if isinstance(model, RssiLocator):
         columns = _of_rssi(model, config, config.source)
@@ -61,8 +63,7 @@ def write_positions(config: LocateConfig) -> None:
 
 
 def _of_rssi(locator: RssiLocator, config: LocateConfig, source: str) -> Columns:
-    unused = [name for name in SPECTRA if getattr(config, name) is not None]
-    if unused:
+    if unused := given(config, SpectraSource):
         raise InputError(f"--{unused[0]} is for spectra, and {config.model} locates by RSSI")
     options = reading(config)
     offsets = locator.model.offsets

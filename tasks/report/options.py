@@ -18,5 +18,5 @@ class ReportConfig(Options):
 
     runs: Annotated[tuple[str, ...], tyro.conf.Positional]
     """directories of the runs"""
-    out: str = "runs/report"
-    """directory of the report; must not exist"""
+    out: str | None = None
+    """directory of the report; must not exist (default: a new one under runs/report)"""

@@ -10,6 +10,7 @@ from typing import Any
 from swiftwrf import InputError
 from tasks.aoa import page as aoa
 from tasks.directory import new_directory
+from tasks.environment import stamp
 from tasks.locate import page as locate
 from tasks.page.page import Page, write_page
 from tasks.page.records import Records
@@ -21,8 +22,9 @@ PAGES: dict[str, Callable[[list[Records[Any]]], Page]] = {"aoa": aoa.page, "rssi
 
 def run(config: ReportConfig) -> None:
     """Write the report and print its place."""
-    merge([Path(folder) for folder in config.runs], Path(config.out))
-    print(f"report: {Path(config.out) / 'report.html'}")
+    out = Path(config.out) if config.out else Path("runs") / "report" / stamp()
+    merge([Path(folder) for folder in config.runs], out)
+    print(f"report: {out / 'report.html'}")
 
 
 def merge(folders: list[Path], out: Path) -> None:

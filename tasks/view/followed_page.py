@@ -5,6 +5,7 @@ from __future__ import annotations
 from nicegui import run, ui
 
 from swiftwrf import InputError
+from tasks.environment import command
 from tasks.records import Row, rounded
 from tasks.view.followed import FollowedView, Snapshot, Version
 from tasks.view.page import header
@@ -38,7 +39,7 @@ class FollowedPage:
         self._table = ui.table(rows=[], columns=columns, row_key="index", title="Last measurements")
         self._table.props('dense flat id="rows"').classes("w-full")
         ui.label(
-            f"Maps and spectra of the newest model: python -m tasks.view {view.folder / 'model.safetensors'}"
+            f"Maps and spectra of the newest model: {command('view', str(view.folder / 'model.safetensors'))}"
         ).classes("quiet")
         ui.timer(PERIOD_S, self._look)
 

@@ -18,9 +18,9 @@ from tasks.aoa.condition import LOCATOR as MATCHED_FIELD
 from tasks.aoa.experiment import measurements as spectra_of
 from tasks.aoa.options import AoaConfig, fraction_key
 from tasks.claim import CONFIG, ENVIRONMENT, LOCATOR, MODEL
-from tasks.command_line import configured
 from tasks.locate.experiment import measurements as rssi_of
 from tasks.locate.options import LocateConfig
+from tasks.parsing import parse
 from tasks.records import Row, read_json
 from tasks.view.followed import FollowedView, open_followed
 from tasks.view.locating import RssiLocating, SpectrumLocating
@@ -83,7 +83,7 @@ def _planes(model: FieldModel) -> list[dict[str, Any]]:
 
 def _aoa_run(folder: Path, content: Row) -> SpectraView:
     with refusing(f"the records in {folder} are not those of a run"):
-        config = configured(AoaConfig, content["config"], folder)
+        config = parse(AoaConfig, [], "tasks.view", content["config"], folder)
         data, train, notes = _measured(folder, config)
         models = []
         for fraction in config.mix:
@@ -137,7 +137,7 @@ def _locate_run(folder: Path, content: Row) -> RssiView:
     if not isinstance(locator, RssiLocator):
         raise InputError(f"{file} holds {with_article(locator.kind)}, expected {with_article(RssiLocator.kind)}")
     with refusing(f"the records in {folder} are not those of a run"):
-        config = configured(LocateConfig, content["config"], folder)
+        config = parse(LocateConfig, [], "tasks.view", content["config"], folder)
         try:
             data = rssi_of(config)
             _expect_unchanged(data.source, folder)

@@ -36,6 +36,13 @@ from quick import run, said
         ("locate", ("--split", "nowhere"), "choose one of block, random"),
         ("locate", ("--cells", 9), "--cells takes 10"),
         ("locate", ("--grid", 8, 32), "--grid is for spectra"),
+        ("locate", ("--rx", "all", "--round-trip"), "--round-trip is for spectra"),
+        ("locate", ("--drop-null",), "--drop-null is for spectra"),
+        ("locate", ("{file}", "{file}", "--offset-by", "x"), "--offset-by is for the experiment"),
+        ("aoa", ("--mix", 0.5, "--processes", 0), "--processes takes a number from 1"),
+        ("rssi", ("--rx", "1", "--out", "link"), "link exists already"),
+        ("report", ("{file}", "--out", "link"), "no finished run"),
+        ("estimate", ("{file}", "{file}", "--out", "link"), "link exists already"),
         ("locate", ("--columns", "x=a"), "give it with --data"),
         ("locate", ("--scheduler", "tcp://127.0.0.1:1"), "no Dask scheduler"),
         ("locate", ("{file}",), "needs observations"),
@@ -52,9 +59,10 @@ from quick import run, said
 def test_command_lines_end_in_a_sentence(tmp_path, capsys, monkeypatch, task, arguments, says):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
+    (tmp_path / "link").symlink_to("nowhere")
     assert run(task, *(str(a).replace("{file}", str(tmp_path / "file")) for a in arguments)) == 2
     assert says in said(capsys)
-    assert [file.name for file in tmp_path.iterdir()] == ["file"]
+    assert {file.name for file in tmp_path.iterdir()} == {"file", "link"}
 
 
 def test_sixty_shares_without_out(tmp_path, monkeypatch):

@@ -130,7 +130,7 @@ def test_the_estimator_that_a_run_recommends_is_the_one_that_cross_validation_ch
     assert len(alone.state()[0]["known"]) < len(turbo.state()[0]["known"])
 
 
-def test_directions_of_measured_and_unknown_positions(finished, small, tmp_path, capsys):
+def test_directions_of_measured_and_unknown_positions(finished, small, tmp_path, capsys, monkeypatch):
     estimator = finished / "kernel_regression-mix0.5.safetensors"
     (tmp_path / "data").mkdir()
     write_spectra(small, tmp_path / "data")
@@ -142,7 +142,12 @@ def test_directions_of_measured_and_unknown_positions(finished, small, tmp_path,
 
     np.save(tmp_path / "unknown.npy", small.spectrum.numpy())
     assert run("estimate", estimator, tmp_path / "unknown.npy", "--out", tmp_path / "unknown.csv") == 0
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "directions.csv").write_text("of another run")
+    assert run("estimate", estimator, tmp_path / "unknown.npy") == 0
+    (default,) = tmp_path.glob("directions-*.csv")
     unknown = pd.read_csv(tmp_path / "unknown.csv")
+    assert default.read_bytes() == (tmp_path / "unknown.csv").read_bytes()
     assert unknown.columns.tolist() == ["index", "azimuth_deg", "elevation_deg"]
     assert run("estimate", estimator, tmp_path / "unknown.npy", "--every", 7, "--out", tmp_path / "some.csv") == 2
     assert "--every does not apply" in said(capsys)

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import re
 from dataclasses import fields
 from importlib import import_module
 
 import pytest
-from quick import said
 
 from swiftwrf import InputError
 from tasks.aoa.options import AoaConfig
 from tasks.command import COMMANDS, main
-from tasks.command_line import command_line
+from tasks.command_line import command_line, execute
 from tasks.inspect.options import InspectConfig
 from tasks.options import plain
-from tasks.parsing import parse
+from tasks.parsing import file_options, parse
 from tasks.report.options import ReportConfig
+from tasks.resume import digest
 from tasks.rssi.options import RssiTaskConfig
 
 SOURCE = ("--data", "x", "--array", "4", "2", "0.06", "2.4e9", "--drop-null")
@@ -50,21 +51,21 @@ def test_help_has_groups_names_examples_and_one_default_an_option(name, capsys, 
 def test_a_run_is_repeated_from_its_configuration_and_the_command_line_wins(tmp_path):
     first = parse(AoaConfig, ["--mix", "0.1", "0.3", "--seed", "7", *SOURCE], "aoa")
     (tmp_path / "config.json").write_text(json.dumps({"task": "aoa", "config": plain(first)}))
-    assert parse(AoaConfig, ["--config", str(tmp_path / "config.json")], "aoa") == first
+    assert parse(AoaConfig, [], "aoa", file_options(tmp_path / "config.json")) == first
     for given in (("--mix", "0.5"), ("--mix=0.5",)):
-        again = parse(AoaConfig, [*given, "--config", str(tmp_path / "config.json")], "aoa")
+        again = parse(AoaConfig, given, "aoa", file_options(tmp_path / "config.json"))
         assert plain(again) == plain(first) | {"mix": (0.5,)}
     rssi = parse(
         RssiTaskConfig, ["--rx", "1", "a b", "--floor-plan", "p", "--floor-extent", "-1", "2", "0", "1"], "rssi"
     )
     (tmp_path / "rssi.json").write_text(json.dumps(plain(rssi)))
-    assert parse(RssiTaskConfig, ["--config", str(tmp_path / "rssi.json")], "rssi") == rssi
+    assert parse(RssiTaskConfig, [], "rssi", file_options(tmp_path / "rssi.json")) == rssi
 
 
 def test_a_yaml_file_holds_options_and_positional_arguments(tmp_path):
     file = tmp_path / "inspect.yaml"
     file.write_text("source: DIR\nevery: 3\nround_trip: true\ncolumns: [x=a, y=b]\nout: null\n")
-    found = parse(InspectConfig, ["--config", str(file)], "inspect")
+    found = parse(InspectConfig, [], "inspect", file_options(file))
     assert (found.source, found.every, found.round_trip, found.columns, found.out) == (
         "DIR",
         3,
@@ -72,7 +73,7 @@ def test_a_yaml_file_holds_options_and_positional_arguments(tmp_path):
         ("x=a", "y=b"),
         None,
     )
-    assert parse(InspectConfig, ["OTHER", "--config", str(file)], "inspect").source == "OTHER"
+    assert parse(InspectConfig, ["OTHER"], "inspect", file_options(file)).source == "OTHER"
 
 
 @pytest.mark.parametrize(
@@ -89,18 +90,90 @@ def test_files_that_hold_no_options_are_refused(tmp_path, content, sentence):
     if content is not None:
         file.write_text(content)
     with pytest.raises(InputError, match=sentence):
-        parse(AoaConfig, ["--config", str(file)], "aoa")
+        parse(AoaConfig, [], "aoa", file_options(file))
 
 
-def test_values_of_a_file_are_checked_as_those_of_a_command_line(tmp_path, capsys):
-    (tmp_path / "options.yaml").write_text("mix: [0.3]\nseed: many\n")
-    with pytest.raises(SystemExit, match="2"):
-        parse(AoaConfig, ["--config", str(tmp_path / "options.yaml")], "aoa")
-    assert "--seed" in capsys.readouterr().err
-    with pytest.raises(InputError, match="--config takes a file"):
-        parse(AoaConfig, ["--config"], "aoa")
-    assert main(["aoa", "--mix", "0.3", "--resume", "x"]) == 2
-    assert "--resume DIR.partial comes first" in said(capsys)
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ("mix: [0.3]\nseed: many\n", "o.yaml: seed takes INT, got 'many'"),
+        ("seed: [1, 2]\n", "seed takes INT"),
+        ("array: [4, 0.1]\n", "array takes"),
+        ("preset: large\n", "preset takes"),
+        ("a: &a [x, x]\nsynthesizer: [*a, *a]\n", "names 'a'"),
+        ("synthesizer: [[x]]\n", "synthesizer takes"),
+        ("[" * 5000, "cannot be read"),
+        ("#" * 2**20 + "\n", "at most 1048576 bytes"),
+    ],
+)
+def test_values_of_a_file_are_checked_as_those_of_a_command_line(tmp_path, content, sentence):
+    (tmp_path / "o.yaml").write_text(content)
+    with pytest.raises(InputError, match=sentence):
+        parse(AoaConfig, [], "aoa", file_options(tmp_path / "o.yaml"), "o.yaml")
+
+
+def executed(config_type, *arguments):
+    """Return the configuration with which a command line runs its task."""
+    found = []
+    execute("tasks.rssi", config_type, lambda config, folder: found.append(config), [*map(str, arguments)])
+    return found[0]
+
+
+@pytest.mark.parametrize("form", [lambda file: ("--config", file), lambda file: (f"--config={file}",)])
+def test_a_file_of_options_is_given_in_both_forms(tmp_path, form):
+    file = tmp_path / "opts.yaml"
+    file.write_text("seed: 5\nsplit: block\nrx: [1, a b]\n")
+    found = executed(RssiTaskConfig, *form(file), "--seed", 6)
+    assert (found.seed, found.split, found.rx) == (6, "block", ("1", "a b"))
+
+
+def test_the_configuration_of_a_run_with_out_starts_another_run(tmp_path):
+    values = plain(RssiTaskConfig(("1",), out=str(tmp_path), keep_filler=True, data="x"))
+    (tmp_path / "config.json").write_text(json.dumps({"task": "rssi", "config": values}))
+    found = executed(RssiTaskConfig, "--config", tmp_path / "config.json")
+    assert plain(found) == values | {"out": None}
+    again = executed(RssiTaskConfig, "--config", tmp_path / "config.json", "--keep-filler", "--out", "other")
+    assert (again.keep_filler, again.out) == (True, "other")
+    assert not executed(RssiTaskConfig, "--config", tmp_path / "config.json", "--no-keep-filler").keep_filler
+
+
+@pytest.mark.parametrize("texts", [["--out", "X"], ["--help"], ["--config=x"], ["-1"]])
+def test_values_of_a_file_are_no_flags(tmp_path, texts):
+    (tmp_path / "options.json").write_text(json.dumps({"rx": texts}))
+    found = executed(RssiTaskConfig, "--config", tmp_path / "options.json")
+    assert (found.rx, found.out) == (tuple(texts), None)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("--config", "a", "--config=b"), "--config is given twice: a and b"),
+        (("--config",), "--config: expected one argument"),
+        (("--verbose=1",), "--verbose"),
+        (("--config", "/dev/zero"), "cannot be read"),
+        (("--config", "fifo"), "cannot be read"),
+        (("--resume=x", "--resume", "y"), "--resume is given twice"),
+    ],
+)
+def test_general_options_are_refused_in_a_sentence(tmp_path, monkeypatch, arguments, sentence):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("fifo")
+    with pytest.raises(InputError, match=sentence):
+        executed(RssiTaskConfig, "--rx", 1, *arguments)
+
+
+def test_resume_is_given_anywhere_and_changes_no_result(tmp_path):
+    folder = tmp_path / "x.partial"
+    folder.mkdir()
+    values = plain(RssiTaskConfig(("1",), scheduler="tcp://old:1"))
+    (folder / "config.json").write_text(json.dumps({"task": "rssi", "config": values}))
+    (folder / "environment.json").write_text(json.dumps({"config_sha256": digest(values)}))
+    for given in (("--resume", folder, "--json"), (f"--resume={folder}", "--json"), ("--json", f"--resume={folder}")):
+        found = executed(RssiTaskConfig, *given)
+        assert (plain(found), found.json) == (values | {"scheduler": None}, True)
+    for given, name in ((("--seed", 7), "seed"), (("--config", "x"), "config"), (("--keep-filler",), "keep-filler")):
+        with pytest.raises(InputError, match=f"--{name} cannot change the run that --resume continues"):
+            executed(RssiTaskConfig, *given, "--resume", folder)
 
 
 def test_verbose_prints_messages_of_logging_and_only_during_the_command(capsys):

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import time
+from functools import partial
 from importlib import import_module
 from multiprocessing import active_children
 from pathlib import Path
@@ -15,15 +16,16 @@ from unittest import mock
 
 import pytest
 import torch
-from sums import Kill, Optional, Refusal, Sum
+from sums import Exit, Kill, Optional, Refusal, Sum
 
 from swiftwrf import AngularGrid, FitError, InputError, simulated_room
 from swiftwrf.data.writing import write_spectra
+from swiftwrf.runtime.threads import set_threads
 from tasks.aoa.options import AoaConfig
 from tasks.command import COMMANDS
 from tasks.directory import Run
+from tasks.environment import number_of_processes
 from tasks.preload import SERVED
-from tasks.processes import number_of_processes
 from tasks.steps import Budget, computed
 
 HERE = Path(__file__).parents[1]
@@ -32,8 +34,8 @@ STEPS = [Sum(1, (3, 4)), Sum(2), Sum(1, (5,))]  # the third is the first one, an
 
 def results(folder, steps, processes, budget=None):
     arrived = []
-    with Run("aoa", str(folder), "", AoaConfig(mix=(0.5,)), torch.device("cpu"), {}) as run:
-        found = list(computed(run, steps, 10, None, processes, lambda step, value: arrived.append(step.name), budget))
+    with Run("aoa", str(folder), "", AoaConfig(mix=(0.5,)), torch.device("cpu"), {}, None, processes) as run:
+        found = list(computed(run, steps, 10, None, lambda step, value: arrived.append(step.name), budget))
         run.finish({}, lambda folder, metrics: None)
     return found, arrived
 
@@ -102,14 +104,71 @@ def test_an_optional_step_is_expected_to_take_as_long_as_the_longest():
     assert Budget().priority(Optional(2)) == Budget().priority(Sum(2))
 
 
-@pytest.mark.parametrize(("step", "error"), [(Refusal(1), InputError("no such number")), (Kill(1), FitError("killed"))])
+KILLED = "was killed, probably because memory was short; continue with one process: .* --processes 1"
+
+
+@pytest.mark.parametrize(
+    ("step", "error"),
+    [
+        (Refusal(1), InputError("no such number")),
+        (Kill(1), FitError(KILLED)),
+        (Exit(1), FitError("ended with exit code 3; continue with one process")),
+    ],
+)
 def test_a_step_that_fails_ends_the_run_and_its_processes(tmp_path, step, error):
     with pytest.raises(type(error), match=str(error)):
         results(tmp_path / "run", [Sum(2), step], 2)
+    assert not (tmp_path / "run.partial" / "steps" / ".context").exists()
     deadline = time.monotonic() + 10
     while active_children() and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not active_children()
+
+
+SCRIPT = """
+import sys, torch
+from sums import Sum
+from tasks.aoa.options import AoaConfig
+from tasks.directory import Run
+from tasks.steps import computed
+
+class Own(int): pass
+
+print("once")
+with Run("aoa", sys.argv[1], "", AoaConfig(mix=(0.5,)), torch.device("cpu"), {}, None, 2) as run:
+    print([value["sum"] for _, value in computed(run, [Sum(1), Sum(2)], eval(sys.argv[2]), None)])
+"""
+
+
+@pytest.mark.parametrize(
+    ("context", "says"), [("10", "[11, 12]"), ("Own(10)", "AttributeError: Can't get attribute 'Own'")]
+)
+def test_a_script_without_main_guard_runs_once_and_its_errors_are_those_that_happened(tmp_path, context, says):
+    (tmp_path / "script.py").write_text(SCRIPT)
+    environment = os.environ | {"PYTHONPATH": f"{HERE}{os.pathsep}{HERE.parent}"}
+    command = [sys.executable, str(tmp_path / "script.py"), str(tmp_path / "run"), context]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout.count("once") == 1
+    assert says in (done.stdout + done.stderr)
+    assert "memory" not in done.stderr
+
+
+@pytest.mark.parametrize(("now", "asked", "processes"), [(4, None, 2), (1, None, 1), (4, 1, 1)])
+def test_a_resumed_run_has_the_processes_of_now_with_the_threads_of_its_beginning(tmp_path, now, asked, processes):
+    file = tmp_path / "run.partial" / "environment.json"
+    start = partial(Run, "aoa", str(tmp_path / "run"), "", AoaConfig(mix=(0.5,)), torch.device("cpu"), {})
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(8)
+        with start(None, None) as run:
+            assert (run.processes, torch.get_num_threads()) == (4, 2)
+        torch.set_num_threads(now)
+        with start(file.parent, asked) as run:
+            assert (run.processes, torch.get_num_threads()) == (processes, 2)
+    finally:
+        set_threads(threads)
+    recorded = json.loads(file.read_text())
+    assert (recorded["threads"], recorded["processes"], recorded["resumed"][0]["processes"]) == (2, 4, processes)
 
 
 def test_one_process_with_one_thread_on_a_gpu_and_with_torchrun():
@@ -117,8 +176,11 @@ def test_one_process_with_one_thread_on_a_gpu_and_with_torchrun():
     with mock.patch("torch.get_num_threads", return_value=16):
         assert number_of_processes(torch.device("cpu")) == 4
         assert number_of_processes(torch.device("cuda")) == 1
-        with mock.patch("tasks.processes.process_count", return_value=2):
+        with mock.patch("tasks.environment.process_count", return_value=2):
             assert number_of_processes(torch.device("cpu")) == 1
+    assert number_of_processes(torch.device("cpu"), 3) == 3
+    with pytest.raises(InputError, match="--processes 2 is for steps on the CPU"):
+        number_of_processes(torch.device("cuda"), 2)
 
 
 def prepare(folder):

@@ -13,6 +13,7 @@ from tasks.aoa.page.room import choice_section, room_section
 from tasks.aoa.page.suggest import suggestion_section
 from tasks.aoa.page.summary import conclusion, next_steps, summary
 from tasks.aoa.page.synthesis import similarity, synthesis_section
+from tasks.environment import command
 from tasks.page.page import Page, Plot, Section, Summary, sections_of
 from tasks.page.provenance import provenance
 
@@ -46,7 +47,7 @@ def _comparison(fractions: list[FractionRecords]) -> Summary:
     table, plot = compared(fractions)
     meaning = [f"{fraction.scene}: {conclusion(fraction)}" for fraction in fractions]
     runs = {fraction.run.path: fraction.run for fraction in fractions}
-    steps = [f"Explore{run.label.replace(',', '')}: `python -m tasks.view {path}`." for path, run in runs.items()]
+    steps = [f"Explore{run.label.replace(',', '')}: `{command('view', path)}`." for path, run in runs.items()]
     if len(runs) == 1:
         steps = list(dict.fromkeys(step for fraction in fractions for step in next_steps(fraction)))
     return Summary([], [plot], meaning, steps, table=table)

@@ -10,6 +10,7 @@ from tasks.aoa.page.overview import overview
 from tasks.aoa.page.records import AoaRecords, FractionRecords
 from tasks.aoa.page.results import choice_sentence
 from tasks.aoa.page.room import cross_validation_sentences
+from tasks.environment import command
 from tasks.page.page import Number, Summary
 from tasks.page.suggestion import worth
 from tasks.summarise import fingerprinting
@@ -114,21 +115,21 @@ def next_steps(fraction: FractionRecords) -> list[str]:
     estimators = files & {*ESTIMATORS, *FORMER_NAMES, LOCATOR, MEASURED_STAND_IN}
     steps = []
     if files - estimators:
-        steps.append(f"Explore the spectra: `python -m tasks.view {path}`.")
+        steps.append(f"Explore the spectra: `{command('view', path)}`.")
     choice = fraction.mix.get("estimator_choice")
     taken = _file_of(fraction, choice["name"], estimators) if choice else ""
     if taken:
         steps.append(
             f"Take {taken} on this data: cross-validation chose it, without the test spectra. Estimate directions of new "
-            f"spectra: `python -m tasks.estimate {path}/{taken}-mix{key}.safetensors SOURCE`."
+            f"spectra: `{command('estimate', f'{path}/{taken}-mix{key}.safetensors', 'SOURCE')}`."
         )
     others = sorted(estimators - {taken})
     if others:
-        kept = f"`python -m tasks.estimate {path}/{others[0]}-mix{key}.safetensors SOURCE`"
+        kept = f"`{command('estimate', f'{path}/{others[0]}-mix{key}.safetensors', 'SOURCE')}`"
         more = f" Also kept: {', '.join(others[1:])}." if len(others) > 1 else ""
         steps.append(f"{'Or by' if taken else 'Estimate directions by'} {others[0]}: {kept}.{more}")
     steps += [
-        f"Predict spectra anywhere: `swiftwrf.load('{path}/{name}-mix{key}.safetensors').predict(positions)`."
+        f"Predict spectra anywhere: `swiftwrf.load({f'{path}/{name}-mix{key}.safetensors'!r}).predict(positions)`."
         for name in sorted(files - estimators)
     ]
     if (fraction.run.folder / f"suggested-mix{key}.csv").is_file():

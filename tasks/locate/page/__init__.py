@@ -6,6 +6,7 @@ import math
 
 from pandas import concat
 
+from tasks.environment import command
 from tasks.labels import LOCALIZERS as LABELS
 from tasks.labels import labels
 from tasks.locate.localizers import LOCALIZERS
@@ -48,7 +49,7 @@ def _comparison(runs: list[LocateRecords]) -> Summary:
     shown = [name for name in (OWN, *NEIGHBOURS, "mean") if any(name in one.errors for one in compared)]
     table, plot = comparison(compared, drawing.palette(), shown, "m", "position error")
     meaning = [f"Run {run.number}, {run.place}: {conclusion(run)}" for run in runs]
-    steps = [f"Explore run {run.number}: `python -m tasks.view {run.path}`." for run in runs]
+    steps = [f"Explore run {run.number}: `{command('view', run.path)}`." for run in runs]
     return Summary([], [plot], meaning, steps, table=table)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from tasks.environment import command
 from tasks.labels import PREDICTORS as LABELS
 from tasks.labels import labels
 from tasks.page.comparison import Compared, comparison
@@ -71,7 +72,7 @@ def _comparison(runs: list[RssiRecords]) -> Summary:
     shown = [*dict.fromkeys(map(model_of, runs)), *(name for name in baselines if name in every)]
     table, plot = comparison(compared, errors.palette(), shown, "dB", "absolute error")
     meaning = [f"Run {run.number}, {run.place}: {conclusion(run)}" for run in runs]
-    steps = [f"Explore run {run.number}: `python -m tasks.view {run.path}`." for run in runs]
+    steps = [f"Explore run {run.number}: `{command('view', run.path)}`." for run in runs]
     return Summary([], [plot], meaning, steps, table=table)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pandas import DataFrame
 
+from tasks.environment import command
 from tasks.metrics import RssiMetrics
 from tasks.page.maps import inside
 from tasks.page.records import Records
@@ -51,10 +52,10 @@ def next_steps(run: RssiRecords) -> list[str]:
     """Return what to do next, a sentence each."""
     interval = run.metrics["interval"]
     pairs = model_of(run) == "pairs"  # its maps depend on both ends, and the page shows one
-    steps = [] if pairs else [f"Explore maps and coverage: `python -m tasks.view {run.path}`."]
+    steps = [] if pairs else [f"Explore maps and coverage: `{command('view', run.path)}`."]
     steps.append(where_next(run))
     steps.append(
-        f"Predict anywhere: `swiftwrf.load('{run.path}/model.safetensors').predict(positions)`, with intervals."
+        f"Predict anywhere: `swiftwrf.load({f'{run.path}/model.safetensors'!r}).predict(positions)`, with intervals."
     )
     # the receivers of a row are not independent
     n_test = min(run.metrics["n_test"], run.metrics["overall"][model_of(run)]["abs_error_db"]["n"])

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from dataclasses import replace
+from html import unescape
 from importlib.metadata import EntryPoint
 from types import SimpleNamespace
 
@@ -178,13 +180,15 @@ def test_whole_run(small, tmp_path, monkeypatch):
     assert list((out / "figures").glob("map-*.svg"))
 
 
-def test_a_lone_receiver_has_one_map_and_no_average(tmp_path):
-    assert run("--rx", "1", "--out", tmp_path / "run") == 0
-    drawn = {file.stem.partition("-")[0] for file in (tmp_path / "run" / "figures").glob("*.svg")}
+def test_a_lone_receiver_has_one_map_and_no_average(tmp_path, capsys):
+    out = tmp_path / "her 'own' run"
+    assert run("--rx", "1", "--out", out) == 0
+    drawn = {file.stem.partition("-")[0] for file in (out / "figures").glob("*.svg")}
     assert drawn == {"summary", "cdf", "where", "speed"}
-    page = (tmp_path / "run" / "report.html").read_text()
-    assert f"python -m tasks.view {tmp_path / 'run'}" in re.sub("<[^>]*>", "", page)
-    assert list((tmp_path / "run" / "figures").glob("summary*.csv"))
+    assert list((out / "figures").glob("summary*.csv"))
+    for text in (capsys.readouterr().out, unescape(re.sub("<[^>]*>", "", (out / "report.html").read_text()))):
+        assert f"python -m tasks.view {shlex.quote(str(out))}" in text
+        assert f"swiftwrf.load({str(out / 'model.safetensors')!r})" in text
 
 
 @pytest.mark.parametrize(
