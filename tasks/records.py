@@ -167,12 +167,12 @@ def read_npz(
 
     Args:
         file: The archive.
-        expected: NumPy kind and shape of each array, e.g. `f n 3` for positions. Sizes with one name are equal. Defaults to
+        expected: NumPy type and shape of each array, e.g. `f n 3` for positions. Sizes with one name are equal. Defaults to
             all arrays of the archive, numbers or texts.
         optional: Names of expected arrays that may be missing.
 
     Raises:
-        InputError: There is no such file, it is damaged, or an array has another kind or shape.
+        InputError: There is no such file, it is damaged, or an array has another type or shape.
     """
     from swiftwrf.data.archives import NUMBERS, array_names, read_arrays
 
@@ -184,6 +184,6 @@ def read_npz(
         kind, *names = expected[name].split()
         pairs = zip(names, array.shape, strict=False)
         known = (sizes.setdefault(key, int(key) if key.isdigit() else size) == size for key, size in pairs)
-        if array.dtype.kind != kind or array.ndim != len(names) or not all(known):
+        if not array.dtype.str[1:].startswith(kind) or array.ndim != len(names) or not all(known):
             raise InputError(f"{file}: {name} is {array.dtype} of {array.shape}, expected {expected[name]}; restore it")
     return arrays

@@ -29,7 +29,7 @@ class FloorPlan:
         corners: Positions x0, x1, y0, y1 [m] of its edges.
 
     Raises:
-        InputError: Pixels of another kind, or edges that are not in order or beyond 1e9 m.
+        InputError: No pixels, or edges that are not in order or beyond 1e9 m.
     """
 
     pixels: NDArray[np.uint8]
@@ -37,12 +37,11 @@ class FloorPlan:
 
     def __post_init__(self) -> None:
         x0, x1, y0, y1 = self.corners
-        if self.pixels.dtype != np.uint8 or self.pixels.ndim != 3 or self.pixels.shape[2] != 3 or not self.pixels.size:
-            raise InputError(f"a floor plan needs pixels of three bytes, got {self.pixels.dtype} {self.pixels.shape}")
-        if not (-MAX_COORDINATE_M <= x0 < x1 <= MAX_COORDINATE_M and -MAX_COORDINATE_M <= y0 < y1 <= MAX_COORDINATE_M):
+        near = all(abs(edge) <= MAX_COORDINATE_M for edge in self.corners)  # false for nan
+        if not (near and x0 < x1 and y0 < y1 and self.pixels.size):
             raise InputError(
-                f"a floor plan from {x0:g} to {x1:g} m and from {y0:g} to {y1:g} m has no place; give a positive scale [m a "
-                f"pixel] and an origin [pixels] such that no edge is beyond {MAX_COORDINATE_M:g} m"
+                f"a floor plan needs pixels, a positive scale [m a pixel] and an origin [pixels] with edges within "
+                f"{MAX_COORDINATE_M:g} m, got edges at {x0:g}, {x1:g}, {y0:g}, {y1:g} m"
             )
 
     @classmethod
@@ -82,7 +81,7 @@ class FloorPlan:
         if not file.exists():
             return None
         with refusing(f"{file} holds no floor plan"):
-            stored = read_npz(file, {"pixels": "u height width 3", "corners": "f 4"})
+            stored = read_npz(file, {"pixels": "u1 height width 3", "corners": "f 4"})
             x0, x1, y0, y1 = stored["corners"].tolist()
             return cls(stored["pixels"], (x0, x1, y0, y1))
 

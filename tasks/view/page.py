@@ -121,21 +121,13 @@ def colour_bar(colours: str, low: float, high: float, label: str) -> str:
     )
 
 
-class LimitedBody:
-    """Middleware that ends a request whose body exceeds that of the largest image.
+def limited(app: ASGIApp) -> ASGIApp:
+    """Return middleware that ends a request whose body exceeds that of the largest image."""
 
-    Args:
-        app: Application that receives the requests.
-    """
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle a request."""
+    async def handle(scope: Scope, receive: Receive, send: Send) -> None:
         left = MAX_UPLOAD_BYTES + MAX_FRAME_BYTES
 
-        async def limited() -> Message:
+        async def part() -> Message:
             nonlocal left
             message = await receive()
             left -= len(message.get("body", b""))
@@ -143,7 +135,9 @@ class LimitedBody:
                 raise HTTPException(413, f"at most {MAX_UPLOAD_BYTES} bytes are taken")
             return message
 
-        await self._app(scope, limited if scope["type"] == "http" else receive, send)
+        await app(scope, part if scope["type"] == "http" else receive, send)
+
+    return handle
 
 
 def local_names(host: str) -> list[str]:
@@ -205,7 +199,7 @@ def serve(title: str, build: Callable[[], object], host: str, port: int, show: b
     ui.page("/")(lambda: (build(), None)[1])  # the page must return nothing
     if names := local_names(host):  # pages of other sites must not reach this one under a name that they own
         app.add_middleware(TrustedHostMiddleware, allowed_hosts=names)
-    app.add_middleware(LimitedBody)
+    app.add_middleware(limited)
     app.on_startup(announce)
     # dark=None follows the browser's setting
     ui.run(host=host, port=port, title=title, dark=None, show=show, reload=False, show_welcome_message=False)

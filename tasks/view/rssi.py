@@ -34,7 +34,7 @@ MIN_STD_DB = 1e-6
 MapKind = Literal["RSSI", "interval", "coverage", "best receiver", "posterior", "expected error"]
 LOCATING: tuple[MapKind, ...] = ("posterior", "expected error")
 MAPS = {"measured_position": "f n 3", "measured": "f n receivers", "receiver": "f receivers 3"}  # of maps.npz
-PLAN = {"plan": "u height width 3", "plan_extent": "f 4"}  # that maps.npz may hold, too
+PLAN = {"plan": "u1 height width 3", "plan_extent": "f 4"}  # that maps.npz may hold, too
 Values = NDArray[np.floating]
 
 

@@ -117,15 +117,19 @@ def damaged_arrays(file: Path) -> dict[str, dict[str, np.ndarray]]:
     return found
 
 
-def damaged_values(content: object) -> dict[str, object]:
-    """Return JSON in which the whole, or one value at any depth, is of another kind."""
-    found = {repr(other): other for other in OTHER_JSON}
+def damaged_values(content: object, others: tuple[object, ...] = OTHER_JSON) -> dict[str, object]:
+    """Return JSON in which the whole or one value is of another kind, of fewer kinds at greater depth."""
+    found = {repr(other): other for other in others}
     if isinstance(content, dict):
         for key, value in content.items():
-            found |= {f"{key} {kind}": content | {key: other} for kind, other in damaged_values(value).items()}
+            found |= {
+                f"{key} {kind}": content | {key: other} for kind, other in damaged_values(value, others[:-2]).items()
+            }
             found[f"{key} missing"] = {name: value for name, value in content.items() if name != key}
     if isinstance(content, list) and content:
-        found |= {f"[0] {kind}": [other, *content[1:]] for kind, other in damaged_values(content[0]).items()}
+        found |= {
+            f"[0] {kind}": [other, *content[1:]] for kind, other in damaged_values(content[0], others[:-2]).items()
+        }
     return found
 
 
