@@ -59,8 +59,8 @@ def _exit_code(action: Callable[[], None]) -> int:
         return _report(str(error), 2)
     except FitError as error:
         return _report(str(error), 1)
-    except OSError as error:  # readers raise InputError, so this is about writing
-        return _report(_not_written(error), 2)
+    except OSError as error:
+        return _report(_no_access(error), 2)
     except MemoryError as error:
         return _report(f"not enough memory ({error}); use less data or a smaller model", 2)
     except KeyboardInterrupt:
@@ -86,12 +86,12 @@ def _report(sentence: str, code: int) -> int:
     return code
 
 
-def _not_written(error: OSError) -> str:
+def _no_access(error: OSError) -> str:
     file = error.filename2 or error.filename or "the run's files"
     if error.errno in DISK_FULL:
-        return f"no space left to write {file}; make room and go on with --resume, or choose another --out"
+        return f"no space left to write {file}; make room or choose another --out"
     reason = "no permission" if isinstance(error, PermissionError) else error.strerror or str(error)
-    return f"cannot write {file} ({reason}); choose another --out"
+    return f"cannot read or write {file} ({reason}); choose another path"
 
 
 def execute(

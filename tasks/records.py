@@ -6,6 +6,7 @@ of that kind is written behind an apostrophe, which those programs take for a ma
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import re
@@ -18,6 +19,7 @@ from swiftwrf.runtime.durable import replacing, write_text
 
 if TYPE_CHECKING:
     import pandas as pd
+    from numpy.typing import NDArray
 
 Row = dict[str, Any]
 NAMES = (  # columns of text, even if a cell reads NA, 1 or 12:34
@@ -66,12 +68,12 @@ def read_json(file: Path) -> Row:
     Raises:
         InputError: There is no such file, or its content is no JSON object.
     """
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{file} cannot be read ({error.strerror}); is this the directory of a run?") from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{file} is not the JSON that a run writes ({error}); restore it") from None
+    from swiftwrf.data.files import read_text
+    from swiftwrf.runtime.checkpoint import refusing
+
+    text = read_text(file)
+    with refusing(f"{file} is not the JSON that a run writes"):
+        content = json.loads(text)
     if not isinstance(content, dict):
         raise InputError(f"{file} must hold a JSON object, got a {type(content).__name__}; restore it")
     return content
@@ -133,15 +135,16 @@ def read_table(file: Path) -> pd.DataFrame:
     """
     import pandas as pd
 
-    try:
-        columns = list(pd.read_csv(file, nrows=0))
+    from swiftwrf.data.files import read_text
+    from swiftwrf.runtime.checkpoint import refusing
+
+    text = read_text(file)
+    with refusing(f"{file} is not the table that a run writes"):
+        columns = list(pd.read_csv(io.StringIO(text), nrows=0))
         names = [name for name in NAMES if name in columns]
         missing = {name: [""] if name in names else ["", "nan"] for name in columns}
-        table = pd.read_csv(file, dtype=dict.fromkeys(names, str), keep_default_na=False, na_values=missing)
-    except OSError as error:
-        raise InputError(f"{file} cannot be read ({error.strerror}); is this the directory of a run?") from None
-    except ValueError as error:  # errors of pandas and of decoding are ValueErrors
-        raise InputError(f"{file} is not the table that a run writes ({error}); restore it") from None
+        options = {"dtype": dict.fromkeys(names, str), "keep_default_na": False, "na_values": missing}
+        table = pd.read_csv(io.StringIO(text), **options)
     for name in names:
         table[name] = table[name].map(
             lambda text: text[1:] if text.startswith("'") and FORMULA.match(text) else text, na_action="ignore"
@@ -155,3 +158,32 @@ def write_npz(file: Path, arrays: Mapping[str, Any]) -> None:
 
     with replacing(file) as temporary, temporary.open("wb") as stream:
         np.savez_compressed(stream, **arrays)
+
+
+def read_npz(
+    file: Path, expected: Mapping[str, str] | None = None, optional: Iterable[str] = ()
+) -> dict[str, NDArray[Any]]:
+    """Read arrays of `write_npz` by name.
+
+    Args:
+        file: The archive.
+        expected: NumPy type and shape of each array, e.g. `f n 3` for positions. Sizes with one name are equal. Defaults to
+            all arrays of the archive, numbers or texts.
+        optional: Names of expected arrays that may be missing.
+
+    Raises:
+        InputError: There is no such file, it is damaged, or an array has another type or shape.
+    """
+    from swiftwrf.data.archives import NUMBERS, array_names, read_arrays
+
+    if expected is None:
+        return read_arrays(file, sorted(array_names(file)), kinds=f"{NUMBERS}U")
+    arrays = read_arrays(file, list(expected.keys() - optional), list(optional))
+    sizes: dict[str, int] = {}
+    for name, array in arrays.items():
+        kind, *names = expected[name].split()
+        pairs = zip(names, array.shape, strict=False)
+        known = (sizes.setdefault(key, int(key) if key.isdigit() else size) == size for key, size in pairs)
+        if not array.dtype.str[1:].startswith(kind) or array.ndim != len(names) or not all(known):
+            raise InputError(f"{file}: {name} is {array.dtype} of {array.shape}, expected {expected[name]}; restore it")
+    return arrays

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from torch import Tensor
 from swiftwrf import AngularGrid, InputError, Rssi, Spectra
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import ReadOptions, read_rssi, read_spectra
+from swiftwrf.data.archives import array_header, read_rows
 from swiftwrf.data.groups import Offsets
 from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
@@ -22,6 +24,8 @@ from swiftwrf.errors import listed
 from swiftwrf.rssi import estimate_offsets
 from tasks.options import OffsetSource, SpectraSource, TableSource
 from tasks.terminal import console
+
+BATCH_ROWS = 1024  # of an array that is read
 
 
 def reading(config: SpectraSource | TableSource) -> ReadOptions:
@@ -151,13 +155,10 @@ def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model
 
 def _read_array(file: Path) -> Tensor:
     """Return the spectra of unknown positions in a .npy file."""
-    try:
-        array = np.load(file, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{file} is not a readable .npy file ({error})") from None
-    if not isinstance(array, np.ndarray) or array.ndim != 3 or array.dtype.kind != "f" or not len(array):
-        raise InputError(f"{file} must hold floating-point spectra (n, elevations, azimuths)")
-    spectrum = torch.from_numpy(np.array(array, dtype=np.float32))
+    shape, dtype = array_header(file, "array")
+    if len(shape) != 3 or dtype.kind != "f" or not math.prod(shape):
+        raise InputError(f"{file} must hold floating-point spectra (n, elevations, azimuths), got {dtype} of {shape}")
+    spectrum = torch.cat([torch.from_numpy(some.astype(np.float32)) for some in read_rows(file, "array", BATCH_ROWS)])
     if not bool(((spectrum >= 0) & (spectrum <= 1)).all()):
         raise InputError(f"{file} must hold magnitudes in [0, 1]")
     return spectrum

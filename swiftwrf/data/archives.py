@@ -28,6 +28,7 @@ MATLAB_NUMBERS = {
     *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
 }
 COMPLEX_FIELDS = (("real", "imag"), ("r", "i"))  # of the compounds that stand for complex numbers in HDF5
+NUMBERS = "biufc"  # kinds of NumPy types
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -47,8 +48,14 @@ def array_names(file: Path) -> set[str]:
         return set()
 
 
-def read_arrays(file: Path, needed: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
+def read_arrays(file: Path, needed: Sequence[str], optional: Sequence[str] = (), kinds: str = NUMBERS) -> Arrays:
     """Return arrays of numbers from an npz archive, HDF5 or MATLAB file. Compounds of real and imaginary parts are complex.
+
+    Args:
+        file: The archive.
+        needed: Names of arrays.
+        optional: Names of arrays that may be missing.
+        kinds: NumPy kinds of the arrays in an npz archive. Defaults to numbers.
 
     Raises:
         InputError: No such file, a broken one, an array that is missing or holds no numbers, or one that unpacks to more
@@ -68,7 +75,7 @@ def read_arrays(file: Path, needed: Sequence[str], optional: Sequence[str] = ())
             names = _choose(file, _stored(archive), needed, optional)
             members = {name: archive.getinfo(f"{name}.npy") for name in names}
             _check_total(sum(member.file_size for member in members.values()), file)
-            return {name: _read_member(archive, member) for name, member in members.items()}
+            return {name: _read_member(archive, member, kinds) for name, member in members.items()}
 
 
 def array_header(file: Path, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
@@ -147,17 +154,17 @@ def _stored(archive: zipfile.ZipFile) -> set[str]:
     return {name.removesuffix(".npy") for name in archive.namelist()}
 
 
-def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, kinds: str) -> NDArray[Any]:
     with archive.open(member) as stream:
-        shape, by_columns, dtype = _header(stream, member.filename, member.file_size)
+        shape, by_columns, dtype = _header(stream, member.filename, member.file_size, kinds)
         return np.frombuffer(stream.read(), dtype).reshape(shape, order="F" if by_columns else "C")
 
 
-def _header(stream: Any, name: str, size: int) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+def _header(stream: Any, name: str, size: int, kinds: str = NUMBERS) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Return shape, order and type of an array, once the stream is as long as the header claims."""
     readers = {(1, 0): read_array_header_1_0, (2, 0): read_array_header_2_0}
     shape, by_columns, dtype = readers[read_magic(stream)](stream)
-    if dtype.kind not in "biufc":
+    if dtype.kind not in kinds:
         raise ValueError(f"{name} holds {dtype}, expected numbers")
     if math.prod(shape) * dtype.itemsize != size - stream.tell():
         raise ValueError(f"{name} does not hold the {shape} numbers that it claims")
@@ -224,7 +231,7 @@ def _is_octave(content: Any, name: str) -> bool:
 
 def _number_type(dtype: np.dtype[Any]) -> np.dtype[Any] | None:
     """Return the type of numbers in HDF5: complex for compounds of real and imaginary parts, None for anything else."""
-    if dtype.kind in "biufc":
+    if dtype.kind in NUMBERS:
         return dtype
     if dtype.names not in COMPLEX_FIELDS or dtype.itemsize not in (8, 16):
         return None

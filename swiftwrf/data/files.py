@@ -54,9 +54,9 @@ def digests(files: Iterable[Path], split_folder: Path | None = None) -> dict[str
 @contextmanager
 def _refusing_unreadable(file: Path) -> Iterator[None]:
     """Raise InputError if a file is missing or may not be read."""
-    if not file.is_file():
-        raise InputError(f"{file} is missing")
     try:
+        if not file.is_file():
+            raise InputError(f"{file} is missing")
         yield
     except OSError as error:
         reason = "no permission to read it" if isinstance(error, PermissionError) else error.strerror
@@ -79,8 +79,10 @@ def read_text(file: Path) -> str:
     Raises:
         InputError: The file is missing, larger than 256 MiB, or in another encoding.
     """
-    if file.is_file() and file.stat().st_size > MAX_TEXT_BYTES:
-        raise InputError(f"{file} has {file.stat().st_size} bytes; a table or list has at most {MAX_TEXT_BYTES}")
+    with _refusing_unreadable(file):
+        size = file.stat().st_size
+    if size > MAX_TEXT_BYTES:
+        raise InputError(f"{file} has {size} bytes; a table or list has at most {MAX_TEXT_BYTES}")
     try:
         text = read_bytes(file).decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from os.path import isfile  # unlike Path.is_file, it is False for names that are too long
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from swiftwrf.data.rasters import Cells, write_geojson, write_geotiff, write_wor
 from swiftwrf.data.receivers import read_places
 from swiftwrf.errors import with_article
 from swiftwrf.locate import RssiLocator
+from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.durable import replacing
@@ -29,13 +31,18 @@ def saved_model(source: Path) -> FieldModel | RssiModel | None:
     Raises:
         InputError: A run without an RSSI model, or a model that predicts neither spectra nor RSSI.
     """
-    file = next((file for name in (MODEL, LOCATOR) if (file := source / name).is_file()), source)
-    if file == source and (source / CONFIG).is_file():
+    file = next((file for name in (MODEL, LOCATOR) if isfile(file := source / name)), source)
+    if file == source and isfile(source / CONFIG):
         raise InputError(f"{source} is a run without an RSSI model; name one of its models, {source}/....safetensors")
     if file.suffix != ".safetensors":
         return None
     model: Saved = load(file)
     model = model.model if isinstance(model, RssiLocator) else model
+    if isinstance(model, RssiPredictor) and not isinstance(model, RssiModel):
+        raise InputError(
+            f"{file} holds {with_article(model.kind)}, of which no file is written; the report of its run shows its maps, "
+            "and in Python its method predict gives RSSI at any position"
+        )
     if not isinstance(model, FieldModel | RssiModel):
         raise InputError(f"{file} holds {with_article(model.kind)}, which predicts neither spectra nor RSSI")
     return model

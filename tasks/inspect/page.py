@@ -23,6 +23,7 @@ AXES = {"x": "#cf4a4a", "y": "#2a9165", "normal": "#3a7fd5"}
 DOTS, NONE = "#3a7fd5", "#7f8794"  # with line of sight, without
 MAX_DOTS = 2000
 MAX_RECEIVERS = 30  # in a figure
+MIN_BINS_M = 1e-3  # of the bins of distances together
 PLAN = (
     "From above and from the side: positions with (blue) and without line of sight (grey); arrows: the array's axes x "
     "(red), y (green) and its normal (blue)."
@@ -145,7 +146,8 @@ def _directions(data: Spectra) -> Plot:
 def _neighbours(data: Spectra) -> Plot:
     figure, ax = figures.panel(6, 3)
     rows, apart = nearest(data.position)
-    ax.hist(apart.numpy(), bins=40, color=DOTS)
+    low, high = (float(end) for end in apart.aminmax())  # all are equal on a regular grid, up to rounding
+    ax.hist(apart.numpy(), bins=40, range=(low, max(high, low + MIN_BINS_M)), color=DOTS)
     if data.array is not None:
         ax.axvline(data.array.wavelength / 2, color="#cf4a4a")
     ax.set(xlabel="nearest other position [m]", ylabel="positions")

@@ -185,7 +185,9 @@ def _times(source: str, data: Rssi) -> Tensor:
         return data.index.double()
     missing = data.time.isnan()
     if bool(missing.any()):
-        raise InputError(f"{source} row {int(data.index[missing][0]) + 1} has no time [s] or date, which --track needs")
+        raise InputError(
+            f"{source} row {int(data.index[missing][0])} (counted from 0) has no time [s] or date, which --track needs"
+        )
     return data.time
 
 

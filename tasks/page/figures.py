@@ -126,7 +126,8 @@ def cdf(axes: Axes, palette: Palette, errors: Mapping[str, ArrayLike], label: st
     _expect_few(errors)
     for dashes, (name, values) in zip(DASHES, errors.items(), strict=False):
         style: dict[str, Any] = {"color": palette.colour(name), "linestyle": dashes, "linewidth": 1.6}
-        axes.ecdf(np.asarray(values), label=name, **style)
+        if np.size(values):
+            axes.ecdf(np.asarray(values), label=name, **style)
     axes.axhline(0.5, color=RULE, linewidth=0.8)
     axes.set(xlabel=label, ylabel="fraction of test spectra", ylim=(0, 1.02), xlim=(0, limit))
     end_labels(axes)
@@ -152,7 +153,7 @@ def end_labels(axes: Axes) -> None:
     """Write the name of each labelled line at its right end, in its colour, such that no name covers another."""
     figure = axes.get_figure(root=True)
     assert figure is not None  # an axes outside of a figure has no size
-    lines = [line for line in axes.get_lines() if not str(line.get_label()).startswith("_")]
+    lines = [line for line in axes.get_lines() if not str(line.get_label()).startswith("_") and len(line.get_path())]
     ends = []
     for line in lines:
         x, y = np.asarray(line.get_xdata(), dtype=float), np.asarray(line.get_ydata(), dtype=float)

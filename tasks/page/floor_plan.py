@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from swiftwrf import InputError
-from tasks.records import write_npz
+from swiftwrf.data.files import MAX_COORDINATE_M
+from swiftwrf.runtime.checkpoint import refusing
+from tasks.records import read_npz, write_npz
 
 MAX_PLAN_PIXELS = 2**24
 STORED = "floor-plan.npz"  # in the directory of a run
@@ -25,10 +27,22 @@ class FloorPlan:
     Args:
         pixels: Image (height, width, 3), the first row on top.
         corners: Positions x0, x1, y0, y1 [m] of its edges.
+
+    Raises:
+        InputError: No pixels, or edges that are not in order or beyond 1e9 m.
     """
 
     pixels: NDArray[np.uint8]
     corners: Corners
+
+    def __post_init__(self) -> None:
+        x0, x1, y0, y1 = self.corners
+        near = all(abs(edge) <= MAX_COORDINATE_M for edge in self.corners)  # false for nan
+        if not (near and x0 < x1 and y0 < y1 and self.pixels.size):
+            raise InputError(
+                f"a floor plan needs pixels, a positive scale [m a pixel] and an origin [pixels] with edges within "
+                f"{MAX_COORDINATE_M:g} m, got edges at {x0:g}, {x1:g}, {y0:g}, {y1:g} m"
+            )
 
     @classmethod
     def scaled(cls, pixels: NDArray[np.uint8], metres_per_pixel: float, origin: tuple[float, float]) -> FloorPlan:
@@ -40,14 +54,12 @@ class FloorPlan:
             origin: Pixel at x = y = 0, counted to the right and down from the upper left corner.
 
         Raises:
-            InputError: A scale that is not positive and finite, or an origin that is not finite.
+            InputError: A scale that is not positive, or edges beyond 1e9 m.
 
         Example:
             >>> FloorPlan.scaled(np.zeros((30, 40, 3), np.uint8), 0.5, (0, 30)).corners
             (0.0, 20.0, 0.0, 15.0)
         """
-        if not (np.isfinite([metres_per_pixel, *origin]).all() and metres_per_pixel > 0):
-            raise InputError("a floor plan needs a positive scale [m a pixel] and an origin [pixels]")
         height, width = pixels.shape[:2]
         right, down = origin
         edges = (-right, width - right, down - height, down)
@@ -60,10 +72,16 @@ class FloorPlan:
 
     @classmethod
     def load(cls, folder: Path) -> FloorPlan | None:
-        """Return the plan in the directory of a run, or None if it has none."""
-        if not (folder / STORED).is_file():
+        """Return the plan in the directory of a run, or None if it has none.
+
+        Raises:
+            InputError: The file of the plan is damaged.
+        """
+        file = folder / STORED
+        if not file.exists():
             return None
-        with np.load(folder / STORED) as stored:
+        with refusing(f"{file} holds no floor plan"):
+            stored = read_npz(file, {"pixels": "u1 height width 3", "corners": "f 4"})
             x0, x1, y0, y1 = stored["corners"].tolist()
             return cls(stored["pixels"], (x0, x1, y0, y1))
 

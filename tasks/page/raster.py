@@ -19,7 +19,7 @@ def colour_image(values: NDArray[np.floating], colours: str, low: float = 0.0, h
         low: Value of its first colour.
         high: Value of its last colour.
     """
-    scaled = (values - low) * (TRANSPARENT - 1) / (high - low)
+    scaled = (values - low) * (TRANSPARENT - 1) / (high - low or 1.0)
     image = Image.fromarray(
         np.where(np.isnan(values), TRANSPARENT, np.clip(scaled, 0, TRANSPARENT - 1)).astype(np.uint8)
     )

@@ -7,13 +7,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
-import numpy as np
 from numpy.typing import NDArray
 from pandas import DataFrame
 
 from swiftwrf import InputError
 from tasks.metrics import RunMetrics
-from tasks.records import read_json, read_table
+from tasks.records import read_json, read_npz, read_table
 
 Metrics = TypeVar("Metrics", bound=RunMetrics)
 
@@ -91,8 +90,7 @@ class Records(Generic[Metrics]):
     def arrays(self, name: str) -> dict[str, NDArray[Any]]:
         """Arrays that the run left, by their names, e.g. `maps`."""
         if name not in self._arrays:
-            with np.load(self.folder / f"{name}.npz") as file:
-                self._arrays[name] = dict(file)
+            self._arrays[name] = read_npz(self.folder / f"{name}.npz")
         return self._arrays[name]
 
     @property

@@ -31,6 +31,7 @@ COLUMNS = (
     "notice",
 )
 WORDS = ("alarm", "notice")  # columns of text
+TYPES = dict.fromkeys(COLUMNS, float) | {"index": int} | dict.fromkeys(WORDS, str)
 WINDOW = 30  # measurements of the running error
 BOXES = ("obstacles", "standing")  # that can have appeared or left; that the training spectra show
 
@@ -183,9 +184,9 @@ def _rows(table: Path) -> list[Row]:
         return []
     try:
         text = table.read_bytes().decode()
-        rows = pd.read_csv(io.StringIO(text[: text.rfind("\n") + 1]), dtype=dict.fromkeys(WORDS, str))
+        rows = pd.read_csv(io.StringIO(text[: text.rfind("\n") + 1]), dtype=TYPES)
         if "notice" not in rows:  # tables of earlier versions
             rows["notice"] = ""
         return list(rows[list(COLUMNS)].fillna(dict.fromkeys(WORDS, "")).to_dict("records"))
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, OverflowError) as error:
         raise InputError(f"{table} is not the table of an update ({error}); restore it") from None

@@ -27,7 +27,8 @@ class ViewConfig(Options):
     port: int = 8080
     """port of the page; 0 takes any free port"""
     host: str = "127.0.0.1"
-    """address to listen on; with any other address, other machines see the page without a password"""
+    """address to listen on; with an address of the network, others can see the page and change the floor plan, without a
+    password"""
     open: bool = False
     """open the page in the browser"""
 

@@ -7,18 +7,21 @@ import errno
 import socket
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
+from ipaddress import ip_address
 from typing import Any
 
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 from nicegui import app, background_tasks, ui
+from starlette.exceptions import HTTPException
 from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from swiftwrf import InputError
 from tasks.view.drawing import PlanProjection, ring, text
 from tasks.view.locating import Located
 
-LOCAL_HOSTS = ["127.0.0.1", "localhost"]
+MAX_UPLOAD_BYTES, MAX_FRAME_BYTES = 2**25, 2**12  # of an image, and of the form around it
 MEDIAN, TRUTH = "#ffffff", "#66ccee"
 STYLE = """
 .nicegui-content { padding: 12px 20px; }
@@ -118,6 +121,40 @@ def colour_bar(colours: str, low: float, high: float, label: str) -> str:
     )
 
 
+def limited(app: ASGIApp) -> ASGIApp:
+    """Return middleware that ends a request whose body exceeds that of the largest image."""
+
+    async def handle(scope: Scope, receive: Receive, send: Send) -> None:
+        left = MAX_UPLOAD_BYTES + MAX_FRAME_BYTES
+
+        async def part() -> Message:
+            nonlocal left
+            message = await receive()
+            left -= len(message.get("body", b""))
+            if left < 0:
+                raise HTTPException(413, f"at most {MAX_UPLOAD_BYTES} bytes are taken")
+            return message
+
+        await app(scope, part if scope["type"] == "http" else receive, send)
+
+    return handle
+
+
+def local_names(host: str) -> list[str]:
+    """Return the names under which a page of this machine alone may be asked for, none if others can reach the address.
+
+    Example:
+        >>> local_names("127.0.0.2")
+        ['127.0.0.2', 'localhost']
+        >>> local_names("0.0.0.0")
+        []
+    """
+    address = str(socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0])
+    if not ip_address(address).is_loopback:
+        return []
+    return list(dict.fromkeys((f"[{address}]" if ":" in address else address, host, "localhost")))
+
+
 def free_port(host: str, port: int) -> int:
     """Return the port if it is free, or any free port for 0.
 
@@ -160,8 +197,9 @@ def serve(title: str, build: Callable[[], object], host: str, port: int, show: b
         print(f"page: http://{name}:{port} (Ctrl-C ends it)", flush=True)
 
     ui.page("/")(lambda: (build(), None)[1])  # the page must return nothing
-    if host in LOCAL_HOSTS:  # pages of other sites must not reach this one under a name that they own
-        app.add_middleware(TrustedHostMiddleware, allowed_hosts=LOCAL_HOSTS)
+    if names := local_names(host):  # pages of other sites must not reach this one under a name that they own
+        app.add_middleware(TrustedHostMiddleware, allowed_hosts=names)
+    app.add_middleware(limited)
     app.on_startup(announce)
     # dark=None follows the browser's setting
     ui.run(host=host, port=port, title=title, dark=None, show=show, reload=False, show_welcome_message=False)

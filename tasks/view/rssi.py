@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import pandas as pd
@@ -16,13 +15,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf import Prediction, Rssi, RssiModel
+from swiftwrf import InputError, Prediction, Rssi, RssiModel
 from swiftwrf.data.coordinates import degree_columns
+from swiftwrf.data.files import MAX_COORDINATE_M
 from swiftwrf.rssi import LEVEL
 from tasks.page import figures, maps
 from tasks.page.floor_plan import FloorPlan
 from tasks.page.maps import Corners
-from tasks.records import as_table, rounded
+from tasks.records import as_table, read_npz, rounded
 from tasks.rssi.page.maps import MAX_WIDTH_DB
 from tasks.view.drawing import PlanProjection
 from tasks.view.locating import RssiLocating
@@ -33,6 +33,8 @@ RECEIVER_MARK = "#cf4a4a"
 MIN_STD_DB = 1e-6
 MapKind = Literal["RSSI", "interval", "coverage", "best receiver", "posterior", "expected error"]
 LOCATING: tuple[MapKind, ...] = ("posterior", "expected error")
+MAPS = {"measured_position": "f n 3", "measured": "f n receivers", "receiver": "f receivers 3"}  # of maps.npz
+PLAN = {"plan": "u1 height width 3", "plan_extent": "f 4"}  # that maps.npz may hold, too
 Values = NDArray[np.floating]
 
 
@@ -52,10 +54,19 @@ class MeasuredFloor:
     receiver: Values
     plan: FloorPlan | None = None
 
+    def __post_init__(self) -> None:
+        known = [self.position, self.receiver[np.isfinite(self.receiver)]]
+        if not len(self.position) or any(not (np.abs(some) <= MAX_COORDINATE_M).all() for some in known):
+            raise InputError(f"expected positions of at most {MAX_COORDINATE_M:g} m, got none or others; restore them")
+
     @classmethod
-    def from_run(cls, maps: Mapping[str, NDArray[Any]]) -> MeasuredFloor:
-        """Return the measurements in the `maps.npz` of a run."""
-        plan = None
+    def from_run(cls, file: Path) -> MeasuredFloor:
+        """Return the measurements in the `maps.npz` of a run.
+
+        Raises:
+            InputError: The file is damaged.
+        """
+        maps, plan = read_npz(file, MAPS | PLAN, PLAN), None
         if "plan" in maps:
             x0, x1, y0, y1 = maps["plan_extent"].tolist()
             plan = FloorPlan(maps["plan"], (x0, x1, y0, y1))
@@ -158,6 +169,8 @@ class RssiView:
         return low, middle, high
 
     def __post_init__(self) -> None:
+        if self.floor.receiver.shape != self.model.receiver.shape:
+            raise InputError("the model has other receivers than the measurements; restore the files of the run")
         if self.folder is not None and (stored := FloorPlan.load(self.folder)) is not None:
             self.floor = replace(self.floor, plan=stored)
 

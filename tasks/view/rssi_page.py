@@ -15,7 +15,7 @@ from swiftwrf import InputError
 from tasks.page.floor_plan import FloorPlan, read_pixels
 from tasks.page.raster import colour_image
 from tasks.view.drawing import text
-from tasks.view.page import NewestOnly, colour_bar, header, located_marks, plan_picture, slider
+from tasks.view.page import MAX_UPLOAD_BYTES, NewestOnly, colour_bar, header, located_marks, plan_picture, slider
 from tasks.view.rssi import (
     LOCATING,
     N_RECEIVER_COLOURS,
@@ -28,7 +28,6 @@ from tasks.view.rssi import (
 
 N_DOT_COLOURS = 33
 MAX_MAP_PX = (880, 700)
-MAX_UPLOAD_BYTES = 2**25
 KIND_LABELS = {"interval": "uncertainty"}  # of the kinds that the page calls by another word
 HINT = "Hover over the map."
 ROW = "#999999"  # of the measured rows under a posterior

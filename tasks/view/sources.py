@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ from augment import withhold
 from swiftwrf import FIELD_MODELS, FieldModel, InputError, RssiModel, Spectra, load
 from swiftwrf.errors import with_article
 from swiftwrf.locate import RssiLocator
+from swiftwrf.models.geometry import Plane
+from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.runtime.checkpoint import Saved, refusing
 from tasks.aoa.artifacts import model_file
 from tasks.aoa.condition import LOCATOR as MATCHED_FIELD
@@ -66,14 +69,19 @@ def _saved_model(file: Path) -> SpectraView | RssiView:
         return RssiView(file.name, model, MeasuredFloor.from_model(model))
     if isinstance(model, RssiLocator):
         return _located(file.name, RssiLocating.of_training(model))
-    field_model = _field_model(model)
+    field_model = _field_model(file, model)
     return SpectraView(file.name, [LoadedModel(model.kind, field_model, _planes(field_model))])
 
 
-def _field_model(model: Saved) -> FieldModel:
+def _field_model(file: Path, model: Saved) -> FieldModel:
     if not isinstance(model, FieldModel):
-        raise InputError(f"{with_article(model.kind)} cannot be shown; {EXPECTED}")
+        raise _not_shown(file, model)
     return model
+
+
+def _not_shown(file: Path, model: Saved) -> InputError:
+    instead = "the report of its run shows its maps" if isinstance(model, RssiPredictor) else EXPECTED
+    return InputError(f"{file} holds {with_article(model.kind)}, which cannot be shown; {instead}")
 
 
 def _planes(model: FieldModel) -> list[dict[str, Any]]:
@@ -95,7 +103,7 @@ def _aoa_run(folder: Path, content: Row) -> SpectraView:
             locating = SpectrumLocating(located_by) if located_by.is_file() else None
             files = {name: model_file(folder, name, fraction_key(fraction)) for name in FIELD_MODELS}
             for name in (name for name, file in files.items() if file.is_file()):
-                model = _field_model(load(files[name]))
+                model = _field_model(files[name], load(files[name]))
                 planes = _planes(model) or _planes_of_run(folder, fraction)
                 models.append(
                     LoadedModel(f"{name}, {100 * fraction:g}% measured", model, planes, in_training, locating)
@@ -108,8 +116,8 @@ def _aoa_run(folder: Path, content: Row) -> SpectraView:
 def _planes_of_run(folder: Path, fraction: float) -> list[dict[str, Any]]:
     """Return the planes that another model of the run found from the same spectra."""
     file = folder / f"geometry-mix{fraction_key(fraction)}.json"
-    planes: list[dict[str, Any]] = read_json(file)["planes"] if file.is_file() else []
-    return planes
+    planes = read_json(file)["planes"] if file.is_file() else []
+    return [asdict(Plane(**plane)) for plane in planes]
 
 
 def _measured(folder: Path, config: AoaConfig) -> tuple[Spectra | None, Spectra | None, list[str]]:
@@ -162,6 +170,6 @@ def _rssi_run(folder: Path) -> RssiView:
         raise InputError(f"{folder} holds no model: it has no {MODEL}; the run did not end, or is of an older version")
     model = load(file)
     if not isinstance(model, RssiModel):
-        raise InputError(f"{file} holds {with_article(model.kind)}, expected {with_article(RssiModel.kind)}")
-    with refusing(f"the maps in {folder} are not those of a run"), np.load(folder / "maps.npz") as stored:
-        return RssiView(folder.name, model, MeasuredFloor.from_run(dict(stored)), folder=folder)
+        raise _not_shown(file, model)
+    with refusing(f"the maps in {folder} are not those of a run"):
+        return RssiView(folder.name, model, MeasuredFloor.from_run(folder / "maps.npz"), folder=folder)

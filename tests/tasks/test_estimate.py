@@ -180,7 +180,7 @@ def test_other_files_are_refused(finished, small, tmp_path, capsys):
     assert run("estimate", tmp_path / "none", spectra, "--out", tmp_path / "out.csv") == 2
     assert "not a readable" in said(capsys)
     assert run("estimate", estimator, tmp_path / "none.npy", "--out", tmp_path / "out.csv") == 2
-    assert "not a readable .npy" in said(capsys)
+    assert "is missing" in said(capsys)
     assert run("estimate", estimator, spectra, "--out", spectra) == 2
     assert "exists already" in said(capsys)
     assert run("estimate", estimator, spectra, "--out", tmp_path / "no" / "out.csv") == 2

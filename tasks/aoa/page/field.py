@@ -12,6 +12,7 @@ from pandas import DataFrame
 
 from tasks.aoa.page.records import FractionRecords
 from tasks.page import figures
+from tasks.page.maps import corners_of
 from tasks.page.page import Plot, Section
 
 MIN_SHIFT_RAD = np.deg2rad(0.1)  # smallest visible shift of a primitive's mean along the walk
@@ -105,7 +106,8 @@ def _draw_primitives(ax: Axes, mean: NDArray[Any], covariance: NDArray[Any], str
 
 
 def _draw_strengths(ax: Axes, walked: NDArray[Any], strength: NDArray[Any]) -> None:
-    extent = (walked[0], walked[-1], strength.shape[1] - 0.5, -0.5)
+    left, right, *_ = corners_of(walked, walked)
+    extent = (left, right, strength.shape[1] - 0.5, -0.5)
     drawn = ax.imshow(strength.T, aspect="auto", extent=extent, cmap="magma", interpolation="nearest")
     ax.set(xlabel="walked [m]", ylabel="primitive, by strength")
     ax.grid(visible=False)

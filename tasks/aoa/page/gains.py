@@ -79,7 +79,7 @@ def gain_table(fraction: FractionRecords) -> list[Table]:
             rows.append([method, name, number(change["median_deg"]), change_text(change), judgement(change)])
     caption = (
         "Change of the median angular error by synthetic spectra, with its 95 % interval: a paired bootstrap over the test "
-        "positions. Repeats are averaged at each position. Best: the smallest test error of all estimators without "
+        "positions. Medians are over all test spectra and repeats. Best: the smallest test error of all estimators without "
         "synthetic spectra other than matched_field."
     )
     columns = ["method", "compared to", "median [deg]", "change", ""]

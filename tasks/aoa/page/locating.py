@@ -101,7 +101,7 @@ def _posteriors(fraction: FractionRecords) -> Plot:
         ax.plot(*estimate[:2], "x", color=ESTIMATE, markersize=8)
         x, y = estimate[:2]
         ax.set(xlim=(x - half, x + half), ylim=(y - half, y + half), aspect="equal")
-        ax.set_title(f"no. {example['index'][row] + 1}: {100 * error[row]:.1f} cm", fontsize=9)
+        ax.set_title(f"row {example['index'][row]}: {100 * error[row]:.1f} cm", fontsize=9)
         ax.set(xlabel="x [m]", ylabel="y [m]")
         ax.locator_params(nbins=5)
         panels.append(figure)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
 from tasks.page.palette import DASHES
 from tasks.page.provenance import number
+from tasks.records import read_json
 
 MARGIN = 0.5  # [m] around the room in a plan
 FIXED, MEASURED, IMAGE = "#cf4a4a", "#3a7fd5", "#d1620f"
@@ -126,7 +126,7 @@ def room_section(fraction: FractionRecords) -> Section | None:
     file = fraction.run.folder / f"geometry-mix{fraction.key}.json"
     if not file.is_file():
         return None
-    room = json.loads(file.read_text())
+    room = read_json(file)
     title = "The room that was found"
     if not room["planes"]:
         return Section(title, ["No plane predicts held-out spectra: the direct path is all that was found."])

@@ -23,7 +23,7 @@ class Example:
     """A test spectrum and its prediction.
 
     Args:
-        title: Number and quality.
+        title: Row and quality.
         images: Values (n_elevation, n_azimuth) by kind, as `tasks.page.polar.spectra` takes them.
         truth: True direction [deg]. None if it is unknown.
     """
@@ -47,7 +47,7 @@ def examples(fraction: FractionRecords) -> list[Example]:
         if index in labels.index:
             label = labels.loc[index]
             truth = (float(label["truth_azimuth_deg"]), float(label["truth_elevation_deg"]))
-        found.append(Example(f"no. {index + 1}, PSNR {stored['psnr_db'][row]:.1f} dB", images, truth))
+        found.append(Example(f"row {index}, PSNR {stored['psnr_db'][row]:.1f} dB", images, truth))
     return found
 
 

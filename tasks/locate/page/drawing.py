@@ -20,6 +20,7 @@ from tasks.locate.localizers import LOCALIZERS
 from tasks.locate.page.summary import NEIGHBOURS, OWN
 from tasks.metrics import StudyMetrics
 from tasks.page import figures
+from tasks.page.maps import corners_of
 from tasks.page.palette import DASHES, MAX_CURVES, Palette
 
 MAX_VECTOR_LINES = 300  # more lines become an image, so that the page stays small
@@ -113,7 +114,7 @@ def _with_bars(axes: Axes, name: str, data: DataFrame, x: str, y: str, line: Any
 def posteriors(maps: Mapping[str, NDArray[Any]]) -> list[Figure]:
     """Draw the posteriors of some test rows in plan, a panel each."""
     shape = float(np.clip(np.ptp(maps["y"]) / max(np.ptp(maps["x"]), 1e-9), 0.4, 1.6))
-    extent = (maps["x"][0], maps["x"][-1], maps["y"][0], maps["y"][-1])
+    extent = corners_of(maps["x"], maps["y"])
     panels = []
     for i in range(len(maps["density"])):
         figure, ax = figures.panel(3.8, 0.6 + 2.8 * shape)

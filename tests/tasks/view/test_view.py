@@ -23,11 +23,12 @@ import torch
 from fuzz import kinds
 from PIL import Image
 
-from swiftwrf import AngularGrid, GeometryModel, InputError, RssiModel, load, load_rssi, rssi_room
+from swiftwrf import AngularGrid, GeometryModel, InputError, PairModel, RssiModel, load, load_rssi, rssi_room
 from swiftwrf.locate import MatchedField, RssiLocator
 from swiftwrf.models.geometry import Plane, fit_hybrid
 from swiftwrf.online import Follower
 from tasks.command_line import command_line
+from tasks.convert.outputs import saved_model
 from tasks.locate.options import LocateConfig
 from tasks.page.floor_plan import FloorPlan
 from tasks.page.raster import colour_image
@@ -454,7 +455,7 @@ def test_a_dropped_floor_plan_lies_at_its_scale_and_origin_and_stays(rssi_run, t
     again = open_source(folder).floor.plan
     assert again.corners == (-2, 38, -2, 13)
     np.testing.assert_array_equal(again.pixels, pixels)
-    for scale, origin in ((0.0, (0, 0)), (np.nan, (0, 0)), (1.0, (np.inf, 0))):
+    for scale, origin in ((0.0, (0, 0)), (np.nan, (0, 0)), (1.0, (np.inf, 0)), (1e308, (1, 1)), (1.0, (1e300, 0))):
         with pytest.raises(InputError, match="scale"):
             FloorPlan.scaled(pixels, scale, origin)
 
@@ -510,3 +511,42 @@ def test_positions_outside_of_the_measured_ones_are_extrapolated(aoa_run):
     middle = view.positions.mean(axis=0)
     assert not view.extrapolates(middle)
     assert view.extrapolates(view.positions.max(axis=0) + 1)
+
+
+@needs_the_extra
+@pytest.mark.parametrize("length", [True, False])
+def test_large_uploads_are_refused_by_the_server(length):
+    from starlette.applications import Starlette
+    from starlette.requests import Request
+    from starlette.responses import Response
+    from starlette.routing import Route
+    from starlette.testclient import TestClient
+
+    from tasks.view.page import MAX_UPLOAD_BYTES, limited
+
+    async def upload(request: Request) -> Response:
+        return Response(str(len(await request.body())))
+
+    app = Starlette(routes=[Route("/", upload, methods=["POST"])])
+    app.add_middleware(limited)
+    for n, code in ((MAX_UPLOAD_BYTES, 200), (MAX_UPLOAD_BYTES + 2**20, 413)):
+        body = bytes(n)
+        content = body if length else iter([body[: n // 2], body[n // 2 :]])
+        assert TestClient(app).post("/", content=content).status_code == code
+
+
+@needs_the_extra
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "::1", "localhost"])
+def test_addresses_of_this_machine_answer_to_their_own_names(host):
+    from tasks.view.page import local_names
+
+    assert {"localhost", f"[{host}]" if ":" in host else host} <= set(local_names(host))
+    assert not local_names("0.0.0.0")
+
+
+def test_models_of_pairs_are_refused_with_what_they_can(tmp_path):
+    data = rssi_room(n=30)
+    PairModel().fit(data).save(tmp_path / "model.safetensors")
+    for act in (open_source, saved_model):
+        with pytest.raises(InputError, match=r"rssi pair model.*report of its run"):
+            act(tmp_path / "model.safetensors")

@@ -1,0 +1,184 @@
+"""Runs whose files were damaged: the page opens them or refuses them in a sentence, and never shows a traceback."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from swiftwrf import InputError, RssiModel, rssi_room
+from swiftwrf.locate import RssiLocator
+from swiftwrf.online import Follower
+from tasks.aoa.page.room import in_plan
+from tasks.locate.options import LocateConfig
+from tasks.options import plain
+from tasks.page.floor_plan import FloorPlan
+from tasks.update.record import Record
+from tasks.view.followed import FollowedView
+from tasks.view.rssi import MapSelection, RssiView
+from tasks.view.sources import open_source
+
+OPENED = ("config.json", "environment.json", "geometry-*", "*.npz", "*.safetensors", "update.json", "measurements.csv")
+OTHER_JSON = (None, "x", 1e400, [[]], {"a": None})
+
+
+@pytest.fixture
+def run(name, request, tmp_path):
+    """A copy of a small finished run."""
+    folder = tmp_path / "run"
+    if name in ("aoa", "rssi"):
+        shutil.copytree(request.getfixturevalue(f"{name}_run"), folder)
+    match name:
+        case "aoa":
+            plane = {"normal": [1.0, 0, 0], "offset_m": 6.0, "gain": -0.5, "std_mm": 1.0, "certain": True}
+            (folder / "geometry-mix1.json").write_text(json.dumps({"planes": [plane]}))
+        case "rssi":
+            FloorPlan.scaled(np.zeros((6, 8, 3), np.uint8), 2.0, (0, 6)).save(folder)
+        case "locate":
+            train, _ = rssi_room(n=60).split()
+            folder.mkdir()
+            RssiLocator(n_cells=200).fit(train).save(folder / "locator.safetensors")
+            config = {"task": "locate", "config": plain(LocateConfig(data="gone.csv"))}
+            (folder / "config.json").write_text(json.dumps(config))
+            (folder / "environment.json").write_text('{"input_sha256": {}}')
+        case "followed":
+            data = rssi_room(n=66)
+            folder.mkdir()
+            (folder / "config.json").write_text('{"task": "update"}')
+            follower, record = Follower(RssiModel().fit(data.subset(torch.arange(60)))), Record("source", " [dB]")
+            for i in range(60, 66):
+                record.append(folder, record.add(i, follower.step(data.subset(torch.tensor([i])))))
+    return folder
+
+
+def show(folder: Path) -> None:
+    """Open a run and compute what its page shows."""
+    view = open_source(folder)
+    if isinstance(view, FollowedView):
+        view.snapshot()
+        return
+    if isinstance(view, RssiView):
+        x, y = (float(line.mean()) for line in view.cells)
+        for kind in set(view.kinds) - {"expected error"}:
+            selection = MapSelection(kind, 0, view.heights[1])
+            view.coloured(selection)
+            view.sentence(selection)
+            view.describe(selection, x, y)
+        plan = view.plan()
+        if view.floor.plan is not None:
+            plan.picture(Image.fromarray(view.floor.plan.pixels), view.floor.plan.corners)
+        plan.dots(view.floor.position, "red", 1)
+        return
+    for loaded in view.models:
+        view.predict(loaded, view.start)
+        for plane in loaded.planes:
+            in_plan(plane, *view.box)
+
+
+def damaged_bytes(content: bytes) -> dict[str, bytes]:
+    """Return what is left of a file that was cut, overwritten or replaced."""
+    random = np.random.default_rng(0)
+    found = {"empty": b"", "cut": content[: len(content) // 2], "zeros": bytes(len(content)), "text": b"hello\n"}
+    for number in range(3):
+        flipped = np.frombuffer(content, np.uint8).copy()
+        flipped[random.integers(0, len(flipped), 1 + len(flipped) // 50)] ^= random.integers(1, 256, dtype=np.uint8)
+        found[f"flipped {number}"] = flipped.tobytes()
+    return found
+
+
+def damaged_arrays(file: Path) -> dict[str, dict[str, np.ndarray]]:
+    """Return archives in which one array has another shape, type or range, or is missing."""
+    with np.load(file) as stored:
+        arrays = dict(stored)
+    found = {"none": {}}
+    for name, array in arrays.items():
+        others = {
+            "flat": array.ravel()[:3],
+            "deeper": array[None],
+            "scalar": np.float64(1),
+            "no rows": array[:0],
+            "shorter": array[:-1],
+            "complex": np.ones(array.shape, complex),
+            "text": np.full(array.shape, "a"),
+            "objects": np.full(array.shape, None),
+            "nan": np.full(array.shape, np.nan),
+            "huge": np.full(array.shape, 1e308),
+            "infinite": np.full(array.shape, np.inf),
+        }
+        found |= {f"{name} {kind}": arrays | {name: other} for kind, other in others.items()}
+        found[f"{name} missing"] = {key: value for key, value in arrays.items() if key != name}
+    return found
+
+
+def damaged_values(content: object, others: tuple[object, ...] = OTHER_JSON) -> dict[str, object]:
+    """Return JSON in which the whole or one value is of another kind, of fewer kinds at greater depth."""
+    found = {repr(other): other for other in others}
+    if isinstance(content, dict):
+        for key, value in content.items():
+            found |= {
+                f"{key} {kind}": content | {key: other} for kind, other in damaged_values(value, others[:-2]).items()
+            }
+            found[f"{key} missing"] = {name: value for name, value in content.items() if name != key}
+    if isinstance(content, list) and content:
+        found |= {
+            f"[0] {kind}": [other, *content[1:]] for kind, other in damaged_values(content[0], others[:-2]).items()
+        }
+    return found
+
+
+def damaged_tables(text: str) -> dict[str, str]:
+    """Return tables whose header, rows or cells are others."""
+    header, *rows = text.splitlines()
+    found = {"no header": "\n".join(rows), "no rows": header, "long row": f"{text}1,{rows[0]}\n", "quote": text + '"'}
+    for column, name in enumerate(header.split(",")):
+        cells = [row.split(",") for row in rows]
+        for other in ("x", "1" * 5000):
+            changed = [",".join([*row[:column], other, *row[column + 1 :]]) for row in cells]
+            found[f"{name} {other[:9]}"] = "\n".join([header, *changed, ""])
+    return found
+
+
+def damages(file: Path) -> dict[str, Callable[[], object]]:
+    """Return functions that damage a file, by the kind of the damage."""
+    content = file.read_bytes()
+    found = {kind: partial(file.write_bytes, other) for kind, other in damaged_bytes(content).items()}
+    found["missing"] = file.unlink
+    match file.suffix:
+        case ".npz":
+            found |= {kind: partial(np.savez, file, **arrays) for kind, arrays in damaged_arrays(file).items()}
+        case ".json":
+            found["brackets"] = partial(file.write_text, "[" * 100_000)
+            values = damaged_values(json.loads(content))
+            found |= {kind: partial(file.write_text, json.dumps(other)) for kind, other in values.items()}
+        case ".csv":
+            found |= {kind: partial(file.write_text, text) for kind, text in damaged_tables(content.decode()).items()}
+    return found
+
+
+@pytest.mark.parametrize("name", ["aoa", "rssi", "locate", "followed"])
+def test_a_damaged_run_is_shown_or_refused(run, monkeypatch):
+    monkeypatch.setattr("tasks.view.rssi.CELLS", 9)
+    monkeypatch.setattr("tasks.view.followed.as_svg", lambda *_: "<svg")  # drawn, but not written
+    show(run)
+    wrong, n = [], 0
+    for file in sorted({file for pattern in OPENED for file in run.glob(pattern)}):
+        content = file.read_bytes()
+        for kind, damage in damages(file).items():
+            damage()
+            n += 1
+            try:
+                show(run)
+            except InputError:
+                pass
+            except Exception as error:
+                wrong.append(f"{file.name}, {kind}: {type(error).__name__}: {error}")
+            finally:
+                file.write_bytes(content)
+    assert not wrong, f"{len(wrong)} of {n} tracebacks:\n" + "\n".join(wrong)
