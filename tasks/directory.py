@@ -74,6 +74,27 @@ def check_new_file(out: Path, option: str = "") -> None:
         raise InputError(f"{option}{out} lies in {out.parent}, which is no directory")
 
 
+def unchanged_environment(folder: Path, source: dict[str, str]) -> Row:
+    """Return the environment in which a run began.
+
+    Args:
+        folder: Directory of the run.
+        source: SHA-256 of everything that the run reads, by name.
+
+    Raises:
+        InputError: The run began with other input.
+    """
+    found = read_json(folder / ENVIRONMENT)
+    before = found.get("input_sha256")
+    if before != source:
+        before = before if isinstance(before, dict) else {}
+        changed = sorted(name for name in {*before, *source} if before.get(name) != source.get(name))
+        raise InputError(
+            f"the input has changed since {folder} began ({', '.join(changed)}); restore it or start a new run"
+        )
+    return found
+
+
 class Run:
     """The directory of a run while it is being filled.
 
@@ -136,14 +157,7 @@ class Run:
         self.write_json(CONFIG, {"task": task, "command": invocation(task), "config": values})
 
     def _go_on(self, device: torch.device, source: dict[str, str]) -> None:
-        self._environment = read_json(self.path(ENVIRONMENT))
-        before = self._environment.get("input_sha256")
-        if before != source:
-            before = before if isinstance(before, dict) else {}
-            changed = sorted(name for name in {*before, *source} if before.get(name) != source.get(name))
-            raise InputError(
-                f"the input has changed since {self.folder} began ({', '.join(changed)}); restore it or start a new run"
-            )
+        self._environment = unchanged_environment(self.folder, source)
         threads = self._environment.get("threads")
         if isinstance(threads, int) and 1 <= threads <= 1024:  # they are part of the seed
             set_threads(threads)
