@@ -75,15 +75,7 @@ def check_new_file(out: Path, option: str = "") -> None:
 
 
 def unchanged_environment(folder: Path, source: dict[str, str]) -> Row:
-    """Return the environment in which a run began.
-
-    Args:
-        folder: Directory of the run.
-        source: SHA-256 of everything that the run reads, by name.
-
-    Raises:
-        InputError: The run began with other input.
-    """
+    """Return the environment in which a run began; refuse other input, by the SHA-256 of everything that it reads."""
     found = read_json(folder / ENVIRONMENT)
     before = found.get("input_sha256")
     if before != source:

@@ -93,7 +93,7 @@ class Follower:
             self.obstacles = ObstacleMonitor(model.room, train, self.monitor.config.false_alarm_rate)
             self.room = Monitor(train.position, (), self.obstacles.unexplained(train), self.monitor.config)
         self._recent: list[Spectra] = []
-        self.waiting: list[Spectra] = []
+        self.waiting: Spectra | None = None
         """spectra that a geometry has not learnt yet, for its next update"""
 
     def step(self, new: Spectra | Rssi) -> Step:
@@ -123,15 +123,15 @@ class Follower:
         if not isinstance(self.model, GeometryModel) or not isinstance(new, Spectra):
             self.model = learnt(self.model, new)
             return []
-        self.waiting.append(new)
-        n_waiting, notices = len(self.waiting), []
+        self.waiting = waiting = new if self.waiting is None else joined([self.waiting, new])
+        notices = []
         try:
-            self.model = learnt(self.model, joined(self.waiting))
+            self.model = learnt(self.model, waiting)
         except InputError as error:  # fewer than 10 positions, or spectra that do not fit the array
-            if n_waiting < MAX_WAITING:
+            if len(waiting) < MAX_WAITING:
                 return []
-            notices = [f"{n_waiting} spectra were not learnt: {error}"]
-        self.waiting = []
+            notices = [f"{len(waiting)} spectra were not learnt: {error}"]
+        self.waiting = None
         return notices
 
     def _check_room(self, obstacles: ObstacleMonitor, new: Spectra) -> list[str]:

@@ -8,6 +8,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -21,45 +22,28 @@ from swiftwrf.online import Step
 from swiftwrf.online.prequential import LEVEL
 from swiftwrf.rssi import RssiModel
 from tasks.records import strict
-from tasks.terminal import console
 from tasks.update.options import UpdateConfig
 
 POLL_S = 0.2  # between two looks at a file that grows
-NOTE_POLLS = 25  # after which a last line without newline is mentioned
 CHUNK_BYTES = 2**20
-
-
-class Place(NamedTuple):
-    """The bytes of a file that were read: how many, and their SHA-256. The content counts, not the name of the file."""
-
-    end: int = 0
-    sha256: str = ""
-
-    def is_in(self, file: BinaryIO) -> bool:
-        """Return True if a file begins with these bytes."""
-        digest = hashlib.sha256()
-        for start in range(0, self.end, CHUNK_BYTES):
-            digest.update(file.read(min(CHUNK_BYTES, self.end - start)))
-        return digest.hexdigest() == self.sha256
-
-
-START = Place()
 
 
 class Line(NamedTuple):
     """A line of a followed source.
 
     Args:
-        number: Number of the line in the source, from 1.
+        number: Its number in the source, from 1.
         content: Its bytes.
         header: First line of a table; empty for JSON lines.
-        place: Place in the file after the line.
+        end: Number of bytes of the file up to the end of the line.
+        sha256: Digest of these bytes.
     """
 
     number: int
     content: bytes
     header: bytes = b""
-    place: Place = START
+    end: int = 0
+    sha256: str = ""
 
 
 def check_source(source: str, model: FieldModel | RssiModel) -> None:
@@ -81,66 +65,62 @@ def _is_table(source: str) -> bool:
     return Path(source).suffix.lower() == ".csv"
 
 
-def lines(source: str, place: Place = START) -> Iterator[Line]:
+def lines(source: str, end: int = 0, sha256: str = "") -> Iterator[Line]:
     """Yield the lines of standard input (-), to its end, or of a file, for as long as it may grow.
 
-    A file that begins with the bytes up to a place continues after them. One that was rewritten, truncated or replaced by
-    another is read from its beginning, also while it is followed.
+    A file that was rewritten, truncated or replaced while it is followed is read from its beginning, unless it begins with
+    the bytes that were read.
 
     Args:
         source: Path of the file, or -.
-        place: Place after the last line that was learnt.
+        end: Number of bytes that were read before. Lines after them are yielded if the file begins with these bytes.
+        sha256: Digest of these bytes.
     """
     if source == "-":
         yield from (Line(number, line) for number, line in enumerate(sys.stdin.buffer, start=1) if line.strip())
         return
     while True:
         with refusing_unreadable(Path(source)), Path(source).open("rb") as file:
-            known = place.end if place.is_in(file) else 0
-            file.seek(0)
+            known = end if _digest(file, end) == sha256 else 0
             header, digest, end = b"", hashlib.sha256(), 0
             for number, line in enumerate(_growing(Path(source), file), start=1):
                 digest.update(line)
-                end += len(line)
-                place = Place(end, digest.hexdigest())
-                if not line.strip():
-                    continue
+                end, sha256 = end + len(line), digest.hexdigest()
                 if _is_table(source) and not header:
-                    header = line
-                elif end > known:
-                    yield Line(number, line, header, place)
+                    header = line.strip() and line
+                elif end > known and line.strip():
+                    yield Line(number, line, header, end, sha256)
+
+
+def _digest(file: BinaryIO, end: int) -> str:
+    """Return the SHA-256 of the first bytes of a file, and go back to its beginning."""
+    digest = hashlib.sha256()
+    for start in range(0, end, CHUNK_BYTES):
+        digest.update(file.read(min(CHUNK_BYTES, end - start)))
+    file.seek(0)
+    return digest.hexdigest()
 
 
 def _growing(path: Path, file: BinaryIO) -> Iterator[bytes]:
     """Yield the lines of an open file until it is rewritten, or is read to its end and another file has its path."""
-    part, before, polls, is_replaced = b"", b"", 0, False
+    part, before, is_replaced = b"", b"", False
     while True:
-        if read := file.readline():
-            part, polls = part + read, 0
-            if part.endswith(b"\n"):
-                yield part
-                before, part = part, b""
-            continue
-        if is_replaced:
-            if part:
-                yield part
+        read = file.readline()
+        part += read
+        if part.endswith(b"\n") or (is_replaced and part and not read):
+            yield part
+            before, part = part, b""
+        elif is_replaced and not read:
             return
-        time.sleep(POLL_S)
-        polls += 1
-        if part and polls == NOTE_POLLS:
-            text = (
-                f"note: the last line of {path} has no newline, so it is not read yet; end it if the file is complete"
-            )
-            console.print(text, markup=False, soft_wrap=True)
-        place, last = file.tell(), before + part
-        file.seek(0, os.SEEK_END)  # drops what is buffered
-        file.seek(max(0, place - len(last)))
-        if file.read(len(last)) != last:
-            return
-        try:
-            is_replaced = not os.path.samestat(path.stat(), os.fstat(file.fileno()))
-        except FileNotFoundError:  # renamed: it may grow until another has its name
-            continue
+        elif not read:
+            time.sleep(POLL_S)
+            place, last = file.tell(), before + part
+            file.seek(0, os.SEEK_END)  # drops what is buffered
+            file.seek(max(0, place - len(last)))
+            if file.read(len(last)) != last:
+                return
+            with suppress(FileNotFoundError):  # renamed: it may grow until another file has its name
+                is_replaced = not os.path.samestat(path.stat(), os.fstat(file.fileno()))
 
 
 def measurement(line: Line, config: UpdateConfig, model: FieldModel | RssiModel) -> Rssi | Spectra:

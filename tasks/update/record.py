@@ -46,10 +46,6 @@ class Record:
         unit: Unit of the errors, in brackets.
         rows: A row of `measurements.csv` for each measurement.
         boxes: Corners of boxes by their kind, as `boxes_of` returns them.
-
-    Attributes:
-        alarms: Number of the measurement that raised each alarm, and the change in words.
-        notices: Number of the measurement after which the model changed beside its data, and how, in words.
     """
 
     source: str
@@ -57,7 +53,9 @@ class Record:
     rows: list[Row] = field(default_factory=list)
     boxes: dict[str, list[Row]] = field(default_factory=dict)
     alarms: list[tuple[int, str]] = field(default_factory=list, init=False)
+    """number of the measurement that raised each alarm, and the change in words"""
     notices: list[tuple[int, str]] = field(default_factory=list, init=False)
+    """number of the measurement after which the model changed beside its data, and how, in words"""
     _sums: dict[str, tuple[float, int]] = field(default_factory=lambda: dict.fromkeys(MEANS, (0.0, 0)), init=False)
 
     def __post_init__(self) -> None:
@@ -203,8 +201,6 @@ def _rows(table: Path) -> list[Row]:
     try:
         text = table.read_bytes().decode()
         rows = pd.read_csv(io.StringIO(text[: text.rfind("\n") + 1]), dtype=dict.fromkeys(WORDS, str))
-        if "notice" not in rows:  # tables of earlier versions
-            rows["notice"] = ""
         return list(rows[list(COLUMNS)].fillna(dict.fromkeys(WORDS, "")).to_dict("records"))
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"{table} is not the table of an update ({error}); restore it") from None

@@ -14,9 +14,8 @@ from swiftwrf import FieldModel, InputError, Rssi, Spectra, load
 from swiftwrf.data import ReadOptions, Snapshots
 from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
-from swiftwrf.errors import CONTENT_ERRORS, with_article
+from swiftwrf.errors import with_article
 from swiftwrf.online import Follower, MonitorConfig
-from swiftwrf.online.follower import joined
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime import checkpoint
 from tasks.claim import CONFIG, ENVIRONMENT, MODEL, Claim, begun
@@ -28,10 +27,10 @@ from tasks.page.page import write_page
 from tasks.records import write_json
 from tasks.source import located, reading
 from tasks.terminal import console, terminal
-from tasks.update.lines import START, Place, answer, check_source, lines, measurement, spectra
+from tasks.update.lines import answer, check_source, lines, measurement, spectra
 from tasks.update.options import UpdateConfig
 from tasks.update.page import page
-from tasks.update.record import Record, resumed
+from tasks.update.record import SUMMARY, Record, resumed
 
 WAITING = "waiting"  # tensor of the spectra that a geometry has not learnt yet
 
@@ -58,8 +57,10 @@ def run(config: UpdateConfig) -> None:
         _write_config(config, folder)
         write_page(folder, page(record, new.name))
     sentences = record.sentences()
-    if n := sum(map(len, follower.waiting)):
-        sentences.append(f"the last {n} spectra are not learnt: a geometry is refined with every 10 positions")
+    if follower.waiting is not None:
+        sentences.append(
+            f"the last {len(follower.waiting)} spectra are not learnt: a room is refined at every 10 positions"
+        )
     terminal.page(record.summary(), "\n".join(sentences), Path(config.out) / "report.html")
 
 
@@ -71,15 +72,12 @@ def follow(config: UpdateConfig) -> None:
     if (train := _training(config, reading(config), model)) is not None:
         digests |= train.source
     with _followed(Path(config.out), digests) as folder:
-        file, place = folder / MODEL, START
-        if file.exists():
-            follower, place = _continued(file, settings)
-        else:
-            follower = Follower(model, train, settings)
+        file = folder / MODEL
+        follower, place = _continued(file, settings) if file.exists() else (Follower(model, train, settings), (0, ""))
         record = resumed(folder, follower.count) or Record(config.source, _unit(model))
         record.write(folder)
         _write_config(config, folder)
-        for line in lines(config.source, place):
+        for line in lines(config.source, *place):
             before = follower.model
             try:
                 new = measurement(line, config, before)
@@ -89,7 +87,7 @@ def follow(config: UpdateConfig) -> None:
                 continue
             print(answer(follower.count, new, before, step), flush=True)
             record.append(folder, record.add(follower.count - 1, step, follower.obstacles))
-            _save(follower, file, line.place)
+            _save(follower, file, line.end, line.sha256)
 
 
 @contextmanager
@@ -99,7 +97,7 @@ def _followed(folder: Path, digests: dict[str, str]) -> Iterator[Path]:
     Raises:
         InputError: The directory holds something else, or another process works in it.
     """
-    is_continued = (folder / ENVIRONMENT).exists() and _is_followed(folder / CONFIG)
+    is_continued = (folder / ENVIRONMENT).exists() and (folder / SUMMARY).exists()  # other updates have no environment
     if is_continued:
         unchanged_environment(folder, digests)
     elif folder.exists() and (not folder.is_dir() or begun(folder)):
@@ -113,32 +111,24 @@ def _followed(folder: Path, digests: dict[str, str]) -> Iterator[Path]:
         claim.release()
 
 
-def _is_followed(config: Path) -> bool:
-    try:
-        content = json.loads(config.read_bytes())
-        return content["task"] == "update" and content["config"]["follow"] is True
-    except (FileNotFoundError, *CONTENT_ERRORS):
-        return False
-
-
-def _continued(file: Path, settings: MonitorConfig) -> tuple[Follower, Place]:
-    """Return the follower that a file holds, and the place in its source after the last line that it learnt."""
+def _continued(file: Path, settings: MonitorConfig) -> tuple[Follower, tuple[int, str]]:
+    """Return the follower in a file, and the place in its source: number and SHA-256 of the bytes that it learnt."""
     follower = Follower(_model(str(file)), None, settings)
     _, tensors, header = checkpoint.read(file, follower.model.kind)
     with checkpoint.refusing(f"{file} is no model that a followed source continues"):
         follower.resume(json.loads(header["provenance"]["followed"]))
         if WAITING in tensors and isinstance(follower.model, FieldModel):
-            follower.waiting = [spectra(tensors[WAITING], tensors[f"{WAITING}_position"], follower.model)]
-        return follower, Place(**json.loads(header["provenance"]["place"]))
+            follower.waiting = spectra(tensors[WAITING], tensors[f"{WAITING}_position"], follower.model)
+        end, digest = json.loads(header["provenance"]["place"])
+        return follower, (int(end), str(digest))
 
 
-def _save(follower: Follower, file: Path, place: Place = START) -> None:
-    """Write the model, the state of its tests, the spectra that it has not learnt yet, and the place in its source."""
+def _save(follower: Follower, file: Path, end: int = 0, digest: str = "") -> None:
+    """Write the model, the state of its tests, the spectra that wait, and the place in its source."""
     tensors, header = follower.model.state()
-    if follower.waiting:
-        waiting = joined(follower.waiting)
-        tensors = tensors | {WAITING: waiting.store[:], f"{WAITING}_position": waiting.position}
-    provenance = {"followed": json.dumps(follower.state()), "place": json.dumps(place._asdict())}
+    if follower.waiting is not None:
+        tensors |= {WAITING: follower.waiting.store[:], f"{WAITING}_position": follower.waiting.position}
+    provenance = {"followed": json.dumps(follower.state()), "place": json.dumps([end, digest])}
     checkpoint.write(file, follower.model.kind, tensors, header | {"provenance": provenance})
 
 
