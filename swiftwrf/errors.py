@@ -6,6 +6,8 @@ from collections.abc import Iterable
 
 MAX_LENGTH = 300  # characters of a message: what came may be a megabyte long
 MAX_NAMES = 12  # names in a message
+CONTENT_ERRORS = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+"""exceptions that inconsistent content of a file or line raises where it is used"""
 
 
 def one_line(message: str) -> str:

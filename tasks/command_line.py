@@ -89,7 +89,7 @@ def _report(sentence: str, code: int) -> int:
 def _no_access(error: OSError) -> str:
     file = error.filename2 or error.filename or "the run's files"
     if error.errno in DISK_FULL:
-        return f"no space left to write {file}; make room or choose another --out"
+        return f"no space left to write {file}; free space and run the same command again, or resume what was stopped"
     reason = "no permission" if isinstance(error, PermissionError) else error.strerror or str(error)
     return f"cannot read or write {file} ({reason}); choose another path"
 

@@ -69,6 +69,19 @@ def check_new_file(out: Path, option: str = "") -> None:
         raise InputError(f"{option}{out} lies in {out.parent}, which is no directory")
 
 
+def unchanged_environment(folder: Path, source: dict[str, str]) -> Row:
+    """Return the environment in which a run began; refuse other input, by the SHA-256 of everything that it reads."""
+    found = read_json(folder / ENVIRONMENT)
+    before = found.get("input_sha256")
+    if before != source:
+        before = before if isinstance(before, dict) else {}
+        changed = sorted(name for name in {*before, *source} if before.get(name) != source.get(name))
+        raise InputError(
+            f"the input has changed since {folder} began ({', '.join(changed)}); restore it or start a new run"
+        )
+    return found
+
+
 class Run:
     """The directory of a run while it is being filled.
 
@@ -137,14 +150,7 @@ class Run:
         self.write_json(CONFIG, {"task": task, "command": invocation(task), "config": values})
 
     def _go_on(self, device: torch.device, source: dict[str, str], processes: int | None) -> None:
-        self._environment = read_json(self.path(ENVIRONMENT))
-        before = self._environment.get("input_sha256")
-        if before != source:
-            before = before if isinstance(before, dict) else {}
-            changed = sorted(name for name in {*before, *source} if before.get(name) != source.get(name))
-            raise InputError(
-                f"the input has changed since {self.folder} began ({', '.join(changed)}); restore it or start a new run"
-            )
+        self._environment = unchanged_environment(self.folder, source)
         threads = self._environment.get("threads")
         if not isinstance(threads, int) or not 1 <= threads <= 1024:
             threads = torch.get_num_threads()

@@ -36,7 +36,7 @@ def sha256(file: Path) -> str:
     Raises:
         InputError: The file is missing or may not be read.
     """
-    with _refusing_unreadable(file), file.open("rb") as stream:
+    with refusing_unreadable(file), file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
@@ -52,11 +52,11 @@ def digests(files: Iterable[Path], split_folder: Path | None = None) -> dict[str
 
 
 @contextmanager
-def _refusing_unreadable(file: Path) -> Iterator[None]:
-    """Raise InputError if a file is missing or may not be read."""
+def refusing_unreadable(file: Path) -> Iterator[None]:
+    """Raise InputError if a file is missing, is none, or may not be read."""
     try:
         if not file.is_file():
-            raise InputError(f"{file} is missing")
+            raise InputError(f"{file} is {'no file' if file.exists() else 'missing'}")
         yield
     except OSError as error:
         reason = "no permission to read it" if isinstance(error, PermissionError) else error.strerror
@@ -69,7 +69,7 @@ def read_bytes(file: Path) -> bytes:
     Raises:
         InputError: The file is missing or may not be read.
     """
-    with _refusing_unreadable(file):
+    with refusing_unreadable(file):
         return file.read_bytes()
 
 
@@ -79,7 +79,7 @@ def read_text(file: Path) -> str:
     Raises:
         InputError: The file is missing, larger than 256 MiB, or in another encoding.
     """
-    with _refusing_unreadable(file):
+    with refusing_unreadable(file):
         size = file.stat().st_size
     if size > MAX_TEXT_BYTES:
         raise InputError(f"{file} has {size} bytes; a table or list has at most {MAX_TEXT_BYTES}")

@@ -10,6 +10,7 @@ import torch
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import MIN_TRAINING
+from swiftwrf.errors import InputError
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.process import ProcessModel
@@ -23,6 +24,7 @@ from swiftwrf.rssi.model import RssiModel
 
 ROOM_NOTICE = "the room no longer explains the spectra since measurement {}; unless an obstacle does, fit it again"
 MAX_RECENT = 500  # spectra that are kept to adapt the model to a change
+MAX_WAITING = 5 * MIN_TRAINING  # spectra that wait for an update of a geometry
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +58,8 @@ class Follower:
     An alarm of the innovations adapts models of spectra to the change, if these can forget spectra, and restarts the test.
     Kernel and noise are chosen again while the data grow (`KernelMonitor`).
     With a room and training spectra, obstacles that appear or leave are detected, too. A notice reports once if the room no
-    longer explains the spectra. The planes of a geometry are refined whenever 10 positions are new.
+    longer explains the spectra. The planes of a geometry are refined whenever 10 positions are new; until then, its spectra
+    wait.
 
     Args:
         model: Fitted model with `update`.
@@ -90,12 +93,8 @@ class Follower:
             self.obstacles = ObstacleMonitor(model.room, train, self.monitor.config.false_alarm_rate)
             self.room = Monitor(train.position, (), self.obstacles.unexplained(train), self.monitor.config)
         self._recent: list[Spectra] = []
-        self._waiting: list[Spectra | Rssi] = []  # of a geometry, for its next update
-
-    @property
-    def is_waiting(self) -> bool:
-        """True if measurements wait for the next update of the model, which geometry makes with every 10 spectra."""
-        return bool(self._waiting)
+        self.waiting: Spectra | None = None
+        """spectra that a geometry has not learnt yet, for its next update"""
 
     def step(self, new: Spectra | Rssi) -> Step:
         """Score one measurement, test it for a change, and learn it.
@@ -109,7 +108,7 @@ class Follower:
         if self.obstacles is not None and isinstance(new, Spectra):
             words += map(self.obstacles.describe, self.obstacles.observe(new))
             notices += self._check_room(self.obstacles, new)
-        self._learn(new)
+        notices += self._learn(new)
         self.count += 1
         if isinstance(new, Spectra) and isinstance(self.model, ProcessModel):
             self._recent = [*self._recent, new][-MAX_RECENT:]
@@ -119,15 +118,21 @@ class Follower:
             notices += self._choose_kernel(self.model, new, scores)
         return Step(scores, tuple(words), correlation, "; ".join(notices))
 
-    def _learn(self, new: Spectra | Rssi) -> None:
-        self._waiting.append(new)
-        if isinstance(self.model, GeometryModel):
-            waiting = [one for one in self._waiting if isinstance(one, Spectra)]
-            if len(torch.cat([one.position for one in waiting]).unique(dim=0)) < MIN_TRAINING:
-                return
-            new = joined(waiting)
-        self._waiting = []
-        self.model = learnt(self.model, new)
+    def _learn(self, new: Spectra | Rssi) -> list[str]:
+        """Learn a measurement. A geometry learns it with those that wait; return a notice if it gives them up."""
+        if not isinstance(self.model, GeometryModel) or not isinstance(new, Spectra):
+            self.model = learnt(self.model, new)
+            return []
+        self.waiting = waiting = new if self.waiting is None else joined([self.waiting, new])
+        notices = []
+        try:
+            self.model = learnt(self.model, waiting)
+        except InputError as error:  # fewer than 10 positions, or spectra that do not fit the array
+            if len(waiting) < MAX_WAITING:
+                return []
+            notices = [f"{len(waiting)} spectra were not learnt: {error}"]
+        self.waiting = None
+        return notices
 
     def _check_room(self, obstacles: ObstacleMonitor, new: Spectra) -> list[str]:
         """Return a notice if the room no longer explains the spectra, which ends the test."""
@@ -156,7 +161,7 @@ class Follower:
         return correlation
 
     def state(self) -> dict[str, Any]:
-        """Return the count of measurements and the state of the tests as plain values."""
+        """Return the count of measurements and the state of the tests as plain values, without the spectra that wait."""
         obstacles = None if self.obstacles is None else self.obstacles.state()
         room = None if self.room is None else self.room.state()
         return {"count": self.count, "monitor": self.monitor.state(), "obstacles": obstacles, "room": room}

@@ -19,7 +19,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from swiftwrf.errors import InputError
+from swiftwrf.errors import CONTENT_ERRORS, InputError
 from swiftwrf.runtime.durable import write_bytes
 
 FORMAT = 1
@@ -170,6 +170,6 @@ def refusing(what: str) -> Iterator[None]:
     """Raise InputError for any error that inconsistent content of a file causes."""
     try:
         yield
-    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+    except CONTENT_ERRORS as error:
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
         raise InputError(f"{what}: {reason}; it was changed or written by another version, create it again") from None

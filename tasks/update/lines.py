@@ -1,19 +1,23 @@
-"""Measurements as JSON lines: reading them as they come, and the answer to each."""
+"""Measurements as lines: reading them as they come, and the answer to each."""
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 import sys
 import time
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, NamedTuple
 
 import torch
 
 from swiftwrf import FieldModel, InputError, Rssi, Spectra
+from swiftwrf.data.files import refusing_unreadable
 from swiftwrf.data.survey import SurveyOptions, frame_of, read_survey
+from swiftwrf.errors import CONTENT_ERRORS
 from swiftwrf.online import Step
 from swiftwrf.online.prequential import LEVEL
 from swiftwrf.rssi import RssiModel
@@ -21,86 +25,155 @@ from tasks.records import strict
 from tasks.update.options import UpdateConfig
 
 POLL_S = 0.2  # between two looks at a file that grows
+CHUNK_BYTES = 2**20
 
 
-def lines(source: str) -> Iterator[str]:
-    """Yield the complete lines of standard input (-), to its end, or of a file, for as long as it may grow."""
+class Line(NamedTuple):
+    """A line of a followed source.
+
+    Args:
+        number: Its number in the source, from 1.
+        content: Its bytes.
+        header: First line of a table; empty for JSON lines.
+        end: Number of bytes of the file up to the end of the line.
+        sha256: Digest of these bytes.
+    """
+
+    number: int
+    content: bytes
+    header: bytes = b""
+    end: int = 0
+    sha256: str = ""
+
+
+def check_source(source: str, model: FieldModel | RssiModel) -> None:
+    """Refuse a source that cannot be followed.
+
+    Raises:
+        InputError: No file that can be read, no standard input, or a table for a model that predicts no RSSI.
+    """
     if source == "-":
-        yield from sys.stdin
+        if sys.stdin is None:
+            raise InputError("standard input is closed; connect it or give a file")
         return
-    with Path(source).open(encoding="utf-8") as file:
-        part = ""
-        while True:
-            part += file.readline()
-            if part.endswith("\n"):
-                yield part
-                part = ""
-            else:
-                time.sleep(POLL_S)
+    with refusing_unreadable(Path(source)), Path(source).open("rb"):
+        if _is_table(source) and not isinstance(model, RssiModel):
+            raise InputError(f"{source} is a table, but the model predicts spectra; give JSON lines")
 
 
-def measurements(config: UpdateConfig, model: FieldModel | RssiModel) -> Iterator[Callable[..., Rssi | Spectra]]:
-    """Yield a reader of each measurement of a followed source, a function of its number and the model.
+def _is_table(source: str) -> bool:
+    return Path(source).suffix.lower() == ".csv"
 
-    Raises:
-        InputError: A table, but a model that predicts no RSSI.
+
+def lines(source: str, end: int = 0, sha256: str = "") -> Iterator[Line]:
+    """Yield the lines of standard input (-), to its end, or of a file, for as long as it may grow.
+
+    A file that was rewritten, truncated or replaced while it is followed is read from its beginning, unless it begins with
+    the bytes that were read.
+
+    Args:
+        source: Path of the file, or -.
+        end: Number of bytes that were read before. Lines after them are yielded if the file begins with these bytes.
+        sha256: Digest of these bytes.
     """
-    found = (line for line in lines(config.source) if line.strip())
-    if Path(config.source).suffix.lower() != ".csv":
-        yield from (partial(measurement, line) for line in found)
+    if source == "-":
+        yield from (Line(number, line) for number, line in enumerate(sys.stdin.buffer, start=1) if line.strip())
         return
-    if not isinstance(model, RssiModel):
-        raise InputError(f"{config.source} is a table, but the model predicts spectra; give JSON lines")
-    header, stated = next(found, ""), SurveyOptions(config.column_names, config.fillers, config.coordinates)
-    yield from (partial(table_row, header, line, stated) for line in found)
+    while True:
+        with refusing_unreadable(Path(source)), Path(source).open("rb") as file:
+            known = end if _digest(file, end) == sha256 else 0
+            header, digest, end = b"", hashlib.sha256(), 0
+            for number, line in enumerate(_growing(Path(source), file), start=1):
+                digest.update(line)
+                end, sha256 = end + len(line), digest.hexdigest()
+                if _is_table(source) and not header:
+                    header = line.strip() and line
+                elif end > known and line.strip():
+                    yield Line(number, line, header, end, sha256)
 
 
-def table_row(header: str, line: str, options: SurveyOptions, number: int, model: RssiModel) -> Rssi:
-    """Return the measurement in a row of a survey table; receivers that the model does not have are left out.
-
-    Raises:
-        InputError: A row without position, or without RSSI at a receiver of the model.
-    """
-    label = f"row {number}"
-    survey = read_survey(label, frame_of(label, header + line), options)
-    rssi = zip(survey.receiver_names, survey.rssi_dbm[0].tolist(), strict=True)
-    value = {name: x for name, x in rssi if name in model.receiver_names}
-    if not value:
-        raise InputError(f"{label}: no receiver of the model detected the transmitter")
-    data = Rssi(
-        torch.tensor([list(value.values())]), survey.position, receiver_names=tuple(value), origin=survey.origin
-    )
-    return _rssi(data.about(model.origin).transmitter_position.tolist(), value, model)
+def _digest(file: BinaryIO, end: int) -> str:
+    """Return the SHA-256 of the first bytes of a file, and go back to its beginning."""
+    digest = hashlib.sha256()
+    for start in range(0, end, CHUNK_BYTES):
+        digest.update(file.read(min(CHUNK_BYTES, end - start)))
+    file.seek(0)
+    return digest.hexdigest()
 
 
-def measurement(line: str, number: int, model: FieldModel | RssiModel) -> Rssi | Spectra:
+def _growing(path: Path, file: BinaryIO) -> Iterator[bytes]:
+    """Yield the lines of an open file until it is rewritten, or is read to its end and another file has its path."""
+    part, before, is_replaced = b"", b"", False
+    while True:
+        read = file.readline()
+        part += read
+        if part.endswith(b"\n") or (is_replaced and part and not read):
+            yield part
+            before, part = part, b""
+        elif is_replaced and not read:
+            return
+        elif not read:
+            time.sleep(POLL_S)
+            place, last = file.tell(), before + part
+            file.seek(0, os.SEEK_END)  # drops what is buffered
+            file.seek(max(0, place - len(last)))
+            if file.read(len(last)) != last:
+                return
+            with suppress(FileNotFoundError):  # renamed: it may grow until another file has its name
+                is_replaced = not os.path.samestat(path.stat(), os.fstat(file.fileno()))
+
+
+def measurement(line: Line, config: UpdateConfig, model: FieldModel | RssiModel) -> Rssi | Spectra:
     """Return the measurement in a line, of the kind that the model predicts.
 
     Raises:
-        InputError: No JSON object, or other values than the model needs.
+        InputError: No row or JSON object, or other values than the model needs.
     """
     needed = "rssi_dbm" if isinstance(model, RssiModel) else "spectrum"
     try:
-        content = json.loads(line)
-        position, value = [[float(x) for x in content["position"]]], content[needed]
+        text = (line.header + line.content).decode("utf-8-sig")
+        if line.header:
+            assert isinstance(model, RssiModel)
+            return _of_row(text, SurveyOptions(config.column_names, config.fillers, config.coordinates), model)
+        content = json.loads(text)
+        position, value = [list(map(_number, content["position"]))], content[needed]
         if isinstance(model, RssiModel):
-            return _rssi(position, value, model)
-        return Spectra([value], position, grid=model.grid, name=f"line {number}", **vars(model.link))
+            return _of_receivers(position, value, model)
+        spectrum = [[list(map(_number, row)) for row in value]]
+        return Spectra(spectrum, position, grid=model.grid, name=f"line {line.number}", **vars(model.link))
     except InputError as error:
-        raise InputError(f"line {number}: {error}") from None
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise InputError(
-            f"line {number} is no JSON object with position and {needed} ({type(error).__name__}: {error}); mend it"
-        ) from None
+        raise InputError(f"line {line.number}: {error}") from None
+    except CONTENT_ERRORS as error:
+        kind = "row of the table" if line.header else f"JSON object with position and {needed}"
+        raise InputError(f"line {line.number} is no {kind} ({type(error).__name__}: {error}); mend it") from None
 
 
-def _rssi(position: list[list[float]], value: dict[str, float | None], model: RssiModel) -> Rssi:
+def _number(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{value!r} is no number")
+    return float(value)
+
+
+def _of_row(text: str, options: SurveyOptions, model: RssiModel) -> Rssi:
+    """Return the measurement in a table of one row; receivers that the model does not have are left out."""
+    survey = read_survey("the table", frame_of("the table", text), options)
+    rssi = zip(survey.receiver_names, survey.rssi_dbm[0].tolist(), strict=True)
+    value = {name: x for name, x in rssi if name in model.receiver_names}
+    if not value:
+        raise InputError("no receiver of the model detected the transmitter")
+    data = Rssi(
+        torch.tensor([list(value.values())]), survey.position, receiver_names=tuple(value), origin=survey.origin
+    )
+    return _of_receivers(data.about(model.origin).transmitter_position.tolist(), value, model)
+
+
+def _of_receivers(position: list[list[float]], value: dict[str, float | None], model: RssiModel) -> Rssi:
     """Return a row at the receivers of the model; those that the line does not name count as not detecting."""
     if unknown := sorted(value.keys() - set(model.receiver_names)):
         raise InputError(f"the model has no receiver {unknown[0]!r}; leave it out")
     row = [value.get(name) for name in model.receiver_names]
     return Rssi(
-        [[torch.nan if x is None else float(x) for x in row]],
+        [[torch.nan if x is None else _number(x) for x in row]],
         position,
         receiver_names=model.receiver_names,
         origin=model.origin,
@@ -108,7 +181,7 @@ def _rssi(position: list[list[float]], value: dict[str, float | None], model: Rs
 
 
 def answer(number: int, new: Rssi | Spectra, before: FieldModel | RssiModel, step: Step) -> str:
-    """Return the answer to a line: what was predicted and observed, the interval, and alarms, as JSON.
+    """Return the answer to a line: what was predicted and observed, the interval, and alarms, as JSON in ASCII.
 
     Args:
         number: Number of the measurement, counted from 1.
@@ -138,4 +211,4 @@ def answer(number: int, new: Rssi | Spectra, before: FieldModel | RssiModel, ste
         found["notice"] = step.notice
     if step.correlation is not None:
         found["correlation"] = step.correlation
-    return json.dumps(strict(found), allow_nan=False, ensure_ascii=False)
+    return json.dumps(strict(found), allow_nan=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from matplotlib.patches import Rectangle
 from pandas import DataFrame
 
@@ -17,14 +19,13 @@ BLUE, RED = "#4477aa", "#ee6677"
 
 def page(record: Record, name: str) -> Page:
     """Return the page of a record, with the name of its data."""
-    error, covered = record.column("error"), record.column("covered")
     numbers = [
-        Number(str(len(error)), "measurements learnt"),
-        Number(f"{float(error.nanmean()):.3g}{record.unit}", "mean error before each was learnt"),
+        Number(str(len(record.rows)), "measurements learnt"),
+        Number(f"{record.mean('error'):.3g}{record.unit}", "mean error before each was learnt"),
         Number(str(len(record.alarms)), "changes detected"),
     ]
-    if bool(covered.isfinite().any()):
-        numbers.append(Number(f"{float(covered.nanmean()):.0%}", "of the values inside their 80 % interval"))
+    if math.isfinite(covered := record.mean("covered")):
+        numbers.append(Number(f"{covered:.0%}", "of the values inside their 80 % interval"))
     summary = Summary(numbers, [error_plot(record)], record.sentences(), ["Continue with model.safetensors."])
     order = record.column("innovation").nan_to_num().argsort(descending=True)[:MAX_SURPRISING].tolist()
     cells = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,13 +33,14 @@ COLUMNS = (
 )
 WORDS = ("alarm", "notice")  # columns of text
 TYPES = dict.fromkeys(COLUMNS, float) | {"index": int} | dict.fromkeys(WORDS, str)
+MEANS = ("error", "covered")  # columns whose means are kept
 WINDOW = 30  # measurements of the running error
 BOXES = ("obstacles", "standing")  # that can have appeared or left; that the training spectra show
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Record:
-    """Measurements that a model learnt one after the other.
+    """Measurements that a model learnt one after the other. Adding one and the summary take a constant time.
 
     Args:
         source: Where the measurements come from.
@@ -51,6 +53,28 @@ class Record:
     unit: str
     rows: list[Row] = field(default_factory=list)
     boxes: dict[str, list[Row]] = field(default_factory=dict)
+    alarms: list[tuple[int, str]] = field(default_factory=list, init=False)
+    """number of the measurement that raised each alarm, and the change in words"""
+    notices: list[tuple[int, str]] = field(default_factory=list, init=False)
+    """number of the measurement after which the model changed beside its data, and how, in words"""
+    _sums: dict[str, tuple[float, int]] = field(default_factory=lambda: dict.fromkeys(MEANS, (0.0, 0)), init=False)
+
+    def __post_init__(self) -> None:
+        for number, row in enumerate(self.rows):
+            self._count(number, row)
+
+    def _count(self, number: int, row: Row) -> None:
+        """Add a row to the alarms, notices and sums."""
+        self.alarms += [(number, row["alarm"])] if row["alarm"] else []
+        self.notices += [(number, row["notice"])] if row["notice"] else []
+        for name, (total, n) in self._sums.items():
+            if not math.isnan(row[name]):
+                self._sums[name] = (total + row[name], n + 1)
+
+    def mean(self, name: str) -> float:
+        """Return the mean of a column of `MEANS`, nan without numbers."""
+        total, n = self._sums[name]
+        return total / n if n else float("nan")
 
     @classmethod
     def read(cls, folder: Path) -> Record:
@@ -74,10 +98,11 @@ class Record:
             "running_error": float(torch.tensor(recent, dtype=torch.float64).nanmean()),
             "innovation": float(scores.innovation.square().nanmean().sqrt()),
             "covered": float(scores.covered[0]),
-            "alarm": "; ".join(step.alarms),
+            "alarm": " ".join("; ".join(step.alarms).split()),  # names of receivers may contain line breaks
             "correlation": step.correlation,
-            "notice": step.notice,
+            "notice": " ".join(step.notice.split()),
         }
+        self._count(len(self.rows), row)
         self.rows.append(row)
         if obstacles is not None:
             self.boxes.update(boxes_of(obstacles))
@@ -89,16 +114,6 @@ class Record:
         values = torch.tensor(cells, dtype=torch.float64).reshape(-1, len(names))
         return values[:, 0] if len(names) == 1 else values
 
-    @property
-    def alarms(self) -> list[tuple[int, str]]:
-        """Number of the measurement that raised each alarm, and the change in words."""
-        return [(number, row["alarm"]) for number, row in enumerate(self.rows) if row["alarm"]]
-
-    @property
-    def notices(self) -> list[tuple[int, str]]:
-        """Number of the measurement after which the model changed beside its data, and how, in words."""
-        return [(number, row["notice"]) for number, row in enumerate(self.rows) if row["notice"]]
-
     def summary(self) -> Row:
         """Return the results as plain values."""
         changes = [
@@ -109,9 +124,9 @@ class Record:
             "source": self.source,
             "unit": self.unit,
             "measurements": len(self.rows),
-            "mean_error": float(self.column("error").nanmean()),
+            "mean_error": self.mean("error"),
             "last_running_error": self.rows[-1]["running_error"] if self.rows else None,
-            "coverage": float(self.column("covered").nanmean()),
+            "coverage": self.mean("covered"),
             "alarms": changes,
             "notices": [{"measurement": number, "what": text} for number, text in self.notices],
             **self.boxes,
@@ -132,9 +147,11 @@ class Record:
         return text
 
     def write(self, folder: Path) -> None:
-        """Write table and summary."""
+        """Write table and summary. Without measurements there is no table."""
         if self.rows:
             write_text(folder / TABLE, as_table(self.rows))
+        else:
+            (folder / TABLE).unlink(missing_ok=True)
         write_json(folder / SUMMARY, self.summary())
 
     def append(self, folder: Path, row: Row) -> None:
@@ -167,8 +184,8 @@ def resumed(folder: Path, count: int) -> Record | None:
     """Return the first rows of the record in a directory, which loses the others. None without a record.
 
     Args:
-        folder: Directory with a model that has learnt measurements.
-        count: Number of measurements that it has learnt: a row more is of one that a kill took from the model.
+        folder: Directory of a followed run.
+        count: Number of measurements that its model has learnt. A row more is of one that a kill took from the model.
     """
     if not (folder / SUMMARY).exists():
         return None
@@ -185,8 +202,6 @@ def _rows(table: Path) -> list[Row]:
     try:
         text = table.read_bytes().decode()
         rows = pd.read_csv(io.StringIO(text[: text.rfind("\n") + 1]), dtype=TYPES)
-        if "notice" not in rows:  # tables of earlier versions
-            rows["notice"] = ""
         return list(rows[list(COLUMNS)].fillna(dict.fromkeys(WORDS, "")).to_dict("records"))
     except (OSError, ValueError, KeyError, OverflowError) as error:
         raise InputError(f"{table} is not the table of an update ({error}); restore it") from None

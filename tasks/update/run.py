@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -10,24 +12,27 @@ import torch
 
 from swiftwrf import FieldModel, InputError, Rssi, Spectra, load
 from swiftwrf.data import ReadOptions, Snapshots
+from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
 from swiftwrf.errors import with_article
 from swiftwrf.online import Follower, MonitorConfig
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime import checkpoint
-from tasks.claim import CONFIG, MODEL, Claim
-from tasks.directory import new_directory
-from tasks.environment import invocation
+from tasks.claim import CONFIG, ENVIRONMENT, MODEL, Claim, begun
+from tasks.directory import new_directory, unchanged_environment
+from tasks.environment import environment, invocation
 from tasks.locate.observations import aligned
 from tasks.options import plain
 from tasks.page.page import write_page
 from tasks.records import write_json
-from tasks.source import reading
+from tasks.source import located, reading
 from tasks.terminal import console, terminal
-from tasks.update.lines import answer, measurements
+from tasks.update.lines import answer, check_source, lines, measurement
 from tasks.update.options import UpdateConfig
 from tasks.update.page import page
-from tasks.update.record import Record, resumed
+from tasks.update.record import SUMMARY, Record, resumed
+
+WAITING = "waiting"  # tensor of the spectra that a geometry has not learnt yet
 
 
 def run(config: UpdateConfig) -> None:
@@ -47,51 +52,86 @@ def run(config: UpdateConfig) -> None:
         record = Record(config.source, _unit(model))
         for i, index in enumerate(new.index.tolist()):
             record.add(index, follower.step(new.subset(torch.tensor([i]))), follower.obstacles)
-        _save(follower, folder / MODEL, {})
+        _save(follower, folder / MODEL)
         record.write(folder)
         _write_config(config, folder)
         write_page(folder, page(record, new.name))
-    terminal.page(record.summary(), "\n".join(record.sentences()), Path(config.out) / "report.html")
+    sentences = record.sentences()
+    if follower.waiting is not None:
+        sentences.append(
+            f"the last {len(follower.waiting)} spectra are not learnt: a room is refined at every 10 positions"
+        )
+    terminal.page(record.summary(), "\n".join(sentences), Path(config.out) / "report.html")
 
 
 def follow(config: UpdateConfig) -> None:
     """Print the answer to each line, then record it and replace the model; a line lost with a kill is answered again."""
-    folder = Path(config.out)
-    folder.mkdir(parents=True, exist_ok=True)
-    claim = Claim(folder, new=False)
-    file = folder / MODEL
-    model = _model(str(file) if file.exists() else config.model)
-    train = None if file.exists() else _training(config, reading(config), model)
-    follower = Follower(model, train, MonitorConfig(false_alarm_rate=config.false_alarm_rate))
-    source, skipped = "" if config.source == "-" else str(Path(config.source).resolve()), 0
-    record = Record(config.source, _unit(model))
-    if file.exists():
-        _, _, header = checkpoint.read(file, model.kind)
-        with checkpoint.refusing(f"{file} is no model that a followed source continues"):
-            follower.resume(json.loads(header["provenance"]["followed"]))
-            record = resumed(folder, follower.count) or record
-            skipped = int(header["provenance"].get("lines", 0)) * (source == header["provenance"].get("source"))
-    record.write(folder)
-    _write_config(config, folder)
-    for number, parse in enumerate(measurements(config, model), start=1):
-        if source and number <= skipped:
-            continue
-        before = follower.model
-        try:
-            new = parse(number, before)
-            step = follower.step(new)
-        except InputError as error:  # one bad line does not end a run of days
-            console.print(f"error: {error}", markup=False)
-            continue
-        print(answer(follower.count, new, before, step), flush=True)
-        record.append(folder, record.add(follower.count - 1, step, follower.obstacles))
-        if not follower.is_waiting:  # after a kill, lines since the last update are answered again
-            _save(follower, file, {"source": source, "lines": str(number)})
-    claim.release()
+    digests = {"model": sha256(Path(config.model))}
+    model, settings = _model(config.model), MonitorConfig(false_alarm_rate=config.false_alarm_rate)
+    check_source(config.source, model)
+    if (train := _training(config, reading(config), model)) is not None:
+        digests |= train.source
+    with _followed(Path(config.out), digests) as folder:
+        file = folder / MODEL
+        follower, place = _continued(file, settings) if file.exists() else (Follower(model, train, settings), (0, ""))
+        record = resumed(folder, follower.count) or Record(config.source, _unit(model))
+        record.write(folder)
+        _write_config(config, folder)
+        for line in lines(config.source, *place):
+            before = follower.model
+            try:
+                new = measurement(line, config, before)
+                step = follower.step(new)
+            except InputError as error:  # one bad line does not end a run of days
+                console.print(f"error: {error}", markup=False, soft_wrap=True)
+                continue
+            print(answer(follower.count, new, before, step), flush=True)
+            record.append(folder, record.add(follower.count - 1, step, follower.obstacles))
+            _save(follower, file, line.end, line.sha256)
 
 
-def _save(follower: Follower, file: Path, read: dict[str, str]) -> None:
-    follower.model.save(file, {"followed": json.dumps(follower.state()), **read})
+@contextmanager
+def _followed(folder: Path, digests: dict[str, str]) -> Iterator[Path]:
+    """Claim a new or empty directory, or that of a followed run which began with the same model and training data.
+
+    Raises:
+        InputError: The directory holds something else, or another process works in it.
+    """
+    is_continued = (folder / ENVIRONMENT).exists() and (folder / SUMMARY).exists()  # other updates have no environment
+    if is_continued:
+        unchanged_environment(folder, digests)
+    elif folder.exists() and (not folder.is_dir() or begun(folder)):
+        raise InputError(f"{folder} exists already and holds no run of update --follow; choose another --out")
+    claim = Claim(folder, new=not is_continued)
+    try:
+        if not is_continued:
+            write_json(folder / ENVIRONMENT, environment(torch.device("cpu"), digests))
+        yield folder
+    finally:
+        claim.release()
+
+
+def _continued(file: Path, settings: MonitorConfig) -> tuple[Follower, tuple[int, str]]:
+    """Return the follower in a file, and the place in its source: number and SHA-256 of the bytes that it learnt."""
+    follower = Follower(_model(str(file)), None, settings)
+    _, tensors, header = checkpoint.read(file, follower.model.kind)
+    with checkpoint.refusing(f"{file} is no model that a followed source continues"):
+        follower.resume(json.loads(header["provenance"]["followed"]))
+        if WAITING in tensors and isinstance(follower.model, FieldModel):
+            follower.waiting = Spectra(
+                tensors[WAITING], tensors[f"{WAITING}_position"], grid=follower.model.grid, **vars(follower.model.link)
+            )
+        end, digest = json.loads(header["provenance"]["place"])
+        return follower, (int(end), str(digest))
+
+
+def _save(follower: Follower, file: Path, end: int = 0, digest: str = "") -> None:
+    """Write the model, the state of its tests, the spectra that wait, and the place in its source."""
+    tensors, header = follower.model.state()
+    if follower.waiting is not None:
+        tensors |= {WAITING: follower.waiting.store[:], f"{WAITING}_position": follower.waiting.position}
+    provenance = {"followed": json.dumps(follower.state()), "place": json.dumps([end, digest])}
+    checkpoint.write(file, follower.model.kind, tensors, header | {"provenance": provenance})
 
 
 def _write_config(config: UpdateConfig, folder: Path) -> None:
@@ -117,7 +157,8 @@ def _training(config: UpdateConfig, options: ReadOptions, model: FieldModel | Rs
 
 
 def _read(source: str, options: ReadOptions, model: FieldModel | RssiModel) -> Spectra | Rssi:
-    """Return measurements of the kind that a model predicts."""
+    """Return measurements of the kind that a model predicts, of a folder, file or public data set."""
+    source = located(source)
     if isinstance(model, RssiModel):
         rssi: Any = read(source, options, RSSI_FORMATS)
         return aligned(rssi.about(model.origin), model.receiver_names)

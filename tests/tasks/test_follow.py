@@ -1,0 +1,445 @@
+"""The command `update --follow`: directories that it continues, places in a source, and lines that are no measurements."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import sys
+import time
+from functools import cache, partial
+from types import SimpleNamespace
+
+import pytest
+import small
+import torch
+
+from swiftwrf import AngularGrid, InputError, Rssi, RssiModel, load, make_model, rssi_room, simulated_room
+from swiftwrf.data.writing import write_rssi
+from swiftwrf.models.geometry import fit_geometry
+from swiftwrf.online import Follower
+from tasks.command import run_command
+from tasks.update import lines as followed_lines
+from tasks.update.record import Record
+
+
+@cache
+def floor():
+    return rssi_room(n=60)
+
+
+@cache
+def rssi_model(n=40):
+    return RssiModel().fit(floor().subset(torch.arange(n)))
+
+
+def line(i, **changes):
+    names = floor().receiver_names
+    row = {name: x for name, x in zip(names, floor().rssi_dbm[i].tolist(), strict=True) if x == x}
+    content = {"position": floor().transmitter_position[i].tolist(), "rssi_dbm": row} | changes
+    return json.dumps(content).encode() + b"\n"
+
+
+HEADER = b"x,y,z,receiver01,receiver02\n"
+ROWS = [b"1,2,1,-60,-61\n", b"2,2,1,-61,-62\n", b"3,2,1,-62,-63\n", b"4,2,1,-63,-64\n", b"5,2,1,-64,-65\n"]
+
+
+@pytest.fixture
+def model(tmp_path):
+    file = tmp_path / "model.safetensors"
+    rssi_model().save(file)
+    return file
+
+
+@pytest.fixture
+def follow(monkeypatch, capsys, tmp_path):
+    """Run the command on standard input, or on a file to its present end, where it is stopped."""
+
+    def stopped(seconds):
+        raise KeyboardInterrupt
+
+    def run(model, source="-", content=b"", out=tmp_path / "out", options=(), stop=stopped):
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(content)))
+        monkeypatch.setattr(followed_lines, "time", SimpleNamespace(sleep=stop))
+        code = run_command("update", [str(model), str(source), "--follow", "--out", str(out), *options])
+        said = capsys.readouterr()
+        return code, [json.loads(text) for text in said.out.splitlines()], said.err
+
+    return run
+
+
+def indices(folder):
+    return [int(row["index"]) for row in csv.DictReader((folder / "measurements.csv").open(newline=""))]
+
+
+def contents(folder):
+    return {file.name: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+def other_model(folder):
+    rssi_model(30).save(folder / "other.safetensors")
+    return folder / "other.safetensors"
+
+
+# whose directory
+
+
+def foreign(folder, name, files):
+    (folder / name).mkdir()
+    for file, content in files.items():
+        (folder / name / file).write_text(content)
+    return folder / name
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        {"config.json": '{"task": "rssi", "config": {}}', "metrics.json": "{}"},
+        {"config.json": '{"my": "website"}'},
+        {"config.json": '{"task": "update", "config": {"follow": false}}', "report.html": ""},
+        {"config.json": '{"task": "rssi"}', "environment.json": "{}"},
+        {"config.json": "no JSON"},
+        {"notes.txt": "mine"},
+    ],
+    ids=lambda files: " ".join(files),
+)
+def test_a_directory_of_something_else_is_refused_and_unchanged(follow, model, tmp_path, files):
+    folder = foreign(tmp_path, "taken", files)
+    code, answers, said = follow(model, content=line(40), out=folder)
+    assert (code, answers) == (2, [])
+    assert said.startswith("error: ")
+    assert said.count("\n") == 1
+    assert "--resume" not in said
+    assert contents(folder) == {name: text.encode() for name, text in files.items()}
+
+
+def test_an_empty_directory_is_taken(follow, model, tmp_path):
+    (tmp_path / "out").mkdir()
+    assert follow(model, content=line(40))[0] == 0
+    assert indices(tmp_path / "out") == [0]
+
+
+@pytest.mark.parametrize("change", ["other", "missing", "rewritten", "data"])
+def test_a_run_goes_on_with_the_model_and_data_that_it_began_with(follow, model, tmp_path, change):
+    assert follow(model, content=line(40))[0] == 0
+    before, options = contents(tmp_path / "out"), ()
+    if change == "other":
+        model = other_model(tmp_path)
+    elif change == "missing":
+        model.unlink()
+    elif change == "rewritten":
+        model.write_bytes(other_model(tmp_path).read_bytes())
+    else:
+        (tmp_path / "data").mkdir()
+        write_rssi(floor().subset(torch.arange(40)), tmp_path / "data")
+        options = ("--data", str(tmp_path / "data"))
+    code, answers, said = follow(model, content=line(41), options=options)
+    assert (code, answers, said.count("\n")) == (2, [], 1)
+    assert ("is missing" if change == "missing" else "has changed since") in said
+    assert contents(tmp_path / "out") == before
+
+
+# where a source goes on
+
+
+def observed(answers):
+    return [round(answer["observed"]["receiver01"]) for answer in answers]
+
+
+@pytest.mark.parametrize(
+    ("after", "expected"),
+    [
+        (HEADER + b"".join(ROWS[:3]), []),
+        (HEADER + b"".join(ROWS), [-63, -64]),
+        (HEADER + b"".join(ROWS[2:]), [-62, -63, -64]),
+        (HEADER + b"".join(ROWS[:1]), [-60]),
+        (HEADER + ROWS[1] + ROWS[0] + b"".join(ROWS[2:]), [-61, -60, -62, -63, -64]),
+    ],
+    ids=["unchanged", "grown", "rewritten", "truncated", "last line the same"],
+)
+@pytest.mark.parametrize("by", ["in place", "by name"])
+def test_a_source_goes_on_after_the_lines_learnt_or_begins_again(follow, model, tmp_path, after, expected, by):
+    source = tmp_path / "rows.csv"
+    source.write_bytes(HEADER + b"".join(ROWS[:3]))
+    assert observed(follow(model, source)[1]) == [-60, -61, -62]
+    if by == "by name":
+        source.rename(tmp_path / "rows.csv.1")
+    source.write_bytes(after)
+    code, answers, _ = follow(model, source)
+    assert code == 130
+    assert observed(answers) == expected
+    assert indices(tmp_path / "out") == list(range(3 + len(expected)))
+
+
+def rewrite(source):
+    source.write_bytes(b"".join([b"g" * 5 + b"\n"] * 6))
+
+
+def rotate(source):
+    with source.open("ab") as file:
+        file.write(b"c\nrest")
+    source.rename(source.with_suffix(".1"))
+    source.write_bytes(b"d\ne\nf\n")
+
+
+def replace_with_more(source):
+    """Save the file under its name, as editors and rsync do."""
+    source.with_suffix(".new").write_bytes(source.read_bytes() + b"c\nd\n")
+    source.with_suffix(".new").replace(source)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (rewrite, [b"ggggg"] * 6),
+        (rotate, [b"c", b"rest", b"d", b"e", b"f"]),
+        (replace_with_more, [b"c", b"d"]),
+    ],
+)
+def test_a_file_that_changes_while_it_is_followed_loses_no_line(tmp_path, monkeypatch, change, expected):
+    source, waits = tmp_path / "rows.ndjson", []
+    source.write_bytes(b"a\nb\n")
+
+    def sleep(seconds):
+        waits.append(seconds)
+        if len(waits) == 1:
+            change(source)
+        if len(waits) > 4:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(followed_lines, "time", SimpleNamespace(sleep=sleep))
+    found = []
+    with pytest.raises(KeyboardInterrupt):
+        found.extend(one.content.strip() for one in followed_lines.lines(str(source)))
+    assert found == [b"a", b"b", *expected]
+
+
+# rows and spectra
+
+
+def killed(*arguments):
+    raise KeyboardInterrupt
+
+
+def test_a_row_without_its_model_is_dropped(follow, model, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr("tasks.update.run._save", killed)
+        assert follow(model, content=line(40))[0] == 130
+    assert indices(tmp_path / "out") == [0]
+    assert follow(model, content=line(41))[0] == 0
+    assert indices(tmp_path / "out") == [0]
+    assert json.loads((tmp_path / "out" / "update.json").read_text())["measurements"] == 1
+    assert Record.read(tmp_path / "out").rows[0]["x_m"] == pytest.approx(float(floor().transmitter_position[41, 0]))
+
+
+@cache
+def room():
+    return simulated_room(n=60, grid=AngularGrid.hemisphere(18, 72))
+
+
+@cache
+def geometry():
+    return fit_geometry(room().subset(torch.arange(40)), small.GLANCE, progress=False)
+
+
+def spectrum_lines(first, last):
+    rows = range(first, last)
+    return b"".join(
+        json.dumps({"position": room().position[i].tolist(), "spectrum": room().store[i : i + 1][0].tolist()}).encode()
+        + b"\n"
+        for i in rows
+    )
+
+
+def test_spectra_that_wait_are_learnt_by_the_next_start(follow, tmp_path):
+    file, learnt = tmp_path / "room.safetensors", tmp_path / "out" / "model.safetensors"
+    geometry().save(file)
+    assert len(follow(file, content=spectrum_lines(40, 45))[1]) == 5
+    first = load(learnt)
+    assert first.planes == load(file).planes
+    assert [answer["measurement"] for answer in follow(file, content=spectrum_lines(45, 51))[1]] == list(range(6, 12))
+    assert indices(tmp_path / "out") == list(range(11))
+    follower = Follower(load(file))
+    for i in range(40, 51):
+        follower.step(room().subset(torch.tensor([i])))
+    assert load(learnt).planes != first.planes
+    found, expected = (model.tensors().offset for model in (load(learnt), follower.model))
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
+
+
+def test_an_update_of_a_room_states_the_spectra_that_it_has_not_learnt(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("tasks.update.run._read", lambda *_: room().subset(torch.arange(40, 43)))
+    geometry().save(tmp_path / "room.safetensors")
+    assert run_command("update", [str(tmp_path / "room.safetensors"), "x", "--out", str(tmp_path / "out")]) == 0
+    assert "3 spectra are not learnt" in capsys.readouterr().out
+
+
+# lines that are no measurements
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        b"nonsense\n",
+        b'{"position":[1,0,0],"note":"caf\xe9"}\n',
+        b"\xff\xfe{\x00\n",
+        line(41, position=[10**400, 0, 0]),
+        line(41, position=[True, 0, 0]),
+        line(41, position=["1", 0, 0]),
+        line(41, rssi_dbm={"receiver01": True}),
+        line(41, rssi_dbm={"receiver01": 10**400}),
+        line(41, rssi_dbm={"nowhere\r\n": -60}),
+        b"[" * 5000 + b"\n",
+    ],
+    ids=lambda bad: str(bad[:40]),
+)
+def test_a_bad_line_is_reported_and_left_out(follow, model, bad):
+    code, answers, said = follow(model, content=line(40) + bad + line(42))
+    assert (code, len(answers), said.count("error: ")) == (0, 2, 1)
+    assert said.startswith("error: line 2")
+    assert said.count("\n") == 1
+
+
+def test_booleans_are_no_spectrum(follow, tmp_path):
+    make_model("gp").fit(room().subset(torch.arange(40))).save(tmp_path / "gp.safetensors")
+    bad = json.dumps({"position": [1, 1, 1], "spectrum": [[True] * 72] * 18}).encode() + b"\n"
+    code, answers, said = follow(tmp_path / "gp.safetensors", content=bad + spectrum_lines(41, 42))
+    assert (code, len(answers)) == (0, 1)
+    assert said.startswith("error: line 1")
+
+
+def test_bad_rows_of_a_table_are_left_out(follow, model, tmp_path):
+    source = tmp_path / "rows.csv"
+    rows = [ROWS[0], b"caf\xe9,2,1,-60,-61\n", b"1" * 401 + b",2,1,-60,-61\n", b"1,2,-60\n", ROWS[1]]
+    source.write_bytes(b"\xef\xbb\xbf" + HEADER + b"".join(rows))
+    _, answers, said = follow(model, source)
+    assert observed(answers) == [-60, -61]
+    assert [text.replace(":", "").split()[:3] for text in said.splitlines()] == [["error", "line", n] for n in "345"]
+
+
+def test_a_character_in_two_parts_is_one(follow, model, tmp_path):
+    source, parts = tmp_path / "rows.ndjson", [b"\xa9", b'"}\n']
+    whole = line(40, note="?").replace(b"?", b"\xc3")
+    source.write_bytes(whole.partition(b"\xc3")[0] + b"\xc3")
+
+    def append(seconds):
+        if not parts:
+            raise KeyboardInterrupt
+        with source.open("ab") as file:
+            file.write(parts.pop(0))
+
+    code, answers, said = follow(model, source, stop=append)
+    assert (code, len(answers), said) == (130, 1, "")
+
+
+def test_names_of_receivers_are_any_text(follow, tmp_path, monkeypatch):
+    """A line break does not break the table, and no encoding of the terminal breaks an answer."""
+    data = floor()
+    names = ("caf\u00e9\r\nhall", *data.receiver_names[1:])
+    data = Rssi(data.rssi_dbm, data.transmitter_position, receiver_names=names)
+    RssiModel().fit(data.subset(torch.arange(40))).save(tmp_path / "model.safetensors")
+    monkeypatch.setattr("swiftwrf.online.monitor.alarm_threshold", lambda *_: 1e-9)
+    content = line(40, rssi_dbm={names[0]: -20.0}) + line(41, rssi_dbm={names[0]: -20.0})
+    code, answers, _ = follow(tmp_path / "model.safetensors", content=content)
+    assert code == 0
+    assert any("hall" in answer["alarm"] for answer in answers if answer["alarm"])
+    rows = Record.read(tmp_path / "out").rows
+    assert [row["index"] for row in rows] == [0, 1]
+    assert any("caf\u00e9 hall stronger" in row["alarm"] for row in rows)
+
+
+def test_answers_are_ascii(follow, model, monkeypatch):
+    monkeypatch.setattr("builtins.print", partial(print_ascii, print))
+    names = ("caf\u00e9", *floor().receiver_names[1:])
+    data = Rssi(floor().rssi_dbm, floor().transmitter_position, receiver_names=names)
+    RssiModel().fit(data.subset(torch.arange(40))).save(model)
+    _, answers, _ = follow(model, content=line(40, rssi_dbm={names[0]: -60.0}))
+    assert answers[0]["observed"]["caf\u00e9"] == -60
+
+
+def print_ascii(write, text, **options):
+    """Print as on a terminal with LC_ALL=C."""
+    text.encode("ascii")
+    write(text, **options)
+
+
+# sources and ends
+
+
+@pytest.mark.parametrize("name", ["nothing.csv", "folder.csv", "nothing.ndjson"])
+def test_a_source_that_is_no_file_is_refused_before_the_directory_is_made(follow, model, tmp_path, name):
+    (tmp_path / "folder.csv").mkdir()
+    code, _, said = follow(model, tmp_path / name)
+    assert code == 2
+    assert said.startswith(f"error: {tmp_path / name} is ")
+    assert "cannot write" not in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_table_for_spectra_is_refused_before_the_directory_is_made(follow, tmp_path):
+    make_model("gp").fit(room().subset(torch.arange(40))).save(tmp_path / "gp.safetensors")
+    (tmp_path / "rows.csv").write_bytes(HEADER)
+    code, _, said = follow(tmp_path / "gp.safetensors", tmp_path / "rows.csv")
+    assert code == 2
+    assert "give JSON lines" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_full_disk_is_answered_with_the_right_advice(follow, model, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("tasks.update.run._save", full)
+        code, _, said = follow(model, content=line(40))
+    assert code == 2
+    assert "free space and run the same command again" in said
+    assert "--resume" not in said
+    assert follow(model, content=line(40))[0] == 0
+
+
+def test_a_last_line_without_its_end(follow, model, tmp_path):
+    """It counts at the end of standard input, but waits in a file, which may grow."""
+    assert len(follow(model, content=line(40) + line(41).strip())[1]) == 2
+    source = tmp_path / "rows.csv"
+    source.write_bytes(HEADER + ROWS[0] + ROWS[1].strip())
+    assert observed(follow(model, source, out=tmp_path / "table")[1]) == [-60]
+    with source.open("ab") as file:
+        file.write(b"\n")
+    assert observed(follow(model, source, out=tmp_path / "table")[1]) == [-61]
+
+
+def test_messages_are_whole_lines(follow, model):
+    bad = line(41, rssi_dbm={"receiver with a long name " * 5: -60.0})
+    assert follow(model, content=bad)[2].count("\n") == 1
+
+
+@pytest.mark.parametrize("kind", ["source", "data"])
+def test_names_of_public_data_sets_are_sources(model, tmp_path, monkeypatch, capsys, kind):
+    folder = tmp_path / "public" / "tetam-tracks"
+    folder.mkdir(parents=True)
+    write_rssi(floor().subset(torch.arange(40, 50)), folder)
+    monkeypatch.setenv("SWIFTWRF_DATA", str(folder.parent))
+    source, data = ("tetam-tracks", folder) if kind == "source" else (folder, "tetam-tracks")
+    options = [str(model), str(source), "--data", str(data), "--out", str(tmp_path / "out")]
+    assert run_command("update", options) == 0
+    assert "10 measurements learnt" in capsys.readouterr().out
+
+
+def test_a_line_costs_the_same_in_a_long_record():
+    step = Follower(rssi_model()).step(floor().subset(torch.tensor([40])))
+    first = Record("source", " [dB]")
+    first.add(0, step)
+    record = Record("source", " [dB]", first.rows * 100_000)
+    begin = time.process_time()
+    for _ in range(10):
+        record.add(1, step)
+        found = record.summary()
+    assert time.process_time() - begin < 0.2
+    assert found["measurements"] == 100_010
+    assert found["mean_error"] == pytest.approx(first.rows[0]["error"])
+
+
+def test_a_source_is_checked():
+    with pytest.raises(InputError, match="is missing"):
+        followed_lines.check_source("nowhere.csv", rssi_model())
