@@ -57,7 +57,7 @@ class Link:
             plain["moving"],
             None if fixed_position is None else to_tensor("fixed_position", fixed_position, float64, (3,)),
             None if rotation is None else to_tensor("rotation", rotation, float64, (3, 3)),
-            array and PlanarArray(tensor(array["element"], dtype=float64), array["wavelength"]),
+            None if array is None else PlanarArray(tensor(array["element"], dtype=float64), array["wavelength"]),
         )
 
     def to_json(self) -> dict[str, Any]:

@@ -325,7 +325,7 @@ def test_saved_model_predicts_the_same(tmp_path):
     assert torch.equal(*(both(m.predict(data.transmitter_position)) for m in (again, model)))
 
 
-DAMAGE = ("level", "slope", "receiver", "centre", "directivity", "anchor", "coefficient", "rendered")
+DAMAGE = ("level", "slope", "centre", "directivity", "anchor", "coefficient", "rendered")
 
 
 @pytest.mark.parametrize("name", [*DAMAGE, "field_db", "noise_db", "mixing_weight"])
@@ -341,6 +341,14 @@ def test_a_file_with_a_tensor_of_another_shape_is_refused(tmp_path, name):
     checkpoint.write(file, kind, tensors, header)
     with pytest.raises(InputError, match="is no rssi model that can be used"):
         load(file)
+
+
+@pytest.mark.parametrize("position", [None, [], [[0, 0, 0]], [[0, 0]] * 3, [[0, 0, float("inf")]] * 3, ["x"] * 3])
+def test_a_file_with_unusable_positions_of_receivers_is_refused(tmp_path, position):
+    tensors, header = fit_rssi(with_field(n=30)).state()
+    checkpoint.write(tmp_path / "model", RssiModel.kind, tensors, header | {"receiver_position": position})
+    with pytest.raises(InputError, match="is no rssi model that can be used"):
+        load(tmp_path / "model")
 
 
 def test_an_incomplete_state_of_a_fit_is_refused(tmp_path):
