@@ -126,7 +126,7 @@ def _end_with_the_run() -> None:
 
 @cache
 def _read(content: Path) -> Any:
-    """Return the context of the steps. Each process reads it once, in a step, whose exception says why it cannot be read."""
+    """Return the context of the steps. Each process reads it once, in a step, so that the step raises the reason."""
     return pickle.loads(content.read_bytes())
 
 
