@@ -104,11 +104,15 @@ class CrossValidationMetrics(TypedDict):
 
 
 class EstimatorChoiceMetrics(TypedDict):
-    """Method with the smallest median angular error on held-out measured spectra; that error of each candidate."""
+    """Method with the smallest median angular error on held-out measured spectra; that error of each candidate.
+
+    `better` has the methods with a significantly smaller error on the test spectra, best first, and why they are not chosen.
+    """
 
     name: str
     held_out_deg: dict[str, float]
     n_held_out: int
+    better: dict[str, str]
 
 
 class LocatingMetrics(TypedDict):

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from augment import Fold, Mixed, synthetic_positions
 from augment.choose import BLIND_FOLDS
-from swiftwrf import FitError, InputError
+from swiftwrf import FitError, InputError, Spectra
 from swiftwrf.gp import subsample
 from swiftwrf.locate import MatchedField, MatchedFieldConfig
 from swiftwrf.metrics import angle_errors
@@ -108,6 +108,18 @@ def cross_validate(folds: Sequence[Fold], n_synthetic: int, seed: int) -> CrossV
     return CrossValidation(validation, alone, by_rule)
 
 
+def measured_errors(fold: Fold, estimator: str, test: Spectra, seed: int) -> Errors:
+    """Return the angular errors [deg] of an estimator, trained on the measured spectra of a fold, on its test spectra.
+
+    Args:
+        fold: Training spectra.
+        estimator: Name of the estimator.
+        test: Held-out spectra of the fold, with their snapshots if they have any.
+        seed: Seed of the estimator.
+    """
+    return _degrees(make_estimator(estimator, seed=seed).fit(Mixed.measured(fold.train)).estimate(test), test.label)
+
+
 def located_folds(folds: Sequence[Fold]) -> dict[int, Fold]:
     """Return the folds by number on which matched-field processing is compared: one of each structure search."""
     return {number: folds[number] for number in range(0, len(folds), len(BLIND_FOLDS[0]))[: len(BLIND_FOLDS)]}
@@ -134,7 +146,7 @@ def located_errors(fold: Fold, seed: int) -> Errors | None:
 def choose_estimator(
     errors: Mapping[str, Sequence[Errors]], located: Mapping[int, Errors | None]
 ) -> EstimatorChoiceMetrics:
-    """Return the estimator with the smallest median error on held-out measured spectra.
+    """Return the estimator with the smallest median error on held-out measured spectra, `better` left empty.
 
     Matched-field processing is compared on few folds, because its fits take seconds. It is a candidate only if planes were
     found without the spectra of each of these folds. All estimators are then compared on the spectra that it located.
@@ -153,7 +165,7 @@ def choose_estimator(
         compared[LOCATOR] = np.concatenate(list(found.values()))
     held_out = {name: float(np.median(values)) for name, values in compared.items()}
     best = min(held_out, key=lambda name: held_out[name])
-    return {"name": best, "held_out_deg": held_out, "n_held_out": len(compared[best])}
+    return {"name": best, "held_out_deg": held_out, "n_held_out": len(compared[best]), "better": {}}
 
 
 def _located_rows(n: int) -> Tensor:
