@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from rooms import ARRAY, GRID, mirror_room
 from threadpoolctl import ThreadpoolController
 
 from swiftwrf import AngularGrid, InputError, load, simulated_room
@@ -37,7 +38,6 @@ from swiftwrf.models.geometry.responses import SteeringResponses
 from swiftwrf.models.geometry.search import SIDES, SIGNS
 from swiftwrf.models.nearest import NearestModel
 from swiftwrf.runtime.checkpoint import write
-from swiftwrf.testing.rooms import ARRAY, GRID, mirror_room
 
 QUICK = GeometryConfig(reach=2.0, width=2)
 SIX = {

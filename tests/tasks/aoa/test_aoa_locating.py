@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 import torch
 from quick import QuickNetwork
+from rooms import mirror_room
 from small import with_defaults
 
 from augment import Fold
@@ -20,7 +21,6 @@ from swiftwrf import FIELD_MODELS, MatchedField, load, make_model
 from swiftwrf.locate import MatchedFieldConfig, Posterior, matched_field
 from swiftwrf.models.geometry import model as geometry
 from swiftwrf.models.geometry.planes import Plane
-from swiftwrf.testing.rooms import mirror_room
 from tasks.aoa import cross_validation, experiment
 from tasks.aoa.condition import LOCATOR, NETWORKS
 from tasks.aoa.estimators import ESTIMATORS
