@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf import InputError
-from swiftwrf.online import ObstacleMonitor, Step
+from swiftwrf.online import Step
 from swiftwrf.runtime.durable import write_text
 from tasks.records import Row, as_table, read_json, write_json
 
@@ -32,7 +31,6 @@ COLUMNS = (
 )
 WORDS = ("alarm", "notice")  # columns of text
 WINDOW = 30  # measurements of the running error
-BOXES = ("obstacles", "standing")  # that can have appeared or left; that the training spectra show
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,13 +41,11 @@ class Record:
         source: Where the measurements come from.
         unit: Unit of the errors, in brackets.
         rows: A row of `measurements.csv` for each measurement.
-        boxes: Corners of boxes by their kind, as `boxes_of` returns them.
     """
 
     source: str
     unit: str
     rows: list[Row] = field(default_factory=list)
-    boxes: dict[str, list[Row]] = field(default_factory=dict)
 
     @classmethod
     def read(cls, folder: Path) -> Record:
@@ -59,11 +55,10 @@ class Record:
             InputError: There is no record, or it is damaged.
         """
         known, rows = read_json(folder / SUMMARY), _rows(folder / TABLE)
-        boxes = {kind: known[kind] for kind in BOXES if kind in known}
-        return cls(str(known.get("source")), str(known.get("unit", "")), rows, boxes)
+        return cls(str(known.get("source")), str(known.get("unit", "")), rows)
 
-    def add(self, index: int, step: Step, obstacles: ObstacleMonitor | None = None) -> Row:
-        """Add a measurement, and replace the boxes by those of a test for obstacles; return the row."""
+    def add(self, index: int, step: Step) -> Row:
+        """Add a measurement and return its row."""
         scores = step.scores
         recent = [row["error"] for row in self.rows[-WINDOW + 1 :]] + [float(scores.error[0])]
         row = {
@@ -78,8 +73,6 @@ class Record:
             "notice": step.notice,
         }
         self.rows.append(row)
-        if obstacles is not None:
-            self.boxes.update(boxes_of(obstacles))
         return row
 
     def column(self, *names: str) -> Tensor:
@@ -113,7 +106,6 @@ class Record:
             "coverage": float(self.column("covered").nanmean()),
             "alarms": changes,
             "notices": [{"measurement": number, "what": text} for number, text in self.notices],
-            **self.boxes,
         }
 
     def sentences(self) -> list[str]:
@@ -125,9 +117,6 @@ class Record:
         ]
         text += [f"change at measurement {number}: {what}" for number, what in self.alarms] or ["no change detected"]
         text += [what for _, what in self.notices]
-        if self.boxes.get("obstacles"):
-            n = len(self.boxes["obstacles"])
-            text.append(f"an obstacle appeared or left: {n} candidate positions, see the map")
         return text
 
     def write(self, folder: Path) -> None:
@@ -144,24 +133,6 @@ class Record:
         write_json(folder / SUMMARY, self.summary())
 
 
-def boxes_of(obstacles: ObstacleMonitor) -> dict[str, list[Row]]:
-    """Return the boxes of a record: corners, cumulative evidence, and whether an obstacle left."""
-    boxes, n, region = obstacles.boxes, len(obstacles.candidates), obstacles.region()
-
-    def rows(chosen: Sequence[int]) -> list[Row]:
-        return [
-            {
-                "low_m": boxes.low[i].tolist(),
-                "high_m": boxes.high[i].tolist(),
-                "evidence_nats": float(obstacles.value[i]),
-                "left": i >= n,
-            }
-            for i in chosen
-        ]
-
-    return dict(zip(BOXES, (rows(region.nonzero()[:, 0].tolist()), rows(range(n, len(boxes)))), strict=True))
-
-
 def resumed(folder: Path, count: int) -> Record | None:
     """Return the first rows of the record in a directory, which loses the others. None without a record.
 
@@ -172,7 +143,7 @@ def resumed(folder: Path, count: int) -> Record | None:
     if not (folder / SUMMARY).exists():
         return None
     record = Record.read(folder)
-    kept = Record(record.source, record.unit, record.rows[:count], record.boxes)
+    kept = Record(record.source, record.unit, record.rows[:count])
     kept.write(folder)
     return kept
 

@@ -46,7 +46,7 @@ def run(config: UpdateConfig) -> None:
         follower = Follower(model, train, MonitorConfig(false_alarm_rate=config.false_alarm_rate))
         record = Record(config.source, _unit(model))
         for i, index in enumerate(new.index.tolist()):
-            record.add(index, follower.step(new.subset(torch.tensor([i]))), follower.obstacles)
+            record.add(index, follower.step(new.subset(torch.tensor([i]))))
         _save(follower, folder / MODEL, {})
         record.write(folder)
         _write_config(config, folder)
@@ -84,7 +84,7 @@ def follow(config: UpdateConfig) -> None:
             console.print(f"error: {error}", markup=False)
             continue
         print(answer(follower.count, new, before, step), flush=True)
-        record.append(folder, record.add(follower.count - 1, step, follower.obstacles))
+        record.append(folder, record.add(follower.count - 1, step))
         if not follower.is_waiting:  # after a kill, lines since the last update are answered again
             _save(follower, file, {"source": source, "lines": str(number)})
     claim.release()
