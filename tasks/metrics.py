@@ -80,10 +80,9 @@ class ChoiceMetrics(TypedDict):
 
 
 class GainMetrics(ChangeMetrics):
-    """Change by a number of synthetic spectra at synthetic positions, samples or means."""
+    """Change by a number of synthetic spectra at synthetic positions."""
 
     n_synthetic: int
-    sampled: bool
 
 
 class CrossValidationMetrics(TypedDict):
@@ -98,7 +97,6 @@ class CrossValidationMetrics(TypedDict):
     measured_only_deg: float
     gains: list[GainMetrics]
     rule: ChangeMetrics | None
-    sampled: bool
     recommended_n_synthetic: int
     helps: bool
 

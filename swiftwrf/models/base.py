@@ -95,8 +95,6 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
     """name in the registry, on the command line and in reports"""
     requires: ClassVar[tuple[str, ...]] = ()
     """properties of the data that the model needs: ARRAY, FIXED_END"""
-    samples: ClassVar[bool] = False
-    """whether `sample` is available"""
     slow: ClassVar[bool] = False
     """whether a fit takes minutes, so that it is compared only on request"""
     any_grid: ClassVar[bool] = False
@@ -171,10 +169,6 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
         Differentiable where the mathematics is. Magnitudes need not be clipped. The standard deviation may be None.
         """
 
-    def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
-        """Return one posterior sample (b, H, W) for each of a batch of positions."""
-        raise NotImplementedError
-
     def predict(self, position: Numbers, grid: AngularGrid | None = None) -> Prediction:
         """Predict spectra.
 
@@ -207,28 +201,6 @@ class FieldModel(Configured, Saved, Updatable, Displayed):
         position = self._checked(position)
         mean, std = self._in_batches(evaluate, position, grid)
         return Prediction(mean, std, position, grid)
-
-    def sample(self, position: Numbers, *, generator: torch.Generator, grid: AngularGrid | None = None) -> Tensor:
-        """Return one sample of the predictive distribution at each position.
-
-        Args:
-            position: Positions of the moving end, (n, 3) [m].
-            generator: Source of randomness.
-            grid: Directions. Defaults to the grid of the training spectra.
-
-        Returns:
-            Magnitudes in [0, 1], float32 (n, n_elevation, n_azimuth).
-
-        Raises:
-            InputError: As `predict`, or a model that cannot be sampled.
-        """
-        if not self.samples:
-            raise InputError(f"{self.name} predicts means only and cannot be sampled")
-        grid = self._checked_grid(grid)
-        with torch.no_grad():
-            return self._in_batches(
-                lambda some: (self._sample(some, grid, generator).clamp(0, 1), None), self._checked(position), grid
-            )[0]
 
     @property
     def room(self) -> swiftwrf.models.geometry.model.GeometryModel | None:

@@ -172,16 +172,14 @@ class Results:
             self.left_out[condition] = reason
 
     def _add_synthesis(self, step: Synthesis, value: Row) -> None:
-        for part, scores in value["scores"].items():
-            name = step.synthesizer if part == "test" else f"{step.synthesizer} sample"
-            key = step.subset.columns | {"synthesizer": name}
-            columns = {score: torch.tensor(values) for score, values in scores.items()}
-            self.synthesis += _rows(key, {"index": self.test.index} | columns)
-            self.synthesis_seconds.append(key | value["seconds"] | {"trains": step.trains and part == "test"})
-        self.history += [step.subset.columns | {"synthesizer": step.synthesizer} | row for row in value["history"]]
+        key = step.subset.columns | {"synthesizer": step.synthesizer}
+        columns = {score: torch.tensor(values) for score, values in value["scores"].items()}
+        self.synthesis += _rows(key, {"index": self.test.index} | columns)
+        self.synthesis_seconds.append(key | value["seconds"] | {"trains": step.trains})
+        self.history += [key | row for row in value["history"]]
         if step.subset.repeat == 0 and step.trains and step.subset.key not in self._examples:
             self._examples.add(step.subset.key)
-            self._write_examples(step, torch.tensor(value["scores"]["test"]["psnr_db"]))
+            self._write_examples(step, torch.tensor(value["scores"]["psnr_db"]))
 
     def _add_suggestion(self, step: Suggestion, value: Row) -> None:
         name = f"suggested-mix{step.subset.key}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any, Self
 
 import torch
@@ -27,7 +27,6 @@ from swiftwrf.models.geometry.fit import (
 )
 from swiftwrf.models.geometry.images import PhaseObservations, image_gain, images
 from swiftwrf.models.geometry.planes import Plane, PlaneSet, RoomEstimate
-from swiftwrf.models.geometry.sample import Residual, sample_field
 from swiftwrf.models.updatable import bounding_box
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.validation import check_value
@@ -38,9 +37,6 @@ MAX_DISTANCE_M = 1e7  # from the fixed end; beyond, rounding destroys the phases
 
 class GeometryModel(FieldModel):
     """Image sources of the fixed end in mirror planes that are estimated from the spectra.
-
-    A sample moves the planes within their standard deviations (once for every 256 positions), hides paths, and adds diffuse
-    paths as strong as the prediction error.
 
     Example:
         >>> import swiftwrf
@@ -54,7 +50,6 @@ class GeometryModel(FieldModel):
     kind = "geometry model"
     config_type = GeometryConfig
     requires = (ARRAY, FIXED_END)
-    samples = True
     updates = True
     any_grid = True
     batch = 256
@@ -91,7 +86,7 @@ class GeometryModel(FieldModel):
             tensor([0, 1])
         """
         certain = torch.diag(torch.tensor([(plane.std_mm / 1000) ** 2 for plane in planes], dtype=torch.float64))
-        model, estimate = cls(), RoomEstimate(planes, order, 0.0, 0.0, "given planes", certain, Residual())
+        model, estimate = cls(), RoomEstimate(planes, order, 0.0, 0.0, "given planes", certain)
         model.grid, model.bounds = link.grid, bounding_box(link.position)
         model._set_link(link)
         model.estimate, model.fingerprint = estimate, ""
@@ -194,16 +189,9 @@ class GeometryModel(FieldModel):
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         return self.array.spectrum(self.channel(position), grid), None
 
-    def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
-        return self.array.spectrum(self.channel(position, generator), grid)
-
-    def channel(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Return the channel of each element at positions (n, 3) [m], complex64 (n, K); a sample with a generator."""
-        scene, room = self.scene(position), self.tensors()
-        if generator is None:
-            return room.field(scene)
-        covariance, residual = self.estimate.covariance, self.estimate.residual
-        return sample_field(scene, room.normal, room.offset, room.gain, room.sequence, covariance, residual, generator)
+    def channel(self, position: Tensor) -> Tensor:
+        """Return the channel of each element at positions (n, 3) [m], complex64 (n, K)."""
+        return self.tensors().field(self.scene(position))
 
     def scene(self, position: Tensor) -> PhaseObservations:
         """Return the link at positions (n, 3) [m], without observations. Beyond 10,000 km only the direction counts."""
@@ -255,7 +243,6 @@ class GeometryModel(FieldModel):
             "wavelength": self.array.wavelength,
             "moving": self.moving,
             "conclusion": self.conclusion,
-            "residual": asdict(self.estimate.residual),
             "fingerprint": self.fingerprint,
         }
         return link | {"covariance": self.estimate.covariance}, header
@@ -279,7 +266,6 @@ class GeometryModel(FieldModel):
             unexplained=float(header["unexplained"]),
             conclusion=str(header.get("conclusion", header.get("verdict"))),
             covariance=tensors["covariance"].double(),
-            residual=Residual(**header["residual"]),
         )
 
 

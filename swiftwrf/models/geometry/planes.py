@@ -13,7 +13,6 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.models.geometry.images import PhaseObservations, Sequence, field, phase_period_m, sequences
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation
 from swiftwrf.models.geometry.refine import refine
-from swiftwrf.models.geometry.sample import Residual
 from swiftwrf.models.geometry.search import SIDES, CandidateRoom
 from swiftwrf.runtime.validation import NonNegativeFloat, configuration
 
@@ -52,7 +51,6 @@ class RoomEstimate:
         unexplained: Fraction of the power of the co-array coefficients of the training spectra that is not predicted.
         conclusion: Result in one sentence.
         covariance: Covariance of the offsets (P, P) [m^2].
-        residual: Statistics of the prediction error, for samples.
     """
 
     planes: list[Plane]
@@ -61,7 +59,6 @@ class RoomEstimate:
     unexplained: float
     conclusion: str
     covariance: Tensor
-    residual: Residual
 
     def to_json(self) -> dict[str, Any]:
         """Return the planes (normal . x = offset in world coordinates), order and scores as plain values."""
