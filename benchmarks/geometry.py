@@ -69,9 +69,6 @@ def measure(data: Spectra, share: float, draw: int) -> dict[str, Any]:
         "conclusion": model.conclusion,
         "psnr_db": {
             "geometry": summary(psnr(model.synthesize(test.position), test.spectrum)),
-            "sample": summary(
-                psnr(model.sample(test.position, generator=torch.Generator().manual_seed(0)), test.spectrum)
-            ),
             "hybrid": summary(psnr(hybrid.synthesize(test.position), test.spectrum)),
         },
     }

@@ -29,9 +29,6 @@ from torch import Tensor
 from swiftwrf import FIELD_MODELS, FitConfig, Spectra, SwiftWRF, load_spectra, make_model
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.choices import Moving
-from swiftwrf.comparison.dcgan import DcganSize
-from swiftwrf.comparison.nerf2 import NeRF2Size
-from swiftwrf.comparison.vae import VaeSize
 from swiftwrf.data.raytraced import ROOMS
 from swiftwrf.data.splits import validation_for
 from swiftwrf.gp import subsample
@@ -57,10 +54,10 @@ BY_GRADIENT = ("nerf2", "wrfgs", "vae", "dcgan", DEFORMING)
 METHODS = (*CLOSED_FORM, *BY_GRADIENT)
 DEFORMING_PRIMITIVES, DEFORMING_BATCH, DEFORMING_STEPS = 256, 4, 4000  # sized for a CPU
 ON_GPU: dict[str, dict[str, Any]] = {  # changes of the paper presets, for a few minutes of a GPU
-    "nerf2": {"size": NeRF2Size(width=128, bands=10, samples=64), "batch": 2048, "steps": 4000, "decay_steps": None},
+    "nerf2": {"width": 128, "batch": 2048, "steps": 4000, "decay_steps": None},
     "wrfgs": {"steps": 5000, "decay_steps": None},
-    "vae": {"size": VaeSize(width=32, hidden=512, latent=64), "batch": 32, "steps": 4000},
-    "dcgan": {"size": DcganSize(width=32, hidden=512, noise=100), "batch": 32, "steps": 4000},
+    "vae": {"width": 32, "batch": 32, "steps": 4000},
+    "dcgan": {"width": 32, "batch": 32, "steps": 4000},
     DEFORMING: {"batch": 16, "steps": 20_000, "smoothing_steps": 2000},
 }
 DEFORMING_PRIMITIVES_ON_GPU = 2000

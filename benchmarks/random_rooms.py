@@ -11,11 +11,11 @@ from typing import Any, get_args
 
 import torch
 from record import write_result
+from rooms import mirror_room
 
 from swiftwrf.choices import Moving
 from swiftwrf.models.geometry import fit_geometry
 from swiftwrf.models.geometry.search import SIDES
-from swiftwrf.testing.rooms import mirror_room
 
 POSITIONS = 72
 ROOMS = 4  # of each kind and noise, either end moving in half of them

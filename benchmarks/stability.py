@@ -13,7 +13,9 @@ from typing import Any
 
 import torch
 import tyro
+from hard_cases import HARD_CASES, field_errors, magnitude_errors
 from record import write_result
+from tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
 from torch import Tensor
 
 from swiftwrf import (
@@ -32,8 +34,6 @@ from swiftwrf.gp import Kernel
 from swiftwrf.metrics import psnr
 from swiftwrf.models.swiftwrf.field import DeformableGaussians
 from swiftwrf.rasterize import Backend, rasterize_magnitude
-from swiftwrf.testing.hard_cases import HARD_CASES, field_errors, magnitude_errors
-from swiftwrf.testing.tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
 
 
 @dataclass(frozen=True)

@@ -81,10 +81,9 @@ class ChoiceMetrics(TypedDict):
 
 
 class GainMetrics(ChangeMetrics):
-    """Change by a number of synthetic spectra at synthetic positions, samples or means."""
+    """Change by a number of synthetic spectra at synthetic positions."""
 
     n_synthetic: int
-    sampled: bool
 
 
 class CrossValidationMetrics(TypedDict):
@@ -99,17 +98,20 @@ class CrossValidationMetrics(TypedDict):
     measured_only_deg: float
     gains: list[GainMetrics]
     rule: ChangeMetrics | None
-    sampled: bool
     recommended_n_synthetic: int
     helps: bool
 
 
 class EstimatorChoiceMetrics(TypedDict):
-    """Method with the smallest median angular error on held-out measured spectra; that error of each candidate."""
+    """Method with the smallest median angular error on held-out measured spectra; that error of each candidate.
+
+    `better` has the methods with a significantly smaller error on the test spectra, best first, and why they are not chosen.
+    """
 
     name: str
     held_out_deg: dict[str, float]
     n_held_out: int
+    better: dict[str, str]
 
 
 class LocatingMetrics(TypedDict):

@@ -12,16 +12,11 @@ from swiftwrf import FIELD_MODELS, FitConfig, ModelConfig, Spectra
 from swiftwrf.comparison import (
     Config,
     DcganConfig,
-    DcganSize,
     NeRF2Config,
     NeRF2Rssi,
     NeRF2RssiConfig,
-    NeRF2RssiSize,
-    NeRF2Size,
     VaeConfig,
-    VaeSize,
     WrfGsConfig,
-    WrfGsSize,
 )
 from swiftwrf.models.geometry import GeometryConfig
 from swiftwrf.models.geometry.fit import search_room
@@ -33,12 +28,12 @@ FIT = FitConfig(model=ModelConfig(n_primitives=4, rank=2), steps=30, check_every
 SHORT = {"steps": 12, "check_every": 6, "batch": 8, "warm_up": 1}
 LONGER = {"steps": 60, "check_every": 30, "batch": 16, "rate": 1e-2}  # the loss of a batch is noisy in so short a fit
 PUBLISHED: dict[str, Config] = {
-    "nerf2": NeRF2Config(size=NeRF2Size(width=8, depth=6, bands=2, samples=6), rays=64, **LONGER),
-    "wrfgs": WrfGsConfig(size=WrfGsSize(n_gaussians=20, width=8, depth=6, bands=2), **SHORT),
-    "vae": VaeConfig(size=VaeSize(latent=2, width=2, hidden=8, bands=2), **LONGER),
-    "dcgan": DcganConfig(size=DcganSize(noise=2, width=2, hidden=8, bands=2), **LONGER),
+    "nerf2": NeRF2Config(width=8, depth=6, bands=2, samples=6, rays=64, **LONGER),
+    "wrfgs": WrfGsConfig(n_gaussians=20, width=8, depth=6, bands=2, **SHORT),
+    "vae": VaeConfig(latent=2, width=2, hidden=8, bands=2, **LONGER),
+    "dcgan": DcganConfig(noise=2, width=2, hidden=8, bands=2, **LONGER),
 }
-PUBLISHED_RSSI = NeRF2RssiConfig(size=NeRF2RssiSize(width=8, bands=2, samples=4, azimuths=4, elevations=2), **LONGER)
+PUBLISHED_RSSI = NeRF2RssiConfig(width=8, bands=2, samples=4, azimuths=4, elevations=2, **LONGER)
 GLANCE = GeometryConfig(reach=0.5, positions=10, width=1, max_order=1, further=0)  # a short search that finds little
 
 

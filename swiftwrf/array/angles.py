@@ -233,10 +233,3 @@ class ArrayPose:
     def rotation(self) -> Tensor:
         """Matrix that rotates array into world coordinates, float64 (3, 3)."""
         return torch.from_numpy(Rotation.from_quat(self.orientation).as_matrix())
-
-    def line_of_sight(self, transmitter: Tensor, receiver: Tensor) -> Tensor:
-        """Return azimuth and elevation (n, 2) [rad] of `transmitter` in coordinates of the array at `receiver`.
-
-        Both are (n, 3) or (3,) [m]: d = R^T (transmitter - receiver) / |.|, folded to the front of the array.
-        """
-        return torch.stack(to_angles((transmitter - receiver) @ self.rotation), dim=-1)

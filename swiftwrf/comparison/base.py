@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
-from pathlib import Path
-from typing import Annotated, Any, ClassVar, Generic, TypeVar, get_type_hints
+from typing import Annotated, Any, ClassVar, Self, cast
 
 import numpy as np
 import torch
 from annotated_types import Ge, Le, Lt
-from torch import Tensor
+from torch import Tensor, nn
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.comparison.network import Network, restored
 from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.models.base import FieldModel, FitContext
-from swiftwrf.runtime.checkpoint import Header
+from swiftwrf.models.link import Linked
+from swiftwrf.positions import frame, normalise
+from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.descent import Descent, Model, Schedule, warm_cosine
-from swiftwrf.runtime.options import from_plain
 from swiftwrf.runtime.progress import progress_bar
-from swiftwrf.runtime.session import Record, Session
-from swiftwrf.runtime.validation import Fraction, NonNegativeInt, PositiveFloat, PositiveInt, configuration
+from swiftwrf.runtime.session import Session
+from swiftwrf.runtime.validation import (
+    Fraction,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    configuration,
+)
 
 # sizes of networks, limited because a damaged file may claim any
 Count = Annotated[int, Ge(1), Le(2**24)]
@@ -30,8 +36,8 @@ Depth = Annotated[int, Ge(1), Le(64)]
 
 
 @configuration
-class Config(ABC):
-    """Size and training of a method. The defaults of each method are its quick preset, `paper()` its publication.
+class Config:
+    """Training of a method. The defaults of each method are its quick preset, `paper()` its publication.
 
     Example:
         >>> from swiftwrf.comparison import VaeConfig
@@ -39,8 +45,9 @@ class Config(ABC):
         (1000, True)
     """
 
-    size: Any = None
-    """size of the network"""
+    published: ClassVar[dict[str, Any]] = {}
+    """options of the publication"""
+
     steps: PositiveInt = 1000
     """number of Adam steps"""
     batch: PositiveInt = 16
@@ -63,44 +70,41 @@ class Config(ABC):
     """seed of everything random"""
 
     @classmethod
-    @abstractmethod
-    def paper(cls, **changes: Any) -> Config:
-        """Return size and training of the publication."""
-
-    @abstractmethod
-    def training(self, train: Any, device: torch.device) -> Training[Any, Any]:
-        """Return the training of a new network."""
+    def paper(cls, **changes: Any) -> Self:
+        """Return size and training of the publication, with changes."""
+        return cls(**cls.published | changes)
 
 
-AnyConfig = TypeVar("AnyConfig", bound=Config)
-
-
-class Training(Descent[Model], Generic[AnyConfig, Model]):
-    """Training of the network of a configuration.
+class Training(Descent[Model]):
+    """Training of a network.
 
     Each step has its own random generator, so that a training that continues from a checkpoint gives the same result.
 
     Args:
         config: Options.
-        model: Initialised network, on its device.
+        network: Initialised network, on its device.
+        loss: Function from the network and the random generator of a step to the loss.
         groups: Parameter groups of Adam. Defaults to all parameters with the configuration's rate.
         betas, weight_decay: Options of Adam.
     """
 
     def __init__(
         self,
-        config: AnyConfig,
-        model: Model,
-        groups: Iterable[dict[str, Any]] | None = None,
+        config: Config,
+        network: Model,
+        loss: Callable[[Model, torch.Generator], Tensor],
+        groups: Iterable[dict[str, Any]] = (),
         *,
         betas: tuple[float, float] = (0.9, 0.99),
         weight_decay: float = 0.0,
     ) -> None:
         schedule = Schedule(config.steps, config.check_every, config.averaging, config.clip, betas, weight_decay)
-        super().__init__(
-            "final", model, groups or [{"params": list(model.parameters()), "peak": config.rate}], schedule
-        )
-        self.config = config
+        every = {"params": list(network.parameters()), "peak": config.rate}
+        super().__init__("final", network, list(groups) or [every], schedule)
+        self.config, self.loss = config, loss
+
+    def objective(self) -> Tensor:
+        return self.loss(self.model, self.generator())
 
     def rate(self, step: int) -> float:
         config = self.config
@@ -111,24 +115,18 @@ class Training(Descent[Model], Generic[AnyConfig, Model]):
         (state,) = np.random.SeedSequence((self.config.seed, self.step)).generate_state(1)
         return torch.Generator().manual_seed(int(state))
 
-
-def descend(
-    training: Training[Any, Model],
-    owner: str,
-    checkpoint: Path | None,
-    on_record: Callable[[Record], None] | None,
-    progress: bool,
-) -> Model:
-    """Return the trained network; `owner` is the fingerprint of the fit, the other arguments are those of a fit."""
-    with progress_bar(progress) as bar:
-        training.run(Session(checkpoint, owner, bar, on_record))
-    return training.result.eval()
+    def trained(self, owner: str, context: FitContext) -> Model:
+        """Take all steps and return the trained network without gradients; `owner` is the fingerprint of the fit."""
+        with progress_bar(context.progress) as bar:
+            self.run(Session(context.checkpoint, owner, bar, context.on_record))
+        return self.result.eval().requires_grad_(False)
 
 
-class TrainedModel(FieldModel):
+class TrainedModel(Linked, FieldModel):
     """Field model of a trained network.
 
-    A subclass sets `network_type` and a `config_type` that derives from `Config`.
+    A subclass sets a `config_type` that derives from `Config`, and implements `blank`, `training` and `render`. If it
+    requires the fixed end, it finds both ends of the link in the frame of the training positions by `ends`.
 
     Example:
         >>> import swiftwrf
@@ -136,31 +134,73 @@ class TrainedModel(FieldModel):
         True
     """
 
-    network_type: ClassVar[type[Any]]
     slow = True
 
-    network: Network
-    """trained network; the gradients of its parameters are off after a fit"""
+    network: nn.Module
+    """trained network; the gradients of its parameters are off"""
+
+    @abstractmethod
+    def blank(self, saved: Mapping[str, Tensor] | None = None) -> nn.Module:
+        """Return a network of the options on the grid, its weights not initialised.
+
+        Args:
+            saved: Tensors that the network will take over, if their number depends on the training.
+        """
+
+    @abstractmethod
+    def training(self, train: Spectra, device: torch.device) -> Training[Any]:
+        """Return the training of a new network."""
+
+    @abstractmethod
+    def render(self, network: Any, position: Tensor, grid: AngularGrid) -> Tensor:
+        """Return magnitudes (b, H, W) at positions (b, 3), float64 [m]; differentiable."""
 
     def _fit(self, train: Spectra, context: FitContext) -> None:
         owner = fingerprint(train, type(self).__name__, asdict(self.config))
-        training = self.config.training(train, context.device)
-        network = descend(training, owner, context.checkpoint, context.on_record, context.progress)
-        self.network = network.requires_grad_(False)
+        self.network = self.training(train, context.device).trained(owner, context)
+
+    def local(self, position: Tensor, device: torch.device) -> Tensor:
+        """Return positions, float32 (n, 3) within [-1, 1]^3 in the box around the training positions, on a device."""
+        centre, scale = frame(self.bounds)
+        return normalise(position.to(device), centre.to(device), scale.to(device))
+
+    def ends(self, position: Tensor, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Return transmitter and receiver, float32 (n or 1, 3) [m from the centre], with the moving end at positions."""
+        centre = frame(self.bounds)[0].to(device)
+        moved, fixed = (normalise(x.to(device), centre, 1.0) for x in (position, self.fixed_position[None]))
+        return (moved, fixed) if self.moving == "transmitter" else (fixed, moved)
 
     def parameters(self) -> Iterable[Tensor]:
         return self.network.parameters()
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
-        return self.network.render(position, grid), None
-
-    def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
-        return self.network.render(position, grid, generator)
+        return self.render(self.network, position, grid), None
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
-        return self.network.state_dict(), self.network.header()
+        return self.network.state_dict(), {}
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        size = from_plain(get_type_hints(self.config_type)["size"], header["size"])
-        network: Network = restored(lambda: self.network_type.blank(size, self.grid, header), tensors)
-        self.network = network.requires_grad_(False)
+        self.network = restored(lambda: self.blank(tensors), tensors)
+
+
+def restored(make: Callable[[], Model], tensors: dict[str, Tensor]) -> Model:
+    """Return the module that `make` returns, with saved tensors and without gradients.
+
+    Raises:
+        InputError: Tensors are missing or have other shapes. No memory is allocated before this check.
+    """
+    with torch.device("meta"):
+        blank = make()
+    expect(tensors, {name: tuple(tensor.shape) for name, tensor in blank.state_dict().items()})
+    model = make()
+    model.load_state_dict(tensors)
+    return cast(Model, model.eval().requires_grad_(False))
+
+
+def draw_parameters(model: nn.Module, generator: torch.Generator) -> None:
+    """Initialise weights and biases of all layers uniformly within 1 / sqrt(inputs), torch's default."""
+    for layer in model.modules():
+        if isinstance(layer, nn.Linear | nn.Conv2d | nn.ConvTranspose2d):
+            inputs, _ = nn.init._calculate_fan_in_and_fan_out(layer.weight)
+            for parameter in layer.parameters(recurse=False):
+                nn.init.uniform_(parameter, -1 / math.sqrt(inputs), 1 / math.sqrt(inputs), generator=generator)

@@ -3,6 +3,11 @@
 X. Zhao, Z. An, Q. Pan and L. Yang, "NeRF2: Neural Radio-Frequency Radiance Fields", ACM MobiCom 2023. `NeRF2Config.paper()`
 has the sizes, rates and steps of its code: 690,564 parameters, 64 samples over 5 m, 8,192 single rays a step.
 
+    S = sum_i a_i exp(j phi_i) g(r_(i+1)) prod_(k < i) exp(-alpha_k d_k) exp(j (1 + sum_(k < i) beta_k d_k))
+
+with samples at distances r_i from the receiver, d_i = r_(i+1) - r_i, g(r) = 0.025 / r, absorption alpha [1/m], phase
+change beta [rad/m], emitted amplitude a and phase phi. The last sample has no next one and contributes nothing.
+
 Changed everywhere: positions are relative to the centre of the training positions, so that map coordinates keep their
 millimetres. The attenuation network is evaluated once for all transmitters (the same function). Transmittance is the
 exponential of a sum, without the 1e-10 that keeps a product from 0. Rays start at the moving array if the receiver moves.
@@ -18,18 +23,15 @@ The quick preset is sized for two cores. The values of the publication are in pa
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.choices import Moving
-from swiftwrf.comparison.base import Config, Count, Depth, TrainedModel, Training
-from swiftwrf.comparison.network import LinkNetwork, chunks, draw_parameters
-from swiftwrf.comparison.volume import Medium, integrate
+from swiftwrf.comparison.base import Config, Count, Depth, TrainedModel, Training, draw_parameters
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.models.base import FIXED_END
 from swiftwrf.models.swiftwrf.mlp import SkipMLP, encode
@@ -37,16 +39,39 @@ from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, Positiv
 
 MAX_SAMPLES_AT_ONCE = 2**19  # samples of the field evaluated at a time, which bounds the memory
 MAX_SAMPLES_ON_CPU = 2**16  # the same on a CPU: layers of more samples leave its caches
+PATH_GAIN = 0.025  # [m] amplitude times distance, from the publication's code
+FIRST_PHASE = 1.0  # [rad], from the publication's code
+
+Medium = tuple[Tensor, Tensor, Tensor, Tensor]
+"""absorption [1/m], phase change [rad/m], emitted amplitude and phase [rad] at samples (..., S) along rays"""
 
 
 @configuration
-class NeRF2Size:
-    """Size of the network and its rays.
+class NeRF2Config(Config):
+    """Options of `NeRF2`.
 
     Example:
-        >>> NeRF2Size(width=32, samples=12).width
-        32
+        >>> NeRF2(NeRF2Config(width=32), rays=128).config.rays
+        128
     """
+
+    published: ClassVar[dict[str, Any]] = {
+        "width": 256,
+        "bands": 10,
+        "samples": 64,
+        "steps": 30_000,
+        "batch": 8192,
+        "rays": 1,
+        "shared_rays": False,
+        "rate": 8e-4,
+        "warm_up": 1,
+        "final_rate": 1e-6 / 8e-4,
+        "decay_steps": 10_000,  # a cosine: the rate rises again until 20,000
+        "averaging": 0.0,
+        "clip": math.inf,
+        "weight_decay": 5e-5,
+        "check_every": 500,
+    }
 
     width: Count = 64
     """width of the layers"""
@@ -58,18 +83,6 @@ class NeRF2Size:
     """samples along a ray"""
     reach: PositiveFloat = 5.0
     """length of a ray [m]"""
-
-
-@configuration
-class NeRF2Config(Config):
-    """Options of `NeRF2`.
-
-    Example:
-        >>> NeRF2(NeRF2Config(size=NeRF2Size(width=32), rays=128)).config.rays
-        128
-    """
-
-    size: NeRF2Size = NeRF2Size()
     steps: PositiveInt = 3000
     batch: PositiveInt = 16
     rate: PositiveFloat = 3e-3
@@ -83,41 +96,22 @@ class NeRF2Config(Config):
     compiled: bool = False
     """compile the network with torch.compile, which needs a C++ compiler, or Triton on a GPU"""
 
-    @classmethod
-    def paper(cls, **changes: Any) -> NeRF2Config:
-        paper = cls(
-            size=NeRF2Size(width=256, bands=10, samples=64),
-            steps=30_000,
-            batch=8192,
-            rays=1,
-            shared_rays=False,
-            rate=8e-4,
-            warm_up=1,
-            final_rate=1e-6 / 8e-4,
-            decay_steps=10_000,  # a cosine: the rate rises again until 20,000
-            averaging=0.0,
-            clip=math.inf,
-            weight_decay=5e-5,
-            check_every=500,
-        )
-        return replace(paper, **changes)
-
-    def training(self, train: Spectra, device: torch.device) -> NeRF2Training:
-        return NeRF2Training(self, train, device)
-
 
 class Field(nn.Module):
     """Networks of the attenuation and of the emission at a point.
 
-    An eight-layer network predicts absorption and phase shift. A three-layer network on its features, the ray's direction
-    and the transmitter's position predicts the emission. Amplitudes are |leaky_relu|, phases 2 pi sigmoid.
+    A network of `depth` layers predicts absorption and phase change. A three-layer network on its features, the ray's
+    direction and the transmitter's position predicts the emission. Amplitudes are |leaky_relu|, phases 2 pi sigmoid.
+
+    Args:
+        width, depth, bands: See `NeRF2Config`.
     """
 
-    def __init__(self, size: NeRF2Size) -> None:
+    def __init__(self, width: int, depth: int, bands: int) -> None:
         super().__init__()
-        self.bands = size.bands
-        inputs, width = 3 * (2 * size.bands + 1), size.width
-        self.layers = SkipMLP(inputs, width, size.depth)
+        self.bands = bands
+        inputs = 3 * (2 * bands + 1)
+        self.layers = SkipMLP(inputs, width, depth)
         self.attenuation = nn.Linear(width, 2)
         self.feature = nn.Linear(width, width)
         self.mixing = nn.Linear(width + 2 * inputs, width)
@@ -137,7 +131,7 @@ class Field(nn.Module):
         mixed = functional.linear(self.feature(h), of_feature, self.mixing.bias)
         mixed = mixed + functional.linear(encode(direction, self.bands, lowest=1.0), of_direction)
         mixed = mixed + functional.linear(encode(transmitter, self.bands, lowest=1.0), of_transmitter)
-        return Medium(absorption, turning, *_polar(self.emission(mixed)))
+        return absorption, turning, *_polar(self.emission(mixed))
 
 
 def _polar(raw: Tensor) -> tuple[Tensor, Tensor]:
@@ -145,81 +139,90 @@ def _polar(raw: Tensor) -> tuple[Tensor, Tensor]:
     return functional.leaky_relu(raw[..., 0]).abs(), 2 * math.pi * torch.sigmoid(raw[..., 1])
 
 
-class NeRF2Network(LinkNetwork):
-    """Magnitude of the integral along a ray from the receiver, for each direction."""
-
-    def __init__(self, size: NeRF2Size, grid: AngularGrid, moving: Moving) -> None:
-        super().__init__(size, grid, moving)
-        self.field = Field(size)
-
-    def forward(self, transmitter: Tensor, receiver: Tensor, direction: Tensor) -> Tensor:
-        """Return magnitudes (P, D) at P positions of the moving end.
-
-        Args:
-            transmitter: Positions (P or 1, 3), see `Link`.
-            receiver: Positions (P or 1, 3).
-            direction: Directions of the rays in world coordinates, (P or 1, D, 3).
-        """
-        return torch.hypot(*received(self.field, self.size, transmitter[:, None], receiver[:, None], direction))
-
-    def render(self, position: Tensor, grid: AngularGrid, generator: torch.Generator | None = None) -> Tensor:
-        ends = self.link(position)
-        direction = self.link.to_world(grid.direction.flatten(0, 1).to(position.device))
-        samples = MAX_SAMPLES_ON_CPU if direction.device.type == "cpu" else MAX_SAMPLES_AT_ONCE
-        parts = chunks(len(direction), max(1, samples // (len(position) * self.size.samples)))
-        return torch.cat([self(*ends, direction[None, part]) for part in parts], dim=1).reshape(-1, *grid.shape)
-
-
-def received(field: Field, size: NeRF2Size, transmitter: Tensor, receiver: Tensor, direction: Tensor) -> Tensor:
+def received(
+    field: nn.Module, reach: float, samples: int, transmitter: Tensor, receiver: Tensor, direction: Tensor
+) -> Tensor:
     """Return real and imaginary part of the signal of rays, (2, ...).
 
     Args:
         field: Field that the rays cross.
-        size: Number of samples and length of a ray.
+        reach: Length of a ray [m].
+        samples: Number of samples of a ray.
         transmitter: Position of the transmitter, (..., 3). All three broadcast.
         receiver: Start of each ray, (..., 3).
         direction: Direction of each ray, (..., 3).
     """
-    distance = torch.linspace(0, size.reach, size.samples, device=direction.device)
+    distance = torch.linspace(0, reach, samples, device=direction.device)
     point = receiver[..., None, :] + distance[:, None] * direction[..., None, :]
     return integrate(field(point, direction[..., None, :], transmitter[..., None, :]), distance)
 
 
-class NeRF2Training(Training[NeRF2Config, NeRF2Network]):
-    """Minimisation of the squared error of magnitudes on random rays."""
+def integrate(medium: Medium, distance: Tensor) -> Tensor:
+    """Return real and imaginary part of the signal of each ray, (2, ...).
 
-    def __init__(self, config: NeRF2Config, train: Spectra, device: torch.device) -> None:
-        model = NeRF2Network.of(config.size, train)
-        draw_parameters(model, torch.Generator().manual_seed(config.seed))
-        super().__init__(config, model.to(device), betas=(0.9, 0.999), weight_decay=config.weight_decay)
-        if config.compiled:
-            model.field.compile()
-        self.position, self.spectrum = train.position, train.spectrum.flatten(1).to(device)
-        self.direction = model.link.to_world(train.grid.direction.flatten(0, 1).to(device))
-
-    def objective(self) -> Tensor:
-        config, generator = self.config, self.generator()
-        row = torch.randint(len(self.position), (config.batch,), generator=generator)
-        rays = (1 if config.shared_rays else config.batch, config.rays)
-        pixel = torch.randint(len(self.direction), rays, generator=generator).to(self.spectrum.device)
-        predicted = self.model(*self.model.link(self.position[row]), self.direction[pixel])
-        measured = self.spectrum[row.to(pixel.device)[:, None], pixel]
-        return functional.mse_loss(predicted, measured)
+    Args:
+        medium: Medium at samples (..., S).
+        distance: Distances of the samples from the receiver [m], ascending, (S,).
+    """
+    step = distance.diff()
+    # the last sample neither attenuates another one nor emits
+    absorption, turning, amplitude, phase = (value[..., :-1] for value in medium)
+    depth, turned = absorption * step, turning * step
+    before = torch.cumsum(depth, dim=-1) - depth
+    arriving = amplitude * (PATH_GAIN / distance[1:]) * torch.exp(-before)
+    angle = phase + FIRST_PHASE + torch.cumsum(turned, dim=-1) - turned
+    return torch.stack([(arriving * torch.cos(angle)).sum(dim=-1), (arriving * torch.sin(angle)).sum(dim=-1)])
 
 
 class NeRF2(TrainedModel):
-    """Neural radio-frequency radiance field.
+    """Neural radio-frequency radiance field: the magnitude of the integral along the ray of each direction.
 
     Example:
         >>> import swiftwrf
         >>> room = swiftwrf.simulated_room(n=20)
-        >>> NeRF2(size=NeRF2Size(width=8, samples=6), steps=1).fit(room).predict(room.position[:2]).mean.shape
+        >>> NeRF2(width=8, samples=6, steps=1).fit(room).predict(room.position[:2]).mean.shape
         torch.Size([2, 30, 120])
     """
 
     name = "nerf2"
     kind = "nerf2 model"
     config_type = NeRF2Config
-    network_type = NeRF2Network
     requires = (FIXED_END,)
     any_grid = True
+
+    def blank(self, saved: Mapping[str, Tensor] | None = None) -> Field:
+        return Field(self.config.width, self.config.depth, self.config.bands)
+
+    def training(self, train: Spectra, device: torch.device) -> Training[Field]:
+        """Return the descent of the squared error of magnitudes on random rays."""
+        config, field = self.config, self.blank()
+        draw_parameters(field, torch.Generator().manual_seed(config.seed))
+        if config.compiled:
+            field.compile()
+        position, spectrum = train.position, train.spectrum.flatten(1).to(device)
+        direction = self._to_world(train.grid, device)
+
+        def loss(field: Field, generator: torch.Generator) -> Tensor:
+            row = torch.randint(len(position), (config.batch,), generator=generator)
+            rays = (1 if config.shared_rays else config.batch, config.rays)
+            pixel = torch.randint(len(direction), rays, generator=generator).to(device)
+            predicted = self._magnitude(field, *self.ends(position[row], device), direction[pixel])
+            return functional.mse_loss(predicted, spectrum[row.to(device)[:, None], pixel])
+
+        return Training(config, field.to(device), loss, betas=(0.9, 0.999), weight_decay=config.weight_decay)
+
+    def render(self, network: Field, position: Tensor, grid: AngularGrid) -> Tensor:
+        ends, direction = self.ends(position, position.device), self._to_world(grid, position.device)
+        samples = MAX_SAMPLES_ON_CPU if direction.device.type == "cpu" else MAX_SAMPLES_AT_ONCE
+        parts = direction.split(max(1, samples // (len(position) * self.config.samples)))
+        magnitudes = [self._magnitude(network, *ends, part[None]) for part in parts]
+        return torch.cat(magnitudes, dim=1).reshape(-1, *grid.shape)
+
+    def _magnitude(self, field: Field, transmitter: Tensor, receiver: Tensor, direction: Tensor) -> Tensor:
+        """Return magnitudes (P, D) at P positions of the moving end for rays (P or 1, D, 3) in world coordinates."""
+        ends = transmitter[:, None], receiver[:, None]
+        return torch.hypot(*received(field, self.config.reach, self.config.samples, *ends, direction))
+
+    def _to_world(self, grid: AngularGrid, device: torch.device) -> Tensor:
+        """Return the directions of the pixels in world coordinates, float32 (H W, 3)."""
+        return (grid.direction.flatten(0, 1).to(device, torch.float64) @ self.rotation.T.to(device)).float()

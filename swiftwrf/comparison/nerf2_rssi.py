@@ -2,7 +2,7 @@
 
     rssi = 100 (a - 1) dBm,    a = |mean over the rays of S|
 
-with S as in `swiftwrf.comparison.volume` (X. Zhao et al., "NeRF2", 2023). `NeRF2RssiConfig.paper()` has the field of its
+with S as in `swiftwrf.comparison.nerf2` (X. Zhao et al., "NeRF2", 2023). `NeRF2RssiConfig.paper()` has the field of its
 code and 36 x 9 rays over the upper half space. (That code averages a ninth of them, by a slip of an index.) The mean before
 the magnitude, the batch and the number of steps are not from the publication.
 
@@ -16,42 +16,23 @@ The quick preset is sized for two cores. The values of the publication are in pa
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any, ClassVar, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.comparison.base import Config, Count, Training, descend
-from swiftwrf.comparison.nerf2 import MAX_SAMPLES_ON_CPU, Field, NeRF2Size, received
-from swiftwrf.comparison.network import chunks, draw_parameters, restored
+from swiftwrf.comparison.base import Config, Count, Depth, Training, draw_parameters, restored
+from swiftwrf.comparison.nerf2 import MAX_SAMPLES_ON_CPU, Field, received
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.models.base import check_finite
 from swiftwrf.positions import frame, normalise
 from swiftwrf.rssi.base import RssiFitContext, RssiPredictor, fingerprint
-from swiftwrf.runtime.checkpoint import Header, Saved
+from swiftwrf.runtime.checkpoint import Header, Saved, expect
 from swiftwrf.runtime.options import from_plain
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
-
-
-@configuration
-class NeRF2RssiSize(NeRF2Size):
-    """Size of the network and its rays.
-
-    Example:
-        >>> NeRF2RssiSize(azimuths=8).azimuths
-        8
-    """
-
-    width: Count = 32
-    bands: Count = 4
-    samples: Count = 8
-    azimuths: Count = 6
-    """azimuths of the rays"""
-    elevations: Count = 3
-    """elevations of the rays"""
 
 
 @configuration
@@ -63,62 +44,43 @@ class NeRF2RssiConfig(Config):
         0.0001
     """
 
-    size: NeRF2RssiSize = NeRF2RssiSize()
+    published: ClassVar[dict[str, Any]] = {
+        "width": 256,
+        "bands": 10,
+        "samples": 64,
+        "azimuths": 36,
+        "elevations": 9,
+        "steps": 30_000,
+        "batch": 8,
+        "rate": 8e-4,
+        "warm_up": 1,
+        "final_rate": 1e-6 / 8e-4,
+        "decay_steps": 10_000,
+        "averaging": 0.0,
+        "clip": math.inf,
+        "weight_decay": 5e-5,
+        "check_every": 500,
+    }
+
+    width: Count = 32
+    """width of the layers"""
+    depth: Depth = 8
+    """layers of the attenuation network"""
+    bands: Count = 4
+    """frequencies of the encodings"""
+    samples: Count = 8
+    """samples along a ray"""
+    reach: PositiveFloat = 5.0
+    """length of a ray [m]"""
+    azimuths: Count = 6
+    """azimuths of the rays"""
+    elevations: Count = 3
+    """elevations of the rays"""
     steps: PositiveInt = 2400
     batch: PositiveInt = 32
     rate: PositiveFloat = 5e-3
     weight_decay: NonNegativeFloat = 0.0
     """weight decay of Adam"""
-
-    @classmethod
-    def paper(cls, **changes: Any) -> NeRF2RssiConfig:
-        paper = cls(
-            size=NeRF2RssiSize(width=256, bands=10, samples=64, azimuths=36, elevations=9),
-            steps=30_000,
-            batch=8,
-            rate=8e-4,
-            warm_up=1,
-            final_rate=1e-6 / 8e-4,
-            decay_steps=10_000,
-            averaging=0.0,
-            clip=math.inf,
-            weight_decay=5e-5,
-            check_every=500,
-        )
-        return replace(paper, **changes)
-
-    def training(self, train: Rssi, device: torch.device) -> NeRF2RssiTraining:
-        return NeRF2RssiTraining(self, train, device)
-
-
-class NeRF2RssiNetwork(nn.Module):
-    """The field and the positions of the receivers in it.
-
-    Args:
-        size: Size of the field and its rays.
-        n_receivers: Number of receivers R.
-    """
-
-    def __init__(self, size: NeRF2RssiSize, n_receivers: int) -> None:
-        super().__init__()
-        self.size, self.field = size, Field(size)
-        self.register_buffer("centre", torch.zeros(3, dtype=torch.float64))
-        self.register_buffer("receiver", torch.zeros(n_receivers, 3, dtype=torch.float64))
-
-    centre: Tensor
-    receiver: Tensor
-
-    def forward(self, transmitter: Tensor) -> Tensor:
-        """Return amplitudes (n, R) with the transmitter at positions (n, 3) [m from the centre]."""
-        grid = AngularGrid.hemisphere(self.size.elevations, self.size.azimuths)
-        receiver = self.local(self.receiver)[:, None]
-        direction = grid.direction.flatten(0, 1).to(receiver)
-        signal = received(self.field, self.size, transmitter[:, None, None], receiver, direction)
-        return torch.hypot(*signal.mean(dim=-1))
-
-    def local(self, position: Tensor) -> Tensor:
-        """Return positions (n, 3) [m] relative to the centre, float32."""
-        return normalise(position.to(self.centre.device), self.centre, 1.0)
 
 
 class NeRF2Rssi(RssiPredictor, Saved):
@@ -142,50 +104,62 @@ class NeRF2Rssi(RssiPredictor, Saved):
     requires_receiver_position = True
     slow = True
 
-    network: NeRF2RssiNetwork
+    field: Field
+    centre: Tensor
+    """centre of the box around the training positions, (3,) [m]"""
+    receiver: Tensor
+    """positions of the receivers, (R, 3) [m]"""
 
     def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+        self.centre, self.receiver = frame(train.transmitter_position)[0], train.receiver_position.double()
         owner = fingerprint(self.config, train, train)
-        training = self.config.training(train, context.device)
-        self.network = descend(training, owner, context.checkpoint, context.on_record, context.progress).cpu()
+        self.field = self._training(train, context.device).trained(owner, context).cpu()
+
+    def _training(self, train: Rssi, device: torch.device) -> Training[Field]:
+        """Return the descent of the squared error of amplitudes where RSSI was detected."""
+        config, field = self.config, self._blank()
+        draw_parameters(field, torch.Generator().manual_seed(config.seed))
+        detected = (~train.rssi_dbm.isnan()).any(dim=1)
+        position = train.transmitter_position[detected]
+        amplitude = (1 + train.rssi_dbm[detected] / 100).float().to(device)
+
+        def loss(field: Field, generator: torch.Generator) -> Tensor:
+            row = torch.randint(len(position), (config.batch,), generator=generator)
+            measured = amplitude[row.to(device)]
+            known = ~measured.isnan()
+            return functional.mse_loss(self._amplitude(field, position[row].to(device))[known], measured[known])
+
+        return Training(config, field.to(device), loss, betas=(0.9, 0.999), weight_decay=config.weight_decay)
+
+    def _blank(self) -> Field:
+        return Field(self.config.width, self.config.depth, self.config.bands)
+
+    def _amplitude(self, field: Field, position: Tensor) -> Tensor:
+        """Return amplitudes (n, R) with the transmitter at positions (n, 3) [m]."""
+        config, centre = self.config, self.centre.to(position.device)
+        transmitter, receiver = (normalise(x.to(centre), centre, 1.0) for x in (position, self.receiver))
+        direction = AngularGrid.hemisphere(config.elevations, config.azimuths).direction.flatten(0, 1).to(receiver)
+        ends = transmitter[:, None, None], receiver[:, None]
+        return torch.hypot(*received(field, config.reach, config.samples, *ends, direction).mean(dim=-1))
 
     def _predict(self, position: Tensor) -> tuple[Tensor, None]:
-        network = self.network
-        rays = network.size.azimuths * network.size.elevations * network.size.samples * max(len(network.receiver), 1)
-        some = chunks(len(position), max(1, MAX_SAMPLES_ON_CPU // rays))
-        parts = [network(network.local(position[part])) for part in some]
-        empty = torch.zeros(0, len(network.receiver))
-        return check_finite(100 * (torch.cat([empty, *parts]).double() - 1)), None
+        config, n_receivers = self.config, len(self.receiver)
+        n_samples = config.azimuths * config.elevations * config.samples * max(n_receivers, 1)
+        some = position.split(max(1, MAX_SAMPLES_ON_CPU // n_samples))
+        amplitude = torch.cat([self._amplitude(self.field, part) for part in some])
+        return check_finite(100 * (amplitude.double() - 1)), None
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         self.check_fitted()
-        return self.network.state_dict(), {"options": asdict(self.config), "receiver_names": self.receiver_names}
+        tensors = self.field.state_dict() | {"centre": self.centre, "receiver": self.receiver}
+        return tensors, {"options": asdict(self.config), "receiver_names": self.receiver_names}
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         model = cls(from_plain(NeRF2RssiConfig, header["options"]))
         model.receiver_names = tuple(map(str, header["receiver_names"]))
-        model.network = restored(lambda: NeRF2RssiNetwork(model.config.size, len(model.receiver_names)), tensors)
+        ends = {name: tensors.pop(name) for name in ("centre", "receiver")}
+        expect(ends, {"centre": (3,), "receiver": (len(model.receiver_names), 3)})
+        model.centre, model.receiver = (end.double() for end in ends.values())
+        model.field = restored(model._blank, tensors)
         return model
-
-
-class NeRF2RssiTraining(Training[NeRF2RssiConfig, NeRF2RssiNetwork]):
-    """Descent of the squared error of amplitudes where RSSI was detected."""
-
-    def __init__(self, config: NeRF2RssiConfig, train: Rssi, device: torch.device) -> None:
-        model = NeRF2RssiNetwork(config.size, len(train.receiver_names))
-        draw_parameters(model, torch.Generator().manual_seed(config.seed))
-        model.centre, _ = frame(train.transmitter_position)
-        model.receiver = train.receiver_position.double()
-        super().__init__(config, model.to(device), betas=(0.9, 0.999), weight_decay=config.weight_decay)
-        detected = (~train.rssi_dbm.isnan()).any(dim=1)
-        self.position = model.local(train.transmitter_position[detected])
-        self.amplitude = (1 + train.rssi_dbm[detected] / 100).float().to(device)
-
-    def objective(self) -> Tensor:
-        row = torch.randint(len(self.position), (self.config.batch,), generator=self.generator()).to(
-            self.position.device
-        )
-        measured = self.amplitude[row]
-        detected = ~measured.isnan()
-        return functional.mse_loss(self.model(self.position[row])[detected], measured[detected])

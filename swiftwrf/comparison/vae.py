@@ -4,37 +4,28 @@ D. P. Kingma and M. Welling, "Auto-Encoding Variational Bayes", 2014, conditione
 Structured Output Representation using Deep Conditional Generative Models", 2015. The layers and the conditioning that papers
 of this field compare with are not published; these are our choice. An encoder takes spectrum and position, a prior takes the
 position. Both return mean and variance of the latent variables. A convolutional decoder takes a latent sample and the
-position. The mean prediction decodes the mean of the prior.
+position. The prediction decodes the mean of the prior.
 
 The quick preset is sized for two cores. `VaeConfig.paper()` has eight times the channels, more latent variables and steps.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.comparison.base import Config, Count, TrainedModel
-from swiftwrf.comparison.convolution import ConvolutionalNetwork, ConvolutionalSize, PairedTraining, decoder, encoder
+from swiftwrf.comparison.base import Config, Count, TrainedModel, Training
+from swiftwrf.comparison.convolution import decoder, encoder, paired_training
 from swiftwrf.data.spectra import Spectra
+from swiftwrf.models.swiftwrf.mlp import encode
 from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, configuration
 
-
-@configuration
-class VaeSize(ConvolutionalSize):
-    """Size of the networks.
-
-    Example:
-        >>> VaeSize(latent=8).latent
-        8
-    """
-
-    latent: Count = 16
-    """number of latent variables"""
+Normal = tuple[Tensor, Tensor]
+"""mean and log variance (B, latent) of independent normal distributions"""
 
 
 @configuration
@@ -42,88 +33,37 @@ class VaeConfig(Config):
     """Options of `Vae`.
 
     Example:
-        >>> Vae(VaeConfig(size=VaeSize(latent=8))).config.size.latent
+        >>> Vae(VaeConfig(latent=8)).config.latent
         8
     """
 
-    size: VaeSize = VaeSize()
-    steps: PositiveInt = 1000
-    batch: PositiveInt = 16
+    published: ClassVar[dict[str, Any]] = {
+        "latent": 64,
+        "width": 64,
+        "hidden": 512,
+        "steps": 50_000,
+        "batch": 64,
+        "rate": 1e-3,
+        "check_every": 500,
+    }
+
+    width: Count = 8
+    """channels at the finest stage"""
+    hidden: Count = 128
+    """width of the fully connected layer"""
+    bands: Count = 5
+    """frequencies of the encoding of the position"""
+    latent: Count = 16
+    """number of latent variables"""
     rate: PositiveFloat = 2e-3
     noise: PositiveFloat = 0.5
     """standard deviation of a pixel about the decoded spectrum, large because the loss treats pixels as independent; with a
     smaller one the latent variables leave their prior"""
-
-    @classmethod
-    def paper(cls, **changes: Any) -> VaeConfig:
-        paper = cls(size=VaeSize(latent=64, width=64, hidden=512), steps=50_000, batch=64, rate=1e-3, check_every=500)
-        return replace(paper, **changes)
-
-    def training(self, train: Spectra, device: torch.device) -> VaeTraining:
-        return VaeTraining(self, VaeNetwork, train, device)
-
-
-class Normal(NamedTuple):
-    """Independent normal distributions of latent variables."""
-
-    mean: Tensor  # (B, latent)
-    log_variance: Tensor  # (B, latent)
-
-    @classmethod
-    def of(cls, raw: Tensor) -> Normal:
-        """Return the distributions of raw outputs (B, 2 latent)."""
-        mean, log_variance = raw.chunk(2, dim=-1)
-        return cls(mean, log_variance.clamp(-10, 10))
-
-    def sample(self, generator: torch.Generator) -> Tensor:
-        """Return one sample of each distribution."""
-        noise = torch.randn(self.mean.shape, generator=generator).to(self.mean.device)
-        return self.mean + noise * (0.5 * self.log_variance).exp()
-
-    def divergence(self, other: Normal) -> Tensor:
-        """Return the Kullback-Leibler divergence from `other`, (B,)."""
-        spread = (self.mean - other.mean).square() + self.log_variance.exp()
-        each = other.log_variance - self.log_variance + spread * torch.exp(-other.log_variance) - 1
-        return 0.5 * each.sum(dim=-1)
-
-
-class VaeNetwork(ConvolutionalNetwork):
-    """Decoder, encoder and prior."""
-
-    def __init__(self, size: VaeSize, grid: AngularGrid) -> None:
-        super().__init__(size, grid)
-        encoded, hidden, latent = self.n_encoded, size.hidden, size.latent
-        self.encoder, features = encoder(grid, size.width, inputs=1)
-        self.posterior = nn.Sequential(nn.Linear(features + encoded, hidden), nn.ReLU(), nn.Linear(hidden, 2 * latent))
-        self.prior = nn.Sequential(nn.Linear(encoded, hidden), nn.ReLU(), nn.Linear(hidden, 2 * latent))
-        self.hidden = nn.Sequential(nn.Linear(latent + encoded, hidden), nn.ReLU())
-        self.decoder = decoder(grid, size.width, hidden)
-
-    def decode(self, latent: Tensor, encoded: Tensor) -> Tensor:
-        """Return magnitudes (B, H, W)."""
-        decoded: Tensor = self.decoder(self.hidden(torch.cat([latent, encoded], dim=-1)))
-        return decoded[:, 0]
-
-    def render(self, position: Tensor, grid: AngularGrid, generator: torch.Generator | None = None) -> Tensor:
-        encoded = self.encoded(position)
-        prior = Normal.of(self.prior(encoded))
-        return self.decode(prior.mean if generator is None else prior.sample(generator), encoded)
-
-
-class VaeTraining(PairedTraining[VaeConfig, VaeNetwork]):
-    """Maximisation of the evidence lower bound, per pixel and in units of the squared error."""
-
-    def objective(self) -> Tensor:
-        generator, model = self.generator(), self.model
-        spectrum, encoded = self.pairs(generator)
-        posterior = Normal.of(model.posterior(torch.cat([model.encoder(spectrum[:, None]), encoded], dim=-1)))
-        decoded = model.decode(posterior.sample(generator), encoded)
-        divergence = posterior.divergence(Normal.of(model.prior(encoded))).mean() / spectrum[0].numel()
-        return (decoded - spectrum).square().mean() + 2 * self.config.noise**2 * divergence
+    steps: PositiveInt = 1000
 
 
 class Vae(TrainedModel):
-    """Conditional variational autoencoder; a sample decodes latent variables sampled from their prior.
+    """Conditional variational autoencoder.
 
     Example:
         >>> import swiftwrf
@@ -135,5 +75,60 @@ class Vae(TrainedModel):
     name = "vae"
     kind = "vae model"
     config_type = VaeConfig
-    network_type = VaeNetwork
-    samples = True
+
+    def blank(self, saved: Mapping[str, Tensor] | None = None) -> nn.ModuleDict:
+        """Return decoder, encoder and prior."""
+        config, encoded = self.config, 3 * (2 * self.config.bands + 1)
+        hidden, latent = config.hidden, config.latent
+        front, features = encoder(self.grid, config.width)
+        return nn.ModuleDict(
+            {
+                "encoder": front,
+                "posterior": nn.Sequential(
+                    nn.Linear(features + encoded, hidden), nn.ReLU(), nn.Linear(hidden, 2 * latent)
+                ),
+                "prior": nn.Sequential(nn.Linear(encoded, hidden), nn.ReLU(), nn.Linear(hidden, 2 * latent)),
+                "hidden": nn.Sequential(nn.Linear(latent + encoded, hidden), nn.ReLU()),
+                "decoder": decoder(self.grid, config.width, hidden),
+            }
+        )
+
+    def training(self, train: Spectra, device: torch.device) -> Training[nn.ModuleDict]:
+        return paired_training(self, train, device, self._loss)
+
+    def _loss(self, network: nn.ModuleDict, spectrum: Tensor, position: Tensor, generator: torch.Generator) -> Tensor:
+        """Return the negative evidence lower bound, per pixel and in units of the squared error."""
+        encoded = self._encoded(position, spectrum.device)
+        posterior = normal(network["posterior"](torch.cat([network["encoder"](spectrum[:, None]), encoded], dim=-1)))
+        mean, log_variance = posterior
+        noise = torch.randn(mean.shape, generator=generator).to(mean.device)
+        decoded = _decode(network, mean + noise * (0.5 * log_variance).exp(), encoded)
+        apart = divergence(posterior, normal(network["prior"](encoded))).mean() / spectrum[0].numel()
+        return (decoded - spectrum).square().mean() + 2 * self.config.noise**2 * apart
+
+    def render(self, network: nn.ModuleDict, position: Tensor, grid: AngularGrid) -> Tensor:
+        encoded = self._encoded(position, position.device)
+        return _decode(network, normal(network["prior"](encoded))[0], encoded)
+
+    def _encoded(self, position: Tensor, device: torch.device) -> Tensor:
+        return encode(self.local(position, device), self.config.bands)
+
+
+def _decode(network: nn.ModuleDict, latent: Tensor, encoded: Tensor) -> Tensor:
+    """Return magnitudes (B, H, W) of latent variables and encoded positions."""
+    decoded: Tensor = network["decoder"](network["hidden"](torch.cat([latent, encoded], dim=-1)))
+    return decoded[:, 0]
+
+
+def normal(raw: Tensor) -> Normal:
+    """Return the normal distributions of raw outputs (B, 2 latent)."""
+    mean, log_variance = raw.chunk(2, dim=-1)
+    return mean, log_variance.clamp(-10, 10)
+
+
+def divergence(one: Normal, other: Normal) -> Tensor:
+    """Return the Kullback-Leibler divergence of one normal distribution from another, (B,)."""
+    (mean, log_variance), (other_mean, other_log_variance) = one, other
+    spread = (mean - other_mean).square() + log_variance.exp()
+    each = other_log_variance - log_variance + spread * torch.exp(-other_log_variance) - 1
+    return 0.5 * each.sum(dim=-1)

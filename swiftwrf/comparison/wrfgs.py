@@ -15,33 +15,41 @@ those of the shapes, too) are not published and our choice.
 
 Changed in the quick preset, sized for two cores: 500 Gaussians (20,000) without densification, 6 bands, 8 spectra a step (1)
 at 90 azimuths (all), 2,000 steps (600,000) at rate 3e-3 (8e-4), averaged parameters (the last), clipped gradients.
+
+The projection is of first order: the image of a Gaussian of covariance S under the map f from a point to its direction is
+one of covariance J S J^T about f(mean), J = df (M. Zwicker, H. Pfister, J. van Baar and M. Gross, "EWA splatting", IEEE
+TVCG 8(3), 2002, there for a camera). With rho = |(x, y)| and r = |(x, y, z)|
+
+    d azimuth = (-y, x, 0) / rho^2,    d elevation = (-x |z|, -y |z|, sign(z) rho^2) / (rho r^2)
+
+because a planar array cannot distinguish z from -z and folds the half space behind it. At the pole d azimuth diverges: a
+Gaussian there is flat over all azimuths, which are one direction at an elevation of 90 degrees.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import torch
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 from torch.nn import functional
 
-from swiftwrf.array.angles import AngularGrid
-from swiftwrf.choices import Moving
-from swiftwrf.comparison.base import Config, Count, Depth, TrainedModel, Training
-from swiftwrf.comparison.network import LinkNetwork, draw_parameters
-from swiftwrf.comparison.sphere import on_sphere
+from swiftwrf.array.angles import AngularGrid, to_angles
+from swiftwrf.comparison.base import Config, Count, Depth, TrainedModel, Training, draw_parameters
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.models.base import FIXED_END
 from swiftwrf.models.swiftwrf.loss import spectrum_loss
 from swiftwrf.models.swiftwrf.mlp import SkipMLP, encode
-from swiftwrf.models.swiftwrf.primitives import min_width
+from swiftwrf.models.swiftwrf.primitives import MAX_WIDTH_RAD, min_width
 from swiftwrf.rasterize import rasterize_magnitude
 from swiftwrf.runtime.session import State
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
+SHAPES = ("log_scale", "quaternion", "opacity")  # of the Gaussians, in the order of the optimiser's first groups
+MIN_AXIS_DISTANCE = 1e-6  # relative to the distance; limits d azimuth near the axis
 FIRST_OPACITY = 0.1
 SSIM_WEIGHT = 0.2
 CUTOFF = 1e-4
@@ -55,13 +63,28 @@ MIN_OPACITY, RESET_OPACITY = 0.005, 0.01
 
 
 @configuration
-class WrfGsSize:
-    """Size of the Gaussians and their network.
+class WrfGsConfig(Config):
+    """Options of `WrfGs`.
 
     Example:
-        >>> WrfGsSize(n_gaussians=100).n_gaussians
+        >>> WrfGs(WrfGsConfig(n_gaussians=100)).config.n_gaussians
         100
     """
+
+    published: ClassVar[dict[str, Any]] = {
+        "n_gaussians": 20_000,
+        "bands": 10,
+        "steps": 600_000,
+        "batch": 1,
+        "rate": 8e-4,
+        "warm_up": 1,
+        "decay_steps": 200_000,
+        "averaging": 0.0,
+        "clip": math.inf,
+        "max_azimuths": 0,
+        "grows": True,
+        "check_every": 1000,
+    }
 
     n_gaussians: Count = 500
     """initial number of Gaussians"""
@@ -73,18 +96,6 @@ class WrfGsSize:
     """number of the network's layers"""
     bands: Count = 6
     """frequencies of the encodings"""
-
-
-@configuration
-class WrfGsConfig(Config):
-    """Options of `WrfGs`.
-
-    Example:
-        >>> WrfGs(WrfGsConfig(size=WrfGsSize(n_gaussians=100))).config.size.n_gaussians
-        100
-    """
-
-    size: WrfGsSize = WrfGsSize()
     steps: PositiveInt = 2000
     batch: PositiveInt = 8
     rate: PositiveFloat = 3e-3
@@ -99,82 +110,109 @@ class WrfGsConfig(Config):
     grows: bool = False
     """clone, split and remove Gaussians (densification)"""
 
-    @classmethod
-    def paper(cls, **changes: Any) -> WrfGsConfig:
-        paper = cls(
-            size=WrfGsSize(n_gaussians=20_000, bands=10),
-            steps=600_000,
-            batch=1,
-            rate=8e-4,
-            warm_up=1,
-            decay_steps=200_000,
-            averaging=0.0,
-            clip=math.inf,
-            max_azimuths=0,
-            grows=True,
-            check_every=1000,
-        )
-        return replace(paper, **changes)
 
-    def training(self, train: Spectra, device: torch.device) -> WrfGsTraining:
-        return WrfGsTraining(self, train, device)
+class WrfGs(TrainedModel):
+    """3D Gaussian splatting with amplitudes by a network.
 
+    Example:
+        >>> import swiftwrf
+        >>> room = swiftwrf.simulated_room(n=20)
+        >>> WrfGs(n_gaussians=20, steps=1).fit(room).predict(room.position).mean.shape
+        torch.Size([20, 30, 120])
+    """
 
-class WrfGsNetwork(LinkNetwork):
-    """Magnitude of the sum of 3D Gaussians, projected onto the sphere of directions."""
+    name = "wrfgs"
+    kind = "wrf-gs model"
+    config_type = WrfGsConfig
+    requires = (FIXED_END,)
+    any_grid = True
+    batch = 16
 
-    mean: Tensor
-    blur: Tensor
+    def blank(self, saved: Mapping[str, Tensor] | None = None) -> nn.ModuleDict:
+        """Return the Gaussians, the network of their features and the layer of their amplitudes."""
+        config = self.config
+        n = config.n_gaussians if saved is None else len(saved["gaussians.mean"])  # densification changes the number
+        gaussians = {
+            "log_scale": nn.Parameter(torch.zeros(n, 3)),
+            "quaternion": nn.Parameter(torch.zeros(n, 4)),
+            "opacity": nn.Parameter(torch.zeros(n)),
+            "path_loss": nn.Parameter(torch.ones(())),
+            "mean": nn.Parameter(torch.zeros(n, 3), requires_grad=False),
+            "blur": nn.Parameter(torch.ones(2), requires_grad=False),
+        }
+        features = SkipMLP(2 * 3 * (2 * config.bands + 1), config.width, config.depth)
+        signal = nn.Linear(config.width, 1)
+        return nn.ModuleDict({"gaussians": nn.ParameterDict(gaussians), "features": features, "signal": signal})
 
-    def __init__(self, size: WrfGsSize, grid: AngularGrid, moving: Moving) -> None:
-        super().__init__(size, grid, moving)
-        n, inputs = size.n_gaussians, 2 * 3 * (2 * size.bands + 1)
-        self.network, self.signal = SkipMLP(inputs, size.width, size.depth), nn.Linear(size.width, 1)
-        self.register_buffer("mean", torch.zeros(n, 3))
-        self.register_buffer("blur", torch.ones(2))
-        self.log_scale = nn.Parameter(torch.zeros(n, 3))
-        self.quaternion = nn.Parameter(torch.zeros(n, 4))
-        self.opacity = nn.Parameter(torch.zeros(n))
-        self.path_loss = nn.Parameter(torch.ones(()))
-
-    def initialise(self, generator: torch.Generator) -> None:
-        """Draw means and network from the generator, and set shapes and opacities."""
-        draw_parameters(self, generator)
-        self.mean = self.size.spread * torch.randn(self.size.n_gaussians, 3, generator=generator)
-        self.blur = min_width(self.grid)
+    def training(self, train: Spectra, device: torch.device) -> GaussianTraining:
+        work = train.at_most(self.config.max_azimuths)
+        network, generator = self.blank(), torch.Generator().manual_seed(self.config.seed)
+        draw_parameters(network, generator)
+        mean = self.config.spread * torch.randn(self.config.n_gaussians, 3, generator=generator)
+        gaussians = network["gaussians"]
         with torch.no_grad():
-            self.log_scale.copy_(_spacing(self.mean).log()[:, None])
-            self.quaternion[:, 3] = 1
-            self.opacity.fill_(math.log(FIRST_OPACITY / (1 - FIRST_OPACITY)))
+            gaussians["mean"].copy_(mean)
+            gaussians["blur"].copy_(min_width(work.grid))
+            gaussians["log_scale"].copy_(_spacing(mean).log()[:, None])
+            gaussians["quaternion"][:, 3] = 1
+            gaussians["opacity"].fill_(math.log(FIRST_OPACITY / (1 - FIRST_OPACITY)))
+        return GaussianTraining(self, network.to(device), work)
 
-    def project(self, position: Tensor) -> tuple[Tensor, Tensor]:
+    def render(self, network: nn.ModuleDict, position: Tensor, grid: AngularGrid) -> Tensor:
+        return self.rasterize(network, position, *self.project(network, position), grid)
+
+    def project(self, network: nn.ModuleDict, position: Tensor) -> tuple[Tensor, Tensor]:
         """Return means (P or 1, N, 2) and Cholesky factors (P, N, 3) or (N, 3) [rad] for positions (P, 3) [m]."""
-        _, receiver = self.link(position)
-        to_array = self.link.rotation.float()  # of rows, from the right
-        local = (self.mean - receiver[:, None]) @ to_array
+        gaussians = network["gaussians"]
+        _, receiver = self.ends(position, gaussians["mean"].device)
+        to_array = self.rotation.to(receiver)  # of rows, from the right
+        local = (gaussians["mean"] - receiver[:, None]) @ to_array
         far = local.norm(dim=-1, keepdim=True) > MIN_DISTANCE_M
         local = torch.where(far, local, local.new_tensor([0.0, 0.0, MIN_DISTANCE_M]))
-        factor = to_array.T @ _rotations(self.quaternion) * self.log_scale.exp()[:, None, :]
-        mean, cholesky = on_sphere(local, factor, self.blur)
+        factor = to_array.T @ _rotations(gaussians["quaternion"]) * gaussians["log_scale"].exp()[:, None, :]
+        mean, cholesky = on_sphere(local, factor, gaussians["blur"])
         return mean, cholesky[0] if len(receiver) == 1 else cholesky
 
-    def weight(self, position: Tensor) -> Tensor:
-        """Return the amplitudes (P, N, 2) of the Gaussians, with imaginary part 0, for positions (P, 3) [m]."""
-        transmitter, receiver = self.link(position)
-        end = transmitter if self.link.moving == "transmitter" else receiver
-        of_mean = encode(self.mean / self.size.spread, self.size.bands, lowest=1.0)
-        of_end = encode(end, self.size.bands, lowest=1.0)
+    def rasterize(
+        self, network: nn.ModuleDict, position: Tensor, mean: Tensor, cholesky: Tensor, grid: AngularGrid
+    ) -> Tensor:
+        """Return magnitudes (P, H, W) of projected Gaussians, whose network predicts amplitudes for positions (P, 3) [m]."""
+        gaussians, bands = network["gaussians"], self.config.bands
+        transmitter, receiver = self.ends(position, mean.device)
+        end = transmitter if self.moving == "transmitter" else receiver
+        of_mean = encode(gaussians["mean"] / self.config.spread, bands, lowest=1.0)
+        of_end = encode(end, bands, lowest=1.0)
         x = torch.cat(torch.broadcast_tensors(of_mean, of_end[:, None]), dim=-1)
-        amplitude = self.path_loss * torch.sigmoid(self.opacity) * self.signal(self.network(x))[..., 0].abs()
-        return torch.stack([amplitude, torch.zeros_like(amplitude)], dim=-1)
-
-    def rasterize(self, position: Tensor, mean: Tensor, cholesky: Tensor, grid: AngularGrid) -> Tensor:
-        """Return magnitudes (P, H, W) of projected Gaussians."""
-        weight = self.weight(position)
+        signal = network["signal"](network["features"](x))[..., 0].abs()
+        amplitude = gaussians["path_loss"] * torch.sigmoid(gaussians["opacity"]) * signal
+        weight = torch.stack([amplitude, torch.zeros_like(amplitude)], dim=-1)
         return rasterize_magnitude(mean.expand_as(weight), cholesky, weight, grid, cutoff=CUTOFF)
 
-    def render(self, position: Tensor, grid: AngularGrid, generator: torch.Generator | None = None) -> Tensor:
-        return self.rasterize(position, *self.project(position), grid)
+
+def on_sphere(mean: Tensor, factor: Tensor, blur: Tensor) -> tuple[Tensor, Tensor]:
+    """Return means (..., N, 2) and Cholesky factors (..., N, 3) [rad] for `swiftwrf.rasterize`.
+
+    Args:
+        mean: Means of the Gaussians in array coordinates, relative to the array, (..., N, 3), not 0.
+        factor: F with covariance F F^T in array coordinates, (N, 3, 3).
+        blur: Standard deviations in azimuth and elevation [rad], (2,), that are added in quadrature, so that no Gaussian
+            falls between pixels.
+    """
+    x, y, z = mean.unbind(-1)
+    r, flat = mean.norm(dim=-1), torch.hypot(x, y)
+    rho = torch.maximum(flat, MIN_AXIS_DISTANCE * r)
+    cosine = torch.where(flat > 0, x / rho, torch.ones_like(x))  # at the pole the azimuth is arbitrary
+    sine, up = y / rho, torch.where(z < 0, -1.0, 1.0)
+    turn = torch.stack([-sine, cosine, torch.zeros_like(z)], dim=-1) / rho[..., None]
+    rise = torch.stack([-cosine * z.abs(), -sine * z.abs(), up * flat], dim=-1) / r.square()[..., None]
+    image = torch.einsum("...nak,nkl->...nal", torch.stack([turn, rise], dim=-2), factor)
+    variance = image.square().sum(dim=-1) + blur.square()
+    shrink = torch.rsqrt(1 + variance / MAX_WIDTH_RAD**2)  # limits the width, which would overflow
+    l1 = variance[..., 0].sqrt() * shrink[..., 0]
+    l2 = (image[..., 0, :] * image[..., 1, :]).sum(dim=-1) * shrink.prod(dim=-1) / l1
+    # positive because of the blur, except for rounding
+    l3 = (variance[..., 1] * shrink[..., 1].square() - l2.square()).clamp_min((blur[1] * 0.5).square()).sqrt()
+    return torch.stack(to_angles(mean), dim=-1), torch.stack([l1, l2, l3], dim=-1)
 
 
 def _spacing(mean: Tensor) -> Tensor:
@@ -194,40 +232,44 @@ def _rotations(quaternion: Tensor) -> Tensor:
     return torch.stack(rows, dim=-2)
 
 
-class WrfGsTraining(Training[WrfGsConfig, WrfGsNetwork]):
+class GaussianTraining(Training[nn.ModuleDict]):
     """Training of shapes, opacities and network.
 
     Densification doubles Gaussians with a large gradient and removes those of low opacity (B. Kerbl et al., section 5.2).
+
+    Args:
+        owner: Model of the network.
+        network: Initialised network, on its device.
+        train: Training spectra.
     """
 
-    SHAPES = ("log_scale", "quaternion", "opacity")  # in the order of the optimiser's first groups
-
-    def __init__(self, config: WrfGsConfig, train: Spectra, device: torch.device) -> None:
-        work = train.at_most(config.max_azimuths)
-        model = WrfGsNetwork.of(config.size, work)
-        model.initialise(torch.Generator().manual_seed(config.seed))
-        model = model.to(device)
+    def __init__(self, owner: WrfGs, network: nn.ModuleDict, train: Spectra) -> None:
+        config, self.gaussians = owner.config, network["gaussians"]
         rates = (config.scale_rate, config.rotation_rate, config.opacity_rate)
-        groups = [{"params": [getattr(model, n)], "peak": r} for n, r in zip(self.SHAPES, rates, strict=True)]
-        network = [*model.network.parameters(), *model.signal.parameters(), model.path_loss]
-        super().__init__(config, model, [*groups, {"params": network, "peak": config.rate}], betas=(0.9, 0.999))
-        self.position, self.spectrum, self.grid = work.position, work.spectrum.to(device), work.grid
-        self.pull = torch.zeros(len(model.mean), device=device)
+        groups = [{"params": [self.gaussians[n]], "peak": rate} for n, rate in zip(SHAPES, rates, strict=True)]
+        rest = [*network["features"].parameters(), *network["signal"].parameters(), self.gaussians["path_loss"]]
+        super().__init__(
+            config, network, self._loss, [*groups, {"params": rest, "peak": config.rate}], betas=(0.9, 0.999)
+        )
+        device = self.gaussians["mean"].device
+        self.owner, self.grid = owner, train.grid
+        self.position, self.spectrum = train.position, train.spectrum.to(device)
+        self.pull = torch.zeros(len(self.gaussians["mean"]), device=device)
 
     def rate(self, step: int) -> float:
         return super().rate(min(step, self.config.decay_steps or step))  # stays low once it has decayed
 
-    def objective(self) -> Tensor:
-        row = torch.randint(len(self.position), (self.config.batch,), generator=self.generator())
+    def _loss(self, network: nn.ModuleDict, generator: torch.Generator) -> Tensor:
+        row = torch.randint(len(self.position), (self.config.batch,), generator=generator)
         position = self.position[row]
-        mean, cholesky = self.model.project(position)
-        self.projected = mean.requires_grad_(self.config.grows)
-        predicted = self.model.rasterize(position, mean, cholesky, self.grid)
+        mean, cholesky = self.owner.project(network, position)
+        self.projected = mean.requires_grad_(self.owner.config.grows)
+        predicted = self.owner.rasterize(network, position, mean, cholesky, self.grid)
         return spectrum_loss(predicted, self.spectrum[row.to(predicted.device)], SSIM_WEIGHT)
 
     def advance(self) -> Tensor:
         loss = super().advance()
-        if self.config.grows and self.step <= GROW_UNTIL:
+        if self.owner.config.grows and self.step <= GROW_UNTIL:
             assert self.projected.grad is not None
             # in units of an image that spans [-1, 1] in both directions, for which the threshold was chosen
             pull = self.projected.grad * self.projected.new_tensor([math.pi, math.pi / 4])
@@ -238,31 +280,31 @@ class WrfGsTraining(Training[WrfGsConfig, WrfGsNetwork]):
                 self.pull.zero_()
             if self.step % RESET_EVERY == 0:
                 with torch.no_grad():
-                    self.model.opacity.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+                    self.gaussians["opacity"].clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
         return loss
 
     @torch.no_grad()
     def _grow(self) -> None:
-        model = self.model
-        pulled, visible = self.pull > MIN_PULL, torch.sigmoid(model.opacity) > MIN_OPACITY
-        large = model.log_scale.max(dim=1).values > math.log(MAX_CLONED * model.size.spread)
+        shape, spread = self.gaussians, self.owner.config.spread
+        pulled, visible = self.pull > MIN_PULL, torch.sigmoid(shape["opacity"]) > MIN_OPACITY
+        large = shape["log_scale"].max(dim=1).values > math.log(MAX_CLONED * spread)
         stay = (visible & ~(pulled & large)).nonzero()[:, 0]
         clone = (visible & pulled & ~large).nonzero()[:, 0]
         split = (visible & pulled & large).nonzero()[:, 0].repeat(2)
-        offset = torch.randn(len(split), 3, generator=self.generator()).to(split.device) * model.log_scale[split].exp()
-        offset = (_rotations(model.quaternion[split]) @ offset[..., None])[..., 0]
+        noise = torch.randn(len(split), 3, generator=self.generator()).to(split.device)
+        offset = _rotations(shape["quaternion"][split]) @ (noise * shape["log_scale"][split].exp())[..., None]
         self._take(torch.cat([stay, clone, split]), n_old=len(stay))
         if len(split):
-            model.mean[-len(split) :] += offset
-            model.log_scale[-len(split) :] -= math.log(SPLIT_FACTOR)
+            shape["mean"][-len(split) :] += offset[..., 0]
+            shape["log_scale"][-len(split) :] -= math.log(SPLIT_FACTOR)
         self.average = self.averaged()
 
     @torch.no_grad()
     def _take(self, row: Tensor, n_old: int) -> None:
         """Replace the Gaussians by these rows; the moments of Adam are kept for the first `n_old` only."""
-        model, fresh = self.model, torch.arange(len(row), device=row.device) >= n_old
-        model.mean = model.mean[row]
-        for name, group in zip(self.SHAPES, self.optimiser.param_groups, strict=False):
+        fresh = torch.arange(len(row), device=row.device) >= n_old
+        self.gaussians["mean"] = nn.Parameter(self.gaussians["mean"][row], requires_grad=False)
+        for name, group in zip(SHAPES, self.optimiser.param_groups, strict=False):
             (old,) = group["params"]
             new = nn.Parameter(old[row])
             if old in self.optimiser.state:
@@ -272,31 +314,11 @@ class WrfGsTraining(Training[WrfGsConfig, WrfGsNetwork]):
                     moment[fresh] = 0
                 self.optimiser.state[new] = state | moments
             group["params"] = [new]
-            setattr(model, name, new)
-        model.size = replace(model.size, n_gaussians=len(row))
+            self.gaussians[name] = new
         self.pull = self.pull.new_zeros(len(row))
 
     def _restore(self, saved: State) -> None:
-        n = len(saved.tensors["model.mean"])
+        n = len(saved.tensors["model.gaussians.mean"])
         self._take(torch.zeros(n, dtype=torch.int64, device=self.pull.device), n_old=0)
         self.average = self.averaged()
         super()._restore(saved)
-
-
-class WrfGs(TrainedModel):
-    """3D Gaussian splatting with amplitudes by a network.
-
-    Example:
-        >>> import swiftwrf
-        >>> room = swiftwrf.simulated_room(n=20)
-        >>> WrfGs(size=WrfGsSize(n_gaussians=20), steps=1).fit(room).predict(room.position).mean.shape
-        torch.Size([20, 30, 120])
-    """
-
-    name = "wrfgs"
-    kind = "wrf-gs model"
-    config_type = WrfGsConfig
-    network_type = WrfGsNetwork
-    requires = (FIXED_END,)
-    any_grid = True
-    batch = 16

@@ -99,8 +99,6 @@ class FieldModel(Configured, Saved, Displayed):
     """properties of the data that the model needs: ARRAY, FIXED_END"""
     searches: ClassVar[bool] = False
     """whether `fit` searches a structure that it can reuse from another model"""
-    samples: ClassVar[bool] = False
-    """whether `sample` is available"""
     updates: ClassVar[bool] = False
     """whether `update` is available; other models must be fitted again"""
     slow: ClassVar[bool] = False
@@ -184,10 +182,6 @@ class FieldModel(Configured, Saved, Displayed):
         Differentiable where the mathematics is. Magnitudes need not be clipped. The standard deviation may be None.
         """
 
-    def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
-        """Return one posterior sample (b, H, W) for each of a batch of positions."""
-        raise NotImplementedError
-
     def predict(self, position: Numbers, grid: AngularGrid | None = None) -> Prediction:
         """Predict spectra.
 
@@ -220,28 +214,6 @@ class FieldModel(Configured, Saved, Displayed):
         position = self._checked(position)
         mean, std = self._in_batches(evaluate, position, grid)
         return Prediction(mean, std, position, grid)
-
-    def sample(self, position: Numbers, *, generator: torch.Generator, grid: AngularGrid | None = None) -> Tensor:
-        """Return one sample of the predictive distribution at each position.
-
-        Args:
-            position: Positions of the moving end, (n, 3) [m].
-            generator: Source of randomness.
-            grid: Directions. Defaults to the grid of the training spectra.
-
-        Returns:
-            Magnitudes in [0, 1], float32 (n, n_elevation, n_azimuth).
-
-        Raises:
-            InputError: As `predict`, or a model that cannot be sampled.
-        """
-        if not self.samples:
-            raise InputError(f"{self.name} predicts means only and cannot be sampled")
-        grid = self._checked_grid(grid)
-        with torch.no_grad():
-            return self._in_batches(
-                lambda some: (self._sample(some, grid, generator).clamp(0, 1), None), self._checked(position), grid
-            )[0]
 
     @single_thread()
     @checked

@@ -105,7 +105,6 @@ class CoarrayModel(Linked, ProcessModel):
     name = "coarray"
     kind = "co-array model"
     requires = (ARRAY,)
-    samples = True
     any_grid = True
     batch = 32  # spectra that stay in the processor's cache
 
@@ -201,13 +200,6 @@ class CoarrayModel(Linked, ProcessModel):
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         mean = self._spectra(self.process.mean(position).float(), grid)
         return mean, self._std(position, grid) if with_std else None
-
-    def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
-        score = self.process.mean(position).float()
-        # a score's variance is 1 over the number of training positions
-        unknown = (self.process.variance(position) / len(self.process.known)).sqrt().float()
-        score[:, :-1] += unknown[:, None] * torch.randn(len(position), score.shape[1] - 1, generator=generator)
-        return self._spectra(score, grid)
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         tensors, header = self.process.state()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -21,8 +19,7 @@ from swiftwrf.runtime.checkpoint import Header
 class GPModel(ProcessModel, MemoryModel):
     """Gaussian process regression of every pixel with one kernel, chosen by cross-validation.
 
-    A prediction among more than 2000 training spectra uses the nearest 64. A sample is drawn from the marginal posterior of
-    each position; correlation between positions is not sampled.
+    A prediction among more than 2000 training spectra uses the nearest 64.
 
     Example:
         >>> import swiftwrf
@@ -33,7 +30,6 @@ class GPModel(ProcessModel, MemoryModel):
 
     name = "gp"
     kind = "pixel Gaussian process"
-    samples = True
 
     def _fit(self, train: Spectra, context: FitContext) -> None:
         self.position, self.store = train.position, train.store
@@ -82,13 +78,6 @@ class GPModel(ProcessModel, MemoryModel):
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         mean = self._mean + self._mean_change(position).reshape(-1, *grid.shape)
         return mean, self._std(position, grid) if with_std else None
-
-    def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
-        variance, n = self.process.variance(position), len(self._change)
-        # the covariance of the training spectra between pixels, scaled by the posterior variance of each position
-        scale = variance.sqrt().float()[:, None] / math.sqrt(n)
-        noise = scale * torch.randn(len(position), n, generator=generator)
-        return self._mean + (self._mean_change(position) + noise @ self._change).reshape(-1, *grid.shape)
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         tensors, header = self.process.state()

@@ -6,23 +6,27 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError
 from swiftwrf.models.base import FieldModel
+from swiftwrf.models.geometry.images import PhaseObservations
 from swiftwrf.models.geometry.model import GeometryModel
+from swiftwrf.models.geometry.path_gains import paths
+from swiftwrf.models.geometry.phase_retrieval import correlations, retrieve_phases
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.online.adaptation import adapted
 from swiftwrf.online.change import Alarm
 from swiftwrf.online.kernel import KernelMonitor, described
 from swiftwrf.online.monitor import Monitor, MonitorConfig
-from swiftwrf.online.obstacles import ObstacleMonitor
 from swiftwrf.online.prequential import Scores, learnt, score
 from swiftwrf.rssi.model import RssiModel
 
-ROOM_NOTICE = "the room no longer explains the spectra since measurement {}; unless an obstacle does, fit it again"
+ROOM_NOTICE = "the room no longer explains the spectra since measurement {}; fit it again, also if an obstacle appeared"
+MIN_MISSING = 3e-3  # missing coherence that counts as none, phases of 3 degrees
 MAX_RECENT = 500  # spectra that are kept to adapt the model to a change
 MAX_WAITING = 5 * MIN_TRAINING  # spectra that wait for an update of a geometry
 
@@ -57,9 +61,8 @@ class Follower:
 
     An alarm of the innovations adapts models of spectra to the change, if these can forget spectra, and restarts the test.
     Kernel and noise are chosen again while the data grow (`KernelMonitor`).
-    With a room and training spectra, obstacles that appear or leave are detected, too. A notice reports once if the room no
-    longer explains the spectra. The planes of a geometry are refined whenever 10 positions are new; until then, its spectra
-    wait.
+    With a room and training spectra, a notice reports once if the room no longer explains the spectra. The planes of a
+    geometry are refined whenever 10 positions are new; until then, its spectra wait.
 
     Args:
         model: Fitted model with `update`.
@@ -85,13 +88,11 @@ class Follower:
         self.model, self.count = model, 0
         self.monitor = Monitor.of(model, train, config)
         self._kernel = KernelMonitor(self.monitor.config.false_alarm_rate)
-        self.obstacles: ObstacleMonitor | None = None
-        """test for obstacles, None without room or training spectra"""
         self.room: Monitor | None = None
         """test of the coherence of room and spectra; None without room or training spectra, and after its alarm"""
-        if isinstance(model, FieldModel) and model.room is not None and isinstance(train, Spectra):
-            self.obstacles = ObstacleMonitor(model.room, train, self.monitor.config.false_alarm_rate)
-            self.room = Monitor(train.position, (), self.obstacles.unexplained(train), self.monitor.config)
+        self._found = model.room if isinstance(model, FieldModel) else None  # as it was before the test
+        if self._found is not None and isinstance(train, Spectra):
+            self.room = Monitor(train.position, (), unexplained(self._found, train), self.monitor.config)
         self._recent: list[Spectra] = []
         self.waiting: Spectra | None = None
         """spectra that a geometry has not learnt yet, for its next update"""
@@ -105,9 +106,8 @@ class Follower:
         scores = score(self.model, new)
         alarms = self.monitor.observe(scores.position[0], scores.innovation[0])
         words, correlation, notices = list(map(self.monitor.describe, alarms)), None, []
-        if self.obstacles is not None and isinstance(new, Spectra):
-            words += map(self.obstacles.describe, self.obstacles.observe(new))
-            notices += self._check_room(self.obstacles, new)
+        if isinstance(new, Spectra):
+            notices += self._check_room(new)
         notices += self._learn(new)
         self.count += 1
         if isinstance(new, Spectra) and isinstance(self.model, ProcessModel):
@@ -134,9 +134,11 @@ class Follower:
         self.waiting = None
         return notices
 
-    def _check_room(self, obstacles: ObstacleMonitor, new: Spectra) -> list[str]:
+    def _check_room(self, new: Spectra) -> list[str]:
         """Return a notice if the room no longer explains the spectra, which ends the test."""
-        alarms = self.room.observe(new.position[0], obstacles.unexplained(new)) if self.room is not None else []
+        if self.room is None or self._found is None:
+            return []
+        alarms = self.room.observe(new.position[0], unexplained(self._found, new))
         if not alarms:
             return []
         self.room = None
@@ -162,20 +164,26 @@ class Follower:
 
     def state(self) -> dict[str, Any]:
         """Return the count of measurements and the state of the tests as plain values, without the spectra that wait."""
-        obstacles = None if self.obstacles is None else self.obstacles.state()
         room = None if self.room is None else self.room.state()
-        return {"count": self.count, "monitor": self.monitor.state(), "obstacles": obstacles, "room": room}
+        return {"count": self.count, "monitor": self.monitor.state(), "room": room}
 
     def resume(self, state: dict[str, Any]) -> None:
         """Continue from a `state`; the model is that of the same moment."""
         self.count, self.monitor = int(state["count"]), self.monitor.continued(state["monitor"])
-        room = self.model.room if isinstance(self.model, FieldModel) else None
-        if room is not None and state.get("obstacles") is not None:
-            rate = self.monitor.config.false_alarm_rate
-            self.obstacles = ObstacleMonitor(room, None, rate).continued(state["obstacles"])
         if (known := state.get("room")) is not None:
             centre = torch.tensor(known["centre"], dtype=torch.float64)
             self.room = Monitor(centre, (), None, self.monitor.config).continued(known)
+
+
+def unexplained(room: GeometryModel, spectra: Spectra) -> Tensor:
+    """Return the missing coherence of the phases of each spectrum and of the paths of a room, float64 (n,)."""
+    channel, _ = retrieve_phases(correlations(spectra), room.array, room.config.seed)
+    scene = PhaseObservations.of(
+        spectra.position, room.fixed_position, room.moving, room.array, room.rotation, channel.to(torch.complex64)
+    )
+    wave, gain = paths(room, scene)
+    missing = 1 - scene.coherence(torch.einsum("s,nsk->nk", gain.to(wave.dtype), wave)[None])[0]
+    return (missing + MIN_MISSING).double()
 
 
 def joined(parts: list[Spectra]) -> Spectra:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -43,8 +43,13 @@ class Experiment:
         return self.config.seed + subset.repeat
 
     def withhold(self, subset: MeasuredSubset) -> tuple[Spectra, SyntheticPositions]:
-        """Return the measured spectra, and the positions of the others."""
-        return withhold(self.train, subset.measured_fraction, self.seed(subset))
+        """Return the measured spectra without their snapshots, and the positions of the others."""
+        measured, withheld = withhold(self.train, subset.measured_fraction, self.seed(subset))
+        return replace(measured, channel=None), withheld  # snapshots train nothing, and every subset would copy them
+
+    def with_snapshots(self, measured: Spectra) -> Spectra:
+        """Return measured spectra with their snapshots, if the data contain them."""
+        return self.train.subset((self.train.index == measured.index[:, None]).nonzero()[:, 1])
 
     def make_model(self, name: str, subset: MeasuredSubset, preset: Preset = "quick") -> FieldModel:
         """Return a field model that is not fitted."""

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from augment import Fold, Mixed, synthetic_positions
 from augment.choose import BLIND_FOLDS
-from swiftwrf import FitError, InputError
+from swiftwrf import FitError, InputError, Spectra
 from swiftwrf.gp import subsample
 from swiftwrf.locate import MatchedField, MatchedFieldConfig
 from swiftwrf.metrics import angle_errors
@@ -31,7 +31,6 @@ from tasks.metrics import CrossValidationMetrics, EstimatorChoiceMetrics
 from tasks.summarise import paired_change
 
 N_SYNTHETIC_CANDIDATES = (300, 1000, 3000)
-N_SYNTHETIC_COMPARED = 1000  # number of positions at which predicted means and samples are compared
 MAX_LOCATED = 60  # held-out spectra of a fold that are located
 FOLD_LOCATOR = MatchedFieldConfig(n_calibration=40, max_cells=100_000, spacing=0.2)  # half the time of the defaults
 Errors = NDArray[np.float64]
@@ -59,53 +58,54 @@ def cross_validate(folds: Sequence[Fold], n_synthetic: int, seed: int) -> CrossV
     Args:
         folds: Field model fitted without each fold in turn, at least two folds.
         n_synthetic: Number of synthetic positions that the run adds. Larger numbers are not compared.
-        seed: Seed of positions, samples and stand-in.
+        seed: Seed of positions and stand-in.
     """
     numbers = sorted({*(n for n in N_SYNTHETIC_CANDIDATES if n < n_synthetic), *([n_synthetic] if n_synthetic else [])})
-    compared = min(N_SYNTHETIC_COMPARED, n_synthetic)
     every = range(len(folds))
 
     @cache
-    def fold_errors(number: int, sampled: bool) -> list[Errors]:
-        return parallel_map(lambda fold: _errors(fold, number, sampled, seed), folds)
+    def fold_errors(number: int) -> list[Errors]:
+        return parallel_map(lambda fold: _errors(fold, number, seed), folds)
 
-    def errors(some: Iterable[int], number: int, sampled: bool = False) -> Errors:
-        return np.concatenate([fold_errors(number, sampled)[fold] for fold in some])
+    def errors(some: Iterable[int], number: int) -> Errors:
+        return np.concatenate([fold_errors(number)[fold] for fold in some])
 
-    def chosen(some: Sequence[int]) -> tuple[int, bool]:
-        """Choose the number of positions, and whether to sample, by the errors of some folds."""
-        means = errors(some, compared)
-        # samples must be significantly better than means
-        sampled = folds[0].model.samples and paired_change(means, errors(some, compared, True))["high"] < 0
-        return min(numbers, key=lambda number: float(np.median(errors(some, number, sampled)))), sampled
+    def best(some: Sequence[int]) -> int:
+        """Return the number of positions with the least error on some folds."""
+        return min(numbers, key=lambda number: float(np.median(errors(some, number))))
 
-    alone = fold_errors(0, False)
+    alone = fold_errors(0)
     measured_only = np.concatenate(alone)
     validation: CrossValidationMetrics = {
         "stand_in": STAND_IN,
         "n_held_out": len(measured_only),
         "measured_only_deg": float(np.median(measured_only)),
-        "gains": [],
+        "gains": [{"n_synthetic": number, **paired_change(measured_only, errors(every, number))} for number in numbers],
         "rule": None,
-        "sampled": False,
         "recommended_n_synthetic": 0,
         "helps": False,
     }
     if not numbers:
         return CrossValidation(validation, alone, [])
-    best, sampled = chosen(every)
-    for with_samples in (False, True) if folds[0].model.samples else (False,):
-        for number in numbers if with_samples == sampled else [compared]:
-            change = paired_change(measured_only, errors(every, number, with_samples))
-            validation["gains"].append({"n_synthetic": number, "sampled": with_samples, **change})
-    by_rule = [fold_errors(*chosen([other for other in every if other != fold]))[fold] for fold in every]
+    by_rule = [fold_errors(best([other for other in every if other != fold]))[fold] for fold in every]
     rule = validation["rule"] = paired_change(measured_only, np.concatenate(by_rule))
-    validation["sampled"] = sampled
     # a gain at one number of positions alone is likely chance, because few spectra are held out
-    if all(gain["change"] < 0 for gain in validation["gains"] if gain["sampled"] == sampled):
-        validation["recommended_n_synthetic"] = best
+    if all(gain["change"] < 0 for gain in validation["gains"]):
+        validation["recommended_n_synthetic"] = best(every)
         validation["helps"] = rule["high"] < 0
     return CrossValidation(validation, alone, by_rule)
+
+
+def measured_errors(fold: Fold, estimator: str, test: Spectra, seed: int) -> Errors:
+    """Return the angular errors [deg] of an estimator, trained on the measured spectra of a fold, on its test spectra.
+
+    Args:
+        fold: Training spectra.
+        estimator: Name of the estimator.
+        test: Held-out spectra of the fold, with their snapshots if they have any.
+        seed: Seed of the estimator.
+    """
+    return _degrees(make_estimator(estimator, seed=seed).fit(Mixed.measured(fold.train)).estimate(test), test.label)
 
 
 def located_folds(folds: Sequence[Fold]) -> dict[int, Fold]:
@@ -134,7 +134,7 @@ def located_errors(fold: Fold, seed: int) -> Errors | None:
 def choose_estimator(
     errors: Mapping[str, Sequence[Errors]], located: Mapping[int, Errors | None]
 ) -> EstimatorChoiceMetrics:
-    """Return the estimator with the smallest median error on held-out measured spectra.
+    """Return the estimator with the smallest median error on held-out measured spectra, `better` left empty.
 
     Matched-field processing is compared on few folds, because its fits take seconds. It is a candidate only if planes were
     found without the spectra of each of these folds. All estimators are then compared on the spectra that it located.
@@ -153,7 +153,7 @@ def choose_estimator(
         compared[LOCATOR] = np.concatenate(list(found.values()))
     held_out = {name: float(np.median(values)) for name, values in compared.items()}
     best = min(held_out, key=lambda name: held_out[name])
-    return {"name": best, "held_out_deg": held_out, "n_held_out": len(compared[best])}
+    return {"name": best, "held_out_deg": held_out, "n_held_out": len(compared[best]), "better": {}}
 
 
 def _located_rows(n: int) -> Tensor:
@@ -161,16 +161,13 @@ def _located_rows(n: int) -> Tensor:
     return subsample(torch.arange(n), rows=MAX_LOCATED)[0]
 
 
-def _errors(fold: Fold, n_synthetic: int, sampled: bool, seed: int) -> Errors:
+def _errors(fold: Fold, n_synthetic: int, seed: int) -> Errors:
     """Return the angular errors [deg] of the stand-in on held-out spectra, trained with synthetic spectra."""
     train = Mixed.measured(fold.train)
     if n_synthetic:
         positions = synthetic_positions(fold.train, n_synthetic, seed)
         with _PREDICTING:
-            if sampled:
-                spectra = fold.model.sample(positions.position, generator=torch.Generator().manual_seed(seed))
-            else:
-                spectra = fold.model.synthesize(positions.position)
+            spectra = fold.model.synthesize(positions.position)
         train = train.add(positions, spectra.cpu())
     stand_in = make_estimator(STAND_IN, seed=seed).fit(train)
     return _degrees(stand_in.predict(fold.test.spectrum), fold.test.label)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 from augment import withhold
@@ -47,7 +46,6 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         raise InputError(f"split {config.split!r} of {data.name} has no test spectra")
     for fraction in config.mix:
         withhold(train, fraction, config.seed)  # refuses before anything is written
-    train = replace(train, channel=None)  # snapshots train nothing, and every training set would copy them
     experiment = Experiment(config, train, test, n_synthetic(data, config), device)
     subsets = [MeasuredSubset(fraction, repeat) for repeat in range(config.repeats) for fraction in config.mix]
     steps: list[Step[Experiment]] = [step for subset in subsets for step in first_steps(experiment, subset)]

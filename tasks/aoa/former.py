@@ -13,7 +13,7 @@ from pandas import DataFrame
 
 FORMER_NAMES = {"kernel_ridge": "kernel_regression", "aann": "aann_kernel"}
 FORMER_KEYS = {"advice": "cross_validation", "recommended_extra": "recommended_n_synthetic"}
-FORMER_GAIN_KEYS = {"extra": "n_synthetic"}  # of a gain, which is `sampled` or not; the options keep `extra`
+FORMER_GAIN_KEYS = {"extra": "n_synthetic"}  # of a gain, which was `sampled` or not; the options keep `extra`
 (_KERNEL, _PRESENT_KERNEL), (_NETWORK, _PRESENT_NETWORK) = FORMER_NAMES.items()
 
 
@@ -25,8 +25,9 @@ def with_present_names(values: Any) -> Any:
         {'kernel_regression_turbo_gp': 1, 'turbo_gp': {'estimator': 'aann_kernel'}}
         >>> with_present_names({"turbo_gp": {"estimator": "aann"}})
         {'turbo_gp': {'estimator': 'aann'}}
-        >>> with_present_names({"advice": {"gp": {"gains": [{"extra": 300, "sampled": True}]}}})
-        {'cross_validation': {'gp': {'gains': [{'n_synthetic': 300, 'sampled': True}]}}}
+        >>> gains = [{"extra": 300, "sampled": False}, {"extra": 300, "sampled": True}]
+        >>> with_present_names({"advice": {"gp": {"gains": gains}}})
+        {'cross_validation': {'gp': {'gains': [{'n_synthetic': 300, 'sampled': False}]}}}
     """
     text = json.dumps(values)
     if _KERNEL in text:
@@ -35,6 +36,8 @@ def with_present_names(values: Any) -> Any:
 
 
 def _with_present_keys(values: dict[str, Any]) -> dict[str, Any]:
+    if "gains" in values:
+        values["gains"] = [gain for gain in values["gains"] if not gain.get("sampled")]
     keys = FORMER_KEYS | FORMER_GAIN_KEYS if "sampled" in values else FORMER_KEYS
     return {keys.get(key, key): value for key, value in values.items()}
 

@@ -172,16 +172,14 @@ class Results:
             self.left_out[condition] = reason
 
     def _add_synthesis(self, step: Synthesis, value: Row) -> None:
-        for part, scores in value["scores"].items():
-            name = step.synthesizer if part == "test" else f"{step.synthesizer} sample"
-            key = step.subset.columns | {"synthesizer": name}
-            columns = {score: torch.tensor(values) for score, values in scores.items()}
-            self.synthesis += _rows(key, {"index": self.test.index} | columns)
-            self.synthesis_seconds.append(key | value["seconds"] | {"trains": step.trains and part == "test"})
-        self.history += [step.subset.columns | {"synthesizer": step.synthesizer} | row for row in value["history"]]
+        key = step.subset.columns | {"synthesizer": step.synthesizer}
+        columns = {score: torch.tensor(values) for score, values in value["scores"].items()}
+        self.synthesis += _rows(key, {"index": self.test.index} | columns)
+        self.synthesis_seconds.append(key | value["seconds"] | {"trains": step.trains})
+        self.history += [key | row for row in value["history"]]
         if step.subset.repeat == 0 and step.trains and step.subset.key not in self._examples:
             self._examples.add(step.subset.key)
-            self._write_examples(step, torch.tensor(value["scores"]["test"]["psnr_db"]))
+            self._write_examples(step, torch.tensor(value["scores"]["psnr_db"]))
 
     def _add_suggestion(self, step: Suggestion, value: Row) -> None:
         name = f"suggested-mix{step.subset.key}"
@@ -251,7 +249,28 @@ class Results:
         located = self.located_folds.get(key, {})
         if not any(c.estimator == LOCATOR and c.measured_fraction == fraction for c, _ in self.pooled):
             located = {}  # its fit to all measured spectra was refused
-        return choose_estimator(errors, {n: None if own is None else np.array(own) for n, own in located.items()})
+        choice = choose_estimator(errors, {n: None if own is None else np.array(own) for n, own in located.items()})
+        return {**choice, "better": self._better(fraction, choice)}
+
+    def _better(self, fraction: float, choice: EstimatorChoiceMetrics) -> dict[str, str]:
+        """Return the methods that are significantly better than the chosen one on the test spectra, and why not chosen."""
+        errors = DataFrame([row for row in self.errors() if row["measured_fraction"] == fraction])
+        error = {method: by_repeat(part, "great_circle_deg") for method, part in errors.groupby("method")}
+        reasons = {}
+        for condition, _ in self.pooled:
+            if condition.measured_fraction != fraction or condition.training == "all":
+                continue
+            if condition.method in choice["held_out_deg"]:
+                reason = "its error on held-out measured spectra is larger"
+            elif condition.is_network:
+                reason = f"{STAND_IN} stands in for the network, whose training takes too long for cross-validation"
+            elif condition.estimator == LOCATOR:
+                reason = "no planes were found without the held-out spectra"
+            else:
+                reason = f"synthetic spectra are compared by {STAND_IN} and the first field model alone"
+            reasons[condition.method] = reason
+        better = [name for name in reasons if paired_change(error[choice["name"]], error[name])["high"] < 0]
+        return {name: reasons[name] for name in sorted(better, key=lambda name: float(np.median(error[name])))}
 
     def _pooled_name(self, method: str, fraction: float) -> str:
         """Return the name under which `pooled` has a method of the stand-in in the first repeat."""

@@ -8,12 +8,21 @@ from pathlib import Path
 
 import torch
 
-from augment import Fold, choose_model
-from swiftwrf import GeometryModel, InputError, load
+from augment import Fold, ModelChoice, choose_model
+from swiftwrf import GeometryModel, InputError, Spectra, load
 from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.condition import EVERYTHING, STAND_IN, Condition, MeasuredSubset, Training, estimators, trainable
+from tasks.aoa.condition import (
+    EVERYTHING,
+    NETWORKS,
+    STAND_IN,
+    Condition,
+    MeasuredSubset,
+    Training,
+    estimators,
+    trainable,
+)
 from tasks.aoa.context import ROOM_MODEL, Experiment
-from tasks.aoa.cross_validation import cross_validate, located_errors, located_folds
+from tasks.aoa.cross_validation import cross_validate, located_errors, located_folds, measured_errors
 from tasks.aoa.evaluation import Evaluation
 from tasks.aoa.options import AUTO
 from tasks.aoa.synthesis import RoomSearch, syntheses
@@ -85,7 +94,14 @@ class CrossValidation(Step[Experiment]):
         turbo = self._turbo(experiment, trained[0], first.metrics)
         errors = {Condition(STAND_IN, "measured").method: first.measured_only}
         errors |= {turbo.method: first.turbo} if first.turbo else {}
-        with_room = next((found for found in choice.folds.values() if found[0].model.room is not None), [])
+        folds = choice.folds[trained[0]]
+        tests = [experiment.with_snapshots(fold.test) for fold in folds]
+        for name in estimators(experiment.config.preset):
+            if name not in (*NETWORKS.values(), STAND_IN, *experiment.lacking):
+                errors[name] = [
+                    measured_errors(fold, name, test, seed) for fold, test in zip(folds, tests, strict=True)
+                ]
+        with_room = self._with_room(experiment, measured, choice)
         return {
             "choice": {
                 "name": choice.name,
@@ -97,6 +113,17 @@ class CrossValidation(Step[Experiment]):
             "errors": errors,
             "folds": {number: self._keep(fold, number, folder) for number, fold in located_folds(with_room).items()},
         }
+
+    def _with_room(self, experiment: Experiment, measured: Spectra, choice: ModelChoice) -> list[Fold]:
+        """Return the folds of a field model with a room, whether such a model was asked for or not; empty without one."""
+        folds = next((found for found in choice.folds.values() if found[0].model.room is not None), [])
+        if folds or not self.compared or ROOM_MODEL not in experiment.candidates:
+            return folds
+        try:
+            seed = experiment.seed(self.subset)
+            return choose_model(measured, (ROOM_MODEL,), seed=seed, device=experiment.device).folds[ROOM_MODEL]
+        except InputError:
+            return []
 
     def _keep(self, fold: Fold, number: int, folder: Path) -> Row:
         """Keep the room of a fold. Return its file, and the numbers of the spectra in the data set."""

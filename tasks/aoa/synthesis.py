@@ -29,7 +29,6 @@ from tasks.steps import Step
 
 KIND = "synthetic spectra"
 SCORE = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
-SCORED = ("test", "test_sample")  # parts of the synthetic spectra
 BATCH_POSITIONS = 4096  # spectra predicted before they are rounded: half a gigabyte of 90 x 360 pixels
 
 
@@ -43,9 +42,8 @@ def syntheses(
     direct: list[Step[Experiment]] = []
     with_room: list[Synthesis] = []
     for name in dict.fromkeys((*names, *experiment.candidates)):
-        trains, own = name in names, validation.get(name)
-        n_synthetic = experiment.n_extra(own) if trains else 0
-        synthesis = Synthesis(subset, name, trains, n_synthetic, bool(own and own["sampled"]))
+        trains = name in names
+        synthesis = Synthesis(subset, name, trains, experiment.n_extra(validation.get(name)) if trains else 0)
         (with_room if experiment.finds_room(name) else direct).append(synthesis)
     search: list[Step[Experiment]] = []
     if with_room:
@@ -127,7 +125,6 @@ class Synthesis(Step[Experiment]):
         synthesizer: Name of the field model.
         trains: Whether its spectra train estimators. Otherwise it predicts at the test positions alone, for comparison.
         n_synthetic: Number of extra synthetic positions.
-        sampled: Train with samples in place of means.
         room: Search for the room that the model reuses, if any.
         room_seconds: Time of that search [s], which counts as part of the fit.
     """
@@ -136,7 +133,6 @@ class Synthesis(Step[Experiment]):
     synthesizer: str
     trains: bool
     n_synthetic: int
-    sampled: bool
     room: RoomSearch | None = None
     room_seconds: float = 0.0
 
@@ -158,7 +154,7 @@ class Synthesis(Step[Experiment]):
         return (self.room.file,) if self.room else ()
 
     def test_spectra(self, folder: Path) -> dict[str, Store]:
-        """Return the spectra at the test positions: `test`, and `test_std` and `test_sample` if the model has them."""
+        """Return the spectra at the test positions: `test`, and `test_std` if the model has it."""
         tensors = read(folder / self.file, KIND)[1]
         return {name: Store(tensor) for name, tensor in tensors.items() if name.startswith("test")}
 
@@ -181,10 +177,6 @@ class Synthesis(Step[Experiment]):
         history = _FitHistory()
         model = self._fitted(experiment, measured, history, folder)
         fitted = time.perf_counter()
-        generator = torch.Generator().manual_seed(experiment.seed(self.subset))
-
-        def sample(position: Tensor) -> Tensor:
-            return model.sample(position, generator=generator)
 
         def std(position: Tensor) -> Tensor:
             return cast(Tensor, model.predict(position).std)
@@ -194,14 +186,11 @@ class Synthesis(Step[Experiment]):
         tested = time.perf_counter()
         if model.predict(test[:1]).std is not None:
             tensors["test_std"] = _as_bytes_at(test, std)
-        if model.samples:
-            tensors["test_sample"] = _as_bytes_at(test, sample)
         parts = {"withheld": withheld} if self.trains else {}
         if self.n_synthetic:
             parts["extra"] = synthetic_positions(measured, self.n_synthetic, experiment.seed(self.subset))
         for part, positions in parts.items():
-            predict = sample if self.sampled and model.samples else model.synthesize
-            tensors[part] = _as_bytes_at(positions.position, predict)
+            tensors[part] = _as_bytes_at(positions.position, model.synthesize)
             tensors |= {f"{part}_{name}": tensor for name, tensor in vars(positions).items()}
         seconds = {
             "fit": fitted - history.began + history.earlier + self.room_seconds,
@@ -209,7 +198,7 @@ class Synthesis(Step[Experiment]):
             "draw": time.perf_counter() - fitted,
         }
         write(folder / self.file, KIND, tensors, {})
-        scores = {part: _scores(tensors[part], experiment.test) for part in SCORED if part in tensors}
+        scores = _scores(tensors["test"], experiment.test)
         if self.trains and self.subset.repeat == 0:
             save_artifacts(model, self.subset.key, measured, experiment.test, folder)
         return {"history": history.records, "seconds": seconds, "scores": scores}

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
-from matplotlib.patches import Rectangle
 from pandas import DataFrame
 
 from swiftwrf.positions import nearest
@@ -65,7 +62,7 @@ def error_plot(record: Record) -> Plot:
 
 
 def map_plot(record: Record) -> Plot:
-    """Return the positions from above with their innovations, and boxes that stand, appeared or left."""
+    """Return the positions from above with their innovations."""
     figure, axes = figures.panel(6.8, 5)
     position = record.column("x_m", "y_m", "z_m")
     _, near = nearest(position, position, min(N_NEIGHBOURS, len(position)))
@@ -73,13 +70,6 @@ def map_plot(record: Record) -> Plot:
     drawn = axes.scatter(position[:, 0], position[:, 1], s=10, c=surprise, cmap="viridis", vmin=0)
     figures.colour_bar(axes, drawn, f"mean innovation of the {N_NEIGHBOURS} nearest measurements")
     caption = "Positions from above, coloured by their innovations."
-    if record.boxes:
-        caption += " Grey: obstacles that the training spectra show. Red: where an obstacle can have appeared or left."
-    for kind, colour in (("standing", figures.RULE), ("obstacles", RED)):
-        for box in record.boxes.get(kind, []):
-            (x0, y0, _), (x1, y1, _) = box["low_m"], box["high_m"]
-            axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=colour))
-    axes.autoscale_view()
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     table = DataFrame(position.numpy(), columns=["x_m", "y_m", "z_m"]).assign(innovation=surprise.numpy())
     return Plot("changes", [figure], caption, table)

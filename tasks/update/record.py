@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf import InputError
-from swiftwrf.online import ObstacleMonitor, Step
+from swiftwrf.online import Step
 from swiftwrf.runtime.durable import write_text
 from tasks.records import Row, as_table, read_json, write_json
 
@@ -35,7 +34,6 @@ WORDS = ("alarm", "notice")  # columns of text
 TYPES = dict.fromkeys(COLUMNS, float) | {"index": int} | dict.fromkeys(WORDS, str)
 MEANS = ("error", "covered")  # columns whose means are kept
 WINDOW = 30  # measurements of the running error
-BOXES = ("obstacles", "standing")  # that can have appeared or left; that the training spectra show
 
 
 @dataclass(eq=False)
@@ -46,13 +44,11 @@ class Record:
         source: Where the measurements come from.
         unit: Unit of the errors, in brackets.
         rows: A row of `measurements.csv` for each measurement.
-        boxes: Corners of boxes by their kind, as `boxes_of` returns them.
     """
 
     source: str
     unit: str
     rows: list[Row] = field(default_factory=list)
-    boxes: dict[str, list[Row]] = field(default_factory=dict)
     alarms: list[tuple[int, str]] = field(default_factory=list, init=False)
     """number of the measurement that raised each alarm, and the change in words"""
     notices: list[tuple[int, str]] = field(default_factory=list, init=False)
@@ -84,11 +80,10 @@ class Record:
             InputError: There is no record, or it is damaged.
         """
         known, rows = read_json(folder / SUMMARY), _rows(folder / TABLE)
-        boxes = {kind: known[kind] for kind in BOXES if kind in known}
-        return cls(str(known.get("source")), str(known.get("unit", "")), rows, boxes)
+        return cls(str(known.get("source")), str(known.get("unit", "")), rows)
 
-    def add(self, index: int, step: Step, obstacles: ObstacleMonitor | None = None) -> Row:
-        """Add a measurement, and replace the boxes by those of a test for obstacles; return the row."""
+    def add(self, index: int, step: Step) -> Row:
+        """Add a measurement and return its row."""
         scores = step.scores
         recent = [row["error"] for row in self.rows[-WINDOW + 1 :]] + [float(scores.error[0])]
         row = {
@@ -104,8 +99,6 @@ class Record:
         }
         self._count(len(self.rows), row)
         self.rows.append(row)
-        if obstacles is not None:
-            self.boxes.update(boxes_of(obstacles))
         return row
 
     def column(self, *names: str) -> Tensor:
@@ -129,7 +122,6 @@ class Record:
             "coverage": self.mean("covered"),
             "alarms": changes,
             "notices": [{"measurement": number, "what": text} for number, text in self.notices],
-            **self.boxes,
         }
 
     def sentences(self) -> list[str]:
@@ -141,9 +133,6 @@ class Record:
         ]
         text += [f"change at measurement {number}: {what}" for number, what in self.alarms] or ["no change detected"]
         text += [what for _, what in self.notices]
-        if self.boxes.get("obstacles"):
-            n = len(self.boxes["obstacles"])
-            text.append(f"an obstacle appeared or left: {n} candidate positions, see the map")
         return text
 
     def write(self, folder: Path) -> None:
@@ -162,24 +151,6 @@ class Record:
         write_json(folder / SUMMARY, self.summary())
 
 
-def boxes_of(obstacles: ObstacleMonitor) -> dict[str, list[Row]]:
-    """Return the boxes of a record: corners, cumulative evidence, and whether an obstacle left."""
-    boxes, n, region = obstacles.boxes, len(obstacles.candidates), obstacles.region()
-
-    def rows(chosen: Sequence[int]) -> list[Row]:
-        return [
-            {
-                "low_m": boxes.low[i].tolist(),
-                "high_m": boxes.high[i].tolist(),
-                "evidence_nats": float(obstacles.value[i]),
-                "left": i >= n,
-            }
-            for i in chosen
-        ]
-
-    return dict(zip(BOXES, (rows(region.nonzero()[:, 0].tolist()), rows(range(n, len(boxes)))), strict=True))
-
-
 def resumed(folder: Path, count: int) -> Record | None:
     """Return the first rows of the record in a directory, which loses the others. None without a record.
 
@@ -190,7 +161,7 @@ def resumed(folder: Path, count: int) -> Record | None:
     if not (folder / SUMMARY).exists():
         return None
     record = Record.read(folder)
-    kept = Record(record.source, record.unit, record.rows[:count], record.boxes)
+    kept = Record(record.source, record.unit, record.rows[:count])
     kept.write(folder)
     return kept
 

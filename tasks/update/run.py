@@ -51,7 +51,7 @@ def run(config: UpdateConfig) -> None:
         follower = Follower(model, train, MonitorConfig(false_alarm_rate=config.false_alarm_rate))
         record = Record(config.source, _unit(model))
         for i, index in enumerate(new.index.tolist()):
-            record.add(index, follower.step(new.subset(torch.tensor([i]))), follower.obstacles)
+            record.add(index, follower.step(new.subset(torch.tensor([i]))))
         _save(follower, folder / MODEL)
         record.write(folder)
         _write_config(config, folder)
@@ -86,7 +86,7 @@ def follow(config: UpdateConfig) -> None:
                 console.print(f"error: {error}", markup=False, soft_wrap=True)
                 continue
             print(answer(follower.count, new, before, step), flush=True)
-            record.append(folder, record.add(follower.count - 1, step, follower.obstacles))
+            record.append(folder, record.add(follower.count - 1, step))
             _save(follower, file, line.end, line.sha256)
 
 

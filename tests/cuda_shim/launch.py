@@ -5,11 +5,11 @@ from types import SimpleNamespace
 from unittest import mock
 
 import torch
+from scenes import random_scene
 
 from swiftwrf import AngularGrid
 from swiftwrf.rasterize import cuda, cuda_kernels, operators, reference
 from swiftwrf.rasterize.magnitude import magnitude
-from swiftwrf.testing.scenes import random_scene
 
 
 def with_gradients(field, length, inputs):

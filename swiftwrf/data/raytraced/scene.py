@@ -14,6 +14,7 @@ from swiftwrf.data.raytraced.rooms import ROOMS
 from swiftwrf.data.raytraced.surfaces import Material, Surface
 from swiftwrf.errors import InputError
 
+MIN_LLVM = 19  # earlier ones abort the process when they compile a trace; tried: 15 and 16
 ISOTROPIC = {"num_rows": 1, "num_cols": 1, "pattern": "iso", "polarization": "V"}
 
 
@@ -21,20 +22,22 @@ def sionna() -> Any:
     """Return the module `sionna.rt`.
 
     Raises:
-        InputError: It is not installed, or finds neither a GPU nor LLVM.
+        InputError: It is not installed, or finds neither a GPU nor LLVM, or an LLVM whose compilation aborts Python.
     """
+    remedy = f"install it (apt-get install libllvm{MIN_LLVM}) and let DRJIT_LIBLLVM_PATH name its libLLVM.so"
     try:
         import drjit
+        import mitsuba
         import sionna.rt
     except ImportError as error:
         if "LLVM" in str(error):
-            raise InputError(
-                "Sionna RT finds no LLVM, which it needs without an NVIDIA GPU; install it (apt-get install libllvm19) and "
-                "let DRJIT_LIBLLVM_PATH name its libLLVM.so"
-            ) from None
+            raise InputError(f"Sionna RT finds no LLVM, which it needs without an NVIDIA GPU; {remedy}") from None
         raise InputError(
             "ray tracing needs Sionna RT; install it with pip install 'swiftwrf-tasks[raytrace]'"
         ) from None
+    version = drjit.detail.llvm_version()[0] if mitsuba.variant().startswith("llvm") else MIN_LLVM
+    if version < MIN_LLVM:
+        raise InputError(f"Sionna RT needs LLVM {MIN_LLVM} without an NVIDIA GPU, got LLVM {version}; {remedy}")
     drjit.set_thread_count(torch.get_num_threads())
     return sionna.rt
 

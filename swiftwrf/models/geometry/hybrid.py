@@ -40,7 +40,7 @@ class HybridModel(ProcessModel):
     """Geometry with position-dependent path gains, and a Gaussian process on the residual.
 
     An update adds to the residual, and components to it while there are fewer than 64. Room, path gains and mixing weight
-    stay as fitted. Only the geometric part of a sample is random.
+    stay as fitted.
 
     Example:
         >>> import swiftwrf
@@ -54,7 +54,6 @@ class HybridModel(ProcessModel):
     config_type = GeometryConfig
     requires = (ARRAY, FIXED_END)
     searches = True
-    samples = True
     batch = 256
 
     path_gains: PathGains | None
@@ -165,23 +164,17 @@ class HybridModel(ProcessModel):
         added = direction[:n][size[:n] > MIN_RESIDUAL * residual.norm()]
         self.process, self.component = self.process.widened(len(added)), torch.cat([self.component, added])
 
-    def _paths(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    def _paths(self, position: Tensor) -> Tensor:
         """Return the spectra (b, H, W) that the paths predict at a batch of positions (b, 3) [m]."""
-        if self.path_gains is None:
-            channel = self.room.channel(position, generator)
-        else:
-            channel = self.path_gains.channel(self.room, position, generator)
+        gains = self.path_gains
+        channel = self.room.channel(position) if gains is None else gains.channel(self.room, position)
         return self.room.array.spectrum(channel, self.grid)
 
-    def _total(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        spectrum = (self.component[0] + self.process.mean(position) @ self.component[1:]).reshape(-1, *self.grid.shape)
-        return spectrum + self.mixing_weight * self._paths(position, generator) if self.mixing_weight else spectrum
-
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
-        return self._total(position), self._std(position, grid) if with_std else None
-
-    def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
-        return self._total(position, generator)
+        mean = (self.component[0] + self.process.mean(position) @ self.component[1:]).reshape(-1, *self.grid.shape)
+        if self.mixing_weight:
+            mean = mean + self.mixing_weight * self._paths(position)
+        return mean, self._std(position, grid) if with_std else None
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         parts = [self.room._state(), self.process.state()]

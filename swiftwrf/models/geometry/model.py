@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any, Self
 
 import torch
@@ -23,18 +23,12 @@ from swiftwrf.models.geometry.fit import (
 )
 from swiftwrf.models.geometry.images import PhaseObservations, image_gain, images
 from swiftwrf.models.geometry.planes import Plane, PlaneSet, RoomEstimate
-from swiftwrf.models.geometry.sample import Residual, sample_field
 from swiftwrf.models.link import Link, Linked
 from swiftwrf.runtime.checkpoint import Header, expect
-
-MAX_DISTANCE_M = 1e7  # from the fixed end; beyond, rounding destroys the phases
 
 
 class GeometryModel(Linked, FieldModel):
     """Image sources of the fixed end in mirror planes that are estimated from the spectra.
-
-    A sample moves the planes within their standard deviations (once for every 256 positions), hides paths, and adds diffuse
-    paths as strong as the prediction error.
 
     Example:
         >>> import swiftwrf
@@ -49,7 +43,6 @@ class GeometryModel(Linked, FieldModel):
     config_type = GeometryConfig
     requires = (ARRAY, FIXED_END)
     searches = True
-    samples = True
     updates = True
     any_grid = True
     batch = 256
@@ -82,7 +75,7 @@ class GeometryModel(Linked, FieldModel):
             tensor([0, 1])
         """
         certain = torch.diag(torch.tensor([(plane.std_mm / 1000) ** 2 for plane in planes], dtype=torch.float64))
-        model, estimate = cls(), RoomEstimate(planes, order, 0.0, 0.0, "given planes", certain, Residual())
+        model, estimate = cls(), RoomEstimate(planes, order, 0.0, 0.0, "given planes", certain)
         model._check_described(link)
         model.grid, model.bounds, model.link = link.grid, bounding_box(link.position), Link.from_spectra(link)
         model.estimate, model.fingerprint = estimate, ""
@@ -177,16 +170,9 @@ class GeometryModel(Linked, FieldModel):
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         return self.array.spectrum(self.channel(position), grid), None
 
-    def _sample(self, position: Tensor, grid: AngularGrid, generator: torch.Generator) -> Tensor:
-        return self.array.spectrum(self.channel(position, generator), grid)
-
-    def channel(self, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Return the channel of each element at positions (n, 3) [m], complex64 (n, K); a sample with a generator."""
-        scene, room = self.scene(position), self.tensors()
-        if generator is None:
-            return room.field(scene)
-        covariance, residual = self.estimate.covariance, self.estimate.residual
-        return sample_field(scene, room.normal, room.offset, room.gain, room.sequence, covariance, residual, generator)
+    def channel(self, position: Tensor) -> Tensor:
+        """Return the channel of each element at positions (n, 3) [m], complex64 (n, K)."""
+        return self.tensors().field(self.scene(position))
 
     def scene(self, position: Tensor) -> PhaseObservations:
         """Return the link at positions (n, 3) [m], without observations."""
@@ -232,7 +218,6 @@ class GeometryModel(Linked, FieldModel):
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         header = self.to_json() | {
             "conclusion": self.conclusion,
-            "residual": asdict(self.estimate.residual),
             "fingerprint": self.fingerprint,
         }
         return {"covariance": self.estimate.covariance}, header
@@ -248,7 +233,6 @@ class GeometryModel(Linked, FieldModel):
             unexplained=float(header["unexplained"]),
             conclusion=str(header.get("conclusion", header.get("verdict"))),
             covariance=tensors["covariance"].double(),
-            residual=Residual(**header["residual"]),
         )
 
 

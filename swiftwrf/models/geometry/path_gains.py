@@ -109,21 +109,10 @@ class PathGains:
         process = GaussianProcess(self.process.kernel, self.process.known, coefficient, exact=True)
         return PathGains(process, self.n_paths, self.prior)
 
-    def channel(self, geometry: GeometryModel, position: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Return the channel of each element in each field at positions (n, 3) [m], complex64 (n, F, K), as of F snapshots.
-
-        With a generator, return one field at random, complex64 (n, 1, K), with gains sampled from the posterior.
-        """
-        change = self.change(position)
-        if generator is not None:
-            field = torch.randint(change.shape[1], (len(change),), generator=generator)
-            change = change[torch.arange(len(change)), field, None]
-            spread = self.process.variance(position).sqrt().float()[:, None, None, None]
-            spread = spread * torch.tensor(PRIORS[self.prior].std)
-            noise = spread * torch.randn(*change.shape, 2, generator=generator)
-            change = change + torch.view_as_complex(noise)
+    def channel(self, geometry: GeometryModel, position: Tensor) -> Tensor:
+        """Return the channel of each element in each of F fields at positions (n, 3) [m], complex64 (n, F, K)."""
         wave, gain = paths(geometry, geometry.scene(position))
-        return (gain + change) @ wave
+        return (gain + self.change(position)) @ wave
 
     def change(self, position: Tensor) -> Tensor:
         """Return the differences of the gains from those of the planes in each field, complex64 (n, F, S)."""

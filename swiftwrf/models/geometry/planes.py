@@ -15,7 +15,6 @@ from swiftwrf.errors import InputError
 from swiftwrf.models.geometry.images import PhaseObservations, Sequence, field, phase_period_m, sequences
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation
 from swiftwrf.models.geometry.refine import refine
-from swiftwrf.models.geometry.sample import Residual
 from swiftwrf.models.geometry.search import SIDES, CandidateRoom
 from swiftwrf.runtime.validation import NonNegativeFloat, check_value, configuration
 
@@ -70,7 +69,6 @@ class RoomEstimate:
         unexplained: Fraction of the power of the co-array coefficients of the training spectra that is not predicted.
         conclusion: Result in one sentence.
         covariance: Covariance of the offsets (P, P) [m^2].
-        residual: Statistics of the prediction error, for samples.
 
     Raises:
         InputError: More than 64 planes, or an order outside 0 to 4.
@@ -82,7 +80,6 @@ class RoomEstimate:
     unexplained: float
     conclusion: str
     covariance: Tensor
-    residual: Residual
 
     def __post_init__(self) -> None:
         check_value("order", self.order, Annotated[int, Ge(0), Le(MAX_ORDER)])

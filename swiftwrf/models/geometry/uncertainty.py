@@ -23,7 +23,6 @@ from swiftwrf.models.geometry.planes import (
     sign_alternatives,
 )
 from swiftwrf.models.geometry.refine import offset_covariance
-from swiftwrf.models.geometry.sample import Residual, residual_statistics
 from swiftwrf.runtime.threads import parallel_map
 
 MAX_STD_RAD = 0.5  # of phase, beyond which a plane is not certain
@@ -38,7 +37,7 @@ def assess(
     """Return the planes of a room with their standard deviations, and which of them are identifiable.
 
     Args:
-        train: Training spectra, for array and line of sight.
+        train: Training spectra, for the array.
         scene: Observed phases.
         room: Refined planes in world coordinates.
         score: Score at held-out positions.
@@ -49,12 +48,10 @@ def assess(
     unexplained = 1 - (1 - correlation_score(scene, room, train.array)) ** 2
     if not room.normal.shape[1]:
         nothing = torch.zeros(0, 0, dtype=torch.float64)
-        return RoomEstimate([], room.order, score, unexplained, "no plane explains the spectra", nothing, Residual())
+        return RoomEstimate([], room.order, score, unexplained, "no plane explains the spectra", nothing)
     covariance = offset_covariance(scene, room.normal, room.offset, room.gain, room.sequence)
     systematic = SYSTEMATIC_STD_WAVELENGTHS * train.array.wavelength * math.sqrt(max(unexplained, 0))
     covariance = covariance + systematic**2 * torch.eye(len(covariance), dtype=torch.float64)
-    direct = float(train.line_of_sight.double().mean())
-    residual = residual_statistics(scene, room.normal, room.offset, room.gain, room.sequence, direct)
     reason = _flat(scene) or _other_carrier(scene, room, certainty)
     std = covariance.diagonal().clamp_min(0).sqrt().tolist()
     alternatives = [
@@ -71,7 +68,7 @@ def assess(
         offset, gain = float(room.offset[0, i]), float(room.gain[0, i])
         planes.append(Plane((x, y, z), offset, gain, 1000 * max(std[i], away), not (lost[i] or all_lost)))
     conclusion = f"{len(planes)} planes, {sum(plane.certain for plane in planes)} of them certain{reason}"
-    return RoomEstimate(planes, room.order, score, unexplained, conclusion, covariance, residual)
+    return RoomEstimate(planes, room.order, score, unexplained, conclusion, covariance)
 
 
 def _nearest_alternative(

@@ -25,7 +25,7 @@ class SnapshotEstimator(Estimator):
     @staticmethod
     @abstractmethod
     def directions(array: PlanarArray, channel: Tensor) -> Tensor:
-        """Return unit vectors (n, 1, 3) from snapshots (n, S, K)."""
+        """Return unit vectors (n, 3) from snapshots (n, S, K)."""
 
     def _fit(self, train: Mixed, device: torch.device) -> None:
         """Learn nothing."""
@@ -40,7 +40,7 @@ class SnapshotEstimator(Estimator):
             raise InputError(f"{type(self).__name__} is not possible: {lacking}")
         assert data.array is not None
         assert data.channel is not None
-        return torch.stack(to_angles(self.directions(data.array, data.channel)[:, 0]), dim=-1)
+        return torch.stack(to_angles(self.directions(data.array, data.channel)), dim=-1)
 
     @classmethod
     def lacking(cls, data: Spectra) -> str:

@@ -65,7 +65,8 @@ def estimator_section(fraction: FractionRecords) -> Section | None:
         return None
     held_out = sorted(choice["held_out_deg"].items(), key=lambda item: item[1])
     rows = [[name, number(error), number(fraction.medians.get(name))] for name, error in held_out]
-    rows += [[name, "", number(fraction.medians[name])] for name in BASELINES if name in fraction.medians]
+    others = [name for name in BASELINES if name in fraction.medians and name not in choice["held_out_deg"]]
+    rows += [[name, "", number(fraction.medians[name])] for name in others]
     caption = (
         f"Median angular error over {choice['n_held_out']} held-out measured spectra, and over the test spectra, which "
         "take no part in the choice. Estimators without a held-out error are no candidates."
@@ -85,7 +86,7 @@ def choice_sentence(fraction: FractionRecords) -> str:
         f"{choice['n_held_out']} held-out spectra: {errors})."
     )
     if LOCATOR not in choice["held_out_deg"]:
-        text += f" {LOCATOR} is not a candidate: no compared field model found planes without the held-out spectra."
+        text += f" {LOCATOR} is not a candidate: no planes were found without the held-out spectra."
     return text
 
 

@@ -16,7 +16,6 @@ from tasks.aoa.page.records import FractionRecords
 from tasks.metrics import ChangeMetrics, CrossValidationMetrics, GainMetrics
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
-from tasks.page.palette import DASHES
 from tasks.page.provenance import number
 from tasks.records import read_json
 
@@ -42,7 +41,7 @@ def cross_validation_sentences(fraction: FractionRecords) -> list[str]:
         found = (
             f"Cross-validation inside the measured fraction ({validation['n_held_out']} spectra held out, "
             f"{validation['stand_in']} in place of the network): spectra "
-            f"{'sampled' if validation['sampled'] else 'predicted'} by {name} at synthetic positions change the "
+            f"predicted by {name} at synthetic positions change the "
             f"median error by {rule['change']:+.0%} [{rule['low']:+.0%}, {rule['high']:+.0%}], from "
             f"{validation['measured_only_deg']:.2f} to {rule['median_deg']:.2f} degrees, with their number {how}. "
             f"The best number is {best['n_synthetic']}."
@@ -62,8 +61,7 @@ def _advice(validation: CrossValidationMetrics) -> str:
 
 def _best_and_rule(validation: CrossValidationMetrics) -> tuple[GainMetrics, ChangeMetrics]:
     """Return the number with the lowest error, and the number chosen on other folds."""
-    gains = [gain for gain in validation["gains"] if gain["sampled"] == validation["sampled"]]
-    best = min(gains, key=lambda gain: gain["median_deg"])
+    best = min(validation["gains"], key=lambda gain: gain["median_deg"])
     return best, validation.get("rule") or best  # older runs have the best number alone
 
 
@@ -95,30 +93,20 @@ def choice_section(fraction: FractionRecords) -> Section | None:
 
 def _gain(fraction: FractionRecords, name: str, validation: CrossValidationMetrics) -> Plot:
     figure, ax = figures.panel(5.8, 3.2)
-    colour, ends = fraction.palette.colour(name), []
-    for sampled, dashes, label in ((False, DASHES[0], "predicted"), (True, DASHES[1], "sampled")):
-        gains = sorted(
-            (gain for gain in validation["gains"] if gain["sampled"] == sampled), key=lambda gain: gain["n_synthetic"]
-        )
-        if gains:
-            at = [0, *(gain["n_synthetic"] for gain in gains)]
-            change = [0, *(100 * gain["change"] for gain in gains)]
-            ends.append(at[-1])
-            ax.plot(at, change, linestyle=dashes, marker="o", markersize=4, color=colour, label=label)
-            ax.fill_between(at, *_band(gains), color=colour, alpha=0.15, linewidth=0)
+    colour = fraction.palette.colour(name)
+    gains = sorted(validation["gains"], key=lambda gain: gain["n_synthetic"])
+    at = [0, *(gain["n_synthetic"] for gain in gains)]
+    change, low, high = ([0, *(100 * gain[end] for gain in gains)] for end in ("change", "low", "high"))
+    ax.plot(at, change, marker="o", markersize=4, color=colour)
+    ax.fill_between(at, low, high, color=colour, alpha=0.15, linewidth=0)
     ax.axhline(0, color=figures.RULE, linewidth=1)
-    ax.set_xlim(0, 1.02 * max(ends))
+    ax.set_xlim(0, 1.02 * at[-1])
     ax.set(xlabel="extra positions with synthetic spectra", ylabel="change of the median error [%]")
-    figures.end_labels(ax)
     caption = (
         f"Held-out measured spectra, {validation['stand_in']} trained on the other measured spectra and on spectra by "
         f"{name}. Bands: 95 % bootstrap intervals of the change. Turbo learning helps below zero."
     )
     return Plot(f"gain-{name}-{fraction.file_name}", [figure], caption, DataFrame(validation["gains"]))
-
-
-def _band(gains: list[GainMetrics]) -> tuple[list[float], list[float]]:
-    return [0, *(100 * gain["low"] for gain in gains)], [0, *(100 * gain["high"] for gain in gains)]
 
 
 def room_section(fraction: FractionRecords) -> Section | None:

@@ -64,6 +64,8 @@ def conclusion(fraction: FractionRecords) -> str:
     sentences, medians = [], fraction.medians
     if choice := fraction.mix.get("estimator_choice"):
         sentences.append(f"Take {choice['name']}: median error {medians[choice['name']]:.2f} degrees.")
+        for name, reason in list(choice.get("better", {}).items())[:1]:  # runs of earlier versions do not have it
+            sentences.append(f"{name} has {medians[name]:.2f} degrees, but is not recommended: {reason}.")
     turbo = turbo_method(fraction)
     best = reference(fraction)
     if change := changes_of(fraction, turbo).get(best):
@@ -123,6 +125,8 @@ def next_steps(fraction: FractionRecords) -> list[str]:
             f"Take {taken} on this data: cross-validation chose it, without the test spectra. Estimate directions of new "
             f"spectra: `{command('estimate', f'{path}/{taken}-mix{key}.safetensors', 'SOURCE')}`."
         )
+    elif choice:
+        steps.append(f"{choice['name']} needs no file: `tasks.aoa.estimators.make_estimator('{choice['name']}')`.")
     others = sorted(estimators - {taken})
     if others:
         kept = f"`{command('estimate', f'{path}/{others[0]}-mix{key}.safetensors', 'SOURCE')}`"

@@ -14,7 +14,7 @@ from augment import Mixed
 from swiftwrf import InputError, load_spectra
 from swiftwrf.array.angles import angular_distance
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.array.subspace import count_sources, esprit, maximum_likelihood, music
+from swiftwrf.array.subspace import esprit, maximum_likelihood, music
 from swiftwrf.metrics import angle_errors
 from tasks.aoa.condition import MeasuredSubset
 from tasks.aoa.context import Experiment
@@ -33,7 +33,7 @@ def unit(*cosine: float) -> torch.Tensor:
     return torch.tensor([*cosine, math.sqrt(1 - sum(c * c for c in cosine))], dtype=torch.float64)
 
 
-def received(array, direction, n=1, snapshots=20, noise=0.3, coherent=False, seed=0):
+def received(array, direction, n=1, snapshots=20, noise=0.3, seed=0):
     """Channels (n, S, K) of Gaussian sources of unit power from directions (q, 3), and the sources (n, S, q)."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -41,8 +41,6 @@ def received(array, direction, n=1, snapshots=20, noise=0.3, coherent=False, see
         return torch.randn(shape, dtype=torch.complex128, generator=generator)
 
     source = gaussian(n, snapshots, len(direction))
-    if coherent:
-        source = source[..., :1] * torch.polar(torch.ones(2), torch.tensor([0.0, 1.0])).to(source)
     steering = torch.exp(1j * array.phase(direction))
     return source @ steering + noise * gaussian(n, snapshots, len(array.element)), source
 
@@ -62,19 +60,8 @@ def bound(array, direction, source, noise):
 def test_errors_of_one_source_reach_the_cramer_rao_bound(method, worst):
     direction = unit(0.35, -0.5)[None]
     channel, source = received(SQUARE, direction, n=500)
-    error = method(SQUARE, channel)[:, 0, :2] - direction[0, :2]
+    error = method(SQUARE, channel)[:, :2] - direction[0, :2]
     ratio = math.sqrt(float(error.square().sum(1).mean() / bound(SQUARE, direction, source, 0.3).trace()))
-    assert 0.92 < ratio < worst
-
-
-@pytest.mark.parametrize(("method", "worst"), [(music, 1.1), (maximum_likelihood, 1.1), (esprit, 1.2)])
-def test_errors_of_two_sources_are_near_the_cramer_rao_bound(method, worst):
-    direction = torch.stack([unit(0.35, -0.5), unit(0.0, 0.0)])
-    channel, source = received(SQUARE, direction, n=300, snapshots=40)
-    found = method(SQUARE, channel, sources=2)[..., :2]
-    nearest = torch.cdist(direction[None, :, :2], found).argmin(dim=2)
-    error = found.take_along_dim(nearest[..., None], dim=1) - direction[:, :2]
-    ratio = math.sqrt(float(error.square().sum((1, 2)).mean() / bound(SQUARE, direction, source, 0.3).trace()))
     assert 0.92 < ratio < worst
 
 
@@ -87,7 +74,7 @@ def test_directions_from_everywhere_and_of_a_linear_array(method):
         folded = array.folded(away)
         folded = folded[folded[:, 2] > 0.3]  # nearer to the plane or the axis both of its ends are alike
         channel = torch.exp(1j * array.phase(folded))[:, None]
-        torch.testing.assert_close(method(array, channel)[:, 0], folded, rtol=0, atol=1e-6)
+        torch.testing.assert_close(method(array, channel), folded, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -103,53 +90,13 @@ def test_the_two_ends_of_an_axis_are_distinguished(method):
         amplitude = torch.randn(len(direction), 40, 1, dtype=torch.complex128, generator=generator)
         channel = torch.exp(1j * array.phase(direction))[:, None] * amplitude
         channel = channel + 0.003 * torch.randn(channel.shape, dtype=torch.complex128, generator=generator)
-        assert angular_distance(method(array, channel)[:, 0], direction).max() < math.radians(5)
+        assert angular_distance(method(array, channel), direction).max() < math.radians(5)
 
 
-def test_the_strongest_source_comes_first_and_missing_ones_are_nan():
-    weak, strong = unit(0.5, 0.3), unit(-0.4, -0.2)
-    both = received(SQUARE, torch.stack([weak, strong]), n=1, snapshots=200, noise=0.1)[1]
-    steering = torch.exp(1j * SQUARE.phase(torch.stack([weak, strong])))
-    noise = (
-        received(SQUARE, weak[None], snapshots=200, noise=0.1)[0]
-        - received(SQUARE, weak[None], snapshots=200, noise=0.0)[0]
-    )
-    channel = torch.cat([both * torch.tensor([1.0, 3.0]) @ steering, both[..., :1] @ steering[:1]]) + noise
-    assert count_sources(channel).tolist() == [2, 1]
-    found = music(SQUARE, channel, sources="mdl")
-    assert angular_distance(found[0], torch.stack([strong, weak])).rad2deg().max() < 1
-    assert angular_distance(found[1, 0], weak).rad2deg() < 1
-    assert found[1, 1].isnan().all()
-
-
-def test_coherent_paths_need_forward_backward_averaging_or_maximum_likelihood():
-    direction = torch.stack([unit(0.3, -0.2), unit(-0.1, 0.1)])
-    channel, _ = received(SQUARE, direction, n=20, snapshots=30, noise=0.05, coherent=True)
-
-    def error(found):
-        """Largest distance of a source from the nearest direction found, median over the trials [deg]."""
-        apart = angular_distance(direction[None, :, None], found[:, None]).amin(dim=2).amax(dim=1)
-        return float(apart.median().rad2deg())
-
-    assert error(maximum_likelihood(SQUARE, channel, 2)) < 1
-    assert error(music(SQUARE, channel, 2, forward_backward=True)) < 1
-    assert error(esprit(SQUARE, channel, 2, forward_backward=True)) < 1
-    assert error(music(SQUARE, channel, 2)) > 3
-    assert count_sources(channel).tolist() == [1] * 20
-
-
-def test_what_cannot_be_separated_is_refused_with_one_sentence():
-    channel = torch.ones(1, 3, 16, dtype=torch.complex128)
-    with pytest.raises(InputError, match="separates 1 to 15 sources, got 16"):
-        music(SQUARE, channel, 16)
-    with pytest.raises(InputError, match="mdl needs more snapshots than elements, got 3 of 16"):
-        music(SQUARE, channel, "mdl")
+def test_esprit_refuses_an_array_of_wide_spacing():
     wide = PlanarArray.grid(2, 2, spacing=0.1, frequency_hz=2.4e9)
     with pytest.raises(InputError, match="at most half a wavelength, along two directions; use MUSIC"):
-        esprit(wide, channel[..., :4])
-    triangle = PlanarArray(torch.tensor([[0.0, 0.0], [0.06, 0.0], [0.0, 0.06]]).double(), 0.125)
-    with pytest.raises(InputError, match="point symmetry"):
-        music(triangle, channel[..., :3], forward_backward=True)
+        esprit(wide, torch.ones(1, 3, 4, dtype=torch.complex128))
 
 
 def test_music_agrees_with_pyroomacoustics():
@@ -166,7 +113,7 @@ def test_music_agrees_with_pyroomacoustics():
     reference.locate_sources(spectra, num_src=1, freq_bins=[8])
     (phi,), (theta,) = reference.azimuth_recon, reference.colatitude_recon
     theirs = torch.tensor([math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)])
-    assert float(angular_distance(music(SQUARE, channel)[0, 0], theirs.double()).rad2deg()) < 1.5  # their grid
+    assert float(angular_distance(music(SQUARE, channel)[0], theirs.double()).rad2deg()) < 1.5  # their grid
 
 
 def test_estimators_use_the_snapshots_of_measured_spectra(tmp_path):

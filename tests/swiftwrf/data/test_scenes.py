@@ -9,8 +9,9 @@ import cmath
 import json
 import math
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -308,12 +309,26 @@ def test_what_cannot_be_is_refused_without_sionna(tmp_path, capsys, monkeypatch,
     assert [file.name for file in tmp_path.iterdir()] == ["file.xml"]
 
 
+@pytest.mark.parametrize(
+    ("variant", "version", "refused"), [("llvm_ad", 15, True), ("cuda_ad", 15, False), ("llvm_ad", 19, False)]
+)
+def test_an_llvm_that_would_abort_the_process_is_refused(monkeypatch, variant, version, refused):
+    drjit = SimpleNamespace(detail=SimpleNamespace(llvm_version=lambda: (version, 0, 6)), set_thread_count=int)
+    monkeypatch.setitem(sys.modules, "drjit", drjit)
+    monkeypatch.setitem(sys.modules, "mitsuba", SimpleNamespace(variant=lambda: variant))
+    monkeypatch.setitem(sys.modules, "sionna", SimpleNamespace(rt="the module"))
+    monkeypatch.setitem(sys.modules, "sionna.rt", "the module")
+    with pytest.raises(InputError, match=r"got LLVM 15; .*libllvm19") if refused else nullcontext():
+        assert sionna() == "the module"
+
+
 def test_a_missing_llvm_is_named(tmp_path, monkeypatch):
     for name in [name for name in sys.modules if name.split(".")[0] == "sionna"]:
         monkeypatch.delitem(sys.modules, name)
     (tmp_path / "sionna.py").write_text("raise ImportError('the LLVM shared library could not be found')")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setitem(sys.modules, "drjit", ModuleType("drjit"))
+    for name in ("drjit", "mitsuba"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
     with pytest.raises(InputError, match=r"apt-get install libllvm19.*DRJIT_LIBLLVM_PATH"):
         sionna()
 

@@ -272,19 +272,6 @@ def test_models_of_many_spectra_come_back_from_their_files(name, exact, tmp_path
         torch.testing.assert_close(again.predict(position).std, model.predict(position).std, atol=0, rtol=0)
 
 
-@pytest.mark.parametrize("name", ["gp", "coarray"])
-def test_draws_scatter_as_those_of_the_exact_method(name, exact):
-    data = simulated_room(n=400, grid=AngularGrid.hemisphere(8, 32))
-    train, test = data.split()
-    scatter = []
-    for n in (400, 240):
-        exact(n)
-        model = fitted(name, train)
-        sample = model.sample(test.position, generator=torch.Generator().manual_seed(0))
-        scatter.append(float((sample - model.synthesize(test.position)).std()))
-    assert scatter[1] == pytest.approx(scatter[0], rel=0.2)
-
-
 def test_inner_products_of_too_many_spectra_are_refused(room, monkeypatch):
     monkeypatch.setattr(hybrid, "MAX_SPECTRA", 39)
     with pytest.raises(InputError, match="at most 39"):

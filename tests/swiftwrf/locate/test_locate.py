@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from rooms import mirror_room
 
 from swiftwrf import AngularGrid, InputError, load, rssi_room, simulated_room
 from swiftwrf.array.angles import angular_distance, to_direction
@@ -21,7 +22,6 @@ from swiftwrf.locate.search import best_cells, refined
 from swiftwrf.locate.spectrum_likelihood import BOUNDS, PathStatistics, PathWaves, PhaseLikelihood, SpectrumFeatures
 from swiftwrf.models.geometry import GeometryModel, Plane
 from swiftwrf.models.geometry.path_gains import PathGains
-from swiftwrf.testing.rooms import mirror_room
 
 SMALL = {"n_best": 60, "n_background": 40, "n_split": 8, "spacing": 0.4, "n_calibration": 40}
 ROOM = [

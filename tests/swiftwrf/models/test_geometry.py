@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from rooms import ARRAY, GRID, mirror_room
 from threadpoolctl import ThreadpoolController
 
 from swiftwrf import AngularGrid, InputError, load, simulated_room
@@ -38,7 +39,6 @@ from swiftwrf.models.geometry.responses import SteeringResponses
 from swiftwrf.models.geometry.search import SIDES, SIGNS
 from swiftwrf.models.nearest import NearestModel
 from swiftwrf.runtime.checkpoint import write
-from swiftwrf.testing.rooms import ARRAY, GRID, mirror_room
 
 QUICK = GeometryConfig(reach=2.0, width=2)
 SIX = {
@@ -364,21 +364,10 @@ def test_few_spectra_are_refused():
         fit(mirror_room(SIX, n=9))
 
 
-def test_the_same_seed_finds_the_same_room_and_draws_the_same_spectra(noisy, room):
+def test_the_same_seed_finds_the_same_room(noisy):
     few = noisy.subset(torch.arange(12))
     quick = {"reach": 0.5, "width": 1, "further": 0}
     assert fit(few, **quick).to_json() == fit(few, **quick).to_json()
-    drawn = [room.sample(noisy.position[:5], generator=torch.Generator().manual_seed(s)) for s in (1, 1, 2)]
-    assert torch.equal(drawn[0], drawn[1])
-    assert not torch.equal(drawn[0], drawn[2])
-
-
-def test_draws_differ_from_the_mean_as_much_as_measurements_do(noisy, room):
-    mean = room.synthesize(noisy.position)
-    drawn = [room.sample(noisy.position, generator=torch.Generator().manual_seed(seed)) for seed in range(32)]
-    assert mean.shape == drawn[0].shape == noisy.spectrum.shape
-    apart = torch.cat([psnr(one, mean) for one in drawn]).median() - psnr(noisy.spectrum, mean).median()
-    assert abs(float(apart)) < 4
 
 
 def test_state_returns_the_same_model(noisy, room):
@@ -471,11 +460,9 @@ def test_path_gains_follow_a_shadow():
     process, paths = hybrid.path_gains.process, hybrid.path_gains.n_paths
     first = process.coefficient[:, : 2 * paths]  # one of the fields that are averaged
     one = PathGains(GaussianProcess(process.kernel, process.known, first), paths)
-    sample = hybrid.sample(test.position, generator=torch.Generator().manual_seed(0))
-    for worse in (with_path_gains(hybrid, one).synthesize(test.position), sample):
-        assert float(psnr(worse, test.spectrum).median()) < float(
-            psnr(hybrid.synthesize(test.position), test.spectrum).median()
-        )
+    worse = with_path_gains(hybrid, one).synthesize(test.position)
+    better = hybrid.synthesize(test.position)
+    assert float(psnr(worse, test.spectrum).median()) < float(psnr(better, test.spectrum).median())
     again = HybridModel.from_state(*hybrid.state())
     assert torch.equal(again.synthesize(test.position), hybrid.synthesize(test.position))
     like = HybridModel().fit(train.subset(torch.arange(60)), like=hybrid)

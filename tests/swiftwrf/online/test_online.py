@@ -1,4 +1,4 @@
-"""Scores of measurements before they are learnt, tests for changes, adaptation, obstacles, and the command that follows."""
+"""Scores of measurements before they are learnt, tests for changes, adaptation, and the command that follows."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from rooms import room_with_box
 
 from swiftwrf import AngularGrid, GeometryModel, HybridModel, ModelConfig, RssiModel, load, make_model
 from swiftwrf.data.simulated import rssi_room, simulated_room
@@ -25,19 +26,16 @@ from swiftwrf.data.writing import write_rssi
 from swiftwrf.metrics import psnr
 from swiftwrf.models.geometry.planes import Plane
 from swiftwrf.online import (
-    Boxes,
     Cusum,
     Follower,
     Monitor,
     MonitorConfig,
-    ObstacleMonitor,
     adapted,
     alarm_threshold,
     prequential,
     score,
 )
-from swiftwrf.online.obstacles import corners
-from swiftwrf.testing.rooms import room_with_box
+from swiftwrf.online.follower import unexplained
 from tasks.command import main
 from tasks.update.record import Record, resumed
 
@@ -160,29 +158,6 @@ def test_a_follower_adapts_and_goes_on():
     assert len(follower.model.process.known) == 102
 
 
-def test_corners_and_blocked_paths_are_those_of_the_simulator():
-    """The built-in room's own boxes block the same paths, whichever way these are traced."""
-    data, room = spectra(30, 4), ShoeboxRoom()
-    scene = walls().scene(data.position)
-    low, high = (torch.tensor(ends, dtype=torch.float64) for ends in zip(*room.boxes, strict=True))
-    blocked = Boxes(low, high).block(corners(walls(), scene)).any(0)
-    rays = room.rays(data.position, data.fixed_position)
-    length = corners(walls(), scene).diff(dim=2).norm(dim=-1).sum(-1)
-    order, expected = length.argsort(1), rays.length.argsort(1)
-    torch.testing.assert_close(length.gather(1, order), rays.length.gather(1, expected))
-    assert torch.equal(blocked.gather(1, order), ~rays.clear.gather(1, expected))
-
-
-def test_an_obstacle_is_found_where_it_stands():
-    monitor = ObstacleMonitor(walls(), spectra(72, 0))
-    assert not monitor.observe(spectra(40, 1))
-    assert not monitor.region().any()
-    assert monitor.observe(spectra(30, 2, PLACE))
-    boxes, region = monitor.boxes, monitor.region()
-    centre = (boxes.low + boxes.high)[region, :2] / 2
-    assert (centre - torch.tensor(PLACE).double()).norm(dim=1).max() < 0.5
-
-
 @cache
 def rssi_lines():
     names = floor().receiver_names
@@ -290,19 +265,6 @@ def test_a_record_is_cut_to_what_the_model_has_learnt(tmp_path):
     assert kept.column("error").tolist() == pytest.approx(record.column("error")[:2].tolist())
 
 
-def test_a_follower_of_a_room_continues_its_test_for_obstacles():
-    changed = spectra(12, 2, PLACE)
-    follower = Follower(walls(), None)
-    follower.obstacles = ObstacleMonitor(walls(), spectra(72, 0))
-    follower.obstacles.observe(changed.subset(torch.arange(6)))
-    again = Follower(walls(), None)
-    again.resume(json.loads(json.dumps(follower.state())))
-    for one in (follower, again):
-        one.obstacles.observe(changed.subset(torch.arange(6, 12)))
-    torch.testing.assert_close(again.obstacles.value, follower.obstacles.value)
-    assert len(again.obstacles.standing) == len(follower.obstacles.standing)
-
-
 def test_a_follower_continues_after_the_model_has_grown():
     """New positions lie outside of those that the tests began with."""
     data = simulated_room(n=80, grid=AngularGrid.hemisphere(8, 32))
@@ -315,16 +277,6 @@ def test_a_follower_continues_after_the_model_has_grown():
     again = Follower(follower.model)
     again.resume(json.loads(json.dumps(follower.state())))
     assert again.monitor.threshold == follower.monitor.threshold
-    assert again.obstacles.threshold == pytest.approx(follower.obstacles.threshold)
-    torch.testing.assert_close(again.obstacles.boxes.low, follower.obstacles.boxes.low)
-
-
-def test_a_box_that_the_training_spectra_do_not_exclude_raises_no_alarm():
-    monitor = ObstacleMonitor(walls(), spectra(72, 0))
-    assert 0 <= monitor.weight.min() < monitor.weight.max() <= 1
-    monitor.weight[:] = 0
-    assert not monitor.observe(spectra(30, 2, PLACE))
-    assert (ObstacleMonitor(walls()).weight == 1).all()
 
 
 @pytest.mark.long
@@ -413,7 +365,7 @@ def test_a_room_whose_wall_moved_is_searched_again():
     follower.resume(json.loads(json.dumps(follower.state())))
     steps = [follower.step(new.subset(torch.tensor([i]))) for i in range(30)]
     (notice,) = [step.notice for step in steps if step.notice]
-    assert re.match(r"the room no longer explains the spectra since measurement \d;.*fit it again$", notice)
+    assert re.match(r"the room no longer explains the spectra since measurement \d+; fit it again", notice)
     again = Follower(walls())
     again.resume(json.loads(json.dumps(follower.state())))
     assert again.room is None
@@ -422,7 +374,7 @@ def test_a_room_whose_wall_moved_is_searched_again():
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_room_that_explains_its_spectra_gives_no_notice(seed):
     follower, new = Follower(walls(), spectra(72, 0)), spectra(100, seed)
-    missing = follower.obstacles.unexplained(new)
+    missing = unexplained(walls(), new)
     assert not [a for at, x in zip(new.position, missing, strict=True) for a in follower.room.observe(at, x[None])]
 
 

@@ -14,14 +14,14 @@ from unittest import mock
 
 import pytest
 import torch
+from hard_cases import HARD_CASES, Case, degrees, field_errors, magnitude_errors
+from scenes import random_scene
+from tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from swiftwrf import AngularGrid, InputError, rasterize
 from swiftwrf.rasterize import available_backends, cuda, cuda_kernels, operators, reference
 from swiftwrf.rasterize.magnitude import magnitude
-from swiftwrf.testing.hard_cases import HARD_CASES, Case, degrees, field_errors, magnitude_errors
-from swiftwrf.testing.scenes import random_scene
-from swiftwrf.testing.tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
 
 SHIM = Path(__file__).parents[2] / "cuda_shim"
 rasterize_package = sys.modules[rasterize.__module__]

@@ -10,15 +10,17 @@ import sys
 import numba
 import pytest
 import torch
+from hard_cases import Case, field_errors
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenes import GRID, random_scene
+from tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
 
 from swiftwrf import AngularGrid, InputError, rasterize
 from swiftwrf.rasterize import operators
 from swiftwrf.rasterize.magnitude import magnitude
-from swiftwrf.testing.hard_cases import Case, field_errors
-from swiftwrf.testing.scenes import GRID, random_scene
-from swiftwrf.testing.tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
+
+WITH_TESTS = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}  # where other processes find the random scenes
 
 
 def against_reference(inputs, grid, cutoff):
@@ -129,7 +131,7 @@ sys.modules["numba"] = None
 import warnings, torch, swiftwrf
 from swiftwrf.rasterize import available_backends
 from swiftwrf.runtime.threads import set_threads
-from swiftwrf.testing.scenes import GRID, random_scene
+from scenes import GRID, random_scene
 
 set_threads(1)
 inputs = [x.detach() for x in random_scene()]
@@ -142,7 +144,7 @@ try:
 except swiftwrf.InputError as error:
     print(error)
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, "-c", code], env=WITH_TESTS, capture_output=True, text=True, check=False)
     assert done.stdout.splitlines() == [
         "('reference',) rendering with the slow backend 'reference': the package numba is not installed",
         "backend 'cpu' needs the package numba; install it or use backend='reference'",
@@ -187,7 +189,7 @@ def test_prepared_backends_compile_nothing_more():
     code = """
 import torch
 from swiftwrf.rasterize import cpu, prepare, rasterize
-from swiftwrf.testing.scenes import GRID, random_scene
+from scenes import GRID, random_scene
 
 prepare("cpu")
 print(len(cpu.render.signatures))
@@ -197,7 +199,7 @@ with torch.no_grad():
         rasterize(mean[:1].expand_as(mean), cholesky, weight, GRID, cutoff=None)
 print(len(cpu.render.signatures))
 """
-    done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], env=WITH_TESTS, stdout=subprocess.PIPE, text=True, check=True)
     assert done.stdout.split() == ["1", "1"]
 
 

@@ -7,14 +7,14 @@ import math
 import pytest
 import stability
 import torch
+from hard_cases import HARD_CASES
+from scenes import random_scene
 
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, rasterize
 from swiftwrf.gp import Kernel, SmoothField
 from swiftwrf.metrics import ssim
 from swiftwrf.models.swiftwrf.deformation import DEFORMATIONS, DeformationContext
 from swiftwrf.rasterize.magnitude import magnitude
-from swiftwrf.testing.hard_cases import HARD_CASES
-from swiftwrf.testing.scenes import random_scene
 
 REFUSED = {
     "a pixel that is not a number": "spectrum of training spectrum 3 is not finite; mend or leave it out",

@@ -16,12 +16,12 @@ import torch
 from sklearn.model_selection import KFold
 from small import with_defaults
 
-from augment import Fold, Mixed, choose, sample_positions
+from augment import Mixed, choose, sample_positions
 from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, load, make_model, simulated_room
 from swiftwrf.data.store import Store
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
-from swiftwrf.models import FIELD_MODELS, FieldModel
+from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import model as geometry
 from tasks.aoa import context, cross_validation, experiment
 from tasks.aoa import synthesis as synthesizing
@@ -321,42 +321,6 @@ def test_networks_are_seeded_and_leave_the_global_generator_alone(room, kind):
     assert torch.equal(torch.get_rng_state(), state)
 
 
-@pytest.mark.parametrize(("right", "sampled"), [("means", False), ("samples", True), ("both", False)])
-def test_samples_train_only_if_they_are_significantly_better_than_means(room, right, sampled):
-    known = make_model("gp").fit(room)
-
-    class Informed(FieldModel):
-        """Knows all spectra. In the wrong way it predicts those of other positions."""
-
-        name = "informed"
-        kind = "informed model"
-        samples = True
-
-        def _fit(self, train, context):
-            pass
-
-        def _predict(self, position, grid, with_std):
-            return known.synthesize(position if right != "samples" else position.roll(1, dims=0)), None
-
-        def _sample(self, position, grid, generator):
-            return known.synthesize(position if right != "means" else position.roll(1, dims=0))
-
-        def _state(self):
-            return {}, {}
-
-        def _restore(self, tensors, header):
-            pass
-
-    part = torch.arange(len(room)) % 4
-    folds = []
-    for number in range(2):
-        train, test = (room.subset(rows.nonzero()[:, 0]) for rows in (part != number, part == number))
-        folds.append(Fold(Informed().fit(train), train, test))
-    given = cross_validation.cross_validate(folds, n_synthetic=100, seed=0).metrics
-    assert given["sampled"] is sampled
-    assert [gain["sampled"] for gain in given["gains"]] == [False, True]
-
-
 def pretended(monkeypatch, room, errors):
     """Return the cross-validation for four folds with these errors by fold and number of synthetic positions."""
     monkeypatch.setattr(cross_validation, "_errors", lambda fold, number, *_: errors(fold.test, number))
@@ -434,7 +398,7 @@ def test_whole_run(small, tmp_path):
     expected = {"measured_only", "constant", "peak", *others, *networks}
     expected |= {f"{estimator}_{training}" for estimator in others for training in trainings}
     assert set(methods) == expected
-    drawn = {"swiftwrf", "idw", "gp", "gp sample", "coarray", "coarray sample"}
+    drawn = {"swiftwrf", "idw", "gp", "coarray"}
     assert set(metrics["mixes"]["0.5"]["synthesis"]) == drawn
     assert metrics["mixes"]["0.5"]["counts"]["turbo_idw_extra"] == {"measured": 20, "withheld": 20, "further": 20}
     assert (
@@ -598,7 +562,7 @@ def test_labels_of_synthetic_spectra_are_those_of_their_positions(small, tmp_pat
     given = AoaConfig((0.5,), synthesizer=("idw",), extra=20)
     train, test = small.split("random", 0)
     data = context.Experiment(given, train, test, 20, torch.device("cpu"))
-    synthesis = synthesizing.Synthesis(MeasuredSubset(0.5), "idw", trains=True, n_synthetic=20, sampled=False)
+    synthesis = synthesizing.Synthesis(MeasuredSubset(0.5), "idw", trains=True, n_synthetic=20)
     (tmp_path / "steps").mkdir()
     synthesis.compute(data, tmp_path)
     measured, _ = data.withhold(synthesis.subset)
@@ -651,12 +615,11 @@ def test_cross_validation_is_that_of_each_field_model(small):
     train, test = small.split("random", 0)
     data = context.Experiment(given, train, test, 3000, torch.device("cpu"))
     validation = {
-        "idw": {"recommended_n_synthetic": 300, "sampled": False},
-        "gp": {"recommended_n_synthetic": 0, "sampled": True},
+        "idw": {"recommended_n_synthetic": 300},
+        "gp": {"recommended_n_synthetic": 0},
     }
     found = {s.synthesizer: s for s in synthesizing.syntheses(data, MeasuredSubset(0.5), given.synthesizer, validation)}
     assert {name: found[name].n_synthetic for name in given.synthesizer} == {"idw": 3000, "gp": 0, "vae": 0}
-    assert {name: found[name].sampled for name in given.synthesizer} == {"idw": False, "gp": True, "vae": False}
 
 
 @pytest.mark.parametrize(

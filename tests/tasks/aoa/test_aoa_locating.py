@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 import torch
 from quick import QuickNetwork
+from rooms import mirror_room
 from small import with_defaults
 
 from augment import Fold
@@ -20,7 +21,6 @@ from swiftwrf import FIELD_MODELS, MatchedField, load, make_model
 from swiftwrf.locate import MatchedFieldConfig, Posterior, matched_field
 from swiftwrf.models.geometry import model as geometry
 from swiftwrf.models.geometry.planes import Plane
-from swiftwrf.testing.rooms import mirror_room
 from tasks.aoa import cross_validation, experiment
 from tasks.aoa.condition import LOCATOR, NETWORKS
 from tasks.aoa.estimators import ESTIMATORS
@@ -118,7 +118,33 @@ def test_a_known_room_without_noise_is_located(finished):
     assert error[LOCATOR] < 0.3 * error["kernel_regression"]
     assert mix["locating"][LOCATOR]["position_error_m"]["median"] < 0.1
     assert mix["estimator_choice"]["name"] == LOCATOR
-    assert set(mix["estimator_choice"]["held_out_deg"]) == {"kernel_regression", LOCATOR}
+    alone = {name for name, method in mix["methods"].items() if method["training"] == "measured"}
+    assert set(mix["estimator_choice"]["held_out_deg"]) == alone - {"measured_only"}
+
+
+@pytest.mark.parametrize("synthesizer", ["idw", "nearest"])
+def test_the_recommendation_does_not_depend_on_the_field_models_asked_for(closed_form, tmp_path, synthesizer):
+    """A method that a user can have is never ten times better than the recommended one without a reason."""
+    with quickly(closed_form):
+        assert run("--mix", 0.6, "--extra", 0, "--synthesizer", synthesizer, "--out", tmp_path / "run") == 0
+    mix = mix_of(tmp_path / "run")
+    choice, methods = mix["estimator_choice"], mix["methods"]
+    assert choice["name"] == LOCATOR
+    assert choice["better"] == {}
+    possible = [m["great_circle_deg"]["median"] for m in methods.values() if m["training"] != "all"]
+    assert methods[LOCATOR]["great_circle_deg"]["median"] < 10 * min(possible)
+    evaluated = {name for name, method in methods.items() if method["training"] == "measured"}
+    assert set(choice["held_out_deg"]) == evaluated - {"measured_only"}  # kernel regression stands in for the network
+
+
+def test_a_better_method_that_is_not_recommended_has_a_reason(closed_form, tmp_path):
+    """Here the search finds no planes without the spectra of a fold."""
+    with quickly(closed_form), mock.patch("tasks.aoa.steps.located_errors", return_value=None):
+        assert run("--mix", 0.6, "--extra", 0, "--synthesizer", "idw", "--out", tmp_path / "run") == 0
+    choice = mix_of(tmp_path / "run")["estimator_choice"]
+    assert LOCATOR not in choice["held_out_deg"]
+    assert choice["better"][LOCATOR] == "no planes were found without the held-out spectra"
+    assert f"{LOCATOR} has 0." in (tmp_path / "run" / "report.html").read_text()
 
 
 def test_the_report_shows_where_it_was(finished):
@@ -188,7 +214,7 @@ def test_without_array_or_planes_it_is_left_out_with_one_sentence(closed_form, t
     else:
         assert f"{LOCATOR} is left out with 60% measured: {reason}" in console
         assert reason == "no plane explains the spectra"
-    assert set(mix["estimator_choice"]["held_out_deg"]) == {"kernel_regression"}
+    assert LOCATOR not in mix["estimator_choice"]["held_out_deg"]
     assert not (tmp_path / "run" / "positions.csv").exists()
     assert "Where was it?" in (tmp_path / "run" / "report.html").read_text()
 

@@ -21,7 +21,7 @@ from sklearn.neighbors import KNeighborsRegressor
 from small import with_defaults
 
 from swiftwrf import InputError, Rssi, fit_rssi, load, rssi_room
-from swiftwrf.comparison import NeRF2Rssi, NeRF2RssiConfig, NeRF2RssiSize
+from swiftwrf.comparison import NeRF2Rssi, NeRF2RssiConfig
 from swiftwrf.data.splits import folds
 from swiftwrf.rssi import RssiPredictor
 from swiftwrf.runtime import registry
@@ -72,8 +72,8 @@ def test_shared_path_loss_model_is_of_all_receivers_of_the_pool():
 @pytest.fixture(autouse=True)
 def short_nerf2(monkeypatch):
     """A field that is fitted in a second."""
-    size = NeRF2RssiSize(width=16, bands=2, samples=4, azimuths=4, elevations=2)
-    config = NeRF2RssiConfig(size=size, steps=300, rate=2e-2)
+    size = {"width": 16, "bands": 2, "samples": 4, "azimuths": 4, "elevations": 2}
+    config = NeRF2RssiConfig(**size, steps=300, rate=2e-2)
     monkeypatch.setattr(NeRF2Rssi, "config_type", with_defaults(config))
 
 
