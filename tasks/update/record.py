@@ -76,13 +76,17 @@ class Record:
         return total / n if n else float("nan")
 
     @classmethod
-    def read(cls, folder: Path) -> Record:
+    def read(cls, folder: Path, count: int | None = None) -> Record:
         """Read the record in a directory, to which another process may append rows.
+
+        Args:
+            folder: Directory of an update.
+            count: Number of measurements that its model has learnt. A row more is of one that a kill took from the model.
 
         Raises:
             InputError: There is no record, or it is damaged.
         """
-        known, rows = read_json(folder / SUMMARY), _rows(folder / TABLE)
+        known, rows = read_json(folder / SUMMARY), _rows(folder / TABLE)[:count]
         boxes = {kind: known[kind] for kind in BOXES if kind in known}
         return cls(str(known.get("source")), str(known.get("unit", "")), rows, boxes)
 
@@ -177,21 +181,6 @@ def boxes_of(obstacles: ObstacleMonitor) -> dict[str, list[Row]]:
         ]
 
     return dict(zip(BOXES, (rows(region.nonzero()[:, 0].tolist()), rows(range(n, len(boxes)))), strict=True))
-
-
-def resumed(folder: Path, count: int) -> Record | None:
-    """Return the first rows of the record in a directory, which loses the others. None without a record.
-
-    Args:
-        folder: Directory of a followed run.
-        count: Number of measurements that its model has learnt. A row more is of one that a kill took from the model.
-    """
-    if not (folder / SUMMARY).exists():
-        return None
-    record = Record.read(folder)
-    kept = Record(record.source, record.unit, record.rows[:count], record.boxes)
-    kept.write(folder)
-    return kept
 
 
 def _rows(table: Path) -> list[Row]:
