@@ -22,28 +22,20 @@ from swiftwrf.online import Step
 from swiftwrf.online.prequential import LEVEL
 from swiftwrf.rssi import RssiModel
 from tasks.records import strict
-from tasks.update.options import UpdateConfig
+from tasks.update.options import TABLE, UpdateConfig
 
 POLL_S = 0.2  # between two looks at a file that grows
 CHUNK_BYTES = 2**20
 
 
 class Line(NamedTuple):
-    """A line of a followed source.
+    """A line of a followed source."""
 
-    Args:
-        number: Its number in the source, from 1.
-        content: Its bytes.
-        header: First line of a table; empty for JSON lines.
-        end: Number of bytes of the file up to the end of the line.
-        sha256: Digest of these bytes.
-    """
-
-    number: int
+    number: int  # from 1
     content: bytes
-    header: bytes = b""
-    end: int = 0
-    sha256: str = ""
+    header: bytes = b""  # first line of a table; empty for JSON lines
+    end: int = 0  # number of bytes of the file up to the end of the line
+    sha256: str = ""  # digest of these bytes
 
 
 def check_source(source: str, model: FieldModel | RssiModel) -> None:
@@ -57,12 +49,8 @@ def check_source(source: str, model: FieldModel | RssiModel) -> None:
             raise InputError("standard input is closed; connect it or give a file")
         return
     with refusing_unreadable(Path(source)), Path(source).open("rb"):
-        if _is_table(source) and not isinstance(model, RssiModel):
+        if source.lower().endswith(TABLE) and not isinstance(model, RssiModel):
             raise InputError(f"{source} is a table, but the model predicts spectra; give JSON lines")
-
-
-def _is_table(source: str) -> bool:
-    return Path(source).suffix.lower() == ".csv"
 
 
 def lines(source: str, end: int = 0, sha256: str = "") -> Iterator[Line]:
@@ -86,7 +74,7 @@ def lines(source: str, end: int = 0, sha256: str = "") -> Iterator[Line]:
             for number, line in enumerate(_growing(Path(source), file), start=1):
                 digest.update(line)
                 end, sha256 = end + len(line), digest.hexdigest()
-                if _is_table(source) and not header:
+                if source.lower().endswith(TABLE) and not header:
                     header = line.strip() and line
                 elif end > known and line.strip():
                     yield Line(number, line, header, end, sha256)

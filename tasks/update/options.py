@@ -10,8 +10,8 @@ import tyro
 from swiftwrf.errors import InputError
 from tasks.options import Output, SpectraSource, TableSource, command_options
 
-JSON_LINES = (".ndjson", ".jsonl")
-FOLLOWED = (*JSON_LINES, ".csv")
+JSON_LINES, TABLE = (".ndjson", ".jsonl"), ".csv"
+FOLLOWED = (*JSON_LINES, TABLE)
 
 
 @command_options

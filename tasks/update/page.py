@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from pandas import DataFrame
 
 from swiftwrf.positions import nearest

@@ -73,13 +73,17 @@ class Record:
         return total / n if n else float("nan")
 
     @classmethod
-    def read(cls, folder: Path) -> Record:
+    def read(cls, folder: Path, count: int | None = None) -> Record:
         """Read the record in a directory, to which another process may append rows.
+
+        Args:
+            folder: Directory of an update.
+            count: Number of measurements that its model has learnt. A row more is of one that a kill took from the model.
 
         Raises:
             InputError: There is no record, or it is damaged.
         """
-        known, rows = read_json(folder / SUMMARY), _rows(folder / TABLE)
+        known, rows = read_json(folder / SUMMARY), _rows(folder / TABLE)[:count]
         return cls(str(known.get("source")), str(known.get("unit", "")), rows)
 
     def add(self, index: int, step: Step) -> Row:
@@ -149,21 +153,6 @@ class Record:
         with (folder / TABLE).open("a", encoding="utf-8", newline="") as file:
             file.write(f"{line}\r\n" if file.tell() else f"{header}\r\n{line}\r\n")
         write_json(folder / SUMMARY, self.summary())
-
-
-def resumed(folder: Path, count: int) -> Record | None:
-    """Return the first rows of the record in a directory, which loses the others. None without a record.
-
-    Args:
-        folder: Directory of a followed run.
-        count: Number of measurements that its model has learnt. A row more is of one that a kill took from the model.
-    """
-    if not (folder / SUMMARY).exists():
-        return None
-    record = Record.read(folder)
-    kept = Record(record.source, record.unit, record.rows[:count])
-    kept.write(folder)
-    return kept
 
 
 def _rows(table: Path) -> list[Row]:

@@ -30,7 +30,7 @@ from tasks.terminal import console, terminal
 from tasks.update.lines import answer, check_source, lines, measurement
 from tasks.update.options import UpdateConfig
 from tasks.update.page import page
-from tasks.update.record import SUMMARY, Record, resumed
+from tasks.update.record import SUMMARY, Record
 
 WAITING = "waiting"  # tensor of the spectra that a geometry has not learnt yet
 
@@ -74,7 +74,9 @@ def follow(config: UpdateConfig) -> None:
     with _followed(Path(config.out), digests) as folder:
         file = folder / MODEL
         follower, place = _continued(file, settings) if file.exists() else (Follower(model, train, settings), (0, ""))
-        record = resumed(folder, follower.count) or Record(config.source, _unit(model))
+        record = Record(config.source, _unit(model))
+        if (folder / SUMMARY).exists():
+            record = Record.read(folder, follower.count)
         record.write(folder)
         _write_config(config, folder)
         for line in lines(config.source, *place):

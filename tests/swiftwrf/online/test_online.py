@@ -37,7 +37,7 @@ from swiftwrf.online import (
 )
 from swiftwrf.online.follower import unexplained
 from tasks.command import main
-from tasks.update.record import Record, resumed
+from tasks.update.record import Record
 
 GRID = AngularGrid.hemisphere(15, 60)
 WALLS = [
@@ -260,7 +260,8 @@ def test_a_record_is_cut_to_what_the_model_has_learnt(tmp_path):
     with (tmp_path / "measurements.csv").open("a") as file:
         file.write("63,1.0")  # a kill while a row was written
     assert [row["index"] for row in Record.read(tmp_path).rows] == [60, 61, 62]
-    kept = resumed(tmp_path, 2)
+    kept = Record.read(tmp_path, 2)
+    kept.write(tmp_path)
     assert [row["index"] for row in kept.rows] == [row["index"] for row in Record.read(tmp_path).rows] == [60, 61]
     assert kept.column("error").tolist() == pytest.approx(record.column("error")[:2].tolist())
 
