@@ -151,7 +151,7 @@ def _pose(file: Path, arrays: Arrays) -> ArrayPose:
             "(x, y, z, w) that turns array into world coordinates"
         )
     try:
-        return ArrayPose(tuple(position.flatten().tolist()), tuple(orientation.flatten().tolist()))  # type: ignore[arg-type]
+        return ArrayPose(tuple(position.flatten().tolist()), tuple(orientation.flatten().tolist()))
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
 

@@ -117,7 +117,7 @@ WRONG = {
     ),
     "at the array": (
         lambda: Spectra(ROOM.spectrum, ROOM.position, pose=ArrayPose(tuple(ROOM.position[2].tolist()))),
-        "position 2 is that of the fixed end",
+        "position 2 of spectra is that of the fixed end",
     ),
     "a field of others": (lambda: Spectra(ROOM.spectrum, ROOM.position, colour="red"), "Spectra has no colour"),
     "no positions": (lambda: Spectra(ROOM.spectrum), "spectra and their positions"),
