@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -141,7 +142,8 @@ def rounding_std(rssi: Tensor) -> float:
 
     The step of the values is their least difference, at most 1 dB, which is also that of constant values.
     """
-    return min([MAX_STEP_DB, *rssi[~rssi.isnan()].unique().diff().tolist()]) / 12**0.5
+    step: float = min([MAX_STEP_DB, *rssi[~rssi.isnan()].unique().diff().tolist()])
+    return step / math.sqrt(12)
 
 
 def representative_receivers(pool: Rssi) -> Rssi:

@@ -32,8 +32,7 @@ from swiftwrf.rssi.training import rounding_std
 SHORT = {"reach": 0.5, "positions": 10, "width": 1, "max_order": 1, "further": 1}  # search for a room
 OPTIONS = {"swiftwrf": {"model": ModelConfig(n_primitives=4, rank=2)}, "geometry": SHORT, "hybrid": SHORT}
 MODELS = [name for name, model in FIELD_MODELS.items() if not model.slow]
-ROOMS = ("geometry", "hybrid")
-SCALES = (1e-3, 10.0, 1e3, 1e6)
+SCALES = (1e-3, 1e3, 1e6)
 
 
 def on_a_line(position):
@@ -58,7 +57,6 @@ SPECTRA = {
     "identical": lambda values: values[:1].expand_as(values),
     "hot pixel": hot,
 }
-REFUSED = ("zero", "one", "hot pixel")  # by models of rooms, as "constant": no array has such spectra
 RSSI = {
     "constant": lambda values: torch.full_like(values, -60.0),
     "zero": torch.zeros_like,
@@ -67,12 +65,14 @@ RSSI = {
         1, torch.tensor([0]), values[:, :1]
     ),
 }
+ALL = (*PLACES, *SPECTRA)
+CASES = {"geometry": (*PLACES, "constant"), "hybrid": ("one position", "scale 1000")}  # searches take seconds
 
 
 @cache
 def spectra(case):
     """Return few small spectra of the built-in room, with one property of the case."""
-    room = simulated_room(n=24, grid=AngularGrid.hemisphere(6, 24))
+    room = simulated_room(n=18, grid=AngularGrid.hemisphere(6, 24))
     if case in SPECTRA:
         return replace(room, store=Store(SPECTRA[case](room.store[:]).contiguous()))
     change = PLACES[case]
@@ -122,10 +122,7 @@ def check(fit, position, bounds):
 
 
 @pytest.mark.usefixtures("_short_searches")
-@pytest.mark.parametrize(
-    ("name", "case"),
-    [(name, case) for name in MODELS for case in (*PLACES, *SPECTRA) if name not in ROOMS or case not in REFUSED],
-)
+@pytest.mark.parametrize(("name", "case"), [(name, case) for name in MODELS for case in CASES.get(name, ALL)])
 def test_field_models_of_hard_data(name, case):
     data = spectra(case)
     check(lambda: make_model(name, **OPTIONS.get(name, {})).fit(data), data.position, (0, 1))
@@ -149,7 +146,7 @@ def test_rssi_locators_of_hard_data(case):
 
 
 @pytest.mark.usefixtures("_short_searches")
-@pytest.mark.parametrize("case", ["collinear", "scale 10", "constant"])
+@pytest.mark.parametrize("case", ["scale 1000", "constant"])
 def test_matched_field_locators_of_hard_data(case):
     data = spectra(case)
     try:
@@ -169,7 +166,7 @@ def test_a_room_without_a_model_of_rounded_phases_is_refused():
 
 def test_aliases_keep_the_plane_of_each_side():
     """Refinement may move a plane between the positions, where no alias is."""
-    scene, _ = observe(spectra("scale 10"))
+    scene, _ = observe(spectra("scale 1000"))
     searched = search.Search(scene, reach=1.0, signs=search.SIGNS[0])
     room = search.CandidateRoom(
         0.0, {side: near - 5.0 for side, near in enumerate(searched.near)}, dict.fromkeys(range(6), 0.5)
