@@ -99,7 +99,8 @@ def _axes(array: PlanarArray) -> Tensor:
 
 def _signal(matrix: Tensor) -> Tensor:
     """Return the eigenvector of the largest eigenvalue of each covariance, (n, K)."""
-    return torch.linalg.eigh(matrix).eigenvectors[..., -1]
+    largest: Tensor = torch.linalg.eigh(matrix).eigenvectors[..., -1]
+    return largest
 
 
 def _music(array: PlanarArray, matrix: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
-from typing import Annotated, Any, ClassVar, Self, cast
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -194,7 +194,7 @@ def restored(make: Callable[[], Model], tensors: dict[str, Tensor]) -> Model:
     expect(tensors, {name: tuple(tensor.shape) for name, tensor in blank.state_dict().items()})
     model = make()
     model.load_state_dict(tensors)
-    return cast(Model, model.eval().requires_grad_(False))
+    return model.eval().requires_grad_(False)
 
 
 def draw_parameters(model: nn.Module, generator: torch.Generator) -> None:

@@ -107,7 +107,8 @@ class Dcgan(TrainedModel):
         discriminator = discriminator + functional.softplus(_logit(features, head, generated.detach(), encoded))
         adversarial = functional.softplus(-_logit(_frozen(features), _frozen(head), generated, encoded))
         error = (generated - spectrum).abs().mean()
-        return discriminator.mean() + adversarial.mean() + self.config.l1_weight * error
+        loss: Tensor = discriminator.mean() + adversarial.mean() + self.config.l1_weight * error
+        return loss
 
     def render(self, network: nn.ModuleDict, position: Tensor, grid: AngularGrid) -> Tensor:
         encoded = encode(self.local(position, position.device), self.config.bands)

@@ -104,7 +104,8 @@ class Vae(TrainedModel):
         noise = torch.randn(mean.shape, generator=generator).to(mean.device)
         decoded = _decode(network, mean + noise * (0.5 * log_variance).exp(), encoded)
         apart = divergence(posterior, normal(network["prior"](encoded))).mean() / spectrum[0].numel()
-        return (decoded - spectrum).square().mean() + 2 * self.config.noise**2 * apart
+        loss: Tensor = (decoded - spectrum).square().mean() + 2 * self.config.noise**2 * apart
+        return loss
 
     def render(self, network: nn.ModuleDict, position: Tensor, grid: AngularGrid) -> Tensor:
         encoded = self._encoded(position, position.device)

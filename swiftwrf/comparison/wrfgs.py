@@ -30,7 +30,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import torch
 from scipy.spatial import KDTree
@@ -149,7 +149,7 @@ class WrfGs(TrainedModel):
         network, generator = self.blank(), torch.Generator().manual_seed(self.config.seed)
         draw_parameters(network, generator)
         mean = self.config.spread * torch.randn(self.config.n_gaussians, 3, generator=generator)
-        gaussians = network["gaussians"]
+        gaussians = _gaussians(network)
         with torch.no_grad():
             gaussians["mean"].copy_(mean)
             gaussians["blur"].copy_(min_width(work.grid))
@@ -163,7 +163,7 @@ class WrfGs(TrainedModel):
 
     def project(self, network: nn.ModuleDict, position: Tensor) -> tuple[Tensor, Tensor]:
         """Return means (P or 1, N, 2) and Cholesky factors (P, N, 3) or (N, 3) [rad] for positions (P, 3) [m]."""
-        gaussians = network["gaussians"]
+        gaussians = _gaussians(network)
         _, receiver = self.ends(position, gaussians["mean"].device)
         to_array = self.rotation.to(receiver)  # of rows, from the right
         local = (gaussians["mean"] - receiver[:, None]) @ to_array
@@ -177,7 +177,7 @@ class WrfGs(TrainedModel):
         self, network: nn.ModuleDict, position: Tensor, mean: Tensor, cholesky: Tensor, grid: AngularGrid
     ) -> Tensor:
         """Return magnitudes (P, H, W) of projected Gaussians, whose network predicts amplitudes for positions (P, 3) [m]."""
-        gaussians, bands = network["gaussians"], self.config.bands
+        gaussians, bands = _gaussians(network), self.config.bands
         transmitter, receiver = self.ends(position, mean.device)
         end = transmitter if self.moving == "transmitter" else receiver
         of_mean = encode(gaussians["mean"] / self.config.spread, bands, lowest=1.0)
@@ -215,6 +215,11 @@ def on_sphere(mean: Tensor, factor: Tensor, blur: Tensor) -> tuple[Tensor, Tenso
     return torch.stack(to_angles(mean), dim=-1), torch.stack([l1, l2, l3], dim=-1)
 
 
+def _gaussians(network: nn.ModuleDict) -> nn.ParameterDict:
+    """Return the parameters of the Gaussians."""
+    return cast(nn.ParameterDict, network["gaussians"])
+
+
 def _spacing(mean: Tensor) -> Tensor:
     """Return the root mean square distance of each of the points (N, 3) from its three neighbours, (N,)."""
     distance, _ = KDTree(mean.numpy()).query(mean.numpy(), k=4)
@@ -244,7 +249,7 @@ class GaussianTraining(Training[nn.ModuleDict]):
     """
 
     def __init__(self, owner: WrfGs, network: nn.ModuleDict, train: Spectra) -> None:
-        config, self.gaussians = owner.config, network["gaussians"]
+        config, self.gaussians = owner.config, _gaussians(network)
         rates = (config.scale_rate, config.rotation_rate, config.opacity_rate)
         groups = [{"params": [self.gaussians[n]], "peak": rate} for n, rate in zip(SHAPES, rates, strict=True)]
         rest = [*network["features"].parameters(), *network["signal"].parameters(), self.gaussians["path_loss"]]
