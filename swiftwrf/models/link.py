@@ -9,9 +9,9 @@ from torch import Tensor, float64, tensor
 
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.choices import Moving
-from swiftwrf.data.dataset import to_tensor
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
+from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.validation import check_value
 
 LENGTH_TOLERANCE_WAVELENGTHS = 1e-3  # between fixed ends, elements and wavelengths of one link

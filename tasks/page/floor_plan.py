@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from swiftwrf import InputError
-from swiftwrf.data.files import MAX_COORDINATE_M
+from swiftwrf.positions import MAX_COORDINATE_M
 from swiftwrf.runtime.checkpoint import refusing
 from tasks.records import read_npz, write_npz
 

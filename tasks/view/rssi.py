@@ -17,7 +17,7 @@ from torch import Tensor
 
 from swiftwrf import InputError, Prediction, Rssi, RssiModel
 from swiftwrf.data.coordinates import degree_columns
-from swiftwrf.data.files import MAX_COORDINATE_M
+from swiftwrf.positions import MAX_COORDINATE_M
 from swiftwrf.rssi import LEVEL
 from tasks.page import figures, maps
 from tasks.page.floor_plan import FloorPlan

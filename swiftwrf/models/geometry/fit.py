@@ -47,7 +47,6 @@ from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
 MAX_PHASE_ERROR = 0.1  # relative error of a spectrum's autocorrelation up to which its phases are used
-MAX_COORDINATE_M = 1e12  # float64 rounds to 0.1 mm there
 MAX_ALIAS_STEPS = 3  # times that planes move to other phase aliases
 FURTHER_SIGNIFICANCE = 4.0  # standard errors for a plane of any orientation, of which far more are tried
 PROMISING_SIGNIFICANCE = 1.0  # standard errors by which one must be better after a few steps to be refined further
@@ -284,10 +283,6 @@ def observe(train: Spectra, config: GeometryConfig | None = None) -> tuple[Phase
     assert train.fixed_position is not None
     if len(train.position.unique(dim=0)) < MIN_TRAINING:
         raise InputError(f"the positions of {train.name} are fewer than {MIN_TRAINING} different ones")
-    if (farthest := float(train.position.abs().max())) > MAX_COORDINATE_M:
-        raise InputError(
-            f"positions of {train.name} up to {farthest:.3g} m have no phases by rounding; give a near origin"
-        )
     channel, error = retrieve_phases(correlations(train), train.array, config.seed)
     solved = (error < MAX_PHASE_ERROR).nonzero()[:, 0]
     if len(solved) < max(MIN_TRAINING, len(train) / 2):
