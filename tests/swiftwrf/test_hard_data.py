@@ -158,12 +158,6 @@ def test_matched_field_locators_of_hard_data(case):
     assert posterior.median.isfinite().all()
 
 
-def test_a_room_without_a_model_of_rounded_phases_is_refused():
-    room = spectra("constant")
-    with pytest.raises(InputError, match="by rounding"):
-        make_model("geometry", **SHORT).fit(replace(room, position=room.position * 1e160))
-
-
 def test_aliases_keep_the_plane_of_each_side():
     """Refinement may move a plane between the positions, where no alias is."""
     scene, _ = observe(spectra("scale 1000"))
