@@ -24,7 +24,8 @@ with lazy_imports(globals()):
     from swiftwrf.models.coarray import CoarrayModel, fit_coarray, project
     from swiftwrf.models.geometry import GeometryModel, HybridModel, fit_geometry, fit_hybrid
     from swiftwrf.models.prediction import Prediction
-    from swiftwrf.models.swiftwrf import FitConfig, ModelConfig, SwiftWRF, fit
+    from swiftwrf.models.swiftwrf import SwiftWRF, fit
+    from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
     from swiftwrf.rasterize import rasterize, rasterize_magnitude
     from swiftwrf.rssi import PairModel, RssiConfig, RssiModel, fit_rssi
     from swiftwrf.runtime.checkpoint import load
@@ -36,13 +37,11 @@ __all__ = [
     "Calibration",
     "CoarrayModel",
     "FieldModel",
-    "FitConfig",
     "FitError",
     "GeometryModel",
     "HybridModel",
     "InputError",
     "MatchedField",
-    "ModelConfig",
     "PairModel",
     "Posterior",
     "Prediction",
@@ -53,6 +52,7 @@ __all__ = [
     "Snapshots",
     "Spectra",
     "SwiftWRF",
+    "SwiftWRFPaper",
     "calibrate",
     "comparison",
     "datasets",

@@ -15,7 +15,7 @@ from swiftwrf.comparison.base import AnyConfig, Count, Training
 from swiftwrf.comparison.network import Frame, Network, draw_parameters
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
-from swiftwrf.models.swiftwrf.mlp import encode
+from swiftwrf.models.mlp import encode
 from swiftwrf.runtime.validation import configuration
 
 MAX_HALVINGS = 4

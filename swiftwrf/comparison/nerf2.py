@@ -32,7 +32,7 @@ from swiftwrf.comparison.network import LinkNetwork, chunks, draw_parameters
 from swiftwrf.comparison.volume import Medium, integrate
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.models.base import FIXED_END
-from swiftwrf.models.swiftwrf.mlp import SkipMLP, encode
+from swiftwrf.models.mlp import SkipMLP, encode
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
 MAX_SAMPLES_AT_ONCE = 2**19  # samples of the field evaluated at a time, which bounds the memory

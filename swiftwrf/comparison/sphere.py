@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import to_angles
-from swiftwrf.models.swiftwrf.primitives import MAX_WIDTH_RAD
+from swiftwrf.models.primitives import MAX_WIDTH_RAD
 
 MIN_AXIS_DISTANCE = 1e-6  # relative to the distance; limits d azimuth near the axis
 

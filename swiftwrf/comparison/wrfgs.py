@@ -34,10 +34,10 @@ from swiftwrf.comparison.base import Config, Count, Depth, TrainedModel, Trainin
 from swiftwrf.comparison.network import LinkNetwork, draw_parameters
 from swiftwrf.comparison.sphere import on_sphere
 from swiftwrf.data.spectra import Spectra
+from swiftwrf.metrics import spectrum_loss
 from swiftwrf.models.base import FIXED_END
-from swiftwrf.models.swiftwrf.loss import spectrum_loss
-from swiftwrf.models.swiftwrf.mlp import SkipMLP, encode
-from swiftwrf.models.swiftwrf.primitives import min_width
+from swiftwrf.models.mlp import SkipMLP, encode
+from swiftwrf.models.primitives import min_width
 from swiftwrf.rasterize import rasterize_magnitude
 from swiftwrf.runtime.session import State
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, configuration

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.choices import FIELD_MODELS, Moving
+from swiftwrf.choices import FIELD_MODELS, PUBLISHED, Moving
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.spectra import Spectra, check_training
 from swiftwrf.data.splits import Validation
@@ -383,7 +383,8 @@ def make_model(name: str, preset: Preset = "quick", **options: Any) -> FieldMode
 
     Args:
         name: Name in the registry, e.g. "hybrid".
-        preset: "quick", or "paper" for published settings; a model without published settings ignores it.
+        preset: "quick", or "paper" for published settings; a model without published settings ignores it. With "paper" the
+            name "swiftwrf" gives `SwiftWRFPaper`.
         options: Options such as seed and validation. A model ignores those that only other models have.
 
     Raises:
@@ -393,7 +394,7 @@ def make_model(name: str, preset: Preset = "quick", **options: Any) -> FieldMode
         >>> make_model("idw", seed=3).config.seed
         3
     """
-    model_type: type[FieldModel] = FIELD_MODELS[name]
+    model_type: type[FieldModel] = FIELD_MODELS[PUBLISHED.get(name, name) if preset == "paper" else name]
     for option in options:
         if not model_type.has_option(option) and not any(
             FIELD_MODELS[other].has_option(option) for other in FIELD_MODELS
