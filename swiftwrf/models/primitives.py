@@ -15,12 +15,12 @@ MIN_WIDTH_PIXELS = 0.3  # narrower primitives fall between pixel centres and get
 
 
 class Gaussians(NamedTuple):
-    """Primitives at some positions; leading dimensions are positions, and none if all positions share a value."""
+    """Parameters of N primitives."""
 
-    mean: Tensor  # (..., N, 2) azimuth, elevation [rad]
-    cholesky: Tensor  # (..., N, 3) l1, l2, l3 [rad]
-    attenuation: Tensor  # (..., N) delta, in (0, 1) before deformation
-    response: Tensor  # (..., N, 2) psi, real and imaginary part
+    mean: Tensor  # (N, 2) azimuth, elevation [rad]
+    cholesky: Tensor  # (N, 3) l1, l2, l3 [rad]
+    attenuation: Tensor  # (N,) delta, in (0, 1)
+    response: Tensor  # (N, 2) psi, real and imaginary part
 
 
 class Primitives(nn.Module):

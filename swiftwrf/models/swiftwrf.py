@@ -98,7 +98,6 @@ class SwiftWRF(ProcessModel):
     """weights of the primitives in the mean spectrum, then in each component, float32 (1 + K, N)"""
     calibration: float
     """factor of the standard deviations with which held-out spectra lie in their intervals"""
-
     process: GaussianProcess
     """process of the K component scores"""
 
@@ -159,6 +158,12 @@ class SwiftWRF(ProcessModel):
     def region(self) -> Tensor:
         return self.process.known.cpu()
 
+    def primitives(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return mean, cholesky and weight at positions (n, 3) [m], the arguments of `swiftwrf.rasterize`."""
+        self.check_fitted()
+        real = self.weight[0] + self.process.mean(self._process_position(position)).float() @ self.weight[1:]
+        return self.mean.expand(len(real), -1, -1), self.cholesky, torch.stack([real, torch.zeros_like(real)], dim=-1)
+
     def _process_position(self, position: Tensor) -> Tensor:
         return position.to(self.device)
 
@@ -169,30 +174,33 @@ class SwiftWRF(ProcessModel):
         return max(self.batch, min(MAX_BATCH_ON_GPU, MAX_PRIMITIVES_ON_GPU // len(self.mean)))
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
-        weight = self.weight[0] + self.process.mean(position).float() @ self.weight[1:]
+        mean, cholesky, weight = self.primitives(position)
         learns = any(tensor.requires_grad for tensor in self.parameters())
         # a GPU renders kernels faster than it multiplies cached ones
         if position.is_cuda or learns or len(self.mean) * math.prod(grid.shape) > MAX_CACHED_VALUES:
-            mean = self.mean.expand(len(position), -1, -1)
-            complex_weight = torch.stack([weight, torch.zeros_like(weight)], dim=-1)
-            spectrum = rasterize_magnitude(mean, self.cholesky, complex_weight, grid, cutoff=CUTOFF)
+            spectrum = rasterize_magnitude(mean, cholesky, weight, grid, cutoff=CUTOFF)
         else:
-            spectrum = (weight @ self._basis(grid).kernel).abs().reshape(-1, *grid.shape)
+            spectrum = (weight[..., 0] @ self._basis(grid).kernel).abs().reshape(-1, *grid.shape)
         if not with_std:
             return spectrum, None
-        return spectrum, self.expected_error(position).float()[:, None, None] * self._basis(grid).std
+        std = (self.calibration * self._basis(grid).prior).clamp_min(MIN_STD)
+        return spectrum, self.expected_error(position).float()[:, None, None] * std
+
+    def _scale_std(self, factor: float) -> None:
+        self.calibration *= factor
 
     @torch.inference_mode(False)  # a cached tensor must also serve calls with gradients
+    @torch.no_grad()
     def _basis(self, grid: AngularGrid) -> Basis:
-        """Return what all predictions on a grid share, from the cache unless a parameter requires gradients."""
+        """Return what all predictions on a grid share, from the cache if it is there."""
         if grid in self._bases:
             return self._bases[grid]
         kernel = kernels(self.mean, self.cholesky, grid, CUTOFF).flatten(1)
         component = self.weight[1:] @ kernel
         dual = torch.linalg.pinv(component.double() @ component.double().T, hermitian=True) @ component.double()
-        std = self.calibration * component.square().sum(dim=0).sqrt().reshape(grid.shape)
-        basis = Basis(kernel, self.weight[0] @ kernel, dual.float(), std.clamp_min(MIN_STD))
-        if kernel.numel() <= MAX_CACHED_VALUES and not kernel.requires_grad and not std.requires_grad:
+        prior = component.square().sum(dim=0).sqrt().reshape(grid.shape)
+        basis = Basis(kernel, self.weight[0] @ kernel, dual.float(), prior)
+        if kernel.numel() <= MAX_CACHED_VALUES:
             while len(self._bases) >= MAX_CACHED_GRIDS:
                 del self._bases[next(iter(self._bases))]
             self._bases[grid] = basis
@@ -229,7 +237,7 @@ class Basis(NamedTuple):
     kernel: Tensor  # of each primitive, (N, pixels)
     mean: Tensor  # spectrum, (pixels,)
     dual: Tensor  # projections of a change of the spectrum onto the scores, (K, pixels)
-    std: Tensor  # standard deviation of a measurement far from all training positions, (H, W)
+    prior: Tensor  # standard deviation of the spectra that the process gives without training data, (H, W)
 
 
 def fit(train: Spectra, *, device: torch.device | str = "cpu", progress: bool = False, **options: Any) -> SwiftWRF:

@@ -22,7 +22,7 @@ from swiftwrf.errors import InputError
 from swiftwrf.metrics import spectrum_loss
 from swiftwrf.models.base import FieldConfig, FieldModel, FitContext
 from swiftwrf.models.mlp import encode, skip_forward, skip_layers
-from swiftwrf.models.primitives import Gaussians, Primitives
+from swiftwrf.models.primitives import Primitives
 from swiftwrf.positions import frame, normalise
 from swiftwrf.rasterize import rasterize_magnitude
 from swiftwrf.runtime.checkpoint import Header, expect
@@ -124,7 +124,13 @@ class SwiftWRFPaper(FieldModel):
         return self.field.parameters()
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
-        return self.field(self.field.normalise(position), grid), None
+        return rasterize_magnitude(*self.primitives(position), grid, cutoff=CUTOFF), None
+
+    def primitives(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return mean, cholesky and weight at positions (n, 3) [m], the arguments of `swiftwrf.rasterize`."""
+        self.check_fitted()
+        found: tuple[Tensor, Tensor, Tensor] = self.field(self.field.normalise(position.to(self.device)))
+        return found
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         return self.field.state_dict(), {}
@@ -143,9 +149,9 @@ class SwiftWRFPaper(FieldModel):
 class DeformableGaussians(nn.Module):
     """Canonical primitives with random parameters, and the paper's network that deforms them (section 4.2).
 
-    The network has eight layers of width 156 on the encodings of mean and position. Every second layer takes the input again.
-    The linear output starts at 0, so that the first deformed spectrum is the canonical one. A primitive and position costs 0.3
-    million multiplications: at 10,000 primitives the network, not the rasterizer, limits the spectra per second.
+    The network has eight layers of width 156 on the encodings of mean and position. Every second layer takes the input
+    again. The linear output starts at 0, so that the first deformed spectrum is the canonical one. A primitive and position
+    costs 0.3 million multiplications: at 10,000 primitives the network, not the rasterizer, limits the spectra per second.
 
     Args:
         n: Number of primitives.
@@ -180,28 +186,26 @@ class DeformableGaussians(nn.Module):
         """
         return normalise(position, self.centre, self.scale)
 
-    def deformed(self, position: Tensor) -> Gaussians:
-        """Return the primitives at normalised positions (B, 3). The canonical means get no gradient."""
+    def forward(self, position: Tensor, *, deform: bool = True) -> tuple[Tensor, Tensor, Tensor]:
+        """Return mean (B, N, 2), Cholesky factor (N, 3) and weight (B, N, 2) of the primitives; differentiable.
+
+        Args:
+            position: Normalised positions (B, 3).
+            deform: False returns the canonical primitives at all positions (the paper's coarse stage). With True the
+                canonical means get no gradient.
+        """
         mean, cholesky, attenuation, response = self.primitives()
+        if not deform:
+            weight = attenuation[:, None] * response
+            return mean.expand(len(position), -1, -1), cholesky, weight.expand(len(position), -1, -1)
         mean = mean.detach()
         unit = mean / mean.new_tensor([math.pi, math.pi / 4]) - 1  # the encoding expects values in [-1, 1]
         shape = (len(position), len(mean), -1)
         of_mean, of_position = encode(unit, MEAN_BANDS), encode(position, POSITION_BANDS)[:, None]
         x = torch.cat([of_mean.expand(shape), of_position.expand(shape)], dim=-1)
         offset = self.output(skip_forward(self.layers, x, SKIPS)).split(OFFSETS, dim=-1)
-        return Gaussians(mean + offset[0], cholesky, attenuation + offset[2].squeeze(-1), response + offset[1])
-
-    def forward(self, position: Tensor, grid: AngularGrid, *, deform: bool = True) -> Tensor:
-        """Return magnitudes (B, H, W) at normalised positions (B, 3); differentiable.
-
-        Args:
-            position: Normalised positions.
-            grid: Directions.
-            deform: False renders the canonical primitives at all positions (the paper's coarse stage).
-        """
-        mean, cholesky, attenuation, response = self.deformed(position) if deform else self.primitives()
-        weight = (attenuation[..., None] * response).expand(len(position), -1, -1)
-        return rasterize_magnitude(mean.expand(len(position), -1, -1), cholesky, weight, grid, cutoff=CUTOFF)
+        weight = (attenuation[:, None] + offset[2]) * (response + offset[1])
+        return mean + offset[0], cholesky, weight
 
 
 class Optimisation(Descent[DeformableGaussians]):
@@ -251,7 +255,9 @@ class Optimisation(Descent[DeformableGaussians]):
     def objective(self) -> Tensor:
         rows, deform = self.rows[self.step], self.step >= self.coarse_steps
         position = self.position[rows] + self.smoothing() * self.noise[self.step]
-        return self.loss(self.model(position, self.grid, deform=deform), self.spectrum[rows])
+        mean, cholesky, weight = self.model(position, deform=deform)
+        rendered = rasterize_magnitude(mean, cholesky, weight, self.grid, cutoff=CUTOFF)
+        return self.loss(rendered, self.spectrum[rows])
 
     def record(self, loss: Tensor) -> Record:
         return super().record(loss) | {"n_primitives": self.config.n_primitives}

@@ -47,7 +47,7 @@ from swiftwrf.comparison.volume import FIRST_PHASE, PATH_GAIN, Medium, integrate
 from swiftwrf.comparison.wrfgs import WrfGsNetwork
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import psnr
-from swiftwrf.models.swiftwrf.mlp import encode
+from swiftwrf.models.mlp import encode
 from swiftwrf.runtime.checkpoint import read, write
 
 GRID = AngularGrid.hemisphere(90, 360)
