@@ -25,6 +25,7 @@ from swiftwrf.data.splits import FOLDS, MIN_TRAINING, Validation, folds
 from swiftwrf.gp import subsample
 from swiftwrf.metrics import psnr
 from swiftwrf.models import FIELD_MODELS, FieldModel, make_model
+from swiftwrf.models.base import model_type
 
 MAX_TEST_SPECTRA = 1000  # predicted spectra of a fold; more do not change the choice
 BLIND_FOLDS = ((0, 1), (2, 3))  # pairs of folds that one structure search leaves out
@@ -131,9 +132,9 @@ def choose_model(
     """
     check_training(measured)
     names = candidates(measured) if names is None else tuple(names)
-    types = {name: FIELD_MODELS[name] for name in names}
+    types = {name: model_type(name, options.get("preset", "quick")) for name in names}
     for option in options:
-        if not any(model_type.supported({option: options[option]}) for model_type in types.values()):
+        if not any(field_model.supported({option: options[option]}) for field_model in types.values()):
             raise InputError(f"none of the candidates {', '.join(types)} has an option {option!r}; leave it out")
     fold, blind_folds = _blind_folds(measured, validation, seed)
     options |= {"validation": validation, "seed": seed}
@@ -142,13 +143,13 @@ def choose_model(
     found: dict[str, list[Fold]] = {}
     seconds: dict[str, float] = {}
     left_out: dict[str, str] = {}
-    for name, model_type in types.items():
+    for name, field_model in types.items():
         scored, score, spent = [], [], 0.0
-        own = model_type.supported(options)
+        own = field_model.supported(options)
         try:
             for blind, models in zip(blind_folds, searched, strict=True):
                 structure = None
-                if model_type.searches:
+                if field_model.searches:
                     structure, searching = _structure(name, measured, _without(fold, *blind), models, device, own)
                     spent += searching
                 for number in blind:

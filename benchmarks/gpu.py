@@ -18,7 +18,18 @@ from typing import Any, Literal
 
 import torch
 import tyro
-from rasterize import CUTOFF, gpu_rates, kernel_values, model_of, positions, rate, scene, timed, with_gradients
+from rasterize import (
+    CUTOFF,
+    gpu_rates,
+    kernel_values,
+    model_of,
+    positions,
+    rate,
+    rendered,
+    scene,
+    timed,
+    with_gradients,
+)
 from record import RESULTS, write_result
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
@@ -26,11 +37,10 @@ from torch.profiler import ProfilerActivity, profile
 from augment import Mixed
 from swiftwrf import (
     AngularGrid,
-    FitConfig,
     GeometryModel,
     MatchedField,
-    ModelConfig,
     Spectra,
+    SwiftWRFPaper,
     fit,
     fit_coarray,
     make_model,
@@ -96,7 +106,7 @@ def rates(config: Config, device: torch.device) -> Row:
             calls = {
                 "forward": partial(rasterize_magnitude, *inputs, grid, "auto", CUTOFF),
                 "forward_backward": partial(with_gradients, inputs, grid, "auto"),
-                "model": partial(model.field, model.field.normalise(position.to(device))),
+                "model": partial(rendered, model, position.to(device), grid),
                 "synthesize": partial(model.synthesize, position),
             }
             row: Row = {"n": n, "batch": batch}
@@ -130,17 +140,16 @@ def targets(rows: list[Row]) -> list[Row]:
 
 
 def training(config: Config, device: torch.device) -> Row:
-    """Seconds of the fit by regression, of a fit by gradient and of the network, on the built-in room."""
+    """Seconds of the fit by regression, of the paper's fit and of the network, on the built-in room."""
     steps, n = (4, 16) if config.quick else (200, 1000)
     grid = AngularGrid.hemisphere(8, 32) if config.quick else AngularGrid.hemisphere(90, 360)
     train, _ = simulated_room(n=40 if config.quick else 300, grid=grid).split()
-    found = FitConfig(model=ModelConfig(n_primitives=n)) if config.quick else FitConfig()
-    everything = ModelConfig(n_primitives=n, components=("mean", "response", "attenuation", "cholesky"))
-    gradient = FitConfig(model=everything, steps=steps, check_every=steps, max_azimuths=0)
+    size = n if config.quick else "auto"
+    paper = SwiftWRFPaper(n_primitives=n, steps=steps, batch=16, check_every=steps, max_azimuths=0)
     network = AANNConfig(steps=2, batch=4) if config.quick else AANNConfig()
     seconds = {
-        "regression": timed(lambda: fit(train, found, device=device, progress=False), device),
-        f"gradient, N = {n}, {steps} steps": timed(lambda: fit(train, gradient, device=device, progress=False), device),
+        "regression": timed(lambda: fit(train, n_primitives=size, device=device), device),
+        f"swiftwrf_paper, N = {n}, {steps} steps": timed(lambda: paper.fit(train, device=device), device),
         f"network, {network.steps} steps": timed(
             lambda: AANN(network).fit(Mixed.measured(train), device=device), device
         ),
@@ -206,12 +215,11 @@ def profiled(config: Config, device: torch.device) -> Row:
     batch, rows = batches[-1], []
     machine = gpu_rates() if device.type == "cuda" else None
     for n in numbers:
-        inputs, field = scene(n, batch, device), model_of(n, grid, device).field
-        position = field.normalise(positions(batch).to(device))
+        inputs, model, position = scene(n, batch, device), model_of(n, grid, device), positions(batch).to(device)
         with torch.no_grad():
             drawing = rate(partial(rasterize_magnitude, *inputs, grid, "auto", CUTOFF), batch, device, config.seconds)
             row: Row = {"n": n, "batch": batch, "forward_per_s": drawing["median"]}
-            row["model"] = kernels_of(partial(field, position), device)
+            row["model"] = kernels_of(partial(rendered, model, position, grid), device)
         if machine is not None:
             row["share_of_bounds"] = {
                 "exponentials": drawing["median"] * kernel_values(inputs, grid) / machine["exponentials_per_s"],

@@ -13,7 +13,7 @@ import tyro
 from record import write_result
 from synthesis import SCENES
 
-from swiftwrf import FitConfig, ModelConfig, Spectra, fit, load_spectra, simulated_room
+from swiftwrf import Spectra, fit, load_spectra, simulated_room
 from swiftwrf.data.splits import Validation, validation_for
 from swiftwrf.metrics import psnr, ssim, summary
 from swiftwrf.rasterize import prepare
@@ -60,17 +60,14 @@ def measure(name: str, data: Spectra, split: str, seed: int, parallel: Map) -> d
 
 def fitted(train: Spectra, test: Spectra, validation: Validation, seed: int, n: int | None) -> dict[str, Any]:
     """Return size, test scores and seconds of a fit with `n` primitives, or with the number that it chooses."""
-    config = FitConfig(
-        model=ModelConfig() if n is None else ModelConfig(n_primitives=n), validation=validation, seed=seed
-    )
     prepare("cpu")
     began, busy = time.perf_counter(), time.process_time()
-    model = fit(train, config, progress=False)
+    model = fit(train, n_primitives=n or "auto", validation=validation, seed=seed)
     seconds, busy = time.perf_counter() - began, time.process_time() - busy
     drawn = model.synthesize(test.position)
     return {
-        "n_primitives": model.field.config.n_primitives,
-        "rank": model.field.config.rank,
+        "n_primitives": len(model.mean),
+        "rank": len(model.weight) - 1,
         "parameters": sum(p.numel() for p in model.parameters()),
         "psnr_db": summary(psnr(drawn, test.spectrum)),
         "ssim": summary(ssim(drawn, test.spectrum)),

@@ -26,7 +26,7 @@ from comparison import MEAN, SHARES, milliseconds, weight
 from record import write_result
 from torch import Tensor
 
-from swiftwrf import FIELD_MODELS, FitConfig, Spectra, SwiftWRF, load_spectra, make_model
+from swiftwrf import FIELD_MODELS, Spectra, load_spectra, make_model
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.choices import Moving
 from swiftwrf.data.raytraced import ROOMS
@@ -48,19 +48,16 @@ HEIGHT_M = 1.2  # of all positions
 SCENES: tuple[tuple[str, Moving], ...] = tuple(
     (room, moving) for room in ("conference", "office", "bedroom") for moving in ("transmitter", "receiver")
 )
-DEFORMING = "swiftwrf_paper"  # the paper's own deformation, fitted by gradient descent
 CLOSED_FORM = (MEAN, "nearest", "idw", "gp", "coarray", "geometry", "hybrid", "swiftwrf")
-BY_GRADIENT = ("nerf2", "wrfgs", "vae", "dcgan", DEFORMING)
+BY_GRADIENT = ("nerf2", "wrfgs", "vae", "dcgan", "swiftwrf_paper")
 METHODS = (*CLOSED_FORM, *BY_GRADIENT)
-DEFORMING_PRIMITIVES, DEFORMING_BATCH, DEFORMING_STEPS = 256, 4, 4000  # sized for a CPU
 ON_GPU: dict[str, dict[str, Any]] = {  # changes of the paper presets, for a few minutes of a GPU
     "nerf2": {"width": 128, "batch": 2048, "steps": 4000, "decay_steps": None},
     "wrfgs": {"steps": 5000, "decay_steps": None},
     "vae": {"width": 32, "batch": 32, "steps": 4000},
     "dcgan": {"width": 32, "batch": 32, "steps": 4000},
-    DEFORMING: {"batch": 16, "steps": 20_000, "smoothing_steps": 2000},
+    "swiftwrf_paper": {"n_primitives": 2000, "batch": 16, "steps": 20_000, "smoothing_steps": 2000},
 }
-DEFORMING_PRIMITIVES_ON_GPU = 2000
 QUICK_DIVISOR = 20  # of the steps of a fit by gradient descent under --quick
 JUDGES = 200  # test spectra of a split, evenly chosen: a neural field takes seconds to predict one
 COUNTS, QUICK_COUNTS = (200, 500, 1000, 2000, 3000), (60, 120)  # training spectra
@@ -176,18 +173,9 @@ def built(method: str, split: Split, config: Config) -> FieldModel | None:
     if method == MEAN:
         return None
     options: dict[str, Any] = {"validation": validation_for(split), "seed": config.seed}
-    if method == DEFORMING:
-        paper = FitConfig.paper()
-        if config.device == "cuda":
-            n_primitives, sizes = DEFORMING_PRIMITIVES_ON_GPU, ON_GPU[DEFORMING]
-        else:
-            n_primitives = DEFORMING_PRIMITIVES
-            sizes = {"batch": DEFORMING_BATCH, "steps": DEFORMING_STEPS}
-            sizes |= {"max_azimuths": FitConfig().max_azimuths, "check_every": FitConfig().check_every}
-        smaller = replace(paper.model, n_primitives=n_primitives)
-        model: FieldModel = SwiftWRF(replace(paper, model=smaller, **sizes, **options))
-    elif config.device == "cuda" and method in BY_GRADIENT:
-        model = make_model(method, "paper", **ON_GPU[method], **FIELD_MODELS[method].supported(options))
+    if config.device == "cuda" and method in BY_GRADIENT:
+        on_gpu = ON_GPU[method] | FIELD_MODELS[method].supported(options)
+        model: FieldModel = make_model(method, "paper", **on_gpu)
     else:
         model = make_model(method, **FIELD_MODELS[method].supported(options))
     steps = getattr(model.config, "steps", 0)

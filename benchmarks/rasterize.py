@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,14 +20,15 @@ import tyro
 from record import RESULTS, write_result
 from torch import Tensor
 
-from swiftwrf import AngularGrid, ModelConfig, SwiftWRF, rasterize
-from swiftwrf.gp import Kernel
-from swiftwrf.models.swiftwrf.field import DeformableGaussians
+from swiftwrf import AngularGrid, SwiftWRF, rasterize
+from swiftwrf.gp import GaussianProcess, Kernel
+from swiftwrf.models import swiftwrf as model_module
 from swiftwrf.rasterize import Backend, rasterize_magnitude
 from tasks.run import choose_device
 
 Rate = dict[str, float]
 CUTOFF = 1e-3
+RANK = 32  # components of the model
 LARGEST_DENSE = 5e7  # kernel values of one spectrum: the definition keeps several such tensors
 LARGEST_OUTPUT = 2**31  # bytes of the spectra of one call
 
@@ -147,26 +148,28 @@ def with_gradients(inputs: list[Tensor], grid: AngularGrid, backend: Backend) ->
 
 
 def end_to_end(n: int, batch: int, grid: AngularGrid, device: torch.device, seconds: float) -> Rate:
-    """Return the rate from positions to magnitudes, with the motion basis and without cached kernels."""
-    field = model_of(n, grid, device).field
+    """Return the rate from positions to magnitudes without cached kernels."""
+    model, position = model_of(n, grid, device), positions(batch).to(device)
     with torch.no_grad():
-        position = field.normalise(positions(batch).to(device))
-        return rate(lambda: field(position), batch, device, seconds)
+        return rate(lambda: rendered(model, position, grid), batch, device, seconds)
+
+
+def rendered(model: SwiftWRF, position: Tensor, grid: AngularGrid) -> Tensor:
+    """Return magnitudes at positions, without cached kernels."""
+    return rasterize_magnitude(*model.primitives(position), grid, cutoff=CUTOFF)
 
 
 def model_of(n: int, grid: AngularGrid, device: torch.device) -> SwiftWRF:
-    """Return a model with a motion basis of the responses and the primitives of `scene`."""
-    config = ModelConfig(n_primitives=n, rank=32, cutoff=CUTOFF)
+    """Return a model of 32 components with the primitives of `scene`."""
+    model_module.CUTOFF = CUTOFF  # of all rates
     generator = torch.Generator().manual_seed(0)
-    field = DeformableGaussians.initial(config, grid, positions(200), Kernel(), generator=generator)
-    with torch.no_grad():
-        mean, cholesky, _ = scene(n, 1, torch.device("cpu"))
-        l1, l2, l3 = cholesky.unbind(-1)
-        field.primitives.mean.copy_(mean[0])
-        field.primitives.cholesky.copy_(torch.stack([l1.log(), l2 / l3, l3.log()], dim=-1))
-    header = {"grid": asdict(grid), "config": asdict(config), "bounds": [[0.0] * 3, [1.0] * 3]}
-    model = SwiftWRF.from_state(field.state_dict(), header | field.deformation.header())
-    model.field.to(device)
+    model, (mean, cholesky, _) = SwiftWRF(n_primitives=n), scene(n, 1, torch.device("cpu"))
+    known, value = positions(200).double(), torch.randn(200, RANK, generator=generator, dtype=torch.float64)
+    model.grid, model.bounds = grid, torch.tensor([[0.0] * 3, [1.0] * 3], dtype=torch.float64)
+    model.mean, model.cholesky, model.calibration = mean[0], cholesky, 1.0
+    model.weight = torch.randn(1 + RANK, n, generator=generator)
+    model.process = GaussianProcess.regress(Kernel(), known, value)
+    model._move(device)
     return model
 
 

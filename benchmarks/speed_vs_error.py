@@ -22,10 +22,7 @@ from torch import Tensor
 from swiftwrf import (
     AngularGrid,
     CoarrayModel,
-    FitConfig,
-    ModelConfig,
     Spectra,
-    SwiftWRF,
     fit,
     make_model,
     project,
@@ -41,6 +38,7 @@ from tasks.page.palette import Palette
 
 CUTOFFS = (None, 1e-5, 1e-4, 1e-3, 1e-2)
 GRIDS = ((45, 180), (90, 360), (180, 720))
+SIZES = (16, 64, 256, 1024)
 BATCH = 32  # spectra a call
 Point = dict[str, Any]
 
@@ -89,12 +87,10 @@ class Study:
         validation = validation_for(config.split)
         self.validation = validation
         self.seed = config.seed
-        self.config = FitConfig(validation=validation, seed=config.seed)
         prepare("cpu")
         began = time.perf_counter()
-        self.model = fit(train, self.config, progress=False)
+        self.model = fit(train, validation=validation, seed=config.seed)
         self.fit_seconds = time.perf_counter() - began
-        self.config = replace(self.config, model=self.model.field.config)
 
     def rate(self, synthesize: Callable[[Tensor], Tensor]) -> dict[str, float]:
         """Return the seconds of a spectrum from positions to magnitudes: median, minimum and maximum of the repeats."""
@@ -162,7 +158,7 @@ class Study:
         self, grid: AngularGrid, backend: Backend, cutoff: float | None, dtype: torch.dtype
     ) -> Callable[[Tensor], Tensor]:
         """Return the rendering of the default model with weights rounded to `dtype`; float64 applies to all tensors."""
-        wide, field = dtype == torch.float64, self.model.field
+        wide = dtype == torch.float64
 
         @torch.no_grad()
         def synthesize(position: Tensor) -> Tensor:
@@ -170,40 +166,25 @@ class Study:
             step = 1 if backend == "reference" else BATCH
             for start in range(0, len(position), step):
                 rows = slice(start, start + step)
-                gaussians = field.gaussians(field.normalise(position[rows]))
-                n, weight = len(position[rows]), gaussians.weight.to(dtype)
-                tensors = (gaussians.mean.expand(n, -1, -1), gaussians.cholesky, weight.expand(n, -1, -1))
-                tensors = tuple(x.double() if wide else x.float() for x in tensors)
+                mean, cholesky, weight = self.model.primitives(position[rows])
+                tensors = tuple(x.double() if wide else x.float() for x in (mean, cholesky, weight.to(dtype)))
                 spectrum[rows] = rasterize_magnitude(*tensors, grid, backend, cutoff)
             return spectrum.clamp_(0, 1)
 
         return synthesize
 
     def models(self) -> list[Point]:
-        """Return the default model and variants of its size, deformation and covariance."""
-        size, rank = self.model.field.config.size
-        parameters = sum(p.numel() for p in self.model.parameters())
-        points = [
-            self.point(
-                f"swiftwrf, default (N {size}, K {rank})",
-                self.model.synthesize,
-                self.fit_seconds,
-                parameters=parameters,
-            )
-        ]
-        variants: dict[str, dict[str, Any]] = {f"swiftwrf, N {n}": {"n_primitives": n} for n in (16, 64, 256, 1024)}
-        variants |= {f"swiftwrf, K {k}": {"rank": k} for k in (4, 12, 48)}
-        variants["swiftwrf, axis-aligned"] = {"axis_aligned": True}
-        variants["swiftwrf, per-primitive network"] = {"deformation": "per_primitive_mlp"}
-        for setting, changes in variants.items():
-            slow = {"steps": 600, "rate": 1e-2, "deformation_rate": 2e-3} if "network" in setting else {}
+        """Return the default model and those of other sizes."""
+        models = {f"swiftwrf, default (N {len(self.model.mean)}, K {len(self.model.weight) - 1})": self.model}
+        seconds = [self.fit_seconds]
+        for n in SIZES:
             began = time.perf_counter()
-            changed: ModelConfig = replace(self.model.field.config, **changes)
-            model: SwiftWRF = fit(self.train, replace(self.config, model=changed, **slow), progress=False)
-            seconds = time.perf_counter() - began
-            parameters = sum(p.numel() for p in model.parameters())
-            points.append(self.point(setting, model.synthesize, seconds, parameters=parameters))
-        return points
+            models[f"swiftwrf, N {n}"] = fit(self.train, n_primitives=n, validation=self.validation, seed=self.seed)
+            seconds.append(time.perf_counter() - began)
+        return [
+            self.point(setting, model.synthesize, taken, parameters=sum(p.numel() for p in model.parameters()))
+            for (setting, model), taken in zip(models.items(), seconds, strict=True)
+        ]
 
     def others(self) -> list[Point]:
         """Return the other field models, and projections onto the spectra that the array can produce."""

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import tyro
@@ -20,19 +20,19 @@ from torch import Tensor
 
 from swiftwrf import (
     AngularGrid,
-    FitConfig,
+    FieldModel,
     FitError,
     InputError,
-    ModelConfig,
     Spectra,
-    fit,
+    SwiftWRF,
+    SwiftWRFPaper,
     rasterize,
     simulated_room,
 )
 from swiftwrf.data.store import Store
-from swiftwrf.gp import Kernel
 from swiftwrf.metrics import psnr
-from swiftwrf.models.swiftwrf.field import DeformableGaussians
+from swiftwrf.models.swiftwrf_paper import DeformableGaussians
+from swiftwrf.positions import frame
 from swiftwrf.rasterize import Backend, rasterize_magnitude
 
 
@@ -90,14 +90,12 @@ def precision(device: torch.device) -> list[dict[str, Any]]:
     generator = torch.Generator().manual_seed(0)
     grid = AngularGrid.hemisphere(90, 360)
     anchor = torch.rand(100, 3, generator=generator)
-    config = ModelConfig(n_primitives=200, rank=32, components=("mean", "response", "attenuation", "cholesky"))
-    model = DeformableGaussians.initial(config, grid, anchor, Kernel(), generator=generator)
-    for parameter in model.parameters():
+    model = DeformableGaussians(200, grid, *frame(anchor), generator=generator)
+    for parameter in (*model.primitives.parameters(), *model.output.parameters()):
         parameter.data += 0.3 * torch.randn(parameter.shape, generator=generator)
     model = model.to(device).requires_grad_(False)
     position = model.normalise(torch.rand(8, 3, generator=generator).to(device))
-    mean, cholesky, attenuation, response = model.gaussians(position)
-    weight = attenuation[..., None] * response
+    mean, cholesky, weight = model(position)
 
     def drawn(
         mean: Tensor = mean, cholesky: Tensor = cholesky, weight: Tensor = weight, cutoff: float | None = 1e-4
@@ -114,7 +112,7 @@ def precision(device: torch.device) -> list[dict[str, Any]]:
         rows.append((f"means in {name}", drawn(mean=mean.to(dtype).float())))
     for name in ("high", "medium"):
         with matmul_precision(name):
-            rows.append((f"matrix products in {name!r} precision", model(position).cpu()))
+            rows.append((f"matrix products in {name!r} precision", drawn(*model(position))))
     return [
         {
             "what": what,
@@ -189,16 +187,16 @@ FITS: dict[str, Callable[[int], Spectra]] = {
 }
 
 
-def fit_case(name: str, many: int, config: FitConfig | None = None) -> dict[str, Any]:
+def fit_case(name: str, many: int, n_primitives: int | Literal["auto"] = "auto") -> dict[str, Any]:
     """Return the error of the fitted training spectra and of their mean, or the message of the refusal."""
-    train, config = FITS[name](many), config or FitConfig()
+    train = FITS[name](many)
+    model: FieldModel = SwiftWRF(n_primitives=n_primitives)
     if name.startswith("learning rate"):
-        gradient = replace(config.model, n_primitives=24, components=("mean", "response", "attenuation", "cholesky"))
-        config = replace(config, model=gradient, steps=300, rate=30 * config.rate)
+        model = SwiftWRFPaper(n_primitives=24, steps=300, rate=0.3, deformation_rate=0.24)
     result: dict[str, Any] = {"case": name, "n": len(train), "psnr_db": None, "mean_psnr_db": None, "refusal": None}
     began = time.perf_counter()
     try:
-        drawn = fit(train, config, progress=False).synthesize(train.position)
+        drawn = model.fit(train).synthesize(train.position)
     except (InputError, FitError) as error:
         result["refusal"] = str(error)
     else:

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from swiftwrf.models.coarray import CoarrayModel, fit_coarray, project
     from swiftwrf.models.geometry import GeometryModel, HybridModel, fit_geometry, fit_hybrid
     from swiftwrf.models.prediction import Prediction
-    from swiftwrf.models.swiftwrf import FitConfig, ModelConfig, SwiftWRF
-    from swiftwrf.models.swiftwrf.model import fit
+    from swiftwrf.models.swiftwrf import SwiftWRF, fit
+    from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
     from swiftwrf.rasterize import rasterize, rasterize_magnitude
     from swiftwrf.rssi import PairModel, RssiConfig, RssiModel, fit_rssi
     from swiftwrf.runtime.checkpoint import load
@@ -50,8 +50,8 @@ import_lazily(
         "swiftwrf.models.coarray": ("CoarrayModel", "fit_coarray", "project"),
         "swiftwrf.models.geometry": ("GeometryModel", "HybridModel", "fit_geometry", "fit_hybrid"),
         "swiftwrf.models.prediction": ("Prediction",),
-        "swiftwrf.models.swiftwrf": ("FitConfig", "ModelConfig", "SwiftWRF"),
-        "swiftwrf.models.swiftwrf.model": ("fit",),
+        "swiftwrf.models.swiftwrf": ("SwiftWRF", "fit"),
+        "swiftwrf.models.swiftwrf_paper": ("SwiftWRFPaper",),
         "swiftwrf.rasterize": ("rasterize", "rasterize_magnitude"),
         "swiftwrf.rssi": ("PairModel", "RssiConfig", "RssiModel", "fit_rssi"),
         "swiftwrf.runtime.checkpoint": ("load",),
@@ -65,13 +65,11 @@ __all__ = [
     "Calibration",
     "CoarrayModel",
     "FieldModel",
-    "FitConfig",
     "FitError",
     "GeometryModel",
     "HybridModel",
     "InputError",
     "MatchedField",
-    "ModelConfig",
     "PairModel",
     "Posterior",
     "Prediction",
@@ -82,6 +80,7 @@ __all__ = [
     "Snapshots",
     "Spectra",
     "SwiftWRF",
+    "SwiftWRFPaper",
     "calibrate",
     "comparison",
     "datasets",

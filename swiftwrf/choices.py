@@ -32,12 +32,14 @@ FIELD_MODELS: Registry[FieldModel] = Registry(
         "idw": "swiftwrf.models.idw:IDWModel",
         "raytrace": "swiftwrf.models.raytrace:RaytraceModel",
         "swiftwrf": "swiftwrf.models.swiftwrf:SwiftWRF",
+        "swiftwrf_paper": "swiftwrf.models.swiftwrf_paper:SwiftWRFPaper",
         "dcgan": "swiftwrf.comparison:Dcgan",
         "nerf2": "swiftwrf.comparison:NeRF2",
         "vae": "swiftwrf.comparison:Vae",
         "wrfgs": "swiftwrf.comparison:WrfGs",
     },
 )
+PUBLISHED = {"swiftwrf": "swiftwrf_paper"}  # field models whose published settings are those of another one
 BEAMFORMERS: Registry[Tensor] = Registry(
     "beamformer",
     "swiftwrf.beamformers",

@@ -59,6 +59,25 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
     return similarity.mean(dim=(-2, -1))
 
 
+def spectrum_loss(predicted: Tensor, measured: Tensor, ssim_weight: float = 0.3) -> Tensor:
+    """Return (1 - w) L1 + w (1 - SSIM), averaged over spectra: the loss of the paper.
+
+    Args:
+        predicted: Predicted magnitudes (B, H, W).
+        measured: Measured magnitudes (B, H, W).
+        ssim_weight: Weight w of the SSIM term, in [0, 1].
+
+    Returns:
+        A scalar; differentiable.
+
+    Example:
+        >>> float(spectrum_loss(torch.zeros(1, 9, 9), torch.zeros(1, 9, 9)))
+        0.0
+    """
+    pixels = (predicted - measured).abs().mean()
+    return (1 - ssim_weight) * pixels + ssim_weight * (1 - ssim(predicted, measured).mean())
+
+
 def psnr(a: Tensor, b: Tensor) -> Tensor:
     """Return 10 log10(1 / MSE) of each pair of images (..., H, W) in [0, 1] [dB], (...).
 

@@ -26,7 +26,8 @@ class Label:
 
 
 FIELD_MODELS = {
-    "swiftwrf": Label("2D Gaussians that deform with the position", "#0072b2"),
+    "swiftwrf": Label("2D Gaussians with weights that depend on the position", "#0072b2"),
+    "swiftwrf_paper": Label("the paper's 2D Gaussians, deformed by a network, fitted by gradient descent", "#6b7a1f"),
     "gp": Label("a Gaussian process on the pixels", "#d1620f"),
     "coarray": Label("a Gaussian process in the space that the array's spectra can lie in", "#c04f9d"),
     "geometry": Label("image sources of the room's walls, found from the spectra", "#8b6fd0"),

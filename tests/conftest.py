@@ -12,7 +12,7 @@ import small
 import torch
 from PIL import Image
 
-from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, Spectra, fit, simulated_room
+from swiftwrf import AngularGrid, InputError, Spectra, fit, simulated_room
 from swiftwrf.data.raytraced import sionna
 from swiftwrf.data.writing import write_spectra
 
@@ -98,8 +98,7 @@ def aoa_run(tmp_path_factory: pytest.TempPathFactory, room: Spectra) -> Path:
     options = ("--synthesizer", "swiftwrf", "--extra", 0, "--data", folder / "data", "--out", folder / "run")
     with mock.patch("tasks.aoa.context.candidates", return_value=["idw"]):  # finding a room has tests of its own
         assert quick.run("aoa", "--mix", 0.5, 1, *options) == 0
-    config = FitConfig(model=ModelConfig(n_primitives=16, rank=4))
-    fit(room, config).save(folder / "run" / "model-mix1.safetensors")
+    fit(room, n_primitives=16).save(folder / "run" / "model-mix1.safetensors")
     return folder / "run"
 
 

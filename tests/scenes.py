@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.models.swiftwrf.primitives import MIN_WIDTH_PIXELS
+from swiftwrf.models.primitives import MIN_WIDTH_PIXELS
 
 GRID = AngularGrid.hemisphere(30, 120)
 

@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 from typing import Any, get_type_hints
 from unittest import mock
 
-from swiftwrf import FIELD_MODELS, FitConfig, ModelConfig, Spectra
+from swiftwrf import FIELD_MODELS, Spectra
 from swiftwrf.comparison import (
     Config,
     DcganConfig,
@@ -22,9 +22,11 @@ from swiftwrf.models.geometry import GeometryConfig
 from swiftwrf.models.geometry.fit import search_room
 from swiftwrf.models.geometry.planes import RoomEstimate
 from swiftwrf.models.geometry.search import Search
+from swiftwrf.models.swiftwrf import SwiftWRFConfig
+from swiftwrf.models.swiftwrf_paper import SwiftWRFPaperConfig
 from swiftwrf.runtime.validation import configuration
 
-FIT = FitConfig(model=ModelConfig(n_primitives=4, rank=2), steps=30, check_every=5)
+FIT = SwiftWRFConfig(n_primitives=16)
 SHORT = {"steps": 12, "check_every": 6, "batch": 8, "warm_up": 1}
 LONGER = {"steps": 60, "check_every": 30, "batch": 16, "rate": 1e-2}  # the loss of a batch is noisy in so short a fit
 PUBLISHED: dict[str, Config] = {
@@ -33,6 +35,7 @@ PUBLISHED: dict[str, Config] = {
     "vae": VaeConfig(latent=2, width=2, hidden=8, bands=2, **LONGER),
     "dcgan": DcganConfig(noise=2, width=2, hidden=8, bands=2, **LONGER),
 }
+PAPER = SwiftWRFPaperConfig(n_primitives=4, steps=30, check_every=5)
 PUBLISHED_RSSI = NeRF2RssiConfig(width=8, bands=2, samples=4, azimuths=4, elevations=2, **LONGER)
 GLANCE = GeometryConfig(reach=0.5, positions=10, width=1, max_order=1, further=0)  # a short search that finds little
 
@@ -53,9 +56,9 @@ def with_defaults(config: Any) -> type[Any]:
 
 @contextmanager
 def small_published() -> Iterator[None]:
-    """Give the methods of comparison small defaults."""
+    """Give the published models small defaults."""
     with ExitStack() as patches:
-        for name, config in PUBLISHED.items():
+        for name, config in {**PUBLISHED, "swiftwrf_paper": PAPER}.items():
             patches.enter_context(mock.patch.object(FIELD_MODELS[name], "config_type", with_defaults(config)))
         patches.enter_context(mock.patch.object(NeRF2Rssi, "config_type", with_defaults(PUBLISHED_RSSI)))
         yield
@@ -63,7 +66,7 @@ def small_published() -> Iterator[None]:
 
 @contextmanager
 def small_swiftwrf() -> Iterator[None]:
-    """Give SwiftWRF the defaults of a short fit by gradient descent."""
+    """Give SwiftWRF few primitives; the search for their number has its own tests."""
     with mock.patch.object(FIELD_MODELS["swiftwrf"], "config_type", with_defaults(FIT)):
         yield
 

@@ -27,7 +27,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.comparison.base import Config, Count, TrainedModel, Training
 from swiftwrf.comparison.convolution import decoder, encoder, paired_training
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.models.swiftwrf.mlp import encode
+from swiftwrf.models.mlp import encode
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
 Layer = Callable[[Tensor], Tensor]

@@ -34,7 +34,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.comparison.base import Config, Count, Depth, TrainedModel, Training, draw_parameters
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.models.base import FIXED_END
-from swiftwrf.models.swiftwrf.mlp import SkipMLP, encode
+from swiftwrf.models.mlp import SkipMLP, encode
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
 MAX_SAMPLES_AT_ONCE = 2**19  # samples of the field evaluated at a time, which bounds the memory

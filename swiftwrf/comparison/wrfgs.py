@@ -40,10 +40,10 @@ from torch.nn import functional
 from swiftwrf.array.angles import AngularGrid, to_angles
 from swiftwrf.comparison.base import Config, Count, Depth, TrainedModel, Training, draw_parameters
 from swiftwrf.data.spectra import Spectra
+from swiftwrf.metrics import spectrum_loss
 from swiftwrf.models.base import FIXED_END
-from swiftwrf.models.swiftwrf.loss import spectrum_loss
-from swiftwrf.models.swiftwrf.mlp import SkipMLP, encode
-from swiftwrf.models.swiftwrf.primitives import MAX_WIDTH_RAD, min_width
+from swiftwrf.models.mlp import SkipMLP, encode
+from swiftwrf.models.primitives import MAX_WIDTH_RAD, min_width
 from swiftwrf.rasterize import rasterize_magnitude
 from swiftwrf.runtime.session import State
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, configuration

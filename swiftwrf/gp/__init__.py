@@ -1,7 +1,6 @@
-"""Gaussian processes over positions: the kernel and its choice, regression, smooth fields, and principal components."""
+"""Gaussian processes over positions: the kernel and its choice, regression, and principal components."""
 
 from swiftwrf.gp.choice import choose_kernel, choose_rank, inner_products, most_informative, squared_errors, subsample
-from swiftwrf.gp.field import SmoothField
 from swiftwrf.gp.kernel import Kernel, candidates
 from swiftwrf.gp.pca import Components, principal_components
 from swiftwrf.gp.process import GaussianProcess, LeaveGroupOut, dense_weights, held_out, held_out_neighbours
@@ -11,7 +10,6 @@ __all__ = [
     "GaussianProcess",
     "Kernel",
     "LeaveGroupOut",
-    "SmoothField",
     "candidates",
     "choose_kernel",
     "choose_rank",

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.choices import FIELD_MODELS, Moving
+from swiftwrf.choices import FIELD_MODELS, PUBLISHED, Moving
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.spectra import Spectra, check_spectra, check_training
 from swiftwrf.data.splits import Validation
@@ -465,7 +465,7 @@ def make_model(name: str, preset: Preset = "quick", **options: Any) -> FieldMode
 
     Args:
         name: Name in the registry, e.g. "hybrid".
-        preset: "quick", or "paper" for published settings.
+        preset: "quick", or "paper" for published settings. With "paper" the name "swiftwrf" gives `SwiftWRFPaper`.
         options: Options of the model.
 
     Raises:
@@ -475,5 +475,10 @@ def make_model(name: str, preset: Preset = "quick", **options: Any) -> FieldMode
         >>> make_model("idw", seed=3).config.seed
         3
     """
-    model_type: type[FieldModel] = FIELD_MODELS[name]
-    return model_type(preset=preset, **options)
+    return model_type(name, preset)(preset=preset, **options)
+
+
+def model_type(name: str, preset: Preset = "quick") -> type[FieldModel]:
+    """Return the field model of a name; with "paper", the one that has the published settings."""
+    found: type[FieldModel] = FIELD_MODELS[PUBLISHED.get(name, name) if preset == "paper" else name]
+    return found

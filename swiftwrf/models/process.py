@@ -79,10 +79,14 @@ class ProcessModel(FieldModel):
         position, before = model.process.known.cpu(), model.process.kernel
         fold = folds(position, self.config.validation, self.config.seed)
         model._set_process(model.process.with_kernel(choose_kernel(position, model._weighted_values(), fold)))
-        if model.spread is not None:
-            errors = [_held_out_std(kernel, position, fold) for kernel in (before, model.process.kernel)]
-            model.spread = model.spread * float(errors[0] / errors[1])
+        errors = [_held_out_std(kernel, position, fold) for kernel in (before, model.process.kernel)]
+        model._scale_std(float(errors[0] / errors[1]))
         return model
+
+    def _scale_std(self, factor: float) -> None:
+        """Multiply all standard deviations by a factor."""
+        if self.spread is not None:
+            self.spread = self.spread * factor
 
     def _set_spread(
         self,

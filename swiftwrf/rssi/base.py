@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.coordinates import GeodeticOrigin
-from swiftwrf.data.dataset import Numbers, to_tensor
+from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.groups import Offsets
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
@@ -25,7 +25,7 @@ from swiftwrf.gp import Kernel
 from swiftwrf.models.base import FieldConfig, FitContext
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
-from swiftwrf.positions import check_positions
+from swiftwrf.positions import check_positions, to_tensor
 from swiftwrf.rssi.floors import FloorAttenuation, estimate_floor_attenuation, receiver_floors
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.options import Configured, all_or_nothing, from_plain

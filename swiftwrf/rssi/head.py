@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.models.swiftwrf.primitives import Primitives
+from swiftwrf.models.primitives import Primitives
 from swiftwrf.rasterize import rasterize
 from swiftwrf.rasterize.magnitude import magnitude
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from augment import sample_positions
-from swiftwrf import Spectra, SwiftWRF
+from swiftwrf import Spectra, SwiftWRF, SwiftWRFPaper
 from swiftwrf.models import FieldModel
 from swiftwrf.models.nearest import MemoryModel
 from tasks.records import write_json, write_npz
@@ -60,7 +60,7 @@ def save_artifacts(model: FieldModel, key: str, measured: Spectra, test: Spectra
         write_npz(folder / f"room-{mix}.npz", {name: value.numpy() for name, value in places.items()})
     if not model.slow:
         write_npz(folder / f"field-{model.name}-{mix}.npz", peak_map(model, measured))
-    if isinstance(model, SwiftWRF):
+    if isinstance(model, SwiftWRF | SwiftWRFPaper):
         write_npz(folder / f"motion-{mix}.npz", deformation(model, measured))
 
 
@@ -87,7 +87,7 @@ def peak_map(model: FieldModel, measured: Spectra) -> dict[str, NDArray[Any]]:
 
 
 @torch.no_grad()
-def deformation(model: SwiftWRF, measured: Spectra) -> dict[str, NDArray[Any]]:
+def deformation(model: SwiftWRF | SwiftWRFPaper, measured: Spectra) -> dict[str, NDArray[Any]]:
     """Return the strongest primitives along a straight walk through the middle of the region, along its longest extent.
 
     Returns:
@@ -95,11 +95,9 @@ def deformation(model: SwiftWRF, measured: Spectra) -> dict[str, NDArray[Any]]:
         (steps, n), the magnitude of each primitive's weight.
     """
     walk = _walk(measured.position)
-    field = model.field
-    gaussians = field.gaussians(field.normalise(walk.to(model.device)))
-    strength = gaussians.weight.norm(dim=-1).expand(len(walk), -1).cpu()
-    mean = gaussians.mean.expand(len(walk), -1, -1).cpu()
-    l1, l2, l3 = gaussians.cholesky.expand(len(walk), -1, -1)[0].cpu().unbind(-1)
+    mean, cholesky, weight = (tensor.cpu() for tensor in model.primitives(walk))
+    strength = weight.norm(dim=-1)
+    l1, l2, l3 = cholesky.unbind(-1)
     factor = torch.stack([torch.stack([l1, torch.zeros_like(l1)], -1), torch.stack([l2, l3], -1)], -2)
     chosen = strength.mean(dim=0).argsort(descending=True)[:MAX_PRIMITIVES]
     return {

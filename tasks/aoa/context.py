@@ -10,7 +10,8 @@ import torch
 from augment import SyntheticPositions, withhold
 from augment.choose import candidates
 from swiftwrf import Spectra
-from swiftwrf.models import FIELD_MODELS, FieldModel, make_model
+from swiftwrf.models import FIELD_MODELS, FieldModel
+from swiftwrf.models.base import model_type
 from tasks.aoa.condition import EVERYTHING, LOCATOR, Condition, MeasuredSubset, estimators
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.options import RAYTRACE, AoaConfig
@@ -55,7 +56,8 @@ class Experiment:
         """Return a field model that is not fitted."""
         # validation at random: withheld positions lie among the measured ones, whatever the split of the test
         options = {"preset": preset, "seed": self.seed(subset), "validation": "random", "scene": self.config.scene}
-        return make_model(name, **FIELD_MODELS[name].supported(options))
+        chosen = model_type(name, preset)
+        return chosen(**chosen.supported(options))
 
     @property
     def candidates(self) -> list[str]:

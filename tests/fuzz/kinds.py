@@ -7,11 +7,9 @@ A format or a kind of model joins by a sample here (a test fails for one without
 from __future__ import annotations
 
 import functools
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import pandas as pd
@@ -35,12 +33,11 @@ from augment import Mixed
 from swiftwrf import (
     FIELD_MODELS,
     AngularGrid,
-    FitConfig,
     MatchedField,
-    ModelConfig,
     Rssi,
     RssiLocator,
     Spectra,
+    SwiftWRFPaper,
     fit,
     fit_coarray,
     fit_rssi,
@@ -57,13 +54,12 @@ from swiftwrf.gp import Kernel
 from swiftwrf.models.geometry import fit_geometry, fit_hybrid
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.path_gains import fit_path_gains
-from swiftwrf.models.swiftwrf import SwiftWRF
 from swiftwrf.rssi import PairModel
 from tasks.aoa.estimators.kernel_regression import KernelRegression
 
 N = 12
 GRID = AngularGrid.hemisphere(8, 32)
-TINY = FitConfig(model=ModelConfig(n_primitives=3, rank=2), steps=12, check_every=6)
+TINY = SwiftWRFPaper(n_primitives=3, steps=12, check_every=6).config
 Reader = Callable[[Path], object]
 
 
@@ -117,7 +113,11 @@ def _room() -> Spectra:
 
 
 def model_swiftwrf(folder: Path) -> None:
-    fit(_room(), TINY, progress=False).save(folder / "model")
+    fit(_room(), n_primitives=3).save(folder / "model")
+
+
+def model_swiftwrf_paper(folder: Path) -> None:
+    SwiftWRFPaper(TINY).fit(_room()).save(folder / "model")
 
 
 def model_of(name: str, folder: Path) -> None:
@@ -207,10 +207,9 @@ def read_estimator(folder: Path) -> torch.Tensor:
     return estimate
 
 
-def go_on(folder: Path) -> SwiftWRF:
-    """A fit from its state; the choice of the kernel, which takes longest, is left out."""
-    with mock.patch.object(sys.modules["swiftwrf.models.swiftwrf.fit"], "choose_kernel", return_value=Kernel()):
-        return fit(_few(), TINY, progress=False, checkpoint=folder / "state")
+def go_on(folder: Path) -> SwiftWRFPaper:
+    """A fit from its state."""
+    return SwiftWRFPaper(TINY).fit(_few(), checkpoint=folder / "state")
 
 
 def model_rssi_locator(folder: Path) -> None:
@@ -255,6 +254,7 @@ KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "survey in Parquet": (survey_parquet, read_rssi),
     "format of RSSI survey": (rssi_survey, read_rssi),
     "swiftwrf model": (model_swiftwrf, read_model),
+    "swiftwrf_paper model": (model_swiftwrf_paper, read_model),
     "co-array model": (model_coarray, read_model),
     "geometry model": (model_geometry, read_model),
     "hybrid model": (model_hybrid, read_model),

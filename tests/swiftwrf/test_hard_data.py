@@ -14,7 +14,6 @@ from swiftwrf import (
     FitError,
     InputError,
     MatchedField,
-    ModelConfig,
     PairModel,
     RssiLocator,
     RssiModel,
@@ -25,12 +24,12 @@ from swiftwrf import (
 from swiftwrf.data.store import Store
 from swiftwrf.models.geometry import ambiguity, orient, search
 from swiftwrf.models.geometry.fit import observe
-from swiftwrf.models.swiftwrf.fit import doubling_search
+from swiftwrf.models.swiftwrf import smallest
 from swiftwrf.rssi.path_loss import PairPathLoss
 from swiftwrf.rssi.training import rounding_std
 
 SHORT = {"reach": 0.5, "positions": 10, "width": 1, "max_order": 1, "further": 1}  # search for a room
-OPTIONS = {"swiftwrf": {"model": ModelConfig(n_primitives=4, rank=2)}, "geometry": SHORT, "hybrid": SHORT}
+OPTIONS = {"swiftwrf": {"n_primitives": 4}, "geometry": SHORT, "hybrid": SHORT}
 MODELS = [name for name, model in FIELD_MODELS.items() if not model.slow]
 SCALES = (1e-3, 1e3, 1e6)
 
@@ -180,7 +179,7 @@ def test_a_search_without_reach_finds_no_plane():
 
 @pytest.mark.parametrize("losses", [[-2e-8, 1e-8, 3e-8], [0.0, 0.0, 0.0], [1.0, 0.5, 0.499]])
 def test_the_search_for_a_size_finds_one_at_any_loss(losses):
-    assert doubling_search(lambda size: losses[size - 1], 1, 2, patience=1) == (2 if losses[0] == 1.0 else 1)
+    assert smallest(lambda size: losses[size - 1], (1, 2)) == (2 if losses[0] == 1.0 else 1)
 
 
 def test_rssi_falls_with_the_distance_beyond_the_data_and_grows_uncertain():

@@ -154,7 +154,7 @@ def test_studies_have_the_same_scores(local, tmp_path, monkeypatch):
         monkeypatch.setattr(study, "simulated_room", lambda: data)
         monkeypatch.setattr(study, "write_result", lambda name, content: written.append(content))
     monkeypatch.setattr(model_size, "SIZES", (16,))
-    monkeypatch.setattr(ablation, "variants", lambda default, gradient: {"default": default})
+    monkeypatch.setattr(ablation, "variants", lambda default: {"default": default})
     for study in (ablation, model_size):
         for address in (None, local.scheduler_address):
             study.main(study.Config(scheduler=address))

@@ -20,8 +20,9 @@ import quick
 import torch
 
 from augment import Mixed
-from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, simulated_room
+from swiftwrf import AngularGrid, InputError, simulated_room
 from swiftwrf.data.store import Store
+from swiftwrf.models.swiftwrf_paper import SwiftWRFPaperConfig
 from swiftwrf.runtime.threads import set_threads
 from tasks import torchrun
 from tasks.aoa.estimators import aann
@@ -34,7 +35,7 @@ AOA = ("aoa", "--mix", 0.5, "--synthesizer", "swiftwrf", "idw", "--preset", "pap
 
 def paper(**options):
     """Return options of SwiftWRF like those of the paper, with one spectrum a step, but for few steps."""
-    return FitConfig(model=ModelConfig(n_primitives=8, rank=2), steps=60, check_every=30, batch=1, **options)
+    return SwiftWRFPaperConfig(n_primitives=8, steps=60, check_every=30, batch=1, **options)
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class Network(AANN):
 
 def run(*arguments):
     """Run a task on the toy, with the network of the paper."""
-    with mock.patch.object(quick, "QuickNetwork", Network), mock.patch.object(FitConfig, "paper", paper):
+    with mock.patch.object(quick, "QuickNetwork", Network), mock.patch.object(SwiftWRFPaperConfig, "paper", paper):
         return quick.run(*arguments)
 
 

@@ -12,14 +12,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swiftwrf import FIELD_MODELS, AngularGrid, InputError, ModelConfig, RssiConfig, RssiModel, load, make_model
+from swiftwrf import FIELD_MODELS, AngularGrid, InputError, RssiConfig, RssiModel, load, make_model
 from swiftwrf.data.floors import Floors
 from swiftwrf.data.simulated import rssi_room, simulated_room
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.rssi.floors import FloorAttenuation
 
 SIGNAL = 1e-5  # of the signal: magnitudes up to 1, RSSI over 60 dB
-OPTIONS = {"swiftwrf": {"model": ModelConfig(n_primitives=24)}}
+OPTIONS = {"swiftwrf": {"n_primitives": 24}}
 PROCESSES = ("gp", "coarray", "swiftwrf", "hybrid")
 N, M = 30, 12  # spectra of the fit and of the updates
 GRID = AngularGrid.hemisphere(15, 60)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pandas import DataFrame, concat
 
 from swiftwrf.models import FIELD_MODELS
-from swiftwrf.models.swiftwrf.fit import MIN_GAIN
+from swiftwrf.models.swiftwrf import MIN_GAIN
 from tasks.aoa.page.overview import essential
 from tasks.aoa.page.records import AoaRecords, FractionRecords, first_history, fits
 from tasks.page import figures

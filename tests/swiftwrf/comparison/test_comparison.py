@@ -40,7 +40,7 @@ from swiftwrf.comparison.vae import divergence
 from swiftwrf.comparison.wrfgs import on_sphere
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import psnr
-from swiftwrf.models.swiftwrf.mlp import encode
+from swiftwrf.models.mlp import encode
 from swiftwrf.runtime.checkpoint import read, write
 
 GRID = AngularGrid.hemisphere(90, 360)

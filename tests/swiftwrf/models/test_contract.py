@@ -15,16 +15,16 @@ import small
 import torch
 
 import swiftwrf
-from swiftwrf import FIELD_MODELS, AngularGrid, FieldModel, InputError, ModelConfig, Spectra, load, make_model
+from swiftwrf import FIELD_MODELS, AngularGrid, FieldModel, InputError, Spectra, load, make_model
 from swiftwrf.models.base import ARRAY, FIXED_END
 
-OPTIONS = {"swiftwrf": {"model": ModelConfig(n_primitives=24)}}
+OPTIONS = {"swiftwrf": {"n_primitives": 24}}
 NOT_DIFFERENTIABLE = {
     "nearest": "piecewise constant",
     "raytrace": "its paths come from a ray tracer that gives no gradients",
 }
 STEP_M = 1e-3  # of finite differences
-ON_GPU = {"swiftwrf", "nerf2", "wrfgs", "vae", "dcgan"}  # the other models stay on the CPU
+ON_GPU = {"swiftwrf", "swiftwrf_paper", "nerf2", "wrfgs", "vae", "dcgan"}  # the other models stay on the CPU
 every = pytest.mark.parametrize("name", list(FIELD_MODELS))
 
 

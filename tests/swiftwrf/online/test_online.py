@@ -19,7 +19,7 @@ import pytest
 import torch
 from rooms import room_with_box
 
-from swiftwrf import AngularGrid, GeometryModel, HybridModel, ModelConfig, RssiModel, load, make_model
+from swiftwrf import AngularGrid, GeometryModel, HybridModel, RssiModel, load, make_model
 from swiftwrf.data.simulated import rssi_room, simulated_room
 from swiftwrf.data.simulated.room import ShoeboxRoom
 from swiftwrf.data.writing import write_rssi
@@ -136,13 +136,13 @@ def test_a_model_adapts_to_a_change():
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 def test_primitives_follow_their_scene_on_each_device(device):
     train, new = spectra(72, 0), spectra(40, 2, PLACE)
-    model = make_model("swiftwrf", model=ModelConfig(n_primitives=64)).fit(train, device=device)
+    model = make_model("swiftwrf", n_primitives=64).fit(train, device=device)
     follower = Follower(model, train, MonitorConfig(false_alarm_rate=1e-3))
     steps = [follower.step(new.subset(torch.tensor([number]))) for number in range(len(new))]
     assert any(step.correlation is not None for step in steps)
     assert follower.model.device.type == device
     assert len(follower.model.with_chosen_kernel().process.known) == 112
-    on_cpu = make_model("swiftwrf", model=ModelConfig(n_primitives=64)).fit(train)
+    on_cpu = make_model("swiftwrf", n_primitives=64).fit(train)
     expected, found = on_cpu.update(new).predict(new.position), model.update(new).predict(new.position)
     torch.testing.assert_close(found.mean.cpu(), expected.mean, atol=1e-3, rtol=0)
     torch.testing.assert_close(found.std.cpu(), expected.std, atol=1e-3, rtol=1e-3)

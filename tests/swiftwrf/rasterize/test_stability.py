@@ -10,17 +10,15 @@ import torch
 from hard_cases import HARD_CASES
 from scenes import random_scene
 
-from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, rasterize
-from swiftwrf.gp import Kernel, SmoothField
+from swiftwrf import AngularGrid, InputError, rasterize
 from swiftwrf.metrics import ssim
-from swiftwrf.models.swiftwrf.deformation import DEFORMATIONS, DeformationContext
 from swiftwrf.rasterize.magnitude import magnitude
 
 REFUSED = {
     "a pixel that is not a number": "spectrum of training spectrum 3 is not finite; mend or leave it out",
     "learning rate thirty times too large": "try a learning rate below 0.3",
 }
-SMALL_FIT = FitConfig(model=ModelConfig(n_primitives=24))
+SMALL = 24  # primitives of a fit
 
 
 @pytest.mark.parametrize("cutoff", [None, 1e-4])
@@ -54,14 +52,14 @@ def test_what_is_not_finite_is_refused(name, value, backend):
 @pytest.mark.parametrize("case", [name for name in stability.FITS if name not in REFUSED])
 def test_fit_ends_well(case):
     """At least as good as the mean spectrum, where that is not perfect; else nearly perfect."""
-    found = stability.fit_case(case, 300, SMALL_FIT)
+    found = stability.fit_case(case, 300, SMALL)
     assert found["refusal"] is None
     assert found["psnr_db"] > min(found["mean_psnr_db"] - 0.5, 30)
 
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_fit_is_refused_in_a_sentence(case):
-    found = stability.fit_case(case, 0, SMALL_FIT)
+    found = stability.fit_case(case, 0, SMALL)
     assert REFUSED[case] in found["refusal"]
 
 
@@ -91,27 +89,3 @@ def test_gradcheck_of_the_magnitude():
 
 def test_gradcheck_of_ssim():
     assert torch.autograd.gradcheck(ssim, (double(8, 9), double(8, 9, seed=1)))
-
-
-def test_gradcheck_of_the_smooth_field():
-    field = SmoothField(torch.rand(5, 3, dtype=torch.float64), Kernel(), 2).double()
-    position = torch.rand(4, 3, dtype=torch.float64).requires_grad_()  # away from the anchors, where |r| has a kink
-    assert torch.autograd.gradcheck(field, position)
-
-
-@pytest.mark.parametrize("make", ["motion_basis", "per_primitive_mlp"])
-def test_gradcheck_of_the_deformations(make):
-    generator, components = torch.Generator().manual_seed(0), ("mean", "response", "attenuation", "cholesky")
-    anchor = torch.rand(5, 3, generator=generator, dtype=torch.float64)
-    context = DeformationContext(3, components, 2, anchor, Kernel())
-    module = DEFORMATIONS[make].initial(context, generator=generator).double()
-    if make == "motion_basis":
-        parameters = {"field.coefficient": double(5, 2), "basis": double(2, 3, 8)}
-    else:
-        parameters = {"output.weight": double(8, 156), "output.bias": double(8)}
-    position, mean = torch.rand(2, 3, generator=generator, dtype=torch.float64), torch.rand(3, 2, dtype=torch.float64)
-
-    def offsets(*values):
-        return tuple(torch.func.functional_call(module, dict(zip(parameters, values, strict=True)), (position, mean)))
-
-    assert torch.autograd.gradcheck(offsets, tuple(parameters.values()))

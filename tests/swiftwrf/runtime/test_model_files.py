@@ -12,35 +12,26 @@ from pathlib import Path
 import pytest
 import torch
 
-from swiftwrf import (
-    FIELD_MODELS,
-    CoarrayModel,
-    FitConfig,
-    InputError,
-    ModelConfig,
-    fit,
-    fit_coarray,
-    load,
-    make_model,
-)
+from swiftwrf import FIELD_MODELS, CoarrayModel, InputError, SwiftWRF, SwiftWRFPaper, fit, fit_coarray, load, make_model
 from swiftwrf.runtime.checkpoint import Saved, read, write
 
 ROOT = Path(__file__).parents[3]
-TINY = FitConfig(model=ModelConfig(n_primitives=4, rank=2), steps=10, check_every=5)
+TINY = {"n_primitives": 4, "steps": 10, "check_every": 5}
 
 
 @pytest.fixture(scope="module")
 def models(room, tmp_path_factory):
     """A file of each kind of model."""
     folder = tmp_path_factory.mktemp("models")
-    fit(room, TINY).save(folder / "swiftwrf")
+    fit(room, n_primitives=4).save(folder / "swiftwrf")
+    SwiftWRFPaper(**TINY).fit(room).save(folder / "swiftwrf_paper")
     fit_coarray(room).save(folder / "coarray")
     return folder
 
 
 def _changed(file, change):
     """The file with its header and tensors changed."""
-    with_kind = {"swiftwrf": "swiftwrf model", "coarray": CoarrayModel.kind}[file.name]
+    with_kind = {model.name: model.kind for model in (SwiftWRF, SwiftWRFPaper, CoarrayModel)}[file.name]
     kind, tensors, header = read(file, with_kind)
     change(tensors, header)
     write(file.with_name("changed"), kind, tensors, header)
@@ -63,31 +54,36 @@ def _tensor(name, to):
 
 DAMAGE = {
     "swiftwrf": [
-        _set("config", "n_primitives", to=200_000_000),
-        _set("config", "n_primitives", to="auto"),
-        _set("config", "n_primitives", to=4.0),
-        _set("config", "n_primitives", to=-1),
-        _set("config", "rank", to=10**9),
-        _set("config", "deformation", to="none"),
-        _set("config", "deformation", to="per_primitive_mlp"),
-        _set("config", "deformation", to="other"),
-        _set("config", "components", to=["mean", "mean"]),
-        _set("config", "components", to=3),
-        _set("config", "cutoff", to=2),
-        _set("config", "unknown", to=2),
-        _set("config", to=None),
+        _set("options", "n_primitives", to=-1),
+        _set("options", "unknown", to=2),
+        _set("options", to=None),
+        _set("calibration", to=-1.0),
+        _set("calibration", to=float("nan")),
+        _set("calibration", to="x"),
         _set("kernel", "long", to=float("nan")),
         _set("kernel", "long", to="x"),
         _set("grid", "n_azimuth", to=10**12),
         _set("grid", "n_azimuth", to=0),
         _set("grid", "elevation_step", to=float("inf")),
+        _tensor("mean", lambda t: t[:-1]),
+        _tensor("mean", lambda t: t * torch.nan),
+        _tensor("cholesky", lambda t: t[:, :2]),
+        _tensor("weight", lambda t: t[:-1]),
+        _tensor("coefficient", lambda t: t[:, :1]),
+        _tensor("position", lambda t: t[:1]),
+        lambda tensors, header: tensors.pop("mean"),
+        lambda tensors, header: tensors.pop("position"),
+        lambda tensors, header: header.clear(),
+    ],
+    "swiftwrf_paper": [
+        _set("options", "steps", to=0),
         _tensor("primitives.mean", lambda t: t[:-1]),
         _tensor("primitives.mean", lambda t: t * torch.nan),
         _tensor("scale", torch.zeros_like),
-        _tensor("deformation.field.whiten", lambda t: t[:1, :1]),
-        _tensor("deformation.basis", lambda t: t[:, :, :0]),
+        _tensor("layers.2.weight", lambda t: t[:1, :1]),
+        _tensor("output.bias", lambda t: t[:0]),
         lambda tensors, header: tensors.pop("primitives.mean"),
-        lambda tensors, header: tensors.pop("deformation.field.anchor"),
+        lambda tensors, header: tensors.pop("output.weight"),
         lambda tensors, header: tensors.__setitem__("more", torch.zeros(1)),
         lambda tensors, header: header.clear(),
     ],
@@ -135,15 +131,15 @@ def test_a_header_that_is_no_header(tmp_path):
 
 def test_a_damaged_state_of_a_fit_is_refused(room, tmp_path):
     state = tmp_path / "state"
-    fit(room, TINY, checkpoint=state)
+    SwiftWRFPaper(**TINY).fit(room, checkpoint=state)
     kind, tensors, header = read(state, "fit state")
     for change in ({"losses": None}, {"records": 3}, {"step": "x"}, {"fingerprint": 1}):
         write(state, kind, tensors, header | change)
         with pytest.raises(InputError):
-            fit(room, TINY, checkpoint=state)
+            SwiftWRFPaper(**TINY).fit(room, checkpoint=state)
     write(state, kind, {name: t for name, t in tensors.items() if "mean" not in name}, header)
     with pytest.raises(InputError):
-        fit(room, TINY, checkpoint=state)
+        SwiftWRFPaper(**TINY).fit(room, checkpoint=state)
 
 
 def test_an_interrupted_fit_has_its_whole_history(room, tmp_path):
@@ -151,15 +147,15 @@ def test_an_interrupted_fit_has_its_whole_history(room, tmp_path):
         pass
 
     whole, first, second = [], [], []
-    fit(room, TINY, on_record=whole.append)
+    SwiftWRFPaper(**TINY).fit(room, on_record=whole.append)
 
     def cut(record):
         first.append(record)
         raise Cut
 
     with pytest.raises(Cut):
-        fit(room, TINY, checkpoint=tmp_path / "state", on_record=cut)
-    fit(room, TINY, checkpoint=tmp_path / "state", on_record=second.append)
+        SwiftWRFPaper(**TINY).fit(room, checkpoint=tmp_path / "state", on_record=cut)
+    SwiftWRFPaper(**TINY).fit(room, checkpoint=tmp_path / "state", on_record=second.append)
     assert [(r["step"], r["loss"]) for r in second] == [(r["step"], r["loss"]) for r in whole]
     assert second[0] == first[0]
     elapsed = [record["elapsed"] for record in second]

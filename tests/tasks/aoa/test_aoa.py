@@ -14,10 +14,10 @@ import pandas as pd
 import pytest
 import torch
 from sklearn.model_selection import KFold
-from small import with_defaults
+from small import FIT, with_defaults
 
 from augment import Mixed, choose, sample_positions
-from swiftwrf import AngularGrid, FitConfig, InputError, ModelConfig, load, make_model, simulated_room
+from swiftwrf import AngularGrid, InputError, load, make_model, simulated_room
 from swiftwrf.data.store import Store
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
@@ -38,15 +38,13 @@ from tasks.command_line import command_line
 from tasks.page.palette import Palette
 from tasks.report.run import merge
 
-TINY_FIT = FitConfig(model=ModelConfig(n_primitives=8), steps=20, check_every=10)
-
 
 @pytest.fixture
 def small(monkeypatch):
     """The task on a toy: few spectra, few steps."""
     room = simulated_room(n=50, grid=AngularGrid.hemisphere(10, 40))
     monkeypatch.setattr(experiment, "simulated_room", lambda **_: room)
-    monkeypatch.setattr(FIELD_MODELS["swiftwrf"], "config_type", with_defaults(TINY_FIT))
+    monkeypatch.setattr(FIELD_MODELS["swiftwrf"], "config_type", with_defaults(FIT))
     for place in (context, choose):  # the search for a room has its own tests
         monkeypatch.setattr(
             place,
@@ -664,7 +662,7 @@ def test_coarray_needs_the_array_and_takes_it_from_the_command_line(small, tmp_p
 
 @pytest.mark.cuda
 def test_whole_run_on_a_gpu(small, small_published, tmp_path):
-    trained = ("swiftwrf", "nerf2", "wrfgs", "vae", "dcgan")
+    trained = ("swiftwrf", "swiftwrf_paper", "nerf2", "wrfgs", "vae", "dcgan")
     options = ("--mix", 0.5, "--extra", 10, "--device", "cuda", "--out", tmp_path / "run")
     assert run(*options, "--synthesizer", *trained) == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())["mixes"]["0.5"]

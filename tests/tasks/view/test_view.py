@@ -154,7 +154,7 @@ def saved(kind, folder, room) -> Path:
     return folder / "model"
 
 
-@pytest.mark.parametrize("kind", ["swiftwrf", "coarray", "geometry", "hybrid", *small.PUBLISHED])
+@pytest.mark.parametrize("kind", ["swiftwrf", "coarray", "geometry", "hybrid", "swiftwrf_paper", *small.PUBLISHED])
 def test_a_model_by_itself(tmp_path, room, kind):
     view = open_source(saved(kind, tmp_path, room))
     shown = view.predict(view.models[0], view.start, dragging=True)

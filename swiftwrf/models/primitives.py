@@ -15,17 +15,12 @@ MIN_WIDTH_PIXELS = 0.3  # narrower primitives fall between pixel centres and get
 
 
 class Gaussians(NamedTuple):
-    """Primitives at some positions; leading dimensions are positions, and none if all positions share a value."""
+    """Parameters of N primitives."""
 
-    mean: Tensor  # (..., N, 2) azimuth, elevation [rad]
-    cholesky: Tensor  # (..., N, 3) l1, l2, l3 [rad]
-    attenuation: Tensor  # (..., N) delta, in (0, 1) before deformation
-    response: Tensor  # (..., N, 2) psi, real and imaginary part
-
-    @property
-    def weight(self) -> Tensor:
-        """Product delta psi, (..., N, 2)."""
-        return self.attenuation[..., None] * self.response
+    mean: Tensor  # (N, 2) azimuth, elevation [rad]
+    cholesky: Tensor  # (N, 3) l1, l2, l3 [rad]
+    attenuation: Tensor  # (N,) delta, in (0, 1)
+    response: Tensor  # (N, 2) psi, real and imaginary part
 
 
 class Primitives(nn.Module):
@@ -34,26 +29,15 @@ class Primitives(nn.Module):
     Args:
         n: Number of primitives.
         grid: Grid of the spectra to fit; its pixels give the minimum and the initial widths.
-        bounded: Keep means inside the grid by the paper's tanh map, az = pi (tanh + 1), el = pi/4 (tanh + 1). Free means
-            are an alternative because azimuth is periodic; a mean below the horizon or beyond the pole contributes its
-            flank.
-        axis_aligned: Keep l2 at 0.
+        bounded: Keep means inside the grid by the paper's tanh map, az = pi (tanh + 1), el = pi/4 (tanh + 1).
         generator: Source of the initial means (uniform over the grid, as in the paper) and responses.
     """
 
     floor: Tensor
 
-    def __init__(
-        self,
-        n: int,
-        grid: AngularGrid,
-        *,
-        generator: torch.Generator,
-        bounded: bool = False,
-        axis_aligned: bool = False,
-    ) -> None:
+    def __init__(self, n: int, grid: AngularGrid, *, generator: torch.Generator, bounded: bool = False) -> None:
         super().__init__()
-        self.bounded, self.shear = bounded, 0.0 if axis_aligned else 1.0
+        self.bounded = bounded
         unit = torch.rand(n, 2, generator=generator).clamp(1e-3, 1 - 1e-3)
         extent = torch.tensor([2 * math.pi, math.pi / 2])
         self.register_buffer("floor", min_width(grid))
@@ -66,18 +50,22 @@ class Primitives(nn.Module):
     def __len__(self) -> int:
         return len(self.mean)
 
-    def constrained(self, cholesky: Tensor) -> Tensor:
-        """Return l1, l2, l3 [rad] of raw values (..., 3): widths between minimum and maximum; l2 is in units of l3."""
-        diagonal = torch.exp(cholesky[..., ::2].clamp(max=math.log(MAX_WIDTH_RAD))) + self.floor
-        return torch.stack(
-            [diagonal[..., 0], self.shear * cholesky[..., 1] * diagonal[..., 1], diagonal[..., 1]], dim=-1
-        )
-
     def forward(self) -> Gaussians:
         mean: Tensor = self.mean
         if self.bounded:
             mean = (torch.tanh(mean) + 1) * mean.new_tensor([math.pi, math.pi / 4])
-        return Gaussians(mean, self.constrained(self.cholesky), torch.sigmoid(self.attenuation), self.response)
+        return Gaussians(mean, constrained(self.cholesky, self.floor), torch.sigmoid(self.attenuation), self.response)
+
+
+def constrained(raw: Tensor, floor: Tensor) -> Tensor:
+    """Return Cholesky factors l1, l2, l3 [rad] of raw values (..., 3): log l1, l2 / l3 and log l3.
+
+    Args:
+        raw: Raw values.
+        floor: Minimum of l1 and l3 [rad], (2,); see `min_width`.
+    """
+    diagonal = torch.exp(raw[..., ::2].clamp(max=math.log(MAX_WIDTH_RAD))) + floor
+    return torch.stack([diagonal[..., 0], raw[..., 1] * diagonal[..., 1], diagonal[..., 1]], dim=-1)
 
 
 def min_width(grid: AngularGrid) -> Tensor:

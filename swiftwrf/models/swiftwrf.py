@@ -1,0 +1,358 @@
+"""The field model of this package: 2D Gaussians on the directions of the array, fitted by regression.
+
+    spectrum(s) = |sum_n (w_0n + sum_k c_k(s) w_kn) kernel_n|
+
+The shapes of the Gaussians do not depend on the position s, so a spectrum is linear in their weights. The weights w are
+least-squares solutions for the mean spectrum and its principal components. The scores c follow a Gaussian process of the
+position. Only the shapes need gradient steps, by variable projection (Golub and Pereyra 1973).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from swiftwrf.array.angles import AngularGrid
+from swiftwrf.data.spectra import Spectra
+from swiftwrf.data.splits import folds
+from swiftwrf.errors import InputError
+from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, choose_rank, held_out, principal_components, subsample
+from swiftwrf.metrics import spectrum_loss, std_factor
+from swiftwrf.models.base import FieldConfig, FitContext
+from swiftwrf.models.primitives import constrained, min_width
+from swiftwrf.models.process import ProcessModel
+from swiftwrf.rasterize import rasterize_magnitude
+from swiftwrf.rasterize.reference import kernels
+from swiftwrf.runtime.checkpoint import Header, expect
+from swiftwrf.runtime.progress import progress_bar
+from swiftwrf.runtime.threads import single_thread
+from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
+
+SIZES = (16, 32, 64, 128, 256, 512)  # numbers of primitives that a fit compares
+MIN_GAIN = 0.004  # relative reduction of the loss that counts, 0.04 dB
+SHAPE_STEPS = 60
+TRIAL_STEPS = 8  # steps of a comparison of sizes; it ranks them as all steps do
+SHAPE_RATE = 0.02  # learning rate of means [rad] and logarithms of widths
+RIDGE = 1e-6  # regularisation relative to a kernel's mean square, against large weights of opposite sign
+MAX_ROWS = 1000  # spectra that fit the shapes and compare sizes; more do not change the choice
+SHAPE_AZIMUTHS = 90  # columns of the spectra that fit the shapes; the beams of an array are far wider
+MIN_VARIANCE = 1e-9  # fraction of the variance below which a principal component is rounding
+MARGIN = 0.5  # spacings by which the first means lie below the horizon
+FILL_EVERY = 16  # one primitive in this number starts at the largest residual
+PEAK_WIDTH = 1.5  # its initial standard deviation, in pixels
+CUTOFF = 1e-4  # kernel values below count as 0
+MAX_CACHED_VALUES = 2**26  # float32 kernel values that one grid caches: 256 MiB
+MAX_CACHED_GRIDS = 2
+MAX_BATCH_ON_GPU, MAX_PRIMITIVES_ON_GPU = 4096, 2**24  # positions at a time, and primitives of all of them
+
+
+@configuration
+class SwiftWRFConfig(FieldConfig):
+    """Options of `SwiftWRF`.
+
+    Example:
+        >>> SwiftWRFConfig(n_primitives=64).max_azimuths
+        180
+    """
+
+    n_primitives: PositiveInt | Literal["auto"] = "auto"
+    """number of primitives; "auto" chooses the smallest number that predicts held-out spectra as well as more"""
+    max_azimuths: NonNegativeInt = 180
+    """fit to spectra averaged down to at most this number of columns; 0 fits to all pixels"""
+
+
+class SwiftWRF(ProcessModel):
+    """2D Gaussians whose weights follow a Gaussian process of the position, fitted by regression.
+
+    The Gaussians are those of M. Liu et al., 2025; `SwiftWRFPaper` fits them by gradient descent, as the paper does. One
+    prediction costs one product with the kernels of the Gaussians, which are cached for each grid.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.simulated_room(n=50).split()
+        >>> model = SwiftWRF(n_primitives=16).fit(train)
+        >>> prediction = model.predict(test.position)
+        >>> prediction.mean.shape == prediction.std.shape == (10, 30, 120)
+        True
+    """
+
+    name = "swiftwrf"
+    kind = "swiftwrf model"
+    config_type = SwiftWRFConfig
+    any_grid = True
+
+    mean: Tensor
+    """azimuth and elevation of each primitive, float32 (N, 2) [rad]"""
+    cholesky: Tensor
+    """Cholesky factors l1, l2, l3 of each primitive, float32 (N, 3) [rad]"""
+    weight: Tensor
+    """weights of the primitives in the mean spectrum, then in each component, float32 (1 + K, N)"""
+    calibration: float
+    """factor of the standard deviations with which held-out spectra lie in their intervals"""
+    process: GaussianProcess
+    """process of the K component scores"""
+
+    def _fit(self, train: Spectra, context: FitContext) -> None:
+        config, work = self.config, train.at_most(self.config.max_azimuths)
+        fold = folds(work.position, config.validation, config.seed)
+        kernel = choose_kernel(work.position, work.store, fold)
+        if config.validation == "random":
+            fold = torch.arange(len(work))  # leave-one-out costs a regression no more than five folds
+        rank = choose_rank(work.position, work.store, fold, kernel)
+        (rows,) = subsample(torch.arange(len(work)), rows=MAX_ROWS)
+        some, fold = work.subset(rows).in_memory(), fold[rows]
+        small = some.at_most(SHAPE_AZIMUTHS).in_memory()
+        n, record = config.n_primitives, context.on_record or (lambda record: None)
+        if n == "auto" and isinstance(context.like, SwiftWRF):
+            n = len(context.like.mean)
+        with progress_bar(context.progress) as bar, single_thread():
+            task = bar.add_task("swiftwrf", total=None)
+            target = torch.cat(_components(small, rank))
+
+            def loss(n: int) -> float:
+                bar.update(task, description=f"swiftwrf, {n} primitives")
+                function = kernels(*_shapes(target, n, small.grid, TRIAL_STEPS), small.grid, CUTOFF)
+                found = float(spectrum_loss(_held_out(small, function, kernel, fold)[0], small.spectrum))
+                record({"stage": "search", "n_primitives": n, "validation": found})
+                return found
+
+            if n == "auto":
+                n = smallest(loss, SIZES)
+            self.mean, self.cholesky = _shapes(target, n, small.grid, SHAPE_STEPS)
+            self._regress(work, some, kernel, rank, fold)
+        record({"stage": "final", "n_primitives": n})
+        self._move(context.device)
+
+    def _regress(self, train: Spectra, some: Spectra, kernel: Kernel, rank: int, fold: Tensor) -> None:
+        """Fit weights and calibration to some of the training spectra, with their folds, and the process to all of them."""
+        function = kernels(self.mean, self.cholesky, train.grid, CUTOFF)
+        mean, component = _components(some, rank)
+        self.weight = _weights(function, torch.cat([mean, component]))
+        flat = component.flatten(1)
+        score = torch.cat([(part - mean).flatten(1) @ flat.T for part in train.store.batches()])
+        self.process = GaussianProcess.regress(kernel, train.position, score / flat.square().sum(dim=1))
+        predicted, variance = _held_out(some, function, kernel, fold)
+        prior = _render(self.weight[1:], function).square().sum(dim=0).clamp_min(1e-12)
+        self.calibration = std_factor((predicted - some.spectrum).abs() / (variance[:, None, None] * prior).sqrt())
+
+    def _move(self, device: torch.device) -> None:
+        """Move the fitted tensors to a device, and start an empty cache."""
+        self.mean, self.cholesky, self.weight = (x.to(device) for x in self.parameters())
+        if device.type != "cpu":
+            known, value = self.process.known.to(device), self.process.value.to(device)
+            self.process = GaussianProcess.regress(self.process.kernel, known, value)
+        self._bases: dict[AngularGrid, Basis] = {}
+
+    def parameters(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self.mean, self.cholesky, self.weight
+
+    def region(self) -> Tensor:
+        return self.process.known.cpu()
+
+    def primitives(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return mean, cholesky and weight at positions (n, 3) [m], the arguments of `swiftwrf.rasterize`."""
+        self.check_fitted()
+        real = self.weight[0] + self.process.mean(self._process_position(position)).float() @ self.weight[1:]
+        return self.mean.expand(len(real), -1, -1), self.cholesky, torch.stack([real, torch.zeros_like(real)], dim=-1)
+
+    def _process_position(self, position: Tensor) -> Tensor:
+        return position.to(self.device)
+
+    def _batch_on(self, device: torch.device) -> int:
+        """Return more positions on a GPU, which takes as long to start the kernels of 64 as to compute them."""
+        if device.type == "cpu":
+            return self.batch
+        return max(self.batch, min(MAX_BATCH_ON_GPU, MAX_PRIMITIVES_ON_GPU // len(self.mean)))
+
+    def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
+        mean, cholesky, weight = self.primitives(position)
+        learns = any(tensor.requires_grad for tensor in self.parameters())
+        # a GPU renders kernels faster than it multiplies cached ones
+        if position.is_cuda or learns or len(self.mean) * math.prod(grid.shape) > MAX_CACHED_VALUES:
+            spectrum = rasterize_magnitude(mean, cholesky, weight, grid, cutoff=CUTOFF)
+        else:
+            spectrum = (weight[..., 0] @ self._basis(grid).kernel).abs().reshape(-1, *grid.shape)
+        if not with_std:
+            return spectrum, None
+        std = self.calibration * self.expected_error(position).float()
+        return spectrum, std[:, None, None] * self._basis(grid).prior
+
+    def _scale_std(self, factor: float) -> None:
+        self.calibration *= factor
+
+    @torch.inference_mode(False)  # a cached tensor must also serve calls with gradients
+    @torch.no_grad()
+    def _basis(self, grid: AngularGrid) -> Basis:
+        """Return what all predictions on a grid share, from the cache if it is there."""
+        if grid in self._bases:
+            return self._bases[grid]
+        kernel = kernels(self.mean, self.cholesky, grid, CUTOFF).flatten(1)
+        component = self.weight[1:] @ kernel
+        dual = torch.linalg.pinv(component.double() @ component.double().T, hermitian=True) @ component.double()
+        prior = component.square().sum(dim=0).sqrt().reshape(grid.shape)
+        basis = Basis(kernel, self.weight[0] @ kernel, dual.float(), prior)
+        if kernel.numel() <= MAX_CACHED_VALUES:
+            while len(self._bases) >= MAX_CACHED_GRIDS:
+                del self._bases[next(iter(self._bases))]
+            self._bases[grid] = basis
+        return basis
+
+    def _values(self, new: Spectra) -> Tensor:
+        work = new.at_most(self.config.max_azimuths)
+        basis = self._basis(work.grid)
+        return (work.store[:].flatten(1).to(self.device) - basis.mean) @ basis.dual.T
+
+    def _weighted_values(self) -> Tensor:
+        weighted: Tensor = self.process.value / self._basis(self.grid).dual.norm(dim=1)  # of orthogonal components
+        return weighted.cpu()
+
+    def _state(self) -> tuple[dict[str, Tensor], Header]:
+        tensors, header = self.process.state()
+        own = {"mean": self.mean, "cholesky": self.cholesky, "weight": self.weight}
+        return tensors | own, header | {"calibration": self.calibration}
+
+    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
+        self.process = GaussianProcess.from_state(tensors, header, torch.float64)
+        n, k = len(tensors["mean"]), tensors["coefficient"].shape[1]
+        expect(tensors, {"mean": (n, 2), "cholesky": (n, 3), "weight": (1 + k, n)})
+        self.mean, self.cholesky, self.weight = (tensors[name] for name in ("mean", "cholesky", "weight"))
+        self.calibration = float(header["calibration"])
+        if not self.calibration >= 0:
+            raise InputError(f"calibration is {self.calibration}, expected 0 or more")
+        self._move(torch.device("cpu"))
+
+
+class Basis(NamedTuple):
+    """What all predictions on one grid share."""
+
+    kernel: Tensor  # of each primitive, (N, pixels)
+    mean: Tensor  # spectrum, (pixels,)
+    dual: Tensor  # projections of a change of the spectrum onto the scores, (K, pixels)
+    prior: Tensor  # standard deviation of the spectra that the process gives without training data, (H, W)
+
+
+def fit(train: Spectra, *, device: torch.device | str = "cpu", progress: bool = False, **options: Any) -> SwiftWRF:
+    """Fit a SwiftWRF model to spectra. Equivalent to `SwiftWRF(**options).fit(train)`.
+
+    Args:
+        train: Training spectra, at least 10.
+        device: See `FieldModel.fit`.
+        progress: See `FieldModel.fit`.
+        options: Options of `SwiftWRF`, see `SwiftWRFConfig`.
+
+    Raises:
+        InputError: As `FieldModel.fit`, or an unknown option.
+
+    Example:
+        >>> import swiftwrf
+        >>> swiftwrf.fit(swiftwrf.simulated_room(n=50), n_primitives=16)
+        SwiftWRF(fitted, 30 x 120 directions)
+    """
+    return SwiftWRF(**options).fit(train, device=device, progress=progress)
+
+
+def smallest(loss: Callable[[int], float], sizes: tuple[int, ...]) -> int:
+    """Return the smallest size whose loss is within 0.4 % of the lowest loss.
+
+    Sizes are tried in order until one reduces the loss by less than 0.4 %, so the search costs about as much as its last
+    fits.
+
+    Args:
+        loss: Held-out loss of a fit of a size.
+        sizes: Sizes, ascending.
+    """
+    found: dict[int, float] = {}
+    for size in sizes:
+        lowest = min(found.values(), default=math.inf)
+        found[size] = loss(size)
+        if lowest <= _level(found[size]):
+            break
+    limit = _level(min(found.values()))
+    return next(size for size, value in found.items() if value <= limit)
+
+
+def _level(loss: float) -> float:
+    """Return the largest loss that counts as equal to a loss of any sign."""
+    return loss + MIN_GAIN * abs(loss)
+
+
+def _components(spectra: Spectra, rank: int) -> tuple[Tensor, Tensor]:
+    """Return mean (1, H, W) and principal components (K, H, W) of spectra, scaled by their standard deviations."""
+    mean, _, component = principal_components(spectra.spectrum.flatten(1), rank, MIN_VARIANCE)
+    whole = torch.cat([mean[None], component / math.sqrt(len(spectra))]).reshape(-1, *spectra.grid.shape)
+    return whole[:1], whole[1:]
+
+
+def _held_out(spectra: Spectra, function: Tensor, kernel: Kernel, fold: Tensor) -> tuple[Tensor, Tensor]:
+    """Return held-out predictions (n, H, W) of spectra, and their variances relative to the prior, (n,).
+
+    Args:
+        spectra: Spectra.
+        function: Kernels of the primitives on their grid, (N, H, W).
+        kernel: Kernel of the process of the weights.
+        fold: Number of the group that each spectrum is held out with, (n,).
+    """
+    weight = _weights(function, spectra.spectrum)
+    mean = weight.mean(dim=0)
+    predicted, variance = held_out(kernel, spectra.position, fold, weight - mean)
+    return _render(mean + predicted.float(), function).clamp(0, 1), variance.float()
+
+
+def _shapes(target: Tensor, n: int, grid: AngularGrid, steps: int) -> tuple[Tensor, Tensor]:
+    """Return means (n, 2) and Cholesky factors (n, 3) [rad] of n primitives that represent spectra (k, H, W) best.
+
+    The means start on a Fibonacci lattice over the hemisphere and a little below the horizon, as wide as their spacing.
+    """
+    spacing = math.sqrt(2 * math.pi / n)
+    height = 1 - (torch.arange(n) + 0.5) / n * (1 + MARGIN * spacing)
+    elevation, azimuth = torch.asin(height), torch.arange(n) * math.pi * (3 - math.sqrt(5)) % (2 * math.pi)
+    wide = spacing / elevation.cos().clamp_min(spacing / (2 * math.pi))
+    mean = torch.stack([azimuth, elevation], dim=1)
+    raw = torch.stack([wide.log(), torch.zeros(n), torch.full((n,), math.log(spacing))], dim=1)
+    floor = min_width(grid)
+
+    def residual() -> Tensor:
+        function = kernels(mean, constrained(raw, floor), grid, CUTOFF)
+        # the gradient by the weights is 0 at their least-squares solution, so they count as constants
+        return _render(_weights(function.detach(), target), function) - target
+
+    _fill(mean, raw, residual().square().sum(dim=0), grid)
+    with torch.enable_grad():
+        optimiser = torch.optim.Adam([mean.requires_grad_(), raw.requires_grad_()], lr=SHAPE_RATE, betas=(0.9, 0.99))
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+        for _ in range(steps):
+            optimiser.zero_grad()
+            residual().square().sum().div(target.square().sum().clamp_min(1e-12)).backward()
+            optimiser.step()
+            schedule.step()
+    return mean.detach(), constrained(raw.detach(), floor)
+
+
+def _fill(mean: Tensor, raw: Tensor, residual: Tensor, grid: AngularGrid) -> None:
+    """Move some primitives, made narrow, to the peaks of the residual energy (H, W)."""
+    width = PEAK_WIDTH * torch.tensor([grid.azimuth_step, grid.elevation_step])
+    for n in range(0, len(mean), FILL_EVERY):
+        row, column = divmod(int(residual.argmax()), residual.shape[1])
+        mean[n] = torch.stack([grid.azimuth[column], grid.elevation[row]]).float()
+        raw[n, ::2] = width.log()
+        taken = kernels(mean[n : n + 1], torch.tensor([[width[0], 0.0, width[1]]]), grid, None)[0]
+        residual = residual * (1 - taken).square()
+
+
+def _weights(function: Tensor, spectrum: Tensor) -> Tensor:
+    """Return the least-squares weights (k, n) of spectra (k, H, W) on kernels (n, H, W)."""
+    flat = function.flatten(1).double()
+    gram = flat @ flat.T
+    gram += RIDGE * gram.diagonal().mean() * torch.eye(len(gram), dtype=gram.dtype)
+    weight: Tensor = torch.linalg.solve(gram, flat @ spectrum.flatten(1).double().T).T.float()
+    return weight
+
+
+def _render(weight: Tensor, function: Tensor) -> Tensor:
+    """Return spectra (k, H, W) of weights (k, n) on kernels (n, H, W)."""
+    rendered: Tensor = torch.tensordot(weight, function, dims=1)
+    return rendered

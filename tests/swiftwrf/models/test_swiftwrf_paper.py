@@ -1,0 +1,228 @@
+"""The paper's model: primitives, network, fit by gradient descent."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from swiftwrf import AngularGrid, FitError, InputError, SwiftWRF, SwiftWRFPaper, load, make_model, rasterize_magnitude
+from swiftwrf.metrics import psnr
+from swiftwrf.models.mlp import encode
+from swiftwrf.models.primitives import MIN_WIDTH_PIXELS, Primitives
+from swiftwrf.models.swiftwrf_paper import DeformableGaussians, Optimisation, SwiftWRFPaperConfig
+from swiftwrf.positions import frame
+
+GRID = AngularGrid.hemisphere(15, 60)
+QUICK = SwiftWRFPaperConfig(n_primitives=24, steps=80, check_every=20)
+
+
+def field(n=6, shift=0.0):
+    """Return random Gaussians whose network does not rest, and positions of their scene."""
+    generator = torch.Generator().manual_seed(0)
+    position = torch.rand(9, 3, generator=generator, dtype=torch.float64) * 2 + 5 + shift
+    gaussians = DeformableGaussians(n, GRID, *frame(position), generator=generator)
+    for parameter in gaussians.output.parameters():
+        torch.nn.init.normal_(parameter, std=0.05, generator=generator)
+    return gaussians, position
+
+
+def rendered(gaussians, position, **options):
+    return rasterize_magnitude(*gaussians(gaussians.normalise(position), **options), GRID)
+
+
+def test_constraints_hold_for_any_parameters(generator):
+    primitives = Primitives(50, GRID, bounded=True, generator=generator)
+    with torch.no_grad():
+        for parameter in primitives.parameters():
+            parameter.normal_(std=20, generator=generator)
+    mean, cholesky, attenuation, _ = primitives()
+    assert (cholesky[:, 0] >= MIN_WIDTH_PIXELS * GRID.azimuth_step).all()
+    assert (cholesky[:, 2] >= MIN_WIDTH_PIXELS * GRID.elevation_step).all()
+    assert ((attenuation >= 0) & (attenuation <= 1)).all()
+    assert ((mean >= 0) & (mean <= torch.tensor([2 * torch.pi, torch.pi / 2]) + 1e-6)).all()
+
+
+def test_encoding_is_that_of_the_paper():
+    encoded = encode(torch.tensor([0.25]), 2)
+    assert encoded.tolist() == pytest.approx([0.25, 0.5**0.5, 1.0, 0.5**0.5, 0.0], abs=1e-6)
+
+
+def test_the_network_has_the_papers_size_and_starts_at_rest(generator):
+    position = torch.rand(3, 3, generator=generator, dtype=torch.float64)
+    gaussians = DeformableGaussians(5, GRID, *frame(position), generator=generator)
+    assert [layer.in_features for layer in gaussians.layers] == [81, 156, 237, 156, 237, 156, 237, 156]
+    assert gaussians.output.out_features == 5
+    for deformed, canonical in zip(*(gaussians(position.float(), deform=d) for d in (True, False)), strict=True):
+        assert torch.equal(deformed, canonical)
+
+
+def test_gradients_reach_every_parameter_but_the_means_of_the_fine_stage():
+    gaussians, position = field()
+    rendered(gaussians, position).square().sum().backward()
+    for name, parameter in gaussians.named_parameters():
+        if name == "primitives.mean":
+            assert parameter.grad is None
+        else:
+            assert parameter.grad.abs().sum() > 0, name
+    rendered(gaussians, position, deform=False).square().sum().backward()
+    assert gaussians.primitives.mean.grad.abs().sum() > 0
+
+
+def test_gradcheck_of_the_network():
+    gaussians, position = field(n=3)
+    gaussians, x = gaussians.double(), gaussians.normalise(position[:2]).double()
+    values = [torch.randn(shape, dtype=torch.float64, requires_grad=True) for shape in ((5, 156), (5,))]
+
+    def deformed(weight, bias):
+        parameters = {"output.weight": weight, "output.bias": bias}
+        mean, _, product = torch.func.functional_call(gaussians, parameters, (x,))
+        return mean, product
+
+    assert torch.autograd.gradcheck(deformed, values)
+
+
+def test_positions_in_kilometres_keep_their_millimetres():
+    (near, position), (far, moved) = field(), field(shift=5e5)
+    torch.testing.assert_close(near.normalise(position), far.normalise(moved), atol=1e-6, rtol=0)
+
+
+def test_predict_gives_gradients_by_parameters_only_on_request(room):
+    model = SwiftWRFPaper(QUICK, steps=20).fit(room)
+    assert not model.predict(room.position).mean.requires_grad
+    model.field.requires_grad_(True)
+    model.predict(room.position).mean.sum().backward()
+    assert model.field.output.weight.grad.abs().sum() > 0
+
+
+def test_a_saved_model_predicts_the_same_bits(room, tmp_path):
+    model = SwiftWRFPaper(QUICK, steps=20).fit(room)
+    model.save(tmp_path / "model.safetensors", {"commit": "abc"})
+    again = load(tmp_path / "model.safetensors")
+    assert torch.equal(again.synthesize(room.position + 0.01), model.synthesize(room.position + 0.01))
+    assert again.config == model.config
+
+
+def test_the_preset_paper_is_the_paper():
+    model = make_model("swiftwrf", preset="paper", seed=1, validation="block")
+    assert isinstance(model, SwiftWRFPaper)
+    assert model.config == SwiftWRFPaperConfig.paper(seed=1, validation="block")
+    assert SwiftWRFPaper(preset="paper", batch=4).config == SwiftWRFPaperConfig.paper(batch=4)
+    paper = model.config
+    assert (paper.n_primitives, paper.steps, paper.batch, paper.max_azimuths) == (10_000, 110_000, 1, 0)
+    assert (paper.rate, paper.deformation_rate, paper.ssim_weight, paper.smoothing) == (1e-2, 8e-3, 0.3, 1.0)
+    with pytest.raises(InputError, match="SwiftWRFPaper"):
+        SwiftWRF(preset="paper")
+
+
+def test_fit_beats_the_mean_spectrum(room):
+    model = SwiftWRFPaper(QUICK, steps=400, batch=16, coarse_fraction=0.3).fit(room)
+    fitted = psnr(model.synthesize(room.position), room.spectrum).median()
+    mean = psnr(room.spectrum.mean(dim=0), room.spectrum).median()
+    assert fitted > mean + 1
+
+
+def test_same_seed_same_model(room):
+    a, b, other = (SwiftWRFPaper(QUICK, seed=seed).fit(room).synthesize(room.position) for seed in (0, 0, 1))
+    assert torch.equal(a, b)
+    assert not torch.equal(a, other)
+
+
+def test_it_has_no_standard_deviation(room):
+    found = SwiftWRFPaper(QUICK, steps=20).fit(room).predict(room.position)
+    assert found.std is None
+    with pytest.raises(InputError, match="no standard deviation"):
+        found.interval()
+
+
+def test_smoothing_is_annealed(room):
+    optimisation = Optimisation(replace(QUICK, steps=200, smoothing_steps=100), room, "cpu")
+    for fine_step, fraction in ((0, 1), (50, 0.5), (101, 0)):
+        optimisation.step = optimisation.coarse_steps + fine_step
+        assert optimisation.smoothing() == pytest.approx(fraction * 2 / len(room) ** (1 / 3))
+
+
+class Stop(Exception):
+    pass
+
+
+def test_interrupted_fit_goes_on_to_the_same_bits(room, tmp_path):
+    def describe(record):
+        return record["stage"], record["n_primitives"], record["step"], record["loss"], record["validation"]
+
+    config, records, rest = replace(QUICK, steps=90, check_every=30), [], []
+    whole = SwiftWRFPaper(config).fit(room, on_record=records.append).synthesize(room.position)
+    assert [describe(record)[:3] for record in records] == [("final", 24, step) for step in (30, 60, 90)]
+
+    def stop(record):
+        if record["step"] == 60:
+            raise Stop
+
+    state = tmp_path / "state"
+    with pytest.raises(Stop):
+        SwiftWRFPaper(config).fit(room, checkpoint=state, on_record=stop)
+    again = SwiftWRFPaper(config).fit(room, checkpoint=state, on_record=rest.append)
+    assert [describe(r) for r in rest] == [describe(r) for r in records]  # the history is whole
+    assert torch.equal(again.synthesize(room.position), whole)
+
+
+def test_refuses_the_state_of_another_fit(room, tmp_path):
+    SwiftWRFPaper(QUICK, steps=20).fit(room, checkpoint=tmp_path / "state")
+    with pytest.raises(InputError, match="another fit"):
+        SwiftWRFPaper(QUICK).fit(room, checkpoint=tmp_path / "state")
+
+
+def test_loss_that_is_not_finite_stops_and_keeps_the_last_good_state(room, tmp_path, monkeypatch):
+    state = tmp_path / "state"
+    honest = Optimisation.loss
+
+    def breaks(self, drawn, measured):
+        return honest(self, drawn, measured) * (float("nan") if self.step == 50 else 1)
+
+    monkeypatch.setattr(Optimisation, "loss", breaks)
+    with pytest.raises(FitError, match="step 50"):
+        SwiftWRFPaper(QUICK).fit(room, checkpoint=state)
+    monkeypatch.undo()
+    records = []
+    SwiftWRFPaper(QUICK).fit(room, checkpoint=state, on_record=records.append)
+    assert [record["step"] for record in records][:3] == [20, 40, 60]  # went on from the state at 40
+    assert records[1]["elapsed"] < records[2]["elapsed"]
+
+
+def test_a_fit_that_ended_worse_is_refused_again(room, tmp_path, monkeypatch):
+    """Its state is kept, and the same call must not take it for a result."""
+    honest = Optimisation.record
+
+    def record(self, loss):
+        self.first_loss = -1.0  # better than any loss
+        return honest(self, loss)
+
+    monkeypatch.setattr(Optimisation, "record", record)
+    for _ in range(2):
+        with pytest.raises(FitError, match="worse than the -1 it began with"):
+            SwiftWRFPaper(QUICK, steps=20).fit(room, checkpoint=tmp_path / "state")
+
+
+def test_recovers_a_scene_that_it_can_represent_exactly(room, generator):
+    """A fit of spectra of known primitives and network that starts beside the truth returns to it."""
+    gaussians, position = field(n=4)
+    with torch.no_grad():
+        gaussians.primitives.response.mul_(3)
+        scene = replace(room.subset(torch.arange(9)), position=position)
+        scene = replace(scene, store=type(scene.store)(rendered(gaussians, position).clamp(0, 1)))
+    config = SwiftWRFPaperConfig(n_primitives=4, steps=300, rate=3e-3, deformation_rate=1e-3, coarse_fraction=0.0)
+    optimisation = Optimisation(replace(config, batch=9, smoothing=0.0, ssim_weight=0.0), scene, "cpu")
+    start = gaussians.state_dict()
+    for name in ("primitives.cholesky", "primitives.response", "output.weight", "output.bias"):
+        start[name] = start[name] + 0.02 * torch.randn(start[name].shape, generator=generator)
+    for module in (optimisation.model, optimisation.average.module):
+        module.load_state_dict(start)
+
+    def quality(module):
+        return float(psnr(rendered(module, position).detach(), scene.spectrum).median())
+
+    before = quality(optimisation.model)
+    while optimisation.step < 300:
+        optimisation.advance()
+    assert before < 35 < 45 < quality(optimisation.result)
