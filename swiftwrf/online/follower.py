@@ -12,6 +12,7 @@ from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry.model import GeometryModel
+from swiftwrf.models.link import Link
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.online.adaptation import adapted
 from swiftwrf.online.change import Alarm
@@ -179,10 +180,7 @@ def joined(parts: list[Spectra]) -> Spectra:
     return Spectra(
         torch.cat([part.store[:] for part in parts]),
         torch.cat([part.position for part in parts]),
-        array=first.array,
-        moving=first.moving,
         grid=first.grid,
         name=first.name,
-        fixed_position=first.fixed_position,
-        rotation=first.rotation,
+        **vars(Link.from_spectra(first)),
     )
