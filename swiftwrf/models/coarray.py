@@ -114,8 +114,8 @@ class CoarrayModel(Linked, ProcessModel):
     """mean offset that stretching removed from a spectrum, float32 (1,)"""
     form: Tensor
     """quadratic form from scores, after a 1, to coefficients, float32 (1 + 2 P, K + 1, K + 1)"""
-    component: Tensor | None
-    """mean magnitude and its components, averaged to few pixels, float32 (1 + K, h, w); None in files of earlier versions"""
+    component: Tensor
+    """mean magnitude and its components, averaged to few pixels, float32 (1 + K, h, w)"""
 
     @property
     def n_parameters(self) -> int:
@@ -173,8 +173,6 @@ class CoarrayModel(Linked, ProcessModel):
         self._set_spread(train, fold, lambda rows: value[rows], lambda score, _: self._spectra(score, self.grid))
 
     def _values(self, new: Spectra) -> Tensor:
-        if self.component is None:
-            raise InputError(f"this {self.kind} is of an earlier version, which cannot be updated; fit it again")
         functions, inverse = basis(self.array, self.grid, torch.float32), _inverse(self.array, self.grid).float()
         spectrum = new.store[:]
         offset = _offset(spectrum.flatten(1), functions, inverse)
@@ -184,7 +182,6 @@ class CoarrayModel(Linked, ProcessModel):
         return torch.cat([score, (offset - self.offset).double()], dim=1)
 
     def _weighted_values(self) -> Tensor:
-        assert self.component is not None  # a model without components cannot be updated
         weighted: Tensor = self.process.value[:, :-1] * self.component[1:].flatten(1).norm(dim=1)
         return weighted
 
@@ -203,21 +200,17 @@ class CoarrayModel(Linked, ProcessModel):
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         tensors, header = self.process.state()
-        tensors |= {"offset": self.offset, "form": self.form}
-        if self.component is not None:
-            tensors["component"] = self.component
-        return tensors | self._spread_state(), header
+        own = {"offset": self.offset, "form": self.form, "component": self.component}
+        return tensors | own | self._spread_state(), header
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         self.process = GaussianProcess.from_state(tensors, header, torch.float64)
         n_scores = tensors["coefficient"].shape[-1]
         form = (1 + 2 * len(differences(self.array)), n_scores, n_scores)
-        expect(tensors, {"offset": (1,), "form": form})
-        self.offset, self.form = tensors["offset"].float(), tensors["form"].float()
+        coarse = _coarse(Store(torch.zeros(1, *self.grid.shape))).shape[1:]
+        expect(tensors, {"offset": (1,), "form": form, "component": (n_scores, *coarse)})
+        self.offset, self.form, self.component = (tensors[name].float() for name in ("offset", "form", "component"))
         self._restore_spread(tensors)
-        self.component = tensors.get("component")
-        if self.component is not None:
-            expect(tensors, {"component": (n_scores, *_coarse(Store(torch.zeros(1, *self.grid.shape))).shape[1:])})
 
 
 def fit_coarray(

@@ -77,23 +77,19 @@ class Link:
         Raises:
             InputError: Another moving end, fixed position, rotation or array.
         """
-        found, array = [], self.array or data.array
+        own, other = self.array, data.array
+        array = own or other
         length = LENGTH_TOLERANCE_WAVELENGTHS * array.wavelength if array else LENGTH_TOLERANCE_M
-        if data.moving != self.moving:
-            found.append(f"the {data.moving} moves and not the {self.moving}")
-        if _differ(self.fixed_position, data.fixed_position, length):
-            found.append(
-                f"the fixed end is at {_metres(data.fixed_position)} and not at {_metres(self.fixed_position)}"
-            )
-        if _differ(self.rotation, data.rotation, ROTATION_TOLERANCE):
-            found.append("the array has another orientation")
-        if self.array and data.array:
-            same_carrier = abs(data.array.wavelength - self.array.wavelength) <= length
-            if not same_carrier or _differ(self.array.element, data.array.element, length):
-                found.append(f"the array has other elements or another carrier ({data.array.summary})")
-        if found:
+        compared = {
+            f"moving end ({data.moving}, not {self.moving})": data.moving != self.moving,
+            "position of the fixed end": _differ(self.fixed_position, data.fixed_position, length),
+            "orientation of the array": _differ(self.rotation, data.rotation, ROTATION_TOLERANCE),
+            "arrangement of the elements": own and other and _differ(own.element, other.element, length),
+            "carrier": own and other and abs(own.wavelength - other.wavelength) > length,
+        }
+        if found := [what for what, differs in compared.items() if differs]:
             raise InputError(
-                f"{data.name} was measured over another link than the training spectra: {', '.join(found)}; "
+                f"{data.name} was measured over another link than the training spectra, with another {', '.join(found)}; "
                 "give spectra of the same link or fit another model"
             )
 
@@ -131,7 +127,3 @@ def _differ(known: Tensor | None, other: Tensor | None, tolerance: float) -> boo
     if known is None or other is None:
         return False
     return known.shape != other.shape or bool((known - other).abs().max() > tolerance)
-
-
-def _metres(position: Tensor | None) -> str:
-    return "" if position is None else f"({', '.join(f'{x:.6g}' for x in position.tolist())}) m"

@@ -44,7 +44,7 @@ class ProcessModel(FieldModel):
     process: GaussianProcess
     """process of the values"""
     spread: Tensor | None = None
-    """standard deviation of a measurement far from all training positions, float32 (H, W); None if it was not determined"""
+    """standard deviation of a measurement far from all training positions, float32 (H, W); None for `SwiftWRF`"""
 
     def expected_error(self, position: Tensor) -> Tensor:
         """Return the expected error at positions (n, 3) [m] relative to that far from all training positions, (n,)."""
@@ -114,10 +114,9 @@ class ProcessModel(FieldModel):
         spread = (total / (len(score) + SHRINKAGE_SPECTRA)).sqrt().clamp_min(MIN_SPREAD)
         self.spread = spread * std_factor(score / spread)
 
-    def _std(self, position: Tensor, grid: AngularGrid) -> Tensor | None:
+    def _std(self, position: Tensor, grid: AngularGrid) -> Tensor:
         """Return the standard deviation (b, H, W) of measurements at positions (b, 3) [m]."""
-        if self.spread is None:
-            return None
+        assert self.spread is not None
         spread = self.spread
         if grid != self.grid:  # that of the nearest direction
             row = ((grid.elevation - self.grid.elevation_start) / self.grid.elevation_step).round().long()
@@ -126,12 +125,12 @@ class ProcessModel(FieldModel):
         return self.expected_error(position).float()[:, None, None] * spread
 
     def _spread_state(self) -> dict[str, Tensor]:
-        return {} if self.spread is None else {"spread": self.spread}
+        assert self.spread is not None
+        return {"spread": self.spread}
 
     def _restore_spread(self, tensors: dict[str, Tensor]) -> None:
-        if "spread" in tensors:
-            expect(tensors, {"spread": self.grid.shape})
-            self.spread = tensors["spread"].float()
+        expect(tensors, {"spread": self.grid.shape})
+        self.spread = tensors["spread"].float()
 
     def _set_process(self, process: GaussianProcess) -> None:
         self.process = process

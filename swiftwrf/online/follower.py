@@ -17,6 +17,7 @@ from swiftwrf.models.geometry.images import PhaseObservations
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.path_gains import paths
 from swiftwrf.models.geometry.phase_retrieval import correlations, retrieve_phases
+from swiftwrf.models.link import Link
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.online.adaptation import adapted
 from swiftwrf.online.change import Alarm
@@ -192,10 +193,7 @@ def joined(parts: list[Spectra]) -> Spectra:
     return Spectra(
         torch.cat([part.store[:] for part in parts]),
         torch.cat([part.position for part in parts]),
-        array=first.array,
-        moving=first.moving,
         grid=first.grid,
         name=first.name,
-        fixed_position=first.fixed_position,
-        rotation=first.rotation,
+        **vars(Link.from_spectra(first)),
     )

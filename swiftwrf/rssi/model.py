@@ -103,7 +103,7 @@ class RssiModel(SavedRssiPredictor):
     noise_db: Tensor
     """calibrated standard deviation of a measurement about the field, (R,) [dB]"""
     _posterior: RssiPosterior | None
-    """least squares of the fit, which `update` continues; None for the paper's head and for files of earlier versions"""
+    """least squares of the fit, which `update` continues; None for the paper's head"""
 
     def _fit(self, train: Rssi, context: RssiFitContext) -> None:
         began = time.perf_counter()
@@ -282,9 +282,7 @@ class RssiModel(SavedRssiPredictor):
 
     def _checked_posterior(self) -> RssiPosterior:
         if self._posterior is None:
-            raise InputError(
-                f"this {self.kind} has the paper's head or is of an earlier version; fit it again to all rows"
-            )
+            raise InputError(f"this {self.kind} has the paper's head; fit it again to all rows")
         return self._posterior
 
     def _take_rows(self, folded: RssiPosterior) -> None:

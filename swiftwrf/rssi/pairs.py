@@ -275,14 +275,8 @@ class PairModel(PairPredictor, SavedRssiPredictor):
         model = cls._of_header(header)
         ratio, reciprocal = header["metric"]
         model.metric = Metric(float(ratio), bool(reciprocal))
-        # files of earlier versions have no places
-        tensors = {"place": torch.zeros(0, 3).double(), "correction": torch.zeros(0, 2).double()} | tensors
         n_pairs, n_places = len(tensors["pair"]), len(tensors["place"])
-        shapes = {
-            "pair": (n_pairs, 6),
-            "residual": (n_pairs,),
-            "scale_db": (1,),
-        }
+        shapes = {"pair": (n_pairs, 6), "residual": (n_pairs,), "scale_db": (1,)}
         files.expect(tensors, shapes | {"path_loss": (2,), "place": (n_places, 3), "correction": (n_places, 2)})
         for name in shapes:
             setattr(model, name, tensors[name])

@@ -29,10 +29,10 @@ from swiftwrf.online import Follower, score
 FLOOR = rssi_room(n=100)
 QUARTER = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
 OTHER_LINKS = {
-    "the receiver moves and not the transmitter": {"moving": "receiver"},
-    r"the fixed end is at \(1, 2, 3\) m and not at \(0.1": {"fixed_position": torch.tensor([1.0, 2, 3]).double()},
-    "the array has another orientation": {"rotation": QUARTER},
-    "other elements or another carrier": {"array": PlanarArray.square(4, 5.2e9)},
+    r"another moving end \(receiver, not transmitter\); give": {"moving": "receiver"},
+    "another position of the fixed end; give": {"fixed_position": torch.tensor([1.0, 2, 3]).double()},
+    "another orientation of the array; give": {"rotation": QUARTER},
+    "another arrangement of the elements, carrier; give": {"array": PlanarArray.square(4, 5.2e9)},
 }
 other_links = pytest.mark.parametrize(("says", "change"), OTHER_LINKS.items(), ids=["end", "place", "pose", "array"])
 
@@ -50,7 +50,7 @@ def models(room):
 
 @other_links
 def test_spectra_of_another_link_are_refused(room, models, tmp_path, says, change):
-    """By updates, scores and followers, also of a saved model."""
+    """Updates, scores and followers refuse them, also those of a saved model."""
     other = replace(room, **change)
     for model in models:
         model.save(tmp_path / "model")
