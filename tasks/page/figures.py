@@ -221,7 +221,7 @@ def dots(
         axes.axvline(0, color=RULE, linewidth=1)
     axes.set(yticks=range(len(rows)), yticklabels=[plain(textwrap.fill(name, NAME)) for name in rows], xlabel=label)
     axes.set_ylim(len(rows) - 0.4, -0.6)
-    if log:
+    if log and any(value > 0 for of_rows in values.values() for value, *_ in of_rows):
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter("")
@@ -256,7 +256,8 @@ def speed(
     for name, (cost, error) in points.items():
         colour = palette.colour(name.split(",")[0])
         axes.plot(cost, error, "o", color=colour, markersize=5 if name in front else 3.5, zorder=2)
-    axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
+    scale = "log" if any(min(point) > 0 for point in points.values()) else "linear"
+    axes.set(xscale=scale, yscale=scale, xlabel=x, ylabel=y)
     axes.margins(x=0.25, y=0.1)
     taken: list[Bbox] = []
     for name, point in points.items():
