@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -93,7 +93,9 @@ class Follower:
         """test of the coherence of room and spectra; None without room or training spectra, and after its alarm"""
         self._found = model.room if isinstance(model, FieldModel) else None  # as it was before the test
         if self._found is not None and isinstance(train, Spectra):
-            self.room = Monitor(train.position, (), unexplained(self._found, train), self.monitor.config)
+            # furniture blocks paths in some regions, whose coherence is lower without any change
+            whole = replace(self.monitor.config, n_regions=1)
+            self.room = Monitor(train.position, (), unexplained(self._found, train), whole)
         self._recent: list[Spectra] = []
         self.waiting: Spectra | None = None
         """spectra that a geometry has not learnt yet, for its next update"""
