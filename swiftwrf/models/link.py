@@ -89,8 +89,8 @@ class Link:
         }
         if found := [what for what, differs in compared.items() if differs]:
             raise InputError(
-                f"{data.name} was measured over another link than the training spectra, with another {', '.join(found)}; give "
-                "spectra of the same link or fit another model"
+                f"{data.name} was measured over another link than the training spectra, with another {', '.join(found)}; "
+                "give spectra of the same link or fit another model"
             )
 
 
