@@ -117,7 +117,7 @@ def _planes_of_run(folder: Path, fraction: float) -> list[dict[str, Any]]:
     """Return the planes that another model of the run found from the same spectra."""
     file = folder / f"geometry-mix{fraction_key(fraction)}.json"
     planes = read_json(file)["planes"] if file.is_file() else []
-    return [asdict(Plane(**plane)) for plane in planes]
+    return [asdict(Plane(**plane | {"normal": tuple(plane["normal"])})) for plane in planes]
 
 
 def _measured(folder: Path, config: AoaConfig) -> tuple[Spectra | None, Spectra | None, list[str]]:

@@ -83,7 +83,7 @@ def show(folder: Path) -> None:
 
 
 def damaged_bytes(content: bytes) -> dict[str, bytes]:
-    """Return what is left of a file that was cut, overwritten or replaced."""
+    """Return contents of a file that was cut, overwritten or replaced."""
     random = np.random.default_rng(0)
     found = {"empty": b"", "cut": content[: len(content) // 2], "zeros": bytes(len(content)), "text": b"hello\n"}
     for number in range(3):
