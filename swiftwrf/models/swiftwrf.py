@@ -227,7 +227,7 @@ class SwiftWRF(ProcessModel):
 
 
 class Basis(NamedTuple):
-    """What all predictions on one grid share."""
+    """Quantities that all predictions on one grid share."""
 
     kernel: Tensor  # of each primitive, (N, pixels)
     mean: Tensor  # spectrum, (pixels,)
