@@ -25,7 +25,16 @@ from tasks.view.followed import FollowedView
 from tasks.view.rssi import MapSelection, RssiView
 from tasks.view.sources import open_source
 
-OPENED = ("config.json", "environment.json", "geometry-*", "*.npz", "*.safetensors", "update.json", "measurements.csv")
+OPENED = (
+    "config.json",
+    "environment.json",
+    "geometry-*",
+    "maps.npz",
+    "floor-plan.npz",
+    "*.safetensors",
+    "update.json",
+    "measurements.csv",
+)
 OTHER_JSON = (None, "x", 1e400, [[]], {"a": None})
 
 
