@@ -11,9 +11,8 @@ import inspect
 import math
 import sys
 import types
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from itertools import repeat
 from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
 
 from annotated_types import Ge, Gt, Le, Lt
@@ -68,11 +67,14 @@ def _allowed(value: object, annotation: Any) -> bool:
             return all(_allowed(item, arguments[0]) for item in value)
         return len(value) == len(arguments) and all(map(_allowed, value, arguments))
     if origin in (list, Sequence):
-        items = value.tolist() if origin is Sequence and hasattr(value, "tolist") else value  # of an array or a column
-        is_listed = isinstance(items, list if origin is list else Collection) and not isinstance(items, str | bytes)
+        try:
+            items = value.tolist() if origin is Sequence and hasattr(value, "tolist") else value  # an array or a column
+        except RuntimeError:  # a tensor without values
+            return False
+        is_listed = isinstance(items, origin) and not isinstance(items, str | bytes)
         return is_listed and all(_allowed(item, arguments[0]) for item in items)
     if origin is Mapping:
-        return isinstance(value, Mapping) and all(map(_allowed, value.keys(), repeat(arguments[0])))
+        return isinstance(value, Mapping) and all(all(map(_allowed, item, arguments)) for item in value.items())
     if annotation in NUMBERS:
         is_number = isinstance(value, NUMBERS[annotation]) and not isinstance(value, bool)
         if isinstance(value, int):
@@ -110,7 +112,7 @@ def _described(annotation: Any) -> str:
             f"a tuple of {_described(arguments[0])}" if arguments[-1] is ... else f"a tuple of {len(arguments)} values"
         )
     if origin is Mapping:
-        return f"a dictionary whose keys are {_described(arguments[0])}"
+        return f"a dictionary, of which each key is {_described(arguments[0])} with {_described(arguments[1])}"
     if origin in (list, Sequence):
         return f"a list, of which each is {_described(arguments[0])}"
     names = {int: "a whole number", float: "a number", bool: "True or False", str: "a text", type(None): "None"}

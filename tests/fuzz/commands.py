@@ -107,10 +107,9 @@ SAVED = {
         "rx": ["1", "receiver06"],
         "split": "block",
         "seed": 7,
-        "floor_extent": [0.0, 20.0, 0.0, 15.0],
         "data": None,
     },
-    "aoa": {"mix": [0.5, 1.0], "synthesizer": ["idw"], "extra": 7, "seed": 3, "grid": [8, 32], "drop_null": True},
+    "aoa": {"mix": [0.5, 1.0], "synthesizer": ["idw"], "extra": 7, "seed": 3},
     "convert": {"source": "data", "out": "new", "cell": 0.5, "rx": ["1"], "columns": ["x=lon"], "filler": [100.0]},
     "update": {"model": "model", "source": "data", "out": "new", "false_alarm_rate": 0.001, "follow": False},
 }
@@ -126,7 +125,7 @@ def config_file(draw: random.Random, folder: Path) -> None:
     task, suffix = draw.choice(list(SAVED)), draw.choice([".json", ".yaml"])
     text, found = json.dumps(SAVED[task]) if suffix == ".json" else yaml.safe_dump(SAVED[task]), []
     file = folder / f"options{suffix}"
-    file.write_bytes(mutated(text.encode(), draw))
+    file.write_bytes(mutated(text.encode(), draw, words_only=draw.random() < 0.5))
     options = [f"--config={file}"] if draw.random() < 0.5 else ["--config", str(file)]
     try:
         with contextlib.redirect_stderr(io.StringIO()):

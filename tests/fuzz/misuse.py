@@ -47,20 +47,9 @@ from swiftwrf.rssi.base import RssiPredictor
 
 MAX_RSSI_DB = 200.0  # of any plausible prediction or measurement, and of its standard deviation
 FLOOR = {"x": [0.0, 1.0], "y": [0.0, 1.0], "z": [1.0, 1.0], "hall": [-50.0, -60.0]}
-SPECTRA_OPTIONS = [
-    "array",
-    "pose",
-    "moving",
-    "grid",
-    "label",
-    "line_of_sight",
-    "name",
-    "fixed_position",
-    "rotation",
-    "index",
-    "channel",
-    "notes",
-]
+SPECTRA_OPTIONS = (
+    "array", "pose", "moving", "grid", "label", "line_of_sight", "name", "fixed_position", "rotation", "index", "notes",
+)  # fmt: skip
 QUATERNION = (0.0, 0.0, 0.0, 1.0)
 Call = Callable[[Any], object]
 
@@ -117,8 +106,8 @@ def strange() -> tuple[Any, ...]:
     plain = [
         None, True, False, 0, -1, 1, 3, 2.5, float("nan"), float("inf"), -float("inf"), 1e300, 1e-320, 10**400, -(10**400),
         2**63, "", "a", "1", "nan", "cuda", "cpu", "\0", "\udcff", "x" * 5000, "/", b"a", 1j, [], [[]], [None], ["a"],
-        [1, "a"], [[1, 2], [3]], [[1, 2, 3]], [[10**400, 0, 0]], [[1e300, 0, 0]], [[True, 0, 0]], (), (0,), (1, 2, 3), [5, -1],
-        (1.0, 2.0, float("nan")), {}, {"x": 1}, {"a": [1, 2, 3]}, {1, 2}, iter([1.0, 2.0]), [[[0.5] * 8] * 4],
+        [1, "a"], [[1, 2], [3]], [[1, 2, 3]], [[10**400, 0, 0]], [[1e300, 0, 0]], [[True, 0, 0]], (), (0,), (1, 2, 3),
+        [5, -1], (1.0, 2.0, float("nan")), {}, {"x": 1}, {"a": [1, 2, 3]}, {1, 2}, iter([1.0, 2.0]), [[[0.5] * 8] * 4],
         0.9999999999999999, ["a", "a", "b"], ("receiver01",),
     ]  # fmt: skip
     return (*plain, *arrays, *tensors, *others)

@@ -204,7 +204,7 @@ def followed(model: FieldModel | RssiModel, content: bytes, folder: Path, source
 def followed_lines(name: str, draw: random.Random, folder: Path) -> None:
     """Follow mutated JSON lines over standard input."""
     model = _rssi_model() if name == "rssi" else _field_model(name)
-    followed(model, mutated(json_lines(model), draw), folder)
+    followed(model, mutated(json_lines(model), draw, words_only=draw.random() < 0.5), folder)
 
 
 def followed_file(source: str, draw: random.Random, folder: Path) -> None:
