@@ -12,7 +12,7 @@ from annotated_types import Ge, Le
 from torch import Tensor
 
 from swiftwrf.data.dataset import Numbers
-from swiftwrf.data.fillers import check_powers
+from swiftwrf.data.fillers import MAX_RSSI_DBM, MIN_RSSI_DBM, check_powers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
@@ -257,7 +257,7 @@ class RssiLocator(Configured, Saved):
         self.check_fitted()
         maps = RssiMaps.of(self.model.predict(position))
         mean, std = maps.mean.double(), maps.std.double()
-        rssi = mean + std * self.values.sample((n, len(mean)), generator)
+        rssi = (mean + std * self.values.sample((n, len(mean)), generator)).clamp(MIN_RSSI_DBM, MAX_RSSI_DBM)
         chance = self.detections.probability(mean)
         lost = torch.rand(rssi.shape, generator=generator, dtype=torch.float64) >= chance
         strongest = torch.nn.functional.one_hot(rssi.argmax(dim=2), rssi.shape[2]).bool()
