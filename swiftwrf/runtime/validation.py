@@ -68,7 +68,9 @@ def _allowed(value: object, annotation: Any) -> bool:
         return len(value) == len(arguments) and all(map(_allowed, value, arguments))
     if origin in (list, Sequence):
         try:
-            items = value.tolist() if origin is Sequence and hasattr(value, "tolist") else value  # an array or a column
+            items: Any = (
+                value.tolist() if origin is Sequence and hasattr(value, "tolist") else value
+            )  # an array or a column
         except RuntimeError:  # a tensor without values
             return False
         is_listed = isinstance(items, origin) and not isinstance(items, str | bytes)
