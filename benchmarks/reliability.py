@@ -1,6 +1,7 @@
 """Attack readers, commands and runs and record how they end: the long version of tests/fuzz and test_interrupts.py.
 
-python benchmarks/reliability.py [--mutations 10000 --commands 200 --right 20 --kills 50 --disks 10 --races 5]
+python benchmarks/reliability.py [--mutations 10000 --attempts 5000 --commands 200 --right 20 --kills 50 --disks 10
+--races 5]
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import os
 import random
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,23 +21,33 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
 import test_interrupts as interrupts
 from fuzz.commands import command_lines, right_command_lines
-from fuzz.kinds import KINDS
+from fuzz.kinds import ATTEMPTS, KINDS
 from fuzz.test_fuzz import SHORT, attack
 from quick import run
 from record import write_result
 
+PAGES = [kind for kind in KINDS if kind.endswith("on the page")]
 CommandLines = Callable[[random.Random, Path, int], Iterator[tuple[str, list[str]]]]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    numbers = {"mutations": 10_000, "commands": 200, "right": 20, "kills": 50, "disks": 10, "races": 5}
+    numbers = {
+        "mutations": 10_000,
+        "attempts": 5_000,
+        "commands": 200,
+        "right": 20,
+        "kills": 50,
+        "disks": 10,
+        "races": 5,
+    }
     for name, number in numbers.items():
         parser.add_argument(f"--{name}", type=int, default=number)
     asked = parser.parse_args()
     root, done = Path(tempfile.mkdtemp()), {}
     parts: dict[str, Callable[[], dict[str, Any]]] = {
-        "mutations": lambda: mutations(root, asked.mutations),
+        "mutations": lambda: mutations(root, KINDS, asked.mutations),
+        "attempts": lambda: mutations(root, [*ATTEMPTS, *PAGES], asked.attempts),
         "commands": lambda: commands(root / "commands", command_lines, asked.commands),
         "right": lambda: commands(root / "right", right_command_lines, asked.right),
         "kills": lambda: kills(root, asked.kills),
@@ -49,15 +60,16 @@ def main() -> None:
         write_result("reliability", done)
 
 
-def mutations(root: Path, count: int) -> dict[str, Any]:
-    """Mutate the files of every reader and model, with seeds that the tests do not use."""
+def mutations(root: Path, kinds: Collection[str], count: int) -> dict[str, Any]:
+    """Attack every kind, with seeds that the tests do not use."""
     ends: dict[str, Any] = {}
-    for kind in KINDS:
-        seeds = range(SHORT, SHORT + -(-count // len(KINDS)))
+    for kind in kinds:
+        seeds = range(SHORT, SHORT + -(-count // len(kinds)))
         try:
             ends[kind] = attack(kind, root / kind.replace(" ", "-"), seeds) | {"wrong": 0}
         except AssertionError as error:
             ends[kind] = {"wrong": 1, "what": str(error)}
+            print(error, flush=True)
     return ends
 
 

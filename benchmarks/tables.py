@@ -106,6 +106,9 @@ def reliability() -> str:
         [f"{disks['full disks']} full disks", "each a sentence, nothing half-written", disks["wrong"]],
         [f"{races['races']} races for one directory", "one run each", races["wrong"]],
     ]
+    for kind, end in done.get("attempts", {}).items():
+        read, refused = (end.get(key, 0) for key in ("read", "refused"))
+        rows.append([f"{read + refused:,} times: {kind}", f"{read} plausible, {refused:,} refused", end["wrong"]])
     return markdown(["attack", "end", "wrong"], [[str(cell) for cell in row] for row in rows])
 
 

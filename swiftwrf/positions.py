@@ -39,7 +39,7 @@ def to_tensor(
     """
     try:
         if isinstance(value, Tensor):
-            tensor = value.detach().cpu()
+            tensor = value.detach().cpu().to_dense()
         else:
             array = np.asarray(value)
             is_wide = array.dtype.kind == "u" and array.itemsize > 1  # torch does not compute with these
@@ -95,7 +95,7 @@ def check_positions(
             f"{name} must be finite numbers [m], at most {MAX_COORDINATE_M:g}{unknown}; row {row}, counted from 0, is "
             f"{rows[row].tolist()}"
         )
-    return position.double() if isinstance(position, Tensor) else checked
+    return position.to_dense().double() if isinstance(position, Tensor) else checked
 
 
 def frame(position: Tensor) -> tuple[Tensor, Tensor]:

@@ -37,6 +37,8 @@ from tasks.rssi.options import RssiTaskConfig
 from tasks.rssi.predictors import PREDICTORS
 from tasks.scenes.options import ScenesConfig
 from tasks.scenes.run import run as scenes
+from tasks.update.options import UpdateConfig
+from tasks.update.run import run as update
 from tasks.view.options import ViewConfig
 from tasks.view.run import run as view
 
@@ -50,6 +52,7 @@ TASKS = {
     "inspect": (InspectConfig, inspect),
     "view": (ViewConfig, view),
     "scenes": (ScenesConfig, scenes),
+    "update": (UpdateConfig, update),
 }
 FOR_LIFE = ExitStack()
 PREDICTORS_KEPT = ("swiftwrf", "mean", "mri_pooled", "mri_receiver")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated
@@ -19,13 +19,14 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from swiftwrf.errors import InputError
-from swiftwrf.runtime.validation import checked
+from swiftwrf.positions import to_tensor
+from swiftwrf.runtime.validation import checked, configuration
 
 MAX_GRID_PIXELS = 2**24  # of one spectrum
 Size = Annotated[int, Ge(2), Le(MAX_GRID_PIXELS)]
 
 
-@dataclass(frozen=True)
+@configuration
 class AngularGrid:
     """Directions of the pixels of a spectrum: evenly spaced elevations (rows) and azimuths (columns, periodic).
 
@@ -50,12 +51,13 @@ class AngularGrid:
     azimuth_start: float
     n_azimuth: int
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Refuse no pixels, too many of them, and angles that are not finite."""
         sizes, angles = (
             (self.n_elevation, self.n_azimuth),
             (self.elevation_start, self.elevation_step, self.azimuth_start),
         )
-        if not all(isinstance(size, int) and size >= 1 for size in sizes) or math.prod(sizes) > MAX_GRID_PIXELS:
+        if min(sizes) < 1 or math.prod(sizes) > MAX_GRID_PIXELS:
             raise InputError(
                 f"a grid has whole numbers of rows and columns and at most {MAX_GRID_PIXELS} pixels, got {sizes}"
             )
@@ -63,13 +65,16 @@ class AngularGrid:
             raise InputError(f"a grid needs finite angles and a step above 0, got {angles} [rad]")
 
     @classmethod
-    def degrees(cls, elevation: Iterable[float], azimuth: Iterable[float]) -> AngularGrid:
+    def degrees(cls, elevation: Sequence[float], azimuth: Sequence[float]) -> AngularGrid:
         """Return the grid of the given angles in degrees, e.g. `degrees(elevation=range(1, 91), azimuth=range(360))`.
 
         Raises:
-            InputError: Uneven spacing, descending order, or azimuths that do not cover the circle once.
+            InputError: No finite numbers, uneven spacing, descending order, or azimuths that do not cover the circle once.
         """
-        rows, columns = [float(e) for e in elevation], [float(a) for a in azimuth]
+        rows, columns = (
+            to_tensor(name, angles, torch.float64, (None,), missing=True).tolist()
+            for name, angles in (("elevation", elevation), ("azimuth", azimuth))
+        )
         row_step = _even_step(rows, "elevation")
         column_step = _even_step(columns, "azimuth")
         if abs(column_step * len(columns) - 360) > 1e-6 * 360:
@@ -216,11 +221,9 @@ class ArrayPose:
     orientation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        sizes = len(self.position), len(self.orientation)
-        if sizes != (3, 4) or not all(map(math.isfinite, (*self.position, *self.orientation))):
-            raise InputError(
-                f"the array's position {self.position} and orientation {self.orientation} must be 3 and 4 finite numbers"
-            )
+        for name, size in (("position", 3), ("orientation", 4)):
+            numbers = to_tensor(f"the array's {name}", getattr(self, name), torch.float64, (size,))
+            object.__setattr__(self, name, tuple(numbers.tolist()))
         length = math.hypot(*self.orientation)
         if abs(length - 1) > 1e-3:
             raise InputError(

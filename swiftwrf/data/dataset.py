@@ -14,7 +14,7 @@ from torch import Tensor
 
 from swiftwrf.data.labelled import Labelled, Variable, position_coordinates
 from swiftwrf.data.splits import choose_split
-from swiftwrf.errors import InputError
+from swiftwrf.errors import CONTENT_ERRORS, InputError
 from swiftwrf.plotting import Displayed, extent
 from swiftwrf.positions import check_positions, to_tensor
 from swiftwrf.runtime.validation import NonNegativeInt, checked
@@ -46,6 +46,7 @@ class PositionedData(Labelled, Displayed):
     row_fields: ClassVar[tuple[str, ...]]
     """fields with one entry a measurement; the first holds the positions"""
 
+    @checked
     def __init__(
         self,
         name: str,
@@ -99,7 +100,7 @@ class PositionedData(Labelled, Displayed):
         """
         try:
             found = np.arange(len(self))[rows.cpu().numpy() if isinstance(rows, Tensor) else rows]
-        except (IndexError, TypeError, ValueError):
+        except CONTENT_ERRORS:
             found = None
         if found is None or found.ndim != 1:
             raise InputError(

@@ -16,6 +16,7 @@ from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.survey import read_frame
 from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import check_positions
+from swiftwrf.runtime.validation import checked
 
 MAX_FROM_ORIGIN_DEG = 2.0  # of receivers in degrees
 
@@ -98,6 +99,7 @@ def _in_metres(file: Path, xy: NDArray[np.float64], named: bool, origin: Geodeti
     return origin.to_metres(xy[:, ::-1])
 
 
+@checked
 def receiver_row(names: Sequence[str], asked: str, owner: str) -> int:
     """Return the index of a receiver.
 

@@ -132,12 +132,13 @@ class Rssi(PositionedData):
         check_powers(name, rssi.numpy(), names, self.index.numpy()[:, None])
 
     @classmethod
+    @checked
     def from_frame(
         cls,
         frame: pd.DataFrame,
         *,
         columns: Mapping[str, str] | None = None,
-        filler: Sequence[float] | None = None,
+        filler: Numbers | None = None,
         coordinates: Coordinates | None = None,
         offset_by: str | None = None,
         transmitter: Sequence[str] = (),
@@ -167,7 +168,7 @@ class Rssi(PositionedData):
             >>> Rssi.from_frame(pd.DataFrame({"x": [0, 1], "y": [0, 1], "z": [1, 1], "hall": [-50, -60]})).receiver_names
             ('hall',)
         """
-        values = None if filler is None else tuple(filler)
+        values = None if filler is None else tuple(to_tensor("filler", filler, torch.float64, (None,)).tolist())
         options = SurveyOptions(columns, values, coordinates, offset_by, tuple(transmitter), pool_by)
         survey = read_survey("the table", frame, options)
         known = receiver_position or survey.receiver_position or {}
@@ -268,6 +269,7 @@ class Rssi(PositionedData):
         own, others = ({*data.session.tolist()} if data.session is not None else {0} for data in (self, test))
         return "session" if len(own) > 1 and own.isdisjoint(others) else validation_for(split)
 
+    @checked
     def receivers(self, asked: Sequence[str]) -> Rssi:
         """Return the data of some receivers.
 

@@ -33,6 +33,7 @@ from swiftwrf.data.splits import FOLDS, MIN_TRAINING, slabs
 from swiftwrf.diagnostics.elements import phases_are_constant
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.threads import single_thread
+from swiftwrf.runtime.validation import checked
 
 MAX_TURN = math.radians(45)  # a larger one is an error of frames, not of mounting
 SCAN_STEP = math.radians(9)  # a third of the beam of a 4 x 4 array
@@ -94,6 +95,7 @@ class Calibration:
 
 
 @single_thread()
+@checked
 def calibrate(train: Snapshots) -> Calibration:
     """Estimate the phases of the elements and the orientation of the array.
 

@@ -38,10 +38,11 @@ from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.path_gains import PathGains, PriorChoice, choose_prior, fit_path_gains, kernel_of
+from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
 from swiftwrf.runtime.options import Configured, all_or_nothing
 from swiftwrf.runtime.threads import parallel_map
-from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
+from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, checked, configuration
 
 FOLDS = 5
 MIN_SPECTRA = 15
@@ -171,6 +172,7 @@ class MatchedField(Configured, Saved):
         return self._fit.room
 
     @all_or_nothing
+    @checked
     def fit(
         self,
         train: Spectra,
@@ -309,13 +311,7 @@ class MatchedField(Configured, Saved):
             InputError: Spectra on another grid, or not finite, or a locator that is not fitted.
         """
         self.check_fitted()
-        spectrum = torch.as_tensor(spectrum, dtype=torch.float32, device="cpu")
-        if spectrum.dim() != 3 or tuple(spectrum.shape[1:]) != self.grid.shape:
-            raise InputError(
-                f"expected spectra of shape (n, {self.grid.shape[0]}, {self.grid.shape[1]}), got {tuple(spectrum.shape)}"
-            )
-        if not bool(spectrum.isfinite().all()):
-            raise InputError("spectra must be finite magnitudes in [0, 1]")
+        spectrum = to_tensor("spectra", spectrum, torch.float32, (None, *self.grid.shape))
         observed = SpectrumFeatures.of([spectrum], self.room.array, self.grid, self.config.seed)
         parts = list(self._searched(observed, self.likelihoods))
         position = torch.cat([cells.position for cells, _ in parts])

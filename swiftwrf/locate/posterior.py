@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import torch
+from annotated_types import Gt, Lt
 from torch import Tensor
 
-from swiftwrf.errors import InputError
 from swiftwrf.plotting import MARK, Displayed, plan
+from swiftwrf.runtime.validation import checked
 
 if TYPE_CHECKING:
     import matplotlib.axes
@@ -118,14 +119,13 @@ class Posterior(Displayed):
         """Posterior standard deviation along each axis, (n, 3) [m]."""
         return self.covariance.diagonal(dim1=1, dim2=2).sqrt()
 
-    def credible_radius(self, level: float = 0.8) -> Tensor:
+    @checked
+    def credible_radius(self, level: Annotated[float, Gt(0), Lt(1)] = 0.8) -> Tensor:
         """Return the radius [m] around the median within which the position lies with probability `level`, (n,).
 
         Raises:
             InputError: A level outside (0, 1).
         """
-        if not 0 < level < 1:
-            raise InputError(f"level must be between 0 and 1, got {level}")
         away = (self.position - self.median[:, None]).norm(dim=2)
         return self.inflation * (self._radius(away, level) + self.resolution_m / 4)
 

@@ -6,11 +6,13 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Annotated, ClassVar, Self
 
+import numpy as np
 import torch
 from annotated_types import Ge, Le
 from torch import Tensor
 
 from swiftwrf.data.dataset import Numbers
+from swiftwrf.data.fillers import MAX_RSSI_DBM, MIN_RSSI_DBM, check_powers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
@@ -18,11 +20,12 @@ from swiftwrf.locate.pool import inflation, pooled_weights
 from swiftwrf.locate.posterior import Posterior, normalised
 from swiftwrf.locate.region import Region, outside_mass
 from swiftwrf.locate.rssi_likelihood import DetectionLikelihood, FingerprintLikelihood, RssiMaps, ValueLikelihood
+from swiftwrf.positions import to_tensor
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
 from swiftwrf.runtime.options import Configured, all_or_nothing
 from swiftwrf.runtime.progress import progress as tracked
-from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
+from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, checked, configuration
 
 MAX_INFLATION_ROWS = 300  # held-out rows that determine the coverage of credible regions
 NEIGHBOUR_COUNTS = (1, 2, 3, 5, 8, 13, 20)
@@ -88,6 +91,7 @@ class RssiLocator(Configured, Saved):
     config: RssiLocatorConfig
 
     @all_or_nothing
+    @checked
     def fit(
         self,
         train: Rssi,
@@ -223,11 +227,8 @@ class RssiLocator(Configured, Saved):
                 not fitted.
         """
         self.check_fitted()
-        rssi = torch.as_tensor(rssi, dtype=torch.float64, device="cpu")
-        if rssi.dim() != 2 or rssi.shape[1] != len(self.receiver_names):
-            raise InputError(f"expected RSSI of shape (n, {len(self.receiver_names)}), got {tuple(rssi.shape)}")
-        if bool(rssi.isinf().any()):
-            raise InputError("RSSI must be finite numbers [dBm], or NaN if not detected")
+        rssi = to_tensor("rssi", rssi, torch.float64, (None, len(self.receiver_names)), missing=True)
+        check_powers("rssi", rssi.numpy(), self.receiver_names, np.arange(len(rssi))[:, None])
         silent = rssi.isnan().all(dim=1).nonzero()[:, 0]
         if len(silent):
             raise InputError(f"no receiver detected the transmitter in row {int(silent[0])}; leave such rows out")
@@ -241,7 +242,8 @@ class RssiLocator(Configured, Saved):
         return Posterior(at[None], normalised(log_mass + self.cells.log_volume), self.cells.edge_m, self.inflation)
 
     @torch.no_grad()
-    def sample(self, position: Numbers, n: int, generator: torch.Generator) -> Tensor:
+    @checked
+    def sample(self, position: Numbers, n: PositiveInt, generator: torch.Generator) -> Tensor:
         """Sample rows of RSSI from the fitted distributions: values with correlated errors, and lost packets.
 
         Args:
@@ -255,7 +257,7 @@ class RssiLocator(Configured, Saved):
         self.check_fitted()
         maps = RssiMaps.of(self.model.predict(position))
         mean, std = maps.mean.double(), maps.std.double()
-        rssi = mean + std * self.values.sample((n, len(mean)), generator)
+        rssi = (mean + std * self.values.sample((n, len(mean)), generator)).clamp(MIN_RSSI_DBM, MAX_RSSI_DBM)
         chance = self.detections.probability(mean)
         lost = torch.rand(rssi.shape, generator=generator, dtype=torch.float64) >= chance
         strongest = torch.nn.functional.one_hot(rssi.argmax(dim=2), rssi.shape[2]).bool()

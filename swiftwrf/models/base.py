@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 import torch
+from annotated_types import Gt, Le
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
@@ -21,7 +22,7 @@ from swiftwrf.errors import InputError, with_article
 from swiftwrf.models.link import Link
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed, extent
-from swiftwrf.positions import check_positions
+from swiftwrf.positions import check_positions, to_tensor
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.options import Configured, Preset, all_or_nothing, from_plain
 from swiftwrf.runtime.session import Record
@@ -130,6 +131,7 @@ class FieldModel(Configured, Saved, Displayed):
         return cls.searches and type(model) is cls
 
     @all_or_nothing
+    @checked
     def fit(
         self,
         train: Spectra,
@@ -182,6 +184,7 @@ class FieldModel(Configured, Saved, Displayed):
         Differentiable where the mathematics is. Magnitudes need not be clipped. The standard deviation may be None.
         """
 
+    @checked
     def predict(self, position: Numbers, grid: AngularGrid | None = None) -> Prediction:
         """Predict spectra.
 
@@ -200,6 +203,7 @@ class FieldModel(Configured, Saved, Displayed):
         """
         return self._predicted(position, grid, with_std=True)
 
+    @checked
     def synthesize(self, position: Numbers, grid: AngularGrid | None = None) -> Tensor:
         """Return the mean of `predict` alone, without the cost of the standard deviation."""
         return self._predicted(position, grid, with_std=False).mean
@@ -257,7 +261,7 @@ class FieldModel(Configured, Saved, Displayed):
         self.link.check(new)
         check_spectra(new)
 
-    def forget(self, rows: Tensor) -> Self:
+    def forget(self, rows: Numbers) -> Self:
         """Return the model without some of its training spectra; see `update`.
 
         Args:
@@ -267,10 +271,11 @@ class FieldModel(Configured, Saved, Displayed):
             InputError: A model that must be fitted again, or a number outside the range.
         """
         model = self._copy()
-        model._forget(rows)
+        model._forget(to_tensor("rows", rows, torch.int64, (None,)))
         return model
 
-    def aged(self, correlation: float) -> Self:
+    @checked
+    def aged(self, correlation: Annotated[float, Gt(0), Le(1)]) -> Self:
         """Return the model after a change of the scene, for which earlier spectra count less than new ones.
 
         Args:
@@ -279,8 +284,6 @@ class FieldModel(Configured, Saved, Displayed):
         Raises:
             InputError: A model that must be fitted again, or a correlation outside the range.
         """
-        if not 0 < correlation <= 1:
-            raise InputError(f"correlation must be above 0 and at most 1, got {correlation}")
         model = self._copy()
         model._age(correlation)
         return model
@@ -406,7 +409,7 @@ class FieldModel(Configured, Saved, Displayed):
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         """Take the fitted state over from `_state`, checking every shape first."""
 
-    def plot(self, position: Tensor, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+    def plot(self, position: Numbers, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
         """Draw the predicted spectrum at one position, seen along the normal of the array.
 
         Args:
@@ -422,8 +425,9 @@ class FieldModel(Configured, Saved, Displayed):
             >>> make_model("nearest").fit(room).plot(room.position[0]).get_title()
             'nearest at ... m'
         """
-        prediction = self.predict(torch.as_tensor(position)[None])
-        at = ", ".join(f"{float(coordinate):.2f}" for coordinate in position)
+        position = check_positions(position, "position", (3,))
+        prediction = self.predict(position[None])
+        at = ", ".join(f"{coordinate:.2f}" for coordinate in position.tolist())
         ax = prediction.plot(ax=ax)
         ax.set_title(f"{self.name} at ({at}) m")
         return ax

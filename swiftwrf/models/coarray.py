@@ -30,6 +30,7 @@ from swiftwrf.runtime.checkpoint import Header, expect, refusing, restore
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.threads import single_thread
+from swiftwrf.runtime.validation import checked
 
 MAX_COMPONENTS = 64  # principal components of the training magnitudes
 VALUE_AZIMUTHS = 90  # columns of the components that new spectra are projected on; the beams of an array are far wider
@@ -44,6 +45,7 @@ def _inverse(array: PlanarArray, grid: AngularGrid) -> Tensor:
     return inverse
 
 
+@checked
 def project(spectrum: Tensor, array: PlanarArray, grid: AngularGrid, *, stretched: bool = False) -> Tensor:
     """Return the nearest spectra that the array can produce, by least squares on the squared magnitudes.
 

@@ -25,6 +25,7 @@ from swiftwrf.online.kernel import KernelMonitor, described
 from swiftwrf.online.monitor import Monitor, MonitorConfig
 from swiftwrf.online.prequential import Scores, learnt, score
 from swiftwrf.rssi.model import RssiModel
+from swiftwrf.runtime.validation import checked
 
 ROOM_NOTICE = "the room no longer explains the spectra since measurement {}; fit it again, also if an obstacle appeared"
 MIN_MISSING = 3e-3  # missing coherence that counts as none, phases of 3 degrees
@@ -83,6 +84,7 @@ class Follower:
         1
     """
 
+    @checked
     def __init__(
         self, model: FieldModel | RssiModel, train: Spectra | Rssi | None = None, config: MonitorConfig | None = None
     ) -> None:
@@ -100,6 +102,7 @@ class Follower:
         self.waiting: Spectra | None = None
         """spectra that a geometry has not learnt yet, for its next update"""
 
+    @checked
     def step(self, new: Spectra | Rssi) -> Step:
         """Score one measurement, test it for a change, and learn it.
 

@@ -120,6 +120,7 @@ class RssiPredictor(Configured, Displayed, ABC):
         return ""
 
     @all_or_nothing
+    @checked
     def fit(
         self,
         train: Rssi,
@@ -248,6 +249,7 @@ class RssiPredictor(Configured, Displayed, ABC):
         std = torch.cat(stds) if stds else None
         return Prediction(mean, std, position, receiver_names=self.receiver_names)
 
+    @checked
     def predict_detected(self, data: Rssi) -> Prediction:
         """Predict the RSSI at least where it is measured, with shapes of `predict` at the positions of the data.
 

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from swiftwrf.errors import CONTENT_ERRORS, InputError
 from swiftwrf.runtime.durable import write_bytes
+from swiftwrf.runtime.validation import checked
 
 FORMAT = 1
 DEFINING_PACKAGES = ("swiftwrf.models", "swiftwrf.comparison", "swiftwrf.rssi", "swiftwrf.locate")  # of saved kinds
@@ -112,6 +113,7 @@ class Saved(ABC):
             InputError: Tensors and header do not match. No memory is allocated for sizes that only the header claims.
         """
 
+    @checked
     def save(self, path: str | Path, provenance: dict[str, str] | None = None) -> None:
         """Write the model to one safetensors file.
 

@@ -69,7 +69,7 @@ def to_device(device: torch.device | str) -> torch.device:
     """
     try:
         found = torch.device(device)
-    except (RuntimeError, TypeError):
+    except (RuntimeError, TypeError, ValueError):
         raise InputError(f"device must be a device of torch, cpu or cuda, got {device!r}") from None
     if found.type == "cuda" and (found.index or 0) >= torch.cuda.device_count():
         raise InputError(f"device {found} needs an NVIDIA GPU that torch can use, and there is none; choose cpu")

@@ -9,9 +9,10 @@ from __future__ import annotations
 import functools
 import inspect
 import math
+import sys
 import types
-from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
 
 from annotated_types import Ge, Gt, Le, Lt
@@ -27,14 +28,14 @@ Fraction = Annotated[float, Ge(0), Le(1)]
 Function = TypeVar("Function", bound=Callable[..., Any])
 Class = TypeVar("Class")
 NUMBERS: dict[type, tuple[type, ...]] = {int: (int,), float: (int, float)}
+LARGEST = {int: 2**63 - 1, float: sys.float_info.max}  # whole number that is accepted
 RANGES = {Ge: ("at least", "ge"), Gt: ("above", "gt"), Le: ("at most", "le"), Lt: ("below", "lt")}
 
 
 def check_value(name: str, value: object, annotation: Any) -> None:
     """Refuse a value that its annotation does not allow.
 
-    Understands `Literal`, `Annotated` with ranges, unions, tuples, dataclasses, int, float, bool and str; other annotations
-    pass.
+    Understands `Literal`, `Annotated` with ranges, unions, tuples, lists, mappings and classes; other annotations pass.
 
     Args:
         name: Name of the value, for the message.
@@ -56,7 +57,7 @@ def _allowed(value: object, annotation: Any) -> bool:
     if origin is Annotated:
         return _allowed(value, arguments[0]) and all(_in_range(value, bound) for bound in arguments[1:])
     if origin is Literal:
-        return any(value == item and type(value) is type(item) for item in arguments)
+        return any(type(value) is type(item) and value == item for item in arguments)
     if origin in (Union, types.UnionType):
         return any(_allowed(value, item) for item in arguments)
     if origin is tuple:
@@ -65,16 +66,25 @@ def _allowed(value: object, annotation: Any) -> bool:
         if arguments[-1] is ...:
             return all(_allowed(item, arguments[0]) for item in value)
         return len(value) == len(arguments) and all(map(_allowed, value, arguments))
+    if origin in (list, Sequence):
+        try:
+            items: Any = (
+                value.tolist() if origin is Sequence and hasattr(value, "tolist") else value
+            )  # an array or a column
+        except RuntimeError:  # a tensor without values
+            return False
+        is_listed = isinstance(items, origin) and not isinstance(items, str | bytes)
+        return is_listed and all(_allowed(item, arguments[0]) for item in items)
+    if origin is Mapping:
+        return isinstance(value, Mapping) and all(all(map(_allowed, item, arguments)) for item in value.items())
     if annotation in NUMBERS:
         is_number = isinstance(value, NUMBERS[annotation]) and not isinstance(value, bool)
-        return is_number and not (isinstance(value, float) and math.isnan(value))
-    if annotation in (bool, str):
-        return isinstance(value, annotation)
+        if isinstance(value, int):
+            return is_number and abs(value) <= LARGEST[annotation]
+        return is_number and not math.isnan(value)  # type: ignore[arg-type]
     if annotation in (None, type(None)):
         return value is None
-    if isinstance(annotation, type) and is_dataclass(annotation):
-        return isinstance(value, annotation)
-    return True
+    return annotation is Any or not isinstance(annotation, type) or isinstance(value, annotation)
 
 
 def _in_range(value: Any, bound: object) -> bool:
@@ -103,10 +113,13 @@ def _described(annotation: Any) -> str:
         return (
             f"a tuple of {_described(arguments[0])}" if arguments[-1] is ... else f"a tuple of {len(arguments)} values"
         )
-    if isinstance(annotation, type) and is_dataclass(annotation):
-        return f"an instance of {annotation.__name__}"
+    if origin is Mapping:
+        return f"a dictionary, of which each key is {_described(arguments[0])} with {_described(arguments[1])}"
+    if origin in (list, Sequence):
+        return f"a list, of which each is {_described(arguments[0])}"
     names = {int: "a whole number", float: "a number", bool: "True or False", str: "a text", type(None): "None"}
-    return names.get(annotation, getattr(annotation, "__name__", str(annotation)))
+    is_class = isinstance(annotation, type) and annotation not in names
+    return f"an instance of {annotation.__name__}" if is_class else names.get(annotation, str(annotation))
 
 
 @dataclass_transform(frozen_default=True)

@@ -26,6 +26,7 @@ from tasks.update.options import TABLE, UpdateConfig
 
 POLL_S = 0.2  # between two looks at a file that grows
 CHUNK_BYTES = 2**20
+KNOWN_BYTES = 2**16  # before the end of a file that are compared to detect that it was rewritten
 
 
 class Line(NamedTuple):
@@ -73,11 +74,19 @@ def lines(source: str, end: int = 0, sha256: str = "") -> Iterator[Line]:
             header, digest, end = b"", hashlib.sha256(), 0
             for number, line in enumerate(_growing(Path(source), file), start=1):
                 digest.update(line)
+                if not line.endswith(b"\n") and _begins_alike(source, end + len(line), digest.hexdigest()):
+                    break  # the file was saved again while its last line was not whole
                 end, sha256 = end + len(line), digest.hexdigest()
                 if source.lower().endswith(TABLE) and not header:
                     header = line.strip() and line
                 elif end > known and line.strip():
                     yield Line(number, line, header, end, sha256)
+
+
+def _begins_alike(source: str, end: int, sha256: str) -> bool:
+    """Return whether the first bytes of a file have this digest."""
+    with Path(source).open("rb") as file:
+        return _digest(file, end) == sha256
 
 
 def _digest(file: BinaryIO, end: int) -> str:
@@ -91,18 +100,18 @@ def _digest(file: BinaryIO, end: int) -> str:
 
 def _growing(path: Path, file: BinaryIO) -> Iterator[bytes]:
     """Yield the lines of an open file until it is rewritten, or is read to its end and another file has its path."""
-    part, before, is_replaced = b"", b"", False
+    part, known, is_replaced = b"", b"", False
     while True:
         read = file.readline()
         part += read
         if part.endswith(b"\n") or (is_replaced and part and not read):
             yield part
-            before, part = part, b""
+            known, part = (known + part)[-KNOWN_BYTES:], b""
         elif is_replaced and not read:
             return
         elif not read:
             time.sleep(POLL_S)
-            place, last = file.tell(), before + part
+            place, last = file.tell(), known + part
             file.seek(0, os.SEEK_END)  # drops what is buffered
             file.seek(max(0, place - len(last)))
             if file.read(len(last)) != last:

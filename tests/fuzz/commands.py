@@ -5,12 +5,25 @@ Those that are mistyped start no long run: whatever is valid among them meets an
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
 import random
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
+from typing import get_type_hints
 
-from quick import TASKS
+import yaml
+from quick import TASKS, run
+
+from fuzz.misuse import rssi, rssi_model
+from fuzz.mutate import mutated
+from swiftwrf import InputError, load_rssi
+from swiftwrf.data.writing import write_rssi
+from swiftwrf.errors import MAX_LENGTH
+from swiftwrf.runtime.validation import check_value
+from tasks.command_line import execute
 
 VALUES = [
     "", "0", "1", "-1", "0.5", "1.5", "nan", "inf", "-inf", "1e400", "1e-320", "4294967296", "99999999999999999999",
@@ -32,6 +45,7 @@ REQUIRED_OPTIONS = {
     "scenes": ["--room", "office", "--moving", "receiver", "--positions", "5"],
     "estimate": ["data", "data"],
     "locate": ["--cells", "100"],
+    "update": ["model", "data"],
 }
 RIGHT = {
     "aoa": {
@@ -86,3 +100,78 @@ def right_command_lines(draw: random.Random, folder: Path, count: int) -> Iterat
         for option, values in draw.sample(others, draw.randint(0, len(others))):
             arguments += [option, *draw.choice(values).split()]
         yield task, [*arguments, "--out", str(folder / f"run{number}")]
+
+
+SAVED = {
+    "rssi": {
+        "rx": ["1", "receiver06"],
+        "split": "block",
+        "seed": 7,
+        "data": None,
+    },
+    "aoa": {"mix": [0.5, 1.0], "synthesizer": ["idw"], "extra": 7, "seed": 3},
+    "convert": {"source": "data", "out": "new", "cell": 0.5, "rx": ["1"], "columns": ["x=lon"], "filler": [100.0]},
+    "update": {"model": "model", "source": "data", "out": "new", "false_alarm_rate": 0.001, "follow": False},
+}
+
+
+def config_file(draw: random.Random, folder: Path) -> None:
+    """Take the options of a command from a mutated file.
+
+    Raises:
+        InputError: The file is refused.
+        AssertionError: A value is not of the type of its option.
+    """
+    task, suffix = draw.choice(list(SAVED)), draw.choice([".json", ".yaml"])
+    text, found = json.dumps(SAVED[task]) if suffix == ".json" else yaml.safe_dump(SAVED[task]), []
+    file = folder / f"options{suffix}"
+    file.write_bytes(mutated(text.encode(), draw, words_only=draw.random() < 0.5))
+    options = [f"--config={file}"] if draw.random() < 0.5 else ["--config", str(file)]
+    try:
+        with contextlib.redirect_stderr(io.StringIO()):
+            execute(f"tasks.{task}", TASKS[task][0], lambda config, *_: found.append(config), options)
+    except SystemExit as end:  # a required option is missing
+        raise InputError(f"the parser ends with {end.code}") from None
+    hints = get_type_hints(TASKS[task][0], include_extras=True)
+    for option in fields(found[0]):
+        try:
+            check_value(option.name, getattr(found[0], option.name), hints[option.name])
+        except InputError as error:
+            raise AssertionError(error) from None
+
+
+def updates_and_conversions(draw: random.Random, folder: Path) -> None:
+    """Update an RSSI model, or convert it or its data, with random options.
+
+    Raises:
+        InputError: The command line is refused.
+        AssertionError: Another exit code, no sentence, or data that differ after the conversion.
+    """
+    data, model, said = folder / "data", folder / "model", io.StringIO()
+    data.mkdir()
+    write_rssi(rssi(), data)
+    rssi_model().save(model)
+    task, out = draw.choice(
+        [("update", "new"), *(("convert", f"new{suffix}") for suffix in ("", ".csv", ".mat", ".tif", ".png"))]
+    )
+    source = [str(model), str(data)] if task == "update" else [str(draw.choice([data, model]))]
+    arguments = [*source, "--out", str(folder / out)] if task == "update" else [*source, str(folder / out)]
+    values = [*VALUES, str(data), str(model), "2", "10", "receiver01", "degrees", "metres", "x=x", "100"]
+    for _ in range(draw.randint(0, 2)):
+        arguments.append(
+            draw.choice([option for option in OPTIONS[task] if option not in ("--follow", "--open", "--out")])
+        )
+        arguments += [draw.choice(values) for _ in range(draw.choice([0, 1, 1, 1, 2, 3]))]
+    try:
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+            code = run(task, *arguments)
+    except SystemExit as end:
+        code = 0 if end.code is None else end.code
+    errors = [line.removeprefix("error: ") for line in said.getvalue().splitlines() if line.startswith("error: ")]
+    assert code in (0, 2), (arguments, code)
+    if code == 2:
+        assert len(errors) <= 1, arguments
+        assert all(len(error) <= MAX_LENGTH for error in errors), arguments
+        raise InputError(errors[0] if errors else "the parser refuses the options")
+    if task == "convert" and out == "new" and len(arguments) == 2:
+        assert load_rssi(folder / out).rssi_dbm.equal(rssi().rssi_dbm)

@@ -7,6 +7,7 @@ A format or a kind of model joins by a sample here (a test fails for one without
 from __future__ import annotations
 
 import functools
+import random
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,9 @@ from samples import (
 from small import GLANCE, PUBLISHED, PUBLISHED_RSSI
 
 from augment import Mixed
+from fuzz import runs
+from fuzz.commands import config_file, updates_and_conversions
+from fuzz.misuse import CALLS, misuse
 from swiftwrf import (
     FIELD_MODELS,
     AngularGrid,
@@ -61,6 +65,7 @@ N = 12
 GRID = AngularGrid.hemisphere(8, 32)
 TINY = SwiftWRFPaper(n_primitives=3, steps=12, check_every=6).config
 Reader = Callable[[Path], object]
+Attempt = Callable[[random.Random, Path], object]
 
 
 def spectra_nerf2(folder: Path) -> None:
@@ -272,4 +277,17 @@ KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "RSSI locator": (model_rssi_locator, read_locator),
     "matched-field locator": (model_matched_field, read_locator),
     "fit state": (state_of_a_fit, go_on),
+    "run of aoa on the page": (runs.run_of_aoa, runs.show),
+    "run of rssi on the page": (runs.run_of_rssi, runs.show),
+    "run of locate on the page": (runs.run_of_locate, runs.show),
+    "followed run on the page": (runs.followed_run, runs.show),
+}
+ATTEMPTS: dict[str, Attempt] = {
+    **{f"followed spectra, {name}": functools.partial(runs.followed_lines, name) for name in ("gp", "geometry")},
+    "followed RSSI": functools.partial(runs.followed_lines, "rssi"),
+    **{f"followed file {name}": functools.partial(runs.followed_file, name) for name in ("rows.csv", "rows.ndjson")},
+    **{f"growing file {name}": functools.partial(runs.growing_file, name) for name in ("rows.csv", "rows.ndjson")},
+    **{f"misuse of {name}": functools.partial(misuse, calls) for name, calls in CALLS.items()},
+    "options of update and convert": updates_and_conversions,
+    "file of options": config_file,
 }

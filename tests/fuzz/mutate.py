@@ -10,16 +10,17 @@ TOKENS = [
     b"nan", b"inf", b"-1", b"0", b"1e400", b"1e-320", b"9" * 5000, b"2001-99-99", b"12:34:56", b"'123'", b"\xe4",
     b"\xff\xfe", b"\xef\xbb\xbf", b"\0", b"[" * 2000, b"&a [*a]", b"!!python/object/apply:os.getcwd []", b"=1+1", b"NA",
     b"", b",,", b"\r", b'"', b"1_0", "\u0661".encode(), b"{}", b"null", b"true", b"-0", b"1e20", b"4294967296",
-    b"-9223372036854775809", b"\\", b"x" * 70_000,
+    b"-9223372036854775809", b"\\", b"x" * 70_000, b"9" * 400,
+    b"-99999", b"60", b"1e30",
 ]  # fmt: skip
 EXTREME = [b"\0\0\0\0", b"\xff\xff\xff\xff", b"\0\0\xc0\x7f", b"\0\0\x80\x7f", b"\xff" * 7 + b"\x7f", b"\0" * 8]
 PLACES = re.compile(rb"[\w.+-]+")
 
 
-def mutated(content: bytes, draw: random.Random) -> bytes:
-    """The content with one to four changes."""
-    for _ in range(draw.randint(1, 4)):
-        content = draw.choice(CHANGES)(content, draw)
+def mutated(content: bytes, draw: random.Random, words_only: bool = False) -> bytes:
+    """The content with one to four changes, or with other words only, which leave its syntax as it is more often."""
+    for _ in range(draw.randint(1, 2 if words_only else 4)):
+        content = draw.choice((_token,) if words_only else CHANGES)(content, draw)
     return content
 
 

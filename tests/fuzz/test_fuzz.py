@@ -1,6 +1,7 @@
 """Whatever is done to files and command lines, there is a result that is finite, or one sentence; never a traceback.
 
-80 mutations a kind with every test run; `pytest -m fuzz` makes 10,000 more, 200 command lines, and some whole runs.
+80 mutations of files a kind and 12 attempts of any other kind with every test run. `pytest -m fuzz` makes 10,000 and 5,000
+more, 200 command lines, and some whole runs.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from hypothesis import strategies as st
 from quick import run
 
 from fuzz.commands import command_lines, right_command_lines
-from fuzz.kinds import KINDS
+from fuzz.kinds import ATTEMPTS, KINDS, Attempt
 from fuzz.mutate import spoil
 from swiftwrf import FitError, InputError
 from swiftwrf.data.files import read_table, read_yaml
@@ -25,27 +26,24 @@ from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.runtime.checkpoint import Saved
 
 SHORT = 80  # mutations a kind
+SHORT_ATTEMPTS = 12
 LONG = -(-10_000 // len(KINDS))
+LONG_ATTEMPTS = -(-5_000 // len(ATTEMPTS))
 
 
 def attack(kind: str, folder: Path, seeds: range) -> dict[str, int]:
-    """Return the number of mutated samples that were read and that were refused.
+    """Return the number of mutated samples, or attempts, that were read and that were refused.
 
     Raises:
-        AssertionError: A sample was neither read nor refused.
+        AssertionError: One was neither read nor refused.
     """
-    write, read = KINDS[kind]
-    sound, spoilt = folder / "sound", folder / "spoilt"
-    sound.mkdir(parents=True)
-    write(sound)
-    read(sound)
-    ends = {"read": 0, "refused": 0}
+    attempt = ATTEMPTS[kind] if kind in ATTEMPTS else _spoiling(kind, folder / "sound")
+    ends, spoilt = {"read": 0, "refused": 0}, folder / "spoilt"
     for seed in seeds:
         shutil.rmtree(spoilt, ignore_errors=True)
-        shutil.copytree(sound, spoilt)
-        spoil(spoilt, random.Random(seed))
+        spoilt.mkdir(parents=True)
         try:
-            read(spoilt)
+            attempt(random.Random(seed), spoilt)
         except (InputError, FitError) as refusal:
             if len(str(refusal)) > MAX_LENGTH or "\n" in str(refusal):
                 raise AssertionError(f"{kind}, seed {seed}: {refusal}") from refusal
@@ -55,6 +53,21 @@ def attack(kind: str, folder: Path, seeds: range) -> dict[str, int]:
         else:
             ends["read"] += 1
     return ends
+
+
+def _spoiling(kind: str, sound: Path) -> Attempt:
+    """Write a sound sample, and return a function that reads a mutated copy of it."""
+    write, read = KINDS[kind]
+    sound.mkdir(parents=True)
+    write(sound)
+    read(sound)
+
+    def attempt(draw: random.Random, spoilt: Path) -> None:
+        shutil.copytree(sound, spoilt, dirs_exist_ok=True)
+        spoil(spoilt, draw)
+        read(spoilt)
+
+    return attempt
 
 
 def test_every_format_and_model_is_fuzzed():
@@ -72,10 +85,21 @@ def test_mutations(kind, tmp_path):
     assert ends["refused"] > 0
 
 
+@pytest.mark.parametrize("kind", ATTEMPTS)
+def test_attempts(kind, tmp_path):
+    attack(kind, tmp_path, range(SHORT_ATTEMPTS))
+
+
 @pytest.mark.fuzz
 @pytest.mark.parametrize("kind", KINDS)
 def test_many_mutations(kind, tmp_path):
     attack(kind, tmp_path, range(SHORT, SHORT + LONG))
+
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize("kind", ATTEMPTS)
+def test_many_attempts(kind, tmp_path):
+    attack(kind, tmp_path, range(SHORT, SHORT + LONG_ATTEMPTS))
 
 
 def _end(task, arguments, capfd):

@@ -25,6 +25,7 @@ from swiftwrf.models.geometry.images import PhaseObservations, image_gain, image
 from swiftwrf.models.geometry.planes import Plane, PlaneSet, RoomEstimate
 from swiftwrf.models.link import Link, Linked
 from swiftwrf.runtime.checkpoint import Header, expect
+from swiftwrf.runtime.validation import checked
 
 
 class GeometryModel(Linked, FieldModel):
@@ -57,6 +58,7 @@ class GeometryModel(Linked, FieldModel):
         return model.room is not None
 
     @classmethod
+    @checked
     def of_planes(cls, link: Spectra, planes: list[Plane], order: int = 2) -> Self:
         """Return the model of a room whose planes are known.
 

@@ -295,7 +295,7 @@ def test_tables_and_one_line_of_a_data_set():
         (lambda: PlanarArray([[0.0, 0.0]], "1 m"), "wavelength must be a number above 0"),
         (lambda: AngularGrid.hemisphere(10, 40.0), "n_azimuth must be a whole number"),
         (lambda: AngularGrid.hemisphere(0, 40), "n_elevation must be a whole number at least 2"),
-        (lambda: ArrayPose((0.0, 1.0)), "must be 3 and 4 finite numbers"),
+        (lambda: ArrayPose((0.0, 1.0)), r"position must have shape \(3\), got \(2,\)"),
         (lambda: ShoeboxRoom(size=(0.0, 1.0, 1.0)), "size must be"),
     ],
 )

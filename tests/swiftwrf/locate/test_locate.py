@@ -285,7 +285,7 @@ def test_detections_are_learnt():
     ("rssi", "message"),
     [
         (torch.full((2, 12), math.nan), "no receiver detected the transmitter in row 0"),
-        (torch.zeros(2, 5), r"expected RSSI of shape \(n, 12\), got \(2, 5\)"),
+        (torch.zeros(2, 5), r"rssi must have shape \(n, 12\), got \(2, 5\)"),
         (torch.full((1, 12), math.inf), "finite"),
     ],
 )
@@ -295,7 +295,7 @@ def test_observations_that_make_no_sense_are_refused(floor, rssi, message):
 
 
 def test_spectra_on_another_grid_are_refused(closed_form):
-    with pytest.raises(InputError, match="expected spectra of shape"):
+    with pytest.raises(InputError, match="spectra must have shape"):
         closed_form[2].locate(torch.zeros(1, 30, 120))
     with pytest.raises(InputError, match="finite"):
         closed_form[2].locate(torch.full((1, 15, 60), math.nan))

@@ -10,20 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from PIL import Image
+from fuzz.runs import followed_run, run_of_locate, show
 
-from swiftwrf import InputError, RssiModel, rssi_room
-from swiftwrf.locate import RssiLocator
-from swiftwrf.online import Follower
-from tasks.aoa.page.room import in_plan
-from tasks.locate.options import LocateConfig
-from tasks.options import plain
+from swiftwrf import InputError
 from tasks.page.floor_plan import FloorPlan
-from tasks.update.record import Record
-from tasks.view.followed import FollowedView
-from tasks.view.rssi import MapSelection, RssiView
-from tasks.view.sources import open_source
 
 OPENED = (
     "config.json",
@@ -51,44 +41,12 @@ def run(name, request, tmp_path):
         case "rssi":
             FloorPlan.scaled(np.zeros((6, 8, 3), np.uint8), 2.0, (0, 6)).save(folder)
         case "locate":
-            train, _ = rssi_room(n=60).split()
             folder.mkdir()
-            RssiLocator(n_cells=200).fit(train).save(folder / "locator.safetensors")
-            config = {"task": "locate", "config": plain(LocateConfig(data="gone.csv"))}
-            (folder / "config.json").write_text(json.dumps(config))
-            (folder / "environment.json").write_text('{"input_sha256": {}}')
+            run_of_locate(folder)
         case "followed":
-            data = rssi_room(n=66)
             folder.mkdir()
-            (folder / "config.json").write_text('{"task": "update"}')
-            follower, record = Follower(RssiModel().fit(data.subset(torch.arange(60)))), Record("source", " [dB]")
-            for i in range(60, 66):
-                record.append(folder, record.add(i, follower.step(data.subset(torch.tensor([i])))))
+            followed_run(folder)
     return folder
-
-
-def show(folder: Path) -> None:
-    """Open a run and compute what its page shows."""
-    view = open_source(folder)
-    if isinstance(view, FollowedView):
-        view.snapshot()
-        return
-    if isinstance(view, RssiView):
-        x, y = (float(line.mean()) for line in view.cells)
-        for kind in set(view.kinds) - {"expected error"}:
-            selection = MapSelection(kind, 0, view.heights[1])
-            view.coloured(selection)
-            view.sentence(selection)
-            view.describe(selection, x, y)
-        plan = view.plan()
-        if view.floor.plan is not None:
-            plan.picture(Image.fromarray(view.floor.plan.pixels), view.floor.plan.corners)
-        plan.dots(view.floor.position, "red", 1)
-        return
-    for loaded in view.models:
-        view.predict(loaded, view.start)
-        for plane in loaded.planes:
-            in_plan(plane, *view.box)
 
 
 def damaged_bytes(content: bytes) -> dict[str, bytes]:
@@ -172,9 +130,7 @@ def damages(file: Path) -> dict[str, Callable[[], object]]:
 
 
 @pytest.mark.parametrize("name", ["aoa", "rssi", "locate", "followed"])
-def test_a_damaged_run_is_shown_or_refused(run, monkeypatch):
-    monkeypatch.setattr("tasks.view.rssi.CELLS", 9)
-    monkeypatch.setattr("tasks.view.followed.as_svg", lambda *_: "<svg")  # drawn, but not written
+def test_a_damaged_run_is_shown_or_refused(run):
     show(run)
     wrong, n = [], 0
     for file in sorted({file for pattern in OPENED for file in run.glob(pattern)}):

@@ -1,0 +1,300 @@
+"""Runs as the page opens them, and sources that a model follows."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import io
+import json
+import math
+import os
+import random
+import sys
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
+
+import numpy as np
+import torch
+from PIL import Image
+from small import GLANCE
+
+from fuzz.misuse import MAX_RSSI_DB, check_plausible
+from fuzz.mutate import mutated
+from swiftwrf import (
+    AngularGrid,
+    FieldModel,
+    InputError,
+    Rssi,
+    RssiLocator,
+    RssiModel,
+    fit,
+    load,
+    make_model,
+    rssi_room,
+    simulated_room,
+)
+from swiftwrf.errors import MAX_LENGTH
+from swiftwrf.models.geometry import fit_geometry
+from swiftwrf.online import Follower
+from tasks.aoa.options import AoaConfig
+from tasks.aoa.page.room import in_plan
+from tasks.command import run_command
+from tasks.locate.options import LocateConfig
+from tasks.options import plain
+from tasks.page.floor_plan import FloorPlan
+from tasks.records import write_json
+from tasks.update import lines
+from tasks.update.record import TABLE, Record
+from tasks.view.followed import FollowedView
+from tasks.view.rssi import MapSelection, RssiView
+from tasks.view.sources import open_source
+
+N_CHANGES = 6  # of a file while it is followed
+ERROR = "error: "
+
+
+def run_of_locate(folder: Path) -> None:
+    train, _ = rssi_room(n=60).split()
+    RssiLocator(n_cells=200).fit(train).save(folder / "locator.safetensors")
+    write_json(folder / "config.json", {"task": "locate", "config": plain(LocateConfig(data="gone.csv"))})
+    write_json(folder / "environment.json", {"input_sha256": {}})
+
+
+def run_of_rssi(folder: Path) -> None:
+    data = _rssi()
+    _rssi_model().save(folder / "model.safetensors")
+    write_json(folder / "config.json", {"task": "rssi", "config": {}})
+    plan = {"plan": np.zeros((6, 8, 3), np.uint8), "plan_extent": np.array([0.0, 20.0, 0.0, 15.0])}
+    measured = {"measured_position": data.transmitter_position, "measured": data.rssi_dbm}
+    arrays = {name: values.numpy() for name, values in (measured | {"receiver": data.receiver_position}).items()}
+    np.savez(folder / "maps.npz", **plan, **arrays)
+    FloorPlan.scaled(np.zeros((6, 8, 3), np.uint8), 2.0, (0, 6)).save(folder)
+
+
+def run_of_aoa(folder: Path) -> None:
+    fit(simulated_room(n=20, grid=AngularGrid.hemisphere(4, 8)), n_primitives=3).save(folder / "model-mix1.safetensors")
+    plane = {"normal": [1.0, 0, 0], "offset_m": 6.0, "gain": -0.5, "std_mm": 1.0, "certain": True}
+    write_json(folder / "geometry-mix1.json", {"planes": [plane]})
+    write_json(folder / "config.json", {"task": "aoa", "config": plain(AoaConfig(mix=(1.0,), data="gone"))})
+    write_json(folder / "environment.json", {"input_sha256": {}})
+
+
+def followed_run(folder: Path) -> None:
+    data = rssi_room(n=66)
+    write_json(folder / "config.json", {"task": "update"})
+    follower, record = Follower(RssiModel().fit(data.subset(torch.arange(60)))), Record("source", " [dB]")
+    for i in range(60, 66):
+        record.append(folder, record.add(i, follower.step(data.subset(torch.tensor([i])))))
+
+
+def show(folder: Path) -> None:
+    """Open a run and compute what its page shows, with small maps and without files of the figures."""
+    with mock.patch("tasks.view.rssi.CELLS", 9), mock.patch("tasks.view.followed.as_svg", return_value="<svg"):
+        view = open_source(folder)
+        if isinstance(view, FollowedView):
+            view.snapshot()
+        elif isinstance(view, RssiView):
+            _show_rssi(view)
+        else:
+            for loaded in view.models:
+                assert np.isfinite(view.predict(loaded, view.start).mean).all()
+                for plane in loaded.planes:
+                    in_plan(plane, *view.box)
+
+
+def _show_rssi(view: RssiView) -> None:
+    x, y = (float(line.mean()) for line in view.cells)
+    assert view.map(view.heights[1]).mean.isfinite().all()
+    for kind in set(view.kinds) - {"expected error"}:
+        selection = MapSelection(kind, 0, view.heights[1])
+        view.coloured(selection)
+        view.sentence(selection)
+        view.describe(selection, x, y)
+    plan = view.plan()
+    if view.floor.plan is not None:
+        plan.picture(Image.fromarray(view.floor.plan.pixels), view.floor.plan.corners)
+    plan.dots(view.floor.position, "red", 1)
+
+
+# followed sources
+
+
+@functools.cache
+def _rssi() -> Rssi:
+    return rssi_room(n=36).receivers(["1", "2", "3"])
+
+
+@functools.cache
+def _rssi_model() -> RssiModel:
+    return RssiModel().fit(_rssi().subset(torch.arange(30)))
+
+
+@functools.cache
+def _field_model(name: str) -> FieldModel:
+    room = simulated_room(n=14, grid=AngularGrid.hemisphere(4, 8))
+    return make_model(name).fit(room) if name != "geometry" else fit_geometry(room, GLANCE, progress=False)
+
+
+def json_lines(model: FieldModel | RssiModel) -> bytes:
+    """Return measurements for a model as JSON lines."""
+    if isinstance(model, RssiModel):
+        new = _rssi().subset(torch.arange(30, 33))
+        values = [dict(zip(new.receiver_names, row, strict=True)) for row in new.rssi_dbm.nan_to_num(-90).tolist()]
+        rows = list(zip(new.transmitter_position.tolist(), values, strict=True))
+    else:
+        room = simulated_room(n=3, grid=model.grid, seed=1)
+        rows = list(zip(room.position.tolist(), room.store[:].tolist(), strict=True))
+    name = "rssi_dbm" if isinstance(model, RssiModel) else "spectrum"
+    return b"".join(json.dumps({"position": place, name: value}).encode() + b"\n" for place, value in rows)
+
+
+def table() -> bytes:
+    """Return rows of RSSI as a table."""
+    header = ",".join(["x", "y", "z", *_rssi().receiver_names])
+    return "\n".join([header, *(f"{x},2,1,-60,-{61 + x},-70" for x in range(3)), ""]).encode()
+
+
+def followed(model: FieldModel | RssiModel, content: bytes, folder: Path, source: str = "-") -> None:
+    """Follow a source and check that each line is learnt once and plausibly, or reported in one sentence.
+
+    Raises:
+        InputError: The first sentence, if a line was reported.
+        AssertionError: A line that was lost, doubled or learnt although it is implausible.
+    """
+    file, out, answers, said = folder / "model", folder / "out", io.StringIO(), io.StringIO()
+    model.save(file)
+    n_lines = sum(bool(line.strip()) for line in content.split(b"\n"))
+    if source != "-":
+        (folder / source).write_bytes(content)
+        n_lines = sum(bool(line.strip()) for line in content.split(b"\n")[:-1])  # the last line may grow
+        n_lines -= source.endswith(".csv") and n_lines > 0
+    with (
+        mock.patch.object(sys, "stdin", io.TextIOWrapper(io.BytesIO(content))),
+        mock.patch.object(lines, "time", SimpleNamespace(sleep=mock.Mock(side_effect=KeyboardInterrupt))),
+        mock.patch("tasks.update.run.environment", return_value={}),  # asks git
+        redirect_stdout(answers),
+        redirect_stderr(said),
+    ):
+        source = source if source == "-" else str(folder / source)
+        code = run_command("update", [str(file), source, "--follow", "--out", str(out)])
+    errors, learnt = said.getvalue().splitlines(), [json.loads(line) for line in answers.getvalue().splitlines()]
+    assert all(line.startswith(ERROR) and len(line) <= MAX_LENGTH + len(ERROR) for line in errors), errors
+    if code == 2 and len(errors) == 1 and not learnt:
+        raise InputError(errors[0])
+    assert code in (0, 130)
+    assert len(learnt) + len(errors) == n_lines, f"{len(learnt)} learnt and {len(errors)} reported of {n_lines}"
+    rows = list(csv.DictReader((out / TABLE).open(newline=""))) if learnt else []
+    assert [int(row["index"]) for row in rows] == list(range(len(learnt)))
+    assert json.loads((out / "update.json").read_text())["measurements"] == len(learnt)
+    for found in learnt:
+        names = ("predicted", "observed", "low", "high") if isinstance(model, RssiModel) else ()
+        values = [value for name in names for value in found[name].values() if value is not None]
+        assert all(abs(value) <= MAX_RSSI_DB for value in values), found
+        assert all(abs(value) <= 1e9 for value in found["position"]), found
+        assert found["error"] is None or math.isfinite(found["error"])
+    if learnt:
+        check_plausible(load(out / "model.safetensors"))
+    if errors:
+        raise InputError(errors[0])
+
+
+def followed_lines(name: str, draw: random.Random, folder: Path) -> None:
+    """Follow mutated JSON lines over standard input."""
+    model = _rssi_model() if name == "rssi" else _field_model(name)
+    followed(model, mutated(json_lines(model), draw, words_only=draw.random() < 0.5), folder)
+
+
+def followed_file(source: str, draw: random.Random, folder: Path) -> None:
+    """Follow a mutated file of JSON lines or rows to its end."""
+    followed(
+        _rssi_model(), mutated(table() if source.endswith(".csv") else json_lines(_rssi_model()), draw), folder, source
+    )
+
+
+class GrowingFile:
+    """A file that changes at random while it is followed, and the lines that a reader must find in it."""
+
+    def __init__(self, draw: random.Random, file: Path) -> None:
+        self._draw, self._file, self._count, self._n_given = draw, file, 0, 0
+        self.expected: list[bytes] = []
+        self._content = self._header = b"header\n" if file.suffix == ".csv" else b""
+        self._write(self._header + self._rows())
+
+    def _rows(self) -> bytes:
+        """Return lines that are written once only; the last one may lack its end."""
+        rows = b""
+        for _ in range(self._draw.randrange(4)):
+            self._count += 1
+            rows += (
+                b"%d" % self._count
+                + b"\xc3\xa9" * self._draw.randrange(3)
+                + self._draw.choice([b"\n", b"\r\n", b"\n\n"])
+            )
+        return rows[: len(rows) - self._draw.choice([0, 0, 1, 2])]
+
+    def _write(self, content: bytes) -> None:
+        self._content = content
+        self._file.write_bytes(content)
+        self._expect(content[: content.rfind(b"\n") + 1])
+
+    def _expect(self, complete: bytes) -> None:
+        rows = [line for line in complete[len(self._header) :].split(b"\n") if line.strip()]
+        self.expected += rows[self._n_given :]
+        self._n_given = max(self._n_given, len(rows))
+
+    def grow(self) -> None:
+        """Append bytes."""
+        self._write(self._content + self._rows())
+
+    def rewrite(self) -> None:
+        """Write other rows over the file."""
+        self._n_given = 0
+        self._write(self._header + self._rows())
+
+    def rotate(self) -> None:
+        """Rename the file after its last line, and begin another one."""
+        self._expect(self._content)
+        self._file.rename(self._file.with_suffix(".1"))
+        self.rewrite()
+
+    def replace(self) -> None:
+        """Save the file with more rows under its name, as editors and rsync do."""
+        self._content += self._rows()
+        self._file.with_suffix(".new").write_bytes(self._content)
+        os.replace(self._file.with_suffix(".new"), self._file)
+        self._expect(self._content[: self._content.rfind(b"\n") + 1])
+
+
+def growing_file(name: str, draw: random.Random, folder: Path) -> None:
+    """Follow a file that grows, is rewritten, rotated and replaced, with stops and starts of the reader.
+
+    Raises:
+        AssertionError: A line that was lost or doubled.
+    """
+    source = GrowingFile(draw, folder / name)
+    changes: list[Callable[[], None]] = [
+        draw.choice([source.grow, source.grow, source.rewrite, source.rotate, source.replace]) for _ in range(N_CHANGES)
+    ]
+    done, found, place = [], [], (0, "")
+
+    def sleep(_: float) -> None:
+        if len(changes) == 0 or (stops and draw.random() < 0.3):
+            raise KeyboardInterrupt
+        done.append(changes.pop(0))
+        done[-1]()
+
+    with mock.patch.object(lines, "time", SimpleNamespace(sleep=sleep)):
+        stops = draw.random() < 0.5
+        for _ in range(1 + len(changes)):
+            try:
+                for line in lines.lines(str(folder / name), *place):
+                    found.append(line.content.strip(b"\r\n"))
+                    place = line.end, line.sha256
+            except KeyboardInterrupt:
+                if not changes:
+                    break
+    expected = [line.strip(b"\r\n") for line in source.expected]
+    assert found == expected, f"{[change.__name__ for change in done]}: {found}, not {expected}"
