@@ -20,7 +20,7 @@ from swiftwrf.positions import check_positions
 MAX_FROM_ORIGIN_DEG = 2.0  # of receivers in degrees
 
 
-def read_receivers(file: Path, names: list[str], origin: GeodeticOrigin | None = None) -> tuple[Tensor, list[str]]:
+def read_receivers(file: Path, names: Sequence[str], origin: GeodeticOrigin | None = None) -> tuple[Tensor, list[str]]:
     """Return the positions of receivers, float64 (R, 3) [m], nan where the table lacks one, and a note on these.
 
     Args:
@@ -35,7 +35,7 @@ def read_receivers(file: Path, names: list[str], origin: GeodeticOrigin | None =
     label = column_of(table, "receiver", {}) or ("name" if "name" in table.columns else None)
     if label is None and len(table) != len(names):
         raise InputError(f"{file} has {len(table)} rows and no column of names, but there are {len(names)} receivers")
-    listed_names = names if label is None else table[label].astype(str).str.strip().tolist()
+    listed_names = list(names) if label is None else table[label].astype(str).str.strip().tolist()
     if len(set(listed_names)) < len(listed_names):
         raise InputError(f"{file} must have each receiver once, got {listed(listed_names)}")
     position = _positions(file, table, origin, "receiver,x,y,z")

@@ -19,7 +19,7 @@ from swiftwrf.data.groups import Groups, Offsets, numbered
 from swiftwrf.data.labelled import Variable, position_coordinates, receiver_coordinates
 from swiftwrf.data.receivers import receiver_row
 from swiftwrf.data.splits import MIN_TRAINING, Validation, random_split, validation_for
-from swiftwrf.data.survey import SurveyOptions, read_survey
+from swiftwrf.data.survey import read_survey
 from swiftwrf.errors import InputError, listed
 from swiftwrf.plotting import MARK, plan
 from swiftwrf.positions import to_tensor
@@ -167,26 +167,20 @@ class Rssi(PositionedData):
             >>> Rssi.from_frame(pd.DataFrame({"x": [0, 1], "y": [0, 1], "z": [1, 1], "hall": [-50, -60]})).receiver_names
             ('hall',)
         """
-        values = None if filler is None else tuple(filler)
-        options = SurveyOptions(columns, values, coordinates, offset_by, tuple(transmitter), pool_by)
-        survey = read_survey("the table", frame, options)
-        known = receiver_position or survey.receiver_position or {}
-        return cls(
-            survey.rssi_dbm,
-            survey.position,
-            receiver_position=[list(known.get(receiver, UNKNOWN)) for receiver in survey.receiver_names],
-            receiver_names=survey.receiver_names,
-            origin=survey.origin,
-            groups=Groups.of(offset_by, survey.group) if offset_by else None,
-            labels=survey.labels,
-            floors=survey.floors,
-            receiver_moves=survey.receiver_moves,
-            session=survey.session,
-            time=survey.time,
-            name=name,
-            index=survey.row,
-            notes=survey.notes,
+        values = read_survey(
+            "the table",
+            frame,
+            columns=columns,
+            filler=filler,
+            coordinates=coordinates,
+            offset_by=offset_by,
+            transmitter=transmitter,
+            pool_by=pool_by,
         )
+        if receiver_position:
+            places = [list(receiver_position.get(receiver, UNKNOWN)) for receiver in values["receiver_names"]]
+            values["receiver_position"] = places
+        return cls(**values, name=name)
 
     @property
     def located(self) -> bool:

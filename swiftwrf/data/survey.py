@@ -6,9 +6,9 @@ A wide table has one column a receiver, a long one has one row a packet.
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -30,7 +30,8 @@ from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin, degrees_in, w
 from swiftwrf.data.ends import as_receivers, transmitter_columns
 from swiftwrf.data.files import cells_of, lines_before_header, read_cells
 from swiftwrf.data.fillers import check_powers, find_fillers, without_fillers
-from swiftwrf.data.floors import STOREY_M, Floors, floors_of, height_of_floors
+from swiftwrf.data.floors import STOREY_M, floors_of, height_of_floors
+from swiftwrf.data.groups import Groups
 from swiftwrf.data.pooling import pool_names, pooled
 from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import check_positions
@@ -40,45 +41,6 @@ SUFFIXES = (".csv", ".parquet")
 SEPARATORS = ",;\t"
 MAX_VALUES = 2**27  # rows x receivers
 MAX_GROUPS, MIN_GROUP_ROWS = 30, 10  # of a column that may distinguish devices or channels
-
-
-class SurveyOptions(NamedTuple):
-    """Options of reading a table.
-
-    Args:
-        columns: Names of columns that are not recognised, by role.
-        filler: Values that stand for not detected. Defaults to those that are recognised; none if it is empty.
-        coordinates: Unit of the positions. Defaults to the one that is recognised.
-        offset_by: Column with the group of each row. Packets of a row of RSSI are of one group.
-        transmitter: Columns of the second end where both ends move: x, y and z, or one with names of its positions.
-        pool_by: Radios to pool, as in `pool_names`, or the column with the access point of each packet.
-    """
-
-    columns: Mapping[str, str] | None = None
-    filler: tuple[float, ...] | None = None
-    coordinates: Coordinates | None = None
-    offset_by: str | None = None
-    transmitter: tuple[str, ...] = ()
-    pool_by: str | None = None
-
-
-class Survey(NamedTuple):
-    """Content of a survey table: n rows with a position at R receivers."""
-
-    receiver_names: list[str]
-    rssi_dbm: Floats  # (n, R), nan where a receiver detected nothing
-    position: Floats  # (n, 3) [m]
-    row: NDArray[np.int64]  # number of each row in the table, before those without a position are left out
-    n_rows: int  # of the table
-    origin: GeodeticOrigin | None  # of positions in degrees
-    group: list[str]  # of each row; empty if it was not asked for
-    session: list[str] | None  # of each row, if the table contains sessions
-    time: Floats | None  # of each row [s], nan where a cell is no time, if the table contains times
-    labels: tuple[str, ...]  # columns that distinguish groups of rows
-    floors: Floors | None  # if the table contains them
-    receiver_moves: bool  # receivers are positions of one that moves
-    receiver_position: dict[str, list[float]] | None  # by name, if the table contains them [m]
-    notes: tuple[str, ...]
 
 
 def read_frame(file: Path) -> pd.DataFrame:
@@ -115,13 +77,28 @@ def has_positions(table: pd.DataFrame, columns: Mapping[str, str]) -> bool:
     return any(column_of(table, role, columns) is not None for role in ("x", "y", *GEODETIC.values()))
 
 
-def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> Survey:
-    """Return receivers, RSSI and positions of a survey table.
+def read_survey(
+    label: object,
+    table: pd.DataFrame,
+    *,
+    columns: Mapping[str, str] | None = None,
+    filler: Sequence[float] | None = None,
+    coordinates: Coordinates | None = None,
+    offset_by: str | None = None,
+    transmitter: Sequence[str] = (),
+    pool_by: str | None = None,
+) -> dict[str, Any]:
+    """Return the arguments of `Rssi` that a survey table determines: RSSI, positions, receivers and what rows are of.
 
     Args:
         label: Name of the table, for messages.
         table: One row a position (wide) or a packet (long).
-        options: What the user states about it.
+        columns: As the other arguments, those of `Rssi.from_frame`.
+        filler: Values that stand for not detected.
+        coordinates: Unit of the positions.
+        offset_by: Column with the group of each row. Packets of a row of RSSI are of one group.
+        transmitter: Columns of the second end where both ends move.
+        pool_by: Radios to pool.
 
     Raises:
         InputError: A column that is missing or ambiguous, or a value that is no position or received power.
@@ -129,16 +106,16 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
     table = table.set_axis([str(name).strip() for name in table.columns], axis=1).reset_index(drop=True)
     if not len(table) or not table.columns.is_unique:
         raise InputError(f"{label} must have rows, and a name of its own for each column")
-    asked, end = _second_end(label, table, options)
+    asked, end = _second_end(label, table, columns or {}, transmitter)
     roles = find_roles(label, table, asked, end.values())
     coordinate, notes = _coordinates(label, table, roles)
     if end:
         coordinate = np.hstack([coordinate, _coordinates(label, table, end)[0]])
         coordinate[np.isnan(coordinate).any(axis=1)] = np.nan
         roles |= {f"transmitter {axis}": name for axis, name in end.items()}
-    if options.offset_by is not None and options.offset_by not in table.columns:
-        raise InputError(f"{label} has no column {options.offset_by!r} for offsets; there are {listed(table.columns)}")
-    group = text_of(table[options.offset_by]) if options.offset_by else pd.Series([""] * len(table))
+    if offset_by is not None and offset_by not in table.columns:
+        raise InputError(f"{label} has no column {offset_by!r} for offsets; there are {listed(table.columns)}")
+    group = text_of(table[offset_by]) if offset_by else pd.Series([""] * len(table))
     session = text_of(table[roles["session"]]) if "session" in roles else None
     if "receiver" in roles:
         apart = group if session is None else group + "\n" + session
@@ -148,25 +125,23 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
         names, rssi = _wide(label, table, roles, asked)
         source = np.arange(len(table))[:, None]
         unused = [name for name in table.columns if name not in roles.values() and name not in names]
-    unused = [name for name in unused if name not in (options.offset_by, options.pool_by)]
+    unused = [name for name in unused if name not in (offset_by, pool_by)]
     if unused:
         notes.append(f"columns that are not used: {listed(unused)}")
-    fillers = find_fillers(rssi) if options.filler is None else list(options.filler)
+    fillers = find_fillers(rssi) if filler is None else list(filler)
     rssi, found = without_fillers(rssi, fillers)
     check_powers(label, rssi, names, source)
-    if options.pool_by is not None:
-        n_radios, pools = len(names), _pools(label, table, roles, names, options.pool_by)
+    if pool_by is not None:
+        n_radios, pools = len(names), _pools(label, table, roles, names, pool_by)
         names, rssi = pooled(rssi, pools)
-        found.append(
-            f"{n_radios} radios are pooled into {len(names)} receivers by {options.pool_by}: mean of their powers"
-        )
+        found.append(f"{n_radios} radios are pooled into {len(names)} receivers by {pool_by}: mean of their powers")
     omitted, missing = without_fix(coordinate[:, :3])
     notes += found + missing
     if omitted.all():
         raise InputError(f"{label} has no row with a position; {missing[0]}")
     row = np.flatnonzero(~omitted)
     check_positions(coordinate[row].reshape(-1, 3), f"positions of {label}")
-    position, origin = _in_metres(label, roles, coordinate[row].reshape(-1, 3), options.coordinates)
+    position, origin = _in_metres(label, roles, coordinate[row].reshape(-1, 3), coordinates)
     position = position.reshape(len(row), -1)
     floors = None
     if "floor" in roles:
@@ -184,35 +159,34 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
         notes.append(f"receivers that never detected the transmitter are left out: {int((~kept).sum())}")
     names, rssi, places = [names[i] for i in np.flatnonzero(kept)], rssi[row][:, kept], None
     if end:
-        names, rssi, position, where, found = as_receivers(label, rssi, position)
-        places, notes = dict(zip(names, where.tolist(), strict=True)), notes + found
+        names, rssi, position, places, found = as_receivers(label, rssi, position)
+        notes += found
     origins = source.max(axis=1)[row]  # row of the table that each row is of
-    groups = group.to_numpy()[origins].tolist() if options.offset_by else []
+    groups = Groups.of(offset_by, group.to_numpy()[origins].tolist()) if offset_by else None
     sessions = None if session is None else session.to_numpy()[origins].tolist()
     time, found = seconds(table[roles["time"]].iloc[origins]) if "time" in roles else (None, [])
     notes += found
     labels = tuple(name for name in (*unused, roles.get("session")) if name and _distinguishes(table[name]))
-    if labels and not options.offset_by:
+    if labels and not offset_by:
         notes.append(f"rows differ in {listed(labels)}; tasks.inspect tests whether its values have constant offsets")
-    moves = bool(end or options.transmitter)
+    moves = bool(end or transmitter)
     if moves and not end:
-        notes.append(f"both ends move; {len(names)} positions of column {options.transmitter[0]} count as receivers")
-    return Survey(
-        receiver_names=names,
-        rssi_dbm=rssi,
-        position=position,
-        row=row,
-        n_rows=len(omitted),
-        origin=origin,
-        group=groups,
-        session=sessions,
-        time=time,
-        labels=labels,
-        floors=floors,
-        receiver_moves=moves,
-        receiver_position=places,
-        notes=tuple(notes),
-    )
+        notes.append(f"both ends move; {len(names)} positions of column {transmitter[0]} count as receivers")
+    return {
+        "rssi_dbm": rssi,
+        "transmitter_position": position,
+        "receiver_position": places,
+        "receiver_names": names,
+        "origin": origin,
+        "groups": groups,
+        "labels": labels,
+        "floors": floors,
+        "receiver_moves": moves,
+        "session": sessions,
+        "time": time,
+        "index": row,
+        "notes": tuple(notes),
+    }
 
 
 def _pools(label: object, table: pd.DataFrame, roles: dict[str, str], names: list[str], by: str) -> list[str]:
@@ -230,14 +204,15 @@ def _pools(label: object, table: pd.DataFrame, roles: dict[str, str], names: lis
     return [pool[name] or name for name in names]
 
 
-def _second_end(label: object, table: pd.DataFrame, options: SurveyOptions) -> tuple[Mapping[str, str], dict[str, str]]:
+def _second_end(
+    label: object, table: pd.DataFrame, asked: Mapping[str, str], transmitter: Sequence[str]
+) -> tuple[Mapping[str, str], dict[str, str]]:
     """Return the columns that the user names, by role, and those of the second end by x, y and z, if both ends move."""
-    asked = options.columns or {}
-    if len(options.transmitter) == 1:
-        return {**asked, "receiver": options.transmitter[0]}, {}
-    if not options.transmitter and {"x", "y"} & asked.keys():
+    if len(transmitter) == 1:
+        return {**asked, "receiver": transmitter[0]}, {}
+    if not transmitter and {"x", "y"} & asked.keys():
         return asked, {}
-    return asked, transmitter_columns(label, table, options.transmitter)
+    return asked, transmitter_columns(label, table, transmitter)
 
 
 def _coordinates(label: object, table: pd.DataFrame, roles: dict[str, str]) -> tuple[Floats, list[str]]:

@@ -23,7 +23,7 @@ from tasks.directory import check_new_file
 from tasks.environment import stamp
 from tasks.locate.localizers import BATCH_ROWS
 from tasks.locate.options import LocateConfig
-from tasks.options import SpectraSource, given
+from tasks.options import SpectraSource, TableSource, given
 from tasks.records import Row, rounded, write_table
 from tasks.source import located, observed_spectra, reading
 from tasks.terminal import console, terminal
@@ -144,6 +144,8 @@ def aligned(data: Rssi, names: tuple[str, ...]) -> Rssi:
 
 
 def _of_spectra(locator: MatchedField, config: LocateConfig, source: str) -> Columns:
+    if unused := given(config, TableSource):
+        raise InputError(f"--{unused[0]} is for RSSI, and {config.model} locates by spectra")
     store, known = observed_spectra(source, reading(config), locator.grid, "locator")
     if known is not None and known.array is not None and known.array != locator.room.array:
         raise InputError(f"{source} has spectra of another array than those that {config.model} was fitted to")

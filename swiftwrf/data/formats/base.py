@@ -34,7 +34,7 @@ class ReadOptions:
 
     Example:
         >>> ReadOptions(every=2).given
-        ['every']
+        {'every': 2}
     """
 
     array: PlanarArray | None = None
@@ -65,9 +65,10 @@ class ReadOptions:
     """phases are those of the way there and back"""
 
     @property
-    def given(self) -> list[str]:
-        """Names of the options that differ from their defaults."""
-        return [field.name for field in fields(self) if getattr(self, field.name) != field.default]
+    def given(self) -> dict[str, Any]:
+        """Options that differ from their defaults, by name."""
+        values = {field.name: (getattr(self, field.name), field.default) for field in fields(self)}
+        return {name: value for name, (value, default) in values.items() if value != default}
 
 
 class Format(ABC, Generic[Data]):
