@@ -15,11 +15,10 @@ from swiftwrf import AngularGrid, InputError, Rssi, Spectra
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import ReadOptions, load_rssi, load_spectra
 from swiftwrf.data.archives import array_header, read_rows
-from swiftwrf.data.groups import Offsets
+from swiftwrf.data.rssi import Offsets
 from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
-from swiftwrf.datasets import fetch
-from swiftwrf.datasets.sources import DATA_SETS
+from swiftwrf.datasets import DATA_SETS, fetch
 from swiftwrf.errors import listed
 from swiftwrf.rssi import estimate_offsets
 from tasks.options import OffsetSource, SpectraSource, TableSource

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from swiftwrf import rssi_room
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data import Snapshots
-from swiftwrf.data.simulated.room import ShoeboxRoom
+from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.data.tfrecords import checksum
 
 FREQUENCY = 2.4e9

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -12,17 +13,92 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf.data.labelled import Labelled, Variable, position_coordinates
+from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
 from swiftwrf.data.splits import choose_split
 from swiftwrf.errors import InputError
 from swiftwrf.plotting import Displayed, extent
 from swiftwrf.positions import check_positions, to_tensor
 from swiftwrf.runtime.validation import NonNegativeInt, checked
 
+if TYPE_CHECKING:
+    import xarray
+
 Numbers = Any  # a tensor, array, list or table of numbers
 Rows = Any  # numbers of rows (tensor, array or list), a mask, or a slice
 Data = TypeVar("Data", bound="PositionedData")
 ROTATION_TOLERANCE = 1e-3  # of the products of its columns, from rounding
+AXES = ("x", "y", "z")
+
+
+class Variable(NamedTuple):
+    """An array with named dimensions.
+
+    Args:
+        dimensions: Name of each dimension.
+        values: The array.
+        units: Unit of the values. Empty if they have none.
+    """
+
+    dimensions: tuple[str, ...]
+    values: NDArray[Any]
+    units: str = ""
+
+
+class Labelled(ABC):
+    """Base class of measurements and predictions that become tables (pandas), data sets (xarray) and files."""
+
+    @abstractmethod
+    def to_frame(self) -> pd.DataFrame:
+        """Return a table."""
+
+    @abstractmethod
+    def coordinates(self) -> dict[str, Variable]:
+        """Return where the values are: positions, directions, names of receivers."""
+
+    @abstractmethod
+    def variables(self) -> dict[str, Variable]:
+        """Return the values by name."""
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return an xarray data set whose coordinates and variables have the attribute `units`.
+
+        Raises:
+            InputError: xarray is not installed.
+        """
+        try:
+            import xarray
+        except ModuleNotFoundError:
+            raise InputError("to_xarray needs xarray; install it with pip install 'swiftwrf-tasks[xarray]'") from None
+
+        def arrays(some: Mapping[str, Variable]) -> dict[str, Any]:
+            return {name: (v.dimensions, v.values, {"units": v.units} if v.units else {}) for name, v in some.items()}
+
+        return xarray.Dataset(arrays(self.variables()), arrays(self.coordinates()))
+
+
+def position_coordinates(position: NDArray[np.float64], origin: GeodeticOrigin | None = None) -> dict[str, Variable]:
+    """Return the coordinates x, y and z of positions (n, 3) [m], and latitude and longitude [deg] with an origin.
+
+    Example:
+        >>> list(position_coordinates(np.zeros((2, 3)), GeodeticOrigin(48.0, 11.0)))
+        ['x', 'y', 'z', 'latitude', 'longitude']
+    """
+    found = {name: Variable(("position",), values, "m") for name, values in zip(AXES, position.T, strict=True)}
+    degrees = degree_columns(origin, position).items()
+    return found | {
+        name.removesuffix("_deg"): Variable(("position",), values, f"degrees_{'north' if 'lat' in name else 'east'}")
+        for name, values in degrees
+    }
+
+
+def receiver_coordinates(names: Sequence[str]) -> dict[str, Variable]:
+    """Return the names of receivers as a coordinate.
+
+    Example:
+        >>> receiver_coordinates(["hall", "office"])["receiver"].values.tolist()
+        ['hall', 'office']
+    """
+    return {"receiver": Variable(("receiver",), np.array(names, dtype=np.str_))}
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)

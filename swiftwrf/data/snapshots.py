@@ -13,8 +13,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid, ArrayPose
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.dataset import Numbers, PositionedData, to_positions, to_rotation
-from swiftwrf.data.labelled import Variable
+from swiftwrf.data.dataset import Numbers, PositionedData, Variable, to_positions, to_rotation
 from swiftwrf.data.spectra import GRID, Spectra, array_spectra, check_pixels
 from swiftwrf.errors import InputError, ranges
 from swiftwrf.positions import to_tensor

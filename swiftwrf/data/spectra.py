@@ -17,8 +17,7 @@ from swiftwrf.array.angles import AngularGrid, ArrayPose, to_angles
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray, folded_angles
 from swiftwrf.choices import Moving
-from swiftwrf.data.dataset import Numbers, PositionedData, to_positions, to_rotation
-from swiftwrf.data.labelled import Variable
+from swiftwrf.data.dataset import Numbers, PositionedData, Variable, to_positions, to_rotation
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.data.store import BATCH_PIXELS, MAX_MEMORY_PIXELS, Store, stored, too_many
 from swiftwrf.errors import InputError

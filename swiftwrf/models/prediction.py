@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.data.labelled import Labelled, Variable, position_coordinates, receiver_coordinates
+from swiftwrf.data.dataset import Labelled, Variable, position_coordinates, receiver_coordinates
 from swiftwrf.data.spectra import DIRECTION, direction_coordinates
 from swiftwrf.errors import InputError
 from swiftwrf.plotting import Displayed, plan, polar_spectrum

@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
-from swiftwrf.data.labelled import Labelled, Variable, receiver_coordinates
-from swiftwrf.data.receivers import receiver_row
+from swiftwrf.data.dataset import Labelled, Variable, receiver_coordinates
+from swiftwrf.data.rssi import receiver_row
 from swiftwrf.errors import InputError, listed
 from swiftwrf.plotting import Displayed, plan_map
 

@@ -14,17 +14,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from swiftwrf.data.columns import column_of, column_of_numbers, seconds, text_of
-from swiftwrf.data.coordinates import GeodeticOrigin, without_fix
+from swiftwrf.data.columns import (
+    NOT_DETECTED_DBM,
+    column_of,
+    column_of_numbers,
+    find_fillers,
+    numbered,
+    seconds,
+    text_of,
+    without_fillers,
+)
+from swiftwrf.data.coordinates import Floors, GeodeticOrigin, without_fix
 from swiftwrf.data.files import digests, numbers, read_yaml
-from swiftwrf.data.fillers import NOT_DETECTED_DBM, find_fillers, without_fillers
-from swiftwrf.data.floors import Floors
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
-from swiftwrf.data.groups import numbered
-from swiftwrf.data.receivers import read_receivers, unknown_positions
 from swiftwrf.data.rssi import META, SURVEY, Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
-from swiftwrf.data.survey import read_frame
+from swiftwrf.data.survey import read_frame, read_receivers, unknown_positions
 from swiftwrf.errors import InputError, listed
 
 TABLES = ("gateway_rssi.csv", "rssi.csv")

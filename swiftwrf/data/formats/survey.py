@@ -9,10 +9,9 @@ from swiftwrf.data.files import digests, lines_before_header
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.captures import holds_captures
 from swiftwrf.data.formats.nerf2_rssi import FILES as NERF2_FILES
-from swiftwrf.data.receivers import read_receivers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
-from swiftwrf.data.survey import SEPARATORS, SUFFIXES, read_frame, read_survey
+from swiftwrf.data.survey import SEPARATORS, SUFFIXES, read_frame, read_receivers, read_survey
 from swiftwrf.errors import InputError
 
 RECEIVERS = "receivers.csv"  # beside the table: receiver,x,y,z

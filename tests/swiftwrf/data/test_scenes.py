@@ -21,9 +21,9 @@ from quick import run, said
 from swiftwrf import AngularGrid, GeometryModel, InputError, load_spectra, simulated_room
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.data.raytraced import ROOMS, FurnishedRoom, Material, Scene, Surface, Tracing, sionna, trace
-from swiftwrf.data.raytraced.surfaces import box
+from swiftwrf.data.raytraced.rooms import box
 from swiftwrf.data.raytraced.trace import _first
-from swiftwrf.data.simulated.room import ShoeboxRoom
+from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.models.geometry import Plane
 from swiftwrf.models.raytrace import RaytraceModel, surfaces
 from tasks.scenes.run import draw_positions
