@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -27,21 +27,8 @@ Numbers = Any  # a tensor, array, list or table of numbers
 Rows = Any  # numbers of rows (tensor, array or list), a mask, or a slice
 Data = TypeVar("Data", bound="PositionedData")
 ROTATION_TOLERANCE = 1e-3  # of the products of its columns, from rounding
-AXES = ("x", "y", "z")
-
-
-class Variable(NamedTuple):
-    """An array with named dimensions.
-
-    Args:
-        dimensions: Name of each dimension.
-        values: The array.
-        units: Unit of the values. Empty if they have none.
-    """
-
-    dimensions: tuple[str, ...]
-    values: NDArray[Any]
-    units: str = ""
+Arrays = dict[str, Any]  # in the form of xarray: dimensions, values, and a dictionary of units if there are any
+DEGREE_UNITS = {"latitude": "degrees_north", "longitude": "degrees_east"}
 
 
 class Labelled(ABC):
@@ -52,11 +39,11 @@ class Labelled(ABC):
         """Return a table."""
 
     @abstractmethod
-    def coordinates(self) -> dict[str, Variable]:
+    def coordinates(self) -> Arrays:
         """Return where the values are: positions, directions, names of receivers."""
 
     @abstractmethod
-    def variables(self) -> dict[str, Variable]:
+    def variables(self) -> Arrays:
         """Return the values by name."""
 
     def to_xarray(self) -> xarray.Dataset:
@@ -69,36 +56,22 @@ class Labelled(ABC):
             import xarray
         except ModuleNotFoundError:
             raise InputError("to_xarray needs xarray; install it with pip install 'swiftwrf-tasks[xarray]'") from None
-
-        def arrays(some: Mapping[str, Variable]) -> dict[str, Any]:
-            return {name: (v.dimensions, v.values, {"units": v.units} if v.units else {}) for name, v in some.items()}
-
-        return xarray.Dataset(arrays(self.variables()), arrays(self.coordinates()))
+        return xarray.Dataset(self.variables(), self.coordinates())
 
 
-def position_coordinates(position: NDArray[np.float64], origin: GeodeticOrigin | None = None) -> dict[str, Variable]:
+def position_coordinates(position: NDArray[np.float64], origin: GeodeticOrigin | None = None) -> Arrays:
     """Return the coordinates x, y and z of positions (n, 3) [m], and latitude and longitude [deg] with an origin.
 
     Example:
         >>> list(position_coordinates(np.zeros((2, 3)), GeodeticOrigin(48.0, 11.0)))
         ['x', 'y', 'z', 'latitude', 'longitude']
     """
-    found = {name: Variable(("position",), values, "m") for name, values in zip(AXES, position.T, strict=True)}
-    degrees = degree_columns(origin, position).items()
-    return found | {
-        name.removesuffix("_deg"): Variable(("position",), values, f"degrees_{'north' if 'lat' in name else 'east'}")
-        for name, values in degrees
+    found: Arrays = {
+        axis: (("position",), values, {"units": "m"}) for axis, values in zip("xyz", position.T, strict=True)
     }
-
-
-def receiver_coordinates(names: Sequence[str]) -> dict[str, Variable]:
-    """Return the names of receivers as a coordinate.
-
-    Example:
-        >>> receiver_coordinates(["hall", "office"])["receiver"].values.tolist()
-        ['hall', 'office']
-    """
-    return {"receiver": Variable(("receiver",), np.array(names, dtype=np.str_))}
+    for (name, units), values in zip(DEGREE_UNITS.items(), degree_columns(origin, position).values(), strict=False):
+        found[name] = (("position",), values, {"units": units})
+    return found
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -221,10 +194,9 @@ class PositionedData(Labelled, Displayed):
         """Return the columns of `to_frame` beside the position."""
         raise NotImplementedError
 
-    def coordinates(self) -> dict[str, Variable]:
+    def coordinates(self) -> Arrays:
         """Return number and position of each row."""
-        index = Variable(("position",), self.index.numpy())
-        return {"index": index} | position_coordinates(self._position.numpy())
+        return {"index": (("position",), self.index.numpy())} | position_coordinates(self._position.numpy())
 
     def to_numpy(self) -> tuple[NDArray[np.float64], NDArray[Any]]:
         """Return positions X (n, 3) [m] and measurements y, as scikit-learn takes them; no copies where possible."""

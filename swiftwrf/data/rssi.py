@@ -7,20 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
 
 from swiftwrf.data.columns import Groups, check_powers, numbered
 from swiftwrf.data.coordinates import Coordinates, Floors, GeodeticOrigin
-from swiftwrf.data.dataset import (
-    Numbers,
-    PositionedData,
-    Variable,
-    position_coordinates,
-    receiver_coordinates,
-    to_positions,
-)
+from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, position_coordinates, to_positions
 from swiftwrf.data.splits import MIN_TRAINING, Validation, random_split, validation_for
 from swiftwrf.data.survey import read_survey
 from swiftwrf.errors import InputError, listed
@@ -340,15 +334,14 @@ class Rssi(PositionedData):
     def _columns(self) -> dict[str, Any]:
         return dict(zip(self.receiver_names, self.rssi_dbm.numpy().T, strict=True))
 
-    def coordinates(self) -> dict[str, Variable]:
+    def coordinates(self) -> Arrays:
         position = position_coordinates(self.transmitter_position.numpy(), self.origin)
-        return super().coordinates() | position | receiver_coordinates(self.receiver_names)
+        return super().coordinates() | position | {"receiver": (("receiver",), np.array(self.receiver_names))}
 
-    def variables(self) -> dict[str, Variable]:
-        places = Variable(("receiver", "axis"), self.receiver_position.numpy(), "m")
+    def variables(self) -> Arrays:
         return {
-            "rssi": Variable(("position", "receiver"), self.rssi_dbm.numpy(), "dBm"),
-            "receiver_position": places,
+            "rssi": (("position", "receiver"), self.rssi_dbm.numpy(), {"units": "dBm"}),
+            "receiver_position": (("receiver", "axis"), self.receiver_position.numpy(), {"units": "m"}),
         }
 
     def _measured(self) -> Tensor:

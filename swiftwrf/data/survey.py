@@ -18,7 +18,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf.data.archives import MAX_UNPACKED_BYTES, refusing_broken
 from swiftwrf.data.columns import (
     GEODETIC,
     Groups,
@@ -45,13 +44,11 @@ from swiftwrf.data.coordinates import (
     height_of_floors,
     without_fix,
 )
-from swiftwrf.data.files import cells_of, lines_before_header, read_cells
+from swiftwrf.data.files import read_table
 from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import cells, check_positions
 
 Floats = NDArray[np.float64]
-SUFFIXES = (".csv", ".parquet")
-SEPARATORS = ",;\t"
 MAX_VALUES = 2**27  # rows x receivers
 MAX_GROUPS, MIN_GROUP_ROWS = 30, 10  # of a column that may distinguish devices or channels
 MAX_PLACES = 500  # positions of the second end that stay apart: each has a column of RSSI
@@ -59,35 +56,6 @@ MARKS = {"tx": "transmitter", "transmitter": "transmitter", "rx": "receiver", "r
 MAC = "mac"  # pools radios by the first five bytes of their addresses
 ADDRESS = re.compile(r"((?:[0-9a-f]{2}[:-]?){4}[0-9a-f]{2})[:-]?[0-9a-f]{2}", re.IGNORECASE)
 MAX_FROM_ORIGIN_DEG = 2.0  # of receivers in degrees
-
-
-def read_frame(file: Path) -> pd.DataFrame:
-    """Return the table in a CSV or Parquet file. Cells of CSV are text.
-
-    Raises:
-        InputError: No such file, or one that is broken, has no rows, or a column without a name of its own.
-    """
-    if file.suffix.lower() != ".parquet":
-        header, rows = read_cells(file, SEPARATORS, lines_before_header(file, SEPARATORS))
-        return pd.DataFrame(rows, columns=header, dtype=object)
-    try:
-        from pyarrow import parquet
-    except ImportError:
-        raise InputError(
-            f"{file} is Parquet, which pyarrow reads; install it with pip install 'swiftwrf-tasks[formats]'"
-        ) from None
-    with refusing_broken(file, "a Parquet file"):
-        content = parquet.ParquetFile(file)
-        groups = range(content.metadata.num_row_groups)
-        if (total := sum(content.metadata.row_group(i).total_byte_size for i in groups)) > MAX_UNPACKED_BYTES:
-            raise InputError(f"it unpacks to {total} bytes; at most {MAX_UNPACKED_BYTES} are read, so split the data")
-        return content.read().to_pandas()
-
-
-def frame_of(label: object, text: str) -> pd.DataFrame:
-    """Return the table in the text of a CSV file, as `read_frame`; the label stands for it in messages."""
-    header, rows = cells_of(label, text, SEPARATORS)
-    return pd.DataFrame(rows, columns=header, dtype=object)
 
 
 def has_positions(table: pd.DataFrame, columns: Mapping[str, str]) -> bool:
@@ -460,7 +428,7 @@ def read_receivers(file: Path, names: Sequence[str], origin: GeodeticOrigin | No
     Raises:
         InputError: A name twice, no position of any receiver, or a position that is not usable.
     """
-    table = read_frame(file)
+    table = read_table(file)
     label = column_of(table, "receiver", {}) or ("name" if "name" in table.columns else None)
     if label is None and len(table) != len(names):
         raise InputError(f"{file} has {len(table)} rows and no column of names, but there are {len(names)} receivers")
@@ -488,7 +456,7 @@ def read_places(file: Path, origin: GeodeticOrigin | None = None) -> Tensor:
     Raises:
         InputError: A column that is missing, or a position that is not usable.
     """
-    return check_positions(_positions(file, read_frame(file), origin, "x,y,z"), f"positions of {file}")
+    return check_positions(_positions(file, read_table(file), origin, "x,y,z"), f"positions of {file}")
 
 
 def _positions(file: Path, table: pd.DataFrame, origin: GeodeticOrigin | None, header: str) -> NDArray[np.float64]:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
-from numpy.typing import NDArray
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -170,14 +169,10 @@ def write_mat(data: Labelled, file: Path) -> None:
     Raises:
         OSError: The file cannot be written.
     """
-    arrays = {name: _as_cells(variable.values) for name, variable in (data.coordinates() | data.variables()).items()}
+    arrays = {name: values for name, (_, values, *_) in (data.coordinates() | data.variables()).items()}
+    arrays |= {name: values.astype(object) for name, values in arrays.items() if values.dtype.kind == "U"}  # to cells
     with replacing(file) as temporary, temporary.open("wb") as stream:
         savemat(stream, arrays, do_compression=True, oned_as="column")
-
-
-def _as_cells(values: NDArray[Any]) -> NDArray[Any]:
-    """Return texts as objects, which become a cell array."""
-    return values.astype(object) if values.dtype.kind == "U" else values
 
 
 def _csv(header: str, values: Tensor) -> str:

@@ -15,8 +15,7 @@ from typing import Any, BinaryIO, NamedTuple
 import torch
 
 from swiftwrf import FieldModel, InputError, Rssi, Spectra
-from swiftwrf.data.files import refusing_unreadable
-from swiftwrf.data.survey import frame_of
+from swiftwrf.data.files import refusing_unreadable, table_of
 from swiftwrf.errors import CONTENT_ERRORS
 from swiftwrf.online import Step
 from swiftwrf.online.prequential import LEVEL
@@ -145,7 +144,7 @@ def _number(value: object) -> float:
 def _of_row(text: str, config: UpdateConfig, model: RssiModel) -> Rssi:
     """Return the measurement in a table of one row; receivers that the model does not have are left out."""
     columns, filler, coordinates = config.column_names, config.fillers, config.coordinates
-    table = frame_of("the table", text)
+    table = table_of("the table", text)
     data = Rssi.from_frame(table, columns=columns, filler=filler, coordinates=coordinates).about(model.origin)
     rssi = zip(data.receiver_names, data.rssi_dbm[0].tolist(), strict=True)
     value = {name: x for name, x in rssi if name in model.receiver_names}

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES, Arrays, refusing_broken
 from swiftwrf.data.columns import column_of, column_of_numbers, text_of
-from swiftwrf.data.files import read_bytes, read_yaml
+from swiftwrf.data.files import read_bytes, read_table, read_yaml
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.snapshots import array_of, snapshots_of
 from swiftwrf.data.snapshots import Snapshots
-from swiftwrf.data.survey import read_frame
 from swiftwrf.errors import InputError, listed, ranges
 
 POSITIONS, DESCRIPTION = "positions.csv", "array.yml"
@@ -180,7 +179,7 @@ class Captures(Format[Snapshots]):
         missing = [file.name for file in (table, described) if not file.is_file()]
         if missing:
             raise InputError(f"{path} lacks {' and '.join(missing)}: {NEEDED}")
-        description, frame = _read_description(described), read_frame(table)
+        description, frame = _read_description(described), read_table(table)
         elements = len(array_of(described, description).element)
         files = _files(table, frame)
         channels, left_out = zip(*(_read_capture(file, elements) for file in files), strict=True)

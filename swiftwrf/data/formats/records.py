@@ -45,7 +45,9 @@ MAX_COSINE = 0.1  # between right and up: beyond, they are no axes of a plane
 MAX_ANTENNAS = 4096
 ROWS, COLUMNS = 2, 4  # of an array of ESPARGOS
 MAX_RECORD_BYTES = 2**28
-DTYPES = {number: np.dtype(name) for number, name in ((1, "<f4"), (2, "<f8"), (3, "<i4"), (8, "<c8"), (9, "<i8"))}
+DTYPES: dict[Any, np.dtype[Any]] = {
+    number: np.dtype(name) for number, name in ((1, "<f4"), (2, "<f8"), (3, "<i4"), (8, "<c8"), (9, "<i8"))
+}
 DTYPES[18] = np.dtype("<c16")
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5  # wire types
 NO_OFFSETS = (
@@ -224,7 +226,7 @@ def _read_station(file: Path, number: int | None, assigned: bool) -> tuple[str, 
         raise InputError(f"{file} lacks frequency, the carrier in Hz; add it")
     check_carrier(file, frequency[0])
     rotation = _rotation(file, antenna)
-    rows: Assignments = np.arange(ROWS * COLUMNS).reshape(ROWS, COLUMNS).tolist()
+    rows: Assignments = [[row * COLUMNS + column for column in range(COLUMNS)] for row in range(ROWS)]
     first = index * ROWS * COLUMNS  # of the antennas of ESPARGOS, whose arrays follow each other
     if assigned:
         rows, first = _assignments(file, antenna.get("assignments"), names[index]), 0

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from swiftwrf.data.files import digests, lines_before_header
+from swiftwrf.data.files import SUFFIXES, digests, lines_before_header, read_table
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.captures import holds_captures
 from swiftwrf.data.formats.nerf2_rssi import FILES as NERF2_FILES
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
-from swiftwrf.data.survey import SEPARATORS, SUFFIXES, read_frame, read_receivers, read_survey
+from swiftwrf.data.survey import read_receivers, read_survey
 from swiftwrf.errors import InputError
 
 RECEIVERS = "receivers.csv"  # beside the table: receiver,x,y,z
@@ -33,9 +33,9 @@ class SurveyTable(Format[Rssi]):
                 f"{path} holds {len(tables)} tables ({', '.join(file.name for file in tables)}); name the one to read"
             )
         file, receivers = tables[0], tables[0].with_name(RECEIVERS)
-        table = read_frame(file)
+        table = read_table(file)
         data = Rssi(**read_survey(file, table, **options.given), name=file.stem)
-        known, unknown = data.receiver_position, []
+        known, unknown = data.receiver_position, list[str]()
         if receivers.is_file() and not data.located:
             known, unknown = read_receivers(receivers, data.receiver_names, data.origin)
         if data.receiver_moves and (bool(known.isnan().all()) or unknown):
@@ -43,7 +43,7 @@ class SurveyTable(Format[Rssi]):
                 f"{file}: column {options.transmitter[0]} has names of positions, so {RECEIVERS} beside it must contain "
                 "each of them"
             )
-        skipped = file.suffix.lower() == ".csv" and lines_before_header(file, SEPARATORS)
+        skipped = file.suffix.lower() == ".csv" and lines_before_header(file)
         notes = [f"lines before the header are skipped: {skipped}"] * bool(skipped)
         splits = read_splits(file.parent, len(table), first=0)
         return replace(

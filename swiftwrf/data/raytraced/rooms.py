@@ -34,7 +34,6 @@ FACES = [  # of a box, corners counted as x y z bits, counter-clockwise from out
     (0, 2, 6, 4),
     (1, 5, 7, 3),
 ]
-FLAT_COSINE = 0.999  # between normals of faces that form one plane
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]  # vertices (V, 3) [m], triangles (F, 3)
 
 
@@ -80,22 +79,6 @@ class Surface:
         first = np.cumsum([0, *(len(vertex) for vertex, _ in meshes[:-1])])
         triangles = [triangle + start for (_, triangle), start in zip(meshes, first, strict=True)]
         return cls(name, material, np.concatenate([vertex for vertex, _ in meshes]), np.concatenate(triangles))
-
-    def outline(self) -> NDArray[Any]:
-        """Return the segments (E, 2, 3) [m] at which faces meet at an angle or end, for a drawing."""
-        corner = self.vertex[self.triangle]
-        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-        sides: dict[tuple[int, int], list[int]] = {}
-        for number, (a, b, c) in enumerate(self.triangle.tolist()):
-            for side in ((a, b), (b, c), (c, a)):
-                sides.setdefault((min(side), max(side)), []).append(number)
-        kept = [
-            side
-            for side, (first, *others) in sides.items()
-            if not others or min(abs(normal[first] @ normal[other]) for other in others) < FLAT_COSINE
-        ]
-        return self.vertex[np.array(kept, dtype=np.int64).reshape(-1, 2)]
 
 
 def box(low: Sequence[float], high: Sequence[float]) -> Mesh:
