@@ -46,7 +46,7 @@ from swiftwrf import (
     make_model,
     simulated_room,
 )
-from swiftwrf.data.simulated.room import ShoeboxRoom
+from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.models.geometry.planes import Plane
 from swiftwrf.online import prequential
 from swiftwrf.rasterize import rasterize_magnitude

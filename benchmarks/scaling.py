@@ -29,7 +29,7 @@ from record import write_result
 
 from augment import Mixed
 from swiftwrf import AngularGrid, Spectra, load_spectra, make_model, simulated_room
-from swiftwrf.data.simulated.spectra import REGION
+from swiftwrf.data.simulated import REGION
 from swiftwrf.data.store import stored
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import psnr

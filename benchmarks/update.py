@@ -16,7 +16,7 @@ from rooms import room_with_box
 
 import swiftwrf
 from swiftwrf import AngularGrid, Rssi, RssiModel, Spectra, rssi_room, simulated_room
-from swiftwrf.data import ReadOptions, read_rssi
+from swiftwrf.data import load_rssi
 from swiftwrf.metrics import psnr
 from swiftwrf.online import Scores, adapted, prequential, score
 
@@ -114,7 +114,7 @@ def change(config: Config) -> list[dict[str, Any]]:
 def tracks(config: Config) -> dict[str, Any]:
     """Measure prequential errors along walks, of a model that learns beside one that does not."""
     assert config.tracks is not None
-    data: Rssi = read_rssi(config.tracks, ReadOptions())
+    data: Rssi = load_rssi(config.tracks)
     n = int(TRACK_TRAINING * len(data))
     new = data.subset(torch.arange(n, len(data)))
     model = RssiModel().fit(data.subset(torch.arange(n)))

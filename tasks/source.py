@@ -13,13 +13,12 @@ from torch import Tensor
 
 from swiftwrf import AngularGrid, InputError, Rssi, Spectra
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data import ReadOptions, read_rssi, read_spectra
+from swiftwrf.data import ReadOptions, load_rssi, load_spectra
 from swiftwrf.data.archives import array_header, read_rows
-from swiftwrf.data.groups import Offsets
+from swiftwrf.data.rssi import Offsets
 from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
-from swiftwrf.datasets import fetch
-from swiftwrf.datasets.sources import DATA_SETS
+from swiftwrf.datasets import DATA_SETS, fetch
 from swiftwrf.errors import listed
 from swiftwrf.rssi import estimate_offsets
 from tasks.options import OffsetSource, SpectraSource, TableSource
@@ -85,7 +84,7 @@ def measured_rssi(data: str | None, config: TableSource) -> Rssi | None:
     Raises:
         InputError: RSSI that cannot be read.
     """
-    return None if data is None else read_rssi(located(data), reading(config))
+    return None if data is None else load_rssi(located(data), **reading(config).given)
 
 
 def asked_offsets(train: Rssi, config: OffsetSource) -> Offsets | None:
@@ -140,9 +139,9 @@ def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model
     """
     known = None
     if not source.endswith(".npy"):
-        known = read_spectra(located(source), options)
+        known = load_spectra(located(source), **options.given)
     elif options.given:
-        raise InputError(f"{source} holds spectra as they are; --{options.given[0]} does not apply")
+        raise InputError(f"{source} holds spectra as they are; --{next(iter(options.given))} does not apply")
     store = Store(_read_array(Path(source))) if known is None else known.store
     if store.shape[1:] != grid.shape or (known is not None and known.grid != grid):
         shape, its = (" x ".join(map(str, s)) for s in (store.shape[1:], grid.shape))

@@ -11,7 +11,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.choices import Moving
-from swiftwrf.data.simulated.room import ShoeboxRoom
+from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.store import Store
 from swiftwrf.models.geometry.images import PhaseObservations, field, sequences

@@ -142,7 +142,7 @@ def _rssi(folder, names="a,b", position="a: [0, 0, 1]\nb: [5, 0, 1]\n"):
         ("train_index.txt", "1\n".encode("utf-16"), "UTF-8"),
         ("train_index.txt", b"1_0\n", "whole number"),
         ("train_index.txt", b"9" * 5000, "whole number"),
-        ("tx_pos.csv", b"x,y,z\n1_0,1,1\n", "text"),
+        ("tx_pos.csv", b"x,y,z\n1_0,1,1\n", "not a number"),
         ("tx_pos.csv", b"x,y,z\n1e10,1,1\n", "must match"),
         ("tx_pos.csv", b'x,y,z\n"' + b"1" * 200_000 + b'",1,1\n', "comma-separated"),
         ("gateway_rssi.csv", b"a,\n" + b"-50,-60\n" * N, "no name for column 2"),

@@ -52,20 +52,6 @@ def load_spectra(
     """
     directions = None if grid is None else AngularGrid.of(grid)
     options = ReadOptions(array, beamformer, directions, every, station, drop_null=drop_null, round_trip=round_trip)
-    return read_spectra(path, options)
-
-
-def read_spectra(path: str | Path, options: ReadOptions) -> Spectra:
-    """Read spectra as `load_spectra`, with its arguments in one object.
-
-    Raises:
-        InputError: As `load_spectra`.
-
-    Example:
-        >>> read_spectra("nowhere", ReadOptions(every=2))
-        Traceback (most recent call last):
-        swiftwrf.errors.InputError: nowhere is not a folder or file; expected measurements (formats: ...)
-    """
     data = read(path, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS)
     return data.spectra(options.grid, options.beamformer or PHASE) if isinstance(data, Snapshots) else data
 
@@ -141,23 +127,9 @@ def load_rssi(
         transmitter=tuple(transmitter),
         pool_by=pool_by,
     )
-    return read_rssi(path, options)
-
-
-def read_rssi(path: str | Path, options: ReadOptions) -> Rssi:
-    """Read RSSI as `load_rssi`, with its arguments in one object.
-
-    Raises:
-        InputError: As `load_rssi`.
-
-    Example:
-        >>> read_rssi("nowhere", ReadOptions())
-        Traceback (most recent call last):
-        swiftwrf.errors.InputError: nowhere is not a folder or file; ...
-    """
     data: Rssi = read(path, options, RSSI_FORMATS)
     return data
 
 
 __all__ = ["PropagationPaths", "ReadOptions", "Rssi", "Snapshots", "Spectra"]
-__all__ += ["load_rssi", "load_snapshots", "load_spectra", "read_rssi", "read_spectra"]
+__all__ += ["load_rssi", "load_snapshots", "load_spectra"]

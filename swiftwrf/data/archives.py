@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,21 +31,17 @@ MATLAB_NUMBERS = {
 COMPLEX_FIELDS = (("real", "imag"), ("r", "i"))  # of the compounds that stand for complex numbers in HDF5
 NUMBERS = "biufc"  # kinds of NumPy types
 Arrays = dict[str, NDArray[Any]]
+Stored = tuple[int, Callable[[], NDArray[Any]]]  # bytes of an array in memory, and what reads it
 
 
 def array_names(file: Path) -> set[str]:
-    """Return the names of the arrays in an npz archive or HDF5 file, none if it is no such file."""
+    """Return the names of the arrays in an npz archive, HDF5 or MATLAB file, none if it is no such file."""
     try:
-        if _is_hdf5(file):
-            with _hdf5(file) as content:
-                return set(content)
-        if file.suffix in MATLAB:
-            return set(_matlab_shapes(file))
-        with zipfile.ZipFile(file) as archive:
-            return _stored(archive)
+        with _opened(file) as (names, _):
+            return names
     except InputError:
         raise
-    except Exception:  # zipfile and h5py raise exceptions of many types for broken files
+    except Exception:  # zipfile, SciPy and h5py raise exceptions of many types for broken files
         return set()
 
 
@@ -64,18 +61,24 @@ def read_arrays(file: Path, needed: Sequence[str], optional: Sequence[str] = (),
     if not file.is_file():
         raise InputError(f"{file} is missing")
     kind = "an HDF5 file" if _is_hdf5(file) else "a MATLAB file" if file.suffix in MATLAB else "an npz archive"
-    with refusing_broken(file, f"{kind} of plain numbers"):
-        if _is_hdf5(file):
-            with _hdf5(file) as content:
-                names = _choose(file, set(content), needed, optional)
-                return _read_hdf5(content, names, file)
-        if file.suffix in MATLAB:
-            return _read_matlab(file, needed, optional)
+    with refusing_broken(file, f"{kind} of plain numbers"), _opened(file, kinds) as (names, find):
+        found = {name: find(name) for name in _choose(file, names, needed, optional)}
+        _check_total(sum(size for size, _ in found.values()), file)
+        return {name: read() for name, (_, read) in found.items()}
+
+
+@contextmanager
+def _opened(file: Path, kinds: str = NUMBERS) -> Iterator[tuple[set[str], Callable[[str], Stored]]]:
+    """Open an archive; yield the names of its arrays, and a function that finds an array by name."""
+    if _is_hdf5(file):
+        with _hdf5(file) as content:
+            yield set(content), partial(_in_hdf5, content)
+    elif file.suffix in MATLAB:
+        variables = {name: (math.prod(shape) * 16, kind) for name, shape, kind in whosmat(file)}  # bytes if complex
+        yield set(variables), lambda name: _in_matlab(file, name, *variables[name])
+    else:
         with zipfile.ZipFile(file) as archive:
-            names = _choose(file, _stored(archive), needed, optional)
-            members = {name: archive.getinfo(f"{name}.npy") for name in names}
-            _check_total(sum(member.file_size for member in members.values()), file)
-            return {name: _read_member(archive, member, kinds) for name, member in members.items()}
+            yield _stored(archive), partial(_in_npz, archive, kinds)
 
 
 def array_header(file: Path, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
@@ -84,7 +87,7 @@ def array_header(file: Path, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]
     Raises:
         InputError: As `read_rows`.
     """
-    with _opened(file, name) as (stream, size):
+    with _stream(file, name) as (stream, size):
         shape, _, dtype = _header(stream, name, size)
         return shape, dtype
 
@@ -95,7 +98,7 @@ def read_rows(file: Path, name: str, rows: int) -> Iterator[NDArray[Any]]:
     Raises:
         InputError: No such file, one that is broken or holds no numbers, or more than 64 GiB.
     """
-    with _opened(file, name) as (stream, size):
+    with _stream(file, name) as (stream, size):
         shape, by_columns, dtype = _header(stream, name, size)
         if by_columns:  # rows are not contiguous
             _check_total(size, file)
@@ -108,7 +111,7 @@ def read_rows(file: Path, name: str, rows: int) -> Iterator[NDArray[Any]]:
 
 
 @contextmanager
-def _opened(file: Path, name: str) -> Iterator[tuple[Any, int]]:
+def _stream(file: Path, name: str) -> Iterator[tuple[Any, int]]:
     """Open an npy file or a member of an npz archive; yield the stream and its length."""
     if not file.is_file():
         raise InputError(f"{file} is missing")
@@ -154,10 +157,15 @@ def _stored(archive: zipfile.ZipFile) -> set[str]:
     return {name.removesuffix(".npy") for name in archive.namelist()}
 
 
-def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, kinds: str) -> NDArray[Any]:
-    with archive.open(member) as stream:
-        shape, by_columns, dtype = _header(stream, member.filename, member.file_size, kinds)
-        return np.frombuffer(stream.read(), dtype).reshape(shape, order="F" if by_columns else "C")
+def _in_npz(archive: zipfile.ZipFile, kinds: str, name: str) -> Stored:
+    member = archive.getinfo(f"{name}.npy")
+
+    def read() -> NDArray[Any]:
+        with archive.open(member) as stream:
+            shape, by_columns, dtype = _header(stream, member.filename, member.file_size, kinds)
+            return np.frombuffer(stream.read(), dtype).reshape(shape, order="F" if by_columns else "C")
+
+    return member.file_size, read
 
 
 def _header(stream: Any, name: str, size: int, kinds: str = NUMBERS) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
@@ -179,20 +187,10 @@ def _is_hdf5(file: Path) -> bool:
         return stream.read(len(MATLAB_HDF5[0])).startswith(MATLAB_HDF5)
 
 
-def _matlab_shapes(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Return shape and class of the variables of a MATLAB file before version 7.3."""
-    return {name: (tuple(shape), kind) for name, shape, kind in whosmat(file)}
-
-
-def _read_matlab(file: Path, needed: Sequence[str], optional: Sequence[str]) -> Arrays:
-    shapes = _matlab_shapes(file)
-    names = _choose(file, set(shapes), needed, optional)
-    for name in names:
-        if shapes[name][1] not in MATLAB_NUMBERS:
-            raise ValueError(f"{name} holds {shapes[name][1]}, expected numbers")
-    _check_total(sum(math.prod(shapes[name][0]) * np.dtype(complex).itemsize for name in names), file)
-    content = loadmat(file, variable_names=names)
-    return {name: np.ascontiguousarray(content[name]) for name in names}
+def _in_matlab(file: Path, name: str, size: int, kind: str) -> Stored:
+    if kind not in MATLAB_NUMBERS:
+        raise ValueError(f"{name} holds {kind}, expected numbers")
+    return size, lambda: np.ascontiguousarray(loadmat(file, variable_names=[name])[name])
 
 
 def _hdf5(file: Path) -> Any:
@@ -205,28 +203,21 @@ def _hdf5(file: Path) -> Any:
     return h5py.File(file, "r")
 
 
-def _read_hdf5(content: Any, names: Sequence[str], file: Path) -> Arrays:
-    """Return datasets of an HDF5 file. Links to other files are refused, because HDF5 follows them silently."""
+def _in_hdf5(content: Any, name: str) -> Stored:
+    """Find a dataset of an HDF5 file. Links to other files are refused, because HDF5 follows them silently."""
     import h5py
 
-    found = {}
-    for name in names:
-        owner, key = (content[name], "value") if _is_octave(content, name) else (content, name)
-        own = isinstance(owner.get(key, getlink=True), h5py.HardLink) and isinstance(owner[key], h5py.Dataset)
-        dtype = _number_type(owner[key].dtype) if own and not (owner[key].is_virtual or owner[key].external) else None
-        if dtype is None:
-            raise ValueError(f"{name} is no array of numbers in this file")
-        found[name] = owner[key], dtype
-    _check_total(sum(math.prod(array.shape) * dtype.itemsize for array, dtype in found.values()), file)
-    return {name: np.asarray(array[()]).view(dtype) for name, (array, dtype) in found.items()}
+    def is_own(owner: Any, key: str, kind: type) -> bool:
+        return isinstance(owner.get(key, getlink=True), h5py.HardLink) and isinstance(owner[key], kind)
 
-
-def _is_octave(content: Any, name: str) -> bool:
-    """Return True for a variable that Octave saved: a group with its type and its value."""
-    import h5py
-
-    own = isinstance(content.get(name, getlink=True), h5py.HardLink)
-    return own and isinstance(content[name], h5py.Group) and {"type", "value"} <= set(content[name])
+    owner, key = content, name
+    if is_own(content, name, h5py.Group) and {"type", "value"} <= set(content[name]):  # as Octave saves variables
+        owner, key = content[name], "value"
+    own = is_own(owner, key, h5py.Dataset)
+    dtype = _number_type(owner[key].dtype) if own and not (owner[key].is_virtual or owner[key].external) else None
+    if dtype is None:
+        raise ValueError(f"{name} is no array of numbers in this file")
+    return math.prod(owner[key].shape) * dtype.itemsize, lambda: np.asarray(owner[key][()]).view(dtype)
 
 
 def _number_type(dtype: np.dtype[Any]) -> np.dtype[Any] | None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -12,17 +13,65 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf.data.labelled import Labelled, Variable, position_coordinates
+from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
 from swiftwrf.data.splits import choose_split
 from swiftwrf.errors import CONTENT_ERRORS, InputError
 from swiftwrf.plotting import Displayed, extent
 from swiftwrf.positions import check_positions, to_tensor
 from swiftwrf.runtime.validation import NonNegativeInt, checked
 
+if TYPE_CHECKING:
+    import xarray
+
 Numbers = Any  # a tensor, array, list or table of numbers
 Rows = Any  # numbers of rows (tensor, array or list), a mask, or a slice
 Data = TypeVar("Data", bound="PositionedData")
 ROTATION_TOLERANCE = 1e-3  # of the products of its columns, from rounding
+Arrays = dict[str, Any]  # in the form of xarray: dimensions, values, and a dictionary of units if there are any
+DEGREE_UNITS = {"latitude": "degrees_north", "longitude": "degrees_east"}
+
+
+class Labelled(ABC):
+    """Base class of measurements and predictions that become tables (pandas), data sets (xarray) and files."""
+
+    @abstractmethod
+    def to_frame(self) -> pd.DataFrame:
+        """Return a table."""
+
+    @abstractmethod
+    def coordinates(self) -> Arrays:
+        """Return where the values are: positions, directions, names of receivers."""
+
+    @abstractmethod
+    def variables(self) -> Arrays:
+        """Return the values by name."""
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return an xarray data set whose coordinates and variables have the attribute `units`.
+
+        Raises:
+            InputError: xarray is not installed.
+        """
+        try:
+            import xarray
+        except ModuleNotFoundError:
+            raise InputError("to_xarray needs xarray; install it with pip install 'swiftwrf-tasks[xarray]'") from None
+        return xarray.Dataset(self.variables(), self.coordinates())
+
+
+def position_coordinates(position: NDArray[np.float64], origin: GeodeticOrigin | None = None) -> Arrays:
+    """Return the coordinates x, y and z of positions (n, 3) [m], and latitude and longitude [deg] with an origin.
+
+    Example:
+        >>> list(position_coordinates(np.zeros((2, 3)), GeodeticOrigin(48.0, 11.0)))
+        ['x', 'y', 'z', 'latitude', 'longitude']
+    """
+    found: Arrays = {
+        axis: (("position",), values, {"units": "m"}) for axis, values in zip("xyz", position.T, strict=True)
+    }
+    for (name, units), values in zip(DEGREE_UNITS.items(), degree_columns(origin, position).values(), strict=False):
+        found[name] = (("position",), values, {"units": units})
+    return found
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -146,10 +195,9 @@ class PositionedData(Labelled, Displayed):
         """Return the columns of `to_frame` beside the position."""
         raise NotImplementedError
 
-    def coordinates(self) -> dict[str, Variable]:
+    def coordinates(self) -> Arrays:
         """Return number and position of each row."""
-        index = Variable(("position",), self.index.numpy())
-        return {"index": index} | position_coordinates(self._position.numpy())
+        return {"index": (("position",), self.index.numpy())} | position_coordinates(self._position.numpy())
 
     def to_numpy(self) -> tuple[NDArray[np.float64], NDArray[Any]]:
         """Return positions X (n, 3) [m] and measurements y, as scikit-learn takes them; no copies where possible."""

@@ -14,14 +14,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+import pandas as pd
 import yaml
-from torch import Tensor
+from numpy.typing import NDArray
 
 from swiftwrf.choices import CARRIERS_HZ
+from swiftwrf.data.archives import MAX_UNPACKED_BYTES, refusing_broken
+from swiftwrf.data.columns import column_of_numbers
 from swiftwrf.errors import InputError
-from swiftwrf.positions import check_positions
 
+SUFFIXES = (".csv", ".parquet")  # of tables
+SEPARATORS = ",;\t"
 MAX_TEXT_BYTES = 2**28  # a million rows of positions take a tenth of it
 MAX_PREAMBLE_LINES = 20  # before the header of a table
 DECIMAL_COMMA = re.compile(r"^(\s*[+-]?\d+),(\d+\s*)$")
@@ -108,7 +111,7 @@ def read_yaml(file: Path) -> dict[str, Any]:
     """
     text = read_text(file)
     try:
-        content = _plain(yaml.compose(text, Loader=yaml.SafeLoader), {})
+        content = yaml.load(text, Loader=_PlainLoader)
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise InputError(f"{file} is not valid YAML: {error or 'nested too deeply'}") from None
     if not isinstance(content, dict):
@@ -116,28 +119,22 @@ def read_yaml(file: Path) -> dict[str, Any]:
     return content
 
 
-def _plain(node: yaml.Node | None, done: dict[int, Any]) -> Any:
-    """Return the text, list or mapping of a node.
+class _PlainLoader(yaml.BaseLoader):
+    """Loader of texts, lists and mappings, without tags and with each name once, of which YAML would keep the last."""
 
-    Nodes referred to twice are built once, because nested references would grow without bound.
-    """
-    if node is None or id(node) in done:
-        return done.get(id(node))
-    if node.tag not in PLAIN_TAGS:
-        raise ValueError(f"the tag {node.tag} is not allowed")
-    value: Any
-    if isinstance(node, yaml.MappingNode):
-        value = {}
-        for key, item in node.value:
-            if not isinstance(key, yaml.ScalarNode):
-                raise ValueError("a name must be text")
-            if key.value in value:  # YAML would silently keep the last
-                raise ValueError(f"it names {key.value!r} twice; each needs a name of its own")
-            value[key.value] = _plain(item, done)
-    else:
-        value = [_plain(item, done) for item in node.value] if isinstance(node, yaml.SequenceNode) else node.value
-    done[id(node)] = value
-    return value
+    def construct_object(self, node: Any, deep: bool = False) -> Any:
+        if node.tag not in PLAIN_TAGS:
+            raise ValueError(f"the tag {node.tag} is not allowed")
+        return super().construct_object(node, deep)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        if not all(isinstance(key, yaml.ScalarNode) for key, _ in node.value):
+            raise ValueError("a name must be text")
+        names = [key.value for key, _ in node.value]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise ValueError(f"it names {twice!r} twice; each needs a name of its own")
+        return super().construct_mapping(node, deep)
 
 
 def numbers(value: Any, count: int) -> tuple[float, ...] | None:
@@ -146,7 +143,7 @@ def numbers(value: Any, count: int) -> tuple[float, ...] | None:
     return found if all(map(math.isfinite, found)) else None
 
 
-def lines_before_header(file: Path, separators: str = ",") -> int:
+def lines_before_header(file: Path) -> int:
     """Return the number of lines before the header of a table, e.g. 1 for a first line of metadata.
 
     The header is the first line of names that has as many cells as the line below.
@@ -156,10 +153,10 @@ def lines_before_header(file: Path, separators: str = ",") -> int:
     """
     lines = read_text(file).split("\n", MAX_PREAMBLE_LINES + 2)[: MAX_PREAMBLE_LINES + 2]
     for skipped, (line, below) in enumerate(itertools.pairwise(lines)):
-        separator = max(separators, key=line.count)
+        separator = max(SEPARATORS, key=line.count)
         try:
             header, row = (next(csv.reader([text], delimiter=separator), []) for text in (line, below))
-        except csv.Error:  # read_cells refuses it
+        except csv.Error:  # read_table refuses it
             return 0
         is_header = all(cell.strip() and math.isnan(number(cell)) for cell in header)
         if len(header) == len(row) > 1 and (is_header or not skipped):
@@ -167,25 +164,36 @@ def lines_before_header(file: Path, separators: str = ",") -> int:
     return 0
 
 
-def read_cells(file: Path, separators: str = ",", skipped: int = 0) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows of a table, as text.
+def read_table(file: Path) -> pd.DataFrame:
+    """Return the table in a CSV or Parquet file. Cells of CSV are text.
 
     Args:
-        file: One row a line, with separators between values.
-        separators: Possible separators; the most frequent one in the header counts. Numbers may have a decimal comma if it
-            is not the comma.
-        skipped: Number of lines before the header.
+        file: Parquet, or one row a line with commas, semicolons or tabs between values; the most frequent one in the header
+            counts. Numbers may have a decimal comma if it is not the comma. Lines before the header are skipped.
 
     Raises:
-        InputError: No such file, a column without name or a name twice, rows of unequal length, no rows.
+        InputError: No such file, one that is broken, a column without name or a name twice, rows of unequal length, no rows.
     """
-    return cells_of(file, read_text(file).split("\n", skipped)[-1], separators)
+    if file.suffix.lower() != ".parquet":
+        return table_of(file, read_text(file).split("\n", lines_before_header(file))[-1])
+    try:
+        from pyarrow import parquet
+    except ImportError:
+        raise InputError(
+            f"{file} is Parquet, which pyarrow reads; install it with pip install 'swiftwrf-tasks[formats]'"
+        ) from None
+    with refusing_broken(file, "a Parquet file"):
+        content = parquet.ParquetFile(file)
+        groups = range(content.metadata.num_row_groups)
+        if (total := sum(content.metadata.row_group(i).total_byte_size for i in groups)) > MAX_UNPACKED_BYTES:
+            raise InputError(f"it unpacks to {total} bytes; at most {MAX_UNPACKED_BYTES} are read, so split the data")
+        return content.read().to_pandas()
 
 
-def cells_of(label: object, text: str, separators: str = ",") -> tuple[list[str], list[list[str]]]:
-    """Return header and rows of the text of a table, as `read_cells`; the label stands for it in messages."""
+def table_of(label: object, text: str) -> pd.DataFrame:
+    """Return the table in the text of a CSV file, as `read_table`; the label stands for it in messages."""
     first = text.split("\n", 1)[0]
-    separator = max(separators, key=first.count)
+    separator = max(SEPARATORS, key=first.count)
     try:
         stream = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
         lines = [line for line in stream if line]
@@ -193,48 +201,32 @@ def cells_of(label: object, text: str, separators: str = ",") -> tuple[list[str]
         raise InputError(f"{label} is not a comma-separated table ({error})") from None
     if not lines:
         raise InputError(f"{label} is empty; expected a header and one row a measurement")
-    header = [name.strip() for name in lines[0]]
+    header, rows = [name.strip() for name in lines[0]], lines[1:]
     if "" in header:
         raise InputError(f"{label} has no name for column {header.index('') + 1}; give it one in the header")
     if len(set(header)) < len(header):
         twice = next(name for name in header if header.count(name) > 1)
         raise InputError(f"{label} names column {twice!r} twice; each needs a name of its own")
-    if len(lines) == 1:
+    if not rows:
         raise InputError(f"{label} has a header but no rows")
-    for row, line in enumerate(lines[1:], start=1):
+    for row, line in enumerate(rows, start=1):
         if len(line) != len(header):
             raise InputError(f"{label} row {row} has {len(line)} values, but the header has {len(header)}")
-    if separator == ",":
-        return header, lines[1:]
-    return header, [[DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in line] for line in lines[1:]]
+    if separator != ",":
+        rows = [[DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in line] for line in rows]
+    return pd.DataFrame(rows, columns=header, dtype=object)
 
 
-def read_table(file: Path, columns: list[str] | None = None) -> tuple[list[str], Tensor]:
-    """Return header and numbers of a comma-separated file, float64 (rows, columns). Numbers may be nan.
-
-    Raises:
-        InputError: As `read_cells`, another header than `columns`, or text in place of a number.
-    """
-    header, rows = read_cells(file)
-    if columns is not None and header != columns:
-        raise InputError(f"{file} must start with the header {','.join(columns)}, got {','.join(header)}")
-    values = np.empty((len(rows), len(header)))
-    for row, line in enumerate(rows, start=1):
-        try:
-            values[row - 1] = [float(text.replace("_", "x")) for text in line]  # float accepts 1_0
-        except ValueError:
-            raise InputError(f"{file} row {row} holds text where a number is expected: {','.join(line)}") from None
-    return header, torch.from_numpy(values)
-
-
-def read_positions(file: Path) -> Tensor:
-    """Return the positions in a file with the header x,y,z, float64 (n, 3) [m].
+def read_xyz(file: Path) -> NDArray[np.float64]:
+    """Return the positions in a file with the header x,y,z, (n, 3) [m], nan where a cell is empty.
 
     Raises:
-        InputError: As `read_table`, or a coordinate that is not finite or beyond 1e9 m.
+        InputError: As `read_table`, another header, or text in place of a number.
     """
-    _, position = read_table(file, ["x", "y", "z"])
-    return check_positions(position, f"positions of {file}")
+    table = read_table(file)
+    if list(table.columns) != ["x", "y", "z"]:
+        raise InputError(f"{file} must start with the header x,y,z, got {','.join(map(str, table.columns))}")
+    return np.stack([column_of_numbers(file, table, axis) for axis in "xyz"], axis=1)
 
 
 def check_carrier(file: Path, frequency_hz: float) -> None:

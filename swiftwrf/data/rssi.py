@@ -7,19 +7,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
 
-from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin
-from swiftwrf.data.dataset import Numbers, PositionedData, to_positions
-from swiftwrf.data.fillers import check_powers
-from swiftwrf.data.floors import Floors
-from swiftwrf.data.groups import Groups, Offsets, numbered
-from swiftwrf.data.labelled import Variable, position_coordinates, receiver_coordinates
-from swiftwrf.data.receivers import receiver_row
+from swiftwrf.data.columns import Groups, check_powers, numbered
+from swiftwrf.data.coordinates import Coordinates, Floors, GeodeticOrigin
+from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, position_coordinates, to_positions
 from swiftwrf.data.splits import MIN_TRAINING, Validation, random_split, validation_for
-from swiftwrf.data.survey import SurveyOptions, read_survey
+from swiftwrf.data.survey import read_survey
 from swiftwrf.errors import InputError, listed
 from swiftwrf.plotting import MARK, plan
 from swiftwrf.positions import to_tensor
@@ -169,25 +166,20 @@ class Rssi(PositionedData):
             ('hall',)
         """
         values = None if filler is None else tuple(to_tensor("filler", filler, torch.float64, (None,)).tolist())
-        options = SurveyOptions(columns, values, coordinates, offset_by, tuple(transmitter), pool_by)
-        survey = read_survey("the table", frame, options)
-        known = receiver_position or survey.receiver_position or {}
-        return cls(
-            survey.rssi_dbm,
-            survey.position,
-            receiver_position=[list(known.get(receiver, UNKNOWN)) for receiver in survey.receiver_names],
-            receiver_names=survey.receiver_names,
-            origin=survey.origin,
-            groups=Groups.of(offset_by, survey.group) if offset_by else None,
-            labels=survey.labels,
-            floors=survey.floors,
-            receiver_moves=survey.receiver_moves,
-            session=survey.session,
-            time=survey.time,
-            name=name,
-            index=survey.row,
-            notes=survey.notes,
+        found = read_survey(
+            "the table",
+            frame,
+            columns=columns,
+            filler=values,
+            coordinates=coordinates,
+            offset_by=offset_by,
+            transmitter=tuple(transmitter),
+            pool_by=pool_by,
         )
+        if receiver_position:
+            places = [list(receiver_position.get(receiver, UNKNOWN)) for receiver in found["receiver_names"]]
+            found["receiver_position"] = places
+        return cls(**found, name=name)
 
     @property
     def located(self) -> bool:
@@ -345,15 +337,14 @@ class Rssi(PositionedData):
     def _columns(self) -> dict[str, Any]:
         return dict(zip(self.receiver_names, self.rssi_dbm.numpy().T, strict=True))
 
-    def coordinates(self) -> dict[str, Variable]:
+    def coordinates(self) -> Arrays:
         position = position_coordinates(self.transmitter_position.numpy(), self.origin)
-        return super().coordinates() | position | receiver_coordinates(self.receiver_names)
+        return super().coordinates() | position | {"receiver": (("receiver",), np.array(self.receiver_names))}
 
-    def variables(self) -> dict[str, Variable]:
-        places = Variable(("receiver", "axis"), self.receiver_position.numpy(), "m")
+    def variables(self) -> Arrays:
         return {
-            "rssi": Variable(("position", "receiver"), self.rssi_dbm.numpy(), "dBm"),
-            "receiver_position": places,
+            "rssi": (("position", "receiver"), self.rssi_dbm.numpy(), {"units": "dBm"}),
+            "receiver_position": (("receiver", "axis"), self.receiver_position.numpy(), {"units": "m"}),
         }
 
     def _measured(self) -> Tensor:
@@ -362,6 +353,61 @@ class Rssi(PositionedData):
     def _summary(self) -> str:
         share = float(self.detected.double().mean()) if len(self) else 0.0
         return f"{len(self)} rows at {len(self.receiver_names)} receivers, {share:.0%} detected"
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """Offsets of RSSI between groups of rows.
+
+    Args:
+        column: Name of the column with the groups' names.
+        reference: Group whose offset is 0.
+        offset_db: Offset of each group [dB].
+        explained: Fraction of the variance about the field that the offsets explain.
+    """
+
+    column: str
+    reference: str
+    offset_db: Mapping[str, float]
+    explained: float
+
+    def of(self, data: Rssi) -> Tensor:
+        """Return the offset of each row, float64 (n,) [dB]; 0 for a group without an estimate, or without groups."""
+        labels = data.groups.labels() if data.groups else [self.reference] * len(data)
+        return torch.tensor([self.offset_db.get(label, 0.0) for label in labels], dtype=torch.float64)
+
+    def removed(self, data: Rssi) -> Rssi:
+        """Return the data as the reference group would have measured them."""
+        return data.derived(rssi_dbm=data.rssi_dbm - self.of(data)[:, None], offsets=self)
+
+    def note(self) -> str:
+        """Return a sentence with all offsets."""
+        each = listed(f"{name} {db:+.1f} dB" for name, db in self.offset_db.items() if name != self.reference)
+        return f"offsets of {self.column} relative to {self.reference}, which maps are of: {each}"
+
+
+@checked
+def receiver_row(names: Sequence[str], asked: str, owner: str) -> int:
+    """Return the index of a receiver.
+
+    Args:
+        names: Names of all receivers.
+        asked: Name, or number counted from 1.
+        owner: What has these receivers, for the message.
+
+    Raises:
+        InputError: An unknown receiver.
+
+    Example:
+        >>> receiver_row(["hall", "office"], "office", "floor"), receiver_row(["hall", "office"], "1", "floor")
+        (1, 0)
+    """
+    if asked in names:
+        return list(names).index(asked)
+    if asked.isdecimal() and 1 <= int(asked) <= len(names):
+        return int(asked) - 1
+    known = ", ".join(f"{number} {name}" for number, name in enumerate(names, start=1))
+    raise InputError(f"{owner} has no receiver {asked!r}; there are {known}")
 
 
 def _is_name(name: object) -> bool:

@@ -13,8 +13,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid, ArrayPose
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.dataset import Numbers, PositionedData, to_positions, to_rotation
-from swiftwrf.data.labelled import Variable
+from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, to_positions, to_rotation
 from swiftwrf.data.spectra import GRID, Spectra, array_spectra, check_pixels
 from swiftwrf.errors import InputError, ranges
 from swiftwrf.positions import to_tensor
@@ -139,8 +138,8 @@ class Snapshots(PositionedData):
         time = {} if self.time is None else {"time_s": self.time.numpy()}
         return time | {"line_of_sight": self.line_of_sight.numpy()}
 
-    def variables(self) -> dict[str, Variable]:
-        return {"channel": Variable(("position", "snapshot", "element"), self.channel.numpy())}
+    def variables(self) -> Arrays:
+        return {"channel": (("position", "snapshot", "element"), self.channel.numpy())}
 
     def _measured(self) -> Tensor:
         return self.channel

@@ -17,8 +17,7 @@ from swiftwrf.array.angles import AngularGrid, ArrayPose, to_angles
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray, folded_angles
 from swiftwrf.choices import Moving
-from swiftwrf.data.dataset import Numbers, PositionedData, to_positions, to_rotation
-from swiftwrf.data.labelled import Variable
+from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, to_positions, to_rotation
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.data.store import BATCH_PIXELS, MAX_MEMORY_PIXELS, Store, stored, too_many
 from swiftwrf.errors import InputError
@@ -228,15 +227,15 @@ class Spectra(PositionedData):
         azimuth, elevation = self.label.rad2deg().numpy().T
         return {"azimuth_deg": azimuth, "elevation_deg": elevation, "line_of_sight": self.line_of_sight.numpy()}
 
-    def coordinates(self) -> dict[str, Variable]:
+    def coordinates(self) -> Arrays:
         return super().coordinates() | direction_coordinates(self.grid)
 
-    def variables(self) -> dict[str, Variable]:
+    def variables(self) -> Arrays:
         label = self.label.rad2deg().numpy()
         return {
-            "spectrum": Variable(("position", *DIRECTION), self.spectrum.numpy(), "1"),
-            "label": Variable(("position", "angle"), label, "degree"),
-            "line_of_sight": Variable(("position",), self.line_of_sight.numpy()),
+            "spectrum": (("position", *DIRECTION), self.spectrum.numpy(), {"units": "1"}),
+            "label": (("position", "angle"), label, {"units": "degree"}),
+            "line_of_sight": (("position",), self.line_of_sight.numpy()),
         }
 
     def _measured(self) -> Tensor:
@@ -248,15 +247,15 @@ class Spectra(PositionedData):
         return f"{len(self)} spectra of {rows} x {columns} directions{array}, moving {self.moving}"
 
 
-def direction_coordinates(grid: AngularGrid) -> dict[str, Variable]:
+def direction_coordinates(grid: AngularGrid) -> Arrays:
     """Return elevation and azimuth [deg] of the rows and columns of spectra.
 
     Example:
-        >>> direction_coordinates(AngularGrid.hemisphere(3, 4))["azimuth"].values.tolist()
+        >>> direction_coordinates(AngularGrid.hemisphere(3, 4))["azimuth"][1].tolist()
         [0.0, 90.0, 180.0, 270.0]
     """
     angles = zip(DIRECTION, (grid.elevation, grid.azimuth), strict=True)
-    return {name: Variable((name,), angle.rad2deg().numpy(), "degree") for name, angle in angles}
+    return {name: ((name,), angle.rad2deg().numpy(), {"units": "degree"}) for name, angle in angles}
 
 
 def _checked_store(spectra: Numbers) -> Store:

@@ -1,113 +1,61 @@
 """Tables of positions and RSSI: the columns of a walk test, recognised by their names.
 
-A wide table has one column a receiver, a long one has one row a packet.
+A wide table has one column a receiver, a long one has one row a packet. Both ends of a link may move, and radios of one
+access point may be pooled. Positions of receivers are in tables, too.
 """
 
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from swiftwrf.data.archives import MAX_UNPACKED_BYTES, refusing_broken
 from swiftwrf.data.columns import (
     GEODETIC,
+    Groups,
+    candidates,
+    check_powers,
     column_of,
     column_of_numbers,
+    find_fillers,
     find_roles,
     is_coordinate,
     is_rssi,
     parsed,
+    plain_name,
     seconds,
     text_of,
+    without_fillers,
 )
-from swiftwrf.data.coordinates import Coordinates, GeodeticOrigin, degrees_in, without_fix
-from swiftwrf.data.ends import as_receivers, transmitter_columns
-from swiftwrf.data.files import cells_of, lines_before_header, read_cells
-from swiftwrf.data.fillers import check_powers, find_fillers, without_fillers
-from swiftwrf.data.floors import STOREY_M, Floors, floors_of, height_of_floors
-from swiftwrf.data.pooling import pool_names, pooled
+from swiftwrf.data.coordinates import (
+    STOREY_M,
+    Coordinates,
+    GeodeticOrigin,
+    degrees_in,
+    floors_of,
+    height_of_floors,
+    without_fix,
+)
+from swiftwrf.data.files import read_table
 from swiftwrf.errors import InputError, listed
-from swiftwrf.positions import check_positions
+from swiftwrf.positions import cells, check_positions
 
 Floats = NDArray[np.float64]
-SUFFIXES = (".csv", ".parquet")
-SEPARATORS = ",;\t"
 MAX_VALUES = 2**27  # rows x receivers
 MAX_GROUPS, MIN_GROUP_ROWS = 30, 10  # of a column that may distinguish devices or channels
-
-
-class SurveyOptions(NamedTuple):
-    """Options of reading a table.
-
-    Args:
-        columns: Names of columns that are not recognised, by role.
-        filler: Values that stand for not detected. Defaults to those that are recognised; none if it is empty.
-        coordinates: Unit of the positions. Defaults to the one that is recognised.
-        offset_by: Column with the group of each row. Packets of a row of RSSI are of one group.
-        transmitter: Columns of the second end where both ends move: x, y and z, or one with names of its positions.
-        pool_by: Radios to pool, as in `pool_names`, or the column with the access point of each packet.
-    """
-
-    columns: Mapping[str, str] | None = None
-    filler: tuple[float, ...] | None = None
-    coordinates: Coordinates | None = None
-    offset_by: str | None = None
-    transmitter: tuple[str, ...] = ()
-    pool_by: str | None = None
-
-
-class Survey(NamedTuple):
-    """Content of a survey table: n rows with a position at R receivers."""
-
-    receiver_names: list[str]
-    rssi_dbm: Floats  # (n, R), nan where a receiver detected nothing
-    position: Floats  # (n, 3) [m]
-    row: NDArray[np.int64]  # number of each row in the table, before those without a position are left out
-    n_rows: int  # of the table
-    origin: GeodeticOrigin | None  # of positions in degrees
-    group: list[str]  # of each row; empty if it was not asked for
-    session: list[str] | None  # of each row, if the table contains sessions
-    time: Floats | None  # of each row [s], nan where a cell is no time, if the table contains times
-    labels: tuple[str, ...]  # columns that distinguish groups of rows
-    floors: Floors | None  # if the table contains them
-    receiver_moves: bool  # receivers are positions of one that moves
-    receiver_position: dict[str, list[float]] | None  # by name, if the table contains them [m]
-    notes: tuple[str, ...]
-
-
-def read_frame(file: Path) -> pd.DataFrame:
-    """Return the table in a CSV or Parquet file. Cells of CSV are text.
-
-    Raises:
-        InputError: No such file, or one that is broken, has no rows, or a column without a name of its own.
-    """
-    if file.suffix.lower() != ".parquet":
-        header, rows = read_cells(file, SEPARATORS, lines_before_header(file, SEPARATORS))
-        return pd.DataFrame(rows, columns=header, dtype=object)
-    try:
-        from pyarrow import parquet
-    except ImportError:
-        raise InputError(
-            f"{file} is Parquet, which pyarrow reads; install it with pip install 'swiftwrf-tasks[formats]'"
-        ) from None
-    with refusing_broken(file, "a Parquet file"):
-        content = parquet.ParquetFile(file)
-        groups = range(content.metadata.num_row_groups)
-        if (total := sum(content.metadata.row_group(i).total_byte_size for i in groups)) > MAX_UNPACKED_BYTES:
-            raise InputError(f"it unpacks to {total} bytes; at most {MAX_UNPACKED_BYTES} are read, so split the data")
-        return content.read().to_pandas()
-
-
-def frame_of(label: object, text: str) -> pd.DataFrame:
-    """Return the table in the text of a CSV file, as `read_frame`; the label stands for it in messages."""
-    header, rows = cells_of(label, text, SEPARATORS)
-    return pd.DataFrame(rows, columns=header, dtype=object)
+MAX_PLACES = 500  # positions of the second end that stay apart: each has a column of RSSI
+MARKS = {"tx": "transmitter", "transmitter": "transmitter", "rx": "receiver", "receiver": "receiver"}  # words in names
+MAC = "mac"  # pools radios by the first five bytes of their addresses
+ADDRESS = re.compile(r"((?:[0-9a-f]{2}[:-]?){4}[0-9a-f]{2})[:-]?[0-9a-f]{2}", re.IGNORECASE)
+MAX_FROM_ORIGIN_DEG = 2.0  # of receivers in degrees
 
 
 def has_positions(table: pd.DataFrame, columns: Mapping[str, str]) -> bool:
@@ -115,13 +63,28 @@ def has_positions(table: pd.DataFrame, columns: Mapping[str, str]) -> bool:
     return any(column_of(table, role, columns) is not None for role in ("x", "y", *GEODETIC.values()))
 
 
-def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> Survey:
-    """Return receivers, RSSI and positions of a survey table.
+def read_survey(
+    label: object,
+    table: pd.DataFrame,
+    *,
+    columns: Mapping[str, str] | None = None,
+    filler: Sequence[float] | None = None,
+    coordinates: Coordinates | None = None,
+    offset_by: str | None = None,
+    transmitter: Sequence[str] = (),
+    pool_by: str | None = None,
+) -> dict[str, Any]:
+    """Return the arguments of `Rssi` that a survey table determines: RSSI, positions, receivers and what rows are of.
 
     Args:
         label: Name of the table, for messages.
         table: One row a position (wide) or a packet (long).
-        options: What the user states about it.
+        columns: As the other arguments, those of `Rssi.from_frame`.
+        filler: Values that stand for not detected.
+        coordinates: Unit of the positions.
+        offset_by: Column with the group of each row. Packets of a row of RSSI are of one group.
+        transmitter: Columns of the second end where both ends move.
+        pool_by: Radios to pool.
 
     Raises:
         InputError: A column that is missing or ambiguous, or a value that is no position or received power.
@@ -129,16 +92,16 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
     table = table.set_axis([str(name).strip() for name in table.columns], axis=1).reset_index(drop=True)
     if not len(table) or not table.columns.is_unique:
         raise InputError(f"{label} must have rows, and a name of its own for each column")
-    asked, end = _second_end(label, table, options)
+    asked, end = _second_end(label, table, columns or {}, transmitter)
     roles = find_roles(label, table, asked, end.values())
     coordinate, notes = _coordinates(label, table, roles)
     if end:
         coordinate = np.hstack([coordinate, _coordinates(label, table, end)[0]])
         coordinate[np.isnan(coordinate).any(axis=1)] = np.nan
         roles |= {f"transmitter {axis}": name for axis, name in end.items()}
-    if options.offset_by is not None and options.offset_by not in table.columns:
-        raise InputError(f"{label} has no column {options.offset_by!r} for offsets; there are {listed(table.columns)}")
-    group = text_of(table[options.offset_by]) if options.offset_by else pd.Series([""] * len(table))
+    if offset_by is not None and offset_by not in table.columns:
+        raise InputError(f"{label} has no column {offset_by!r} for offsets; there are {listed(table.columns)}")
+    group = text_of(table[offset_by]) if offset_by else pd.Series([""] * len(table))
     session = text_of(table[roles["session"]]) if "session" in roles else None
     if "receiver" in roles:
         apart = group if session is None else group + "\n" + session
@@ -148,25 +111,23 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
         names, rssi = _wide(label, table, roles, asked)
         source = np.arange(len(table))[:, None]
         unused = [name for name in table.columns if name not in roles.values() and name not in names]
-    unused = [name for name in unused if name not in (options.offset_by, options.pool_by)]
+    unused = [name for name in unused if name not in (offset_by, pool_by)]
     if unused:
         notes.append(f"columns that are not used: {listed(unused)}")
-    fillers = find_fillers(rssi) if options.filler is None else list(options.filler)
+    fillers = find_fillers(rssi) if filler is None else list(filler)
     rssi, found = without_fillers(rssi, fillers)
     check_powers(label, rssi, names, source)
-    if options.pool_by is not None:
-        n_radios, pools = len(names), _pools(label, table, roles, names, options.pool_by)
+    if pool_by is not None:
+        n_radios, pools = len(names), _pools(label, table, roles, names, pool_by)
         names, rssi = pooled(rssi, pools)
-        found.append(
-            f"{n_radios} radios are pooled into {len(names)} receivers by {options.pool_by}: mean of their powers"
-        )
+        found.append(f"{n_radios} radios are pooled into {len(names)} receivers by {pool_by}: mean of their powers")
     omitted, missing = without_fix(coordinate[:, :3])
     notes += found + missing
     if omitted.all():
         raise InputError(f"{label} has no row with a position; {missing[0]}")
     row = np.flatnonzero(~omitted)
     check_positions(coordinate[row].reshape(-1, 3), f"positions of {label}")
-    position, origin = _in_metres(label, roles, coordinate[row].reshape(-1, 3), options.coordinates)
+    position, origin = _in_metres(label, roles, coordinate[row].reshape(-1, 3), coordinates)
     position = position.reshape(len(row), -1)
     floors = None
     if "floor" in roles:
@@ -184,35 +145,34 @@ def read_survey(label: object, table: pd.DataFrame, options: SurveyOptions) -> S
         notes.append(f"receivers that never detected the transmitter are left out: {int((~kept).sum())}")
     names, rssi, places = [names[i] for i in np.flatnonzero(kept)], rssi[row][:, kept], None
     if end:
-        names, rssi, position, where, found = as_receivers(label, rssi, position)
-        places, notes = dict(zip(names, where.tolist(), strict=True)), notes + found
+        names, rssi, position, places, found = as_receivers(label, rssi, position)
+        notes += found
     origins = source.max(axis=1)[row]  # row of the table that each row is of
-    groups = group.to_numpy()[origins].tolist() if options.offset_by else []
+    groups = Groups.of(offset_by, group.to_numpy()[origins].tolist()) if offset_by else None
     sessions = None if session is None else session.to_numpy()[origins].tolist()
     time, found = seconds(table[roles["time"]].iloc[origins]) if "time" in roles else (None, [])
     notes += found
     labels = tuple(name for name in (*unused, roles.get("session")) if name and _distinguishes(table[name]))
-    if labels and not options.offset_by:
+    if labels and not offset_by:
         notes.append(f"rows differ in {listed(labels)}; tasks.inspect tests whether its values have constant offsets")
-    moves = bool(end or options.transmitter)
+    moves = bool(end or transmitter)
     if moves and not end:
-        notes.append(f"both ends move; {len(names)} positions of column {options.transmitter[0]} count as receivers")
-    return Survey(
-        receiver_names=names,
-        rssi_dbm=rssi,
-        position=position,
-        row=row,
-        n_rows=len(omitted),
-        origin=origin,
-        group=groups,
-        session=sessions,
-        time=time,
-        labels=labels,
-        floors=floors,
-        receiver_moves=moves,
-        receiver_position=places,
-        notes=tuple(notes),
-    )
+        notes.append(f"both ends move; {len(names)} positions of column {transmitter[0]} count as receivers")
+    return {
+        "rssi_dbm": rssi,
+        "transmitter_position": position,
+        "receiver_position": places,
+        "receiver_names": names,
+        "origin": origin,
+        "groups": groups,
+        "labels": labels,
+        "floors": floors,
+        "receiver_moves": moves,
+        "session": sessions,
+        "time": time,
+        "index": row,
+        "notes": tuple(notes),
+    }
 
 
 def _pools(label: object, table: pd.DataFrame, roles: dict[str, str], names: list[str], by: str) -> list[str]:
@@ -230,14 +190,15 @@ def _pools(label: object, table: pd.DataFrame, roles: dict[str, str], names: lis
     return [pool[name] or name for name in names]
 
 
-def _second_end(label: object, table: pd.DataFrame, options: SurveyOptions) -> tuple[Mapping[str, str], dict[str, str]]:
+def _second_end(
+    label: object, table: pd.DataFrame, asked: Mapping[str, str], transmitter: Sequence[str]
+) -> tuple[Mapping[str, str], dict[str, str]]:
     """Return the columns that the user names, by role, and those of the second end by x, y and z, if both ends move."""
-    asked = options.columns or {}
-    if len(options.transmitter) == 1:
-        return {**asked, "receiver": options.transmitter[0]}, {}
-    if not options.transmitter and {"x", "y"} & asked.keys():
+    if len(transmitter) == 1:
+        return {**asked, "receiver": transmitter[0]}, {}
+    if not transmitter and {"x", "y"} & asked.keys():
         return asked, {}
-    return asked, transmitter_columns(label, table, options.transmitter)
+    return asked, transmitter_columns(label, table, transmitter)
 
 
 def _coordinates(label: object, table: pd.DataFrame, roles: dict[str, str]) -> tuple[Floats, list[str]]:
@@ -332,3 +293,205 @@ def _distinguishes(column: pd.Series) -> bool:
 def _check_size(label: object, rows: int, receivers: int) -> None:
     if rows * receivers > MAX_VALUES:
         raise InputError(f"{label} has {rows} rows and {receivers} receivers; at most {MAX_VALUES} values are read")
+
+
+def transmitter_columns(label: object, table: pd.DataFrame, given: Sequence[str]) -> dict[str, str]:
+    """Return the columns of the second end by x, y and z; none in a table with positions of one end.
+
+    Args:
+        label: Name of the table, for messages.
+        table: Its columns.
+        given: Columns that the user names, in this order. Otherwise those marked tx or transmitter beside others, or those
+            marked rx or receiver beside unmarked ones.
+
+    Raises:
+        InputError: A missing column, or another number of columns.
+
+    Example:
+        >>> table = pd.DataFrame(columns=["x", "y", "tx_x", "tx_y", "rssi"])
+        >>> transmitter_columns("walk.csv", table, ())
+        {'x': 'tx_x', 'y': 'tx_y'}
+    """
+    if given:
+        missing = [name for name in given if name not in table.columns]
+        if missing or len(given) not in (2, 3) or len(set(given)) < len(given):
+            raise InputError(
+                f"{label}: transmitter takes the columns of x, y and, if it is known, z, or one column of names, got "
+                f"{' '.join(given)}; there are {listed(table.columns)}"
+            )
+        return dict(zip("xyz", given, strict=False))
+    marked = {axis: {_mark(name): name for name in reversed(candidates(table, axis))} for axis in "xyz"}
+    for mark, beside in (("transmitter", {"receiver", ""}), ("receiver", {""})):
+        if all(mark in marked[axis] and beside & marked[axis].keys() for axis in "xy"):
+            return {axis: names[mark] for axis, names in marked.items() if mark in names}
+    return {}
+
+
+def _mark(name: str) -> str:
+    return next((MARKS[word] for word in plain_name(name).split("_") if word in MARKS), "")
+
+
+def as_receivers(label: object, rssi: Floats, ends: Floats) -> tuple[list[str], Floats, Floats, Floats, list[str]]:
+    """Return links as RSSI of one moving end at the positions of the other.
+
+    Args:
+        label: Name of the table, for messages.
+        rssi: RSSI of the links, (n, 1) [dBm].
+        ends: Positions of both ends, (n, 6) [m]. The end with fewer positions becomes the receivers.
+
+    Returns:
+        Names of P receivers, RSSI (n, P) [dBm], positions of the other end (n, 3) [m], those of the receivers (P, 3) [m],
+        and notes.
+
+    Raises:
+        InputError: RSSI of several receivers.
+    """
+    if rssi.shape[1] != 1:
+        raise InputError(
+            f"{label} has positions of both ends and RSSI of {rssi.shape[1]} receivers; name one: columns rssi=NAME, or "
+            "pool them: pool_by"
+        )
+    own, other = ends[:, :3], ends[:, 3:]
+    if len(np.unique(own, axis=0)) < len(np.unique(other, axis=0)):
+        own, other = other, own
+    place, edge = cells(torch.from_numpy(other), MAX_PLACES)
+    n = int(place.max()) + 1
+    count = np.bincount(place.numpy(), minlength=n)
+    position = np.stack([np.bincount(place.numpy(), axis, minlength=n) / count for axis in other.T], axis=1)
+    notes = [f"both ends move; {n} positions of one of them count as receivers place1 to place{n}"]
+    if edge:
+        notes.append(f"its positions are averaged in cubes of {edge:.3g} m")
+    values = np.full((len(rssi), n), np.nan)
+    values[np.arange(len(rssi)), place.numpy()] = rssi[:, 0]
+    return [f"place{number}" for number in range(1, n + 1)], values, own, position, notes
+
+
+def pool_names(names: Sequence[str], by: str) -> list[str]:
+    """Return the access point of each radio; a radio that does not match is one of its own.
+
+    Args:
+        names: Names of the radios.
+        by: "mac" for the first five bytes of a MAC address, else a regular expression whose group is the access point.
+
+    Raises:
+        InputError: An expression that is broken, has no group, or matches no radio.
+
+    Example:
+        >>> pool_names(["a4:56:cc:00:10:b0", "a4:56:cc:00:10:b1", "lab"], "mac")
+        ['a4:56:cc:00:10', 'a4:56:cc:00:10', 'lab']
+        >>> pool_names(["hall-2G", "hall-5G"], "(.*)-.G")
+        ['hall', 'hall']
+    """
+    try:
+        pattern = ADDRESS if by == MAC else re.compile(by)
+    except re.error as error:
+        raise InputError(f"pool_by {by!r} is no column and no regular expression ({error})") from None
+    if pattern.groups != 1:
+        raise InputError(f"pool_by takes {MAC}, a column, or a regular expression with one group, got {by!r}")
+    found = [pattern.fullmatch(name) for name in names]
+    if not any(found):
+        raise InputError(f"pool_by {by!r} matches no receiver; there are {listed(names)}")
+    return [name if match is None else match.group(1) for name, match in zip(names, found, strict=True)]
+
+
+def pooled(rssi: Floats, pools: Sequence[str]) -> tuple[list[str], Floats]:
+    """Return the access points and their RSSI: the mean power of those radios that detected the transmitter.
+
+    Args:
+        rssi: RSSI of the radios (n, R) [dBm], nan where not detected.
+        pools: Access point of each radio, R names.
+
+    Returns:
+        P names in order of their first radio, and RSSI (n, P) [dBm].
+
+    Example:
+        >>> pooled(np.array([[-50.0, -50.0], [-60.0, np.nan]]), ["hall", "hall"])
+        (['hall'], array([[-50.],
+               [-60.]]))
+    """
+    names = list(dict.fromkeys(pools))
+    member = np.array([[pool == name for name in names] for pool in pools], dtype=np.float64)
+    detected = ~np.isnan(rssi)
+    power = np.where(detected, 10 ** (np.nan_to_num(rssi) / 10), 0.0) @ member
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return names, 10 * np.log10(power / (detected @ member))
+
+
+def read_receivers(file: Path, names: Sequence[str], origin: GeodeticOrigin | None = None) -> tuple[Tensor, list[str]]:
+    """Return the positions of receivers, float64 (R, 3) [m], nan where the table lacks one, and a note on these.
+
+    Args:
+        file: Table of positions with names of receivers, or without names in the order of the receivers.
+        names: R names.
+        origin: Origin of the measurements, if their positions were in degrees; then these are, too.
+
+    Raises:
+        InputError: A name twice, no position of any receiver, or a position that is not usable.
+    """
+    table = read_table(file)
+    label = column_of(table, "receiver", {}) or ("name" if "name" in table.columns else None)
+    if label is None and len(table) != len(names):
+        raise InputError(f"{file} has {len(table)} rows and no column of names, but there are {len(names)} receivers")
+    listed_names = list(names) if label is None else table[label].astype(str).str.strip().tolist()
+    if len(set(listed_names)) < len(listed_names):
+        raise InputError(f"{file} must have each receiver once, got {listed(listed_names)}")
+    position = _positions(file, table, origin, "receiver,x,y,z")
+    given = np.flatnonzero(~np.isnan(position[:, :2]).all(axis=1))
+    position, listed_names = position[given], [listed_names[row] for row in given]
+    place = dict(zip(listed_names, check_positions(position, f"positions of {file}").tolist(), strict=True))
+    unknown = [name for name in names if name not in place]
+    if len(unknown) == len(names):
+        raise InputError(f"{file} has none of the receivers ({listed(names)}); there are {listed(listed_names)}")
+    found = torch.tensor([place.get(name, [float("nan")] * 3) for name in names], dtype=torch.float64)
+    return found, unknown_positions(unknown)
+
+
+def read_places(file: Path, origin: GeodeticOrigin | None = None) -> Tensor:
+    """Return the positions in a table with columns x, y, z or longitude, latitude, altitude, float64 (n, 3) [m].
+
+    Args:
+        file: CSV or Parquet file. Without a column of heights, z is 0.
+        origin: Origin of the metres, if positions are in degrees.
+
+    Raises:
+        InputError: A column that is missing, or a position that is not usable.
+    """
+    return check_positions(_positions(file, read_table(file), origin, "x,y,z"), f"positions of {file}")
+
+
+def _positions(file: Path, table: pd.DataFrame, origin: GeodeticOrigin | None, header: str) -> NDArray[np.float64]:
+    """Return the positions (n, 3) [m] in a table, nan where a cell is empty."""
+    columns = [column_of(table, axis, {}) or column_of(table, GEODETIC[axis], {}) for axis in "xy"]
+    if None in columns:
+        raise InputError(f"{file} must start with the header {header}, got {','.join(map(str, table.columns))}")
+    height = column_of(table, "z", {})
+    values = [column_of_numbers(file, table, str(name)) for name in columns]
+    position = np.column_stack([*values, column_of_numbers(file, table, height) if height else np.zeros(len(table))])
+    known = ~np.isnan(position[:, :2]).all(axis=1)
+    position[known, :2] = _near_origin(file, position[known, :2], column_of(table, "longitude", {}) in columns, origin)
+    return position
+
+
+def unknown_positions(names: list[str]) -> list[str]:
+    """Return a note on receivers of unknown position, or none."""
+    return [f"the position of these receivers is unknown, so they have no path-loss model: {listed(names)}"] * bool(
+        names
+    )
+
+
+def _near_origin(
+    file: Path, xy: NDArray[np.float64], named: bool, origin: GeodeticOrigin | None
+) -> NDArray[np.float64]:
+    """Return x and y (R, 2) [m] of receivers."""
+    if origin is None:
+        if named and (np.abs(xy) <= (180, 90)).all():
+            raise InputError(
+                f"{file} holds longitudes and latitudes, but the measurements are in metres; give one unit"
+            )
+        return xy
+    if not (np.abs(xy - (origin.longitude, origin.latitude)) <= MAX_FROM_ORIGIN_DEG).all():
+        raise InputError(
+            f"{file}: receivers must be in degrees as the measurements are, within {MAX_FROM_ORIGIN_DEG:g} degrees of "
+            f"{origin}"
+        )
+    return origin.to_metres(xy[:, ::-1])

@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
+from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, to_angles
 from swiftwrf.array.planar import LIGHT_SPEED
-from swiftwrf.data.fillers import NOT_DETECTED_DBM
+from swiftwrf.data.columns import NOT_DETECTED_DBM
+from swiftwrf.data.dataset import Labelled
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.rssi import META, SURVEY, Rssi
 from swiftwrf.data.spectra import Spectra
@@ -159,6 +161,18 @@ def write_deepmimo(paths: PropagationPaths, folder: Path) -> None:
             np.savez_compressed(stream, **{name: values.numpy()})
     params = {"rt_params": {"frequency": paths.frequency_hz, "raytracer_name": "SwiftWRF"}}
     write_text(folder / "params.json", json.dumps(params, indent=1) + "\n")
+
+
+def write_mat(data: Labelled, file: Path) -> None:
+    """Write coordinates and variables as a MATLAB file of version 5: arrays of one dimension as (n, 1), names as cells.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    arrays = {name: values for name, (_, values, *_) in (data.coordinates() | data.variables()).items()}
+    arrays |= {name: values.astype(object) for name, values in arrays.items() if values.dtype.kind == "U"}  # to cells
+    with replacing(file) as temporary, temporary.open("wb") as stream:
+        savemat(stream, arrays, do_compression=True, oned_as="column")
 
 
 def _csv(header: str, values: Tensor) -> str:

@@ -9,17 +9,148 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Literal
+from urllib.parse import quote
 
 import pandas as pd
 
 from swiftwrf.data import Rssi, Spectra, load_rssi, load_spectra
-from swiftwrf.datasets.sources import DATA_SETS, DataSet
+from swiftwrf.datasets import conversions
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.durable import cache_folder, refusing_unwritable, rename, write_text
 
 FOLDER = "SWIFTWRF_DATA"  # environment variable with a folder of converted data sets
 PAGE = "README.md"
+CHECKSUMS = Path(__file__).parent / "checksums"
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """A public data set, pinned to one commit of a repository on GitHub.
+
+    Args:
+        kind: What it holds: "spectra" or "rssi".
+        content: What was measured, one sentence.
+        repository: Owner and name on GitHub.
+        commit: Commit of the raw files.
+        licence: Licence of the data.
+        citation: Authors, title, year.
+        convert: Writes the toolkit's layout (second folder) from the raw files (first folder).
+        checksums: File with path and sha256 of each raw file.
+
+    Example:
+        >>> DATA_SETS["kolak"].url
+        'https://raw.githubusercontent.com/marckolak/ble-rss-fingerprints-calib2021/0a69aaa7006909d3f8f9f3a14fcba9405d404fa5/'
+    """
+
+    kind: Literal["spectra", "rssi"]
+    content: str
+    repository: str
+    commit: str
+    licence: str
+    citation: str
+    convert: Callable[[Path, Path], None]
+    checksums: Path
+
+    @property
+    def source(self) -> str:
+        """Address of the repository."""
+        return f"https://github.com/{self.repository}"
+
+    @property
+    def url(self) -> str:
+        """Address that the paths of the raw files are appended to."""
+        return f"https://raw.githubusercontent.com/{quote(self.repository)}/{self.commit}/"
+
+
+def _newrf(room: str) -> DataSet:
+    return DataSet(
+        "spectra",
+        f"Ray paths in a {room}, 2.412 GHz, traced with MATLAB's image method; the receiver moves",
+        "LuHaofan/NeWRF",
+        "78feb38471f766f17764a28e8518a05697944107",
+        "MIT",
+        "H. Lu, C. Vattheuer, B. Mirzasoleiman, O. Abari, NeWRF, ICML 2024",
+        conversions.newrf,
+        CHECKSUMS / f"newrf-{room}.txt",
+    )
+
+
+def _wifi_room(room: str) -> DataSet:
+    return DataSet(
+        "rssi",
+        f"Wi-Fi RSSI of a phone in a {room.replace('-', ' ')}, means of at least 10 packets a point",
+        "Fx386483710/WiFi_RSS_RTT_Dataset_for_Model_Selection",
+        "48e41763ff1dc37aed1746be82f8d073531d9b82",
+        "MIT",
+        "X. Feng, K. A. Nguyen, Z. Luo, WiFi RSS & RTT dataset, doi 10.5281/zenodo.11558792, 2024",
+        partial(conversions.wifi_room, room=room),
+        CHECKSUMS / f"wifi-rooms-{room}.txt",
+    )
+
+
+DATA_SETS = {
+    "s23-200": DataSet(
+        "spectra",
+        "Measured spectra of a moving RFID tag at 4 x 4 antennas, 915 MHz: the first 200 of the NeRF2 data set s23",
+        "wenchaozheng/WRF-GS",
+        "2123040698664552b10071d8b708028c77c939ac",
+        "MIT (NeRF2)",
+        "X. Zhao, Z. An, Q. Pan, L. Yang, NeRF2: Neural Radio-Frequency Radiance Fields, MobiCom 2023",
+        conversions.s23,
+        CHECKSUMS / "s23-200.txt",
+    ),
+    "newrf-bedroom": _newrf("bedroom"),
+    "newrf-office": _newrf("office"),
+    "newrf-conference": _newrf("conference"),
+    "tetam-tracks": DataSet(
+        "rssi",
+        "BLE RSSI at twelve receivers, the beacon carried along nine paths through an office floor",
+        "philotuxo/Position-Annotated-BLE-RSSI-Dataset",
+        "77474b69dc7d73fc5b07b74d7b4b65f3235a663e",
+        "CC0 1.0",
+        "F. S. Danis, A. T. Naskali, A. T. Cemgil, C. Ersoy, Pervasive and Mobile Computing 81, 2022",
+        conversions.tetam_tracks,
+        CHECKSUMS / "tetam-tracks.txt",
+    ),
+    "kolak": DataSet(
+        "rssi",
+        "BLE RSSI at six anchors in a flat, the tag carried by a robot",
+        "marckolak/ble-rss-fingerprints-calib2021",
+        "0a69aaa7006909d3f8f9f3a14fcba9405d404fa5",
+        "CC BY 4.0",
+        "M. Kolakowski, Automated Calibration of RSS Fingerprinting Based Systems, Sensors 21, 6270, 2021",
+        conversions.kolak,
+        CHECKSUMS / "kolak.txt",
+    ),
+    "dcm-rssi": DataSet(
+        "rssi",
+        "Wi-Fi RSSI of a robot for 92 positions of the router in a room of 5 x 6 m",
+        "wenhaol/DCM-RSSI",
+        "86d2d21bb7d33569cefd75912f369156d86e42c1",
+        "MIT",
+        "Y. Yang et al., Integrating Online Learning and Connectivity Maintenance, IROS 2024",
+        conversions.dcm,
+        CHECKSUMS / "dcm-rssi.txt",
+    ),
+    "lora-campus": DataSet(
+        "rssi",
+        "LoRa RSSI over 3 km of a campus, one gateway, on foot and by car",
+        "oliveiraleo/LoRa-RSSI-dataset-outdoor",
+        "4c3cd274f8b94c01f7e8edbb9d466709de6f5cbd",
+        "CC BY-NC-SA 4.0 (not for commercial use)",
+        "L. Oliveira, L. Chaves, E. Silva, Explorando o RSSI na Geração de Chaves para LoRaWAN, SBSeg 2023",
+        conversions.lora,
+        CHECKSUMS / "lora-campus.txt",
+    ),
+    "wifi-rooms/office": _wifi_room("office"),
+    "wifi-rooms/lecture-theatre": _wifi_room("lecture-theatre"),
+    "wifi-rooms/corridor": _wifi_room("corridor"),
+}
 
 
 def catalogue() -> pd.DataFrame:

@@ -13,7 +13,7 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
-from swiftwrf.data.fillers import NOT_DETECTED_DBM
+from swiftwrf.data.columns import NOT_DETECTED_DBM
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.writing import write_paths, write_rssi

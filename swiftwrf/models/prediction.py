@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.data.labelled import Labelled, Variable, position_coordinates, receiver_coordinates
+from swiftwrf.data.dataset import Arrays, Labelled, position_coordinates
 from swiftwrf.data.spectra import DIRECTION, direction_coordinates
 from swiftwrf.errors import InputError
 from swiftwrf.plotting import Displayed, plan, polar_spectrum
@@ -128,16 +128,18 @@ class Prediction(Labelled, Displayed):
         std = {} if self.std is None else {"std_db": self.std.detach().cpu().flatten().numpy()}
         return table.assign(**values, **std)
 
-    def coordinates(self) -> dict[str, Variable]:
-        own = receiver_coordinates(self.receiver_names) if self.grid is None else direction_coordinates(self.grid)
+    def coordinates(self) -> Arrays:
+        own: Arrays = {"receiver": (("receiver",), np.array(self.receiver_names, dtype=np.str_))}
+        if self.grid is not None:
+            own = direction_coordinates(self.grid)
         return position_coordinates(self._place()) | own
 
-    def variables(self) -> dict[str, Variable]:
+    def variables(self) -> Arrays:
         name, dimensions, unit = ("spectrum", DIRECTION, "1") if self.grid else ("rssi", ("receiver",), "dBm")
-        found = {name: Variable(("position", *dimensions), self.mean.detach().cpu().numpy(), unit)}
+        found: Arrays = {name: (("position", *dimensions), self.mean.detach().cpu().numpy(), {"units": unit})}
         if self.std is not None:
             std = self.std.detach().cpu().numpy()
-            found["std"] = Variable(("position", *dimensions), std, "1" if self.grid else "dB")
+            found["std"] = (("position", *dimensions), std, {"units": "1" if self.grid else "dB"})
         return found
 
     def _place(self) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.raytraced import Material, Scene, Surface, Tracing, open_scene, sionna, trace
-from swiftwrf.data.raytraced.surfaces import rectangle
+from swiftwrf.data.raytraced.rooms import rectangle
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext
 from swiftwrf.models.geometry import GeometryConfig, GeometryModel

@@ -17,8 +17,7 @@ from torch import Tensor
 
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.dataset import Numbers
-from swiftwrf.data.groups import Offsets
-from swiftwrf.data.rssi import Rssi
+from swiftwrf.data.rssi import Offsets, Rssi
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError, listed
 from swiftwrf.gp import Kernel

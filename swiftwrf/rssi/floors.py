@@ -15,7 +15,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from swiftwrf.data.floors import Floors
+from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.positions import distance
 from swiftwrf.rssi.path_loss import MIN_DISTANCE_M

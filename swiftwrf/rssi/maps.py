@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
-from swiftwrf.data.labelled import Labelled, Variable, receiver_coordinates
-from swiftwrf.data.receivers import receiver_row
+from swiftwrf.data.dataset import DEGREE_UNITS, Arrays, Labelled
+from swiftwrf.data.rssi import receiver_row
 from swiftwrf.errors import InputError, listed
 from swiftwrf.plotting import Displayed, plan_map
 
@@ -136,17 +136,19 @@ class RssiMap(Labelled, Displayed):
             std_db=self.std.ravel(),
         )
 
-    def coordinates(self) -> dict[str, Variable]:
-        axes = {"x": Variable(("x",), self.x, "m"), "y": Variable(("y",), self.y, "m")}
-        height = {"z": Variable((), np.array(self.height), "m")}
+    def coordinates(self) -> Arrays:
+        metres = {"units": "m"}
+        found: Arrays = {
+            "x": (("x",), self.x, metres),
+            "y": (("y",), self.y, metres),
+            "z": ((), np.array(self.height), metres),
+        }
         cells = np.stack(np.meshgrid(self.x, self.y), axis=-1)
         degrees = degree_columns(self.origin, cells.reshape(-1, 2)).values()
-        names = (("latitude", "degrees_north"), ("longitude", "degrees_east"))
-        places = zip(names, degrees, strict=False)
-        shape = cells.shape[:2]
-        in_degrees = {name: Variable(("y", "x"), values.reshape(shape), unit) for (name, unit), values in places}
-        return axes | height | in_degrees | receiver_coordinates(self.receiver_names)
+        for (name, units), values in zip(DEGREE_UNITS.items(), degrees, strict=False):
+            found[name] = (("y", "x"), values.reshape(cells.shape[:2]), {"units": units})
+        return found | {"receiver": (("receiver",), np.array(self.receiver_names))}
 
-    def variables(self) -> dict[str, Variable]:
+    def variables(self) -> Arrays:
         dimensions = ("receiver", "y", "x")
-        return {"rssi": Variable(dimensions, self.mean, "dBm"), "std": Variable(dimensions, self.std, "dB")}
+        return {"rssi": (dimensions, self.mean, {"units": "dBm"}), "std": (dimensions, self.std, {"units": "dB"})}

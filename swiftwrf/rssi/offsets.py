@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from swiftwrf.data.groups import Offsets
-from swiftwrf.data.rssi import Rssi
+from swiftwrf.data.rssi import Offsets, Rssi
 from swiftwrf.errors import InputError, listed
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi.path_loss import log_distance

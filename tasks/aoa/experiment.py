@@ -6,7 +6,7 @@ from pathlib import Path
 
 from augment import withhold
 from swiftwrf import InputError, Spectra, simulated_room
-from swiftwrf.data import read_spectra
+from swiftwrf.data import load_spectra
 from swiftwrf.data.files import sha256
 from swiftwrf.data.raytraced import sionna
 from tasks.aoa.condition import MeasuredSubset
@@ -93,4 +93,4 @@ def measurements(config: AoaConfig) -> Spectra:
     """
     if config.data is None:
         return simulated_room(seed=config.seed, moving=config.moving or "transmitter")
-    return read_spectra(located(config.data), reading(config))
+    return load_spectra(located(config.data), **reading(config).given)

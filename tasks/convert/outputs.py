@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from swiftwrf import FieldModel, InputError, Prediction, RssiModel, load
-from swiftwrf.data.labelled import Labelled, write_mat
+from swiftwrf.data.dataset import Labelled
 from swiftwrf.data.rasters import Cells, write_geojson, write_geotiff, write_world_file
-from swiftwrf.data.receivers import read_places
+from swiftwrf.data.survey import read_places
+from swiftwrf.data.writing import write_mat
 from swiftwrf.errors import with_article
 from swiftwrf.locate import RssiLocator
 from swiftwrf.rssi.base import RssiPredictor

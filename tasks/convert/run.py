@@ -50,7 +50,7 @@ def _write_new_file(config: ConvertConfig, model: FieldModel | RssiModel | None)
     if model is None and (config.at is not None or config.rx or config.cell is not None or config.height is not None):
         raise InputError(f"--at, --rx, --cell and --height are for models, but {config.source} holds measurements")
     if model is not None and (options := reading(config).given):
-        raise InputError(f"{config.source} is a model; --{options[0].replace('_', '-')} is for measurements")
+        raise InputError(f"{config.source} is a model; --{next(iter(options)).replace('_', '-')} is for measurements")
     check_new_file(out)
     data = _spectra_or_rssi(_read(config), reading(config)) if model is None else predicted(model, config)
     print(f"{write_file(data, out)}: {out}")

@@ -12,9 +12,10 @@ from torch import Tensor
 from swiftwrf import InputError, Rssi, Spectra, load
 from swiftwrf.data import ReadOptions
 from swiftwrf.data.coordinates import degree_columns
+from swiftwrf.data.files import SUFFIXES, read_table
 from swiftwrf.data.formats import RSSI_FORMATS, read
 from swiftwrf.data.store import Store
-from swiftwrf.data.survey import SUFFIXES, has_positions, read_frame
+from swiftwrf.data.survey import has_positions
 from swiftwrf.errors import listed, with_article
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
 from swiftwrf.locate.track import joined
@@ -23,7 +24,7 @@ from tasks.directory import check_new_file
 from tasks.environment import stamp
 from tasks.locate.localizers import BATCH_ROWS
 from tasks.locate.options import LocateConfig
-from tasks.options import SpectraSource, given
+from tasks.options import SpectraSource, TableSource, given
 from tasks.records import Row, rounded, write_table
 from tasks.source import located, observed_spectra, reading
 from tasks.terminal import console, terminal
@@ -100,7 +101,7 @@ def read_rssi(source: str, options: ReadOptions) -> tuple[Rssi, bool]:
     """
     file = Path(source)
     if file.is_file() and file.suffix.lower() in SUFFIXES:
-        frame = read_frame(file)
+        frame = read_table(file)
         if not has_positions(frame, options.columns or {}):
             somewhere = frame.assign(x=0.0, y=0.0, z=0.0)
             columns, filler, offset_by = options.columns, options.filler, options.offset_by
@@ -114,7 +115,7 @@ def read_rssi(source: str, options: ReadOptions) -> tuple[Rssi, bool]:
 def has_column(source: str, name: str) -> bool:
     """Return True if a source is a table that has a column of this name."""
     file = Path(source)
-    return file.is_file() and file.suffix.lower() in SUFFIXES and name in read_frame(file).columns
+    return file.is_file() and file.suffix.lower() in SUFFIXES and name in read_table(file).columns
 
 
 def aligned(data: Rssi, names: tuple[str, ...]) -> Rssi:
@@ -144,6 +145,8 @@ def aligned(data: Rssi, names: tuple[str, ...]) -> Rssi:
 
 
 def _of_spectra(locator: MatchedField, config: LocateConfig, source: str) -> Columns:
+    if unused := given(config, TableSource):
+        raise InputError(f"--{unused[0]} is for RSSI, and {config.model} locates by spectra")
     store, known = observed_spectra(source, reading(config), locator.grid, "locator")
     if known is not None and known.array is not None and known.array != locator.room.array:
         raise InputError(f"{source} has spectra of another array than those that {config.model} was fitted to")

@@ -12,6 +12,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from numpy.typing import NDArray
 from pandas import DataFrame
 from torch import Tensor
 
@@ -40,6 +41,7 @@ MATERIALS = {  # any other is grey
 OTHER = "#999999"
 MAX_PATHS = 25  # of one position that are drawn
 MAX_DOTS = 1000
+FLAT_COSINE = 0.999  # between normals of faces that form one plane
 ENCLOSING_EXTENT = 0.95  # of the scene: a surface from that size on is drawn as outline only
 
 
@@ -141,7 +143,7 @@ def _drawing(surfaces: list[Surface]) -> tuple[Figure, Axes, Any]:
     every = np.concatenate([surface.vertex for surface in surfaces])
     low, high = every.min(axis=0), every.max(axis=0)
     for surface in surfaces:
-        edges, colour = surface.outline(), MATERIALS.get(surface.material.name, OTHER)
+        edges, colour = outline(surface), MATERIALS.get(surface.material.name, OTHER)
         encloses = bool((np.ptp(surface.vertex, axis=0)[:2] > ENCLOSING_EXTENT * (high - low)[:2]).all())
         plan.add_collection(
             LineCollection(
@@ -177,3 +179,20 @@ def _drawing(surfaces: list[Surface]) -> tuple[Figure, Axes, Any]:
         }
         plan.legend(handles=handles, fontsize=7, **below)
     return figure, plan, space
+
+
+def outline(surface: Surface) -> NDArray[Any]:
+    """Return the segments (E, 2, 3) [m] at which faces meet at an angle or end, for a drawing."""
+    corner = surface.vertex[surface.triangle]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    sides: dict[tuple[int, int], list[int]] = {}
+    for number, (a, b, c) in enumerate(surface.triangle.tolist()):
+        for side in ((a, b), (b, c), (c, a)):
+            sides.setdefault((min(side), max(side)), []).append(number)
+    kept = [
+        side
+        for side, (first, *others) in sides.items()
+        if not others or min(abs(normal[first] @ normal[other]) for other in others) < FLAT_COSINE
+    ]
+    return surface.vertex[np.array(kept, dtype=np.int64).reshape(-1, 2)]

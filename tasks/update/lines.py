@@ -15,8 +15,7 @@ from typing import Any, BinaryIO, NamedTuple
 import torch
 
 from swiftwrf import FieldModel, InputError, Rssi, Spectra
-from swiftwrf.data.files import refusing_unreadable
-from swiftwrf.data.survey import SurveyOptions, frame_of, read_survey
+from swiftwrf.data.files import refusing_unreadable, table_of
 from swiftwrf.errors import CONTENT_ERRORS
 from swiftwrf.online import Step
 from swiftwrf.online.prequential import LEVEL
@@ -131,7 +130,7 @@ def measurement(line: Line, config: UpdateConfig, model: FieldModel | RssiModel)
         text = (line.header + line.content).decode("utf-8-sig")
         if line.header:
             assert isinstance(model, RssiModel)
-            return _of_row(text, SurveyOptions(config.column_names, config.fillers, config.coordinates), model)
+            return _of_row(text, config, model)
         content = json.loads(text)
         position, value = [list(map(_number, content["position"]))], content[needed]
         if isinstance(model, RssiModel):
@@ -151,17 +150,16 @@ def _number(value: object) -> float:
     return float(value)
 
 
-def _of_row(text: str, options: SurveyOptions, model: RssiModel) -> Rssi:
+def _of_row(text: str, config: UpdateConfig, model: RssiModel) -> Rssi:
     """Return the measurement in a table of one row; receivers that the model does not have are left out."""
-    survey = read_survey("the table", frame_of("the table", text), options)
-    rssi = zip(survey.receiver_names, survey.rssi_dbm[0].tolist(), strict=True)
+    columns, filler, coordinates = config.column_names, config.fillers, config.coordinates
+    table = table_of("the table", text)
+    data = Rssi.from_frame(table, columns=columns, filler=filler, coordinates=coordinates).about(model.origin)
+    rssi = zip(data.receiver_names, data.rssi_dbm[0].tolist(), strict=True)
     value = {name: x for name, x in rssi if name in model.receiver_names}
     if not value:
         raise InputError("no receiver of the model detected the transmitter")
-    data = Rssi(
-        torch.tensor([list(value.values())]), survey.position, receiver_names=tuple(value), origin=survey.origin
-    )
-    return _of_receivers(data.about(model.origin).transmitter_position.tolist(), value, model)
+    return _of_receivers(data.transmitter_position.tolist(), value, model)
 
 
 def _of_receivers(position: list[list[float]], value: dict[str, float | None], model: RssiModel) -> Rssi:

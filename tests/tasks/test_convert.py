@@ -25,8 +25,7 @@ from test_calibration import spoilt
 from swiftwrf import AngularGrid, InputError, load_rssi, load_spectra, simulated_room
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import ReadOptions
-from swiftwrf.data.coordinates import GeodeticOrigin
-from swiftwrf.data.floors import Floors
+from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.data.rssi import SURVEY
 from swiftwrf.data.writing import write_rssi, write_spectra

@@ -23,10 +23,9 @@ from sklearn.neighbors import KNeighborsRegressor
 
 from swiftwrf import AngularGrid, InputError, RssiModel, Spectra, load_spectra, make_model, rssi_room, simulated_room
 from swiftwrf.data.coordinates import GeodeticOrigin
-from swiftwrf.data.labelled import write_mat
 from swiftwrf.data.rasters import Cells, write_geojson, write_geotiff, write_world_file
-from swiftwrf.data.simulated.room import ShoeboxRoom
-from swiftwrf.data.writing import write_deepmimo, write_paths, write_rssi, write_spectra
+from swiftwrf.data.simulated import ShoeboxRoom
+from swiftwrf.data.writing import write_deepmimo, write_mat, write_paths, write_rssi, write_spectra
 from swiftwrf.rssi.maps import RssiMap
 from tasks.command_line import command_line
 from tasks.convert.options import ConvertConfig

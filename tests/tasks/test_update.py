@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from swiftwrf import FIELD_MODELS, AngularGrid, InputError, RssiConfig, RssiModel, load, make_model
-from swiftwrf.data.floors import Floors
+from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.simulated import rssi_room, simulated_room
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.rssi.floors import FloorAttenuation

@@ -30,44 +30,34 @@ Data = TypeVar("Data", bound=Spectra | Snapshots | Rssi)
 
 @configuration
 class ReadOptions:
-    """Options of reading that files leave open. A reader names those that it takes, and others are refused.
+    """Options of reading that files leave open: the arguments of `load_spectra` and `load_rssi`.
+
+    A reader names those that it takes, and others are refused.
 
     Example:
         >>> ReadOptions(every=2).given
-        ['every']
+        {'every': 2}
     """
 
     array: PlanarArray | None = None
-    """array of the spectra, or for which spectra of paths are computed (default: 4 x 4 at half a wavelength)"""
     beamformer: str | None = None
-    """beamformer for array snapshots (default: phase)"""
     grid: AngularGrid | None = None
-    """directions of computed spectra (default: 90 x 360)"""
     every: PositiveInt | None = None
-    """reads one measurement of that many"""
     station: PositiveInt | None = None
-    """number of the array in a file with several, counted from 1"""
-    columns: Mapping[str, str] | None = None
-    """names of the columns of a table, by what they hold"""
-    filler: tuple[float, ...] | None = None
-    """values of RSSI that stand for not detected, () for none (default: those that are recognised)"""
-    coordinates: Coordinates | None = None
-    """unit of the positions in a table (default: the one that is recognised)"""
-    offset_by: str | None = None
-    """column of a table with groups of rows, e.g. devices, between which RSSI has constant offsets"""
-    transmitter: tuple[str, ...] = ()
-    """columns of a table with the position of the transmitter where both ends move: x, y and z, or one of names"""
-    pool_by: str | None = None
-    """radios of a table to pool into one receiver: "mac", a regular expression, or a column with access points"""
     drop_null: bool = False
-    """leaves out null subcarriers, which are the same at every position and element"""
     round_trip: bool = False
-    """phases are those of the way there and back"""
+    columns: Mapping[str, str] | None = None
+    filler: tuple[float, ...] | None = None
+    coordinates: Coordinates | None = None
+    offset_by: str | None = None
+    transmitter: tuple[str, ...] = ()
+    pool_by: str | None = None
 
     @property
-    def given(self) -> list[str]:
-        """Names of the options that differ from their defaults."""
-        return [field.name for field in fields(self) if getattr(self, field.name) != field.default]
+    def given(self) -> dict[str, Any]:
+        """Options that differ from their defaults, by name."""
+        values = {field.name: (getattr(self, field.name), field.default) for field in fields(self)}
+        return {name: value for name, (value, default) in values.items() if value != default}
 
 
 class Format(ABC, Generic[Data]):

@@ -30,7 +30,7 @@ from swiftwrf.data.files import (
     number,
     numbers,
     read_bytes,
-    read_positions,
+    read_xyz,
     read_yaml,
     sha256,
     sha256_of_all,
@@ -40,7 +40,7 @@ from swiftwrf.data.spectra import Spectra, check_pixels
 from swiftwrf.data.splits import read_splits
 from swiftwrf.data.store import BATCH_PIXELS, MAX_FINE_PIXELS, MAX_MEMORY_PIXELS, Store, stored, too_many
 from swiftwrf.errors import InputError
-from swiftwrf.positions import to_tensor
+from swiftwrf.positions import check_positions, to_tensor
 
 
 @SPECTRA_FORMATS.register("nerf2")
@@ -65,7 +65,7 @@ class Nerf2(Format[Spectra]):
                 f"{path} must hold one of tx_pos.csv (moving transmitter) and rx_pos.csv (moving receiver)"
             )
         moving: Moving = "transmitter" if tables[0].name == "tx_pos.csv" else "receiver"
-        position = read_positions(tables[0])
+        position = check_positions(read_xyz(tables[0]), f"positions of {tables[0]}")
         store, line_of_sight, read = _read_spectra(path, len(position))
         return Spectra(
             store=store,

@@ -14,24 +14,28 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from swiftwrf.data.columns import column_of, column_of_numbers, seconds, text_of
-from swiftwrf.data.coordinates import GeodeticOrigin, without_fix
-from swiftwrf.data.files import digests, numbers, read_yaml
-from swiftwrf.data.fillers import NOT_DETECTED_DBM, find_fillers, without_fillers
-from swiftwrf.data.floors import Floors
+from swiftwrf.data.columns import (
+    NOT_DETECTED_DBM,
+    column_of,
+    column_of_numbers,
+    find_fillers,
+    numbered,
+    seconds,
+    text_of,
+    without_fillers,
+)
+from swiftwrf.data.coordinates import Floors, GeodeticOrigin, without_fix
+from swiftwrf.data.files import digests, numbers, read_table, read_xyz, read_yaml
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
-from swiftwrf.data.groups import numbered
-from swiftwrf.data.receivers import read_receivers, unknown_positions
 from swiftwrf.data.rssi import META, SURVEY, Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
-from swiftwrf.data.survey import read_frame
+from swiftwrf.data.survey import read_receivers, unknown_positions
 from swiftwrf.errors import InputError, listed
 
 TABLES = ("gateway_rssi.csv", "rssi.csv")
 POSITIONS = ("tx_pos.csv", "rx_pos.csv", "beacon_pos.csv")
 RECEIVERS = ("gateway_position.yml", "gateway_pos.csv")
 FILES = ("gateway_rssi.csv", *POSITIONS, *RECEIVERS)  # any of which marks the layout
-AXES = ["x", "y", "z"]
 EMPTY_VALUES = ("", "~", "null", "none")  # of a receiver whose position is unknown
 
 
@@ -47,17 +51,14 @@ class Nerf2Rssi(Format[Rssi]):
     def read(self, path: Path, options: ReadOptions) -> Rssi:
         table, positions = _one_of(path, TABLES), _one_of(path, POSITIONS)
         receivers = next((path / name for name in RECEIVERS if (path / name).is_file()), None)
-        frame, places = read_frame(table), read_frame(positions)
+        frame, position = read_table(table), read_xyz(positions)
         names = list(map(str, frame.columns))
-        if list(places.columns) != AXES:
-            raise InputError(f"{positions} must start with the header x,y,z, got {','.join(places.columns)}")
-        position = np.stack([column_of_numbers(positions, places, axis) for axis in AXES], axis=1)
         omitted, missing = without_fix(position)
         if omitted.all():
             raise InputError(f"{positions} needs 3 finite numbers [m] in each row")
-        if len(frame) != len(places):
+        if len(frame) != len(position):
             raise InputError(
-                f"{path}: {table.name} has {len(frame)} rows, {positions.name} {len(places)}; they must match"
+                f"{path}: {table.name} has {len(frame)} rows, {positions.name} {len(position)}; they must match"
             )
         rssi = np.stack([column_of_numbers(table, frame, name) for name in names], axis=1)
         fillers = sorted({NOT_DETECTED_DBM, *find_fillers(rssi)}) if options.filler is None else list(options.filler)
@@ -90,7 +91,7 @@ class Nerf2Rssi(Format[Rssi]):
 
 def _of_rows(file: Path, n: int) -> tuple[dict[str, Any], list[str]]:
     """Return session and time of each of n rows, (n,), as far as a table has these columns, and a note on times."""
-    frame = read_frame(file)
+    frame = read_table(file)
     session, time = (column_of(frame, role, {}) for role in ("session", "time"))
     found: dict[str, Any] = {}
     notes: list[str] = []

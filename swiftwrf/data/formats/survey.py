@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
-import torch
-from torch import Tensor
-
-from swiftwrf.data.files import digests, lines_before_header
+from swiftwrf.data.files import SUFFIXES, digests, lines_before_header, read_table
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.captures import holds_captures
 from swiftwrf.data.formats.nerf2_rssi import FILES as NERF2_FILES
-from swiftwrf.data.groups import Groups
-from swiftwrf.data.receivers import read_receivers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
-from swiftwrf.data.survey import SEPARATORS, SUFFIXES, SurveyOptions, read_frame, read_survey
+from swiftwrf.data.survey import read_receivers, read_survey
 from swiftwrf.errors import InputError
 
 RECEIVERS = "receivers.csv"  # beside the table: receiver,x,y,z
@@ -37,47 +33,25 @@ class SurveyTable(Format[Rssi]):
                 f"{path} holds {len(tables)} tables ({', '.join(file.name for file in tables)}); name the one to read"
             )
         file, receivers = tables[0], tables[0].with_name(RECEIVERS)
-        stated = SurveyOptions(
-            options.columns,
-            options.filler,
-            options.coordinates,
-            options.offset_by,
-            options.transmitter,
-            options.pool_by,
-        )
-        survey = read_survey(file, read_frame(file), stated)
-        known: Tensor | None = None
-        unknown: list[str] = []
-        if survey.receiver_position is not None:
-            places = [survey.receiver_position[name] for name in survey.receiver_names]
-            known = torch.tensor(places, dtype=torch.float64)
-        elif receivers.is_file():
-            known, unknown = read_receivers(receivers, survey.receiver_names, survey.origin)
-        if survey.receiver_moves and (known is None or unknown):
+        table = read_table(file)
+        data = Rssi(**read_survey(file, table, **options.given), name=file.stem)
+        known, unknown = data.receiver_position, list[str]()
+        if receivers.is_file() and not data.located:
+            known, unknown = read_receivers(receivers, data.receiver_names, data.origin)
+        if data.receiver_moves and (bool(known.isnan().all()) or unknown):
             raise InputError(
                 f"{file}: column {options.transmitter[0]} has names of positions, so {RECEIVERS} beside it must contain "
                 "each of them"
             )
-        skipped = file.suffix.lower() == ".csv" and lines_before_header(file, SEPARATORS)
+        skipped = file.suffix.lower() == ".csv" and lines_before_header(file)
         notes = [f"lines before the header are skipped: {skipped}"] * bool(skipped)
-        splits = read_splits(file.parent, survey.n_rows, first=0)
-        return Rssi(
-            survey.rssi_dbm,
-            survey.position,
-            name=file.stem,
-            receiver_names=survey.receiver_names,
+        splits = read_splits(file.parent, len(table), first=0)
+        return replace(
+            data,
             receiver_position=known,
-            origin=survey.origin,
-            groups=Groups.of(options.offset_by, survey.group) if options.offset_by else None,
-            labels=survey.labels,
-            floors=survey.floors,
-            receiver_moves=survey.receiver_moves,
-            session=survey.session,
-            time=survey.time,
-            index=survey.row,
-            named_splits=kept_splits(splits, torch.from_numpy(survey.row), survey.n_rows),
+            named_splits=kept_splits(splits, data.index, len(table)),
             source=digests([file, *([receivers] if receivers.is_file() else [])], file.parent),
-            notes=(*notes, *survey.notes, *unknown),
+            notes=(*notes, *data.notes, *unknown),
         )
 
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import yaml
+from numpy.typing import NDArray
 from torch import Tensor
-
-from swiftwrf.data.raytraced.surfaces import Material, Surface, box, rectangle
 
 Point = tuple[float, float, float]
 THICKNESS_M = {  # of panels, walls and sheets by material
@@ -25,6 +26,76 @@ THICKNESS_M = {  # of panels, walls and sheets by material
     "wood": 0.02,
 }
 DEFAULT_THICKNESS_M = 0.1
+FACES = [  # of a box, corners counted as x y z bits, counter-clockwise from outside
+    (0, 1, 3, 2),
+    (4, 6, 7, 5),
+    (0, 4, 5, 1),
+    (2, 3, 7, 6),
+    (0, 2, 6, 4),
+    (1, 5, 7, 3),
+]
+Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]  # vertices (V, 3) [m], triangles (F, 3)
+
+
+@dataclass(frozen=True)
+class Material:
+    """A material of ITU-R P.2040 by its name, or any other by its constants.
+
+    Args:
+        name: Name in the recommendation, or another one.
+        thickness_m: Thickness of the slab that reflects [m].
+        relative_permittivity, conductivity: Constants [1, S/m] of a material that is not in the recommendation.
+    """
+
+    name: str
+    thickness_m: float
+    relative_permittivity: float | None = None
+    conductivity: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles of one material.
+
+    Args:
+        name: Name of the object.
+        material: Its material.
+        vertex: Corners, (V, 3) [m].
+        triangle: Indices of three corners each, (F, 3).
+
+    Example:
+        >>> Surface.joined("cube", Material("wood", 0.02), [box((0, 0, 0), (1, 1, 1))]).triangle.shape
+        (12, 3)
+    """
+
+    name: str
+    material: Material
+    vertex: NDArray[np.float64]
+    triangle: NDArray[np.int64]
+
+    @classmethod
+    def joined(cls, name: str, material: Material, meshes: Sequence[Mesh]) -> Surface:
+        """Return one surface of several meshes."""
+        first = np.cumsum([0, *(len(vertex) for vertex, _ in meshes[:-1])])
+        triangles = [triangle + start for (_, triangle), start in zip(meshes, first, strict=True)]
+        return cls(name, material, np.concatenate([vertex for vertex, _ in meshes]), np.concatenate(triangles))
+
+
+def box(low: Sequence[float], high: Sequence[float]) -> Mesh:
+    """Return the twelve triangles of an axis-parallel box, which share its eight corners so that edges diffract."""
+    ends = np.array([low, high], dtype=np.float64)
+    vertex = np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    return vertex, _halved(FACES)
+
+
+def rectangle(corner: Sequence[float], a: Sequence[float], b: Sequence[float]) -> Mesh:
+    """Return two triangles between a corner and the vectors a and b from it."""
+    p, u, v = (np.array(x, dtype=np.float64) for x in (corner, a, b))
+    return np.array([p, p + u, p + u + v, p + v]), _halved([(0, 1, 2, 3)])
+
+
+def _halved(faces: Sequence[tuple[int, int, int, int]]) -> NDArray[np.int64]:
+    return np.array([half for a, b, c, d in faces for half in ((a, b, c), (a, c, d))])
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from torch import Tensor
 
 from swiftwrf.data import Rssi
-from swiftwrf.data.fillers import has_frequent_edge
+from swiftwrf.data.columns import has_frequent_edge
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.diagnostics.path_loss import check_path_loss
 from swiftwrf.errors import listed

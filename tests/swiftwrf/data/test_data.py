@@ -77,7 +77,7 @@ WRONG = {
     "no rows": (_write("tx_pos.csv", "x,y,z\n"), "no rows"),
     "nan": (_positions("nan,1,1"), "row 11, counted from 0"),
     "infinite": (_positions("inf,1,1"), "row 11, counted from 0"),
-    "text": (_positions("here,1,1"), "row 12 holds text"),
+    "text": (_positions("here,1,1"), "row 12, column x: 'here' is not a number"),
     "short row": (_positions("1,1"), "row 12 has 2 values"),
     "at the gateway": (_positions("0,0,0"), "position 11 of .* is that of the fixed end"),
     "more positions than images": (_write("tx_pos.csv", "x,y,z\n" + "1,1,1\n" * 13), "12 images, but there are 13"),

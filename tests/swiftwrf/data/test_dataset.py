@@ -27,10 +27,11 @@ from swiftwrf import (
 from swiftwrf.array import planar
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import load_snapshots
+from swiftwrf.data.columns import Groups
 from swiftwrf.data.formats import SPECTRA_FORMATS
-from swiftwrf.data.groups import Groups, Offsets
 from swiftwrf.data.raytraced import Tracing
-from swiftwrf.data.simulated.room import ShoeboxRoom
+from swiftwrf.data.rssi import Offsets
+from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.data.splits import folds
 from swiftwrf.runtime import cache, durable
 

@@ -11,7 +11,7 @@ from samples import FREQUENCY, WAVELENGTH, write_deepmimo
 
 from swiftwrf import AngularGrid, InputError, load_spectra
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
-from swiftwrf.data.simulated.room import ShoeboxRoom
+from swiftwrf.data.simulated import ShoeboxRoom
 
 GRID = AngularGrid.hemisphere(24, 96)
 

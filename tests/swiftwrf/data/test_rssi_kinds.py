@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from swiftwrf import InputError, Rssi, RssiModel, load, load_rssi
 from swiftwrf.data.coordinates import GeodeticOrigin
-from swiftwrf.data.groups import Offsets
+from swiftwrf.data.rssi import Offsets
 from swiftwrf.data.splits import folds, random_split, repeated_fraction
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.locate import RssiLocator

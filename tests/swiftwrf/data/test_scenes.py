@@ -21,11 +21,12 @@ from quick import run, said
 from swiftwrf import AngularGrid, GeometryModel, InputError, load_spectra, simulated_room
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.data.raytraced import ROOMS, FurnishedRoom, Material, Scene, Surface, Tracing, sionna, trace
-from swiftwrf.data.raytraced.surfaces import box
+from swiftwrf.data.raytraced.rooms import box
 from swiftwrf.data.raytraced.trace import _first
-from swiftwrf.data.simulated.room import ShoeboxRoom
+from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.models.geometry import Plane
 from swiftwrf.models.raytrace import RaytraceModel, surfaces
+from tasks.scenes.page import outline
 from tasks.scenes.run import draw_positions
 
 FREQUENCY = 2.4e9
@@ -72,7 +73,7 @@ def test_a_box_is_closed_and_turned_outwards():
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 2
     assert ((corner.mean(axis=1) - [1.5, 3, 4.5]) * normal).sum(axis=1).min() > 0
     assert np.linalg.norm(normal, axis=1).sum() == pytest.approx(2 * (2 + 3 + 6))
-    assert len(Surface("box", Material("wood", 0.02), vertex, triangle).outline()) == 12
+    assert len(outline(Surface("box", Material("wood", 0.02), vertex, triangle))) == 12
 
 
 # the physics

@@ -19,8 +19,7 @@ from PIL import Image
 from quick import said
 
 from swiftwrf import InputError, Rssi, Spectra, datasets, load_rssi, load_spectra
-from swiftwrf.datasets import conversions
-from swiftwrf.datasets.sources import DATA_SETS, DataSet
+from swiftwrf.datasets import DATA_SETS, DataSet, conversions
 from tasks.command_line import command_line
 from tasks.inspect.options import InspectConfig
 from tasks.inspect.run import run as inspect

@@ -10,7 +10,7 @@ import torch
 from swiftwrf import AngularGrid, InputError, simulated_room
 from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
-from swiftwrf.data.simulated.room import ShoeboxRoom
+from swiftwrf.data.simulated import ShoeboxRoom
 
 FINE = AngularGrid.hemisphere(90, 360)
 

@@ -20,8 +20,7 @@ import torch
 from rooms import room_with_box
 
 from swiftwrf import AngularGrid, GeometryModel, HybridModel, RssiModel, load, make_model
-from swiftwrf.data.simulated import rssi_room, simulated_room
-from swiftwrf.data.simulated.room import ShoeboxRoom
+from swiftwrf.data.simulated import ShoeboxRoom, rssi_room, simulated_room
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.metrics import psnr
 from swiftwrf.models.geometry.planes import Plane

@@ -1,4 +1,4 @@
-"""A simulated room: image sources of a rectangular room with a few boxes in it.
+"""Built-in scenes with exact geometry: spectra in a rectangular room with a few boxes in it, RSSI on an office floor.
 
 Walls mirror the transmitter; up to two reflections give 25 image sources, each visible along a straight line through the
 unfolded rooms (J. B. Allen and D. A. Berkley, "Image method for efficiently simulating small-room acoustics", J. Acoust.
@@ -11,18 +11,40 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from swiftwrf.array.planar import LIGHT_SPEED
+from swiftwrf.array.angles import AngularGrid, ArrayPose
+from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
+from swiftwrf.choices import Moving
 from swiftwrf.data.paths import PropagationPaths
+from swiftwrf.data.rssi import Rssi
+from swiftwrf.data.spectra import Spectra, array_spectra
 from swiftwrf.errors import InputError
-from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, configuration
+from swiftwrf.runtime.validation import (
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    checked,
+    configuration,
+)
 
 MAX_ORDER = 2  # reflections
 Point = tuple[float, float, float]
+GRID = AngularGrid.hemisphere(30, 120)
+FACING_X = ArrayPose((0.1, 2.4, 1.2), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)))  # on the wall x = 0, its normal is +x
+CEILING = ArrayPose((3.0, 2.5, 2.7))  # position of the fixed transmitter, orientation of the level array that moves
+REGION = ((2.2, 1.6, 0.9), (4.2, 3.4, 1.5))  # of the moving end: opposite corners [m]
+BATCH_POSITIONS = 4096  # whose paths take half a gigabyte
+CHANNELS_HZ = (2.402e9, 2.426e9, 2.480e9)  # of BLE advertisements; a receiver does not report the channel
+TRANSMIT_DBM = -8.0
+PACKET_NOISE_DB = 2.0
+SENSITIVITY_DBM = -97.0
+MISSED_SHARE = 0.1  # of packets, lost to scanning gaps and collisions
 
 
 class Rays(NamedTuple):
@@ -163,3 +185,119 @@ def _hits(segments: Sequence[tuple[Tensor, Tensor]], low: Point, high: Point) ->
         a, b = (near - start) / step, (far - start) / step
         enter, leave = torch.maximum(enter, torch.minimum(a, b)), torch.minimum(leave, torch.maximum(a, b))
     return enter < leave
+
+
+@checked
+def simulated_room(
+    n: PositiveInt = 300,
+    moving: Moving = "transmitter",
+    seed: NonNegativeInt = 0,
+    room: ShoeboxRoom | None = None,
+    grid: AngularGrid = GRID,
+    phase_noise: NonNegativeFloat = 0.1,
+    position: Tensor | None = None,
+) -> Spectra:
+    """Return spectra of a 4 x 4 array in the simulated room, with the moving end in a region of 2 x 1.8 x 0.6 m.
+
+    300 positions are a third of a wavelength apart, close enough to interpolate the field between them.
+
+    Args:
+        n: Number of positions.
+        moving: "transmitter": the array hangs on a wall and faces the room. "receiver": the level array moves under a
+            transmitter at the ceiling.
+        seed: Seed of positions and noise.
+        room: Room that contains the region. Defaults to `ShoeboxRoom()`.
+        grid: Directions of the spectra.
+        phase_noise: Standard deviation of the phase at each element [rad].
+        position: Positions of the moving end, (n, 3) [m]. Defaults to random ones.
+
+    Raises:
+        InputError: An argument outside its range, or a position outside the room.
+
+    Example:
+        >>> simulated_room(n=20, moving="receiver").spectrum.shape
+        torch.Size([20, 30, 120])
+    """
+    generator = torch.Generator().manual_seed(seed)
+    room = room or ShoeboxRoom()
+    if position is None:
+        low, high = torch.tensor(REGION, dtype=torch.float64)
+        position = low + (high - low) * torch.rand(n, 3, dtype=torch.float64, generator=generator)
+    position = position.double()
+    pose = FACING_X if moving == "transmitter" else CEILING
+    fixed = torch.tensor(pose.position, dtype=torch.float64)
+    array = PlanarArray.square(4, room.frequency_hz)
+    links = [(some, fixed) if moving == "transmitter" else (fixed, some) for some in position.split(BATCH_POSITIONS)]
+    parts = [room.paths(*ends) for ends in links]
+    channel = torch.cat([paths.channel(array, pose.rotation) for paths in parts])
+    noise = phase_noise * torch.randn(channel.shape, dtype=torch.float64, generator=generator)
+    return Spectra(
+        store=array_spectra(array, channel * torch.polar(torch.ones_like(noise), noise), grid),
+        position=position,
+        array=array,
+        moving=moving,
+        grid=grid,
+        line_of_sight=torch.cat([paths.line_of_sight for paths in parts]),
+        name="simulated-room",
+        fixed_position=fixed,
+        rotation=pose.rotation,
+    )
+
+
+FLOOR = ShoeboxRoom(
+    size=(20.0, 16.0, 3.0),
+    boxes=(
+        ((4.0, 3.0, 0.0), (6.5, 3.4, 2.6)),
+        ((9.0, 7.0, 0.0), (11.0, 9.5, 2.8)),
+        ((14.0, 11.0, 0.0), (14.4, 14.0, 2.6)),
+        ((3.0, 11.5, 0.0), (4.5, 13.0, 2.2)),
+        ((15.5, 3.0, 0.0), (18.0, 4.0, 2.0)),
+    ),
+    reflection=-0.6,
+    blockage=0.3,
+    frequency_hz=2.44e9,
+)
+
+
+@checked
+def rssi_room(n: PositiveInt = 600, seed: NonNegativeInt = 0) -> Rssi:
+    """Return simulated RSSI at twelve receivers, one packet a row and receiver on a random channel.
+
+    Args:
+        n: Number of positions of the transmitter.
+        seed: Seed of positions, gains, channels, noise and misses.
+
+    Raises:
+        InputError: An argument outside its range.
+
+    Example:
+        >>> rssi_room(n=20).rssi_dbm.shape
+        torch.Size([20, 12])
+    """
+    generator = torch.Generator().manual_seed(seed)
+    x, y = torch.meshgrid(torch.tensor([2.5, 7.5, 12.5, 17.5]), torch.tensor([1.0, 8.0, 15.0]), indexing="ij")
+    height = torch.where(torch.arange(12) % 2 == 0, 2.3, 1.2)
+    receiver = torch.stack([x.flatten(), y.flatten(), height], dim=1).double()
+    low, high = torch.tensor([[0.5, 0.5, 1.0], [19.5, 15.5, 1.4]], dtype=torch.float64)
+    position = low + (high - low) * torch.rand(n, 3, dtype=torch.float64, generator=generator)
+    gain_db = 2 * torch.randn(12, dtype=torch.float64, generator=generator)  # receivers differ
+    power = torch.stack([_power(position, place) for place in receiver], dim=1)  # (n, R, channels)
+    channel = torch.randint(len(CHANNELS_HZ), (n, 12, 1), generator=generator)
+    noise = PACKET_NOISE_DB * torch.randn(n, 12, dtype=torch.float64, generator=generator)
+    rssi = (TRANSMIT_DBM + gain_db + power.gather(2, channel)[..., 0] + noise).round()
+    missed = (torch.rand(n, 12, generator=generator) < MISSED_SHARE) | (rssi < SENSITIVITY_DBM)
+    return Rssi(
+        torch.where(missed, torch.nan, rssi),
+        position,
+        receiver_position=receiver,
+        receiver_names=[f"receiver{number:02d}" for number in range(1, 13)],
+        name="simulated-floor",
+    )
+
+
+def _power(position: Tensor, receiver: Tensor) -> Tensor:
+    """Return the power gain of the coherent sum of all paths on each channel, (n, channels) [dB]."""
+    floors = [replace(FLOOR, frequency_hz=f) for f in CHANNELS_HZ]
+    rays = (FLOOR.rays(some, receiver) for some in position.split(BATCH_POSITIONS))
+    sums = torch.cat([torch.stack([floor.gain(part).sum(dim=1).abs() for floor in floors], dim=1) for part in rays])
+    return 20 * sums.clamp_min(1e-9).log10()
