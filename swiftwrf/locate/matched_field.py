@@ -44,7 +44,6 @@ FOLDS = 5
 MIN_SPECTRA = 15
 BATCH_OBSERVATIONS = 16  # searched at a time: their likelihoods at all cells are 26 MB at most
 BATCH_CANDIDATES = 2048  # whose waves are computed together: as many as a processor's cache holds
-FIRST_WEIGHTS = (0.05, 0.05, 0.3)  # of the likelihoods, before calibration
 
 
 @configuration
@@ -215,7 +214,8 @@ class MatchedField(Configured, Saved):
         others = [Region(train.position[fold != number]) for number in range(FOLDS)]
         self.region = region or Region(train.position, outside=outside_mass(others, held_out))
         self._prepare()
-        self.weight, self.inflation = torch.tensor(FIRST_WEIGHTS, dtype=torch.float64), 1.0
+        # weights by which the calibration searches
+        self.weight, self.inflation = torch.tensor([0.05, 0.05, 0.3], dtype=torch.float64), 1.0
         self._calibrate(train.position, features, fold, parts)
         return self
 

@@ -16,9 +16,6 @@ from swiftwrf.errors import InputError
 from swiftwrf.positions import nearest
 
 Evaluate = Callable[[Tensor], Tensor]  # candidates (n, m, 3) to log-likelihoods (k, n, m)
-FLAT = 1e-3  # extent below which a dimension of the region counts as none, as a fraction of the largest extent
-NEIGHBOURS = 8  # the distance to this neighbour gives the scale on which positions fill a region
-QUANTILE = 0.95  # of these distances
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +85,8 @@ class Region:
     def scale_m(self) -> float:
         """Distance [m] from the known positions that their neighbourhood covers."""
         spots = self.known.unique(dim=0)
-        apart, _ = nearest(spots, spots, min(NEIGHBOURS + 1, len(spots)))
-        return float(apart[:, -1].quantile(QUANTILE))
+        apart, _ = nearest(spots, spots, min(9, len(spots)))  # the nearest one is the position itself
+        return float(apart[:, -1].quantile(0.95))
 
     @cached_property
     def _box(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -97,7 +94,7 @@ class Region:
         away = self.known - self.known[0]  # exactly 0 if all positions are one
         middle = self.known[0] + away.mean(dim=0)
         _, size, axes = torch.linalg.svd(away - away.mean(dim=0), full_matrices=False)
-        extended = size > FLAT * size[0].clamp_min(1e-12)
+        extended = size > 1e-3 * size[0].clamp_min(1e-12)
         # a region in all three dimensions is a box along the coordinates, as rooms are
         axes = torch.eye(3, dtype=torch.float64) if bool(extended.sum() == 3) else axes[extended]
         along = (self.known - middle) @ axes.T
@@ -108,14 +105,6 @@ class Region:
     def extent(self) -> Tensor:
         """Lengths of the box, (d,) [m]."""
         return 2 * self._box[2]
-
-    def contains(self, position: Tensor) -> Tensor:
-        """Return True for each position (n, 3) [m] inside the box, (n,)."""
-        centre, axes, half = self._box
-        away = position - centre
-        flat = (away - away @ axes.T @ axes).norm(dim=1)
-        inside: Tensor = ((away @ axes.T).abs() <= half).all(dim=1) & (flat <= self.scale_m)
-        return inside
 
     def is_near(self, position: Tensor) -> Tensor:
         """Return True for each position (n, 3) [m] in the neighbourhood of the known positions, (n,)."""

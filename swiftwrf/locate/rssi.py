@@ -24,9 +24,7 @@ from swiftwrf.runtime.options import Configured, all_or_nothing
 from swiftwrf.runtime.progress import progress as tracked
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 
-MAX_INFLATION_ROWS = 300  # held-out rows that determine the coverage of credible regions
 NEIGHBOUR_COUNTS = (1, 2, 3, 5, 8, 13, 20)
-BLOCK_MARGIN = 0.25  # of the region: a block of a fifth may lie beyond the known positions
 UNDETECTED_BELOW_DB = 5.0  # below the weakest value, of what is not detected, in the space of fingerprints
 
 
@@ -120,7 +118,7 @@ class RssiLocator(Configured, Saved):
         parts = [self._part(train, fold, number) for number in numbers]
         self.region = region or Region(
             known,
-            BLOCK_MARGIN if config.validation == "block" else 0.03,
+            0.25 if config.validation == "block" else 0.03,  # a block of a fifth may lie beyond the known positions
             outside_mass([Region(known[part.kept]) for part in parts], [known[part.out] for part in parts]),
         )
         self.cells = self.region.cells(config.n_cells)
@@ -179,7 +177,7 @@ class RssiLocator(Configured, Saved):
         candidates, position, volume = torch.cat(values, dim=1), torch.cat(positions), torch.cat(masses)
         self.weight = pooled_weights(torch.cat(truth, dim=1), candidates, volume)
         generator = torch.Generator().manual_seed(self.config.seed)
-        rows = torch.randperm(len(position), generator=generator)[:MAX_INFLATION_ROWS]
+        rows = torch.randperm(len(position), generator=generator)[:300]
         log_mass = torch.einsum("k,knm->nm", self.weight, candidates[:, rows]) + volume[rows]
         held_out = Posterior(self.cells.position[None], normalised(log_mass), self.cells.edge_m)
         self.inflation = inflation(held_out, position[rows])

@@ -134,10 +134,11 @@ class PhaseLikelihood:
 
     Args:
         room: Room with P planes, and its paths.
-        log_variance: Logarithms of variances, (4 + P,), relative to the power of the direct path's mean gain. They are those
-            of the direct path's gain, of a first-order gain in each plane, of higher orders relative to the product of their
-            planes' variances and squared gains, of scattering from all directions relative to the power of the channel, and
-            of each element's phasor relative to its power.
+        log_variance: Logarithms of variances, (4 + P,), relative to the power of the direct path's mean gain. The first is
+            that of the direct path's gain, the next P are those of a first-order gain in each plane. The next one is that
+            of higher orders, relative to the product of their planes' variances and squared gains. The last two are those of
+            scattering from all directions, relative to the power of the channel, and of each element's phasor, relative to
+            its power.
     """
 
     def __init__(self, room: GeometryModel, log_variance: Tensor) -> None:
