@@ -19,7 +19,7 @@ from swiftwrf.data.files import refusing_unreadable
 from swiftwrf.data.survey import SurveyOptions, frame_of, read_survey
 from swiftwrf.errors import CONTENT_ERRORS
 from swiftwrf.online import Step
-from swiftwrf.online.prequential import LEVEL
+from swiftwrf.online.scores import LEVEL
 from swiftwrf.rssi import RssiModel
 from tasks.records import strict
 from tasks.update.options import TABLE, UpdateConfig
