@@ -144,7 +144,7 @@ class PhaseLikelihood:
     def __init__(self, room: GeometryModel, log_variance: Tensor) -> None:
         self.log_variance = log_variance
         found, value = room.tensors(), log_variance.exp()
-        direct, plane, (order, self._diffuse, self._floor) = value[0], value[1:-3], value[-3:]
+        direct, plane, (order, self._diffuse, self._floor) = value[0], value[1:-3], value[-3:].unbind()
         second = found.gain[0].square() + plane
         images = [
             plane[planes[0]] if len(planes) == 1 else order * torch.stack([second[i] for i in planes]).prod()

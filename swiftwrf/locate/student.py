@@ -58,7 +58,8 @@ class Student:
     @cached_property
     def whitening(self) -> Tensor:
         """Matrix W (F, F) with residuals @ W of unit scale, float32."""
-        return torch.linalg.inv(torch.linalg.cholesky(self.scale)).T.float()
+        matrix: Tensor = torch.linalg.inv(torch.linalg.cholesky(self.scale)).T.float()
+        return matrix
 
     def log_density(self, distance: Tensor, count: Tensor | None = None) -> Tensor:
         """Return the log-density of squared whitened distances, without the determinants of scale and whitening.
