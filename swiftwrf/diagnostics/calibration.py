@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from scipy.spatial.transform import Rotation
@@ -30,21 +30,14 @@ from swiftwrf.array.beamforming import covariance
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.splits import FOLDS, MIN_TRAINING, slabs
-from swiftwrf.diagnostics.elements import phases_are_constant
+from swiftwrf.diagnostics.elements import phases_are_constant, unit_phasor
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import checked
 
 MAX_TURN = math.radians(45)  # a larger one is an error of frames, not of mounting
-SCAN_STEP = math.radians(9)  # a third of the beam of a 4 x 4 array
-SCANNED_POSITIONS = 150
-MAX_STEPS, MIN_STEP = 40, 1e-6  # of the descent, [rad]
 SINGULAR = 1e-9  # relative eigenvalue below which a matrix is singular
 CLEAR_SHARE = 0.5  # of the received power, along a clear line of sight
-NEIGHBOURHOODS = 20
-MAX_LOSS = 0.02  # of that share at held-out positions
-MIN_CONE = math.radians(20)  # angle between the lines of sight and their mean (median), below which they are too narrow
-MAX_TURN_STD, MAX_PHASE_STD = math.radians(3), math.radians(30)  # beyond, the rotation is not identifiable
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +70,7 @@ class Calibration:
 
     def apply(self, snapshots: Snapshots) -> Snapshots:
         """Return the snapshots with corrected phases of the elements and orientation of the array."""
-        correction = _unit(-self.phase).to(torch.complex64)
+        correction = unit_phasor(-self.phase).to(torch.complex64)
         return replace(
             snapshots,
             channel=snapshots.channel * correction,
@@ -147,16 +140,18 @@ def calibrate(train: Snapshots) -> Calibration:
             f"{math.degrees(MAX_TURN):.0f} degrees; a calibration needs at least {MIN_TRAINING} (is the frame right?)"
         )
     phase_std, turn_std = problem.standard_errors(found)
-    if float(turn_std.max()) > MAX_TURN_STD or float(phase_std.max()) > MAX_PHASE_STD:
+    if float(turn_std.max()) > math.radians(3) or float(phase_std.max()) > math.radians(30):
         reason = "phases change from position to position as no direct path explains"
-        if problem.cone() < MIN_CONE and clear >= len(seen) / 2:
+        mean = problem.direction.mean(dim=0).expand_as(problem.direction)
+        cone = float(angular_distance(problem.direction, mean).median())
+        if cone < math.radians(20) and clear >= len(seen) / 2:
             reason = "measure positions in more directions from the array"
         raise InputError(
             f"{train.name} does not determine the array's orientation and its elements' phases (standard errors "
             f"{math.degrees(float(turn_std.max())):.1f} and {math.degrees(float(phase_std.max())):.0f} degrees); {reason}"
         )
     before, after = problem.held_out(found, slabs(seen.position, FOLDS))
-    if after < before - MAX_LOSS:
+    if after < before - 0.02:
         raise InputError(
             f"a calibration of {train.name} does harm at held-out positions: {before:.0%} of the received power arrives "
             f"along the line of sight without, {after:.0%} with it"
@@ -168,13 +163,6 @@ def calibrate(train: Snapshots) -> Calibration:
 class _Found:
     phase: Tensor  # (K,)
     turn: Tensor  # (3,)
-
-
-class _System(NamedTuple):
-    """Normal equations of the residual phases for small changes of all phases but the first, and of the rotation."""
-
-    normal: Tensor  # (p, p)
-    score: Tensor  # (p,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,15 +180,10 @@ class _Problem:
 
     @classmethod
     def of(cls, data: Snapshots) -> _Problem:
-        received = covariance(_unit(data.channel.angle().double()))
+        received = covariance(unit_phasor(data.channel.angle().double()))
         return cls(
             data.array, data.position, data.direction, received, torch.linalg.eigh(received).eigenvectors[..., -1]
         )
-
-    def cone(self) -> float:
-        """Return the median angle [rad] between the lines of sight and their mean direction."""
-        mean = self.direction.mean(dim=0).expand_as(self.direction)
-        return float(angular_distance(self.direction, mean).median())
 
     def subset(self, rows: Tensor) -> _Problem:
         return _Problem(
@@ -209,10 +192,14 @@ class _Problem:
 
     def scan(self) -> _Found:
         """Return the best of the scanned rotations, with its phases."""
-        few = self.subset(
-            torch.linspace(0, len(self.direction) - 1, min(SCANNED_POSITIONS, len(self.direction))).round().long()
-        )
-        _, phase, turn = max(((*few._phases(turn), turn) for turn in _turns()), key=lambda found: found[0])
+        n = len(self.direction)
+        few = self.subset(torch.linspace(0, n - 1, min(150, n)).round().long())
+        # a cubic grid of a third of the beam of a 4 x 4 array within the largest rotation
+        step = math.radians(9)
+        line = torch.arange(-MAX_TURN, MAX_TURN + step / 2, step, dtype=torch.float64)
+        turns = torch.cartesian_prod(line, line, line)
+        turns = turns[turns.norm(dim=1) <= MAX_TURN + 1e-9]
+        _, phase, turn = max(((*few._phases(turn), turn) for turn in turns), key=lambda found: found[0])
         return _Found(phase, turn)
 
     def _phases(self, turn: Tensor) -> tuple[float, Tensor]:
@@ -224,17 +211,18 @@ class _Problem:
 
     def descend(self, found: _Found) -> _Found:
         """Minimise the residual phases by Gauss-Newton steps, reweighted in each."""
-        for _ in range(MAX_STEPS):
-            system = self._system(found)
-            step = torch.linalg.pinv(system.normal, rtol=SINGULAR, hermitian=True) @ system.score
+        for _ in range(40):
+            normal, score = self._system(found)
+            step = torch.linalg.pinv(normal, rtol=SINGULAR, hermitian=True) @ score
             turned = Rotation.from_rotvec(found.turn.numpy()) * Rotation.from_rotvec(step[-3:].numpy())
             phase = found.phase + torch.cat([torch.zeros(1, dtype=torch.float64), step[:-3]])
             found = _Found(phase, torch.from_numpy(turned.as_rotvec()))
-            if float(step.abs().max()) < MIN_STEP:
+            if float(step.abs().max()) < 1e-6:
                 break
         return found
 
-    def _system(self, found: _Found) -> _System:
+    def _system(self, found: _Found) -> tuple[Tensor, Tensor]:
+        """Return the normal equations (p, p), (p,) of residual phases for changes of all phases but one, and of rotation."""
         residual = self.strongest * self._response(found).conj()
         residual = (residual * residual.sum(1, keepdim=True).conj()).angle()
         n, k = residual.shape
@@ -249,10 +237,7 @@ class _Problem:
         # phases err in proportion to the fraction 1 - share of the power that does not arrive along the direct path
         weight = (share / CLEAR_SHARE).clamp(0, 1) ** 4 / (1.02 - share) ** 2
         weighted = weight[:, None, None] * jacobian
-        return _System(
-            normal=torch.einsum("nkp,nkq->pq", weighted, jacobian),
-            score=torch.einsum("nkp,nk->p", weighted, residual),
-        )
+        return torch.einsum("nkp,nkq->pq", weighted, jacobian), torch.einsum("nkp,nk->p", weighted, residual)
 
     def shares(self, found: _Found) -> Tensor:
         """Return the fraction of the received power at each position that arrives along the line of sight, (n,)."""
@@ -261,17 +246,17 @@ class _Problem:
 
     def _response(self, found: _Found) -> Tensor:
         """Return the response to the direct path alone, (n, K)."""
-        return self._steering(found.turn) * _unit(found.phase)
+        return self._steering(found.turn) * unit_phasor(found.phase)
 
     def _steering(self, turn: Tensor) -> Tensor:
-        return _unit(self.array.phase(self.direction @ _matrix(turn)))
+        return unit_phasor(self.array.phase(self.direction @ _matrix(turn)))
 
     def standard_errors(self, found: _Found) -> tuple[Tensor, Tensor]:
         """Return the jackknife standard errors of the phases (K,) and of the rotation (3,), infinite if not identifiable."""
-        normal = self._system(found).normal
+        normal, _ = self._system(found)
         if torch.linalg.matrix_rank(normal, rtol=SINGULAR, hermitian=True) < len(normal):
             return torch.full_like(found.phase, math.inf), torch.full_like(found.turn, math.inf)
-        group = slabs(self.position, min(NEIGHBOURHOODS, len(self.position)))
+        group = slabs(self.position, min(20, len(self.position)))
         count = int(group.max()) + 1
         away = []
         for number in range(count):
@@ -292,17 +277,6 @@ class _Problem:
         return float(self.shares(nothing).mean()), float(after.mean())
 
 
-def _unit(phase: Tensor) -> Tensor:
-    return torch.polar(torch.ones_like(phase), phase)
-
-
 def _matrix(turn: Tensor) -> Tensor:
     """Return the matrix of a rotation vector (3,)."""
     return torch.from_numpy(Rotation.from_rotvec(turn.numpy()).as_matrix())
-
-
-def _turns() -> list[Tensor]:
-    """Return the rotation vectors of a cubic grid within the largest rotation."""
-    steps = torch.arange(-MAX_TURN, MAX_TURN + SCAN_STEP / 2, SCAN_STEP, dtype=torch.float64)
-    grid = torch.cartesian_prod(steps, steps, steps)
-    return list(grid[grid.norm(dim=1) <= MAX_TURN + 1e-9])

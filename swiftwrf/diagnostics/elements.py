@@ -15,17 +15,6 @@ from torch import Tensor
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.snapshots import Snapshots
 
-LATTICE_TOLERANCE_WAVELENGTHS = 1e-3  # between coordinates of elements in one row or column
-MIN_FLIP_GAIN = 0.15  # in the fraction of the power along the line of sight, above no flips and above chance
-MIN_FLIP_SHARE = 0.75  # of the power along the line of sight, once flips are taken back
-MIN_DOUBLED_SHARE = 0.5  # of the power of the squared channel along the line of sight, which flips do not change
-MIN_ALONG = 0.45  # of the power along a line of sight, above that of random phases
-MIN_FLIP_COSINE = 0.85  # mean magnitude of the cosine between flipping and steady elements; 0.64 for random phases
-MIN_CORRELATION = 0.8  # between the signs of elements that flip together
-MIN_COMMON_SHARE = 0.8  # of the power in one direction, to call phases constant
-MAX_GEOMETRIC_SHARE = 0.65  # the same by the lines of sight: beyond, they are too close to each other
-MAX_SNAPSHOTS = 8  # subcarriers or packets of a position that are used
-CHANCE_SHIFTS = 5  # pairings of channels with lines of sight of other positions
 ROUND_TRIP = (
     "the phases are those of the way there and back, as of RFID and backscatter (--round-trip); elements are then "
     "{spacing:.2f} wavelengths apart{ambiguous}"
@@ -50,7 +39,7 @@ def other_readings(data: Snapshots) -> dict[str, Snapshots]:
 
 def _element_orders(array: PlanarArray) -> dict[str, Tensor]:
     """Return the order (K,) of the channels if elements of a lattice are given along its other axis, by description."""
-    tolerance = LATTICE_TOLERANCE_WAVELENGTHS * array.wavelength
+    tolerance = 1e-3 * array.wavelength  # between coordinates of elements in one row or column
     sites = [_ranks(array.element[:, axis], tolerance) for axis in (0, 1)]
     columns, rows = (int(rank.max()) + 1 for rank in sites)
     if columns * rows != len(array.element) or min(rows, columns) < 2:
@@ -82,9 +71,9 @@ def arrives_along(data: Snapshots, direction: Tensor) -> bool:
     Random phases at K elements have the fraction 1 / K along any direction. Only the excess over it counts, and it must be
     larger for fewer elements, whose phases agree more easily by chance.
     """
-    residual = _unit_channel(data) * _steering(data.array, direction)[:, None].conj()
+    residual = _unit_channel(data) * unit_phasor(data.array.phase(direction))[:, None].conj()
     share, chance = float(residual.mean(dim=-1).abs().square().mean()), 1 / residual.shape[-1]
-    return (share - chance) / (1 - chance) >= MIN_ALONG + chance
+    return (share - chance) / (1 - chance) >= 0.45 + chance
 
 
 def flipping_elements(data: Snapshots) -> list[int]:
@@ -92,21 +81,23 @@ def flipping_elements(data: Snapshots) -> list[int]:
 
     Of two groups that flip against each other, the larger one counts as steady.
     """
-    channel, steering = _unit_channel(data), _steering(data.array, data.direction)
+    channel, steering = _unit_channel(data), unit_phasor(data.array.phase(data.direction))
     residual = channel * steering[:, None].conj()
     plain, doubled = (residual.pow(power).mean(dim=-1).abs().square() for power in (1, 2))
     sign, mended = _without_flips(residual)
-    rolled = (steering.roll(shift, 0) for shift in _shifts(len(data)))
+    # pairings of channels with lines of sight of other positions
+    rolled = (steering.roll(shift, 0) for shift in {max(1, len(data) * k // 6) for k in range(1, 6)})
     chance = torch.stack([_without_flips(channel * other[:, None].conj())[1].mean() for other in rolled]).mean()
     gain = min(mended.mean() - plain.mean(), mended.mean() - chance)
-    if gain < MIN_FLIP_GAIN or mended.median() < MIN_FLIP_SHARE or doubled.median() < MIN_DOUBLED_SHARE:
+    # fractions of the power along the line of sight; flips do not change that of the squared channel
+    if gain < 0.15 or mended.median() < 0.75 or doubled.median() < 0.5:
         return []
     signs = sign.flatten(0, 1)
-    together = (signs.T @ signs / len(signs)).abs() > MIN_CORRELATION
+    together = (signs.T @ signs / len(signs)).abs() > 0.8
     steady = together[int(together.sum(dim=1).argmax())]
     reference = residual[..., steady].mean(dim=-1, keepdim=True).angle()
-    cosine = (residual * torch.polar(torch.ones_like(reference), -reference)).real.abs().mean(dim=(0, 1))
-    if bool((cosine[~steady] < MIN_FLIP_COSINE).any()):  # phases that change by other angles
+    cosine = (residual * unit_phasor(-reference)).real.abs().mean(dim=(0, 1))
+    if bool((cosine[~steady] < 0.85).any()):  # phases that change by other angles; random ones have a mean of 0.64
         return []
     return [number + 1 for number in (~steady).nonzero()[:, 0].tolist()]
 
@@ -114,32 +105,28 @@ def flipping_elements(data: Snapshots) -> list[int]:
 def _without_flips(residual: Tensor) -> tuple[Tensor, Tensor]:
     """Return the signs (n, S, K) that align residual phases best, and the fraction of the power with them (n, S)."""
     axis = residual.square().mean(dim=-1, keepdim=True).angle() / 2
-    aligned = residual * torch.polar(torch.ones_like(axis), -axis)
+    aligned = residual * unit_phasor(-axis)
     sign = torch.where(aligned.real < 0, -1.0, 1.0).double()
     return sign, (aligned * sign).mean(dim=-1).abs().square()
 
 
-def _shifts(n: int) -> list[int]:
-    return sorted({max(1, n * k // (CHANCE_SHIFTS + 1)) for k in range(1, CHANCE_SHIFTS + 1)})
-
-
 def phases_are_constant(data: Snapshots) -> bool:
     """Return True if the phases between elements hardly depend on the position, although the lines of sight differ."""
-    channel, steering = _unit_channel(data), _steering(data.array, data.direction)
+    channel, steering = _unit_channel(data), unit_phasor(data.array.phase(data.direction))
     each = channel.mT @ channel.conj() / channel.shape[1]
     of_one_position = torch.linalg.eigvalsh(each)[:, -1].mean()
     common = torch.linalg.eigvalsh(each.mean(dim=0))[-1] / of_one_position
     geometric = torch.linalg.eigvalsh(steering.T @ steering.conj() / len(data))[-1] / len(data.array.element)
-    return bool(common > MIN_COMMON_SHARE and geometric < MAX_GEOMETRIC_SHARE)
+    # beyond 0.65 the lines of sight are too close to each other
+    return bool(common > 0.8 and geometric < 0.65)
 
 
 def _unit_channel(data: Snapshots) -> Tensor:
     """Return the phases of some snapshots of each position, complex128 (n, S, K)."""
-    few = data.channel[:, :: max(1, data.channel.shape[1] // MAX_SNAPSHOTS)]
-    phase = few.angle().double()
-    return torch.polar(torch.ones_like(phase), phase)
+    few = data.channel[:, :: max(1, data.channel.shape[1] // 8)]
+    return unit_phasor(few.angle().double())
 
 
-def _steering(array: PlanarArray, direction: Tensor) -> Tensor:
-    phase = array.phase(direction)
+def unit_phasor(phase: Tensor) -> Tensor:
+    """Return exp(j phase) for phases [rad] of any shape."""
     return torch.polar(torch.ones_like(phase), phase)

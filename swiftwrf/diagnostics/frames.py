@@ -17,8 +17,9 @@ sight that the error implies: peaks alone may agree by chance.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,22 +37,11 @@ from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import slabs
 from swiftwrf.diagnostics.elements import arrives_along, other_readings
 
-SIGMA = math.radians(10)
-MAX_ANGLE_DEG = 10.0  # median angle between peak and line of sight in a frame that fits
-MAX_POSITIONS = 300
+MIN_CLEAR_POSITIONS = 20  # with line of sight, to check frames
 MIN_EVIDENCE = 0.15  # agreement above chance to accept a frame, and above the declared frame to prefer another one
-MIN_EXPLAINED = 0.5  # agreement with an error that is named
-TIE = 0.03  # difference in agreement of explanations that are not distinguished
-EQUAL_PEAKS = 0.97  # of the largest magnitude: peaks above it are alternatives
-MAX_PEAKS = 8
-SCANNED_ROTATIONS = 4000
-# of a constant rotation that is reported, and the largest difference between those of two halves of the positions
+# angle of a constant rotation that is reported, and the largest difference between those of two halves of the positions
 MIN_TURN = math.radians(5)
-MIN_TURN_EXPLAINED = 0.8  # agreement with a constant rotation that is reported: with three angles, much is explained
-MIN_TURN_GAIN = 0.03  # in agreement, of such a rotation
-NARROW_DEG = 10.0  # angle between lines of sight (median of pairs), below which no frame can be checked
-MAX_STEADY = 0.25  # angle between peaks relative to that between lines of sight, below which spectra hardly differ
-SCANNED_OFFSETS = 40  # of a mirror
+MIN_GAIN = 0.03  # in agreement, of such a rotation or of a mirror
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
 AXES = torch.eye(3, dtype=torch.float64)
 SWAPS = {"x and y": AXES[[1, 0, 2]], "y and z": AXES[[0, 2, 1]], "x and z": AXES[[2, 1, 0]]}
@@ -83,7 +73,6 @@ AZIMUTH_ERRORS = {
         "the array's x and y are swapped",
     ): ((0, 1), (1, 0)),
 }
-MIN_CLEAR_POSITIONS = 20  # with line of sight, to check frames
 
 
 @dataclass(frozen=True)
@@ -122,17 +111,17 @@ class FrameReport:
     @property
     def fits(self) -> bool:
         """True if the declared frame explains most peaks, and no other frame does clearly better."""
-        return self.follows and self.angle_deg <= MAX_ANGLE_DEG
+        return self.follows and self.angle_deg <= 10
 
     @property
     def narrow(self) -> bool:
         """True if all lines of sight have nearly one direction, so that frames cannot be checked."""
-        return self.span_deg < NARROW_DEG
+        return self.span_deg < 10
 
     @property
     def steady(self) -> bool:
         """True if the spectra hardly differ, although the lines of sight do."""
-        return not self.narrow and self.peak_span_deg < MAX_STEADY * self.span_deg
+        return not self.narrow and self.peak_span_deg < self.span_deg / 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,32 +181,32 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None, beamforme
     rows = spectra.line_of_sight.nonzero()[:, 0]
     if len(rows) < MIN_CLEAR_POSITIONS or spectra.fixed_position is None or spectra.rotation is None:
         return None
-    rows = rows[torch.linspace(0, len(rows) - 1, min(MAX_POSITIONS, len(rows))).round().long()]
+    rows = rows[torch.linspace(0, len(rows) - 1, min(300, len(rows))).round().long()]
     sign = 1.0 if spectra.moving == "transmitter" else -1.0
     frame = _Frame(spectra.position[rows], spectra.fixed_position, spectra.rotation, sign, spectra.array)
     peak, declared = frame.peaks(spectra.store[rows], spectra.grid), frame.direction()
     agreement, chance = _agreement(declared, peak)
-    towards = dict(_others(frame, computed=snapshots is not None))
-    found = {name: _agreement(to, peak) for name, to in towards.items()}
     seen = None if snapshots is None else snapshots.subset(rows)
     readings = {} if seen is None else other_readings(seen)
+    # directions of the line of sight and peaks under each error
+    tried = {name: (to, peak) for name, to in _others(frame, computed=seen is not None)}
     for name, other in readings.items():
-        found[name] = _agreement(declared, frame.peaks(other.spectra(spectra.grid, beamformer).store[:], spectra.grid))
+        tried[name] = declared, frame.peaks(other.spectra(spectra.grid, beamformer).store[:], spectra.grid)
+    found = {name: _agreement(*pair) for name, pair in tried.items()}
     best = max(value for value, _ in found.values())
     for name, to in _mirrors(frame, peak):
-        if (pair := _agreement(to, peak))[0] >= best + MIN_TURN_GAIN:
-            towards[name], found[name] = to, pair
-    named, by_chance = max(found.values())
+        if (agreed := _agreement(to, peak))[0] >= best + MIN_GAIN:
+            tried[name], found[name] = (to, peak), agreed
+    named, names = best_explanations({name: value for name, (value, _) in found.items()}, tie=0.03)
     turn, turned, turned_by_chance = _constant_turn(frame, peak)
-    clear = named - max(by_chance, agreement) >= MIN_EVIDENCE
-    error = clear and named >= max(MIN_EXPLAINED, turned - MIN_TURN_GAIN)
-    explanations = [name for name, (value, _) in found.items() if error and value >= named - TIE]
+    clear = named - max(max(found.values())[1], agreement) >= MIN_EVIDENCE
+    # with three angles, a rotation explains much
+    error = clear and named >= max(0.5, turned - MIN_GAIN)
+    explanations = names if error else []
     if seen is not None:
-        explanations = [
-            name for name in explanations if arrives_along(readings.get(name, seen), towards.get(name, declared))
-        ]
-    rotates = not explanations and turned >= MIN_TURN_EXPLAINED and turned - turned_by_chance >= MIN_EVIDENCE
-    rotates = rotates and float(np.linalg.norm(turn)) >= MIN_TURN and turned - agreement >= MIN_TURN_GAIN
+        explanations = [name for name in explanations if arrives_along(readings.get(name, seen), tried[name][0])]
+    rotates = not explanations and turned >= 0.8 and turned - turned_by_chance >= MIN_EVIDENCE
+    rotates = rotates and float(np.linalg.norm(turn)) >= MIN_TURN and turned - agreement >= MIN_GAIN
     rotates = rotates and (seen is None or arrives_along(seen, seen.direction @ _matrix(turn)))
     rotates = rotates and _constant(turn, frame, peak)
     return FrameReport(
@@ -234,13 +223,43 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None, beamforme
     )
 
 
+def best_explanations(score: Mapping[str, float], tie: float) -> tuple[float, list[str]]:
+    """Return the highest score of the hypotheses, and the names of those that are not distinguished from the best.
+
+    Args:
+        score: Score of each hypothesis by its name.
+        tie: Difference in score of hypotheses that are not distinguished.
+    """
+    best = max(score.values(), default=0.0)
+    return best, [name for name, value in score.items() if value >= best - tie]
+
+
+def mirror(position: Tensor, axis: int, offset: float) -> Tensor:
+    """Return positions (n, 3) with coordinate x of an axis replaced by offset - x."""
+    mirrored = position.clone()
+    mirrored[:, axis] = offset - position[:, axis]
+    return mirrored
+
+
+def best_offset(coordinate: Tensor, score: Callable[[float], Any]) -> tuple[float, float]:
+    """Return the offset of the mirror with the highest score, and the step of the scanned offsets.
+
+    Args:
+        coordinate: Coordinates (n,) along the mirrored axis, in whose range the mirror lies.
+        score: Score of an offset.
+    """
+    low, high = 2 * float(coordinate.amin()), 2 * float(coordinate.amax())
+    offsets = torch.linspace(low, high, 40).tolist()
+    return max(offsets, key=score), (high - low) / 39
+
+
 def _peaks(spectra: Tensor, grid: AngularGrid) -> Tensor:
     """Return the directions of the largest magnitude of each spectrum and of other peaks of nearly its height, (n, P, 3)."""
     padded = functional.pad(functional.pad(spectra, (1, 1), mode="circular"), (0, 0, 1, 1), value=-math.inf)
     highest = spectra.amax(dim=(1, 2), keepdim=True)
-    is_peak = (spectra == functional.max_pool2d(padded, 3, stride=1)) & (spectra >= EQUAL_PEAKS * highest)
-    height, pixel = (spectra * is_peak).flatten(1).topk(min(MAX_PEAKS, spectra[0].numel()))
-    used = height >= EQUAL_PEAKS * height[:, :1]
+    is_peak = (spectra == functional.max_pool2d(padded, 3, stride=1)) & (spectra >= 0.97 * highest)
+    height, pixel = (spectra * is_peak).flatten(1).topk(min(8, spectra[0].numel()))
+    used = height >= 0.97 * height[:, :1]
     pixel = pixel.where(used, pixel[:, :1])[:, : int(used.sum(dim=1).max())]
     return grid.direction.flatten(0, 1)[pixel]
 
@@ -251,7 +270,7 @@ def _nearest(direction: Tensor, peak: Tensor) -> Tensor:
 
 
 def _kernel(angle: Tensor) -> Tensor:
-    return torch.exp(-0.5 * (angle / SIGMA).square())
+    return torch.exp(-0.5 * (angle / math.radians(10)).square())
 
 
 def _agreement(direction: Tensor, peak: Tensor) -> tuple[float, float]:
@@ -298,10 +317,10 @@ def _frames(frame: _Frame) -> Iterator[tuple[str, _Frame]]:
     for names, swap in SWAPS.items():
         yield f"{names} of the positions are swapped", frame.mapped(swap)
         yield f"{names} of positions and array are swapped against the orientation", frame.mapped(swap, both=True)
-    for axis, mirror in MIRRORS.items():
-        yield f"{axis} of the positions has the wrong sign", frame.mapped(mirror)
+    for axis, matrix in MIRRORS.items():
+        yield f"{axis} of the positions has the wrong sign", frame.mapped(matrix)
         against = f"{axis} of positions and array has the wrong sign against the orientation"
-        yield against, frame.mapped(mirror, both=True)
+        yield against, frame.mapped(matrix, both=True)
     for unit, scale in UNITS.items():
         yield f"the positions are in {unit}, the array's is in metres", frame.mapped(scale * AXES)
         metres = f"the array's position is in {unit}, the others are in metres"
@@ -312,15 +331,15 @@ def _mirrors(frame: _Frame, peak: Tensor) -> Iterator[tuple[str, Tensor]]:
     """Yield the directions (n, 3) of the line of sight for the mirror c - x of each axis with most agreement."""
     every = torch.cat([frame.position, frame.fixed[None]])
     for number, axis in enumerate("xyz"):
-        low, high = 2 * float(every[:, number].amin()), 2 * float(every[:, number].amax())
-        mirrored = {}
-        for offset in torch.linspace(low, high, SCANNED_OFFSETS).tolist():
-            position = frame.position.clone()
-            position[:, number] = offset - position[:, number]
-            mirrored[offset] = replace(frame, position=position).direction()
-        offset = max(mirrored, key=lambda c: _agreement(mirrored[c], peak))
-        name = f"{axis} of the positions counts from the other side (near {axis} = {offset:.1f} - {axis})"
-        yield name, mirrored[offset]
+
+        def mirrored(offset: float, number: int = number) -> Tensor:
+            return replace(frame, position=mirror(frame.position, number, offset)).direction()
+
+        offset, _ = best_offset(every[:, number], lambda offset: _agreement(mirrored(offset), peak))
+        yield (
+            f"{axis} of the positions counts from the other side (near {axis} = {offset:.1f} - {axis})",
+            mirrored(offset),
+        )
 
 
 def _constant_turn(frame: _Frame, peak: Tensor) -> tuple[NDArray[np.float64], float, float]:
@@ -331,7 +350,7 @@ def _constant_turn(frame: _Frame, peak: Tensor) -> tuple[NDArray[np.float64], fl
     """
     if frame.linear:
         return np.zeros(3), *_agreement(frame.direction(), peak)
-    scanned = Rotation.random(SCANNED_ROTATIONS, rng=np.random.default_rng(0))
+    scanned = Rotation.random(4000, rng=np.random.default_rng(0))
     turns = Rotation.concatenate([Rotation.identity(), scanned])
     matrices, towards = torch.from_numpy(turns.as_matrix()).float(), frame.towards().float()
     score = torch.cat(

@@ -17,20 +17,11 @@ from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
-from swiftwrf.diagnostics.frames import MIRRORS, SWAPS, UNITS
+from swiftwrf.diagnostics.frames import MIRRORS, SWAPS, UNITS, best_explanations, best_offset, mirror
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
 
-MIN_VARIANCE_GAIN = 0.1  # in explained variance, to prefer another frame
 MIN_EXPLAINED = 0.25  # of the variance, by an error that is named
-MIN_ATTAINED = 0.9  # fraction of the limit that an error that is named explains
-MAX_MISPLACED = 0.5  # fraction of the limit, below which the declared frame does not fit
-MAX_ROWS, MAX_RECEIVERS = 2000, 20  # that are compared
-MAX_FITTED_ROWS = 400  # for the limit
-ZOOMS, ZOOM = 4, 4.0  # grids of positions of a receiver, and the ratio of their sizes
-MIN_DISTANCE_RATIO = 1e-3  # of a receiver, relative to the extent of the positions
 TIE = 0.02  # difference in explained variance of errors that are not distinguished
-MIN_EXTENT_M = 1e-6  # of an axis along which positions differ
-SCANNED_OFFSETS = 40  # of a mirror
 
 
 @dataclass(frozen=True)
@@ -67,9 +58,10 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
     """
     if not data.located:
         return None
-    report = _declared(data)
-    data = data.subset(torch.linspace(0, len(data) - 1, min(MAX_ROWS, len(data))).round().long())
-    data = data.columns(data.detected.sum(dim=0).argsort(descending=True, stable=True)[:MAX_RECEIVERS].tolist())
+    model = fit_path_loss(log_distance(data.transmitter_position, data.receiver_position), data.rssi_dbm, shared=True)
+    report = PathLossReport(_explained(data.transmitter_position, data), float(model.level), float(-model.slope / 10))
+    data = _some_rows(data, 2000)
+    data = data.columns(data.detected.sum(dim=0).argsort(descending=True, stable=True)[:20].tolist())
     place = data.transmitter_position
     found = {meaning: _explained(other, data) for meaning, other in _others(place)}
     best = max(found.values(), default=0.0)
@@ -78,20 +70,17 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
         for axis, offset, value in _mirrors(place, data)
         if value >= best + TIE
     }
-    best, declared, attainable = max(found.values(), default=0.0), _explained(place, data), _attainable(data)
+    best, names = best_explanations(found, TIE)
+    declared, attainable = _explained(place, data), _attainable(data)
     report = replace(report, attainable=attainable)
-    if best >= max(MIN_EXPLAINED, MIN_ATTAINED * attainable) and best - declared >= MIN_VARIANCE_GAIN:
-        named = [name for name, value in found.items() if value >= best - TIE]
-        return replace(report, explanation="; or if ".join(named))
-    return replace(report, misplaced=attainable >= MIN_EXPLAINED and declared < MAX_MISPLACED * attainable)
+    if best >= max(MIN_EXPLAINED, 0.9 * attainable) and best - declared >= 0.1:
+        return replace(report, explanation="; or if ".join(names))
+    return replace(report, misplaced=attainable >= MIN_EXPLAINED and declared < attainable / 2)
 
 
-def _declared(data: Rssi) -> PathLossReport:
-    """Return the report of the declared frame."""
-    distance = log_distance(data.transmitter_position, data.receiver_position)
-    model = fit_path_loss(distance, data.rssi_dbm, shared=True)
-    explained = _explained(data.transmitter_position, data)
-    return PathLossReport(explained, float(model.level), float(-model.slope / 10))
+def _some_rows(data: Rssi, count: int) -> Rssi:
+    """Return at most `count` rows, equally spaced."""
+    return data.subset(torch.linspace(0, len(data) - 1, min(count, len(data))).round().long())
 
 
 def _others(place: Tensor) -> Iterator[tuple[str, Tensor]]:
@@ -102,15 +91,15 @@ def _others(place: Tensor) -> Iterator[tuple[str, Tensor]]:
             yield f"{names} of the positions are swapped", place @ swap
     for unit, scale in UNITS.items():
         yield f"the positions are in {unit}, the receivers' in metres", place * scale
-    for axis, mirror in MIRRORS.items():
+    for axis, matrix in MIRRORS.items():
         if axis in varying:
-            yield f"{axis} of the positions has the wrong sign", place @ mirror
+            yield f"{axis} of the positions has the wrong sign", place @ matrix
 
 
 def _varying(place: Tensor) -> set[str]:
     """Return the axes along which positions (n, 3) differ."""
     extent = place.amax(dim=0) - place.amin(dim=0)
-    return {axis for axis, size in zip("xyz", extent.tolist(), strict=True) if size > MIN_EXTENT_M}
+    return {axis for axis, size in zip("xyz", extent.tolist(), strict=True) if size > 1e-6}
 
 
 def _mirrors(place: Tensor, data: Rssi) -> Iterator[tuple[str, float, float]]:
@@ -122,13 +111,9 @@ def _mirrors(place: Tensor, data: Rssi) -> Iterator[tuple[str, float, float]]:
             continue
 
         def explained(offset: float, number: int = number) -> float:
-            mirrored = place.clone()
-            mirrored[:, number] = offset - place[:, number]
-            return _explained(mirrored, data)
+            return _explained(mirror(place, number, offset), data)
 
-        low, high = 2 * float(every[:, number].amin()), 2 * float(every[:, number].amax())
-        offsets = torch.linspace(low, high, SCANNED_OFFSETS).tolist()
-        start, step = max(offsets, key=explained), (high - low) / (SCANNED_OFFSETS - 1)
+        start, step = best_offset(every[:, number], explained)
         result = minimize_scalar(lambda c: -explained(float(c)), bounds=(start - step, start + step), method="bounded")
         yield axis, float(result.x), -float(result.fun)
 
@@ -147,7 +132,7 @@ def _attainable(data: Rssi) -> float:
 
     The position of each receiver is that of a grid around the positions with the highest fraction, then of finer grids.
     """
-    data = data.subset(torch.linspace(0, len(data) - 1, min(MAX_FITTED_ROWS, len(data))).round().long())
+    data = _some_rows(data, 400)
     residual = total = 0.0
     for rssi, detected in zip(data.rssi_dbm.T, data.detected.T, strict=True):
         if int(detected.sum()) < MIN_TRAINING:
@@ -172,16 +157,16 @@ def _fitted_receiver(place: Tensor, level: Tensor) -> float:
     flat = int(reach.argmin())
     reach[flat] = reach[flat].clamp_min(width / 2)  # receivers may hang above or below all positions
     explained = 0.0
-    for _ in range(ZOOMS):
+    for _ in range(4):
         axes = [
             centre[axis] + reach[axis] * torch.linspace(-1, 1, 5 if axis == flat else 11, dtype=torch.float64)
             for axis in range(3)
         ]
         receiver = torch.cartesian_prod(*axes)
-        distance = torch.cdist(receiver, place).clamp_min(MIN_DISTANCE_RATIO * width).log10()
+        distance = torch.cdist(receiver, place).clamp_min(1e-3 * width).log10()
         offset = distance - distance.mean(dim=1, keepdim=True)
         covariance, variance = offset @ level, offset.square().sum(dim=1)
         value = (covariance.square() / variance.clamp_min(1e-12)).where(covariance < 0, 0.0)
         explained = max(explained, float(value.max()))
-        centre, reach = receiver[int(value.argmax())], reach / ZOOM
+        centre, reach = receiver[int(value.argmax())], reach / 4
     return explained

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, ClassVar, Self
 
 import torch
 from annotated_types import Ge, Le
@@ -19,21 +19,18 @@ from swiftwrf.data.spectra import Spectra, check_training, direction_of_link
 from swiftwrf.data.splits import places
 from swiftwrf.errors import InputError, with_article
 from swiftwrf.gp import subsample
-from swiftwrf.locate.pool import inflation, pooled_weights
-from swiftwrf.locate.posterior import Posterior, normalised
-from swiftwrf.locate.region import Cells, Region, outside_mass
-from swiftwrf.locate.residuals import ResidualDistribution
-from swiftwrf.locate.search import best_cells, refined
+from swiftwrf.locate.posterior import Posterior, inflation, normalised, pooled_weights, read_inflation
+from swiftwrf.locate.region import Cells, Region, best_cells, outside_mass, refined
 from swiftwrf.locate.spectrum_likelihood import (
     CoarrayLikelihood,
     Features,
-    PathStatistics,
     PathWaves,
     PhaseLikelihood,
     SpectrumFeatures,
     gain_features,
     room_features,
 )
+from swiftwrf.locate.student import Student
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
@@ -46,10 +43,8 @@ from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, checked, co
 
 FOLDS = 5
 MIN_SPECTRA = 15
-MAX_LOG_VARIANCE = 30.0  # of path gains in a file
 BATCH_OBSERVATIONS = 16  # searched at a time: their likelihoods at all cells are 26 MB at most
 BATCH_CANDIDATES = 2048  # whose waves are computed together: as many as a processor's cache holds
-FIRST_WEIGHTS = (0.05, 0.05, 0.3)  # of the likelihoods, before calibration
 
 
 @configuration
@@ -85,7 +80,7 @@ class _Fit:
 
     room: GeometryModel
     gains: PathGains
-    statistics: PathStatistics
+    phases: PhaseLikelihood
 
     @property
     def features(self) -> tuple[Features, Features]:
@@ -107,7 +102,7 @@ class _Likelihoods:
 
         def of_batch(rows: Tensor) -> Tensor:
             waves, target = PathWaves.at(self.room, at[rows]), observed.subset(owner[rows])
-            return torch.stack([part.log_likelihood(waves, target) for part in self.parts])
+            return torch.stack([part(waves, target) for part in self.parts])
 
         batches = torch.arange(n * m).split(BATCH_CANDIDATES)
         return torch.cat(parallel_map(of_batch, batches), dim=1).reshape(len(self.parts), n, m)
@@ -123,7 +118,7 @@ class _Screen:
     """
 
     whitened: Tensor
-    distribution: ResidualDistribution
+    distribution: Student
 
     @cached_property
     def _squared(self) -> Tensor:
@@ -211,8 +206,8 @@ class MatchedField(Configured, Saved):
         def fitted(kept: Tensor) -> _Fit:
             phases = scene.subset(kept[rows].nonzero()[:, 0])
             part = choice.room.refined_on(phases)
-            statistics = PathStatistics.fit(part, train.position[kept], features.subset(kept))
-            return _Fit(part, fit_path_gains(part, phases, kernel, choice.prior), statistics)
+            likelihood = PhaseLikelihood.fit(part, train.position[kept], features.subset(kept))
+            return _Fit(part, fit_path_gains(part, phases, kernel, choice.prior), likelihood)
 
         everything = torch.ones_like(fold, dtype=torch.bool)
         *parts, self._fit = parallel_map(fitted, [*(fold != number for number in range(FOLDS)), everything])
@@ -221,7 +216,8 @@ class MatchedField(Configured, Saved):
         others = [Region(train.position[fold != number]) for number in range(FOLDS)]
         self.region = region or Region(train.position, outside=outside_mass(others, held_out))
         self._prepare()
-        self.weight, self.inflation = torch.tensor(FIRST_WEIGHTS, dtype=torch.float64), 1.0
+        # weights by which the calibration searches
+        self.weight, self.inflation = torch.tensor([0.05, 0.05, 0.3], dtype=torch.float64), 1.0
         self._calibrate(train.position, features, fold, parts)
         return self
 
@@ -260,7 +256,7 @@ class MatchedField(Configured, Saved):
             CoarrayLikelihood(predict, part, self.observed_power)
             for predict, part in zip(fit.features, residual, strict=True)
         )
-        return _Likelihoods(fit.room, (constant, varying, PhaseLikelihood(fit.room, fit.statistics)))
+        return _Likelihoods(fit.room, (constant, varying, fit.phases))
 
     def _calibrate(self, position: Tensor, features: SpectrumFeatures, fold: Tensor, parts: list[_Fit]) -> None:
         """Choose the weights of the likelihoods and the inflation of credible radii by held-out positions."""
@@ -346,7 +342,7 @@ class MatchedField(Configured, Saved):
         tensors, header = self.room.state()
         gains, values = self._fit.gains.state()
         own = {
-            "statistics": self._fit.statistics.raw,
+            "statistics": self._fit.phases.log_variance,
             "residual": self.residual,
             "weight": self.weight,
         }
@@ -372,20 +368,13 @@ class MatchedField(Configured, Saved):
             "weight": (3,),
         }
         expect(tensors, shapes)
-        if n < MIN_SPECTRA or bool((tensors["statistics"].abs() > MAX_LOG_VARIANCE).any()):
+        if n < MIN_SPECTRA or bool((tensors["statistics"].abs() > 30).any()):
             raise InputError("residuals, positions or variances are not those of a fitted locator")
         gains = PathGains.from_state(tensors, header, room)
         locator.grid = room.grid
-        locator._fit = _Fit(room, gains, PathStatistics.of(tensors["statistics"]))
+        locator._fit = _Fit(room, gains, PhaseLikelihood(room, tensors["statistics"]))
         locator.residual, locator.weight = tensors["residual"], tensors["weight"]
         locator.region, locator.observed_power = Region.from_state(tensors, header), float(header["observed_power"])
-        locator.inflation = _positive(header["inflation"])
+        locator.inflation = read_inflation(header)
         locator._prepare()
         return locator
-
-
-def _positive(value: Any) -> float:
-    """Return a factor of a file."""
-    if not (isinstance(value, int | float) and 0 < value < math.inf):
-        raise InputError(f"inflation must be a number above 0, got {value!r}")
-    return float(value)

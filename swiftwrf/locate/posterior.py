@@ -1,24 +1,27 @@
-"""A posterior over positions on weighted candidates, and what follows from it."""
+"""Posteriors over positions on weighted candidates, and the calibrated pool of likelihoods that they come from."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Self
 
+import numpy as np
 import torch
 from annotated_types import Gt, Lt
+from numpy.typing import NDArray
+from scipy.optimize import minimize
 from torch import Tensor
 
 from swiftwrf.plotting import MARK, Displayed, plan
+from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.validation import checked
 
 if TYPE_CHECKING:
     import matplotlib.axes
 
-WEISZFELD_STEPS = 30
-MODE_MASS = 0.1  # mass of a second mode from which on a posterior is ambiguous
-MODE_LEVEL, MODE_WIDTH = 0.3, 5.0  # of the first mode, see `Posterior.ambiguous`
+RIDGE = 1e-3  # of the weights: keeps those that the data do not determine near their start
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +89,18 @@ class Posterior(Displayed):
     def __len__(self) -> int:
         return len(self.log_weight)
 
+    @classmethod
+    def cat(cls, parts: Sequence[Self]) -> Self:
+        """Return the posteriors of several groups of observations, on equally many candidates each, as one."""
+        first = parts[0]
+        is_shared = all(len(part.position) == 1 and part.position.equal(first.position) for part in parts)
+        position = [part.position.expand(len(part), -1, -1) for part in parts]
+        return replace(
+            first,
+            position=first.position if is_shared else torch.cat(position),
+            log_weight=torch.cat([part.log_weight for part in parts]),
+        )
+
     @property
     def weight(self) -> Tensor:
         """Posterior masses (n, m), which sum to 1."""
@@ -149,8 +164,8 @@ class Posterior(Displayed):
         and at least `mode_width_m`.
         """
         away = (self.position - self.most_likely[:, None]).norm(dim=2)
-        width = (MODE_WIDTH * self._radius(away, MODE_LEVEL) + self.resolution_m).clamp_min(self.mode_width_m)
-        second: Tensor = (self.weight * (away > width[:, None])).sum(dim=1) > MODE_MASS
+        width = (5 * self._radius(away, 0.3) + self.resolution_m).clamp_min(self.mode_width_m)
+        second: Tensor = (self.weight * (away > width[:, None])).sum(dim=1) > 0.1
         return second
 
     def _radius(self, away: Tensor, level: float) -> Tensor:
@@ -165,7 +180,7 @@ class Posterior(Displayed):
 def _geometric_median(point: Tensor, weight: Tensor, start: Tensor, smallest: float) -> Tensor:
     """Return the weighted geometric median (n, k) of points (n, m, k), from a start (n, k)."""
     found = start
-    for _ in range(WEISZFELD_STEPS):
+    for _ in range(30):
         away = (point - found[:, None]).norm(dim=2).clamp_min(max(smallest / 4, 1e-9))
         pull = weight / away
         found = torch.einsum("nm,nmk->nk", pull, point) / pull.sum(dim=1, keepdim=True)
@@ -175,3 +190,69 @@ def _geometric_median(point: Tensor, weight: Tensor, start: Tensor, smallest: fl
 def normalised(log_mass: Tensor) -> Tensor:
     """Return logarithms of masses (n, m) shifted so that each row sums to mass 1."""
     return log_mass - log_mass.logsumexp(dim=1, keepdim=True)
+
+
+def pooled_weights(at_truth: Tensor, at_candidates: Tensor, log_volume: Tensor) -> Tensor:
+    """Return the weights of a log-linear pool that maximise the posterior density at held-out true positions.
+
+        log p(x | y) = sum_k w_k l_k(x, y) - log sum_j V_j exp(sum_k w_k l_k(x_j, y)),    w_k >= 0
+
+    The objective is concave in w (T. Heskes, "Selecting weighting factors in logarithmic opinion pools", 1998). One weight
+    below 1 tempers a likelihood that is too certain. The true position is one more candidate, with the smallest mass:
+    where a search misses it, the density would otherwise rise with the weights without limit.
+
+    Args:
+        at_truth: Log-likelihoods at the true positions, (k, n).
+        at_candidates: Log-likelihoods at the candidates of each observation, (k, n, m).
+        log_volume: Logarithms of the candidates' prior masses, (n, m).
+
+    Returns:
+        Weights, float64 (k,).
+    """
+    smallest = log_volume.masked_fill(log_volume.isinf(), torch.inf).amin(dim=1, keepdim=True)
+    volume = torch.cat([log_volume, smallest], dim=1).double()
+    values = torch.cat([at_candidates, at_truth[..., None]], dim=2)
+    # relative to the best candidate: constants of each observation cancel
+    top = values.amax(dim=2)
+    truth, candidates = (at_truth - top).double(), (values - top[..., None]).double()
+
+    def loss(values: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        weight = torch.from_numpy(values)
+        log_mass = torch.einsum("k,knm->nm", weight, candidates) + volume
+        total = log_mass.logsumexp(dim=1, keepdim=True)
+        expected = torch.einsum("nm,knm->kn", (log_mass - total).exp(), candidates)
+        density = torch.einsum("k,kn->n", weight, truth) - total[:, 0]
+        gradient = (truth - expected).mean(dim=1) - 2 * RIDGE * weight
+        return float(RIDGE * weight.square().sum() - density.mean()), -gradient.numpy()
+
+    first = np.full(len(at_truth), 0.3 / len(at_truth))
+    found = minimize(loss, first, jac=True, method="L-BFGS-B", bounds=[(0, None)] * len(first))
+    return torch.from_numpy(found.x)
+
+
+def inflation(posterior: Posterior, truth: Tensor, level: float = 0.8) -> float:
+    """Return the factor of credible radii for which regions of `level` contain that fraction of held-out positions.
+
+    The weights of largest posterior density leave regions too small if the likelihoods are wrong in ways that no weight
+    corrects (split conformal calibration: V. Vovk, A. Gammerman and G. Shafer, "Algorithmic Learning in a Random World",
+    2005).
+
+    Args:
+        posterior: Posterior of held-out observations.
+        truth: Their true positions, (n, 3) [m].
+        level: Nominal coverage.
+    """
+    ratio = (posterior.median - truth).norm(dim=1) / posterior.credible_radius(level).clamp_min(1e-9)
+    return float(ratio.quantile(level))
+
+
+def read_inflation(header: Header) -> float:
+    """Return the inflation of the header of a saved locator.
+
+    Raises:
+        InputError: A value that is not a number above 0.
+    """
+    value = header["inflation"]
+    if not (isinstance(value, int | float) and 0 < value < math.inf):
+        raise InputError(f"inflation must be a number above 0, got {value!r}")
+    return float(value)

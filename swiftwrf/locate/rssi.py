@@ -16,10 +16,10 @@ from swiftwrf.data.fillers import MAX_RSSI_DBM, MIN_RSSI_DBM, check_powers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import Validation, folds
 from swiftwrf.errors import InputError
-from swiftwrf.locate.pool import inflation, pooled_weights
-from swiftwrf.locate.posterior import Posterior, normalised
+from swiftwrf.locate.posterior import Posterior, inflation, normalised, pooled_weights, read_inflation
 from swiftwrf.locate.region import Region, outside_mass
-from swiftwrf.locate.rssi_likelihood import DetectionLikelihood, FingerprintLikelihood, RssiMaps, ValueLikelihood
+from swiftwrf.locate.rssi_likelihood import DetectionLikelihood, FingerprintLikelihood, Maps, RssiLikelihoods, maps_at
+from swiftwrf.locate.student import Student, correlation
 from swiftwrf.positions import to_tensor
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
@@ -27,10 +27,7 @@ from swiftwrf.runtime.options import Configured, all_or_nothing
 from swiftwrf.runtime.progress import progress as tracked
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, checked, configuration
 
-MAX_INFLATION_ROWS = 300  # held-out rows that determine the coverage of credible regions
 NEIGHBOUR_COUNTS = (1, 2, 3, 5, 8, 13, 20)
-BLOCK_MARGIN = 0.25  # of the region: a block of a fifth may lie beyond the known positions
-MIN_SCALE_M = 0.05  # of the error of nearest neighbours
 UNDETECTED_BELOW_DB = 5.0  # below the weakest value, of what is not detected, in the space of fingerprints
 
 
@@ -60,7 +57,7 @@ class _Part:
     out: Tensor
     kept: Tensor
     model: RssiModel
-    maps: RssiMaps
+    maps: Maps
 
 
 class RssiLocator(Configured, Saved):
@@ -125,92 +122,66 @@ class RssiLocator(Configured, Saved):
         parts = [self._part(train, fold, number) for number in numbers]
         self.region = region or Region(
             known,
-            BLOCK_MARGIN if config.validation == "block" else 0.03,
+            0.25 if config.validation == "block" else 0.03,  # a block of a fifth may lie beyond the known positions
             outside_mass([Region(known[part.kept]) for part in parts], [known[part.out] for part in parts]),
         )
         self.cells = self.region.cells(config.n_cells)
-        self._fit_likelihoods(train, parts)
-        self._calibrate(train, parts)
-        self._maps = RssiMaps.of(self.model.predict(self.cells.position))
+        max_neighbours = min(len(part.kept) for part in parts)
+        self.likelihoods = self._likelihoods(train, parts, torch.arange(len(train)), max_neighbours)
+        self._calibrate(train, parts, max_neighbours)
+        self._maps = maps_at(self.model, self.cells.position)
         return self
 
     def _part(self, train: Rssi, fold: Tensor, number: int) -> _Part:
         out, kept = (fold == number).nonzero()[:, 0], (fold != number).nonzero()[:, 0]
         model = RssiModel(validation=self.config.validation, seed=self.config.seed).fit(train.subset(kept))
-        return _Part(out, kept, model, RssiMaps.of(model.predict(train.transmitter_position[out])))
+        return _Part(out, kept, model, maps_at(model, train.transmitter_position[out]))
 
-    def _likelihoods(
-        self, train: Rssi, parts: list[_Part], max_neighbours: int
-    ) -> tuple[ValueLikelihood, DetectionLikelihood, int, Tensor]:
-        """Fit the distributions to held-out folds: of values, of detections, and of the error of k nearest neighbours."""
+    def _likelihoods(self, train: Rssi, parts: list[_Part], rows: Tensor, max_neighbours: int) -> RssiLikelihoods:
+        """Fit the distributions to held-out folds, with `rows` of the training data as fingerprints."""
         rssi = torch.cat([train.rssi_dbm[part.out] for part in parts])
-        mean, std = (torch.cat([getattr(part.maps, name) for part in parts]) for name in ("mean", "std"))
-        counts = [k for k in NEIGHBOUR_COUNTS if k < len(rssi) / 2 and k <= max_neighbours]
-        errors = {k: self._neighbour_errors(train, parts, k) for k in counts}
-        k = min(errors, key=lambda k: float(errors[k].norm(dim=1).median()))
-        scale = (errors[k].abs().quantile(0.6, dim=0).square() + max(self.cells.edge_m, MIN_SCALE_M) ** 2).sqrt()
-        values = ValueLikelihood.fit((rssi.float() - mean) / std)
-        return values, DetectionLikelihood.fit(mean, ~rssi.isnan()), k, scale
+        mean, std = (torch.cat(values) for values in zip(*(part.maps for part in parts), strict=True))
 
-    def _neighbour_errors(self, train: Rssi, parts: list[_Part], k: int) -> Tensor:
-        one = torch.ones(3, dtype=torch.float64)
-        return torch.cat(
-            [
-                self._fingerprints(train, part.kept, k, one).estimate(train.rssi_dbm[part.out])
+        def fingerprints(rows: Tensor, k: int, scale_m: Tensor) -> FingerprintLikelihood:
+            filled = train.rssi_dbm[rows].float().nan_to_num(self.floor_dbm)
+            return FingerprintLikelihood(train.transmitter_position[rows], filled, self.floor_dbm, k, scale_m)
+
+        def errors(k: int) -> Tensor:
+            found = (
+                fingerprints(part.kept, k, torch.ones(3)).estimate(train.rssi_dbm[part.out])
                 - train.transmitter_position[part.out]
                 for part in parts
-            ]
-        )
+            )
+            return torch.cat(list(found))
 
-    def _fingerprints(self, train: Rssi, rows: Tensor, k: int, scale_m: Tensor) -> FingerprintLikelihood:
-        filled = train.rssi_dbm[rows].float().nan_to_num(self.floor_dbm)
-        return FingerprintLikelihood(train.transmitter_position[rows], filled, self.floor_dbm, k, scale_m)
+        counts = [k for k in NEIGHBOUR_COUNTS if k < len(rssi) / 2 and k <= max_neighbours]
+        k = min(counts, key=lambda k: float(errors(k).norm(dim=1).median()))
+        # positions are measured to a few centimetres at best
+        scale = (errors(k).abs().quantile(0.6, dim=0).square() + max(self.cells.edge_m, 0.05) ** 2).sqrt()
+        values = Student.fit((rssi.float() - mean) / std, correlation, (0.0, 0.1, 0.3, 0.6, 1.0), n_folds=2)
+        return RssiLikelihoods(values, DetectionLikelihood.fit(mean, ~rssi.isnan()), fingerprints(rows, k, scale))
 
-    def _fit_likelihoods(self, train: Rssi, parts: list[_Part]) -> None:
-        self.values, self.detections, k, scale = self._likelihoods(train, parts, _fewest_kept(parts))
-        self.fingerprints = self._fingerprints(train, torch.arange(len(train)), k, scale)
-
-    def _calibrate(self, train: Rssi, parts: list[_Part]) -> None:
+    def _calibrate(self, train: Rssi, parts: list[_Part], max_neighbours: int) -> None:
         """Choose the weights of the likelihoods by the posterior density at held-out positions.
 
         The distributions of each fold are fitted to the other folds, and so is the prior over positions.
         """
         truth, values, positions, masses = [], [], [], []
-        share = min(1.0, self.config.n_calibration / len(train))
+        fraction = min(1.0, self.config.n_calibration / len(train))
         for number, part in enumerate(parts):
-            value, detection, k, scale = self._likelihoods(
-                train, parts[:number] + parts[number + 1 :], _fewest_kept(parts)
-            )
-            fingerprints = self._fingerprints(train, part.kept, k, scale)
-            some = torch.linspace(0, len(part.out) - 1, max(1, round(share * len(part.out)))).long()
+            likelihoods = self._likelihoods(train, parts[:number] + parts[number + 1 :], part.kept, max_neighbours)
+            some = torch.linspace(0, len(part.out) - 1, max(1, round(fraction * len(part.out)))).long()
             rssi, at = train.rssi_dbm[part.out[some]], train.transmitter_position[part.out[some]]
-            maps = RssiMaps.of(part.model.predict(self.cells.position))
-
-            def all_of(
-                maps: RssiMaps,
-                position: Tensor,
-                rows: Tensor,
-                one: ValueLikelihood = value,
-                two: DetectionLikelihood = detection,
-                three: FingerprintLikelihood = fingerprints,
-            ) -> Tensor:
-                parts = (
-                    one.log_likelihood(maps, rows),
-                    two.log_likelihood(maps, rows),
-                    three.log_likelihood(position, rows),
-                )
-                return torch.stack([value.double() for value in parts])
-
-            values.append(all_of(maps, self.cells.position, rssi))
+            values.append(likelihoods(self.cells.position, maps_at(part.model, self.cells.position), rssi))
+            own = part.maps[0][some], part.maps[1][some]
+            truth.append(likelihoods(at, own, rssi).diagonal(dim1=1, dim2=2))
             prior = Region(train.transmitter_position[part.kept], self.region.margin, self.region.outside)
             masses.append(prior.log_mass(self.cells.position).expand(len(rssi), -1))
-            own = RssiMaps(part.maps.mean[some], part.maps.std[some])
             positions.append(at)
-            truth.append(all_of(own, at, rssi).diagonal(dim1=1, dim2=2))
         candidates, position, volume = torch.cat(values, dim=1), torch.cat(positions), torch.cat(masses)
         self.weight = pooled_weights(torch.cat(truth, dim=1), candidates, volume)
         generator = torch.Generator().manual_seed(self.config.seed)
-        rows = torch.randperm(len(position), generator=generator)[:MAX_INFLATION_ROWS]
+        rows = torch.randperm(len(position), generator=generator)[:300]
         log_mass = torch.einsum("k,knm->nm", self.weight, candidates[:, rows]) + volume[rows]
         held_out = Posterior(self.cells.position[None], normalised(log_mass), self.cells.edge_m)
         self.inflation = inflation(held_out, position[rows])
@@ -233,12 +204,8 @@ class RssiLocator(Configured, Saved):
         if len(silent):
             raise InputError(f"no receiver detected the transmitter in row {int(silent[0])}; leave such rows out")
         at = self.cells.position
-        parts = (
-            self.values.log_likelihood(self._maps, rssi),
-            self.detections.log_likelihood(self._maps, rssi),
-            self.fingerprints.log_likelihood(at, rssi),
-        )
-        log_mass = sum(weight * part.double() for weight, part in zip(self.weight.tolist(), parts, strict=True))
+        values = self.likelihoods(at, self._maps, rssi)
+        log_mass = torch.einsum("k,knm->nm", self.weight, values)
         return Posterior(at[None], normalised(log_mass + self.cells.log_volume), self.cells.edge_m, self.inflation)
 
     @torch.no_grad()
@@ -255,10 +222,10 @@ class RssiLocator(Configured, Saved):
             RSSI (n, m, R) [dBm], NaN if not detected. A row whose packets are all lost keeps its strongest value.
         """
         self.check_fitted()
-        maps = RssiMaps.of(self.model.predict(position))
-        mean, std = maps.mean.double(), maps.std.double()
-        rssi = (mean + std * self.values.sample((n, len(mean)), generator)).clamp(MIN_RSSI_DBM, MAX_RSSI_DBM)
-        chance = self.detections.probability(mean)
+        mean, std = (values.double() for values in maps_at(self.model, position))
+        draws = self.likelihoods.values.sample((n, len(mean)), generator)
+        rssi = (mean + std * draws).clamp(MIN_RSSI_DBM, MAX_RSSI_DBM)
+        chance = self.likelihoods.detections.probability(mean)
         lost = torch.rand(rssi.shape, generator=generator, dtype=torch.float64) >= chance
         strongest = torch.nn.functional.one_hot(rssi.argmax(dim=2), rssi.shape[2]).bool()
         lost &= ~(strongest & lost.all(dim=2, keepdim=True))
@@ -273,19 +240,20 @@ class RssiLocator(Configured, Saved):
         """Return the fitted tensors by name, and plain values."""
         self.check_fitted()
         tensors, header = self.model.state()
+        values, fingerprints = self.likelihoods.values, self.likelihoods.fingerprints
         own = {
-            "known": self.fingerprints.position,
-            "fingerprint": self.fingerprints.rssi,
-            "scale_m": self.fingerprints.scale_m,
-            "correlation": self.values.correlation,
+            "known": fingerprints.position,
+            "fingerprint": fingerprints.rssi,
+            "scale_m": fingerprints.scale_m,
+            "correlation": values.scale,
             "weight": self.weight,
         }
         plain = {
             "locator": asdict(self.config),
             "floor_dbm": self.floor_dbm,
-            "k": self.fingerprints.k,
-            "degrees": None if math.isinf(self.values.degrees) else self.values.degrees,
-            "detections": asdict(self.detections),
+            "k": fingerprints.k,
+            "degrees": None if math.isinf(values.degrees) else values.degrees,
+            "detections": asdict(self.likelihoods.detections),
             "inflation": self.inflation,
         }
         at, prior = self.region.state()
@@ -305,25 +273,18 @@ class RssiLocator(Configured, Saved):
         degrees, k = header["degrees"], int(header["k"])
         if not 1 <= k <= n:
             raise InputError(f"k must be between 1 and the number of rows, got {k}")
-        correlation, scale = tensors["correlation"], tensors["scale_m"]
-        definite = not bool(torch.linalg.cholesky_ex(correlation).info)
+        matrix, scale = tensors["correlation"], tensors["scale_m"]
+        definite = not bool(torch.linalg.cholesky_ex(matrix).info)
         if not (definite and bool((scale > 0).all()) and (degrees is None or float(degrees) > 0)):
             raise InputError("correlation, scale or degrees of freedom are those of no distribution")
-        locator.values = ValueLikelihood(tensors["correlation"], math.inf if degrees is None else float(degrees))
-        locator.detections = DetectionLikelihood(**header["detections"])
         locator.floor_dbm = float(header["floor_dbm"])
-        locator.fingerprints = FingerprintLikelihood(
-            tensors["known"], tensors["fingerprint"], locator.floor_dbm, k, tensors["scale_m"]
+        locator.likelihoods = RssiLikelihoods(
+            Student(matrix, math.inf if degrees is None else float(degrees)),
+            DetectionLikelihood(**header["detections"]),
+            FingerprintLikelihood(tensors["known"], tensors["fingerprint"], locator.floor_dbm, k, scale),
         )
         locator.region = Region.from_state(tensors, header)
         locator.cells = locator.region.cells(locator.config.n_cells)
-        locator.weight, locator.inflation = tensors["weight"], float(header["inflation"])
-        if not 0 < locator.inflation < math.inf:
-            raise InputError(f"inflation must be a number above 0, got {locator.inflation}")
-        locator._maps = RssiMaps.of(locator.model.predict(locator.cells.position))
+        locator.weight, locator.inflation = tensors["weight"], read_inflation(header)
+        locator._maps = maps_at(locator.model, locator.cells.position)
         return locator
-
-
-def _fewest_kept(parts: list[_Part]) -> int:
-    """Return the smallest number of rows that are trained on while a fold is held out."""
-    return min(len(part.kept) for part in parts)

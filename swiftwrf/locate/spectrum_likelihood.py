@@ -9,10 +9,10 @@ J. Acoust. Soc. Am. 89, 1991).
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import partial
+from typing import Self
 
 import numpy as np
 import torch
@@ -22,14 +22,12 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.locate.residuals import ResidualDistribution
+from swiftwrf.locate.student import Student, covariance
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.path_gains import PathGains, paths
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation, coarray_numbers, retrieve_phases
 
-MAX_STEPS = 20  # of L-BFGS
 BOUNDS = (-10.0, 6.0)  # of the logarithms of variances: products of four of them stay within float32
-PENALTY = 0.01  # of the squared logarithms of the variances: keeps those that the data do not determine near 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,17 +107,7 @@ def gain_features(array: PlanarArray, gains: PathGains) -> Features:
     return features
 
 
-class SpectrumLikelihood(ABC):
-    """Log-likelihood of a spectrum at a candidate position."""
-
-    name: ClassVar[str]
-
-    @abstractmethod
-    def log_likelihood(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
-        """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""
-
-
-class CoarrayLikelihood(SpectrumLikelihood):
+class CoarrayLikelihood:
     """Student likelihood of the co-array numbers, with the covariance of held-out residuals.
 
     Args:
@@ -128,107 +116,72 @@ class CoarrayLikelihood(SpectrumLikelihood):
         power: Mean square of the observed numbers.
     """
 
-    name = "coarray"
-
     def __init__(self, features: Features, residual: Tensor, power: float) -> None:
         self.features = features
-        self.distribution = ResidualDistribution.fit(residual, power)
+        estimate = partial(covariance, floor=1e-6 * power)
+        self.distribution = Student.fit(residual, estimate, (0.05, 0.1, 0.2, 0.4, 0.7), n_folds=5)
 
-    def log_likelihood(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
+    def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
+        """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""
         away = (self.features(waves) - observed.coarray) @ self.distribution.whitening
         return self.distribution.log_density(away.square().sum(dim=1))
 
 
-@dataclass(frozen=True, eq=False)
-class PathStatistics:
-    """Variances of path gains and of what no path explains, relative to the power of the direct path's mean gain.
-
-    Args:
-        direct: Variance of the direct path's gain.
-        plane: Variance of a first-order gain in each plane, (P,).
-        order: Variance of a path of higher order, relative to the product of its planes' variances and squared gains.
-        diffuse: Power of scattering from all directions, relative to that of the channel.
-        floor: Variance of each element's phasor, relative to its power.
-    """
-
-    direct: Tensor
-    plane: Tensor
-    order: Tensor
-    diffuse: Tensor
-    floor: Tensor
-
-    @classmethod
-    def fit(cls, room: GeometryModel, position: Tensor, observed: SpectrumFeatures) -> PathStatistics:
-        """Fit the variances by the marginal likelihood of n observations at known positions (n, 3)."""
-        start = torch.cat(
-            [torch.tensor([-3.0]), torch.full((len(room.planes),), -2.0), torch.tensor([0.0, -2.0, -2.0])]
-        )
-        waves = PathWaves.at(room, position)
-
-        @torch.enable_grad()
-        def loss(values: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-            raw = torch.from_numpy(values).float().requires_grad_()
-            density = PhaseLikelihood(room, cls.of(raw)).log_likelihood(waves, observed).mean()
-            total = PENALTY * raw.square().mean() - density
-            (gradient,) = torch.autograd.grad(total, raw)
-            return float(total.detach()), gradient.double().numpy()
-
-        first, bounds = start.double().numpy(), [BOUNDS] * len(start)
-        found = minimize(loss, first, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": MAX_STEPS})
-        return cls.of(torch.from_numpy(found.x).float())
-
-    @property
-    def raw(self) -> Tensor:
-        """Logarithms of all variances, (4 + P,)."""
-        rest = torch.stack([self.order, self.diffuse, self.floor])
-        return torch.cat([self.direct[None], self.plane, rest]).log()
-
-    @classmethod
-    def of(cls, raw: Tensor) -> PathStatistics:
-        """Return the statistics of logarithms (4 + P,)."""
-        value, planes = raw.exp(), len(raw) - 4
-        return cls(value[0], value[1 : 1 + planes], value[1 + planes], value[2 + planes], value[3 + planes])
-
-    def of_paths(self, room: GeometryModel) -> Tensor:
-        """Return the variance of each path's gain, (1 + S,): direct, then images in their order."""
-        found = room.tensors()
-        second = found.gain[0].square() + self.plane
-        variance = [self.direct]
-        for planes in found.sequence:
-            if len(planes) == 1:
-                variance.append(self.plane[planes[0]])
-            else:
-                variance.append(self.order * torch.stack([second[i] for i in planes]).prod())
-        return torch.stack(variance)
-
-
-class PhaseLikelihood(SpectrumLikelihood):
+class PhaseLikelihood:
     """Marginal likelihood of the element phases if path gains vary about their mean by a complex normal distribution.
 
     The phase of the whole channel is unknown and integrated over.
 
     Args:
-        room: Room with its paths.
-        statistics: Variances of path gains.
+        room: Room with P planes, and its paths.
+        log_variance: Logarithms of variances, (4 + P,), relative to the power of the direct path's mean gain. The first is
+            that of the direct path's gain, the next P are those of a first-order gain in each plane. The next one is that
+            of higher orders, relative to the product of their planes' variances and squared gains. The last two are those of
+            scattering from all directions, relative to the power of the channel, and of each element's phasor, relative to
+            its power.
     """
 
-    name = "phases"
+    def __init__(self, room: GeometryModel, log_variance: Tensor) -> None:
+        self.log_variance = log_variance
+        found, value = room.tensors(), log_variance.exp()
+        direct, plane, (order, self._diffuse, self._floor) = value[0], value[1:-3], value[-3:].unbind()
+        second = found.gain[0].square() + plane
+        images = [
+            plane[planes[0]] if len(planes) == 1 else order * torch.stack([second[i] for i in planes]).prod()
+            for planes in found.sequence
+        ]
+        self._variance = torch.stack([direct, *images])
+        self._isotropic = _isotropic(room)
 
-    def __init__(self, room: GeometryModel, statistics: PathStatistics) -> None:
-        self.room, self.statistics = room, statistics
-        self._variance = statistics.of_paths(room)
-        self._diffuse = _isotropic(room)
+    @classmethod
+    def fit(cls, room: GeometryModel, position: Tensor, observed: SpectrumFeatures) -> Self:
+        """Fit the variances by the marginal likelihood of n observations at known positions (n, 3)."""
+        start = np.array([-3.0, *[-2.0] * len(room.planes), 0.0, -2.0, -2.0])
+        waves = PathWaves.at(room, position)
 
-    def log_likelihood(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
+        @torch.enable_grad()
+        def loss(values: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+            raw = torch.from_numpy(values).float().requires_grad_()
+            # the penalty keeps variances that the data do not determine near 1
+            total = 0.01 * raw.square().mean() - cls(room, raw)(waves, observed).mean()
+            (gradient,) = torch.autograd.grad(total, raw)
+            return float(total.detach()), gradient.double().numpy()
+
+        bounds = [BOUNDS] * len(start)
+        found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 20})
+        return cls(room, torch.from_numpy(found.x).float())
+
+    def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
+        """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""
         mean, wave, phases = waves.channel, waves.wave, observed.phases
         power = (self._variance[:, None] * wave.abs().square()).sum(dim=1).mean(dim=1) + mean.abs().square().mean(dim=1)
-        total = power * (1 + self.statistics.diffuse + self.statistics.floor)
+        total = power * (1 + self._diffuse + self._floor)
         weighted = wave * self._variance.sqrt()[:, None]
-        covariance = torch.einsum("msk,msl->mkl", weighted, weighted.conj()) / total[:, None, None]
-        rest = self.statistics.diffuse * self._diffuse + self.statistics.floor * torch.eye(wave.shape[2])
-        covariance = covariance + rest * (power / total)[:, None, None]
+        spread = torch.einsum("msk,msl->mkl", weighted, weighted.conj()) / total[:, None, None]
+        rest = self._diffuse * self._isotropic + self._floor * torch.eye(wave.shape[2])
+        spread = spread + rest * (power / total)[:, None, None]
         mean = mean / total.sqrt()[:, None]
-        root = torch.linalg.cholesky(covariance)
+        root = torch.linalg.cholesky(spread)
         white = torch.linalg.solve_triangular(root, torch.cat([mean[:, :, None], phases.mT], dim=2), upper=False)
         m, x = white[..., :1], white[..., 1:]
         match = 2 * (m.conj() * x).sum(dim=1).abs()

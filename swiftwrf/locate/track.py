@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -14,7 +13,7 @@ from swiftwrf.locate.posterior import Posterior, normalised
 
 JUMP = 1e-3  # prior probability of a displacement that does not depend on the distance, for each step
 CHUNK = 2**22  # pairs of candidates whose distances are computed together
-MAX_KERNEL = 4096**2  # pairs of candidates whose transition densities are kept from step to step
+MAX_KEPT_PAIRS = 4096**2  # pairs of shared candidates whose distances are kept from step to step
 MAX_PAIRS = 20_000**2  # pairs of candidates of two consecutive observations
 
 
@@ -49,7 +48,21 @@ def smoothed(posterior: Posterior, time: Tensor | None, speed_m_s: float) -> Pos
     # the error of the distances is that of float32 relative to the region, not to the origin of the coordinates
     position = (posterior.position - posterior.position.reshape(-1, 3).mean(dim=0)).float().expand(n, -1, -1)
     own = posterior.log_weight
-    step = _Transition(shared=len(posterior.position) == 1)
+    # distances between candidates that all observations share are computed once
+    shared = _square(position[0], position[0]) if len(posterior.position) == 1 and m * m <= MAX_KEPT_PAIRS else None
+
+    def step(to: Tensor, start: Tensor, std: float, log_mass: Tensor) -> Tensor:
+        """Return the log-density at candidates `to` (m, 3) after a step from masses (m,) at `start` (m, 3)."""
+        mass = (log_mass - log_mass.max()).exp()
+        moved, total = torch.empty(m), 0.0
+        for rows in torch.arange(m).split(max(1, CHUNK // m)):
+            square = _square(to[rows], start) if shared is None else shared[rows]
+            density = (square * (-0.5 / std**2)).exp_()
+            moved[rows] = density @ mass.float()
+            total += float(density.sum(dtype=torch.float64))
+        floor = JUMP * max(total / m**2, 1e-30) * mass.sum()
+        return ((1 - JUMP) * moved.double() + floor).log()
+
     before, after = torch.zeros_like(own), torch.zeros_like(own)
     for i in range(1, n):
         before[i] = step(position[i], position[i - 1], std[i - 1], own[i - 1] + before[i - 1])
@@ -57,25 +70,6 @@ def smoothed(posterior: Posterior, time: Tensor | None, speed_m_s: float) -> Pos
         after[i] = step(position[i], position[i + 1], std[i], own[i + 1] + after[i + 1])
     # the inflation belongs to posteriors of single observations
     return replace(posterior, log_weight=normalised(own + before + after), inflation=1.0)
-
-
-def joined(posteriors: Sequence[Posterior]) -> Posterior:
-    """Return the posteriors of several groups of observations as one.
-
-    Raises:
-        InputError: Groups with different numbers of candidates.
-    """
-    first = posteriors[0]
-    if len({part.log_weight.shape[1] for part in posteriors}) > 1:
-        raise InputError("posteriors on different numbers of candidates cannot be joined")
-    is_shared = all(len(part.position) == 1 and part.position.equal(first.position) for part in posteriors)
-    expanded = (part.position.expand(len(part), -1, -1) for part in posteriors)
-    return Posterior(
-        first.position if is_shared else torch.cat(list(expanded)),
-        torch.cat([part.log_weight for part in posteriors]),
-        max(part.resolution_m for part in posteriors),
-        mode_width_m=first.mode_width_m,
-    )
 
 
 def _intervals(time: Tensor | None, n: int) -> Tensor:
@@ -92,50 +86,6 @@ def _intervals(time: Tensor | None, n: int) -> Tensor:
     return interval
 
 
-class _Transition:
-    """Products with the transition densities between two sets of candidates.
-
-    Args:
-        shared: True if all observations have the same candidates. Their distances are computed once, and the densities are
-            kept until the interval changes.
-    """
-
-    def __init__(self, *, shared: bool) -> None:
-        self._shared = shared
-        self._square: Tensor | None = None
-        self._kept: tuple[float, Tensor, float] | None = None
-
-    def __call__(self, to: Tensor, start: Tensor, std: float, log_mass: Tensor) -> Tensor:
-        """Return the logarithm of the density at candidates `to` (k, 3) after a step from masses (m,) at `start` (m, 3)."""
-        mass = (log_mass - log_mass.max()).exp()
-        if self._shared and len(to) * len(start) <= MAX_KERNEL:
-            kernel, mean = self._of_shared(to, std)
-            moved = kernel @ mass.float()
-        else:
-            parts, total = [], 0.0
-            for some in to.split(max(1, CHUNK // len(start))):
-                kernel = _kernel(_square(some, start), std)
-                parts.append(kernel @ mass.float())
-                total += float(kernel.sum(dtype=torch.float64))
-            moved, mean = torch.cat(parts), total / (len(to) * len(start))
-        floor = JUMP * max(mean, 1e-30) * mass.sum()
-        return ((1 - JUMP) * moved.double() + floor).log()
-
-    def _of_shared(self, position: Tensor, std: float) -> tuple[Tensor, float]:
-        """Return the densities between all candidates and their mean."""
-        if self._square is None:
-            self._square = _square(position, position)
-        if self._kept is None or self._kept[0] != std:
-            kernel = _kernel(self._square, std)
-            self._kept = std, kernel, float(kernel.mean())
-        return self._kept[1:]
-
-
 def _square(to: Tensor, start: Tensor) -> Tensor:
     """Return the squared distances between candidates (k, 3) and (m, 3), float32 (k, m) [m^2]."""
     return torch.cdist(to, start, compute_mode="donot_use_mm_for_euclid_dist").square_()
-
-
-def _kernel(square: Tensor, std: float) -> Tensor:
-    """Return exp(-d^2 / 2 std^2) for squared distances d^2 [m^2]."""
-    return (square * (-0.5 / std**2)).exp_()

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Annotated, Any
 
 import torch
+from annotated_types import Ge, Gt, Lt
+from scipy import stats
+from scipy.cluster.vq import kmeans2
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError
+from swiftwrf.gp import Kernel
+from swiftwrf.metrics import psnr
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry.images import PhaseObservations
 from swiftwrf.models.geometry.model import GeometryModel
@@ -19,18 +25,253 @@ from swiftwrf.models.geometry.path_gains import paths
 from swiftwrf.models.geometry.phase_retrieval import correlations, retrieve_phases
 from swiftwrf.models.link import Link
 from swiftwrf.models.process import ProcessModel
-from swiftwrf.online.adaptation import adapted
-from swiftwrf.online.change import Alarm
-from swiftwrf.online.kernel import KernelMonitor, described
-from swiftwrf.online.monitor import Monitor, MonitorConfig
-from swiftwrf.online.prequential import Scores, learnt, score
+from swiftwrf.online.scores import Alarm, Cusum, Scores, alarm_threshold, learnt, score
+from swiftwrf.positions import nearest
 from swiftwrf.rssi.model import RssiModel
-from swiftwrf.runtime.validation import checked
+from swiftwrf.runtime.validation import checked, configuration
 
+CORRELATIONS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.05)  # of the fields before and after a change, that are compared
+N_FOLDS = 5  # of the spectra after a change, and of the training spectra that give the reference
+MAX_INNOVATION = 3.0  # standard deviations; single outliers raise no alarm
+MIN_NEW, MIN_GROWTH = 30, 0.1  # measurements, and relative to those before, after which a kernel is chosen
 ROOM_NOTICE = "the room no longer explains the spectra since measurement {}; fit it again, also if an obstacle appeared"
 MIN_MISSING = 3e-3  # missing coherence that counts as none, phases of 3 degrees
 MAX_RECENT = 500  # spectra that are kept to adapt the model to a change
 MAX_WAITING = 5 * MIN_TRAINING  # spectra that wait for an update of a geometry
+
+
+def adapted(before: ProcessModel, after: Spectra) -> tuple[ProcessModel, float]:
+    """Return a model that has learnt spectra after a change, and the chosen correlation of the fields before and after it.
+
+    The correlation is that with the highest mean PSNR of held-out spectra after the change. With 1, all spectra count alike.
+
+    Args:
+        before: Model of the spectra before the change.
+        after: Spectra after the change.
+
+    Raises:
+        InputError: As `FieldModel.update`.
+
+    Example:
+        >>> import swiftwrf
+        >>> data = swiftwrf.simulated_room(n=60)
+        >>> model = swiftwrf.make_model("coarray").fit(data.subset(torch.arange(50)))
+        >>> adapted(model, data.subset(torch.arange(50, 60)))[1] > 0.5
+        True
+    """
+    parts = torch.arange(len(after)) % min(N_FOLDS, len(after))
+
+    def held_out(model: ProcessModel) -> float:
+        scores = []
+        for number in parts.unique() if len(after) > 1 else ():
+            out = after.subset(parts == number)
+            predicted = model.update(after.subset(parts != number)).synthesize(out.position)
+            scores.append(psnr(predicted.cpu(), out.spectrum))
+        return float(torch.cat(scores).mean()) if scores else 0.0
+
+    best = max(CORRELATIONS, key=lambda correlation: held_out(before.aged(correlation)))
+    return before.aged(best).update(after), best
+
+
+@configuration
+class MonitorConfig:
+    """Options of a `Monitor`.
+
+    Example:
+        >>> Monitor(torch.rand(50, 3), config=MonitorConfig(false_alarm_rate=1e-3)).config.n_regions
+        8
+    """
+
+    false_alarm_rate: Annotated[float, Gt(0), Lt(1)] = 1e-4
+    """false alarms a measurement, over all regions and receivers together"""
+    n_regions: Annotated[int, Ge(1)] = 8
+    """number of regions of the positions that are tested separately, beside all positions together"""
+    n_reference: Annotated[int, Ge(10)] = 30
+    """number of measurements without alarm, which calibrate the innovations if no reference is given"""
+
+
+class Monitor:
+    """Cumulative sums of innovations: of all positions and of each region; for RSSI of each receiver, up and down.
+
+    Innovations of spectra are replaced by normal scores, their rank among those of a reference. Innovations of RSSI are
+    standard normal if the standard deviations of the model are right.
+
+    Args:
+        position: Positions around which the model was fitted, (n, 3) [m], which give the regions.
+        receiver_names: Names of the receivers; none for spectra.
+        reference: Innovations (n,) of spectra of the unchanged scene. Defaults to the first measurements.
+        config: Options.
+
+    Example:
+        >>> import swiftwrf
+        >>> data = swiftwrf.simulated_room(n=60)
+        >>> train, new = data.subset(torch.arange(50)), data.subset(torch.arange(50, 60))
+        >>> model = swiftwrf.make_model("coarray").fit(train)
+        >>> monitor = Monitor.of(model, train)
+        >>> scores = score(model, new)
+        >>> [alarm for at, z in zip(scores.position, scores.innovation) for alarm in monitor.observe(at, z)]
+        []
+    """
+
+    def __init__(
+        self,
+        position: Tensor,
+        receiver_names: Sequence[str] = (),
+        reference: Tensor | None = None,
+        config: MonitorConfig | None = None,
+    ) -> None:
+        self.config, self.receiver_names = config or MonitorConfig(), tuple(receiver_names)
+        n_regions = min(self.config.n_regions, max(1, len(position) // 10))
+        self.centre = torch.from_numpy(kmeans2(position.double().numpy(), n_regions, seed=0, minit="++")[0])
+        self.reference = torch.zeros(0, dtype=torch.float64) if reference is None else reference.double()
+        self.cusum = Cusum.start((1 + n_regions) * (2 * len(self.receiver_names) or 1))
+        self.threshold = alarm_threshold(self.config.false_alarm_rate, len(self.cusum.value))
+
+    @classmethod
+    def of(
+        cls, model: FieldModel | RssiModel, train: Spectra | Rssi | None = None, config: MonitorConfig | None = None
+    ) -> Monitor:
+        """Return the monitor of a fitted model.
+
+        Args:
+            model: Fitted model.
+            train: Its training data in their order. Spectra give the reference; see `held_out_scores`.
+            config: Options.
+        """
+        if isinstance(model, RssiModel):
+            return cls(model.region(), model.receiver_names, None, config)
+        if isinstance(train, Spectra):
+            model.check_measurements(train)
+        reference = held_out_scores(model, train).innovation[:, 0] if isinstance(train, Spectra) else None
+        return cls(model.region(), (), reference, config)
+
+    def observe(self, position: Tensor, innovation: Tensor) -> list[Alarm]:
+        """Add the innovations of one measurement at a position (3,) [m], (1,) or (R,); return the alarms."""
+        value = innovation.double()
+        if self.receiver_names:
+            standard = value.clamp(-MAX_INNOVATION, MAX_INNOVATION)
+            standard = torch.cat([standard, -standard])
+        elif self.cusum.count == 0 and len(self.reference) < self.config.n_reference:
+            self.reference = torch.cat([self.reference, value])
+            return []
+        else:
+            rank = (self.reference < value).double().sum() + 0.5
+            standard = torch.special.ndtri(rank / (len(self.reference) + 1))[None]
+        series = torch.full((1 + len(self.centre), len(standard)), torch.nan, dtype=torch.float64)
+        series[[0, 1 + int(nearest(position[None], self.centre, 1)[1])]] = standard
+        self.cusum, alarms = self.cusum.updated(series.flatten(), self.threshold)
+        return alarms
+
+    def state(self) -> dict[str, Any]:
+        """Return reference, regions and sums as plain values."""
+        sums = {"value": self.cusum.value.tolist(), "since": self.cusum.since.tolist(), "count": self.cusum.count}
+        return {"reference": self.reference.tolist(), "centre": self.centre.tolist(), "cusum": sums}
+
+    def resume(self, state: dict[str, Any]) -> None:
+        """Continue with the reference, regions and sums of a `state`."""
+        sums = state["cusum"]
+        self.reference, self.centre, value = (
+            torch.tensor(values, dtype=torch.float64) for values in (state["reference"], state["centre"], sums["value"])
+        )
+        self.cusum = Cusum(value, torch.tensor(sums["since"]), int(sums["count"]))
+        self.threshold = alarm_threshold(self.config.false_alarm_rate, len(self.cusum.value))
+
+    def describe(self, alarm: Alarm) -> str:
+        """Return what changed and where, in words."""
+        region, column = divmod(alarm.series, 2 * len(self.receiver_names) or 1)
+        where = "everywhere"
+        if region:
+            where = "around " + ", ".join(f"{x:.1f}" for x in self.centre[region - 1].tolist()) + " m"
+        if not self.receiver_names:
+            return f"spectra {where}"
+        change = "stronger" if column < len(self.receiver_names) else "weaker"
+        return f"{self.receiver_names[column % len(self.receiver_names)]} {change} {where}"
+
+
+def held_out_scores(model: FieldModel, train: Spectra) -> Scores:
+    """Return the scores of training spectra, each fifth of them predicted without itself if the model can forget spectra.
+
+    Args:
+        model: Fitted model.
+        train: Its training spectra in their order.
+    """
+    if not isinstance(model, ProcessModel):
+        return score(model, train)
+    parts, order = [], []
+    for rows in torch.randperm(len(train), generator=torch.Generator().manual_seed(0)).chunk(N_FOLDS):
+        parts.append(score(model.forget(rows), train.subset(rows)))
+        order.append(rows)
+    back = torch.cat(order).argsort()
+    joined = Scores.joined(parts)
+    return Scores(*(getattr(joined, field.name)[back] for field in fields(joined)))
+
+
+class KernelMonitor:
+    """Choice of the kernel whenever a model has learnt 30 measurements and a tenth of its data more.
+
+    The kernel is chosen by all data before these measurements. It is kept if it predicts these measurements, each before it
+    is learnt, with an error that is lower by a paired t-test of the log errors. The level of the test is the false-alarm
+    rate times the number of measurements.
+
+    Args:
+        false_alarm_rate: Kernels per measurement that are kept though they are no better.
+
+    Example:
+        >>> import swiftwrf
+        >>> data = swiftwrf.rssi_room(n=61)
+        >>> model, new = RssiModel().fit(data.subset(torch.arange(60))), data.subset(torch.tensor([60]))
+        >>> KernelMonitor(1e-4).observe(model.update(new), new, score(model, new)) is None
+        True
+    """
+
+    def __init__(self, false_alarm_rate: float) -> None:
+        self.false_alarm_rate = false_alarm_rate
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin with new measurements."""
+        self._new: list[Spectra | Rssi] = []
+        self._scores: list[Scores] = []
+
+    def observe(
+        self, model: ProcessModel | RssiModel, new: Spectra | Rssi, scores: Scores
+    ) -> ProcessModel | RssiModel | None:
+        """Add one measurement; return the model with another kernel if that predicts better.
+
+        Args:
+            model: Model that has learnt the measurement.
+            new: The measurement.
+            scores: Its scores before it was learnt.
+        """
+        self._new.append(new)
+        self._scores.append(scores)
+        count = len(self._new)
+        n = len(model.process.known if isinstance(model, ProcessModel) else model.anchor)
+        if count < max(MIN_NEW, MIN_GROWTH * (n - count)) or n - count < MIN_TRAINING:
+            return None
+        last, error = self._new, Scores.joined(self._scores).error
+        self.restart()
+        other = model.with_chosen_kernel(without=torch.arange(n - count, n))
+        if other.kernel == model.kernel:
+            return None
+        found = []
+        for one in last:
+            found.append(score(other, one))
+            other = learnt(other, one)
+        gain = error.log() - Scores.joined(found).error.log()
+        better = stats.ttest_1samp(gain, 0.0, nan_policy="omit", alternative="greater")
+        return other if better.pvalue < self.false_alarm_rate * count else None
+
+
+def described(old: Kernel, new: Kernel) -> str:
+    """Return how a kernel differs from an earlier one, in words.
+
+    Example:
+        >>> described(Kernel(long=1.0, share=1.0), Kernel(long=0.5, share=1.0, noise=0.1))
+        'correlation length 1 -> 0.5 m, noise 0.01 -> 0.1'
+    """
+    lengths = f"correlation length {old.correlation_length:.2g} -> {new.correlation_length:.2g} m"
+    return f"{lengths}, noise {old.noise:.2g} -> {new.noise:.2g}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,10 +416,12 @@ class Follower:
 
     def resume(self, state: dict[str, Any]) -> None:
         """Continue from a `state`; the model is that of the same moment."""
-        self.count, self.monitor = int(state["count"]), self.monitor.continued(state["monitor"])
-        if (known := state.get("room")) is not None:
-            centre = torch.tensor(known["centre"], dtype=torch.float64)
-            self.room = Monitor(centre, (), None, self.monitor.config).continued(known)
+        self.count = int(state["count"])
+        self.monitor.resume(state["monitor"])
+        self.room = None
+        if (known := state["room"]) is not None:
+            self.room = Monitor(self.model.region(), (), None, self.monitor.config)
+            self.room.resume(known)
 
 
 def unexplained(room: GeometryModel, spectra: Spectra) -> Tensor:

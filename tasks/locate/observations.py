@@ -18,7 +18,6 @@ from swiftwrf.data.store import Store
 from swiftwrf.data.survey import has_positions
 from swiftwrf.errors import listed, with_article
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
-from swiftwrf.locate.track import joined
 from swiftwrf.metrics import angle_errors
 from tasks.directory import check_new_file
 from tasks.environment import stamp
@@ -206,7 +205,7 @@ def _tracked(posteriors: Iterable[Posterior], time: Tensor, speed_m_s: float) ->
         if sum(some.log_weight.numel() for some in parts) > MAX_TRACKED:
             most = MAX_TRACKED // part.log_weight.shape[1]
             raise InputError(f"--track takes {most} rows with this locator; split SOURCE, or fit it with fewer --cells")
-    whole = smoothed(joined(parts), time, speed_m_s)
+    whole = smoothed(Posterior.cat(parts), time, speed_m_s)
     for start in range(0, len(whole), BATCH_ROWS):
         rows = slice(start, start + BATCH_ROWS)
         position = whole.position if len(whole.position) == 1 else whole.position[rows]

@@ -18,7 +18,7 @@ from swiftwrf import FieldModel, InputError, Rssi, Spectra
 from swiftwrf.data.files import refusing_unreadable, table_of
 from swiftwrf.errors import CONTENT_ERRORS
 from swiftwrf.online import Step
-from swiftwrf.online.prequential import LEVEL
+from swiftwrf.online.scores import LEVEL
 from swiftwrf.rssi import RssiModel
 from tasks.records import strict
 from tasks.update.options import TABLE, UpdateConfig

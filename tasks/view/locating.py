@@ -128,7 +128,7 @@ class RssiLocating:
     @classmethod
     def of_training(cls, locator: RssiLocator) -> RssiLocating:
         """Return a locator with its training rows, if the measurements are not known."""
-        known = locator.fingerprints
+        known = locator.likelihoods.fingerprints
         rssi = known.rssi.double()
         rssi[known.rssi < known.floor + UNDETECTED_BELOW_DB / 2] = torch.nan
         rows = Rssi(

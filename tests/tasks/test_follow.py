@@ -338,7 +338,7 @@ def test_names_of_receivers_are_any_text(follow, tmp_path, monkeypatch):
     names = ("caf\u00e9\r\nhall", *data.receiver_names[1:])
     data = Rssi(data.rssi_dbm, data.transmitter_position, receiver_names=names)
     RssiModel().fit(data.subset(torch.arange(40))).save(tmp_path / "model.safetensors")
-    monkeypatch.setattr("swiftwrf.online.monitor.alarm_threshold", lambda *_: 1e-9)
+    monkeypatch.setattr("swiftwrf.online.follower.alarm_threshold", lambda *_: 1e-9)
     content = line(40, rssi_dbm={names[0]: -20.0}) + line(41, rssi_dbm={names[0]: -20.0})
     code, answers, _ = follow(tmp_path / "model.safetensors", content=content)
     assert code == 0

@@ -13,13 +13,11 @@ from swiftwrf import AngularGrid, InputError, load, rssi_room, simulated_room
 from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.locate import MatchedField, Posterior, Region, RssiLocator
-from swiftwrf.locate.pool import pooled_weights
-from swiftwrf.locate.posterior import normalised
-from swiftwrf.locate.region import Cells
-from swiftwrf.locate.residuals import ResidualDistribution
-from swiftwrf.locate.rssi_likelihood import DetectionLikelihood, RssiMaps, ValueLikelihood
-from swiftwrf.locate.search import best_cells, refined
-from swiftwrf.locate.spectrum_likelihood import BOUNDS, PathStatistics, PathWaves, PhaseLikelihood, SpectrumFeatures
+from swiftwrf.locate.posterior import normalised, pooled_weights
+from swiftwrf.locate.region import Cells, best_cells, refined
+from swiftwrf.locate.rssi_likelihood import DetectionLikelihood
+from swiftwrf.locate.spectrum_likelihood import BOUNDS, CoarrayLikelihood, PathWaves, PhaseLikelihood, SpectrumFeatures
+from swiftwrf.locate.student import Student
 from swiftwrf.models.geometry import GeometryModel, Plane
 from swiftwrf.models.geometry.path_gains import PathGains
 
@@ -146,7 +144,8 @@ def test_residuals_with_outliers_have_heavy_tails():
     generator = torch.Generator().manual_seed(0)
     clean = torch.randn(400, 6, generator=generator)
     heavy = clean / (torch.rand(400, 1, generator=generator) + 0.05)
-    assert ResidualDistribution.fit(heavy, 1.0).degrees < ResidualDistribution.fit(clean, 1.0).degrees
+    degrees = [CoarrayLikelihood(None, residual, 1.0).distribution.degrees for residual in (heavy, clean)]
+    assert degrees[0] < degrees[1]
 
 
 def test_a_region_follows_a_path_and_fills_a_room():
@@ -217,7 +216,7 @@ def test_the_order_of_receivers_changes_nothing(floor):
 def test_rssi_is_located_better_than_by_fingerprints(floor):
     _, test, locator = floor
     found = (locator.locate(test.rssi_dbm).median - test.transmitter_position).norm(dim=1)
-    nearest = (locator.fingerprints.estimate(test.rssi_dbm) - test.transmitter_position).norm(dim=1)
+    nearest = (locator.likelihoods.fingerprints.estimate(test.rssi_dbm) - test.transmitter_position).norm(dim=1)
     assert found.median() < nearest.median()
 
 
@@ -262,14 +261,11 @@ def test_a_locator_that_is_not_fitted_is_refused(locator, tmp_path):
 
 
 def test_missing_values_count_as_missing():
-    maps = RssiMaps(torch.tensor([[-60.0, -70.0, -80.0]]), torch.full((1, 3), 2.0))
-    likelihood = ValueLikelihood(torch.eye(3, dtype=torch.float64), math.inf)
-    both = likelihood.log_likelihood(maps, torch.tensor([[-61.0, math.nan, -80.0]]))
-    alone = RssiMaps(maps.mean[:, [0, 2]], maps.std[:, [0, 2]])
-    less = ValueLikelihood(torch.eye(2, dtype=torch.float64), math.inf).log_likelihood(
-        alone, torch.tensor([[-61.0, -80.0]])
-    )
-    assert torch.allclose(both, less)
+    observed, mean = torch.tensor([[-61.0, math.nan, -80.0]]), torch.tensor([[-60.0, -70.0, -80.0]])
+    std, kept = torch.full((1, 3), 2.0), [0, 2]
+    both, less = (Student(torch.eye(n, dtype=torch.float64), math.inf) for n in (3, 2))
+    expected = less.log_likelihood(observed[:, kept], mean[:, kept], std[:, kept])
+    assert torch.allclose(both.log_likelihood(observed, mean, std), expected)
 
 
 def test_detections_are_learnt():
@@ -314,8 +310,7 @@ def test_variances_of_phases_that_no_room_explains_stay_finite():
     room = GeometryModel.of_planes(data, [Plane(*plane, gain=0.6) for plane in six.items()], order=3)
     assert data.array is not None
     features = SpectrumFeatures.of(data.store.batches(), data.array, data.grid, 0)
-    statistics = PathStatistics.fit(room, data.position, features)
-    assert bool((statistics.raw >= BOUNDS[0] - 1e-4).all())
-    assert bool((statistics.raw <= BOUNDS[1] + 1e-4).all())
-    density = PhaseLikelihood(room, statistics).log_likelihood(PathWaves.at(room, data.position), features)
-    assert bool(density.isfinite().all())
+    likelihood = PhaseLikelihood.fit(room, data.position, features)
+    assert bool((likelihood.log_variance >= BOUNDS[0] - 1e-4).all())
+    assert bool((likelihood.log_variance <= BOUNDS[1] + 1e-4).all())
+    assert bool(likelihood(PathWaves.at(room, data.position), features).isfinite().all())

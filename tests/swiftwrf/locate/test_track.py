@@ -10,7 +10,6 @@ import torch
 from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.locate import Posterior, RssiLocator, smoothed, track
 from swiftwrf.locate.posterior import normalised
-from swiftwrf.locate.track import joined
 from tasks.command_line import command_line
 from tasks.locate import experiment
 from tasks.locate.options import LocateConfig
@@ -76,7 +75,7 @@ def test_the_time_between_observations_widens_the_step():
 def test_products_in_chunks_are_the_same(monkeypatch):
     posterior = gaussian(line(), walk(n=5)[1])
     whole = smoothed(posterior, None, 1.0)
-    monkeypatch.setattr(track, "MAX_KERNEL", 0)
+    monkeypatch.setattr(track, "MAX_KEPT_PAIRS", 0)
     monkeypatch.setattr(track, "CHUNK", 1000)
     assert smoothed(posterior, None, 1.0).weight.allclose(whole.weight, atol=1e-6)
 
@@ -110,13 +109,11 @@ def test_a_jump_and_impossible_candidates_keep_finite_weights():
 def test_joined_groups_are_one_walk():
     at, observed = line(), walk(n=9)[1]
     whole = gaussian(at, observed)
-    parts = joined([gaussian(at, some) for some in observed.split(4)])
+    parts = Posterior.cat([gaussian(at, some) for some in observed.split(4)])
     assert parts.position.shape == whole.position.shape
     assert parts.log_weight.equal(whole.log_weight)
-    own = joined([gaussian(at.expand(len(some), -1, -1), some) for some in observed.split(4)])
+    own = Posterior.cat([gaussian(at.expand(len(some), -1, -1), some) for some in observed.split(4)])
     assert own.position.shape == (9, 301, 3)
-    with pytest.raises(InputError, match="different numbers"):
-        joined([whole, gaussian(line(5), observed)])
 
 
 @pytest.mark.parametrize(
@@ -170,7 +167,7 @@ def test_walks_without_a_time_are_refused(cell, tmp_path, capsys):
     table = pd.DataFrame(data.rssi_dbm[:3].numpy(), columns=list(data.receiver_names)).assign(time=["2", cell, "7"])
     table.to_csv(tmp_path / "walk.csv", index=False)
     assert locate(tmp_path / "locator", tmp_path / "walk.csv", "--track", 1, "--out", tmp_path / "out.csv") == 2
-    assert "row 2 has no time" in capsys.readouterr().err
+    assert "row 1 (counted from 0) has no time" in capsys.readouterr().err
 
 
 def test_positions_of_a_walk(tmp_path, capsys):

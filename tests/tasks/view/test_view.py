@@ -327,7 +327,8 @@ def test_larger_errors_of_rssi_make_the_expected_error_larger(located_floor):
     """Here RSSI deviates three times as far from the maps."""
     locator, data, in_training = located_floor
     noisy = copy.copy(locator)
-    noisy.values = replace(locator.values, correlation=9 * locator.values.correlation)
+    values = locator.likelihoods.values
+    noisy.likelihoods = replace(locator.likelihoods, values=replace(values, scale=9 * values.scale))
     expected = [np.nanmean(RssiLocating(one, data, in_training).expected_error.values) for one in (locator, noisy)]
     assert expected[1] > 1.3 * expected[0]
 
