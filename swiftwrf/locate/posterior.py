@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from swiftwrf.errors import InputError
-from swiftwrf.plotting import MARK, Displayed, plan
-
-if TYPE_CHECKING:
-    import matplotlib.axes
+from swiftwrf.plotting import MARK, Axes, Displayed, plan
 
 WEISZFELD_STEPS = 30
 MODE_MASS = 0.1  # mass of a second mode from which on a posterior is ambiguous
@@ -59,7 +55,7 @@ class Posterior(Displayed):
     def _median_radius(self) -> str:
         return f"{float(self.credible_radius().median()):.2f} m"
 
-    def plot(self, row: int = 0, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+    def plot(self, row: int = 0, ax: Axes | None = None) -> Axes:
         """Draw the mass of the candidates, the median and the 80 % credible circle of an observation, seen from above.
 
         Args:

@@ -26,9 +26,8 @@ from swiftwrf.models.primitives import Primitives
 from swiftwrf.positions import frame, normalise
 from swiftwrf.rasterize import rasterize_magnitude
 from swiftwrf.runtime.checkpoint import Header, expect
-from swiftwrf.runtime.descent import Descent, Schedule, warm_cosine
 from swiftwrf.runtime.progress import progress_bar
-from swiftwrf.runtime.session import Record, Session
+from swiftwrf.runtime.session import Descent, Record, Schedule, Session, warm_cosine
 from swiftwrf.runtime.validation import (
     Fraction,
     NonNegativeFloat,
