@@ -3,7 +3,7 @@
 | backend     | tensors                      | method                                                       |
 |-------------|------------------------------|--------------------------------------------------------------|
 | `reference` | any device, float32, float64 | the definition, dense                                        |
-| `cpu`       | CPU, float32                 | culled rows, compiled by numba at the first use              |
+| `cpu`       | CPU, float32                 | culled rows, compiled by numba (extra `paper`) at the first use |
 | `cuda`      | NVIDIA GPU, float32          | culled tiles, compiled by NVRTC at the first use             |
 | `auto`      |                              | the fast backend of device and dtype if available, else `reference` |
 """
@@ -105,11 +105,15 @@ def rasterize_magnitude(
 def prepare(device: torch.device | str) -> None:
     """Compile the fast backend of a device, so that measured times do not include its compilation.
 
+    Raises:
+        InputError: The backend needs a package that is missing.
+
     Example:
         >>> prepare("cpu")
     """
+    backend: Backend = "cuda" if torch.device(device).type == "cuda" else "cpu"
     ones = torch.ones(1, 1, 2, device=device)
-    rasterize_magnitude(ones, torch.ones(1, 3, device=device), ones, AngularGrid(0.0, 1.0, 1, 0.0, 1))
+    rasterize(ones, torch.ones(1, 3, device=device), ones, AngularGrid(0.0, 1.0, 1, 0.0, 1), backend)
 
 
 def _constant(function: Callable[[torch.device], bool]) -> Callable[[torch.device], bool]:
@@ -147,7 +151,8 @@ def _fast(mean: Tensor, cholesky: Tensor, weight: Tensor, backend: Backend, cuto
     if backend == "auto":
         if mean.device.type == "cpu" and mean.dtype == torch.float32 and not HAS_NUMBA:
             warnings.warn(
-                "rendering with the slow backend 'reference': the package numba is not installed", stacklevel=3
+                "rendering with the slow backend 'reference'; the fast one needs numba: pip install 'swiftwrf-tasks[paper]'",
+                stacklevel=3,
             )
         return mean.dtype == torch.float32 and _available(mean.device)
     if backend != "reference" and (mean.device.type != backend or mean.dtype != torch.float32):

@@ -37,9 +37,9 @@ def backend_module(device: str) -> ModuleType:
     try:
         return import_module(BACKENDS[device])
     except ModuleNotFoundError as error:
-        remedy = "install 'swiftwrf-tasks[paper]'" if error.name == "numba" else "install it"
+        remedy = "pip install 'swiftwrf-tasks[paper]'" if error.name == "numba" else "install it"
         raise InputError(
-            f"backend {device!r} needs the package {error.name}; {remedy} or use backend='reference'"
+            f"backend {device!r} needs the package {error.name}; {remedy}, or use backend='reference'"
         ) from error
 
 

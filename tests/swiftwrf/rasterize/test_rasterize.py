@@ -137,15 +137,19 @@ with warnings.catch_warnings(record=True) as caught:
     rendered = swiftwrf.rasterize(*inputs, GRID)
 print(caught[0].message)
 assert torch.equal(rendered, swiftwrf.rasterize(*inputs, GRID, "reference"))
-try:
-    swiftwrf.rasterize(*inputs, GRID, "cpu")
-except swiftwrf.InputError as error:
-    print(error)
+for use in (
+    lambda: swiftwrf.rasterize(*inputs, GRID, "cpu"),
+    lambda: swiftwrf.SwiftWRFPaper(steps=1).fit(swiftwrf.simulated_room(n=20)),
+):
+    try:
+        use()
+    except swiftwrf.InputError as error:
+        print(error)
 """
     done = subprocess.run([sys.executable, "-c", code], env=WITH_TESTS, capture_output=True, text=True, check=False)
     assert done.stdout.splitlines() == [
-        "rendering with the slow backend 'reference': the package numba is not installed",
-        "backend 'cpu' needs the package numba; install 'swiftwrf-tasks[paper]' or use backend='reference'",
+        "rendering with the slow backend 'reference'; the fast one needs numba: pip install 'swiftwrf-tasks[paper]'",
+        *["backend 'cpu' needs the package numba; pip install 'swiftwrf-tasks[paper]', or use backend='reference'"] * 2,
     ], done.stderr
 
 
