@@ -25,7 +25,7 @@ from samples import snapshots, write_snapshots
 from test_calibration import errors, spoilt
 
 from swiftwrf import calibrate, load_spectra, rssi_room
-from swiftwrf.choices import BEAMFORMERS
+from swiftwrf.array.beamforming import BEAMFORMERS
 
 ROWS, POSITIONS, SNAPSHOTS = 5000, 1000, 64
 ECHOES, DRAWS = (0.0, 0.05, 0.1, 0.2), 5

@@ -31,7 +31,8 @@ from swiftwrf import Rssi, load_rssi
 from swiftwrf.data.rssi import PLACE
 from swiftwrf.rssi import LEVEL, PairModel, RssiModel
 from swiftwrf.rssi.head import DB_PER_UNIT, Head, render
-from tasks.rssi.predictors import PREDICTORS, make_predictor
+from tasks.rssi.predictors import PREDICTORS
+from tasks.rssi.predictors.base import make_predictor
 from tasks.summarise import error_summary, paired_difference
 
 RESULT = "rssi"

@@ -6,21 +6,17 @@ Implementations are named as in an entry point, `module:object`, and imported at
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Any, Literal
 
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.registry import Registry
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from swiftwrf.models.base import FieldModel
-
 Moving = Literal["transmitter", "receiver"]
 CARRIERS_HZ = (1e6, 1e13)
+MAX_SUGGESTIONS = 500  # positions to measure next
 SCENE_FILE = ".xml"  # suffix of scene files; other names are those of rooms
 
-FIELD_MODELS: Registry[FieldModel] = Registry(
+FIELD_MODELS: Registry[Any] = Registry(
     "field model",
     "swiftwrf.models",
     {
@@ -40,15 +36,6 @@ FIELD_MODELS: Registry[FieldModel] = Registry(
     },
 )
 PUBLISHED = {"swiftwrf": "swiftwrf_paper"}  # field models whose published settings are those of another one
-BEAMFORMERS: Registry[Tensor] = Registry(
-    "beamformer",
-    "swiftwrf.beamformers",
-    {
-        "phase": "swiftwrf.array.beamforming:phase",
-        "bartlett": "swiftwrf.array.beamforming:bartlett",
-        "capon": "swiftwrf.array.beamforming:capon",
-    },
-)
 ROOMS = {  # what stands in the rooms of data/raytraced/rooms.yml
     "conference": "conference room, 8 x 5 x 2.8 m: a table with ten chairs, screen, whiteboard, sideboard",
     "office": "office, 6 x 5 x 2.7 m: four desks with screens, a partition, metal cabinets, shelves",

@@ -13,7 +13,9 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 
 if TYPE_CHECKING:
-    import matplotlib.axes
+    from matplotlib.axes import Axes as Axes
+else:
+    Axes = Any
 
 MARK = "#cc3311"  # of a true or estimated value in a figure, distinct from all colours of viridis
 
@@ -50,7 +52,7 @@ def extent(position: Tensor) -> str:
     return f"{' x '.join(f'{side:.2f}' for side in sides)} m"
 
 
-def polar_spectrum(spectrum: Tensor, grid: AngularGrid, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+def polar_spectrum(spectrum: Tensor, grid: AngularGrid, ax: Axes | None = None) -> Axes:
     """Draw a spectrum as seen along the normal of the array, which is the centre, and return the axes.
 
     Args:
@@ -77,15 +79,13 @@ def polar_spectrum(spectrum: Tensor, grid: AngularGrid, ax: matplotlib.axes.Axes
     return ax
 
 
-def mark_direction(ax: matplotlib.axes.Axes, azimuth: float, elevation: float, label: str) -> None:
+def mark_direction(ax: Axes, azimuth: float, elevation: float, label: str) -> None:
     """Mark a direction [rad] in the figure of `polar_spectrum`."""
     ax.plot(azimuth, 90 - np.degrees(elevation), "o", markersize=11, fillstyle="none", color=MARK, label=label)
     ax.legend(loc="lower left", bbox_to_anchor=(-0.15, -0.12))
 
 
-def plan(
-    position: Tensor, value: Tensor, label: str, ax: matplotlib.axes.Axes | None = None, **style: Any
-) -> matplotlib.axes.Axes:
+def plan(position: Tensor, value: Tensor, label: str, ax: Axes | None = None, **style: Any) -> Axes:
     """Draw values at positions, seen from above and to scale, and return the axes. Values that are nan are left out.
 
     Args:
@@ -107,9 +107,7 @@ def plan(
     return ax
 
 
-def plan_map(
-    corners: NDArray[Any], value: NDArray[Any], label: str, ax: matplotlib.axes.Axes | None = None
-) -> matplotlib.axes.Axes:
+def plan_map(corners: NDArray[Any], value: NDArray[Any], label: str, ax: Axes | None = None) -> Axes:
     """Draw a map seen from above and to scale, and return the axes.
 
     Args:
@@ -128,7 +126,7 @@ def plan_map(
     return ax
 
 
-def _plan_axes(ax: matplotlib.axes.Axes | None) -> matplotlib.axes.Axes:
+def _plan_axes(ax: Axes | None) -> Axes:
     if ax is None:
         from matplotlib import pyplot
 

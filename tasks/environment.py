@@ -10,7 +10,7 @@ import subprocess
 import sys
 from contextlib import suppress
 from datetime import UTC, datetime
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -85,8 +85,11 @@ def environment(device: torch.device, source: dict[str, str], processes: int = 1
 
 def packages() -> dict[str, str]:
     """Return the versions of this project and of the libraries on which results depend."""
-    names = ("swiftwrf-tasks", "torch", "torchvision", "numpy", "scipy", "scikit-learn", "numba")
-    return {name: version(name) for name in names}
+    found = {}
+    for name in ("swiftwrf-tasks", "torch", "torchvision", "numpy", "scipy", "scikit-learn", "numba"):
+        with suppress(PackageNotFoundError):  # numba is an extra
+            found[name] = version(name)
+    return found
 
 
 def _commit() -> str | None:

@@ -11,7 +11,6 @@ from unicodedata import category
 
 import tyro
 
-from swiftwrf.choices import BEAMFORMERS
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.registry import Registry
 from tasks import labels
@@ -90,18 +89,18 @@ def plain(config: Any) -> dict[str, Any]:
     return {name: value for name, value in asdict(config).items() if name not in OUTPUT}
 
 
-def choice(meaning: str, registry: Registry[Any], known: Mapping[str, labels.Label], default: str) -> Any:
+def choice(meaning: str, registry: Registry[Any] | None, known: Mapping[str, labels.Label], default: str) -> Any:
     """Return the annotation of an option that takes names of a registry. Its help lists the names.
 
     Args:
         meaning: Meaning of the option.
-        registry: Registry of the names.
+        registry: Registry of the names. None if `known` has all of them.
         known: Labels by name. Names of other packages have the first line of their docstring.
         default: Default that the help shows.
     """
 
     def entries(_: str) -> str:
-        found = labels.labels(registry, dict(known))
+        found = known if registry is None else labels.labels(registry, dict(known))
         return f"{'; '.join(f'{name}: {label.meaning}' for name, label in found.items())} (default: {default})"
 
     return tyro.conf.arg(help=f"{meaning}:", help_behavior_hint=entries)
@@ -116,9 +115,9 @@ class SpectraSource(Options):
     array: tuple[int, float, float] | tuple[int, int, float, float] | None = None
     """array of the spectra if the data do not describe it, or for which spectra of ray paths are computed: elements a side,
     spacing [m], carrier [Hz] of a square array, or rows, columns, spacing [m], carrier [Hz]"""
-    beamformer: Annotated[
-        str | None, choice("beamformer for array snapshots", BEAMFORMERS, labels.BEAMFORMERS, "phase")
-    ] = None
+    beamformer: Annotated[str | None, choice("beamformer for array snapshots", None, labels.BEAMFORMERS, "phase")] = (
+        None
+    )
     grid: tuple[int, int] | None = None
     """elevations and azimuths of computed spectra (default: 90 360)"""
     every: int | None = None
@@ -132,8 +131,8 @@ class SpectraSource(Options):
 
     def check(self) -> None:
         super().check()
-        if self.beamformer is not None:
-            BEAMFORMERS.check(self.beamformer)
+        if self.beamformer is not None and self.beamformer not in labels.BEAMFORMERS:
+            raise InputError(f"unknown beamformer {self.beamformer!r}; choose from {', '.join(labels.BEAMFORMERS)}")
         if self.array is not None:
             self._check_array(*self.array)
         if self.grid is not None and min(self.grid) < 2:

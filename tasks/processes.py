@@ -20,7 +20,7 @@ from functools import cache
 from multiprocessing import parent_process
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import torch
 
@@ -30,10 +30,14 @@ from swiftwrf.runtime.threads import set_threads
 from tasks.claim import STEPS
 from tasks.preload import process_context, without_main
 
-if TYPE_CHECKING:
-    from tasks.steps import Step
-
 MAX_SECONDS_TO_END = 10.0  # from the signal to the end of a process
+
+
+class Computation(Protocol):
+    """What a process needs of a step of `tasks.steps`."""
+
+    def compute(self, context: Any, folder: Path) -> Any:
+        """Return plain values."""
 
 
 class LocalProcesses:
@@ -51,7 +55,7 @@ class LocalProcesses:
         self._pool = ProcessPoolExecutor(number, process_context(), _begin)
         self._started: dict[int, BaseProcess] = {}
 
-    def submit(self, step: Step[Any]) -> Future[Any]:
+    def submit(self, step: Computation) -> Future[Any]:
         """Begin a step in a process.
 
         Raises:
@@ -130,7 +134,7 @@ def _read(content: Path) -> Any:
     return pickle.loads(content.read_bytes())
 
 
-def _compute(step: Step[Any], threads: int, folder: Path, content: Path) -> tuple[Any, float]:
+def _compute(step: Computation, threads: int, folder: Path, content: Path) -> tuple[Any, float]:
     """Return the values of a step and its seconds."""
     context = _read(content)
     set_threads(threads)  # after the libraries of the step are loaded, so that it reaches all of them

@@ -9,7 +9,8 @@ import pytest
 
 import augment
 import swiftwrf
-from swiftwrf.choices import BEAMFORMERS, FIELD_MODELS, ROOMS
+from swiftwrf.array.beamforming import BEAMFORMERS
+from swiftwrf.choices import FIELD_MODELS, ROOMS
 from swiftwrf.data.raytraced import ROOMS as BUILT_IN_ROOMS
 from tasks import labels
 from tasks.command import COMMANDS

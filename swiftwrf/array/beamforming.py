@@ -11,8 +11,7 @@ spectrum S into [0, 1]. With steering vector a(k) and K elements:
 Capon's relative levels are not reliable if paths are coherent over the snapshots, because they cancel each other.
 
 A beamformer is a function `(channel (n, S, K), responses) -> squared spectra`; `responses` computes a^H M a of Hermitian
-matrices (n, K, K) at the directions of a grid. Other packages add beamformers by entry points of the group
-`swiftwrf.beamformers`.
+matrices (n, K, K) at the directions of a grid.
 """
 
 from __future__ import annotations
@@ -67,3 +66,6 @@ def _of_unit_power(channel: Tensor) -> Tensor:
     found = covariance(channel)
     power = found.diagonal(dim1=1, dim2=2).real.mean(dim=1).clamp_min(1e-300)
     return found / power[:, None, None]
+
+
+BEAMFORMERS = {PHASE: phase, "bartlett": bartlett, "capon": capon}

@@ -12,8 +12,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, folded_to_front, to_angles, to_direction
-from swiftwrf.array.beamforming import PHASE
-from swiftwrf.choices import BEAMFORMERS
+from swiftwrf.array.beamforming import BEAMFORMERS, PHASE
 from swiftwrf.errors import InputError
 from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.cache import cached_tensors
@@ -165,12 +164,14 @@ class PlanarArray:
         Args:
             channel: Complex channel of each element, (n, K), or (n, S, K) of several snapshots (subcarriers or packets).
             grid: Directions to scan.
-            beamformer: Name in `swiftwrf.array.beamforming`: phase, bartlett or capon. With phase, magnitudes of the
+            beamformer: phase, bartlett or capon; see `swiftwrf.array.beamforming`. With phase, magnitudes of the
                 channel have no effect, as in the paper.
 
         Raises:
             InputError: An unknown beamformer, or too few snapshots for it.
         """
+        if beamformer not in BEAMFORMERS:
+            raise InputError(f"unknown beamformer {beamformer!r}; choose from {', '.join(BEAMFORMERS)}")
         snapshots = channel[:, None] if channel.dim() == 2 else channel
         make, functions = BEAMFORMERS[beamformer], basis(self, grid)
         spectrum = torch.empty(len(channel), *grid.shape)

@@ -19,9 +19,8 @@ from swiftwrf.models.base import FieldModel, FitContext
 from swiftwrf.models.link import Linked
 from swiftwrf.positions import frame, normalise
 from swiftwrf.runtime.checkpoint import Header, expect
-from swiftwrf.runtime.descent import Descent, Model, Schedule, warm_cosine
 from swiftwrf.runtime.progress import progress_bar
-from swiftwrf.runtime.session import Session
+from swiftwrf.runtime.session import Descent, Model, Schedule, Session, warm_cosine
 from swiftwrf.runtime.validation import (
     Fraction,
     NonNegativeInt,

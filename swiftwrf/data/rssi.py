@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -18,15 +18,13 @@ from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, position_coor
 from swiftwrf.data.splits import MIN_TRAINING, Validation, random_split, validation_for
 from swiftwrf.data.survey import read_survey
 from swiftwrf.errors import InputError, listed
-from swiftwrf.plotting import MARK, plan
+from swiftwrf.plotting import MARK, Axes, plan
 from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.validation import NonNegativeInt, checked
 
 META = "meta.csv"  # file of the NeRF2 layout with a row for each measurement
 SURVEY = "survey.yml"  # file of the toolkit's own layout with properties of all measurements
 PLACE, MIN_PLACES = "place", 5  # split by receiver, a fifth of which is held out
-if TYPE_CHECKING:
-    import matplotlib.axes
 
 UNKNOWN = (float("nan"),) * 3  # position of a receiver
 NO_NAME = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")  # line breaks, controls, halves of characters
@@ -310,7 +308,7 @@ class Rssi(PositionedData):
             rssi_dbm=self.rssi_dbm[:, columns],
         )
 
-    def plot(self, receiver: str | None = None, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+    def plot(self, receiver: str | None = None, ax: Axes | None = None) -> Axes:
         """Draw the RSSI where it was detected, seen from above, and the known positions of the receivers.
 
         Args:

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -22,12 +22,9 @@ from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.data.store import BATCH_PIXELS, MAX_MEMORY_PIXELS, Store, stored, too_many
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
-from swiftwrf.plotting import mark_direction, polar_spectrum
+from swiftwrf.plotting import Axes, mark_direction, polar_spectrum
 from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.validation import checked
-
-if TYPE_CHECKING:
-    import matplotlib.axes
 
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
 DIRECTION = ("elevation", "azimuth")  # names of the dimensions of a spectrum
@@ -202,7 +199,7 @@ class Spectra(PositionedData):
         """Return the spectra averaged to at most that many columns, with enough rows for SSIM; 0 keeps all pixels."""
         return self.coarsen(coarsening(self.grid.shape, azimuths, least_rows=WINDOW))
 
-    def plot(self, row: int = 0, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+    def plot(self, row: int = 0, ax: Axes | None = None) -> Axes:
         """Draw a spectrum and the direction of the line of sight, seen along the normal of the array.
 
         Args:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Self
+from typing import Annotated, Self
 
 import numpy as np
 import torch
@@ -14,12 +14,10 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
-from swiftwrf.plotting import MARK, Displayed, plan
+from swiftwrf.errors import InputError
+from swiftwrf.plotting import MARK, Axes, Displayed, plan
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.validation import checked
-
-if TYPE_CHECKING:
-    import matplotlib.axes
 
 RIDGE = 1e-3  # of the weights: keeps those that the data do not determine near their start
 
@@ -63,7 +61,7 @@ class Posterior(Displayed):
     def _median_radius(self) -> str:
         return f"{float(self.credible_radius().median()):.2f} m"
 
-    def plot(self, row: int = 0, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+    def plot(self, row: int = 0, ax: Axes | None = None) -> Axes:
         """Draw the mass of the candidates, the median and the 80 % credible circle of an observation, seen from above.
 
         Args:

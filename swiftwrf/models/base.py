@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import torch
 from annotated_types import Gt, Le
@@ -21,18 +21,13 @@ from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError, with_article
 from swiftwrf.models.link import Link
 from swiftwrf.models.prediction import Prediction
-from swiftwrf.plotting import Displayed, extent
+from swiftwrf.plotting import Axes, Displayed, extent
 from swiftwrf.positions import check_positions, to_tensor
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.options import Configured, Preset, all_or_nothing, from_plain
 from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.threads import single_thread, to_device
 from swiftwrf.runtime.validation import NonNegativeInt, checked, configuration
-
-if TYPE_CHECKING:
-    import matplotlib.axes
-
-    import swiftwrf.models.geometry.model
 
 ARRAY, FIXED_END = "array", "fixed end"  # requirements that a model can declare
 CPU = torch.device("cpu")
@@ -306,7 +301,7 @@ class FieldModel(Configured, Saved, Displayed):
         raise InputError(f"{self.kind}: cannot weigh earlier spectra less; fit it again to the new ones")
 
     @property
-    def room(self) -> swiftwrf.models.geometry.model.GeometryModel | None:
+    def room(self) -> FieldModel | None:
         """Room that the model found or uses; None for models without one."""
         return None
 
@@ -409,7 +404,7 @@ class FieldModel(Configured, Saved, Displayed):
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         """Take the fitted state over from `_state`, checking every shape first."""
 
-    def plot(self, position: Numbers, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+    def plot(self, position: Numbers, ax: Axes | None = None) -> Axes:
         """Draw the predicted spectrum at one position, seen along the normal of the array.
 
         Args:

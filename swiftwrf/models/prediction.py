@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
@@ -16,11 +16,8 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.dataset import Arrays, Labelled, position_coordinates
 from swiftwrf.data.spectra import DIRECTION, direction_coordinates
 from swiftwrf.errors import InputError
-from swiftwrf.plotting import Displayed, plan, polar_spectrum
+from swiftwrf.plotting import Axes, Displayed, plan, polar_spectrum
 from swiftwrf.runtime.validation import checked
-
-if TYPE_CHECKING:
-    import matplotlib.axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +46,7 @@ class Prediction(Labelled, Displayed):
     grid: AngularGrid | None = None
     receiver_names: tuple[str, ...] = ()
 
-    def plot(self, number: int = 0, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+    def plot(self, number: int = 0, ax: Axes | None = None) -> Axes:
         """Draw a predicted spectrum seen along the normal of the array, or the RSSI at a receiver seen from above.
 
         Args:

@@ -24,11 +24,10 @@ from swiftwrf.models.base import FieldConfig, FieldModel, FitContext
 from swiftwrf.models.mlp import encode, skip_forward, skip_layers
 from swiftwrf.models.primitives import Primitives
 from swiftwrf.positions import frame, normalise
-from swiftwrf.rasterize import rasterize_magnitude
+from swiftwrf.rasterize import prepare, rasterize_magnitude
 from swiftwrf.runtime.checkpoint import Header, expect
-from swiftwrf.runtime.descent import Descent, Schedule, warm_cosine
 from swiftwrf.runtime.progress import progress_bar
-from swiftwrf.runtime.session import Record, Session
+from swiftwrf.runtime.session import Descent, Record, Schedule, Session, warm_cosine
 from swiftwrf.runtime.validation import (
     Fraction,
     NonNegativeFloat,
@@ -218,6 +217,8 @@ class Optimisation(Descent[DeformableGaussians]):
     """
 
     def __init__(self, config: SwiftWRFPaperConfig, train: Spectra, device: torch.device | str) -> None:
+        if torch.device(device).type == "cpu":
+            prepare("cpu")  # without numba a step would take hundreds of times as long
         self.config, self.grid, steps = config, train.grid, config.steps
         self.coarse_steps = round(config.coarse_fraction * steps)
         generator = torch.Generator().manual_seed(config.seed)

@@ -3,7 +3,7 @@
 | backend     | tensors                      | method                                                       |
 |-------------|------------------------------|--------------------------------------------------------------|
 | `reference` | any device, float32, float64 | the definition, dense                                        |
-| `cpu`       | CPU, float32                 | culled rows, compiled by numba at the first use              |
+| `cpu`       | CPU, float32                 | culled rows, compiled by numba (extra `paper`) at the first use |
 | `cuda`      | NVIDIA GPU, float32          | culled tiles, compiled by NVRTC at the first use             |
 | `auto`      |                              | the fast backend of device and dtype if available, else `reference` |
 """
@@ -22,7 +22,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.errors import InputError
-from swiftwrf.rasterize import cuda_kernels, operators, reference
+from swiftwrf.rasterize import cuda, operators, reference
 from swiftwrf.rasterize.magnitude import magnitude
 from swiftwrf.runtime.validation import check_value
 
@@ -70,7 +70,9 @@ def rasterize(
     """
     if not _fast(mean, cholesky, weight, backend, cutoff):
         return reference.field(mean, cholesky, weight, grid, cutoff)
-    rendered = operators.field(*_flattened(mean, cholesky, weight), grid, cutoff)
+    n_position, n = mean.shape[:-2].numel(), mean.shape[-2]  # all positions in one leading dimension
+    factor = cholesky.reshape(n_position, n, 3) if cholesky.dim() > 2 else cholesky
+    rendered = operators.field(mean.reshape(n_position, n, 2), factor, weight.reshape(n_position, n, 2), grid, cutoff)
     return rendered.reshape(*mean.shape[:-2], 2, *grid.shape)
 
 
@@ -84,7 +86,7 @@ def rasterize_magnitude(
 ) -> Tensor:
     """Render the magnitude |A| of the sum of 2D Gaussians, with gradient 0 where A = 0.
 
-    Args and errors are those of `rasterize`. The CUDA backend does not store A.
+    Args and errors are those of `rasterize`.
 
     Returns:
         Magnitude of A, (..., n_elevation, n_azimuth).
@@ -96,32 +98,22 @@ def rasterize_magnitude(
         >>> round(spectrum[0, 0].item(), 3)
         1.0
     """
-    if not _fast(mean, cholesky, weight, backend, cutoff):
-        return magnitude(reference.field(mean, cholesky, weight, grid, cutoff))
-    rendered = operators.magnitude(*_flattened(mean, cholesky, weight), grid, cutoff)
-    return rendered.reshape(*mean.shape[:-2], *grid.shape)
-
-
-def available_backends(device: torch.device | str = "cpu") -> tuple[str, ...]:
-    """Return the backends that render float32 tensors on a device, fastest first.
-
-    Example:
-        >>> available_backends("cpu")[-1]
-        'reference'
-    """
-    device = torch.device(device)
-    return (device.type, "reference") if _available(device) else ("reference",)
+    return magnitude(rasterize(mean, cholesky, weight, grid, backend, cutoff))
 
 
 @lru_cache
 def prepare(device: torch.device | str) -> None:
     """Compile the fast backend of a device, so that measured times do not include its compilation.
 
+    Raises:
+        InputError: The backend needs a package that is missing.
+
     Example:
         >>> prepare("cpu")
     """
+    backend: Backend = "cuda" if torch.device(device).type == "cuda" else "cpu"
     ones = torch.ones(1, 1, 2, device=device)
-    rasterize_magnitude(ones, torch.ones(1, 3, device=device), ones, AngularGrid(0.0, 1.0, 1, 0.0, 1))
+    rasterize(ones, torch.ones(1, 3, device=device), ones, AngularGrid(0.0, 1.0, 1, 0.0, 1), backend)
 
 
 def _constant(function: Callable[[torch.device], bool]) -> Callable[[torch.device], bool]:
@@ -144,19 +136,11 @@ def _cuda_available(device: torch.device) -> bool:
 @cache
 def _cuda_compiles(device: torch.device) -> bool:
     try:
-        cuda_kernels.kernels(device)
-    except cuda_kernels.CudaUnavailable as error:
+        cuda.kernels(device)
+    except cuda.CudaUnavailable as error:
         warnings.warn(f"rendering with the slow backend 'reference': {error}", stacklevel=2)
         return False
     return True
-
-
-def _flattened(mean: Tensor, cholesky: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the tensors with all positions in one leading dimension."""
-    n_position, n = mean.shape[:-2].numel(), mean.shape[-2]
-    if cholesky.dim() > 2:
-        cholesky = cholesky.reshape(n_position, n, 3)
-    return mean.reshape(n_position, n, 2), cholesky, weight.reshape(n_position, n, 2)
 
 
 def _fast(mean: Tensor, cholesky: Tensor, weight: Tensor, backend: Backend, cutoff: float | None) -> bool:
@@ -167,7 +151,8 @@ def _fast(mean: Tensor, cholesky: Tensor, weight: Tensor, backend: Backend, cuto
     if backend == "auto":
         if mean.device.type == "cpu" and mean.dtype == torch.float32 and not HAS_NUMBA:
             warnings.warn(
-                "rendering with the slow backend 'reference': the package numba is not installed", stacklevel=3
+                "rendering with the slow backend 'reference'; the fast one needs numba: pip install 'swiftwrf-tasks[paper]'",
+                stacklevel=3,
             )
         return mean.dtype == torch.float32 and _available(mean.device)
     if backend != "reference" and (mean.device.type != backend or mean.dtype != torch.float32):
@@ -204,4 +189,4 @@ def _check(mean: Tensor, cholesky: Tensor, weight: Tensor) -> None:
             )
 
 
-__all__ = ["Backend", "available_backends", "prepare", "rasterize", "rasterize_magnitude"]
+__all__ = ["Backend", "prepare", "rasterize", "rasterize_magnitude"]

@@ -15,14 +15,14 @@ class _Magnitude(torch.autograd.Function):
     @staticmethod
     def forward(ctx, field):
         magnitude = torch.hypot(*field.unbind(-3))
-        ctx.save_for_backward(field, magnitude)
+        if ctx.needs_input_grad[0]:
+            ctx.save_for_backward(field / torch.where(magnitude == 0, 1.0, magnitude).unsqueeze(-3))
         return magnitude
 
     @staticmethod
     def backward(ctx, grad):
-        field, magnitude = ctx.saved_tensors
-        scale = torch.where(magnitude > 0, grad / magnitude, torch.zeros_like(grad))
-        return field * scale.unsqueeze(-3)
+        (phase,) = ctx.saved_tensors
+        return grad.unsqueeze(-3) * phase
 
 
 def magnitude(field: Tensor) -> Tensor:

@@ -20,10 +20,10 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.errors import InputError
 
-# Modules with the functions `field`, `magnitude`, `field_gradients` and `magnitude_gradients`, imported at the first call.
+# Modules with the functions `field` and `field_gradients`, imported at the first call.
 BACKENDS = {"cpu": "swiftwrf.rasterize.cpu", "cuda": "swiftwrf.rasterize.cuda"}
-PRIMITIVES = "Tensor mean, Tensor cholesky, Tensor weight"
-OPTIONS = (
+ARGUMENTS = (
+    "Tensor mean, Tensor cholesky, Tensor weight, "
     "float elevation_start, float elevation_step, int n_elevation, float azimuth_start, int n_azimuth, float? cutoff"
 )
 
@@ -37,8 +37,9 @@ def backend_module(device: str) -> ModuleType:
     try:
         return import_module(BACKENDS[device])
     except ModuleNotFoundError as error:
+        remedy = "pip install 'swiftwrf-tasks[paper]'" if error.name == "numba" else "install it"
         raise InputError(
-            f"backend {device!r} needs the package {error.name}; install it or use backend='reference'"
+            f"backend {device!r} needs the package {error.name}; {remedy}, or use backend='reference'"
         ) from error
 
 
@@ -46,12 +47,11 @@ def _operator(name: str, schema: str, fake: Callable[..., Any]) -> Any:
     """Return the operator `swiftwrf::rasterize_<name>`, which calls the function `name` of the device's backend."""
     qualified_name = f"swiftwrf::rasterize_{name}"
 
-    n_tensors = schema.partition(")")[0].count("Tensor")
-
     def implement(device: str) -> None:
         def call(*arguments: Any) -> Any:
-            grid = AngularGrid(*arguments[n_tensors : n_tensors + 5])
-            return getattr(backend_module(device), name)(*arguments[:n_tensors], grid, *arguments[n_tensors + 5 :])
+            *tensors_and_axes, cutoff = arguments
+            tensors, axes = tensors_and_axes[:-5], tensors_and_axes[-5:]
+            return getattr(backend_module(device), name)(*tensors, AngularGrid(*axes), cutoff)
 
         torch.library.impl(qualified_name, device, call)
 
@@ -68,57 +68,24 @@ def _empty_field(
     return mean.new_empty(mean.shape[0], 2, n_elevation, n_azimuth)
 
 
-def _empty_magnitude(*arguments):
-    *_, keep_phase = arguments
-    field = _empty_field(*arguments[:-1])
-    return field.new_empty(field.shape[0], *field.shape[2:]), field if keep_phase else field.new_empty(
-        0, *field.shape[1:]
-    )
+def _empty_gradients(grad, *arguments):
+    return tuple(torch.empty_like(tensor, memory_format=torch.contiguous_format) for tensor in arguments[:3])
 
 
-def _empty_gradients(*arguments):
-    primitives = [argument for argument in arguments if isinstance(argument, Tensor)][-3:]
-    return tuple(torch.empty_like(tensor, memory_format=torch.contiguous_format) for tensor in primitives)
+_field = _operator("field", f"({ARGUMENTS}) -> Tensor", _empty_field)
+_gradients = _operator("field_gradients", f"(Tensor grad, {ARGUMENTS}) -> (Tensor, Tensor, Tensor)", _empty_gradients)
 
 
-GRADIENTS = "(Tensor, Tensor, Tensor)"
-_field = _operator("field", f"({PRIMITIVES}, {OPTIONS}) -> Tensor", _empty_field)
-_field_gradients = _operator(
-    "field_gradients", f"(Tensor grad, {PRIMITIVES}, {OPTIONS}) -> {GRADIENTS}", _empty_gradients
-)
-_magnitude = _operator("magnitude", f"({PRIMITIVES}, {OPTIONS}, bool keep_phase) -> (Tensor, Tensor)", _empty_magnitude)
-_magnitude_gradients = _operator(
-    "magnitude_gradients", f"(Tensor grad, Tensor phase, {PRIMITIVES}, {OPTIONS}) -> {GRADIENTS}", _empty_gradients
-)
-
-
-def _save_field(ctx, inputs, output) -> None:
+def _save(ctx, inputs, output) -> None:
     ctx.options = inputs[3:]
     ctx.save_for_backward(*inputs[:3])
 
 
-def _save_magnitude(ctx, inputs, output) -> None:
-    ctx.options = inputs[3:]
-    ctx.save_for_backward(output[1], *inputs[:3])
-    ctx.set_materialize_grads(False)  # The phase has no gradient, so no zeros are needed for it.
+def _backward(ctx, grad):
+    return *_gradients(grad, *ctx.saved_tensors, *ctx.options), *(None for _ in ctx.options)
 
 
-def _field_backward(ctx, grad):
-    return *_field_gradients(grad, *ctx.saved_tensors, *ctx.options), *(None for _ in ctx.options)
-
-
-def _magnitude_backward(ctx, grad, grad_phase):
-    gradients = _magnitude_gradients(grad, *ctx.saved_tensors, *ctx.options[:-1])  # all options but keep_phase
-    return *gradients, *(None for _ in ctx.options)
-
-
-torch.library.register_autograd(_field._schema.name, _field_backward, setup_context=_save_field)
-torch.library.register_autograd(_magnitude._schema.name, _magnitude_backward, setup_context=_save_magnitude)
-
-
-def _arguments(grid: AngularGrid, cutoff: float | None) -> tuple[float | None, ...]:
-    axes = grid.elevation_start, grid.elevation_step, grid.n_elevation, grid.azimuth_start, grid.n_azimuth
-    return *axes, cutoff
+torch.library.register_autograd(_field._schema.name, _backward, setup_context=_save)
 
 
 def field(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None) -> Tensor:
@@ -134,15 +101,6 @@ def field(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cut
     Returns:
         Real and imaginary part, (B, 2, n_elevation, n_azimuth).
     """
-    rendered: Tensor = _field(mean, cholesky, weight, *_arguments(grid, cutoff))
-    return rendered
-
-
-def magnitude(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None) -> Tensor:
-    """Return the magnitude of the field, (B, n_elevation, n_azimuth), with gradient 0 where the field is 0.
-
-    If a gradient is needed, the backend keeps A / |A| for the backward pass.
-    """
-    keep_phase = torch.is_grad_enabled() and any(x.requires_grad for x in (mean, cholesky, weight))
-    rendered: Tensor = _magnitude(mean, cholesky, weight, *_arguments(grid, cutoff), keep_phase)[0]
+    axes = grid.elevation_start, grid.elevation_step, grid.n_elevation, grid.azimuth_start, grid.n_azimuth
+    rendered: Tensor = _field(mean, cholesky, weight, *axes, cutoff)
     return rendered

@@ -168,8 +168,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
     const float* __restrict__ cholesky,    // (N, 3) or (B, N, 3) [rad]
     const float2* __restrict__ weight,     // (B, N) real and imaginary part
     const unsigned* __restrict__ reached,  // (B, strips, words), from find_reach
-    float* __restrict__ field,             // (B, 2, n_elevation, n_azimuth): A; with `magnitude` A / |A|, 0 where A is 0
-    float* __restrict__ magnitude,         // (B, n_elevation, n_azimuth): |A|; either may be null
+    float* __restrict__ field,             // (B, 2, n_elevation, n_azimuth): A
     unsigned n_positions, int n, int cholesky_per_position, Grid grid, Cutoff cutoff) {
     __shared__ int s_collected[WARPS][2 * LANES];   // indices: fewer than 32 wait while up to 32 come
     __shared__ float4 s_prepared[WARPS][LANES][2];  // u at the tile's centre, s1, v there, s21; s3, weight, column
@@ -258,16 +257,8 @@ extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
     for (int k = 0; k < PIXELS; ++k) {
         if (row + k * ROW_STEP < grid.n_elevation && column < grid.n_azimuth) {
             const size_t at = pixel + static_cast<size_t>(k) * ROW_STEP * grid.n_azimuth;
-            float unit = 1.0f;  // what the field is divided by
-            if (magnitude) {
-                const float length = hypotf(re[k], im[k]);
-                magnitude[plane * position + at] = length;
-                unit = length == 0.0f ? 1.0f : length;
-            }
-            if (field) {
-                field[2 * plane * position + at] = re[k] / unit;
-                field[2 * plane * position + plane + at] = im[k] / unit;
-            }
+            field[2 * plane * position + at] = re[k];
+            field[2 * plane * position + plane + at] = im[k];
         }
     }
 }
@@ -294,11 +285,15 @@ struct Prepared {
     float2 weight;
 };
 
-__device__ __forceinline__ void gather(
-    const float* __restrict__ grad, const float* __restrict__ phase,
-    const float2* __restrict__ mean, const float* __restrict__ cholesky, const float2* __restrict__ weight,
-    float2* __restrict__ d_mean, float* __restrict__ d_cholesky, float2* __restrict__ d_weight,
-    int n, int per_warp, int cholesky_per_position, const Grid& grid, const Cutoff& cutoff) {
+extern "C" __global__ void __launch_bounds__(GATHERING_THREADS, 2) rasterize_backward(
+    const float* __restrict__ grad,      // (B, 2, n_elevation, n_azimuth), by A
+    const float2* __restrict__ mean,     // (B, N)
+    const float* __restrict__ cholesky,  // (N, 3) or (B, N, 3)
+    const float2* __restrict__ weight,   // (B, N)
+    float2* __restrict__ d_mean,         // (B, N)
+    float* __restrict__ d_cholesky,      // (B, N, 3)
+    float2* __restrict__ d_weight,       // (B, N)
+    int n, int per_warp, int cholesky_per_position, Grid grid, Cutoff cutoff) {
     __shared__ float2 s_grad[PATCH_ROWS + ROWS_AT_ONCE - 1][PATCH_COLUMNS];  // by the real and by the imaginary part
     __shared__ Prepared s_prepared[GATHERING_WARPS][LANES];
 
@@ -310,9 +305,7 @@ __device__ __forceinline__ void gather(
     const size_t i = static_cast<size_t>(position) * n + primitive;
     cholesky += 3 * (cholesky_per_position ? i : primitive);
     const int plane = grid.n_elevation * grid.n_azimuth;
-    // the gradient by A = re + j im, itself or as the gradient by |A| times A / |A|
-    grad += static_cast<size_t>(phase ? 1 : 2) * plane * position;
-    if (phase) phase += static_cast<size_t>(2) * plane * position;
+    grad += static_cast<size_t>(2) * plane * position;
 
     float columns = -1e30f, rows = -1e30f;  // how far the thread's primitive reaches
     if (mine) {
@@ -361,8 +354,7 @@ __device__ __forceinline__ void gather(
                 float2 g = make_float2(0.0f, 0.0f);
                 if (lane < width && row < height) {
                     const int at = (patch_row + row) * grid.n_azimuth + patch_column + lane;
-                    g = phase ? make_float2(grad[at] * phase[at], grad[at] * phase[at + plane])
-                              : make_float2(grad[at], grad[at + plane]);
+                    g = make_float2(grad[at], grad[at + plane]);
                 }
                 s_grad[row][lane] = g;
             }
@@ -436,29 +428,4 @@ __device__ __forceinline__ void gather(
         d_cholesky[3 * i + 1] = two * v_y * sum[5];
         d_cholesky[3 * i + 2] = two * v_y * sum[6];
     }
-}
-
-extern "C" __global__ void __launch_bounds__(GATHERING_THREADS, 2) rasterize_backward(
-    const float* __restrict__ grad,      // (B, 2, n_elevation, n_azimuth), by A
-    const float2* __restrict__ mean,     // (B, N)
-    const float* __restrict__ cholesky,  // (N, 3) or (B, N, 3)
-    const float2* __restrict__ weight,   // (B, N)
-    float2* __restrict__ d_mean,         // (B, N)
-    float* __restrict__ d_cholesky,      // (B, N, 3)
-    float2* __restrict__ d_weight,       // (B, N)
-    int n, int per_warp, int cholesky_per_position, Grid grid, Cutoff cutoff) {
-    gather(grad, nullptr, mean, cholesky, weight, d_mean, d_cholesky, d_weight, n, per_warp, cholesky_per_position, grid, cutoff);
-}
-
-extern "C" __global__ void __launch_bounds__(GATHERING_THREADS, 2) magnitude_backward(
-    const float* __restrict__ grad,      // (B, n_elevation, n_azimuth), by |A|
-    const float* __restrict__ phase,     // (B, 2, n_elevation, n_azimuth): A / |A|, 0 where A is 0
-    const float2* __restrict__ mean,     // (B, N)
-    const float* __restrict__ cholesky,  // (N, 3) or (B, N, 3)
-    const float2* __restrict__ weight,   // (B, N)
-    float2* __restrict__ d_mean,         // (B, N)
-    float* __restrict__ d_cholesky,      // (B, N, 3)
-    float2* __restrict__ d_weight,       // (B, N)
-    int n, int per_warp, int cholesky_per_position, Grid grid, Cutoff cutoff) {
-    gather(grad, phase, mean, cholesky, weight, d_mean, d_cholesky, d_weight, n, per_warp, cholesky_per_position, grid, cutoff);
 }

@@ -215,6 +215,10 @@ class RssiPredictor(Configured, Displayed, ABC):
         """Add checked rows to this copy."""
         raise InputError(f"a predictor {self.name} cannot be updated; fit it again to all rows")
 
+    def region(self) -> Tensor:
+        """Return the training positions (n, 3) [m], whose box a map covers."""
+        raise NotImplementedError
+
     @abstractmethod
     def _fit(self, train: Rssi, context: RssiFitContext) -> None:
         """Fit to checked data."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -15,12 +14,8 @@ from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
 from swiftwrf.data.dataset import DEGREE_UNITS, Arrays, Labelled
 from swiftwrf.data.rssi import receiver_row
 from swiftwrf.errors import InputError, listed
-from swiftwrf.plotting import Displayed, plan_map
-
-if TYPE_CHECKING:
-    import matplotlib.axes
-
-    from swiftwrf.rssi.model import RssiModel
+from swiftwrf.plotting import Axes, Displayed, plan_map
+from swiftwrf.rssi.base import RssiPredictor
 
 CELLS = 120  # of a map, along its longer side
 MAX_CELLS = 2**22
@@ -52,7 +47,7 @@ class RssiMap(Labelled, Displayed):
     origin: GeodeticOrigin | None = None
 
     @classmethod
-    def predict(cls, model: RssiModel, cell: float | None = None, height: float | None = None) -> RssiMap:
+    def predict(cls, model: RssiPredictor, cell: float | None = None, height: float | None = None) -> RssiMap:
         """Return the map of a fitted model over the box of its training positions.
 
         Args:
@@ -69,7 +64,7 @@ class RssiMap(Labelled, Displayed):
             >>> RssiMap.predict(model, cell=1.0).mean.shape
             (12, 15, 19)
         """
-        position = (model.anchor + model.centre).double()
+        position = model.region()
         low, high = (end[:2].numpy() for end in (position.amin(dim=0), position.amax(dim=0)))
         cell = float((high - low).max()) / CELLS or 1.0 if cell is None else cell
         if not cell > 0:
@@ -100,7 +95,7 @@ class RssiMap(Labelled, Displayed):
         names = tuple(self.receiver_names[row] for row in rows)
         return replace(self, mean=self.mean[rows], std=self.std[rows], receiver_names=names)
 
-    def plot(self, receiver: str | None = None, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+    def plot(self, receiver: str | None = None, ax: Axes | None = None) -> Axes:
         """Draw the map of the predictive mean, seen from above.
 
         Args:

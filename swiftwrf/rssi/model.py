@@ -15,7 +15,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from statistics import NormalDist
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -23,6 +23,7 @@ from torch import Tensor
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, subsample
+from swiftwrf.plotting import Axes
 from swiftwrf.rssi.base import Map, RssiFitContext, SavedRssiPredictor, fingerprint, map_threads
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
@@ -38,9 +39,6 @@ from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.session import Record, Session
 from swiftwrf.runtime.threads import single_thread
-
-if TYPE_CHECKING:
-    import matplotlib.axes
 
 LEVEL = 0.8  # nominal coverage of the interval that the standard deviation is calibrated for
 PAPER_RECEIVERS = 4  # receivers that the paper's head is learnt for together, which saves time
@@ -304,9 +302,7 @@ class RssiModel(SavedRssiPredictor):
         trend = (self.slope_std * (distance - self._middle - self._process.mean(offset))).square().float()
         return mean, (self.noise_db.square() + variance + trend).sqrt()
 
-    def plot(
-        self, receiver: str | None = None, height_m: float | None = None, ax: matplotlib.axes.Axes | None = None
-    ) -> matplotlib.axes.Axes:
+    def plot(self, receiver: str | None = None, height_m: float | None = None, ax: Axes | None = None) -> Axes:
         """Draw the map of the predicted RSSI over the measured region, seen from above.
 
         Args:

@@ -58,10 +58,10 @@ class Registry(Mapping[str, type[Made]]):
 
         return decorate
 
-    def discover(self, package: str, path: list[str], first: tuple[str, ...] = ()) -> None:
-        """Import every module of a package, the modules named `first` before the others, so that each registers itself."""
+    def discover(self, package: str, path: list[str]) -> None:
+        """Import every module of a package in the order of names, so that each registers itself."""
         self._package = package
-        for module in (*first, *sorted(module.name for module in pkgutil.iter_modules(path))):
+        for module in sorted(module.name for module in pkgutil.iter_modules(path)):
             importlib.import_module(f"{package}.{module}")
 
     def check(self, name: str) -> None:

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import cached_property
-from typing import TypeVar
+from functools import cache
+from typing import Generic, TypeVar
 
 import torch
 from threadpoolctl import ThreadpoolController, threadpool_limits
@@ -17,43 +17,44 @@ from swiftwrf.errors import InputError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+State = TypeVar("State")
 
 
-class _Users:
-    """Users of `threads_kept` that are active in this process, and the number of threads before the first of them."""
+class _Shared(Generic[State]):
+    """A setting of the whole process: users in several threads may overlap, and the last one restores it.
 
-    def __init__(self) -> None:
-        self.lock, self.active, self.original = threading.Lock(), 0, 0
+    Args:
+        begin: Called before the first user. Returns the state to restore.
+        end: Called with this state after the last user.
+    """
 
-
-class _LinearAlgebra:
-    """Users that keep the linear algebra of NumPy and SciPy at one thread. It has one number for the whole process."""
-
-    def __init__(self) -> None:
-        self.lock, self.active = threading.Lock(), 0
-
-    @cached_property
-    def libraries(self) -> ThreadpoolController:
-        import scipy.linalg  # noqa: F401  # loads the libraries, which the controller would miss later
-
-        return ThreadpoolController().select(user_api="blas")
+    def __init__(self, begin: Callable[[], State], end: Callable[[State], object]) -> None:
+        self._lock, self._active, self._begin, self._end = threading.Lock(), 0, begin, end
 
     @contextmanager
-    def single_thread(self) -> Iterator[None]:
-        with self.lock:
-            if self.active == 0:
-                self.limits = self.libraries.limit(limits=1)
-            self.active += 1
+    def used(self) -> Iterator[None]:
+        with self._lock:
+            if self._active == 0:
+                self._state = self._begin()
+            self._active += 1
         try:
             yield
         finally:
-            with self.lock:
-                self.active -= 1
-                if self.active == 0:
-                    self.limits.restore_original_limits()
+            with self._lock:
+                self._active -= 1
+                if self._active == 0:
+                    self._end(self._state)
 
 
-_users, _linear_algebra = _Users(), _LinearAlgebra()
+@cache
+def _linear_algebra() -> ThreadpoolController:
+    import scipy.linalg  # noqa: F401  # loads the libraries, which the controller would miss later
+
+    return ThreadpoolController().select(user_api="blas")
+
+
+_torch_threads = _Shared(torch.get_num_threads, torch.set_num_threads)
+_one_blas_thread = _Shared(lambda: _linear_algebra().limit(limits=1), lambda limits: limits.restore_original_limits())
 _workers: ContextVar[int | None] = ContextVar("workers", default=None)  # of `parallel_map` inside `single_thread`
 
 
@@ -106,16 +107,11 @@ def threads_kept() -> Iterator[None]:
         True
     """
     before = torch.get_num_threads()
-    with _users.lock:
-        if _users.active == 0:
-            _users.original = before
-        _users.active += 1
-    try:
-        yield
-    finally:
-        with _users.lock:
-            _users.active -= 1
-            torch.set_num_threads(before if _users.active else _users.original)
+    with _torch_threads.used():
+        try:
+            yield
+        finally:
+            torch.set_num_threads(before)
 
 
 @contextmanager
@@ -129,7 +125,7 @@ def single_thread() -> Iterator[None]:
     """
     token = _workers.set(_workers.get() or torch.get_num_threads())
     try:
-        with threads_kept(), _linear_algebra.single_thread():
+        with threads_kept(), _one_blas_thread.used():
             torch.set_num_threads(1)
             yield
     finally:

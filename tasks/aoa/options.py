@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from augment.limits import MAX_SUGGESTIONS
-from swiftwrf.choices import FIELD_MODELS, Moving, check_scene
+from swiftwrf.choices import FIELD_MODELS, MAX_SUGGESTIONS, Moving, check_scene
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.options import Preset
 from tasks import labels

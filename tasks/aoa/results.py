@@ -14,12 +14,11 @@ from swiftwrf.models import FIELD_MODELS
 from tasks.aoa.condition import EVERYTHING, LOCATOR, STAND_IN, Condition, MeasuredSubset, pooled, reference_of
 from tasks.aoa.context import ROOM_MODEL, Experiment
 from tasks.aoa.cross_validation import choose_estimator
-from tasks.aoa.evaluation import Evaluation
 from tasks.aoa.locating import LEVEL, NO_PLANE, Locating
 from tasks.aoa.options import AUTO, fraction_key
 from tasks.aoa.steps import CrossValidation, FoldLocating
 from tasks.aoa.suggestion import Suggestion
-from tasks.aoa.synthesis import RoomSearch, Synthesis, as_bytes
+from tasks.aoa.synthesis import Evaluation, RoomSearch, Synthesis, as_bytes
 from tasks.metrics import (
     ANGLES,
     SCORES,

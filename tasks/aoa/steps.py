@@ -23,9 +23,8 @@ from tasks.aoa.condition import (
 )
 from tasks.aoa.context import ROOM_MODEL, Experiment
 from tasks.aoa.cross_validation import cross_validate, located_errors, located_folds, measured_errors
-from tasks.aoa.evaluation import Evaluation
 from tasks.aoa.options import AUTO
-from tasks.aoa.synthesis import RoomSearch, syntheses
+from tasks.aoa.synthesis import Evaluation, RoomSearch, syntheses
 from tasks.claim import STEPS
 from tasks.metrics import CrossValidationMetrics
 from tasks.records import read_json

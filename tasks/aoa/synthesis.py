@@ -1,4 +1,4 @@
-"""Steps of the experiment: the room is found, and field models predict spectra."""
+"""Steps of the experiment: the room is found, field models predict spectra, and estimators are trained and tested."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from augment import SyntheticPositions, synthetic_positions
+from augment import Mixed, SyntheticPositions, mix, synthetic_positions
 from swiftwrf import FitError, GeometryModel, InputError, Spectra, load
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import l1, psnr, ssim
 from swiftwrf.models import FieldModel
 from swiftwrf.runtime.checkpoint import read, write
 from tasks.aoa.artifacts import save_artifacts
-from tasks.aoa.condition import NETWORKS, Condition, MeasuredSubset, Training, trainable
+from tasks.aoa.condition import MEASURED_STAND_IN, NETWORKS, STAND_IN, Condition, MeasuredSubset, Training, trainable
 from tasks.aoa.context import ROOM_MODEL, Experiment
-from tasks.aoa.evaluation import Evaluation
+from tasks.aoa.estimators import SavedEstimator, make_estimator
 from tasks.aoa.locating import Locating
+from tasks.aoa.options import AUTO
 from tasks.claim import STEPS
 from tasks.metrics import CrossValidationMetrics
 from tasks.run import Row
@@ -230,6 +231,81 @@ class Synthesis(Step[Experiment]):
             # a training of the network takes most of the time
             if training == trainings[-1][0] or estimator not in NETWORKS.values()
         ]
+
+
+@dataclass(frozen=True)
+class Evaluation(Step[Experiment]):
+    """Train and test one condition.
+
+    Args:
+        condition: Estimator and training set.
+        synthesis: Step of the synthetic spectra, if there are any.
+    """
+
+    condition: Condition
+    synthesis: Synthesis | None = None
+
+    @property
+    def subset(self) -> MeasuredSubset:
+        """Measured spectra of the condition."""
+        return self.condition.subset
+
+    @property
+    def name(self) -> str:
+        return self.condition.result_name
+
+    @property
+    def title(self) -> str:
+        return f"training {self.condition.estimator}, {self.condition.meaning}"
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return (self.synthesis.file,) if self.synthesis else ()
+
+    @property
+    def priority(self) -> int:
+        return int(self.condition.is_network)
+
+    @property
+    def is_optional(self) -> bool:
+        return self.condition.is_network
+
+    def compute(self, experiment: Experiment, folder: Path) -> Row:
+        train = self._training_set(experiment, folder)
+        config, name = experiment.config, self.condition.estimator
+        estimator = make_estimator(name, len(experiment.train), config.preset, seed=experiment.seed(self.subset))
+        began = time.perf_counter()
+        estimator.fit(train, device=experiment.device)
+        fitted = time.perf_counter()
+        estimate = estimator.estimate(experiment.test)
+        if isinstance(estimator, SavedEstimator) and (file := self._saved_as(experiment)):
+            estimator.save(folder / f"{file}-mix{self.subset.key}.safetensors")
+        seconds = {"train": fitted - began, "estimate": time.perf_counter() - fitted}
+        return {"estimate": estimate, "seconds": seconds, "history": estimator.history, "counts": train.counts}
+
+    def _saved_as(self, experiment: Experiment) -> str:
+        """Return the file name of a condition that a user may choose, empty for the others.
+
+        These have all spectra of the first field model, or are the measured-only candidate of the cross-validation.
+        """
+        if self.subset.repeat:
+            return ""
+        if self.synthesis is None:
+            return MEASURED_STAND_IN if self.condition.method == STAND_IN else ""
+        first = experiment.config.synthesizer[0] in (AUTO, self.synthesis.synthesizer)
+        is_complete = self.condition.n_synthetic == self.synthesis.n_synthetic
+        return self.condition.estimator if first and is_complete else ""
+
+    def _training_set(self, experiment: Experiment, folder: Path) -> Mixed:
+        if self.condition.training == "all":
+            return Mixed.measured(experiment.train)
+        measured, _ = experiment.withhold(self.subset)
+        if self.synthesis is None:
+            return Mixed.measured(measured)
+        train = mix(measured, *self.synthesis.training_spectra(folder, "withheld"))
+        if self.condition.training == "turbo_extra":
+            train = train.add(*self.synthesis.training_spectra(folder, "extra"))
+        return train
 
 
 class _FitHistory:

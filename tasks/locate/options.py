@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 
 import tyro
 
-from augment.limits import MAX_SUGGESTIONS
+from swiftwrf.choices import MAX_SUGGESTIONS
 from swiftwrf.errors import InputError
 from tasks.options import OffsetSource, Options, Output, SpectraSource, command_options, given
 

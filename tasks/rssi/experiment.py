@@ -29,7 +29,8 @@ from tasks.page.records import Records
 from tasks.rssi.options import RssiTaskConfig
 from tasks.rssi.page import page
 from tasks.rssi.page.summary import answer
-from tasks.rssi.predictors import PREDICTORS, make_predictor
+from tasks.rssi.predictors import PREDICTORS
+from tasks.rssi.predictors.base import make_predictor
 from tasks.run import Row, Run, choose_device
 from tasks.source import asked_offsets, measured_rssi, offset_notes, split_notes
 from tasks.summarise import error_summary, grouped

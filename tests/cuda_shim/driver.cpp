@@ -22,7 +22,7 @@ int cuModuleLoadData(void** module, const void* image) {
 }
 
 int cuModuleGetFunction(void** function, void* module, const char* name) {
-    static const char* const known[] = {"find_reach", "rasterize", "rasterize_backward", "magnitude_backward"};
+    static const char* const known[] = {"find_reach", "rasterize", "rasterize_backward"};
     for (const char* kernel : known)
         if (std::strcmp(name, kernel) == 0) return *function = const_cast<char*>(kernel), module != MODULE;
     return 500;

@@ -8,7 +8,6 @@ extern "C" int launch(const char* kernel, unsigned blocks, int threads, void** a
     if (is("find_reach")) shim::launch(find_reach, blocks, threads, arguments);
     else if (is("rasterize")) shim::launch(rasterize, blocks, threads, arguments);
     else if (is("rasterize_backward")) shim::launch(rasterize_backward, blocks, threads, arguments);
-    else if (is("magnitude_backward")) shim::launch(magnitude_backward, blocks, threads, arguments);
     else return 1;
     return 0;
 }

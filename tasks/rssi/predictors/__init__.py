@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from swiftwrf.runtime.lazy import import_lazily
 from swiftwrf.runtime.registry import Registry
 
 if TYPE_CHECKING:
     from swiftwrf.rssi import RssiPredictor
-    from tasks.rssi.predictors.base import make_predictor
-
-import_lazily(__name__, {"tasks.rssi.predictors.base": ("make_predictor",)})
 
 PREDICTORS: Registry[RssiPredictor] = Registry(
     "predictor",
@@ -31,4 +27,4 @@ PREDICTORS: Registry[RssiPredictor] = Registry(
     },
 )
 
-__all__ = ["PREDICTORS", "make_predictor"]
+__all__ = ["PREDICTORS"]

@@ -15,7 +15,8 @@ from swiftwrf.rssi import RssiFitContext, RssiPredictor
 from swiftwrf.rssi.stacking import mixing_weights
 from swiftwrf.runtime.options import Preset
 from swiftwrf.runtime.validation import configuration
-from tasks.rssi.predictors import PREDICTORS, make_predictor
+from tasks.rssi.predictors import PREDICTORS
+from tasks.rssi.predictors.base import make_predictor
 
 
 @configuration

@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from swiftwrf import AngularGrid, InputError
-from swiftwrf.array.beamforming import DIAGONAL_LOADING
+from swiftwrf.array.beamforming import BEAMFORMERS, DIAGONAL_LOADING
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.choices import BEAMFORMERS
 
 ARRAY = PlanarArray.grid(2, 3, 0.06, 2.4e9)
 GRID = AngularGrid.hemisphere(6, 24)

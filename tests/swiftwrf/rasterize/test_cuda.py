@@ -20,12 +20,12 @@ from tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from swiftwrf import AngularGrid, InputError, rasterize
-from swiftwrf.rasterize import available_backends, cuda, cuda_kernels, operators, reference
+from swiftwrf.rasterize import cuda, operators, reference
 from swiftwrf.rasterize.magnitude import magnitude
 
 SHIM = Path(__file__).parents[2] / "cuda_shim"
 rasterize_package = sys.modules[rasterize.__module__]
-KERNELS = {"find_reach", "rasterize", "rasterize_backward", "magnitude_backward"}
+KERNELS = {"find_reach", "rasterize", "rasterize_backward"}
 SANITIZERS = os.environ.get("CUDA_SHIM_SANITIZERS", "")  # set by `test_sanitizers_find_nothing` in its child process
 
 
@@ -35,8 +35,8 @@ SANITIZERS = os.environ.get("CUDA_SHIM_SANITIZERS", "")  # set by `test_sanitize
 @pytest.fixture(scope="module")
 def architectures():
     try:
-        return cuda_kernels.architectures()
-    except cuda_kernels.CudaUnavailable as error:
+        return cuda.architectures()
+    except cuda.CudaUnavailable as error:
         pytest.skip(str(error))
 
 
@@ -44,8 +44,8 @@ def architectures():
 def test_compiles_to_machine_code_without_stack_and_within_64_registers(architectures, architecture):
     if architecture not in architectures:
         pytest.skip(f"this NVRTC does not compile for sm_{architecture}")
-    source = cuda_kernels.SOURCE.read_text()
-    image, log = cuda_kernels.compile_source(source, f"sm_{architecture}", "--ptxas-options=-v")
+    source = cuda.SOURCE.read_text()
+    image, log = cuda.compile_source(source, f"sm_{architecture}", "--ptxas-options=-v")
     assert image.startswith(b"\x7fELF")
     assert set(re.findall(r"entry function '(\w+)'", log)) == KERNELS
     assert re.findall(r"(\d+) bytes stack frame, (\d+) bytes spill", log) == [("0", "0")] * len(KERNELS)
@@ -54,23 +54,23 @@ def test_compiles_to_machine_code_without_stack_and_within_64_registers(architec
 
 @pytest.mark.usefixtures("architectures")
 def test_compiles_to_portable_code():
-    image, _ = cuda_kernels.compile_source(cuda_kernels.SOURCE.read_text(), "compute_90")
+    image, _ = cuda.compile_source(cuda.SOURCE.read_text(), "compute_90")
     assert set(re.findall(r"\.entry (\w+)\(", image.decode())) == KERNELS
     assert image.endswith(b"\0")  # The driver reads PTX up to the null byte.
 
 
 def test_newer_gpus_get_portable_code_and_older_ones_a_sentence(architectures):
     newest = architectures[-1]
-    assert cuda_kernels.target(newest) == f"sm_{newest}"
-    assert cuda_kernels.target(newest + 10) == f"compute_{newest}"
+    assert cuda.target(newest) == f"sm_{newest}"
+    assert cuda.target(newest + 10) == f"compute_{newest}"
     with pytest.raises(InputError, match=r"compute capability 7\.5 or more, got 6\.1"):
-        cuda_kernels.target(61)
+        cuda.target(61)
 
 
 @pytest.mark.usefixtures("architectures")
 def test_a_source_that_does_not_compile_is_refused_with_the_log():
     with pytest.raises(InputError, match=r"cannot compile the rasterizer for sm_90.*: rasterize\.cu\(1\): error"):
-        cuda_kernels.compile_source("nonsense", "sm_90")
+        cuda.compile_source("nonsense", "sm_90")
 
 
 # ------------------------------------------------------------------------------------------------------- unavailability
@@ -79,26 +79,26 @@ def test_a_source_that_does_not_compile_is_refused_with_the_log():
 def test_missing_bindings_are_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "cuda.bindings.nvrtc", None)
     with pytest.raises(InputError, match="needs the package cuda-bindings; install it, or use backend='reference'"):
-        cuda_kernels.architectures()
+        cuda.architectures()
 
 
 @pytest.mark.parametrize(("function", "library"), [("nvrtcVersion", "NVRTC"), ("cuInit", "the NVIDIA driver")])
 def test_missing_libraries_are_named(function, library):
     missing = mock.Mock(side_effect=RuntimeError("not found"), __name__=function)
     with pytest.raises(InputError, match=f"needs {library}, which cuda.bindings does not find"):
-        cuda_kernels._call(missing)
+        cuda._call(missing)
 
 
 def test_auto_falls_back_to_the_reference_with_one_warning(monkeypatch):
-    monkeypatch.setattr(cuda_kernels, "kernels", mock.Mock(side_effect=cuda_kernels.CudaUnavailable("no driver")))
+    monkeypatch.setattr(cuda, "kernels", mock.Mock(side_effect=cuda.CudaUnavailable("no driver")))
     rasterize_package._cuda_compiles.cache_clear()
     device = torch.device("cuda")
     with pytest.warns(UserWarning, match="slow backend 'reference': no driver") as warned:
-        assert [available_backends(device) for _ in range(2)] == [("reference",)] * 2
+        assert [rasterize_package._available(device) for _ in range(2)] == [False] * 2
     assert len(warned) == 1
     rasterize_package._cuda_compiles.cache_clear()
-    monkeypatch.setattr(cuda_kernels, "kernels", mock.Mock())
-    assert available_backends("cuda") == ("cuda", "reference")
+    monkeypatch.setattr(cuda, "kernels", mock.Mock())
+    assert rasterize_package._available(device)
     with FakeTensorMode():
         mean, cholesky = torch.empty(1, 3, 2, device="cuda"), torch.empty(3, 3, device="cuda")
         assert rasterize_package._fast(mean, cholesky, mean, "auto", None)
@@ -110,13 +110,13 @@ def test_auto_falls_back_to_the_reference_with_one_warning(monkeypatch):
 
 
 class KernelsOnCpu:
-    """Launch like `cuda_kernels.Kernels`, on the CPU."""
+    """Launch like `cuda.Kernels`, on the CPU."""
 
     def __init__(self, library: Path) -> None:
         self._library = ctypes.CDLL(str(library))
 
     def launch(self, kernel, blocks, threads, *arguments):
-        values = cuda_kernels.packed(*arguments)
+        values = cuda.packed(*arguments)
         pointers = (ctypes.c_void_p * len(values))(*(value.ctypes.data for value in values))
         assert self._library.launch(kernel.encode(), ctypes.c_uint(blocks), threads, pointers) == 0
 
@@ -125,7 +125,7 @@ def build(library, *options):
     """Compile the kernels for the CPU."""
     if shutil.which("g++") is None or sys.platform != "linux":
         pytest.skip("needs g++ on Linux")
-    command = ["g++", "-std=c++17", "-ffp-contract=off", "-shared", "-fPIC", f"-I{cuda_kernels.SOURCE.parent}"]
+    command = ["g++", "-std=c++17", "-ffp-contract=off", "-shared", "-fPIC", f"-I{cuda.SOURCE.parent}"]
     subprocess.run([*command, *options, str(SHIM / "rasterize.cpp"), "-o", str(library)], check=True)
 
 
@@ -163,7 +163,7 @@ def assert_close(case, cutoff, device="cpu"):
     """A and |A|, in value and gradient, within the table of tolerances."""
     for value, gradient in (
         field_errors(operators.field, case, cutoff, device),
-        magnitude_errors(operators.magnitude, case, cutoff, device),
+        magnitude_errors(lambda *arguments: magnitude(operators.field(*arguments)), case, cutoff, device),
     ):
         assert value < VALUE_TOLERANCE[cutoff] * case.slack
         assert gradient < GRADIENT_TOLERANCE[cutoff] * case.slack
@@ -263,15 +263,12 @@ def value_and_gradients(inputs, grid, cotangent):
 
 
 @pytest.mark.usefixtures("shim", "poisoned")
-def test_magnitude_is_that_of_the_field_and_has_no_gradient_where_nothing_is():
-    """With and without a gradient in sight; a lone primitive leaves most pixels at 0."""
-    grid = AngularGrid.hemisphere(30, 120)
+def test_magnitude_has_no_gradient_where_nothing_is():
+    """A lone primitive leaves most pixels at 0."""
     leaves = [
         x.requires_grad_() for x in (degrees((180.0, 45.0)), torch.tensor([[0.05, 0.0, 0.05]]), torch.ones(1, 1, 2))
     ]
-    rendered = operators.magnitude(*leaves, grid, 1e-4)
-    torch.testing.assert_close(rendered, magnitude(operators.field(*leaves, grid, 1e-4)))
-    assert torch.equal(rendered, operators.magnitude(*(x.detach() for x in leaves), grid, 1e-4))
+    rendered = magnitude(operators.field(*leaves, AngularGrid.hemisphere(30, 120), 1e-4))
     assert bool((rendered == 0).any())
     assert all(gradient.isfinite().all() for gradient in torch.autograd.grad(rendered.sum(), leaves))
 
@@ -313,11 +310,7 @@ def check_registration(device):
     inputs = [x.detach().to(device).requires_grad_() for x in random_scene(4, 2)]
     torch.library.opcheck(operators._field, (*inputs, 0.1, 0.2, 5, 0.0, 9, 1e-4))
     grad = torch.ones(2, 2, 5, 9, device=device)
-    torch.library.opcheck(operators._field_gradients, (grad, *(x.detach() for x in inputs), 0.1, 0.2, 5, 0.0, 9, None))
-    rendered, phase = operators._magnitude(*inputs, 0.1, 0.2, 5, 0.0, 9, 1e-4, True)
-    torch.library.opcheck(operators._magnitude, (*(x.detach() for x in inputs), 0.1, 0.2, 5, 0.0, 9, 1e-4, False))
-    tensors = (x.detach() for x in (rendered, phase, *inputs))
-    torch.library.opcheck(operators._magnitude_gradients, (*tensors, 0.1, 0.2, 5, 0.0, 9, None))
+    torch.library.opcheck(operators._gradients, (grad, *(x.detach() for x in inputs), 0.1, 0.2, 5, 0.0, 9, None))
 
 
 @pytest.mark.usefixtures("shim")
@@ -331,7 +324,7 @@ def check_full_graph(device, backend):
     inputs = [x.detach().to(device).requires_grad_() for x in random_scene(4, 2)]
 
     def render(*tensors):
-        return operators.magnitude(*tensors, grid, 1e-4)
+        return magnitude(operators.field(*tensors, grid, 1e-4))
 
     compiled = torch.compile(render, fullgraph=True, backend=backend)
     torch.testing.assert_close(compiled(*inputs), render(*inputs))

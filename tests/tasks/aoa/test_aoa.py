@@ -31,9 +31,9 @@ from tasks.aoa.estimators.aann import AANN, AANNConfig
 from tasks.aoa.estimators.aann_kernel import AANNKernel, AANNKernelConfig
 from tasks.aoa.estimators.baselines import Constant, NearestSpectrum, Peak
 from tasks.aoa.estimators.kernel_regression import KernelRegression
-from tasks.aoa.evaluation import Evaluation
 from tasks.aoa.options import AoaConfig, fraction_key
 from tasks.aoa.page.records import palette
+from tasks.aoa.synthesis import Evaluation
 from tasks.command_line import command_line
 from tasks.page.palette import Palette
 from tasks.report.run import merge

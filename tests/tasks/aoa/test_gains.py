@@ -18,12 +18,12 @@ from pandas import DataFrame
 from swiftwrf import simulated_room
 from swiftwrf.metrics import median_interval
 from tasks.aoa.condition import LOCATOR, Condition
-from tasks.aoa.evaluation import Evaluation
 from tasks.aoa.options import AoaConfig
 from tasks.aoa.page.gains import gain_sentence, gain_table
 from tasks.aoa.page.records import FractionRecords
 from tasks.aoa.page.summary import summary
 from tasks.aoa.results import Results
+from tasks.aoa.synthesis import Evaluation
 from tasks.page.records import Records
 from tasks.report.run import merge
 from tasks.summarise import error_summary, paired_change, repeated_summary, summaries

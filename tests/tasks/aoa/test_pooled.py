@@ -11,10 +11,10 @@ from quick import run
 
 from swiftwrf import simulated_room
 from tasks.aoa.condition import Condition, MeasuredSubset, pooled
-from tasks.aoa.evaluation import Evaluation
 from tasks.aoa.options import AoaConfig
 from tasks.aoa.results import Results
 from tasks.aoa.steps import choose_model
+from tasks.aoa.synthesis import Evaluation
 
 MEASURED = Condition("aann_kernel", "measured", measured_fraction=0.3)
 GP, IDW = (Condition("aann_kernel", "turbo", name, measured_fraction=0.3) for name in ("gp", "idw"))

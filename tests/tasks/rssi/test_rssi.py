@@ -31,7 +31,8 @@ from tasks.report.run import merge
 from tasks.rssi import experiment
 from tasks.rssi.options import RssiTaskConfig
 from tasks.rssi.page.summary import where_next
-from tasks.rssi.predictors import PREDICTORS, make_predictor
+from tasks.rssi.predictors import PREDICTORS
+from tasks.rssi.predictors.base import make_predictor
 from tasks.rssi.predictors.blend import Blend, BlendConfig
 from tasks.rssi.predictors.regressors import NEIGHBOUR_COUNTS
 from tasks.summarise import paired_difference
