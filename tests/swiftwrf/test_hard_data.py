@@ -28,7 +28,13 @@ from swiftwrf.models.swiftwrf import smallest
 from swiftwrf.rssi.path_loss import PairPathLoss
 from swiftwrf.rssi.training import rounding_std
 
-SHORT = {"reach": 0.5, "positions": 10, "width": 1, "max_order": 1, "further": 1}  # search for a room
+SHORT = {
+    "search_distance_m": 0.5,
+    "n_search_positions": 10,
+    "beam_width": 1,
+    "max_order": 1,
+    "max_extra_planes": 1,
+}  # search for a room
 OPTIONS = {"swiftwrf": {"n_primitives": 4}, "geometry": SHORT, "hybrid": SHORT}
 MODELS = [name for name, model in FIELD_MODELS.items() if not model.slow]
 SCALES = (1e-3, 1e3, 1e6)

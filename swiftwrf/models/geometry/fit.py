@@ -63,15 +63,15 @@ Splits = list[tuple[PhaseObservations, PhaseObservations]]  # kept and held-out 
 class GeometryConfig(FieldConfig):
     """Options of the search for a room."""
 
-    reach: PositiveFloat = 3.0
+    search_distance_m: PositiveFloat = 3.0
     """distance beyond the region of both ends up to which planes are searched [m]"""
-    positions: PositiveInt = 100
+    n_search_positions: PositiveInt = 100
     """number of positions in the search; all positions refine its result"""
-    width: PositiveInt = 8
+    beam_width: PositiveInt = 8
     """width of the beam search for the first planes"""
     max_order: Annotated[int, Ge(1), Le(MAX_ORDER)] = 3
     """highest number of reflections of an image source"""
-    further: NonNegativeInt = 3
+    max_extra_planes: NonNegativeInt = 3
     """maximum number of planes of any orientation beyond those of the six sides"""
     max_spectra: Annotated[int, Ge(MIN_TRAINING)] = 2000
     """maximum number of training spectra that the room is estimated from, evenly chosen"""
@@ -98,11 +98,11 @@ def search_room(train: Spectra, config: GeometryConfig, progress: bool = False) 
     evidence = _Evidence.of(train, config)
     with progress_bar(progress) as bar:
         task = bar.add_task("finding the room", total=N_STARTS + len(SIGNS) + 1)
-        some = _some(evidence.kept, config.positions, config.seed)
-        rooms = find_rooms(some, config.reach, config.width, tick=lambda: bar.advance(task))
+        some = _some(evidence.kept, config.n_search_positions, config.seed)
+        rooms = find_rooms(some, config.search_distance_m, config.beam_width, tick=lambda: bar.advance(task))
         improved = []
         for signs, room in rooms:
-            improved.append(Search(evidence.more, config.reach, signs).improve(room))
+            improved.append(Search(evidence.more, config.search_distance_m, signs).improve(room))
             bar.advance(task)
         found, (signs, searched) = min(zip(improved, rooms, strict=True), key=lambda item: item[0].score)
         score = evidence.held_out_score(PlaneSet.of(searched))
@@ -138,7 +138,9 @@ def extend_room(room: PlaneSet, train: Spectra, is_new: Tensor, config: Geometry
     gains = room.by_side().gain
     signs = max(SIGNS, key=lambda row: sum(float(row[side]) * gain > 0 for side, gain in gains.items()))
     score, room = evidence.held_out_score(room), room.refined(scene)
-    improved = PlaneSet.of(Search(evidence.more, config.reach, signs).improve(room.by_side())).refined(scene)
+    improved = PlaneSet.of(Search(evidence.more, config.search_distance_m, signs).improve(room.by_side())).refined(
+        scene
+    )
     # a phase alias explains new spectra nearly as well as others, but all positions together less than the right room
     if scene.score(improved.field(scene)) < MAX_SCORE_RATIO * scene.score(room.field(scene)):
         room = improved
@@ -174,7 +176,10 @@ class _Evidence:
         scene = observed.around(train.fixed_position)
         fold = folds(scene.moving, config.validation, config.seed)
         used, _ = _evenly(train, config.max_spectra)
-        some, more = (_some(scene, most, config.seed) for most in (config.positions, max(config.positions, N_FINAL)))
+        some, more = (
+            _some(scene, most, config.seed)
+            for most in (config.n_search_positions, max(config.n_search_positions, N_FINAL))
+        )
         return cls(used, observed, scene, rows, fold, some, more)
 
     @property
@@ -205,7 +210,7 @@ def _completed(
     room = _with_further_planes(room, scene, some, splits, config)
     room = _with_order(room, splits, config)
     final = room.shifted(evidence.origin).refined(evidence.observed)
-    return assess(evidence.train, evidence.observed, final, score, config.reach, config.certainty)
+    return assess(evidence.train, evidence.observed, final, score, config.search_distance_m, config.certainty)
 
 
 @single_thread()
@@ -353,7 +358,7 @@ def _with_weak_planes(
     known = signs.clone()
     for side, gain in found.gain.items():
         known[side] = math.copysign(1, gain)
-    found = Search(some, config.reach, known, usual=WEAK_GAIN).improve(found)
+    found = Search(some, config.search_distance_m, known, usual=WEAK_GAIN).improve(found)
     return _pruned(_without_aliases(PlaneSet.of(found).refined(scene), scene, config), scene, splits, config)
 
 
@@ -361,11 +366,11 @@ def _with_further_planes(
     room: PlaneSet, scene: PhaseObservations, some: PhaseObservations, splits: Splits, config: GeometryConfig
 ) -> PlaneSet:
     """Add planes of any orientation, searched with some positions, as long as they are significant."""
-    for _ in range(config.further):
+    for _ in range(config.max_extra_planes):
         if float(some.score(room.field(some))) < PERFECT_SCORE:
             break
         wider = []
-        for normal, offset, sign in candidates(scene, room.field(scene), config.reach, MAX_FURTHER_TRIED):
+        for normal, offset, sign in candidates(scene, room.field(scene), config.search_distance_m, MAX_FURTHER_TRIED):
             normals = torch.cat([room.normal, normal[None, None]], dim=1)
             offsets = torch.cat([room.offset, torch.full((1, 1), offset, dtype=torch.float64)], dim=1)
             gains = torch.cat([room.gain, torch.full((1, 1), FURTHER_GAIN * sign)], dim=1)

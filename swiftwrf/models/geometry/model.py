@@ -11,7 +11,6 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra, check_training, fingerprint
-from swiftwrf.data.splits import Validation
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext, bounding_box
 from swiftwrf.models.geometry.fit import (
     GeometryConfig,
@@ -33,7 +32,7 @@ class GeometryModel(Linked, FieldModel):
     Example:
         >>> import swiftwrf
         >>> train, test = swiftwrf.simulated_room(n=50).split()
-        >>> room = GeometryModel(width=1, further=0).fit(train)
+        >>> room = GeometryModel(beam_width=1, max_extra_planes=0).fit(train)
         >>> room.predict(test.position).mean.shape
         torch.Size([10, 30, 120])
     """
@@ -231,54 +230,6 @@ class GeometryModel(Linked, FieldModel):
             order=order,
             score_held_out=float(header["score_held_out"]),
             unexplained=float(header["unexplained"]),
-            conclusion=str(header.get("conclusion", header.get("verdict"))),
+            conclusion=str(header["conclusion"]),
             covariance=tensors["covariance"].double(),
         )
-
-
-def fit_geometry(
-    train: Spectra,
-    config: GeometryConfig | None = None,
-    *,
-    validation: Validation | None = None,
-    seed: int | None = None,
-    progress: bool = True,
-) -> GeometryModel:
-    """Estimate the room in which spectra were measured.
-
-    Args:
-        train: Training spectra with array, rotation and fixed end.
-        config: Options of the search.
-        validation: Replaces `config.validation`.
-        seed: Replaces `config.seed`.
-        progress: Show a progress bar on a terminal.
-
-    Raises:
-        InputError: As `FieldModel.fit`, or spectra that the array cannot have produced.
-
-    Example:
-        >>> import swiftwrf
-        >>> data = swiftwrf.simulated_room(n=40)
-        >>> fit_geometry(data, GeometryConfig(width=1, further=0), progress=False).order
-        2
-    """
-    given: dict[str, Any] = {
-        name: value for name, value in (("validation", validation), ("seed", seed)) if value is not None
-    }
-    return GeometryModel(config, **given).fit(train, progress=progress)
-
-
-def refit_geometry(model: FieldModel, train: Spectra, *, seed: int | None = None) -> GeometryModel:
-    """Return the room of a model with offsets and gains refined on other spectra of the scene, without a search.
-
-    Args:
-        model: Fitted model with a room.
-        train: Spectra to refine on.
-        seed: Seed of the phase retrieval. Defaults to that of the room's search.
-
-    Raises:
-        InputError: As `fit_geometry`, or a model without a room.
-    """
-    config = model.room.config if model.room is not None else None
-    given: dict[str, Any] = {} if seed is None else {"seed": seed}
-    return GeometryModel(config, **given).fit(train, like=model)

@@ -97,7 +97,7 @@ class PathGains:
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header, geometry: GeometryModel) -> PathGains:
         """Return the path gains of a room that `state` describes."""
-        prior = header.get(f"{PREFIX}prior", "loose")  # the only one of versions up to 0.2.0
+        prior = header[f"{PREFIX}prior"]
         check_value(f"{PREFIX}prior", prior, PriorName)
         process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True, prefix=PREFIX)
         return cls(process, len(geometry.image_sources()[0]), prior)

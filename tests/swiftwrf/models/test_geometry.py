@@ -16,12 +16,12 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.store import Store
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.metrics import psnr
-from swiftwrf.models.geometry import GeometryConfig, GeometryModel, Plane, fit_geometry, refit_geometry
+from swiftwrf.models.geometry import GeometryConfig, GeometryModel, Plane
 from swiftwrf.models.geometry import fit as geometry_fit
 from swiftwrf.models.geometry.ambiguity import _AlternativeTable, phase_alternatives
 from swiftwrf.models.geometry.batched import batched, batched_field, batched_score
 from swiftwrf.models.geometry.fit import _pruned, _with_weak_planes, _without_aliases, observe, split
-from swiftwrf.models.geometry.hybrid import HybridModel, fit_hybrid
+from swiftwrf.models.geometry.hybrid import HybridModel
 from swiftwrf.models.geometry.images import PhaseObservations, field, image_gain, images, mirror, sequences
 from swiftwrf.models.geometry.path_gains import (
     PRIORS,
@@ -40,7 +40,7 @@ from swiftwrf.models.geometry.search import SIDES, SIGNS
 from swiftwrf.models.nearest import NearestModel
 from swiftwrf.runtime.checkpoint import write
 
-QUICK = GeometryConfig(reach=2.0, width=2)
+QUICK = GeometryConfig(search_distance_m=2.0, beam_width=2)
 SIX = {
     (-1, 0, 0): 0.0,
     (1, 0, 0): 5.0,
@@ -52,7 +52,7 @@ SIX = {
 
 
 def fit(data, **changes):
-    return fit_geometry(data, replace(QUICK, **changes), progress=False)
+    return GeometryModel(replace(QUICK, **changes)).fit(data)
 
 
 def errors(model, planes):
@@ -267,7 +267,7 @@ def test_a_room_of_a_search_is_extended_to_more_spectra_unless_it_does_not_expla
     observed, _ = observe(data.subset((~is_new).nonzero()[:, 0]))
     walls = [*zip(SIDES.tolist(), (0.0, 6.166, 0.0, 5.0, 0.0, 3.0), (-0.7,) * 4 + (-0.6,) * 2, strict=True)]
     start = GeometryModel.of_planes(data, [Plane(tuple(n), offset, gain) for n, offset, gain in walls])
-    start.config = GeometryConfig(further=0)
+    start.config = GeometryConfig(max_extra_planes=0)
     room = start.refined_on(observed).extended(data, is_new)
     assert [plane.offset_m for plane in room.planes] == pytest.approx([0, 6, 0, 5, 0, 3], abs=0.01)
     assert start.extended(data, torch.arange(70) >= 49) is None
@@ -277,7 +277,7 @@ def test_a_room_of_a_search_is_extended_to_more_spectra_unless_it_does_not_expla
 
 @pytest.mark.long
 def test_a_tilted_plane_is_found_to_a_millimetre():
-    model = fit(mirror_room({(0.8, 0.5, 0.1): 5.0}, -0.7, n=60), width=1)
+    model = fit(mirror_room({(0.8, 0.5, 0.1): 5.0}, -0.7, n=60), beam_width=1)
     assert len(model.planes) == 1
     assert errors(model, {(0.8, 0.5, 0.1): 5.0})[0][0] < 1
     torch.testing.assert_close(
@@ -323,7 +323,9 @@ def test_nothing_to_find_is_no_plane():
 
 
 def test_a_reach_without_walls_ends_without_them():
-    assert not any(p.certain for p in fit(mirror_room(SIX, n=12), reach=0.3, width=1, further=0).planes)
+    assert not any(
+        p.certain for p in fit(mirror_room(SIX, n=12), search_distance_m=0.3, beam_width=1, max_extra_planes=0).planes
+    )
 
 
 def test_noise_stays_within_the_deviations(room):
@@ -332,7 +334,9 @@ def test_noise_stays_within_the_deviations(room):
 
 
 def test_positions_in_a_plane_leave_no_plane_certain():
-    model = fit(mirror_room(SIX, noise=0.1, n=24, low=(1.5, 1.2, 1.2), high=(3.5, 3.2, 1.2)), further=0, width=1)
+    model = fit(
+        mirror_room(SIX, noise=0.1, n=24, low=(1.5, 1.2, 1.2), high=(3.5, 3.2, 1.2)), max_extra_planes=0, beam_width=1
+    )
     assert not any(p.certain for p in model.planes)
     assert all(error < 3 * std for error, std in errors(model, SIX) if model.planes)
 
@@ -341,7 +345,7 @@ def test_pure_noise_has_no_certain_plane():
     generator = torch.Generator().manual_seed(0)
     data = mirror_room({}, n=30)
     channel = torch.randn(30, 16, dtype=torch.complex128, generator=generator)
-    model = fit(replace(data, store=Store(ARRAY.spectrum(channel, GRID))), further=0, width=1)
+    model = fit(replace(data, store=Store(ARRAY.spectrum(channel, GRID))), max_extra_planes=0, beam_width=1)
     assert not any(p.certain for p in model.planes)
 
 
@@ -366,7 +370,7 @@ def test_few_spectra_are_refused():
 
 def test_the_same_seed_finds_the_same_room(noisy):
     few = noisy.subset(torch.arange(12))
-    quick = {"reach": 0.5, "width": 1, "further": 0}
+    quick = {"search_distance_m": 0.5, "beam_width": 1, "max_extra_planes": 0}
     assert fit(few, **quick).to_json() == fit(few, **quick).to_json()
 
 
@@ -388,8 +392,8 @@ def test_json_and_images_describe_the_room(room):
 def test_hybrid_is_not_worse_than_geometry():
     data = simulated_room(n=60, grid=GRID)
     train, test = data.split("random")
-    room = fit(train, further=0, width=1)
-    hybrid = fit_hybrid(train, room)
+    room = fit(train, max_extra_planes=0, beam_width=1)
+    hybrid = HybridModel().fit(train, like=room)
     gained = psnr(hybrid.synthesize(test.position), test.spectrum) - psnr(room.synthesize(test.position), test.spectrum)
     assert float(gained.mean()) > -0.5
     again = HybridModel.from_state(*hybrid.state())
@@ -452,8 +456,8 @@ def test_path_gains_follow_a_shadow():
     spectrum = torch.where(hidden[:, None, None], bare.spectrum, whole.spectrum)
     data = replace(whole, store=Store(spectrum))
     train, test = data.subset(torch.arange(0, 110)), data.subset(torch.arange(110, 140))
-    room = fit(train, further=0, width=1)
-    hybrid = fit_hybrid(train, room)
+    room = fit(train, max_extra_planes=0, beam_width=1)
+    hybrid = HybridModel().fit(train, like=room)
     assert hybrid.path_gains is not None
     gained = psnr(hybrid.synthesize(test.position), test.spectrum) - psnr(room.synthesize(test.position), test.spectrum)
     assert float(gained.median()) > 5
@@ -478,7 +482,7 @@ def test_path_gains_are_held_out_from_spectra_without_observed_phases_too():
     kernel = Kernel(long=0.5, short=1.0, share=1.0, noise=1e-3)
     few = GeometryConfig(max_spectra=40)
     hybrid, like = HybridModel(few), HybridModel()
-    hybrid._room, hybrid.grid = fit(data, further=0, width=1, max_spectra=40), data.grid
+    hybrid._room, hybrid.grid = fit(data, max_extra_planes=0, beam_width=1, max_spectra=40), data.grid
     like._room = hybrid._room
     like.path_gains = PathGains(GaussianProcess(kernel, data.position, torch.zeros(80, 2)), 1)
     known = hybrid._fit_path_gains(data, fold, like)
@@ -523,25 +527,23 @@ def test_weak_planes_are_kept_if_all_folds_together_resolve_them():
     assert found == [1, 2]
 
 
-def test_hybrids_of_earlier_versions_have_loose_path_gains(hybrid):
+def test_priors_of_path_gains_are_checked(hybrid):
     known, kernel = hybrid.process.known, hybrid.process.kernel
     gains = PathGains(GaussianProcess(kernel, known, torch.zeros(len(known), 2 * 25 * 2)), 25, "tight")
     tensors, header = with_path_gains(hybrid, gains).state()
     assert HybridModel.from_state(tensors, header).path_gains.prior == "tight"
-    del header["path_gains.prior"]
-    assert HybridModel.from_state(tensors, header).path_gains.prior == "loose"
     with pytest.raises(InputError, match=r"path_gains\.prior"):
         HybridModel.from_state(tensors, header | {"path_gains.prior": "narrow"})
 
 
 def test_path_gains_stay_constant_where_nothing_is_hidden():
     data = mirror_room(SIX, n=120)
-    assert fit_hybrid(data, fit(data, further=0, width=1)).path_gains is None
+    assert HybridModel().fit(data, like=fit(data, max_extra_planes=0, beam_width=1)).path_gains is None
 
 
 @pytest.fixture(scope="module")
 def hybrid(noisy, room):
-    return fit_hybrid(noisy, room)
+    return HybridModel().fit(noisy, like=room)
 
 
 def test_a_room_of_the_same_spectra_is_reused_and_of_others_refined(noisy, room, hybrid):
@@ -550,7 +552,7 @@ def test_a_room_of_the_same_spectra_is_reused_and_of_others_refined(noisy, room,
     for model in (room, hybrid):
         refined = GeometryModel().fit(few, like=model)
         assert [plane.normal for plane in refined.planes] == [plane.normal for plane in room.planes]
-        assert refined.to_json() == refit_geometry(room, few).to_json() != room.to_json()
+        assert refined.to_json() != room.to_json()
     with pytest.raises(InputError, match="cannot reuse the structure"):
         GeometryModel().fit(few, like=NearestModel().fit(few))
 
@@ -560,7 +562,7 @@ def test_spectra_are_differentiable_in_the_position(moving):
     data = simulated_room(n=40, moving=moving, grid=GRID)
     walls = [Plane((1.0, 0.0, 0.0), 6.0, -0.5), Plane((0.0, 0.0, -1.0), 0.0, -0.5)]
     room = GeometryModel.of_planes(data, walls)
-    hybrid = fit_hybrid(data, room)
+    hybrid = HybridModel().fit(data, like=room)
     assert hybrid.mixing_weight > 0
     assert hybrid.process.coefficient.shape[1]
     position = data.position[:3] + 0.02
@@ -640,7 +642,14 @@ def test_headers_of_wrong_values_are_refused(hybrid, key, value, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "change", [{"positions": 0}, {"reach": -1.0}, {"max_order": 9}, {"width": 0}, {"validation": "blok"}]
+    "change",
+    [
+        {"n_search_positions": 0},
+        {"search_distance_m": -1.0},
+        {"max_order": 9},
+        {"beam_width": 0},
+        {"validation": "blok"},
+    ],
 )
 def test_options_outside_their_range_are_refused(change):
     with pytest.raises(InputError):
