@@ -20,8 +20,8 @@ from swiftwrf.models.geometry.fit import (
     search_room,
     update_room,
 )
-from swiftwrf.models.geometry.images import PhaseObservations, image_gain, images
-from swiftwrf.models.geometry.planes import Plane, PlaneSet, RoomEstimate
+from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet, images
+from swiftwrf.models.geometry.planes import Plane, RoomEstimate
 from swiftwrf.models.link import Link, Linked
 from swiftwrf.runtime.checkpoint import Header, expect
 
@@ -171,7 +171,7 @@ class GeometryModel(Linked, FieldModel):
 
     def channel(self, position: Tensor) -> Tensor:
         """Return the channel of each element at positions (n, 3) [m], complex64 (n, K)."""
-        return self.tensors().field(self.scene(position))
+        return self.tensors().channel(self.scene(position))
 
     def scene(self, position: Tensor) -> PhaseObservations:
         """Return the link at positions (n, 3) [m], without observations."""
@@ -188,18 +188,11 @@ class GeometryModel(Linked, FieldModel):
         """Return the fixed end and its mirror images: positions (S, 3) [m], gains (S,) and numbers of reflections (S,)."""
         at, strength, order = self.fixed_position[None], torch.ones(1), torch.zeros(1, dtype=torch.int64)
         room = self.tensors()
-        if not (chain := room.sequence):
+        if not room.sequence:
             return at, strength, order
-        scene = PhaseObservations.of(
-            at, at[0], "receiver", self.array, self.rotation, torch.ones(1, len(self.array.element))
-        )
-        found = images(scene, room.normal, room.offset, chain)[0, :, 0]
-        reflections = torch.tensor([len(s) for s in chain])
-        return (
-            torch.cat([at, found]),
-            torch.cat([strength, image_gain(room.gain, chain)[0]]),
-            torch.cat([order, reflections]),
-        )
+        link = replace(self.scene(at), transmitter=at)
+        found, reflections = images(link, room)[0, :, 0], torch.tensor([len(s) for s in room.sequence])
+        return torch.cat([at, found]), torch.cat([strength, room.image_gain[0]]), torch.cat([order, reflections])
 
     def to_json(self) -> dict[str, Any]:
         """Return the room as plain values, see `RoomEstimate.to_json`."""

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel
-from swiftwrf.models.geometry.images import PhaseObservations, image_gain, images, visibility
+from swiftwrf.models.geometry.images import PhaseObservations, images, visibility
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation
 from swiftwrf.models.geometry.planes import advantage
@@ -123,13 +123,10 @@ class PathGains:
 def paths(geometry: GeometryModel, scene: PhaseObservations) -> tuple[Tensor, Tensor]:
     """Return the waves of the direct path and of each image, complex64 (n, 1 + S, K), and their gains (1 + S,)."""
     room = geometry.tensors()
-    sequence = room.sequence
     wave, strength = [scene.wave(scene.transmitter)[None]], [torch.ones(1)]
-    if sequence:
-        source = images(scene, room.normal, room.offset, sequence)
-        reflected = scene.wave(source) * visibility(scene, room.normal, room.offset, sequence)[..., None]
-        wave.append(reflected[0])
-        strength.append(image_gain(room.gain, sequence)[0])
+    if room.sequence:
+        wave.append((scene.wave(images(scene, room)) * visibility(scene, room)[..., None])[0])
+        strength.append(room.image_gain[0])
     return torch.cat([part.expand(-1, len(scene), -1) for part in wave]).transpose(0, 1), torch.cat(strength)
 
 

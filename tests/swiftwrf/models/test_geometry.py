@@ -18,11 +18,9 @@ from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.metrics import psnr
 from swiftwrf.models.geometry import GeometryConfig, GeometryModel, Plane
 from swiftwrf.models.geometry import fit as geometry_fit
-from swiftwrf.models.geometry.ambiguity import _AlternativeTable, phase_alternatives
-from swiftwrf.models.geometry.batched import batched, batched_field, batched_score
 from swiftwrf.models.geometry.fit import _pruned, _with_weak_planes, _without_aliases, observe, split
 from swiftwrf.models.geometry.hybrid import HybridModel
-from swiftwrf.models.geometry.images import PhaseObservations, field, image_gain, images, mirror, sequences
+from swiftwrf.models.geometry.images import SIDES, PhaseObservations, PlaneSet, field, images, mirror
 from swiftwrf.models.geometry.path_gains import (
     PRIORS,
     GainPosterior,
@@ -33,10 +31,9 @@ from swiftwrf.models.geometry.path_gains import (
     paths,
 )
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation, correlations, retrieve_phases
-from swiftwrf.models.geometry.planes import PlaneSet, refined
-from swiftwrf.models.geometry.refine import image_jacobian, phase_jacobian
-from swiftwrf.models.geometry.responses import SteeringResponses
-from swiftwrf.models.geometry.search import SIDES, SIGNS
+from swiftwrf.models.geometry.planes import image_jacobian, phase_jacobian, refine, refine_all
+from swiftwrf.models.geometry.search import SIGNS, SteeringResponses
+from swiftwrf.models.geometry.uncertainty import _AlternativeTable, phase_alternatives
 from swiftwrf.models.nearest import NearestModel
 from swiftwrf.runtime.checkpoint import write
 
@@ -83,8 +80,7 @@ def test_elements_may_be_listed_in_any_order():
     offset = torch.tensor([list(SIX.values())], dtype=torch.float64)
     for array in (plain, shuffled):
         scene, _ = observe(mirror_room(SIX, array=array))
-        waves = field(scene, normal, offset, torch.full((1, 6), -0.6), sequences(normal[0], 2))[0]
-        assert float(scene.score(scene.wave(scene.transmitter) + waves)) < 1e-3
+        assert PlaneSet(normal, offset, torch.full((1, 6), -0.6)).score_at(scene) < 1e-3
     assert PlanarArray(ARRAY.element[:7], ARRAY.wavelength).opposite is None
 
 
@@ -107,12 +103,16 @@ def test_derivatives_of_the_phase_are_differences_of_the_field(moving):
     normal = torch.tensor([[[1, 0, 0], [0, 0, -1], [0, 1, 0]], [[1, 0.1, 0], [0.1, 0, -1], [-0.2, 1, 0.1]]]).double()
     normal = torch.nn.functional.normalize(normal, dim=-1)
     offset, gain = torch.tensor([[5.0, 0.4, 4.0], [4.8, 0.2, 4.1]]).double(), torch.full((2, 3), -0.6)
-    chain, step = [*sequences(normal[1], 2), (0, 1, 0)], 1e-3
+    chain, step = (*PlaneSet(normal[1:], offset[1:], gain[1:]).sequence, (0, 1, 0)), 1e-3
     across = torch.linalg.svd(normal[:, :, None]).Vh[:, :, 1:]
-    movement = image_jacobian(normal, offset, scene.transmitter, chain, tilt=True)
-    total, jacobian = phase_jacobian(scene, normal, offset, gain, chain, movement)
-    direct = scene.wave(scene.transmitter)
-    torch.testing.assert_close(total.permute(1, 2, 0), direct + field(scene, normal, offset, gain, chain))
+    planes = PlaneSet(normal, offset, gain, only=chain)
+
+    def of_rooms(rooms):
+        real, imaginary = rooms.field(scene).chunk(2, dim=1)
+        return torch.complex(real, imaginary).permute(2, 0, 1)
+
+    total, jacobian = phase_jacobian(scene, planes, image_jacobian(planes, scene.transmitter, tilt=True))
+    torch.testing.assert_close(total.permute(1, 2, 0), of_rooms(planes))
     for plane in range(3):
         for q in range(4):
             moved = []
@@ -124,34 +124,42 @@ def test_derivatives_of_the_phase_are_differences_of_the_field(moving):
                     g[:, plane] += side
                 else:
                     n[:, plane] += side * across[:, plane, q - 2]
-                moved.append(direct + field(scene, n, o, g, chain))
+                moved.append(of_rooms(PlaneSet(n, o, g, only=chain)))
             difference = (moved[1] / moved[0]).angle() / (2 * step)
             found = jacobian[:, :, 3 * q + plane].permute(1, 2, 0)
             assert float((found - difference).norm() / difference.norm()) < 0.02
 
 
 @pytest.mark.parametrize("moving", ["receiver", "transmitter"])
-def test_batched_fields_and_scores_are_the_plain_ones(moving):
-    """Also of an array that is no lattice, where each element is a step of its own."""
+def test_fields_and_scores_of_many_rooms_are_those_of_the_definition(moving):
+    """Each image, transmitter mirrored in one plane after another, adds gain exp(-j k d) / d at each element."""
     generator = torch.Generator().manual_seed(0)
     scattered = PlanarArray(ARRAY.element + 0.02 * torch.rand(16, 2, generator=generator).double(), ARRAY.wavelength)
     offset, gain = 4 + torch.rand(9, 3, generator=generator).double(), torch.rand(9, 3, generator=generator) - 0.5
-    tilted = torch.nn.functional.normalize(torch.tensor([[1, 0.3, 0], [-0.2, 1, 0.1], [0, 0, -1]]).double(), dim=1)
     for array in (ARRAY, scattered):
-        data, observed = (
-            mirror_room({}, moving=moving, n=10),
-            torch.randn(10, 16, generator=generator, dtype=torch.complex64),
-        )
+        data = mirror_room({}, moving=moving, n=10)
+        observed = torch.randn(10, 16, generator=generator, dtype=torch.complex64)
         scene = PhaseObservations.of(data.position, data.fixed_position, moving, array, data.rotation, observed.sgn())
-        assert len(scene.chain.step) == (3 if array is ARRAY else 16)
-        for normal in (tilted, SIDES[[0, 1, 3]]):
-            planes, chain = (normal.expand(9, 3, 3), offset, gain), sequences(normal, 2)
-            plain, fast = field(scene, *planes, chain), batched_field(scene, *planes, chain)
-            torch.testing.assert_close(
-                torch.cat([plain.real, plain.imag], dim=-1).permute(1, 2, 0), fast, atol=1e-5, rtol=0
-            )
-            torch.testing.assert_close(batched_score(scene, fast), scene.score(plain), atol=1e-5, rtol=0)
-            torch.testing.assert_close(batched(plain[0]), fast[..., :1], atol=1e-5, rtol=0)
+        rooms = PlaneSet(SIDES[[0, 1, 3]].expand(9, 3, 3), offset, gain)
+        expected = torch.zeros(9, 10, 16, dtype=torch.complex128)
+        for sequence in ((), *rooms.sequence):
+            for room in range(9):
+                source, strength = scene.transmitter, 1.0
+                for plane in sequence:
+                    n, o = rooms.normal[room, plane], offset[room, plane]
+                    source, strength = source - 2 * ((source @ n) - o)[:, None] * n, strength * gain[room, plane]
+                ray = source - scene.receiver
+                length = ray.norm(dim=-1, keepdim=True)
+                phase = (ray / length) @ scene.element.double().T - scene.wavenumber * length
+                expected[room] += torch.polar(torch.ones_like(phase), phase) * strength / length
+        found = rooms.field(scene)
+        torch.testing.assert_close(
+            found, torch.cat([expected.real, expected.imag], dim=-1).permute(1, 2, 0).float(), atol=1e-4, rtol=0
+        )
+        match = torch.einsum("bnk,nfk->bnf", expected.sgn(), scene.channel.conj().to(torch.complex128))
+        coherence = (match.abs().square().amax(-1) / 16**2).float()
+        torch.testing.assert_close(scene.coherence(found), coherence.T, atol=1e-4, rtol=0)
+        torch.testing.assert_close(scene.score(found), 1 - coherence.mean(1), atol=1e-4, rtol=0)
 
 
 def test_rooms_are_refined_together_as_one_by_one():
@@ -164,10 +172,11 @@ def test_rooms_are_refined_together_as_one_by_one():
         replace(room, offset=offset - 0.01),
         PlaneSet(normal[:, :0], offset[:, :0], offset[:, :0], 2),
     ]
-    for together, given in zip(refined(rooms, scene, 3), rooms, strict=True):
-        alone = given.refined(scene, 3)
+    for together, given in zip(refine_all(scene, rooms, 3), rooms, strict=True):
+        alone = refine(scene, given, 3)
         torch.testing.assert_close(together.offset, alone.offset, atol=1e-6, rtol=0)
         torch.testing.assert_close(together.gain, alone.gain, atol=1e-4, rtol=0)
+        assert float(together.score) == pytest.approx(together.score_at(scene), abs=1e-5)
 
 
 def test_mirroring_twice_returns():
@@ -200,9 +209,9 @@ def test_a_sign_does_not_change_for_a_little():
     """Half a turn away the wrong sign explains a weak wall better by chance, but not clearly."""
     scene, _ = observe(mirror_room({(1, 0, 0): 4.6, (0, 0, -1): 0.0}, (-0.6, -0.2), n=40, noise=0.5))
     normal, offset = torch.tensor([[[1, 0, 0], [0, 0, -1]]]).double(), torch.tensor([[4.6, 0.0]]).double()
-    room = PlaneSet(normal, offset, torch.tensor([[-0.6, -0.2]]), 2).refined(scene)
+    room = refine(scene, PlaneSet(normal, offset, torch.tensor([[-0.6, -0.2]])))
     other = phase_alternatives(scene, room)[0]
-    assert float(scene.score(other.field(scene))) < 0.99 * float(scene.score(room.field(scene)))
+    assert other.score_at(scene) < 0.99 * room.score_at(scene)
     assert _without_aliases(room, scene, QUICK) is room
 
 
@@ -221,9 +230,9 @@ def test_planes_that_are_turns_away_together_return(away):
     scene, _ = observe(mirror_room(SIX, gain, "transmitter", n=40))
     normal, offset = torch.tensor([list(SIX)]).double(), torch.tensor([list(SIX.values())]).double()
     true = PlaneSet(normal, offset, torch.tensor([gain]), 2)
-    wrong = _AlternativeTable(scene, true).room(away).refined(scene, 20)
+    wrong = refine(scene, _AlternativeTable(scene, true).room(away), 20)
     assert float((wrong.offset - offset).abs().max()) > 0.2
-    assert float(scene.score(wrong.field(scene))) < 0.02  # explains nearly all
+    assert wrong.score_at(scene) < 0.02  # explains nearly all
     assert float((_without_aliases(wrong, scene, QUICK).offset - offset).abs().max()) < 1e-3
 
 
@@ -231,7 +240,7 @@ def test_a_weak_wall_beside_strong_ones_is_added():
     gain = (-0.6, -0.6, -0.12, -0.6, -0.6, -0.6)
     scene, _ = observe(mirror_room(SIX, gain, n=60, noise=0.1))
     normal, offset = torch.tensor([list(SIX)]).double(), torch.tensor([list(SIX.values())]).double()
-    rest = PlaneSet(normal, offset, torch.tensor([gain]), 2).without(2).refined(scene)
+    rest = refine(scene, PlaneSet(normal, offset, torch.tensor([gain])).without(2))
     folds = split(scene, torch.arange(60) % 5)
     whole = _with_weak_planes(rest, scene, scene, folds, SIGNS[0], QUICK)
     assert whole.normal.shape[1] == 6
@@ -245,15 +254,15 @@ def test_scores_of_combinations_are_those_of_their_rooms():
     normal = torch.tensor(list(SIX)).double()
     offset = [o + 0.05 * torch.arange(1 + i % 3, dtype=torch.float64) for i, o in enumerate(SIX.values())]
     gain = [torch.linspace(-0.6, 0.4, len(o)) for o in offset]
-    direct, waves = batched(scene.wave(scene.transmitter)), SteeringResponses.of(scene, normal, offset, gain)
+    direct, waves = scene.direct, SteeringResponses.of(scene, normal, offset, gain)
     score = waves.scores(scene, direct)
     base, moving = waves.moved(direct, (1, 2, 4, 5))
     torch.testing.assert_close(moving.scores(scene, base), score[0, :, :, 0])
     for choice in ((0, 0, 0, 0, 0, 0), (0, 1, 2, 0, 1, 2), (0, 1, 0, 0, 0, 1)):
         own = ([t[c] for t, c in zip(table, choice, strict=True)] for table in (offset, gain))
         room = PlaneSet(normal[None], *(torch.stack(row)[None] for row in own), 2)
-        torch.testing.assert_close(score[choice], scene.score(room.field(scene)), atol=1e-5, rtol=0)
-        picked = batched_score(scene, direct + waves.of_choices([torch.tensor([c]) for c in choice]))
+        assert float(score[choice]) == pytest.approx(room.score_at(scene), abs=1e-5)
+        picked = scene.score(direct + waves.of_choices([torch.tensor([c]) for c in choice]))
         torch.testing.assert_close(score[choice], picked[0], atol=1e-5, rtol=0)
     some = torch.tensor([0, 5, 7])
     few = waves.subset(some).first(2).scores(scene.subset(some), direct[some])
@@ -292,9 +301,9 @@ def test_images_are_mirrored_in_one_plane_after_another():
     offset, gain = torch.rand(2, 3, generator=generator, dtype=torch.float64), torch.rand(2, 3, generator=generator)
     position = torch.rand(5, 3, generator=generator, dtype=torch.float64)
     scene = PhaseObservations.of(position, torch.zeros(3), "transmitter", ARRAY, torch.eye(3), torch.ones(5, 16))
-    chain = [(1, 0, 2), (2,), (0, 1)]
-    found, strength = images(scene, normal, offset, chain), image_gain(gain, chain)
-    for row, sequence in enumerate(chain):
+    planes = PlaneSet(normal, offset, gain, only=((1, 0, 2), (2,), (0, 1)))
+    found, strength = images(scene, planes), planes.image_gain
+    for row, sequence in enumerate(planes.sequence):
         point, product = position.T[:, None], torch.ones(2)
         for plane in sequence:
             point = mirror(point, normal[:, plane].T[..., None], offset[:, plane, None])
@@ -309,10 +318,9 @@ def test_the_field_is_the_sum_over_any_parts_of_its_images(moving):
     scene, _ = observe(mirror_room({}, moving=moving, n=10))
     normal = torch.nn.functional.normalize(torch.tensor([[1, 0.3, 0], [-0.2, 1, 0.1], [0, 0, -1]]).double(), dim=1)
     offset, gain = torch.tensor([[5.2, 4.1, 0.0]]).double(), torch.tensor([[-0.6, 0.5, -0.4]])
-    chain = sequences(normal, 2)
-    whole = field(scene, normal[None], offset, gain, chain)
-    parts = sum(field(scene, normal[None], offset, gain, [s]) for s in chain)
-    torch.testing.assert_close(parts, whole)
+    whole = PlaneSet(normal[None], offset, gain)
+    parts = sum(field(scene, replace(whole, only=(s,))) for s in whole.sequence)
+    torch.testing.assert_close(parts, field(scene, whole))
 
 
 def test_nothing_to_find_is_no_plane():
@@ -443,7 +451,8 @@ def test_the_gradient_of_path_gains_is_that_of_their_definition(prior):
     root = torch.linalg.cholesky(kernel.covariance(scene.moving.double())).float()
     change = torch.tensor(prior.std) * torch.einsum("mn,nfsc->mfsc", root, normal)
     field = (gain + torch.view_as_complex(change)) @ wave
-    missing = 1 - scene.coherence(field.transpose(0, 1))
+    match = torch.einsum("nfk,nak->nfa", field.sgn(), scene.channel.conj())
+    missing = 1 - match.abs().square().amax(-1) / field.shape[-1] ** 2
     loss = missing.sum() / prior.missing_scale + (normal - posterior.sample).square().sum() / 2
     (expected,) = torch.autograd.grad(loss, normal)
     torch.testing.assert_close(posterior.gradient(normal.detach()), expected, rtol=1e-4, atol=1e-4)
@@ -522,7 +531,7 @@ def test_weak_planes_are_kept_if_all_folds_together_resolve_them():
     data = mirror_room({(-1, 0, 0): 0.0, (0, 0, -1): 0.0}, gain=(-0.6, -0.1), n=600, noise=0.3)
     scene, rows = observe(data)
     true = GeometryModel.of_planes(data, [Plane((-1, 0, 0), 0.0, -0.6), Plane((0, 0, -1), 0.0, -0.1)])
-    room, splits = true.tensors().refined(scene), split(scene, rows % 5)
+    room, splits = refine(scene, true.tensors()), split(scene, rows % 5)
     found = [_pruned(room, scene, some, GeometryConfig()).normal.shape[1] for some in (splits[:1], splits)]
     assert found == [1, 2]
 
