@@ -212,20 +212,6 @@ def _completed(
 
 
 @single_thread()
-def refine_room(room: RoomEstimate, planes: PlaneSet, scene: PhaseObservations) -> RoomEstimate:
-    """Refine offsets and gains of a room on other spectra of the scene, without a search, in under a second.
-
-    Args:
-        room: Estimate from other spectra.
-        planes: Its planes as tensors.
-        scene: Observed phases of the spectra to refine on.
-    """
-    new = refine(scene, planes)
-    found = zip(room.planes, new.normal[0].tolist(), new.offset[0].tolist(), new.gain[0].tolist(), strict=True)
-    return replace(room, planes=[replace(p, normal=tuple(n), offset_m=o, gain=g) for p, n, o, g in found])
-
-
-@single_thread()
 def update_room(room: RoomEstimate, planes: PlaneSet, new: Spectra, config: GeometryConfig) -> RoomEstimate:
     """Refine a room on more spectra, each estimate weighed by its covariance (R. E. Kalman, 1960), without a search.
 

@@ -217,7 +217,8 @@ class PhaseObservations:
         observed = self.channel
         match = torch.cat([observed.real, -observed.imag], dim=1) @ (real * inverse)
         match += torch.cat([observed.imag, observed.real], dim=1) @ (imaginary * inverse)
-        return match.square_().unflatten(1, (2, -1)).sum(1).amax(1) / size**2
+        coherence: Tensor = match.square_().unflatten(1, (2, -1)).sum(1).amax(1) / size**2
+        return coherence
 
     def score(self, field: Tensor) -> Tensor:
         """Return 1 - the mean coherence, 0 if all phases agree, (n, 2 K, B) to (B,)."""

@@ -16,14 +16,14 @@ from swiftwrf.models.geometry.fit import (
     GeometryConfig,
     extend_room,
     observe,
-    refine_room,
     search_room,
     update_room,
 )
 from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet, images
-from swiftwrf.models.geometry.planes import Plane, RoomEstimate
+from swiftwrf.models.geometry.planes import Plane, RoomEstimate, refine
 from swiftwrf.models.link import Link, Linked
 from swiftwrf.runtime.checkpoint import Header, expect
+from swiftwrf.runtime.threads import single_thread
 
 
 class GeometryModel(Linked, FieldModel):
@@ -134,10 +134,12 @@ class GeometryModel(Linked, FieldModel):
         model.estimate, model.fingerprint = estimate, fingerprint(train)
         return model
 
+    @single_thread()
     def refined_on(self, scene: PhaseObservations) -> Self:
         """Return the room with offsets and gains refined on the observed phases of some spectra, without a search."""
-        model = copy(self)
-        model.estimate = refine_room(self.estimate, self.tensors(), scene)
+        model, new = copy(self), refine(scene, self.tensors())
+        found = zip(self.planes, new.offset[0].tolist(), new.gain[0].tolist(), strict=True)
+        model.estimate = replace(self.estimate, planes=[replace(p, offset_m=o, gain=g) for p, o, g in found])
         return model
 
     def with_order(self, order: int) -> Self:

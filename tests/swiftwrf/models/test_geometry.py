@@ -16,19 +16,19 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.store import Store
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.metrics import psnr
-from swiftwrf.models.geometry import GeometryConfig, GeometryModel, Plane
+from swiftwrf.models.geometry import GeometryConfig, GeometryModel, Plane, path_gains
 from swiftwrf.models.geometry import fit as geometry_fit
 from swiftwrf.models.geometry.fit import _pruned, _with_weak_planes, _without_aliases, observe, split
 from swiftwrf.models.geometry.hybrid import HybridModel
 from swiftwrf.models.geometry.images import SIDES, PhaseObservations, PlaneSet, field, images, mirror
 from swiftwrf.models.geometry.path_gains import (
     PRIORS,
-    GainPosterior,
     PathGains,
     choose_prior,
     fit_path_gains,
     kernel_of,
     paths,
+    posterior_gradient,
 )
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation, correlations, retrieve_phases
 from swiftwrf.models.geometry.planes import image_jacobian, phase_jacobian, refine, refine_all
@@ -417,17 +417,17 @@ def with_path_gains(hybrid, path_gains):
 
 def test_path_gains_are_fitted_with_one_thread(monkeypatch):
     """Several threads wait for each other after each of many small products: 24 s in place of 7 s on two cores."""
-    found, gradient = set(), GainPosterior.gradient
+    found = set()
 
-    def recorded(posterior, normal):
+    def recorded(*given):
         blas = (library["num_threads"] for library in ThreadpoolController().select(user_api="blas").info())
         found.update({torch.get_num_threads(), *blas})
-        return gradient(posterior, normal)
+        return posterior_gradient(*given)
 
     data = simulated_room(n=20, grid=AngularGrid.hemisphere(8, 32))
     room = GeometryModel.of_planes(data, [Plane((0.0, 0.0, -1.0), offset_m=0.0, gain=-0.6)])
     scene, _ = observe(data)
-    monkeypatch.setattr(GainPosterior, "gradient", recorded)
+    monkeypatch.setattr(path_gains, "posterior_gradient", recorded)
     before = torch.get_num_threads()
     torch.set_num_threads(4)
     try:
@@ -443,19 +443,20 @@ def test_the_gradient_of_path_gains_is_that_of_their_definition(prior):
     room = GeometryModel.of_planes(data, [Plane(n, o, gain=-0.6) for n, o in SIX.items()], order=1)
     scene = observe(data)[0]
     kernel = kernel_of(scene.moving)
-    posterior = GainPosterior.of(room, scene, kernel, prior)
-    generator = torch.Generator().manual_seed(1)
-    normal = torch.randn(posterior.sample.shape, generator=generator, requires_grad=True)
-
     wave, gain = paths(room, scene)
     root = torch.linalg.cholesky(kernel.covariance(scene.moving.double())).float()
+    generator = torch.Generator().manual_seed(1)
+    sample, normal = (torch.randn(30, 8, len(gain), 2, generator=generator) for _ in range(2))
+    normal.requires_grad_()
+
     change = torch.tensor(prior.std) * torch.einsum("mn,nfsc->mfsc", root, normal)
     field = (gain + torch.view_as_complex(change)) @ wave
     match = torch.einsum("nfk,nak->nfa", field.sgn(), scene.channel.conj())
     missing = 1 - match.abs().square().amax(-1) / field.shape[-1] ** 2
-    loss = missing.sum() / prior.missing_scale + (normal - posterior.sample).square().sum() / 2
+    loss = missing.sum() / prior.missing_scale + (normal - sample).square().sum() / 2
     (expected,) = torch.autograd.grad(loss, normal)
-    torch.testing.assert_close(posterior.gradient(normal.detach()), expected, rtol=1e-4, atol=1e-4)
+    found = posterior_gradient(scene, wave, gain, root, sample, prior)(normal.detach())
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_path_gains_follow_a_shadow():
