@@ -16,7 +16,7 @@ from record import write_result
 from swiftwrf import Spectra, load_spectra, simulated_room
 from swiftwrf.choices import Moving
 from swiftwrf.metrics import psnr, summary
-from swiftwrf.models.geometry import fit_geometry, fit_hybrid
+from swiftwrf.models.geometry import GeometryModel, HybridModel
 
 SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")  # of a room
 WALLS = {  # where they are on each side [m]
@@ -53,9 +53,9 @@ def measure(data: Spectra, share: float, draw: int) -> dict[str, Any]:
     order = torch.randperm(len(train), generator=torch.Generator().manual_seed(draw))
     train = train.subset(order[: round(share * len(train))].sort().values)
     began, cpu = time.perf_counter(), time.process_time()
-    model = fit_geometry(train, progress=False)
+    model = GeometryModel().fit(train)
     seconds, cpu_seconds = time.perf_counter() - began, time.process_time() - cpu
-    hybrid = fit_hybrid(train, model, progress=False)
+    hybrid = HybridModel().fit(train, like=model)
     planes = model.to_json()["planes"]
     walls = {f"{side[0]} = {o}": nearest(planes, side, o) for side, o in zip(SIDES, WALLS[data.name], strict=True)}
     return {

@@ -14,7 +14,7 @@ from record import write_result
 from rooms import mirror_room
 
 from swiftwrf.choices import Moving
-from swiftwrf.models.geometry import fit_geometry
+from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.models.geometry.search import SIDES
 
 POSITIONS = 72
@@ -43,7 +43,7 @@ def measure(offset: tuple[float, ...], gain: tuple[float, ...], moving: Moving, 
     """Return the estimate of one room."""
     data = mirror_room(dict(zip(map(tuple, SIDES.tolist()), offset, strict=True)), gain, moving, POSITIONS, noise)
     began = time.process_time()
-    model = fit_geometry(data, progress=False)
+    model = GeometryModel().fit(data)
     seconds, planes = time.process_time() - began, []
     for plane in model.planes:
         side = int((SIDES @ torch.tensor(plane.normal, dtype=SIDES.dtype)).argmax())

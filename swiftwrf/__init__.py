@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from swiftwrf.locate import MatchedField, Posterior, RssiLocator
     from swiftwrf.models.base import FieldModel, make_model
     from swiftwrf.models.coarray import CoarrayModel, fit_coarray, project
-    from swiftwrf.models.geometry import GeometryModel, HybridModel, fit_geometry, fit_hybrid
+    from swiftwrf.models.geometry import GeometryModel, HybridModel
     from swiftwrf.models.prediction import Prediction
     from swiftwrf.models.swiftwrf import SwiftWRF, fit
     from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
@@ -48,7 +48,7 @@ import_lazily(
         "swiftwrf.locate": ("MatchedField", "Posterior", "RssiLocator"),
         "swiftwrf.models.base": ("FieldModel", "make_model"),
         "swiftwrf.models.coarray": ("CoarrayModel", "fit_coarray", "project"),
-        "swiftwrf.models.geometry": ("GeometryModel", "HybridModel", "fit_geometry", "fit_hybrid"),
+        "swiftwrf.models.geometry": ("GeometryModel", "HybridModel"),
         "swiftwrf.models.prediction": ("Prediction",),
         "swiftwrf.models.swiftwrf": ("SwiftWRF", "fit"),
         "swiftwrf.models.swiftwrf_paper": ("SwiftWRFPaper",),
@@ -86,8 +86,6 @@ __all__ = [
     "datasets",
     "fit",
     "fit_coarray",
-    "fit_geometry",
-    "fit_hybrid",
     "fit_rssi",
     "load",
     "load_rssi",

@@ -14,7 +14,7 @@ from swiftwrf.choices import Moving
 from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.store import Store
-from swiftwrf.models.geometry.images import PhaseObservations, field, sequences
+from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet
 
 Normal = tuple[float, float, float]
 GRID = AngularGrid.hemisphere(10, 40)
@@ -58,7 +58,7 @@ def mirror_room(
         normal = torch.nn.functional.normalize(normal, dim=1)[None]
         offset = torch.tensor([list(planes.values())], dtype=torch.float64)
         gains = torch.tensor(gain).expand(offset.shape)
-        channel = channel + field(scene, normal, offset, gains, sequences(normal[0], 2))[0]
+        channel = PlaneSet(normal, offset, gains).channel(scene)
     turn: Tensor = noise * torch.randn(channel.shape, generator=generator)
     return Spectra(
         name="closed form",

@@ -37,7 +37,9 @@ PUBLISHED: dict[str, Config] = {
 }
 PAPER = SwiftWRFPaperConfig(n_primitives=4, steps=30, check_every=5)
 PUBLISHED_RSSI = NeRF2RssiConfig(width=8, bands=2, samples=4, azimuths=4, elevations=2, **LONGER)
-GLANCE = GeometryConfig(reach=0.5, positions=10, width=1, max_order=1, further=0)  # a short search that finds little
+GLANCE = GeometryConfig(
+    search_distance_m=0.5, n_search_positions=10, beam_width=1, max_order=1, max_extra_planes=0
+)  # a short search that finds little
 
 
 def with_defaults(config: Any) -> type[Any]:

@@ -21,7 +21,6 @@ from swiftwrf.metrics import psnr
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry.images import PhaseObservations
 from swiftwrf.models.geometry.model import GeometryModel
-from swiftwrf.models.geometry.path_gains import paths
 from swiftwrf.models.geometry.phase_retrieval import correlations, retrieve_phases
 from swiftwrf.models.link import Link
 from swiftwrf.models.process import ProcessModel
@@ -430,9 +429,7 @@ def unexplained(room: GeometryModel, spectra: Spectra) -> Tensor:
     scene = PhaseObservations.of(
         spectra.position, room.fixed_position, room.moving, room.array, room.rotation, channel.to(torch.complex64)
     )
-    wave, gain = paths(room, scene)
-    missing = 1 - scene.coherence(torch.einsum("s,nsk->nk", gain.to(wave.dtype), wave)[None])[0]
-    return (missing + MIN_MISSING).double()
+    return (1 - room.tensors().coherence(scene) + MIN_MISSING).double()
 
 
 def joined(parts: list[Spectra]) -> Spectra:

@@ -92,7 +92,9 @@ def test_mix_refuses_a_wrong_number_of_spectra():
 
 @pytest.mark.parametrize("name", [name for name in FIELD_MODELS if not FIELD_MODELS[name].slow])  # they have their own
 def test_field_models_predict_unseen_spectra_better_than_the_mean_spectrum(name, glances, monkeypatch):
-    monkeypatch.setattr("small.GLANCE", replace(GLANCE, reach=2.5, positions=24))  # a glance as far as the walls
+    monkeypatch.setattr(
+        "small.GLANCE", replace(GLANCE, search_distance_m=2.5, n_search_positions=24)
+    )  # a glance as far as the walls
     predicted = make_model(name, **OPTIONS.get(name, {})).fit(TRAIN).synthesize(TEST.position)
     mean = psnr(TRAIN.spectrum.mean(dim=0), TEST.spectrum).median()
     assert psnr(predicted, TEST.spectrum).median() > mean + MARGIN_DB.get(name, 0.5)

@@ -55,7 +55,7 @@ from swiftwrf import (
 from swiftwrf.comparison import NeRF2Rssi
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.gp import Kernel
-from swiftwrf.models.geometry import fit_geometry, fit_hybrid
+from swiftwrf.models.geometry import GeometryModel, HybridModel
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.path_gains import fit_path_gains
 from swiftwrf.rssi import PairModel
@@ -134,12 +134,12 @@ def model_coarray(folder: Path) -> None:
 
 
 def model_geometry(folder: Path) -> None:
-    fit_geometry(_room(), GLANCE, progress=False).save(folder / "model")
+    GeometryModel(GLANCE).fit(_room()).save(folder / "model")
 
 
 def model_hybrid(folder: Path) -> None:
-    geometry = fit_geometry(_room(), GLANCE, progress=False)
-    model = fit_hybrid(_room(), geometry, progress=False)
+    geometry = GeometryModel(GLANCE).fit(_room())
+    model = HybridModel().fit(_room(), like=geometry)
     model.path_gains = fit_path_gains(geometry, observe(_room())[0], Kernel())
     model.save(folder / "model")
 
@@ -225,7 +225,7 @@ def model_rssi_locator(folder: Path) -> None:
 def model_matched_field(folder: Path) -> None:
     room = simulated_room(n=20, grid=GRID)
     locator = MatchedField(spacing=0.5, n_best=20, n_background=10, n_split=4)
-    locator.fit(room, room=fit_geometry(room, GLANCE, progress=False)).save(folder / "model")
+    locator.fit(room, room=GeometryModel(GLANCE).fit(room)).save(folder / "model")
 
 
 def read_locator(folder: Path) -> torch.Tensor:

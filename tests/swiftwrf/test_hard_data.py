@@ -22,13 +22,19 @@ from swiftwrf import (
     simulated_room,
 )
 from swiftwrf.data.store import Store
-from swiftwrf.models.geometry import ambiguity, orient, search
+from swiftwrf.models.geometry import search, uncertainty
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.swiftwrf import smallest
 from swiftwrf.rssi.path_loss import PairPathLoss
 from swiftwrf.rssi.training import rounding_std
 
-SHORT = {"reach": 0.5, "positions": 10, "width": 1, "max_order": 1, "further": 1}  # search for a room
+SHORT = {
+    "search_distance_m": 0.5,
+    "n_search_positions": 10,
+    "beam_width": 1,
+    "max_order": 1,
+    "max_extra_planes": 1,
+}  # search for a room
 OPTIONS = {"swiftwrf": {"n_primitives": 4}, "geometry": SHORT, "hybrid": SHORT}
 MODELS = [name for name, model in FIELD_MODELS.items() if not model.slow]
 SCALES = (1e-3, 1e3, 1e6)
@@ -96,8 +102,8 @@ def _short_searches(monkeypatch):
     """Shorten the search for rooms, not its stages."""
     for module, values in (
         (search, {"SIGNS": search.SIGNS[:1], "MAX_MOVES": 1, "N_REFINED": 2, "MAX_ALTERNATIVES": {2: 5, 3: 2}}),
-        (ambiguity, {"MAX_PERIODS": 1, "N_COARSE": 2, "N_FINE": 1, "N_WHOLE": 1}),
-        (orient, {"N_HORIZONTAL_NORMALS": 20, "N_SPHERE_NORMALS": 20}),
+        (uncertainty, {"MAX_PERIODS": 1, "N_COARSE": 2, "N_FINE": 1, "N_WHOLE": 1}),
+        (search, {"N_HORIZONTAL_NORMALS": 20, "N_SPHERE_NORMALS": 20}),
     ):
         for name, value in values.items():
             monkeypatch.setattr(module, name, value)
@@ -161,20 +167,18 @@ def test_aliases_keep_the_plane_of_each_side():
     """Refinement may move a plane between the positions, where no alias is."""
     scene, _ = observe(spectra("scale 1000"))
     searched = search.Search(scene, reach=1.0, signs=search.SIGNS[0])
-    room = search.CandidateRoom(
-        0.0, {side: near - 5.0 for side, near in enumerate(searched.near)}, dict.fromkeys(range(6), 0.5)
-    )
+    room = search.PlaneSet.on_sides({side: (near - 5.0, 0.5) for side, near in enumerate(searched.near)})
     aliases = searched.aliases(room)
-    assert [alias[0] for alias in aliases] == [(room.offset[side], 0.5) for side in range(6)]
-    assert searched.improve(room).score <= 1
+    assert [alias[0] for alias in aliases] == [room.by_side()[side] for side in range(6)]
+    assert float(searched.improve(room).score) <= 1
 
 
 def test_a_search_without_reach_finds_no_plane():
     """The wavelength may exceed the search distance many times over."""
     scene, _ = observe(spectra("scale 0.001"))
     (_, found), *_ = search.find_rooms(scene, reach=1e-4, width=1)
-    assert not found.offset
-    assert orient.candidates(scene, scene.wave(scene.transmitter), 1e-4, 3) == []
+    assert not found.by_side()
+    assert search.oblique_planes(scene, scene.direct, 1e-4, 3) == []
 
 
 @pytest.mark.parametrize("losses", [[-2e-8, 1e-8, 3e-8], [0.0, 0.0, 0.0], [1.0, 0.5, 0.499]])

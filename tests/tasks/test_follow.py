@@ -16,7 +16,7 @@ import torch
 
 from swiftwrf import AngularGrid, InputError, Rssi, RssiModel, load, make_model, rssi_room, simulated_room
 from swiftwrf.data.writing import write_rssi
-from swiftwrf.models.geometry import fit_geometry
+from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.online import Follower
 from tasks.command import run_command
 from tasks.update import lines as followed_lines
@@ -239,7 +239,7 @@ def room():
 
 @cache
 def geometry():
-    return fit_geometry(room().subset(torch.arange(40)), small.GLANCE, progress=False)
+    return GeometryModel(small.GLANCE).fit(room().subset(torch.arange(40)))
 
 
 def spectrum_lines(first, last):

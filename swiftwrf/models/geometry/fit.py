@@ -15,23 +15,21 @@ from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import subsample
 from swiftwrf.models.base import FieldConfig
-from swiftwrf.models.geometry.ambiguity import phase_alternatives
-from swiftwrf.models.geometry.images import PhaseObservations
-from swiftwrf.models.geometry.orient import FURTHER_GAIN, candidates
+from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet
 from swiftwrf.models.geometry.phase_retrieval import correlations, retrieve_phases
 from swiftwrf.models.geometry.planes import (
     MAX_ORDER,
     MIN_MISSING,
-    PlaneSet,
     RoomEstimate,
     advantage,
     correlation_score,
     log_explained,
-    refined,
+    offset_covariance,
+    refine,
+    refine_all,
     robust_advantage,
     sign_alternatives,
 )
-from swiftwrf.models.geometry.refine import offset_covariance
 from swiftwrf.models.geometry.search import (
     MAX_SCORE_RATIO,
     N_STARTS,
@@ -40,8 +38,9 @@ from swiftwrf.models.geometry.search import (
     WEAK_GAIN,
     Search,
     find_rooms,
+    oblique_planes,
 )
-from swiftwrf.models.geometry.uncertainty import assess
+from swiftwrf.models.geometry.uncertainty import assess, phase_alternatives
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, configuration
@@ -63,15 +62,15 @@ Splits = list[tuple[PhaseObservations, PhaseObservations]]  # kept and held-out 
 class GeometryConfig(FieldConfig):
     """Options of the search for a room."""
 
-    reach: PositiveFloat = 3.0
+    search_distance_m: PositiveFloat = 3.0
     """distance beyond the region of both ends up to which planes are searched [m]"""
-    positions: PositiveInt = 100
+    n_search_positions: PositiveInt = 100
     """number of positions in the search; all positions refine its result"""
-    width: PositiveInt = 8
+    beam_width: PositiveInt = 8
     """width of the beam search for the first planes"""
     max_order: Annotated[int, Ge(1), Le(MAX_ORDER)] = 3
     """highest number of reflections of an image source"""
-    further: NonNegativeInt = 3
+    max_extra_planes: NonNegativeInt = 3
     """maximum number of planes of any orientation beyond those of the six sides"""
     max_spectra: Annotated[int, Ge(MIN_TRAINING)] = 2000
     """maximum number of training spectra that the room is estimated from, evenly chosen"""
@@ -98,15 +97,15 @@ def search_room(train: Spectra, config: GeometryConfig, progress: bool = False) 
     evidence = _Evidence.of(train, config)
     with progress_bar(progress) as bar:
         task = bar.add_task("finding the room", total=N_STARTS + len(SIGNS) + 1)
-        some = _some(evidence.kept, config.positions, config.seed)
-        rooms = find_rooms(some, config.reach, config.width, tick=lambda: bar.advance(task))
+        some = _some(evidence.kept, config.n_search_positions, config.seed)
+        rooms = find_rooms(some, config.search_distance_m, config.beam_width, tick=lambda: bar.advance(task))
         improved = []
         for signs, room in rooms:
-            improved.append(Search(evidence.more, config.reach, signs).improve(room))
+            improved.append(Search(evidence.more, config.search_distance_m, signs).improve(room))
             bar.advance(task)
-        found, (signs, searched) = min(zip(improved, rooms, strict=True), key=lambda item: item[0].score)
-        score = evidence.held_out_score(PlaneSet.of(searched))
-        return _completed(PlaneSet.of(found).refined(evidence.scene), signs, score, evidence, config)
+        found, (signs, searched) = min(zip(improved, rooms, strict=True), key=lambda item: float(item[0].score))
+        score = evidence.held_out_score(searched)
+        return _completed(refine(evidence.scene, found), signs, score, evidence, config)
 
 
 @single_thread()
@@ -131,16 +130,17 @@ def extend_room(room: PlaneSet, train: Spectra, is_new: Tensor, config: Geometry
     evidence = _Evidence.of(train, config)
     room, scene = room.shifted(-evidence.origin), evidence.scene
     new = is_new[evidence.rows]
-    explained = log_explained(scene.coherence(room.field(scene)))
+    explained = log_explained(room.coherence(scene))
     excess = explained[~new].mean() - explained[new].mean()
     if int((~new).sum()) < MIN_SEARCHED or not room.normal.shape[1] or not float(excess) < math.log(MAX_MISSING_RATIO):
         return None
-    gains = room.by_side().gain
-    signs = max(SIGNS, key=lambda row: sum(float(row[side]) * gain > 0 for side, gain in gains.items()))
-    score, room = evidence.held_out_score(room), room.refined(scene)
-    improved = PlaneSet.of(Search(evidence.more, config.reach, signs).improve(room.by_side())).refined(scene)
+    planes = room.by_side()
+    signs = max(SIGNS, key=lambda row: sum(float(row[side]) * gain > 0 for side, (_, gain) in planes.items()))
+    score, room = evidence.held_out_score(room), refine(scene, room)
+    on_sides = PlaneSet.on_sides(room.by_side())
+    improved = refine(scene, Search(evidence.more, config.search_distance_m, signs).improve(on_sides))
     # a phase alias explains new spectra nearly as well as others, but all positions together less than the right room
-    if scene.score(improved.field(scene)) < MAX_SCORE_RATIO * scene.score(room.field(scene)):
+    if float(improved.score) < MAX_SCORE_RATIO * float(room.score):
         room = improved
     return _completed(room, signs, score, evidence, config)
 
@@ -174,7 +174,10 @@ class _Evidence:
         scene = observed.around(train.fixed_position)
         fold = folds(scene.moving, config.validation, config.seed)
         used, _ = _evenly(train, config.max_spectra)
-        some, more = (_some(scene, most, config.seed) for most in (config.positions, max(config.positions, N_FINAL)))
+        some, more = (
+            _some(scene, most, config.seed)
+            for most in (config.n_search_positions, max(config.n_search_positions, N_FINAL))
+        )
         return cls(used, observed, scene, rows, fold, some, more)
 
     @property
@@ -192,7 +195,7 @@ class _Evidence:
         """Return the score of a room at the positions of the first fold, refined on the others."""
         assert self.train.array is not None
         held = self.scene.subset((self.fold == 0).nonzero()[:, 0])
-        return correlation_score(held, room.refined(self.kept), self.train.array)
+        return correlation_score(held, refine(self.kept, room), self.train.array)
 
 
 def _completed(
@@ -204,22 +207,8 @@ def _completed(
     room = _with_weak_planes(room, scene, some, splits, signs, config)
     room = _with_further_planes(room, scene, some, splits, config)
     room = _with_order(room, splits, config)
-    final = room.shifted(evidence.origin).refined(evidence.observed)
-    return assess(evidence.train, evidence.observed, final, score, config.reach, config.certainty)
-
-
-@single_thread()
-def refine_room(room: RoomEstimate, planes: PlaneSet, scene: PhaseObservations) -> RoomEstimate:
-    """Refine offsets and gains of a room on other spectra of the scene, without a search, in under a second.
-
-    Args:
-        room: Estimate from other spectra.
-        planes: Its planes as tensors.
-        scene: Observed phases of the spectra to refine on.
-    """
-    new = planes.refined(scene)
-    found = zip(room.planes, new.normal[0].tolist(), new.offset[0].tolist(), new.gain[0].tolist(), strict=True)
-    return replace(room, planes=[replace(p, normal=tuple(n), offset_m=o, gain=g) for p, n, o, g in found])
+    final = refine(evidence.observed, room.shifted(evidence.origin))
+    return assess(evidence.train, evidence.observed, final, score, config.search_distance_m, config.certainty)
 
 
 @single_thread()
@@ -236,8 +225,8 @@ def update_room(room: RoomEstimate, planes: PlaneSet, new: Spectra, config: Geom
         InputError: As `search_room`.
     """
     scene, _ = observe(new, config)
-    found = planes.refined(scene)
-    covariance = offset_covariance(scene, found.normal, found.offset, found.gain, found.sequence)
+    found = refine(scene, planes)
+    covariance = offset_covariance(scene, found)
     weight = room.covariance @ torch.linalg.pinv(room.covariance + covariance, hermitian=True)
     offset = planes.offset[0] + weight @ (found.offset - planes.offset)[0]
     gain = planes.gain[0] + weight.diagonal().float() * (found.gain - planes.gain)[0]
@@ -297,14 +286,14 @@ def observe(train: Spectra, config: GeometryConfig | None = None) -> tuple[Phase
 
 def _held_out(rooms: list[PlaneSet], splits: Splits, steps: int = 4) -> list[Tensor]:
     """Return each room's coherence at held-out positions (n,), with offsets and gains refined on the other positions."""
-    found = [[held.coherence(r.field(held)) for r in refined(rooms, kept, steps)] for kept, held in splits]
+    found = [[room.coherence(held) for room in refine_all(kept, rooms, steps)] for kept, held in splits]
     return [torch.cat(parts) for parts in zip(*found, strict=True)]
 
 
 def _pruned(room: PlaneSet, scene: PhaseObservations, splits: Splits, config: GeometryConfig) -> PlaneSet:
     """Drop planes that hardly reflect or do not explain held-out spectra significantly, the least significant first."""
     while room.normal.shape[1]:
-        rest = refined([room.without(i) for i in range(room.normal.shape[1])], scene, 4)
+        rest = refine_all(scene, [room.without(i) for i in range(room.normal.shape[1])], 4)
         full, *held = _held_out([room, *rest], splits)
         faint = (room.gain[0].abs() < config.min_gain).tolist()
         needed = [0.0 if f else robust_advantage(full, h) for f, h in zip(faint, held, strict=True)]
@@ -322,13 +311,9 @@ def _without_aliases(room: PlaneSet, scene: PhaseObservations, config: GeometryC
     the wrong sign explains planes that are often hidden nearly as well, so a lower score alone does not count.
     """
     for _ in range(MAX_ALIAS_STEPS):
-        here = scene.coherence(room.field(scene))
-        others = (
-            r
-            for r in phase_alternatives(scene, room)
-            if robust_advantage(scene.coherence(r.field(scene)), here) > config.significance
-        )
-        other = next(others, None)
+        here = room.coherence(scene)
+        others = phase_alternatives(scene, room)
+        other = next((r for r in others if robust_advantage(r.coherence(scene), here) > config.significance), None)
         if other is None:
             break
         room = other
@@ -347,37 +332,33 @@ def _with_weak_planes(
 
     The search assumes strong planes. At the offset of one that is hidden from most positions its score is worse.
     """
-    found = room.by_side()
-    if not 0 < len(found.gain) < len(signs) or float(some.score(room.field(some))) < MIN_MISSING:
+    planes, known = room.by_side(), signs.clone()
+    if not 0 < len(planes) < len(signs) or room.score_at(some) < MIN_MISSING:
         return room
-    known = signs.clone()
-    for side, gain in found.gain.items():
+    for side, (_, gain) in planes.items():
         known[side] = math.copysign(1, gain)
-    found = Search(some, config.reach, known, usual=WEAK_GAIN).improve(found)
-    return _pruned(_without_aliases(PlaneSet.of(found).refined(scene), scene, config), scene, splits, config)
+    search = Search(some, config.search_distance_m, known, usual=WEAK_GAIN)
+    found = refine(scene, search.improve(PlaneSet.on_sides(planes)))
+    return _pruned(_without_aliases(found, scene, config), scene, splits, config)
 
 
 def _with_further_planes(
     room: PlaneSet, scene: PhaseObservations, some: PhaseObservations, splits: Splits, config: GeometryConfig
 ) -> PlaneSet:
     """Add planes of any orientation, searched with some positions, as long as they are significant."""
-    for _ in range(config.further):
-        if float(some.score(room.field(some))) < PERFECT_SCORE:
+    for _ in range(config.max_extra_planes):
+        if room.score_at(some) < PERFECT_SCORE:
             break
-        wider = []
-        for normal, offset, sign in candidates(scene, room.field(scene), config.reach, MAX_FURTHER_TRIED):
-            normals = torch.cat([room.normal, normal[None, None]], dim=1)
-            offsets = torch.cat([room.offset, torch.full((1, 1), offset, dtype=torch.float64)], dim=1)
-            gains = torch.cat([room.gain, torch.full((1, 1), FURTHER_GAIN * sign)], dim=1)
-            wider.append(PlaneSet(normals, offsets, gains, room.order))
-        wider = sorted(refined(wider, some, 8, tilt=True), key=lambda r: float(some.score(r.field(some))))
-        now = some.coherence(room.field(some))
-        if not wider or advantage(some.coherence(wider[0].field(some)), now) < PROMISING_SIGNIFICANCE:
+        further = oblique_planes(scene, room.field(scene), config.search_distance_m, MAX_FURTHER_TRIED)
+        wider = refine_all(some, [room.joined(plane) for plane in further], 8, tilt=True)
+        wider.sort(key=lambda r: r.score_at(some))
+        now = room.coherence(some)
+        if not wider or advantage(wider[0].coherence(some), now) < PROMISING_SIGNIFICANCE:
             break
         wider = [r for other in wider[:2] for r in (other, *sign_alternatives(scene, other))]
-        wider = refined(wider, some, 20, tilt=True)
-        best = min(wider, key=lambda r: float(some.score(r.field(some)))).refined(scene, 15, tilt=True)
-        if advantage(scene.coherence(best.field(scene)), scene.coherence(room.field(scene))) < FURTHER_SIGNIFICANCE:
+        best = min(refine_all(some, wider, 20, tilt=True), key=lambda r: r.score_at(some))
+        best = refine(scene, best, 15, tilt=True)
+        if advantage(best.coherence(scene), room.coherence(scene)) < FURTHER_SIGNIFICANCE:
             break
         best = _pruned(best, scene, splits, config)
         if advantage(*_held_out([best, room], splits)) < FURTHER_SIGNIFICANCE:

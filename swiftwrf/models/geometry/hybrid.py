@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.data.splits import Validation, folds
+from swiftwrf.data.splits import folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, LeaveGroupOut, choose_kernel, principal_components
 from swiftwrf.metrics import psnr
@@ -45,7 +45,7 @@ class HybridModel(ProcessModel):
     Example:
         >>> import swiftwrf
         >>> train, test = swiftwrf.simulated_room(n=50).split()
-        >>> HybridModel(width=1, further=0).fit(train).predict(test.position).mean.shape
+        >>> HybridModel(beam_width=1, max_extra_planes=0).fit(train).predict(test.position).mean.shape
         torch.Size([10, 30, 120])
     """
 
@@ -200,37 +200,6 @@ class HybridModel(ProcessModel):
         )
         if "path_gains.kernel" in header:
             self.path_gains = PathGains.from_state(tensors, header, self.room)
-
-
-def fit_hybrid(
-    train: Spectra,
-    geometry: FieldModel | None = None,
-    *,
-    validation: Validation = "random",
-    seed: int = 0,
-    progress: bool = True,
-) -> HybridModel:
-    """Fit the hybrid model.
-
-    Args:
-        train: Training spectra, 10 to 10,000, with array, rotation and fixed end.
-        geometry: Fitted model with a room. Its planes are refined if it was fitted to other spectra. By default the room is
-            estimated from `train`.
-        validation: How training spectra are held out to choose kernel and mixing weight.
-        seed: Seed of the folds.
-        progress: Show a progress bar on a terminal.
-
-    Raises:
-        InputError: As `FieldModel.fit`, or more than 10,000 spectra.
-
-    Example:
-        >>> import swiftwrf
-        >>> data = swiftwrf.simulated_room(n=40)
-        >>> room = swiftwrf.GeometryModel(width=1, further=0).fit(data)
-        >>> fit_hybrid(data, room).mixing_weight > 0
-        True
-    """
-    return HybridModel(validation=validation, seed=seed).fit(train, like=geometry, progress=progress)
 
 
 def _mixing_weight(position: Tensor, seen: Tensor, known: Tensor, fold: Tensor, kernel: Kernel) -> tuple[float, bool]:

@@ -1,8 +1,11 @@
-"""Image sources of paths that mirror planes reflect, and their waves at the array.
+"""Mirror planes, the image sources of paths that they reflect, and the waves of these at the array.
 
 A path reflected by planes one after another arrives as if from the transmitter mirrored in them one after another, along a
 straight line (J. B. Allen and D. A. Berkley, J. Acoust. Soc. Am. 65, 1979). Everything is batched over rooms that have
 equally many planes; B rooms, P planes, S images, n positions, K elements.
+
+A field is float32 (n, 2 K, B): at each position the real parts at the elements, then the imaginary parts, and the rooms
+last. Sums and scores of many rooms are fast in this order of memory.
 """
 
 from __future__ import annotations
@@ -10,25 +13,113 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import torch
 from torch import Tensor
 
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.choices import Moving
-from swiftwrf.models.geometry.chain import ElementChain
 
 MAX_COSINE = 0.02  # of two planes that count as perpendicular; above 1 - MAX_COSINE**2 they count as parallel
 ROUNDING_RAD = 1e-3  # of phase, to which positions are rounded in a search
 N_POSITIONS = 36  # that many rooms are scored at
 MAX_DISTANCE_M = 1e7  # from the fixed end; beyond, only the direction counts, because rounding destroys the phases
 MIN_LENGTH_M = 1e-6  # of a path, whose amplitude is finite also between ends at one place
+BATCH_WAVES = 2**15  # waves that are summed at a time
+SIDES = torch.tensor(
+    [[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], dtype=torch.float64
+)  # outward normals
+UNKNOWN = torch.tensor([math.nan])  # score of a room that was not refined
 
 Sequence = tuple[int, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class PlaneSet:
+    """Planes of B rooms whose images have the same sequences of reflections.
+
+    Args:
+        normal: Outward unit normals, float64 (B, P, 3).
+        offset: Offsets, float64 (B, P) [m].
+        gain: Reflection gains, float32 (B, P).
+        order: Highest number of reflections of an image.
+        only: Sequences of reflections of the images to compute. Defaults to all up to the order.
+        score: 1 - the mean coherence of each room with the positions where it was last refined, (B,) or nan.
+    """
+
+    normal: Tensor
+    offset: Tensor
+    gain: Tensor
+    order: int = 2
+    only: tuple[Sequence, ...] | None = None
+    score: Tensor = UNKNOWN
+
+    @classmethod
+    def on_sides(cls, planes: dict[int, tuple[float, float]], order: int = 2, score: float = math.nan) -> PlaneSet:
+        """Return a room with at most one plane on each of the six SIDES, from their offsets [m] and gains."""
+        sides = sorted(planes)
+        offset = torch.tensor([[planes[side][0] for side in sides]], dtype=torch.float64)
+        gain = torch.tensor([[planes[side][1] for side in sides]])
+        return cls(SIDES[sides][None], offset, gain, order, score=torch.tensor([score]))
+
+    @property
+    def side(self) -> Tensor:
+        """Number of the side that each plane faces most, (B, P)."""
+        return (self.normal @ SIDES.T).argmax(-1)
+
+    def by_side(self) -> dict[int, tuple[float, float]]:
+        """Return offset [m] and gain of the planes of one room by the side that each faces most."""
+        planes = zip(self.offset[0].tolist(), self.gain[0].tolist(), strict=True)
+        return dict(zip(self.side[0].tolist(), planes, strict=True))
+
+    @cached_property
+    def sequence(self) -> tuple[Sequence, ...]:
+        """Sequences of reflections of the images."""
+        return tuple(sequences(self.normal[0], self.order)) if self.only is None else self.only
+
+    @property
+    def image_gain(self) -> Tensor:
+        """Product of the gains along each sequence, (B, S)."""
+        tree, last, found = tree_of(self.sequence), torch.ones(len(self.gain), 1), []
+        for parent, plane in tree.levels:
+            last = last[:, parent] * self.gain[:, plane]
+            found.append(last)
+        return torch.cat(found, dim=1)[:, tree.rows]
+
+    def shifted(self, by: Tensor) -> PlaneSet:
+        """Return the planes in coordinates whose origin is at `-by` (3,) [m]."""
+        return replace(self, offset=self.offset + self.normal @ by)
+
+    def without(self, plane: int) -> PlaneSet:
+        """Return the other planes."""
+        keep = [i for i in range(self.normal.shape[1]) if i != plane]
+        return replace(self, normal=self.normal[:, keep], offset=self.offset[:, keep], gain=self.gain[:, keep])
+
+    def joined(self, other: PlaneSet) -> PlaneSet:
+        """Return these planes with those of another set."""
+        normal, offset = torch.cat([self.normal, other.normal], dim=1), torch.cat([self.offset, other.offset], dim=1)
+        return replace(self, normal=normal, offset=offset, gain=torch.cat([self.gain, other.gain], dim=1))
+
+    def field(self, scene: PhaseObservations) -> Tensor:
+        """Return the field with the direct wave at the positions of a scene, (n, 2 K, B)."""
+        return scene.direct + field(scene, self)
+
+    def channel(self, scene: PhaseObservations) -> Tensor:
+        """Return the channel of one room at each element, complex64 (n, K)."""
+        real, imaginary = self.field(scene)[..., 0].chunk(2, dim=1)
+        return torch.complex(real, imaginary)
+
+    def coherence(self, scene: PhaseObservations) -> Tensor:
+        """Return the coherence of one room's field with the observed phases at each position, (n,)."""
+        return scene.coherence(self.field(scene))[:, 0]
+
+    def score_at(self, scene: PhaseObservations) -> float:
+        """Return 1 - the mean coherence of one room."""
+        return 1 - float(self.coherence(scene).mean())
+
+
+@dataclass(frozen=True, eq=False)
 class PhaseObservations:
     """A link at n positions and the observed phases of its channel.
 
@@ -36,7 +127,6 @@ class PhaseObservations:
         transmitter, receiver: Positions, float64 (n, 3), of the fixed end (1, 3) [m].
         end: The end that moves.
         element: Phase of a wave from unit vector u at each element is element @ u, float32 (K, 3) [rad].
-        chain: The same phases in few steps, for many waves at once.
         wavenumber: Wavenumber [rad / m].
         channel: Observed phases, complex64 (n, 2, K) of unit modulus: the channel and its alternative, the conjugate
             observed by an array rotated by half a turn. Spectra cannot distinguish them if each element has an opposite one.
@@ -46,7 +136,6 @@ class PhaseObservations:
     receiver: Tensor
     end: Moving
     element: Tensor
-    chain: ElementChain
     wavenumber: float
     channel: Tensor
 
@@ -63,8 +152,7 @@ class PhaseObservations:
         element = wavenumber * array.element.double() @ rotation[:, :2].T.double()
         opposite = array.opposite
         both = torch.stack([channel, channel if opposite is None else channel.conj()[:, opposite]], dim=1)
-        chain = ElementChain.of(array, element)
-        return cls(transmitter, receiver, moving, element.float(), chain, wavenumber, both.to(torch.complex64))
+        return cls(transmitter, receiver, moving, element.float(), wavenumber, both.to(torch.complex64))
 
     def __len__(self) -> int:
         return len(self.moving)
@@ -97,43 +185,44 @@ class PhaseObservations:
         transmitter, receiver = (((end - origin) / step).round() * step for end in (self.transmitter, self.receiver))
         return replace(self, transmitter=transmitter, receiver=receiver)
 
+    @cached_property
+    def direct(self) -> Tensor:
+        """Field of the direct wave, (n, 2 K, 1)."""
+        wave = self.wave(self.transmitter)
+        return torch.cat([wave.real, wave.imag], dim=1)[..., None]
+
     def wave(self, source: Tensor) -> Tensor:
         """Return the wave exp(-j k d) / d of sources (..., n or 1, 3) [m] at each element, complex64 (..., n, K)."""
-        ray = (source - self.receiver).float()
-        length = ray.norm(dim=-1, keepdim=True).clamp_min(MIN_LENGTH_M)
-        return spherical((ray / length) @ self.element.T - self.wavenumber * length, length)
+        phase, length = self.phases((source - self.receiver).float().movedim(-1, 0))
+        return torch.complex(phase.cos() / length, phase.sin() / length).movedim(0, -1)
 
-    def waves(self, ray: Tensor, amplitude: Tensor) -> Tensor:
-        """Return waves along rays times an amplitude, as `wave`, in the memory order for many waves.
+    def phases(self, ray: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the phase at each element (K, ...) [rad] of waves along rays, and the lengths of the rays (...) [m].
 
         Args:
             ray: Vectors from the receiver to the source, float32 (3, ...) [m].
-            amplitude: Real amplitudes that broadcast to (...).
-
-        Returns:
-            Waves, complex64 (K, ...).
         """
         length = ray.square().sum(0).sqrt().clamp_min(MIN_LENGTH_M)  # the norm over a first dimension is slow
-        unit, amplitude = ray / length, amplitude / length
-        wave = self.chain.phasors(unit.flatten(1), amplitude.flatten(), -self.wavenumber * length.flatten())
-        return wave.reshape(len(self.element), *length.shape)
+        phase = (self.element @ (ray / length).flatten(1)).reshape(-1, *length.shape)
+        return phase - self.wavenumber * length, length
 
     def coherence(self, field: Tensor) -> Tensor:
-        """Return |x^H h|^2 / K^2 of the observed and the given phases, (..., n, K) to (..., n), in [0, 1].
+        """Return |x^H h|^2 / K^2 of the observed phases and those of a field (n, 2 K, B), (n, B), in [0, 1].
 
         The better of the two observed alternatives counts.
         """
-        match = torch.einsum("...nk,nfk->...nf", field.sgn(), self.channel.conj())
-        return match.abs().square().amax(-1) / field.shape[-1] ** 2
+        size = field.shape[1] // 2
+        real, imaginary = field[:, :size], field[:, size:]
+        inverse = (real * real).addcmul_(imaginary, imaginary).clamp_min_(1e-30).rsqrt_()
+        observed = self.channel
+        match = torch.cat([observed.real, -observed.imag], dim=1) @ (real * inverse)
+        match += torch.cat([observed.imag, observed.real], dim=1) @ (imaginary * inverse)
+        coherence: Tensor = match.square_().unflatten(1, (2, -1)).sum(1).amax(1) / size**2
+        return coherence
 
     def score(self, field: Tensor) -> Tensor:
-        """Return 1 - the mean coherence, 0 if all phases agree, (..., n, K) to (...)."""
-        return 1 - self.coherence(field).mean(-1)
-
-
-def spherical(phase: Tensor, length: Tensor) -> Tensor:
-    """Return exp(j phase) / length, complex64; cosine and sine are vectorised, torch.polar is not."""
-    return torch.complex(phase.cos() / length, phase.sin() / length)
+        """Return 1 - the mean coherence, 0 if all phases agree, (n, 2 K, B) to (B,)."""
+        return 1 - self.coherence(field).mean(0)
 
 
 def sequences(normal: Tensor, order: int) -> list[Sequence]:
@@ -192,48 +281,45 @@ def mirror(source: Tensor, normal: Tensor, offset: Tensor) -> Tensor:
     return source - 2 * ((source * normal).sum(0) - offset) * normal
 
 
-def images(scene: PhaseObservations, normal: Tensor, offset: Tensor, sequence: list[Sequence]) -> Tensor:
-    """Return the image positions, float64 (B, S, n or 1, 3) [m], in planes (B, P, 3) and (B, P) [m]."""
-    tree, last, found = tree_of(tuple(sequence)), scene.transmitter.T[:, None, None].expand(-1, len(normal), 1, -1), []
+def images(scene: PhaseObservations, planes: PlaneSet) -> Tensor:
+    """Return the image positions, float64 (B, S, n or 1, 3) [m]."""
+    normal, offset, tree = planes.normal, planes.offset, tree_of(planes.sequence)
+    last, found = scene.transmitter.T[:, None, None].expand(-1, len(normal), 1, -1), []
     for parent, plane in tree.levels:
         last = mirror(last[:, :, parent], normal[:, plane].movedim(-1, 0)[..., None], offset[:, plane, None])
         found.append(last)
     return torch.cat(found, dim=2)[:, :, tree.rows].movedim(0, -1)
 
 
-def phase_period_m(scene: PhaseObservations, normal: Tensor, offset: Tensor, plane: int) -> float:
-    """Return the movement [m] of a plane of the room (1, P, 3), (1, P) that changes its phase by 2 pi on average."""
-    ray = images(scene, normal, offset, [(plane,)])[0, 0] - scene.receiver
-    cosine = float((ray @ normal[0, plane] / ray.norm(dim=-1)).abs().mean().clamp_min(0.3))
+def phase_period_m(scene: PhaseObservations, room: PlaneSet, plane: int) -> float:
+    """Return the movement [m] of a plane of one room that changes its phase by 2 pi on average."""
+    ray = images(scene, replace(room, only=((plane,),)))[0, 0] - scene.receiver
+    cosine = float((ray @ room.normal[0, plane] / ray.norm(dim=-1)).abs().mean().clamp_min(0.3))
     return math.pi / (scene.wavenumber * cosine)
 
 
-def field(scene: PhaseObservations, normal: Tensor, offset: Tensor, gain: Tensor, sequence: list[Sequence]) -> Tensor:
-    """Return the sum of the waves of the given images, complex64 (B, n, K); gains (B, P), real or complex."""
-    if not sequence:
-        shape = (len(normal), len(scene), len(scene.element))
-        return torch.zeros(shape, dtype=torch.complex64)
-    source = images(scene, normal, offset, sequence)
-    strength = image_gain(gain, sequence)[..., None] * visibility(scene, normal, offset, sequence)
-    wave = scene.wave(source)
-    return torch.einsum("bsnk,bsn->bnk", wave, strength.to(wave.dtype).expand(wave.shape[:3]))
+def field(scene: PhaseObservations, planes: PlaneSet) -> Tensor:
+    """Return the sum of the waves of the images, without the direct wave, (n, 2 K, B)."""
+    if not planes.sequence:
+        return torch.zeros(len(scene), 2 * len(scene.element), len(planes.offset))
+    ray = (images(scene, planes) - scene.receiver).permute(3, 1, 2, 0).float().contiguous()
+    strength = (planes.image_gain[..., None] * visibility(scene, planes)).permute(1, 2, 0)
+    size = max(1, BATCH_WAVES // max(1, ray[0, 0].numel()))  # there may be no rooms
+    total = torch.zeros(())
+    for some, part in zip(ray.split(size, dim=1), strength.split(size), strict=True):
+        phase, length = scene.phases(some)
+        amplitude = part / length
+        total = total + torch.stack([(phase.cos() * amplitude).sum(1), (phase.sin() * amplitude).sum(1)])
+    return total.permute(2, 0, 1, 3).flatten(1, 2)
 
 
-def image_gain(gain: Tensor, sequence: list[Sequence]) -> Tensor:
-    """Return the product of the gains (B, P) along each sequence, (B, S)."""
-    tree, last, found = tree_of(tuple(sequence)), torch.ones(len(gain), 1), []
-    for parent, plane in tree.levels:
-        last = last[:, parent] * gain[:, plane]
-        found.append(last)
-    return torch.cat(found, dim=1)[:, tree.rows]
-
-
-def visibility(scene: PhaseObservations, normal: Tensor, offset: Tensor, sequence: list[Sequence]) -> Tensor:
+def visibility(scene: PhaseObservations, planes: PlaneSet) -> Tensor:
     """Return 1 where the path of each image exists, else 0, float32 (B, S, n or 1).
 
     Between parallel or perpendicular planes all paths exist, because the region is inside of all planes. Other paths are
     followed back from the receiver: they must meet their last plane from the inside, and so on.
     """
+    normal, offset, sequence = planes.normal, planes.offset, planes.sequence
     facing = normal[:1] if normal.stride(0) == 0 else normal  # rooms that are expanded from one share their normals
     cosine = (facing @ facing.mT).abs()
     if not bool(((cosine > MAX_COSINE) & (cosine < 1 - MAX_COSINE**2)).any()):
@@ -243,10 +329,10 @@ def visibility(scene: PhaseObservations, normal: Tensor, offset: Tensor, sequenc
         rows = [row for row, s in enumerate(sequence) if len(s) == length]
         point = scene.receiver.expand(len(normal), len(rows), -1, -1)
         for end in range(length, 0, -1):
-            begun = [sequence[row][:end] for row in rows]
+            begun = tuple(sequence[row][:end] for row in rows)
             last = [s[-1] for s in begun]
             n, o = normal[:, last, None], offset[:, last, None]
-            towards = images(scene, normal, offset, begun) - point
+            towards = images(scene, replace(planes, only=begun)) - point
             share = (o - (point * n).sum(-1)) / (towards * n).sum(-1)
             there[:, rows] *= ((share > 0) & (share < 1)).float()
             point = point + share[..., None] * towards

@@ -11,20 +11,19 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra, check_training, fingerprint
-from swiftwrf.data.splits import Validation
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext, bounding_box
 from swiftwrf.models.geometry.fit import (
     GeometryConfig,
     extend_room,
     observe,
-    refine_room,
     search_room,
     update_room,
 )
-from swiftwrf.models.geometry.images import PhaseObservations, image_gain, images
-from swiftwrf.models.geometry.planes import Plane, PlaneSet, RoomEstimate
+from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet, images
+from swiftwrf.models.geometry.planes import Plane, RoomEstimate, refine
 from swiftwrf.models.link import Link, Linked
 from swiftwrf.runtime.checkpoint import Header, expect
+from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import checked
 
 
@@ -34,7 +33,7 @@ class GeometryModel(Linked, FieldModel):
     Example:
         >>> import swiftwrf
         >>> train, test = swiftwrf.simulated_room(n=50).split()
-        >>> room = GeometryModel(width=1, further=0).fit(train)
+        >>> room = GeometryModel(beam_width=1, max_extra_planes=0).fit(train)
         >>> room.predict(test.position).mean.shape
         torch.Size([10, 30, 120])
     """
@@ -137,10 +136,12 @@ class GeometryModel(Linked, FieldModel):
         model.estimate, model.fingerprint = estimate, fingerprint(train)
         return model
 
+    @single_thread()
     def refined_on(self, scene: PhaseObservations) -> Self:
         """Return the room with offsets and gains refined on the observed phases of some spectra, without a search."""
-        model = copy(self)
-        model.estimate = refine_room(self.estimate, self.tensors(), scene)
+        model, new = copy(self), refine(scene, self.tensors())
+        found = zip(self.planes, new.offset[0].tolist(), new.gain[0].tolist(), strict=True)
+        model.estimate = replace(self.estimate, planes=[replace(p, offset_m=o, gain=g) for p, o, g in found])
         return model
 
     def with_order(self, order: int) -> Self:
@@ -174,7 +175,7 @@ class GeometryModel(Linked, FieldModel):
 
     def channel(self, position: Tensor) -> Tensor:
         """Return the channel of each element at positions (n, 3) [m], complex64 (n, K)."""
-        return self.tensors().field(self.scene(position))
+        return self.tensors().channel(self.scene(position))
 
     def scene(self, position: Tensor) -> PhaseObservations:
         """Return the link at positions (n, 3) [m], without observations."""
@@ -191,18 +192,11 @@ class GeometryModel(Linked, FieldModel):
         """Return the fixed end and its mirror images: positions (S, 3) [m], gains (S,) and numbers of reflections (S,)."""
         at, strength, order = self.fixed_position[None], torch.ones(1), torch.zeros(1, dtype=torch.int64)
         room = self.tensors()
-        if not (chain := room.sequence):
+        if not room.sequence:
             return at, strength, order
-        scene = PhaseObservations.of(
-            at, at[0], "receiver", self.array, self.rotation, torch.ones(1, len(self.array.element))
-        )
-        found = images(scene, room.normal, room.offset, chain)[0, :, 0]
-        reflections = torch.tensor([len(s) for s in chain])
-        return (
-            torch.cat([at, found]),
-            torch.cat([strength, image_gain(room.gain, chain)[0]]),
-            torch.cat([order, reflections]),
-        )
+        link = replace(self.scene(at), transmitter=at)
+        found, reflections = images(link, room)[0, :, 0], torch.tensor([len(s) for s in room.sequence])
+        return torch.cat([at, found]), torch.cat([strength, room.image_gain[0]]), torch.cat([order, reflections])
 
     def to_json(self) -> dict[str, Any]:
         """Return the room as plain values, see `RoomEstimate.to_json`."""
@@ -233,54 +227,6 @@ class GeometryModel(Linked, FieldModel):
             order=order,
             score_held_out=float(header["score_held_out"]),
             unexplained=float(header["unexplained"]),
-            conclusion=str(header.get("conclusion", header.get("verdict"))),
+            conclusion=str(header["conclusion"]),
             covariance=tensors["covariance"].double(),
         )
-
-
-def fit_geometry(
-    train: Spectra,
-    config: GeometryConfig | None = None,
-    *,
-    validation: Validation | None = None,
-    seed: int | None = None,
-    progress: bool = True,
-) -> GeometryModel:
-    """Estimate the room in which spectra were measured.
-
-    Args:
-        train: Training spectra with array, rotation and fixed end.
-        config: Options of the search.
-        validation: Replaces `config.validation`.
-        seed: Replaces `config.seed`.
-        progress: Show a progress bar on a terminal.
-
-    Raises:
-        InputError: As `FieldModel.fit`, or spectra that the array cannot have produced.
-
-    Example:
-        >>> import swiftwrf
-        >>> data = swiftwrf.simulated_room(n=40)
-        >>> fit_geometry(data, GeometryConfig(width=1, further=0), progress=False).order
-        2
-    """
-    given: dict[str, Any] = {
-        name: value for name, value in (("validation", validation), ("seed", seed)) if value is not None
-    }
-    return GeometryModel(config, **given).fit(train, progress=progress)
-
-
-def refit_geometry(model: FieldModel, train: Spectra, *, seed: int | None = None) -> GeometryModel:
-    """Return the room of a model with offsets and gains refined on other spectra of the scene, without a search.
-
-    Args:
-        model: Fitted model with a room.
-        train: Spectra to refine on.
-        seed: Seed of the phase retrieval. Defaults to that of the room's search.
-
-    Raises:
-        InputError: As `fit_geometry`, or a model without a room.
-    """
-    config = model.room.config if model.room is not None else None
-    given: dict[str, Any] = {} if seed is None else {"seed": seed}
-    return GeometryModel(config, **given).fit(train, like=model)

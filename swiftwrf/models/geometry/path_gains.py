@@ -13,6 +13,7 @@ closely a field follows the phases, is chosen on held-out spectra.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,7 +23,7 @@ from torch import Tensor
 
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel
-from swiftwrf.models.geometry.images import PhaseObservations, image_gain, images, visibility
+from swiftwrf.models.geometry.images import PhaseObservations, images, visibility
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation
 from swiftwrf.models.geometry.planes import advantage
@@ -97,7 +98,7 @@ class PathGains:
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header, geometry: GeometryModel) -> PathGains:
         """Return the path gains of a room that `state` describes."""
-        prior = header.get(f"{PREFIX}prior", "loose")  # the only one of versions up to 0.2.0
+        prior = header[f"{PREFIX}prior"]
         check_value(f"{PREFIX}prior", prior, PriorName)
         process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True, prefix=PREFIX)
         return cls(process, len(geometry.image_sources()[0]), prior)
@@ -123,13 +124,10 @@ class PathGains:
 def paths(geometry: GeometryModel, scene: PhaseObservations) -> tuple[Tensor, Tensor]:
     """Return the waves of the direct path and of each image, complex64 (n, 1 + S, K), and their gains (1 + S,)."""
     room = geometry.tensors()
-    sequence = room.sequence
     wave, strength = [scene.wave(scene.transmitter)[None]], [torch.ones(1)]
-    if sequence:
-        source = images(scene, room.normal, room.offset, sequence)
-        reflected = scene.wave(source) * visibility(scene, room.normal, room.offset, sequence)[..., None]
-        wave.append(reflected[0])
-        strength.append(image_gain(room.gain, sequence)[0])
+    if room.sequence:
+        wave.append((scene.wave(images(scene, room)) * visibility(scene, room)[..., None])[0])
+        strength.append(room.image_gain[0])
     return torch.cat([part.expand(-1, len(scene), -1) for part in wave]).transpose(0, 1), torch.cat(strength)
 
 
@@ -138,25 +136,28 @@ def fit_path_gains(
     geometry: GeometryModel, scene: PhaseObservations, kernel: Kernel, name: PriorName = "loose"
 ) -> PathGains:
     """Fit path gains around several samples of their prior to the observed phases."""
-    prior = PRIORS[name]
-    posterior = GainPosterior.of(geometry, scene, kernel, prior)
-    normal = posterior.sample.clone()
+    prior, (wave, gain) = PRIORS[name], paths(geometry, scene)
+    root = torch.linalg.cholesky(kernel.covariance(scene.moving.double())).float()
+    shape = len(scene), N_FIELDS, len(gain), 2
+    sample = prior.sample_std * torch.randn(shape, generator=torch.Generator().manual_seed(0))
+    gradient, normal = posterior_gradient(scene, wave, gain, root, sample, prior), sample.clone()
     optimiser = torch.optim.Adam([normal], lr=LEARNING_RATE, fused=True)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, prior.steps)
     for _ in range(prior.steps):
-        normal.grad = posterior.gradient(normal)
+        normal.grad = gradient(normal)
         optimiser.step()
         schedule.step()
-    root, weighted = posterior.root.double(), (posterior.std * normal).flatten(1).double()
+    root, weighted = root.double(), (torch.tensor(prior.std) * normal).flatten(1).double()
     coefficient = torch.linalg.solve_triangular(root.T, weighted, upper=True).float()
     return PathGains(GaussianProcess(kernel, scene.moving.double(), coefficient, exact=True), normal.shape[2], name)
 
 
-@dataclass(frozen=True)
-class GainPosterior:
-    """Negative logarithm of the posterior density of path gains, around samples of the prior.
+def posterior_gradient(
+    scene: PhaseObservations, wave: Tensor, gain: Tensor, root: Tensor, sample: Tensor, prior: GainPrior
+) -> Callable[[Tensor], Tensor]:
+    """Return the gradient of the negative logarithm of the posterior density of path gains, around samples of the prior.
 
-    Gains are a_i = gain_i + std (root @ z)_i with standard normal variables z. Up to a constant it is
+    Gains are a_i = gain_i + std (root @ z)_i with standard normal variables z (n, F, S, 2). Up to a constant it is
 
         sum_s (1 - c_s) / missing_scale + |z - sample|^2 / 2,    c_s = max_x |sum_k conj(x_sk) u_sk|^2 / K^2,
 
@@ -164,52 +165,33 @@ class GainPosterior:
     automatic differentiation takes twice as long. It follows from du_k = j u_k Im(conj(u_k) dh_k) / |h_k|.
 
     Args:
-        root: Cholesky factor of the kernel matrix, lower triangle, (n, n).
-        std: Prior standard deviation of a gain, real and imaginary part, (F, S, 2).
-        sample: Samples of the prior (n, F, S, 2).
+        scene: Observed phases at n positions.
         wave: Waves of the paths, complex64 (n, S, K).
-        without: Field of the constant gains alone, complex64 (n, 1, K).
-        conjugate: Conjugate observed phases, complex64 (n, 2, K).
-        missing_scale: Twice the expected missing coherence of a spectrum.
+        gain: Constant gains of the paths (S,).
+        root: Cholesky factor of the kernel matrix, lower triangle, (n, n).
+        sample: Samples of the prior (n, F, S, 2).
+        prior: Prior of the gains.
     """
+    without, conjugate = gain.to(wave.dtype)[None] @ wave, scene.channel.conj().resolve_conj()
+    std = torch.tensor(prior.std).expand(sample.shape[1:]).contiguous()
+    scale = 2 / (prior.missing_scale * wave.shape[-1] ** 2)
 
-    root: Tensor
-    std: Tensor
-    sample: Tensor
-    wave: Tensor
-    without: Tensor
-    conjugate: Tensor
-    missing_scale: float
-
-    @classmethod
-    def of(cls, geometry: GeometryModel, scene: PhaseObservations, kernel: Kernel, prior: GainPrior) -> GainPosterior:
-        """Return the posterior of the gains of a room's paths, given the observed phases."""
-        wave, gain = paths(geometry, scene)
-        root = torch.linalg.cholesky(kernel.covariance(scene.moving.double())).float()
-        shape = len(scene), N_FIELDS, len(gain), 2
-        sample = prior.sample_std * torch.randn(shape, generator=torch.Generator().manual_seed(0))
-        without, conjugate = gain.to(wave.dtype)[None] @ wave, scene.channel.conj().resolve_conj()
-        std = torch.tensor(prior.std).expand(shape[1:]).contiguous()
-        return cls(root, std, sample, wave, without, conjugate, prior.missing_scale)
-
-    def gradient(self, normal: Tensor) -> Tensor:
-        """Return the derivatives with respect to the standard normal variables z, (n, F, S, 2)."""
-        change = self.std * self._times_root(normal)
-        field = self.without + torch.view_as_complex(change) @ self.wave
-        unit = field.sgn()
-        match = unit @ self.conjugate.mT
-        better = match.abs().argmax(-1, keepdim=True)
-        nearer = self.conjugate.gather(1, better.expand(-1, -1, field.shape[-1]))
-        across = (match.gather(2, better).conj() * nearer * unit).imag
-        scale = 2 / (self.missing_scale * field.shape[-1] ** 2)
-        slope = scale * across / field.abs().clamp_min_(MIN_MODULUS)
-        by_gain = torch.complex(-slope * unit.imag, slope * unit.real) @ self.wave.mH
-        return self._times_root(self.std * torch.view_as_real(by_gain), transposed=True) + (normal - self.sample)
-
-    def _times_root(self, values: Tensor, transposed: bool = False) -> Tensor:
-        """Return the product of the root, or its transpose, with values (n, ...); half the operations of a full matrix."""
-        product = strmm(1.0, self.root.numpy().T, values.flatten(1).numpy().T, side=1, trans_a=transposed)
+    def times_root(values: Tensor, transposed: bool = False) -> Tensor:  # half the operations of a full matrix
+        product = strmm(1.0, root.numpy().T, values.flatten(1).numpy().T, side=1, trans_a=transposed)
         return torch.from_numpy(product.T).view_as(values)
+
+    def gradient(normal: Tensor) -> Tensor:
+        field = without + torch.view_as_complex(std * times_root(normal)) @ wave
+        unit = field.sgn()
+        match = unit @ conjugate.mT
+        better = match.abs().argmax(-1, keepdim=True)
+        nearer = conjugate.gather(1, better.expand(-1, -1, field.shape[-1]))
+        across = (match.gather(2, better).conj() * nearer * unit).imag
+        slope = scale * across / field.abs().clamp_min_(MIN_MODULUS)
+        by_gain = torch.complex(-slope * unit.imag, slope * unit.real) @ wave.mH
+        return times_root(std * torch.view_as_real(by_gain), transposed=True) + (normal - sample)
+
+    return gradient
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,10 @@
-"""Rooms of mirror planes: their field, their refinement, and the comparison of two rooms."""
+"""Planes of a room, their refinement to the nearest minimum of the score, and the comparison of two rooms."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from typing import Annotated, Any
 
 import torch
@@ -12,16 +13,23 @@ from torch import Tensor
 
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.errors import InputError
-from swiftwrf.models.geometry.images import PhaseObservations, Sequence, field, phase_period_m, sequences
+from swiftwrf.models.geometry.images import (
+    PhaseObservations,
+    PlaneSet,
+    Sequence,
+    images,
+    mirror,
+    phase_period_m,
+    tree_of,
+    visibility,
+)
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation
-from swiftwrf.models.geometry.refine import refine
-from swiftwrf.models.geometry.search import SIDES, CandidateRoom
 from swiftwrf.runtime.validation import NonNegativeFloat, check_value, configuration
 
-PLANE_TENSORS = ("normal", "offset", "gain")  # of a `PlaneSet`
 MAX_PLANES, MAX_ORDER = 64, 4  # of a room, whose image sources number MAX_PLANES^MAX_ORDER at most
 NORMAL_TOLERANCE = 1e-6  # of the length of a normal, from rounding
 MIN_MISSING = 1e-5  # missing coherence by rounding of spectra and phases
+MIN_FIELD, MIN_GAIN = 1e-9, 1e-6  # moduli by which derivatives are divided
 
 
 @configuration
@@ -92,63 +100,189 @@ class RoomEstimate:
         return {"planes": planes, "order": self.order} | scores
 
 
-@dataclass(frozen=True)
-class PlaneSet:
-    """Planes of one room: normals (1, P, 3), offsets (1, P) [m], gains (1, P), and the order of their images."""
+def phase_jacobian(scene: PhaseObservations, planes: PlaneSet, movement: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the field h with the direct wave, complex64 (K, B, n), and the derivatives of its phase, (K, B, Q P, n).
 
-    normal: Tensor
-    offset: Tensor
-    gain: Tensor
-    order: int
+    The Q parameters of each plane are offset [m], gain and, if planes tilt, two rotation angles of the normal [rad]. A
+    change dh of the field changes its phase by Im(dh / h). The wave w of an image at position x, distance d and direction u
+    changes by
 
-    @classmethod
-    def of(cls, found: CandidateRoom) -> PlaneSet:
-        """Return the planes of a candidate room."""
-        normal, offset, gain = found.tensors()
-        return cls(normal, offset, gain, 2)
+        dw_k / w_k = j e_k . du - j k dd - dd / d,    dd = u . dx,    du = (dx - u dd) / d,
 
-    def by_side(self) -> CandidateRoom:
-        """Return the candidate room with each plane on the side of the region that it faces most, without a score."""
-        sides = (self.normal[0] @ SIDES.T).argmax(1).tolist()
-        offset, gain = (dict(zip(sides, values[0].tolist(), strict=True)) for values in (self.offset, self.gain))
-        return CandidateRoom(0.0, offset, gain)
+    where e_k . u is the phase at element k. So the derivatives are sums over images of a vector times dx.
 
-    @property
-    def sequence(self) -> list[Sequence]:
-        """Sequences of reflections up to the order."""
-        return sequences(self.normal[0], self.order) if self.normal.shape[1] else []
-
-    def field(self, scene: PhaseObservations) -> Tensor:
-        """Return the field with the direct wave at the positions of a scene, complex64 (n, K)."""
-        return scene.wave(scene.transmitter) + field(scene, self.normal, self.offset, self.gain, self.sequence)[0]
-
-    def shifted(self, by: Tensor) -> PlaneSet:
-        """Return the planes in coordinates whose origin is at `-by` (3,) [m]."""
-        return replace(self, offset=self.offset + self.normal @ by)
-
-    def without(self, plane: int) -> PlaneSet:
-        """Return the other planes."""
-        keep = [i for i in range(self.normal.shape[1]) if i != plane]
-        return replace(self, normal=self.normal[:, keep], offset=self.offset[:, keep], gain=self.gain[:, keep])
-
-    def refined(self, scene: PhaseObservations, steps: int = 10, tilt: bool = False) -> PlaneSet:
-        """Return the planes after Levenberg-Marquardt steps on offsets, gains and, with `tilt`, normals."""
-        return refined([self], scene, steps, tilt)[0]
+    Args:
+        scene: Observed phases.
+        planes: Planes of B rooms.
+        movement: `image_jacobian` of the planes.
+    """
+    ray = (images(scene, planes) - scene.receiver).permute(3, 0, 1, 2).float().contiguous()
+    phase, length = scene.phases(ray)
+    amplitude = planes.image_gain[..., None] * visibility(scene, planes) / length
+    wave = torch.complex(phase.cos() * amplitude, phase.sin() * amplitude)  # (K, B, S, n)
+    total = scene.wave(scene.transmitter).T[:, None] + wave.sum(2)
+    safe = torch.where(total.abs() < MIN_FIELD, torch.full_like(total, MIN_FIELD), total)
+    ratio = wave * safe.reciprocal()[:, :, None]
+    unit = ray / length
+    real, imaginary = ratio.real / length, ratio.imag.contiguous()
+    along = (scene.element @ unit.flatten(1)).view_as(real) + scene.wavenumber * length
+    along = along.mul_(real).addcdiv_(imaginary, length)
+    moved = torch.zeros(())
+    for e, u, dx in zip(scene.element.T, unit, movement, strict=True):
+        moved = moved + _over_images((real * e[:, None, None, None]).addcmul_(along, u, value=-1), dx)
+    gain = planes.gain
+    safe_gain = torch.where(gain.abs() < MIN_GAIN, torch.full_like(gain, MIN_GAIN), gain)
+    scaled = (_reflections(planes.sequence, gain.shape[1]) / safe_gain[..., None]) @ imaginary
+    return total, torch.cat([moved[:, :, : gain.shape[1]], scaled, moved[:, :, gain.shape[1] :]], dim=2)
 
 
-def refined(rooms: list[PlaneSet], scene: PhaseObservations, steps: int = 10, tilt: bool = False) -> list[PlaneSet]:
-    """Return the rooms, each as by `PlaneSet.refined`. Rooms with the same sequences are computed together."""
+def _over_images(values: Tensor, weights: Tensor) -> Tensor:
+    """Return the sums over images of values (K, B, S, n) with weights (B, R, S, n or 1), (K, B, R, n)."""
+    if weights.shape[-1] == 1:
+        return weights[..., 0] @ values
+    return torch.einsum("kbsn,brsn->kbrn", values, weights)
+
+
+@lru_cache(maxsize=1024)
+def _reflections(sequence: tuple[Sequence, ...], planes: int) -> Tensor:
+    """Return how many times each plane reflects each sequence, (P, S)."""
+    return torch.tensor([[float(s.count(plane)) for s in sequence] for plane in range(planes)])
+
+
+def image_jacobian(planes: PlaneSet, transmitter: Tensor, tilt: bool = False) -> Tensor:
+    """Return the derivatives of the image positions with respect to offset and, with `tilt`, two tilts of each plane.
+
+    Without tilts they depend on the normals alone.
+
+    Returns:
+        Derivatives, float32 (3, B, P or 3 P, S, n or 1).
+    """
+    normal, offset, tree = planes.normal, planes.offset, tree_of(planes.sequence)
+    (rooms, count), turns = offset.shape, 2 if tilt else 0
+    across = torch.linalg.svd(normal[:, :, None]).Vh[:, :, 1:].permute(3, 2, 0, 1)  # (3, 2, B, P)
+    point = transmitter.T[:, None, None].expand(-1, rooms, 1, -1)
+    last, found = point.new_zeros(3, rooms, 1, count, 1 + turns, len(transmitter) if tilt else 1), []
+    for parent, plane in tree.levels:
+        n, o, point = normal[:, plane].movedim(-1, 0)[..., None], offset[:, plane, None], point[:, :, parent]
+        last = mirror(last[:, :, parent], n[..., None, None], o.new_zeros(()))  # as points in planes through the origin
+        rows = torch.arange(len(plane))
+        last[:, :, rows, plane, 0] += 2 * n
+        for q in range(turns):
+            turn = across[:, q, :, plane, None]
+            last[:, :, rows, plane, 1 + q] -= 2 * ((point * turn).sum(0) * n + ((point * n).sum(0) - o) * turn)
+        point = mirror(point, n, o)
+        found.append(last)
+    return torch.cat(found, dim=2)[:, :, tree.rows].permute(0, 1, 4, 3, 2, 5).flatten(2, 3).float()
+
+
+def normal_equations(
+    scene: PhaseObservations, total: Tensor, jacobian: Tensor, exact: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the score (B,), half its gradient at each position (B, Q P, n) and its Gauss-Newton matrix (B, Q P, Q P).
+
+    Gradient and matrix are times n. Only phases count, and one phase of each position is free. With `exact`, the matrix
+    includes the phase errors, as standard deviations require. It may then be singular.
+    """
+    match = total.sgn()[..., None] * scene.channel.conj().permute(2, 0, 1)[:, None]
+    better = match.sum(0).abs().argmax(-1, keepdim=True)
+    chosen = match.gather(-1, better.expand(*total.shape, 1))[..., 0]
+    mean = chosen.mean(0)
+    score = 1 - mean.abs().square().mean(-1)
+    error = chosen * (mean.conj() / len(chosen))  # |mean| exp(-j arg mean) / K
+    turn = jacobian.clamp(-1e3, 1e3)
+    turn = turn - turn.mean(0)
+    slope = (turn * error.imag[:, :, None]).sum(0)
+    weight = error.real[:, :, None] if exact else mean.abs()[:, None] / len(chosen)
+    return score, slope, ((turn * weight) @ turn.mT).sum(0)
+
+
+def refine(
+    scene: PhaseObservations,
+    planes: PlaneSet,
+    steps: int = 10,
+    *,
+    tilt: bool = False,
+    signs: Tensor | None = None,
+    limit: float = 0.03,
+) -> PlaneSet:
+    """Return the planes of B rooms and their scores after Levenberg-Marquardt steps on offsets and gains.
+
+    Args:
+        scene: Observed phases.
+        planes: Planes to start from.
+        steps: Number of steps.
+        tilt: True to rotate the normals, too.
+        signs: Fixed signs of the gains on the six SIDES (6,). Defaults to free signs.
+        limit: Maximum movement [m] or tilt [rad] of a plane in one step.
+    """
+    if not planes.sequence:
+        return replace(planes, score=scene.score(planes.field(scene)))
+    here, own = replace(planes, only=planes.sequence), None if signs is None else signs[planes.side]
+    damping = torch.full((len(planes.offset),), 1e-2)
+    movement = image_jacobian(here, scene.transmitter, tilt)
+    score, slope, curve = normal_equations(scene, *phase_jacobian(scene, here, movement))
+    for _ in range(steps):
+        diagonal = curve.diagonal(dim1=1, dim2=2)
+        system = curve + torch.diag_embed(damping[:, None] * diagonal + 1e-6 * diagonal.mean(1, keepdim=True) + 1e-9)
+        step = -torch.linalg.solve(system, slope.sum(-1, keepdim=True))[..., 0]
+        step = step.reshape(len(damping), -1, here.gain.shape[1])
+        normal, offset = here.normal, here.offset + step[:, 0].clamp(-limit, limit).double()
+        gain = here.gain + step[:, 1].clamp(-0.3, 0.3)
+        if own is not None:
+            gain = own * (own * gain).clamp(0.02, 1.5)
+        if tilt:
+            across = torch.linalg.svd(normal[:, :, None]).Vh[:, :, 1:]
+            turn = step[:, 2:].clamp(-limit, limit).double()
+            normal = normal + (turn.transpose(1, 2)[..., None] * across).sum(2)
+            normal = normal / normal.norm(dim=-1, keepdim=True)
+        trial = replace(here, normal=normal, offset=offset, gain=gain)
+        if tilt:
+            movement = image_jacobian(trial, scene.transmitter, tilt)
+        after = normal_equations(scene, *phase_jacobian(scene, trial, movement))
+        better = after[0] < score
+        damping = torch.where(better, damping * 0.3, damping * 6).clamp(1e-6, 1e4)
+        row, matrix = better[:, None], better[:, None, None]
+        here = replace(
+            here,
+            normal=torch.where(matrix, normal, here.normal),
+            offset=torch.where(row, offset, here.offset),
+            gain=torch.where(row, gain, here.gain),
+        )
+        score, slope = torch.where(better, after[0], score), torch.where(matrix, after[1], slope)
+        curve = torch.where(matrix, after[2], curve)
+    return replace(here, only=planes.only, score=score)
+
+
+def refine_all(scene: PhaseObservations, rooms: list[PlaneSet], steps: int = 10, **options: Any) -> list[PlaneSet]:
+    """Return single rooms, each as by `refine`. Rooms with the same sequences are computed together."""
     found = list(rooms)
     groups: dict[tuple[Sequence, ...], list[int]] = {}
     for number, room in enumerate(rooms):
-        if room.sequence:
-            groups.setdefault(tuple(room.sequence), []).append(number)
+        groups.setdefault(room.sequence, []).append(number)
     for sequence, numbers in groups.items():
-        normal, offset, gain = (torch.cat([getattr(rooms[i], name) for i in numbers]) for name in PLANE_TENSORS)
-        _, *planes = refine(scene, normal, offset, gain, list(sequence), steps=steps, tilt=tilt)
-        for number, *one in zip(numbers, *(t.split(1) for t in planes), strict=True):
-            found[number] = replace(rooms[number], **dict(zip(PLANE_TENSORS, one, strict=True)))
+        normal, offset, gain = (
+            torch.cat([getattr(rooms[i], name) for i in numbers]) for name in ("normal", "offset", "gain")
+        )
+        together = refine(scene, PlaneSet(normal, offset, gain, only=sequence), steps, **options)
+        parts = (t.split(1) for t in (together.normal, together.offset, together.gain, together.score))
+        for number, n, o, g, score in zip(numbers, *parts, strict=True):
+            found[number] = replace(rooms[number], normal=n, offset=o, gain=g, score=score)
     return found
+
+
+def offset_covariance(scene: PhaseObservations, room: PlaneSet) -> Tensor:
+    """Return the covariance of the offsets (P, P) [m^2] of one room.
+
+    The sandwich estimator, inverse curvature around the scatter of the positions' gradients, counts unexplained paths as
+    noise (P. J. Huber 1967).
+    """
+    jacobian = phase_jacobian(scene, room, image_jacobian(room, scene.transmitter))
+    _, slope, curve = normal_equations(scene, *jacobian, exact=True)
+    n, q, planes = len(scene), curve.shape[-1], room.gain.shape[1]
+    inverse = torch.linalg.pinv(curve[0].double(), hermitian=True)
+    scatter = slope[0].double() @ slope[0].double().T * (n / max(n - q, 1))
+    covariance: Tensor = (inverse @ scatter @ inverse)[:planes, :planes]
+    return covariance
 
 
 def advantage(a: Tensor, b: Tensor) -> float:
@@ -173,7 +307,7 @@ def robust_advantage(a: Tensor, b: Tensor) -> float:
 def sign_alternatives(scene: PhaseObservations, room: PlaneSet, plane: int = -1) -> list[PlaneSet]:
     """Return the rooms in which a plane has a gain of the other sign and its wave the same phase, to either side."""
     plane %= room.normal.shape[1]
-    period, rooms = phase_period_m(scene, room.normal, room.offset, plane), []
+    period, rooms = phase_period_m(scene, room, plane), []
     for step in (-period / 2, period / 2):
         offset, gain = room.offset.clone(), room.gain.clone()
         offset[:, plane] += step
@@ -184,7 +318,7 @@ def sign_alternatives(scene: PhaseObservations, room: PlaneSet, plane: int = -1)
 
 def correlation_score(scene: PhaseObservations, room: PlaneSet, array: PlanarArray) -> float:
     """Return 1 - correlation of predicted and observed co-array coefficients."""
-    predicted = autocorrelation(room.field(scene).sgn(), array)
+    predicted = autocorrelation(room.channel(scene).sgn(), array)
     seen = autocorrelation(scene.channel[:, 0], array)
     power = float(predicted.abs().square().sum() * seen.abs().square().sum())
     return 1 - float((predicted * seen.conj()).real.sum()) / math.sqrt(power)

@@ -1,4 +1,4 @@
-"""Search for a room without a start: at most one plane on each of the six sides of a region.
+"""Search for a room without a start: planes on the six sides of a region, then planes of any orientation.
 
 The score of a plane has many minima, about half a wavelength / cosine of incidence apart, and planes at wrong minima hold
 each other in place. Therefore several planes move at once. Each side has a list of alternatives: the minima of its scans,
@@ -11,23 +11,18 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from dataclasses import field as of
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
-from swiftwrf.models.geometry.batched import batched, batched_field, batched_score
-from swiftwrf.models.geometry.images import PhaseObservations, phase_period_m, sequences
-from swiftwrf.models.geometry.refine import refine
-from swiftwrf.models.geometry.responses import SteeringResponses
+from swiftwrf.models.geometry.images import SIDES, PhaseObservations, PlaneSet, field, phase_period_m, sequences
+from swiftwrf.models.geometry.planes import refine_all
 from swiftwrf.runtime.threads import parallel_map
 
-SIDES = torch.tensor(
-    [[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], dtype=torch.float64
-)  # outward normals
 SIGNS = torch.tensor(
     [[-1, -1, -1, -1, -1, -1], [-1, -1, -1, -1, 1, 1], [1, 1, 1, 1, 1, 1]]
 )  # of the gains: one material, vertical fields (walls turn them round, floor and ceiling do not), anything else
@@ -46,25 +41,128 @@ N_SCREENED = 24  # positions at which all combinations of a kind of move are sco
 N_RESCORED = 8  # times as many combinations as are wanted are scored at all positions
 MAX_MOVES = 20
 BEAM_STEPS = 3  # Levenberg-Marquardt steps after each plane of a beam; moves refine its rooms further
+MAX_COMBINATIONS = 1000  # that are scored at a time
+N_HORIZONTAL_NORMALS = 90  # of upright walls
+N_SPHERE_NORMALS = 1200  # in all directions
+N_NEAR = 24  # positions close together, whose waves stay in phase over a few degrees of tilt
+BATCH_NORMALS = 4  # that are scanned at a time
+FURTHER_GAIN = 0.7  # modulus of the gain that planes of any orientation are tried with
+MIN_DISTANCE_RAD, DISTANCE_STEP_RAD = 0.5, 0.6  # of the scanned offsets beyond both ends, in phase
 
 
-@dataclass
-class CandidateRoom:
-    """A candidate with at most one plane on each side: offset [m] and gain by the number of the side, and the score."""
+@dataclass(frozen=True)
+class SteeringResponses:
+    """Fields of single and double reflections in P planes at many alternative offsets, and scores of all combinations.
 
-    score: float
-    offset: dict[int, float] = of(default_factory=dict)
-    gain: dict[int, float] = of(default_factory=dict)
+    Args:
+        single: Waves of each plane at each of its A offsets, float32 (n, 2 K, A).
+        double: Waves of each pair i < j of planes at all their offsets, both orders of reflection together,
+            (n, 2 K, A, B).
+    """
 
-    def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return normals (1, P, 3), offsets and gains (1, P), by ascending side."""
-        sides = sorted(self.offset)
-        offset = torch.tensor([[self.offset[i] for i in sides]], dtype=torch.float64)
-        return SIDES[sides][None], offset, torch.tensor([[self.gain[i] for i in sides]])
+    single: list[Tensor]
+    double: dict[tuple[int, int], Tensor]
 
-    def key(self, step: float) -> tuple[tuple[int, int], ...]:
-        """Return a key that is equal for rooms with offsets in the same steps [m]."""
-        return tuple((i, round(o / step)) for i, o in sorted(self.offset.items()))
+    @classmethod
+    def of(
+        cls, scene: PhaseObservations, normal: Tensor, offset: list[Tensor], gain: list[Tensor], order: int = 2
+    ) -> SteeringResponses:
+        """Return the waves of planes with normals (P, 3) at offsets (A,) [m] with gains (A,); none are double at order 1."""
+        single = [
+            field(scene, PlaneSet(normal[i].expand(len(o), 1, 3), o[:, None], g[:, None], only=((0,),)))
+            for i, (o, g) in enumerate(zip(offset, gain, strict=True))
+        ]
+        double = {}
+        for i, j in itertools.combinations(range(len(normal)), 2):
+            both, pair = normal[[i, j]], torch.cartesian_prod(offset[i], offset[j])
+            if chain := tuple(s for s in sequences(both, min(order, 2)) if len(s) > 1):
+                gains = torch.cartesian_prod(gain[i], gain[j])
+                waves = field(scene, PlaneSet(both.expand(len(pair), 2, 3), pair, gains, only=chain))
+                double[i, j] = waves.unflatten(-1, (len(offset[i]), len(offset[j])))
+        return cls(single, double)
+
+    def first(self, most: int | None) -> SteeringResponses:
+        """Return the waves at no more than the first offsets of each plane."""
+        double = {pair: waves[:, :, :most, :most] for pair, waves in self.double.items()}
+        return SteeringResponses([waves[:, :, :most] for waves in self.single], double)
+
+    def subset(self, rows: Tensor) -> SteeringResponses:
+        """Return the waves at some of the positions."""
+        return SteeringResponses([w[rows] for w in self.single], {pair: w[rows] for pair, w in self.double.items()})
+
+    def at(self, rows: list[Tensor]) -> SteeringResponses:
+        """Return the waves at the given offset numbers (A,) of each plane."""
+        double = {(i, j): w.index_select(2, rows[i]).index_select(3, rows[j]) for (i, j), w in self.double.items()}
+        return SteeringResponses([w.index_select(2, r) for w, r in zip(self.single, rows, strict=True)], double)
+
+    def of_choices(self, rows: list[Tensor]) -> Tensor:
+        """Return the fields (n, 2 K, C) of C combinations with these offset numbers (C,) of each plane."""
+        total = torch.zeros(())
+        for waves, r in zip(self.single, rows, strict=True):
+            total = total + waves.index_select(-1, r)
+        for (i, j), waves in self.double.items():
+            total += waves.flatten(2).index_select(-1, rows[i] * waves.shape[-1] + rows[j])
+        return total
+
+    def moved(self, direct: Tensor, moving: tuple[int, ...]) -> tuple[Tensor, SteeringResponses]:
+        """Return the field (n, 2 K, 1) of the planes that stay at their first offsets, with the direct wave.
+
+        Also return the waves that the moving planes add to it.
+        """
+        stay = [i for i in range(len(self.single)) if i not in moving]
+        base = sum((self.single[i][..., :1] for i in stay), start=direct)
+        base = sum((d[..., 0, :1] for (i, j), d in self.double.items() if {i, j} <= {*stay}), start=base)
+        single = []
+        for i in moving:
+            before = [self.double[j, i][..., 0, :] for j in stay if (j, i) in self.double]
+            after = [self.double[i, j][..., 0] for j in stay if (i, j) in self.double]
+            single.append(sum([*before, *after], start=self.single[i]))
+        pairs = itertools.combinations(enumerate(moving), 2)
+        double = {(p, q): self.double[i, j] for (p, i), (q, j) in pairs if (i, j) in self.double}
+        return base, SteeringResponses(single, double)
+
+    def scores(self, scene: PhaseObservations, base: Tensor) -> Tensor:
+        """Return the scores (A, B, ...) of all combinations of the planes' offsets, added to a field (n, 2 K, 1).
+
+        The planes are divided into two halves. Double reflections between them are a product with a matrix that selects the
+        offsets of the second half.
+        """
+        size = [waves.shape[-1] for waves in self.single]
+        half = len(size) // 2
+        first, second = range(half), range(half, len(size))
+        left, right = _combinations(size[:half]), _combinations(size[half:])
+        stay, move = base + self._among(first, left), self._among(second, right)
+        pairs = {j: [i for i in first if (i, j) in self.double] for j in second}
+        crossed = [j for j, some in pairs.items() if some]
+        chosen = [functional.one_hot(right[j - half], size[j]).T for j in crossed]
+        found = []
+        for rows in torch.arange(left.shape[1]).split(max(1, MAX_COMBINATIONS // right.shape[1])):
+            total = stay.expand(-1, -1, left.shape[1])[:, :, rows, None] + move[:, :, None]
+            between = [
+                sum((self.double[i, j].index_select(2, left[i, rows]) for i in pairs[j]), start=torch.zeros(()))
+                for j in crossed
+            ]
+            if len(second) > 1 and between:
+                between = [torch.cat(between, dim=-1) @ torch.cat(chosen).float()]
+            for waves in between:
+                total += waves
+            found.append(scene.score(total.flatten(2)))
+        return torch.cat(found).reshape(size)
+
+    def _among(self, planes: range, rows: Tensor) -> Tensor:
+        """Return the fields (n, 2 K, C) of some neighbouring planes alone, at the offset numbers (P, C)."""
+        double = {
+            (i - planes.start, j - planes.start): waves
+            for (i, j), waves in self.double.items()
+            if i in planes and j in planes
+        }
+        return SteeringResponses(self.single[planes.start : planes.stop], double).of_choices(list(rows))
+
+
+def _combinations(size: list[int]) -> Tensor:
+    """Return the numbers (P, C) of all combinations of P choices, each from size[p] numbers."""
+    grids = torch.meshgrid(*map(torch.arange, size), indexing="ij") if size else ()
+    return torch.stack([grid.flatten() for grid in grids]) if size else torch.zeros(0, 1, dtype=torch.int64)
 
 
 class Search:
@@ -86,101 +184,81 @@ class Search:
         self.offsets = [
             n + torch.arange(self.step, max(reach, self.step), self.step, dtype=torch.float64) for n in self.near
         ]
-        self.direct = batched(scene.wave(scene.transmitter))
         self._scanned, self._screened = scene.few(N_SCANNED), scene.few_rows(N_SCREENED)
-        self._scanned_direct = batched(self._scanned.wave(self._scanned.transmitter))
 
     @cached_property
     def single(self) -> list[Tensor]:
-        """Waves of a plane on each side at all its offsets."""
-        return [self._waves(SIDES[i : i + 1], o[:, None]) for i, o in enumerate(self.offsets)]
+        """Waves of a plane of gain 1 on each side at all its offsets."""
+        return [
+            field(self._scanned, PlaneSet(n.expand(len(o), 1, 3), o[:, None], torch.ones(len(o), 1), only=((0,),)))
+            for n, o in zip(SIDES, self.offsets, strict=True)
+        ]
 
-    def _waves(self, normal: Tensor, offset: Tensor) -> Tensor:
-        """Return the waves of single reflections with gain 1, (n, 2 K, C), at offsets (C, 1)."""
-        one = torch.ones(len(offset), 1)
-        return batched_field(self._scanned, normal.expand(len(offset), 1, 3), offset, one, [(0,)])
+    def key(self, room: PlaneSet) -> tuple[tuple[int, int], ...]:
+        """Return a key that is equal for rooms with offsets in the same steps."""
+        return tuple((side, round(offset / (2 * self.step))) for side, (offset, _) in room.by_side().items())
 
-    def total(self, room: CandidateRoom, order: int) -> Tensor:
-        """Return the field of a room with images up to an order, (n, 2 K, 1)."""
-        if not room.offset:
-            return self._scanned_direct
-        normal, offset, gain = room.tensors()
-        return self._scanned_direct + batched_field(self._scanned, normal, offset, gain, sequences(normal[0], order))
-
-    def scan(self, room: CandidateRoom, side: int, order: int) -> Tensor:
+    def scan(self, room: PlaneSet, side: int) -> Tensor:
         """Return the scores (C,) over the offsets of a side, without the plane that the room has there."""
-        rest = CandidateRoom(0.0, {i: o for i, o in room.offset.items() if i != side}, room.gain)
-        gain, offsets = room.gain.get(side, self.usual[side]), self.offsets[side]
-        total = self.total(rest, order) + gain * self.single[side]
-        sides = sorted([*rest.offset, side])
-        own = sides.index(side)
-        if chain := [s for s in sequences(SIDES[sides], order) if own in s and len(s) > 1]:
-            offset = torch.tensor([rest.offset.get(i, 0.0) for i in sides], dtype=torch.float64)
-            offset = offset.repeat(len(offsets), 1)
+        planes, offsets = room.by_side(), self.offsets[side]
+        _, gain = planes.pop(side, (0.0, self.usual[side]))
+        total = PlaneSet.on_sides(planes, room.order).field(self._scanned) + gain * self.single[side]
+        whole = PlaneSet.on_sides({**planes, side: (0.0, gain)}, room.order)
+        own = sorted([*planes, side]).index(side)
+        if chain := tuple(s for s in whole.sequence if own in s and len(s) > 1):
+            offset = whole.offset.repeat(len(offsets), 1)
             offset[:, own] = offsets
-            gains = torch.tensor([gain if i == side else rest.gain[i] for i in sides]).expand(len(offsets), -1)
-            normal = SIDES[sides].expand(len(offsets), -1, -1)
-            total += batched_field(self._scanned, normal, offset, gains, chain)
-        return batched_score(self._scanned, total)
+            normal, gains = (values.expand(len(offsets), *values.shape[1:]) for values in (whole.normal, whole.gain))
+            total += field(self._scanned, PlaneSet(normal, offset, gains, only=chain))
+        return self._scanned.score(total)
 
-    def minima(self, room: CandidateRoom, side: int, order: int, top: int) -> list[tuple[float, float]]:
+    def minima(self, room: PlaneSet, side: int, top: int) -> list[tuple[float, float]]:
         """Return score and offset of the lowest local minima over the offsets of a side."""
-        v = self.scan(room, side, order)
+        v = self.scan(room, side)
         low = ((v[1:-1] <= v[:-2]) & (v[1:-1] < v[2:])).nonzero()[:, 0] + 1
         low = low[v[low].argsort()[:top]]
         return list(zip(v[low].tolist(), self.offsets[side][low].tolist(), strict=True))
 
-    def refined(self, rooms: list[CandidateRoom], order: int, steps: int = 6) -> list[CandidateRoom]:
-        """Return the rooms after Levenberg-Marquardt steps, the best first; equal sides are computed together."""
-        done = []
-        by_sides: dict[tuple[int, ...], list[CandidateRoom]] = {}
-        for room in rooms:
-            by_sides.setdefault(tuple(sorted(room.offset)), []).append(room)
-        for sides, group in by_sides.items():
-            if not sides:
-                done += [CandidateRoom(float(batched_score(self.scene, self.direct)))]
-                continue
-            normal, offset, gain = (torch.cat(t) for t in zip(*[r.tensors() for r in group], strict=True))
-            chain = sequences(SIDES[list(sides)], order)
-            score, _, offset, gain = refine(
-                self.scene, normal, offset, gain, chain, steps=steps, signs=self.signs[list(sides)], limit=2 * self.step
-            )
-            for v, o, g in zip(score.tolist(), offset.tolist(), gain.tolist(), strict=True):
-                done.append(CandidateRoom(v, dict(zip(sides, o, strict=True)), dict(zip(sides, g, strict=True))))
-        return sorted(done, key=lambda r: r.score)
+    def refined(self, rooms: list[PlaneSet], steps: int = 6) -> list[PlaneSet]:
+        """Return the rooms after Levenberg-Marquardt steps with gains of fixed signs, the best first."""
+        found = refine_all(self.scene, rooms, steps, signs=self.signs, limit=2 * self.step)
+        return sorted(found, key=lambda room: float(room.score))
 
-    def beam(self, width: int, order: int) -> list[CandidateRoom]:
-        """Return the best rooms of a beam search that adds one plane at a time."""
-        rooms = [CandidateRoom(float(batched_score(self.scene, self.direct)))]
+    def beam(self, width: int, order: int) -> PlaneSet:
+        """Return the best room of a beam search that adds one plane at a time."""
+        rooms = [PlaneSet.on_sides({}, order, float(self.scene.score(self.scene.direct)))]
         for _ in SIDES:
-            pool: dict[tuple[tuple[int, int], ...], CandidateRoom] = {}
+            pool: dict[tuple[tuple[int, int], ...], PlaneSet] = {}
             for room in rooms:
-                for side in set(range(6)) - set(room.offset):
-                    for v, o in self.minima(room, side, order, 4):
-                        new = CandidateRoom(v, {**room.offset, side: o}, {**room.gain, side: self.usual[side]})
-                        pool.setdefault(new.key(2 * self.step), new)
+                planes = room.by_side()
+                for side in set(range(6)) - set(planes):
+                    for score, offset in self.minima(room, side, 4):
+                        new = PlaneSet.on_sides({**planes, side: (offset, self.usual[side])}, order, score)
+                        pool.setdefault(self.key(new), new)
             if not pool:  # no side left has a minimum within reach
                 break
-            best = sorted(pool.values(), key=lambda r: r.score)[: 3 * width]
-            distinct: dict[tuple[tuple[int, int], ...], CandidateRoom] = {}
-            for r in self.refined(best, order, BEAM_STEPS):
-                distinct.setdefault(r.key(2 * self.step), r)
+            best = sorted(pool.values(), key=lambda room: float(room.score))[: 3 * width]
+            distinct: dict[tuple[tuple[int, int], ...], PlaneSet] = {}
+            for room in self.refined(best, BEAM_STEPS):
+                distinct.setdefault(self.key(room), room)
             rooms = list(distinct.values())[:width]
-        return rooms
+        return rooms[0]
 
-    def alternatives(self, room: CandidateRoom, top: int) -> Alternatives:
+    def alternatives(self, room: PlaneSet, top: int) -> Alternatives:
         """Return (offset, gain) of each side's alternatives.
 
         These are the present plane, no plane (gain 0), and the minima of scans with and without second-order images.
         """
+        planes = room.by_side()
 
         def of_side(side: int) -> list[tuple[float, float]]:
-            gain = room.gain[side] if side in room.offset else self.usual[side]
-            own = [(room.offset[side], gain), (room.offset[side], 0.0)] if side in room.offset else [(0.0, 0.0)]
+            offset, gain = planes.get(side, (0.0, self.usual[side]))
+            own = [(offset, gain), (offset, 0.0)] if side in planes else [(0.0, 0.0)]
             far: list[float] = []
-            for o in (o for order in (1, SEARCH_ORDER) for _, o in self.minima(room, side, order, top)):
-                if all(abs(o - p) > 2 * self.step for p in far):
-                    far.append(o)
+            for order in (1, SEARCH_ORDER):
+                for _, o in self.minima(replace(room, order=order), side, top):
+                    if all(abs(o - p) > 2 * self.step for p in far):
+                        far.append(o)
             return own + [(o, gain) for o in far]
 
         return parallel_map(of_side, range(6))
@@ -191,7 +269,7 @@ class Search:
         gain = [torch.tensor([g for _, g in a]) for a in alternatives]
         return SteeringResponses.of(self.scene, SIDES, offset, gain, SEARCH_ORDER)
 
-    def moves(self, alternatives: Alternatives, responses: SteeringResponses, k: int, keep: int) -> list[CandidateRoom]:
+    def moves(self, alternatives: Alternatives, responses: SteeringResponses, k: int, keep: int) -> list[PlaneSet]:
         """Return the best rooms in which k sides take other alternatives, of which `MAX_ALTERNATIVES` are tried.
 
         All combinations are scored at few positions, and the best of them at all.
@@ -199,12 +277,12 @@ class Search:
         few, few_responses = self.scene.subset(self._screened), responses.subset(self._screened)
         pool: list[tuple[float, tuple[int, ...]]] = []
         for which in itertools.combinations(range(6), k):
-            base, moving = few_responses.moved(self.direct[self._screened], which)
+            base, moving = few_responses.moved(few.direct, which)
             screened = moving.first(MAX_ALTERNATIVES.get(k)).scores(few, base)
             best = screened.flatten().argsort()[: N_RESCORED * keep].numpy()
             number = np.unravel_index(best, screened.shape)
-            base, moving = responses.moved(self.direct, which)
-            value = batched_score(self.scene, base + moving.of_choices([torch.from_numpy(n) for n in number]))
+            base, moving = responses.moved(self.scene.direct, which)
+            value = self.scene.score(base + moving.of_choices([torch.from_numpy(n) for n in number]))
             for index in value.argsort()[:keep].tolist():
                 choice = [0] * 6
                 for i, at in zip(which, number, strict=True):
@@ -213,52 +291,49 @@ class Search:
         rooms = []
         for value_, choice_ in sorted(set(pool))[:keep]:
             picked = {i: alternatives[i][c] for i, c in enumerate(choice_) if alternatives[i][c][1] != 0}
-            rooms.append(
-                CandidateRoom(value_, {i: p[0] for i, p in picked.items()}, {i: p[1] for i, p in picked.items()})
-            )
+            rooms.append(PlaneSet.on_sides(picked, SEARCH_ORDER, value_))
         return rooms
 
-    def aliases(self, room: CandidateRoom) -> Alternatives:
+    def aliases(self, room: PlaneSet) -> Alternatives:
         """Return (offset, gain) of each side's present plane, wherever it is, and of its aliases up to two periods away."""
-        found = []
+        found, planes = [], room.by_side()
         for side in range(6):
-            if side not in room.offset:
+            if side not in planes:
                 found.append([(0.0, 0.0)])
                 continue
-            one = CandidateRoom(0.0, {side: room.offset[side]}, room.gain)
-            normal, offset, _ = one.tensors()
-            period = phase_period_m(self.scene, normal, offset, 0)
-            steps = [room.offset[side] + m * period for m in (0, -1, 1, -2, 2)]
-            found.append([(o, room.gain[side]) for o in steps if o == steps[0] or o >= self.near[side]])
+            offset, gain = planes[side]
+            period = phase_period_m(self.scene, PlaneSet.on_sides({side: (offset, gain)}), 0)
+            steps = [offset + m * period for m in (0, -1, 1, -2, 2)]
+            found.append([(o, gain) for o in steps if o == offset or o >= self.near[side]])
         return found
 
-    def improve(self, room: CandidateRoom) -> CandidateRoom:
+    def improve(self, room: PlaneSet) -> PlaneSet:
         """Return the room after moves of several planes at a time, with second-order images, until no move is better."""
-        best = self.refined([room], SEARCH_ORDER)[0]
+        best = self.refined([replace(room, order=SEARCH_ORDER)])[0]
         for _ in range(MAX_MOVES):
             for tried in self._trials(best):
-                if tried.score < MAX_SCORE_RATIO * best.score:
+                if float(tried.score) < MAX_SCORE_RATIO * float(best.score):
                     best = tried
                     break
             else:
                 break
         return best
 
-    def _trials(self, room: CandidateRoom) -> Iterator[CandidateRoom]:
+    def _trials(self, room: PlaneSet) -> Iterator[PlaneSet]:
         """Yield the best room of each kind of move, cheap kinds first."""
-        if room.score < PERFECT_SCORE:
+        if float(room.score) < PERFECT_SCORE:
             return
         alternatives = self.alternatives(room, N_MINIMA)
         responses = self.responses(alternatives)
         for k in MAX_ALTERNATIVES:
-            yield self.refined(self.moves(alternatives, responses, k, N_REFINED), SEARCH_ORDER)[0]
+            yield self.refined(self.moves(alternatives, responses, k, N_REFINED))[0]
         few, aliases = Search(self.scene.few(), self.reach, self.signs), self.aliases(room)
-        yield self.refined(few.moves(aliases, few.responses(aliases), 6, N_REFINED), SEARCH_ORDER)[0]
+        yield self.refined(few.moves(aliases, few.responses(aliases), 6, N_REFINED))[0]
 
 
 def find_rooms(
     scene: PhaseObservations, reach: float, width: int = 8, tick: Callable[[], None] | None = None
-) -> list[tuple[Tensor, CandidateRoom]]:
+) -> list[tuple[Tensor, PlaneSet]]:
     """Return the best room of each of SIGNS with the signs of its gains, the best first.
 
     Rooms come from beams with and without second-order images. Those that start far behind the best one are left out.
@@ -269,25 +344,70 @@ def find_rooms(
         width: Width of the beam search.
         tick: Called after each of the N_STARTS starts.
     """
-    nothing = CandidateRoom(float(scene.score(scene.wave(scene.transmitter))))
-    if nothing.score < PERFECT_SCORE:
+    nothing = PlaneSet.on_sides({}, score=float(scene.score(scene.direct)))
+    if float(nothing.score) < PERFECT_SCORE:
         return [(SIGNS[0], nothing)]
     searches = [Search(scene, reach, signs) for signs in SIGNS]
     searched = list(itertools.product((SEARCH_ORDER, 1), searches))
-    rooms = parallel_map(lambda item: item[1].beam(width, item[0])[0], searched)
+    rooms = parallel_map(lambda item: item[1].beam(width, item[0]), searched)
     starts = [(room, search) for room, (_, search) in zip(rooms, searched, strict=True)]
-    found: dict[Search, CandidateRoom] = {}
-    for start, search in sorted(starts, key=lambda s: s[0].score):
-        lowest = min((room.score for room in found.values()), default=math.inf)
-        if not found or PERFECT_SCORE < start.score < MAX_START_RATIO * lowest:
+    found: dict[Search, PlaneSet] = {}
+    for start, search in sorted(starts, key=lambda s: float(s[0].score)):
+        lowest = min((float(room.score) for room in found.values()), default=math.inf)
+        if not found or PERFECT_SCORE < float(start.score) < MAX_START_RATIO * lowest:
             room = search.improve(start)
             if search not in found or room.score < found[search].score:
                 found[search] = room
         if tick:
             tick()
-    best = sorted(found.items(), key=lambda item: item[1].score)
+    best = sorted(found.items(), key=lambda item: float(item[1].score))
     return [
         (search.signs, room)
         for search, room in best
-        if room.score < max(PERFECT_SCORE, MAX_START_RATIO * best[0][1].score)
+        if float(room.score) < max(PERFECT_SCORE, MAX_START_RATIO * float(best[0][1].score))
     ]
+
+
+def directions() -> Tensor:
+    """Return normals to try, float64 (D, 3): all around the horizon, and a Fibonacci lattice on the sphere."""
+    around = 2 * math.pi / N_HORIZONTAL_NORMALS * torch.arange(N_HORIZONTAL_NORMALS, dtype=torch.float64)
+    upright = torch.stack([around.cos(), around.sin(), torch.zeros_like(around)], dim=1)
+    number = torch.arange(N_SPHERE_NORMALS, dtype=torch.float64)
+    z, turn = 1 - (2 * number + 1) / N_SPHERE_NORMALS, math.pi * (3 - math.sqrt(5)) * number
+    flat = (1 - z * z).sqrt()
+    return torch.cat([upright, torch.stack([flat * turn.cos(), flat * turn.sin(), z], dim=1)])
+
+
+def oblique_planes(scene: PhaseObservations, base: Tensor, reach: float, top: int) -> list[PlaneSet]:
+    """Return the best further planes of any orientation by single reflections, each as a room of its own, the best first.
+
+    Args:
+        scene: All positions, of which the 24 nearest to their centre are used.
+        base: Field of the known planes (n, 2 K, 1).
+        reach: Distance beyond the region of both ends up to which planes are scanned [m].
+        top: Number of planes.
+    """
+    both = torch.cat([scene.transmitter, scene.receiver])
+    rows = (scene.moving - scene.moving.mean(0)).norm(dim=1).argsort()[:N_NEAR]
+    near, base = scene.subset(rows), base[rows]
+    farthest = max(reach * scene.wavenumber, MIN_DISTANCE_RAD)
+    distance = torch.arange(MIN_DISTANCE_RAD, farthest, DISTANCE_STEP_RAD, dtype=torch.float64) / scene.wavenumber
+    if not len(distance):
+        return []
+
+    def of_normals(normal: Tensor) -> list[PlaneSet]:
+        found = []
+        offset = (both @ normal.T).amax(0)[:, None] + distance
+        planes = normal.repeat_interleave(len(distance), dim=0)[:, None], offset.reshape(-1, 1)
+        wave = FURTHER_GAIN * field(near, PlaneSet(*planes, torch.ones(offset.numel(), 1), only=((0,),)))
+        for sign in (-1.0, 1.0):
+            best = near.score(base + sign * wave).view_as(offset).min(1)
+            at, gain = offset.gather(1, best.indices[:, None]), torch.full((1, 1), FURTHER_GAIN * sign)
+            found += [
+                PlaneSet(n[None, None], o[None], gain, score=v[None])
+                for v, n, o in zip(best.values, normal, at, strict=True)
+            ]
+        return found
+
+    found = itertools.chain.from_iterable(parallel_map(of_normals, directions().split(BATCH_NORMALS)))
+    return sorted(found, key=lambda plane: float(plane.score))[:top]

@@ -1,34 +1,50 @@
-"""Uncertainty of estimated planes: standard deviations, alternatives, and conditions under which no plane is certain."""
+"""Uncertainty of estimated planes: standard deviations, and rooms that explain the spectra nearly as well.
+
+Phase ambiguity: a plane that moves by half a wavelength / cosine of incidence changes the phase of its wave by a whole
+period. A plane that moves by half of that has a wave of the same phase with a gain of the other sign. Observed from a small
+region such rooms are nearly equal, and higher-order images keep a single plane from moving while others are wrong. Therefore
+all combinations are tried, from the steering responses of single and double reflections: half periods nearby, whole periods
+farther away, and half periods around the best of these.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.models.geometry.ambiguity import phase_alternatives
-from swiftwrf.models.geometry.batched import batched, batched_field, batched_score
-from swiftwrf.models.geometry.images import PhaseObservations, field, phase_period_m
+from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet, field, images, phase_period_m
 from swiftwrf.models.geometry.planes import (
     Plane,
-    PlaneSet,
     RoomEstimate,
     advantage,
     correlation_score,
     log_explained,
-    refined,
+    offset_covariance,
+    refine,
+    refine_all,
     sign_alternatives,
 )
-from swiftwrf.models.geometry.refine import offset_covariance
+from swiftwrf.models.geometry.search import SteeringResponses
 from swiftwrf.runtime.threads import parallel_map
 
 MAX_STD_RAD = 0.5  # of phase, beyond which a plane is not certain
 MIN_SPREAD_RAD = 0.8  # of phase: positions with less spread in any direction count as flat
 CARRIER_SCALES = (0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05)  # of alternative carriers
 SYSTEMATIC_STD_WAVELENGTHS = 0.02  # of planes that explain nothing, because unmodelled paths are no random noise
+MAX_MOVING = 6  # planes, one for each side of a room
+MAX_PERIODS = 4  # to either side
+N_POSITIONS = 18  # that the best combinations are scored at
+N_FIRST_POSITIONS = 6  # that all combinations are scored at
+N_RESCORED = 8  # times as many combinations as are wanted are scored at more than the first positions
+OFFSET_STEP_WAVELENGTHS = 0.125  # of the grid from which aliases are interpolated
+N_WHOLE = 32  # combinations of whole periods around which half periods are tried
+N_COARSE, N_FINE = 24, 8  # rooms that are refined with some positions, and with all
+HalfPeriods = tuple[int, ...]  # by which each plane is moved
 
 
 def assess(
@@ -49,14 +65,12 @@ def assess(
     if not room.normal.shape[1]:
         nothing = torch.zeros(0, 0, dtype=torch.float64)
         return RoomEstimate([], room.order, score, unexplained, "no plane explains the spectra", nothing)
-    covariance = offset_covariance(scene, room.normal, room.offset, room.gain, room.sequence)
+    covariance = offset_covariance(scene, room)
     systematic = SYSTEMATIC_STD_WAVELENGTHS * train.array.wavelength * math.sqrt(max(unexplained, 0))
     covariance = covariance + systematic**2 * torch.eye(len(covariance), dtype=torch.float64)
     reason = _flat(scene) or _other_carrier(scene, room, certainty)
     std = covariance.diagonal().clamp_min(0).sqrt().tolist()
-    alternatives = [
-        (room_, log_explained(scene.coherence(room_.field(scene)))) for room_ in phase_alternatives(scene, room)
-    ]
+    alternatives = [(other, log_explained(other.coherence(scene))) for other in phase_alternatives(scene, room)]
     nearest = parallel_map(lambda plane: _nearest_alternative(scene, room, plane, alternatives), range(len(std)))
     lost = [lead <= certainty or s * scene.wavenumber > MAX_STD_RAD for s, (lead, _) in zip(std, nearest, strict=True)]
     # a room most of whose planes have alternatives may be wrong as a whole, because each plane holds the others
@@ -85,22 +99,22 @@ def _nearest_alternative(
         plane: Number of the plane.
         alternatives: Rooms in which several planes are moved, and how well each explains the spectra.
     """
-    period = phase_period_m(scene, room.normal, room.offset, plane)
+    period = phase_period_m(scene, room, plane)
     step = torch.arange(period / 2, 3.5 * period, 0.4 / scene.wavenumber, dtype=torch.float64)
     beside = torch.cat([-step.flip(0), step])
     offset = room.offset.repeat(len(beside), 1)
     offset[:, plane] += beside
-    rest = [s for s in room.sequence if plane not in s]
-    own = [s for s in room.sequence if plane in s]
-    base = scene.wave(scene.transmitter) + field(scene, room.normal, room.offset, room.gain, rest)[0]
-    expanded = room.normal.expand(len(offset), -1, -1), offset, room.gain.expand(len(offset), -1)
-    value = batched_score(scene, batched(base) + batched_field(scene, *expanded, own))
+    rest, own = ([s for s in room.sequence if (plane in s) == of_plane] for of_plane in (False, True))
+    scanned = PlaneSet(
+        room.normal.expand(len(offset), -1, -1), offset, room.gain.expand(len(offset), -1), only=tuple(own)
+    )
+    value = scene.score(replace(room, only=tuple(rest)).field(scene) + field(scene, scanned))
     moved = room.offset.clone()
     moved[:, plane] += beside[value.argmin()]
-    here = log_explained(scene.coherence(room.field(scene)))
+    here = log_explained(room.coherence(scene))
     nearest = math.inf, 0.0
-    near = refined([replace(room, offset=moved), *sign_alternatives(scene, room, plane)], scene, 5)
-    for other, there in [*((o, log_explained(scene.coherence(o.field(scene)))) for o in near), *alternatives]:
+    near = refine_all(scene, [replace(room, offset=moved), *sign_alternatives(scene, room, plane)], 5)
+    for other, there in [*((o, log_explained(o.coherence(scene))) for o in near), *alternatives]:
         distance = abs(float(other.offset[0, plane] - room.offset[0, plane]))
         if distance > period / 4:
             nearest = min(nearest, (advantage(here, there), distance))
@@ -118,13 +132,97 @@ def _flat(scene: PhaseObservations) -> str:
 
 def _other_carrier(scene: PhaseObservations, room: PlaneSet, certainty: float) -> str:
     """Return the reason if another carrier explains the spectra significantly better, else nothing."""
-    here = scene.coherence(room.field(scene))
+    here = room.coherence(scene)
 
     def lead(scale: float) -> float:
         other = replace(scene, wavenumber=scale * scene.wavenumber)
-        return advantage(other.coherence(room.refined(other, 6).field(other)), here)
+        return advantage(refine(other, room, 6).coherence(other), here)
 
     for scale, found in zip(CARRIER_SCALES, parallel_map(lead, CARRIER_SCALES), strict=True):
         if found > certainty:
             return f"; a carrier {100 * (scale - 1):+.0f} % from the given one explains the spectra better"
     return ""
+
+
+def phase_alternatives(scene: PhaseObservations, room: PlaneSet) -> list[PlaneSet]:
+    """Return the best refined rooms of the same planes at other phase aliases, the best first.
+
+    Of more than six planes the first six move.
+    """
+    planes = room.normal.shape[1]
+    if not planes:
+        return []
+    few, table = scene.few(), _AlternativeTable(scene.few(N_POSITIONS), room)
+    near = [[h for h in p if abs(h) <= MAX_PERIODS] for p in table.offsets]
+    whole = [[h for h in p if h % 2 == 0] for p in table.offsets]
+    tried = table.best(near, N_COARSE)
+    for choice in table.best(whole, N_WHOLE):
+        around = [[h for h in (c - 1, c, c + 1) if h in p] for c, p in zip(choice, table.offsets, strict=True)]
+        tried |= table.best(around, N_COARSE)
+    tried.pop((0,) * planes, None)
+    rooms = refine_all(few, [table.room(c) for c in sorted(tried, key=tried.__getitem__)[:N_COARSE]], 4)
+    rooms.sort(key=lambda r: float(r.score))
+    return sorted(refine_all(scene, rooms[:N_FINE], 12), key=lambda r: float(r.score))
+
+
+def _alias_offsets(scene: PhaseObservations, room: PlaneSet, plane: int) -> dict[int, float]:
+    """Return the offsets [m] at which the mean phase of a plane's wave differs by half periods, by their number."""
+    here = float(room.offset[0, plane])
+    if plane >= MAX_MOVING:
+        return {0: here}
+    normal = room.normal[0, plane]
+    nearest = float((torch.cat([scene.transmitter, scene.receiver]) @ normal).max())
+    wavelength = 2 * math.pi / scene.wavenumber
+    farthest = MAX_PERIODS * wavelength  # twice as far as at normal incidence
+    if nearest >= here + farthest:  # it lies among the positions, where no alias is outside of the region
+        return {0: here}
+    grid = torch.arange(
+        max(nearest, here - farthest), here + farthest, OFFSET_STEP_WAVELENGTHS * wavelength, dtype=torch.float64
+    )
+    scanned = PlaneSet(normal.expand(len(grid), 1, 3), grid[:, None], torch.ones(len(grid), 1), only=((0,),))
+    source = images(scene, scanned)[:, 0]
+    now = images(scene, replace(room, only=((plane,),)))[0, 0]
+    longer = (source - scene.receiver).norm(dim=-1).mean(-1) - (now - scene.receiver).norm(dim=-1).mean()
+    half_periods = longer / (wavelength / 2)
+    offsets = {0: here}
+    for number in range(-2 * MAX_PERIODS, 2 * MAX_PERIODS + 1):
+        above = int(torch.searchsorted(half_periods, float(number)))
+        if number and 0 < above < len(grid):
+            share = (number - half_periods[above - 1]) / (half_periods[above] - half_periods[above - 1])
+            offsets[number] = float(grid[above - 1] + share * (grid[above] - grid[above - 1]))
+    return offsets
+
+
+class _AlternativeTable:
+    """Steering responses of single and double reflections at all aliases of the planes."""
+
+    def __init__(self, scene: PhaseObservations, room: PlaneSet) -> None:
+        self.before = room
+        self.offsets = [_alias_offsets(scene, room, plane) for plane in range(room.normal.shape[1])]
+        offset = [torch.tensor(list(p.values()), dtype=torch.float64) for p in self.offsets]
+        gain = [g * (-1.0) ** torch.tensor(list(p)) for g, p in zip(room.gain[0], self.offsets, strict=True)]
+        self.scenes = [scene.few(N_FIRST_POSITIONS), scene]
+        self.waves = [SteeringResponses.of(some, room.normal[0], offset, gain, room.order) for some in self.scenes]
+
+    def room(self, choice: HalfPeriods) -> PlaneSet:
+        """Return the room whose planes are moved by half periods."""
+        offset = torch.tensor([[p[c] for c, p in zip(choice, self.offsets, strict=True)]], dtype=torch.float64)
+        return replace(self.before, offset=offset, gain=self.before.gain * (-1.0) ** torch.tensor(choice))
+
+    def best(self, half_periods: list[list[int]], most: int) -> dict[HalfPeriods, float]:
+        """Return the best combinations of the given half periods of the planes, with their scores.
+
+        All combinations are scored at few positions, and the best of them at more.
+        """
+        rows = [
+            torch.tensor([list(p).index(h) for h in some]) for p, some in zip(self.offsets, half_periods, strict=True)
+        ]
+        (first, scene), (few, waves) = self.scenes, self.waves
+        score = few.at(rows).scores(first, first.direct)
+        best = score.flatten().argsort()[: N_RESCORED * most].numpy()
+        number = [torch.from_numpy(n) for n in np.unravel_index(best, score.shape)]  # torch's own loads its compiler
+        score = scene.score(scene.direct + waves.of_choices([r[n] for r, n in zip(rows, number, strict=True)]))
+        kept = score.argsort()[:most]
+        choices = torch.stack([n[kept] for n in number], dim=1).tolist()
+        best_choices = [tuple(some[k] for some, k in zip(half_periods, choice, strict=True)) for choice in choices]
+        return dict(zip(best_choices, score[kept].tolist(), strict=True))

@@ -21,7 +21,7 @@ from swiftwrf.data.writing import write_spectra
 from swiftwrf.gp import principal_components, process
 from swiftwrf.metrics import psnr
 from swiftwrf.models import coarray, idw, make_model
-from swiftwrf.models.geometry import fit_hybrid, hybrid
+from swiftwrf.models.geometry import HybridModel, hybrid
 from swiftwrf.positions import distance, nearest
 from swiftwrf.runtime.durable import cache_folder
 
@@ -275,7 +275,7 @@ def test_models_of_many_spectra_come_back_from_their_files(name, exact, tmp_path
 def test_inner_products_of_too_many_spectra_are_refused(room, monkeypatch):
     monkeypatch.setattr(hybrid, "MAX_SPECTRA", 39)
     with pytest.raises(InputError, match="at most 39"):
-        fit_hybrid(room)
+        HybridModel().fit(room)
 
 
 def test_a_fit_is_the_same_in_memory_and_in_a_file(cache, monkeypatch):

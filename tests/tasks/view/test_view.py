@@ -25,7 +25,7 @@ from PIL import Image
 
 from swiftwrf import AngularGrid, GeometryModel, InputError, PairModel, RssiModel, load, load_rssi, rssi_room
 from swiftwrf.locate import MatchedField, RssiLocator
-from swiftwrf.models.geometry import Plane, fit_hybrid
+from swiftwrf.models.geometry import HybridModel, Plane
 from swiftwrf.online import Follower
 from tasks.command_line import command_line
 from tasks.convert.outputs import saved_model
@@ -145,7 +145,7 @@ def saved(kind, folder, room) -> Path:
         plane = Plane((1.0, 0.0, 0.0), 6.0, -0.5, 1.0, True)
         model = GeometryModel.of_planes(room, [plane], order=1)
         if kind == "hybrid":
-            model = fit_hybrid(room, model, progress=False)
+            model = HybridModel().fit(room, like=model)
         model.save(folder / "model")
     elif kind in small.PUBLISHED:
         kinds.model_published(kind, folder)
