@@ -26,7 +26,7 @@ from swiftwrf import FIELD_MODELS, FieldModel, Spectra, make_model, simulated_ro
 from swiftwrf.data.splits import validation_for
 from swiftwrf.gp import subsample
 from swiftwrf.metrics import l1, psnr, ssim, summary
-from swiftwrf.models.nearest import MemoryModel
+from swiftwrf.models.neighbours import MemoryModel
 from swiftwrf.runtime.durable import write_text
 from tasks import labels
 from tasks.aoa.condition import conditions_of

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from swiftwrf.errors import FitError, InputError
     from swiftwrf.locate import MatchedField, Posterior, RssiLocator
     from swiftwrf.models.base import FieldModel, make_model
-    from swiftwrf.models.coarray import CoarrayModel, fit_coarray, project
+    from swiftwrf.models.coarray import CoarrayModel
     from swiftwrf.models.geometry import GeometryModel, HybridModel, fit_geometry, fit_hybrid
     from swiftwrf.models.prediction import Prediction
     from swiftwrf.models.swiftwrf import SwiftWRF, fit
@@ -47,7 +47,7 @@ import_lazily(
         "swiftwrf.errors": ("FitError", "InputError"),
         "swiftwrf.locate": ("MatchedField", "Posterior", "RssiLocator"),
         "swiftwrf.models.base": ("FieldModel", "make_model"),
-        "swiftwrf.models.coarray": ("CoarrayModel", "fit_coarray", "project"),
+        "swiftwrf.models.coarray": ("CoarrayModel",),
         "swiftwrf.models.geometry": ("GeometryModel", "HybridModel", "fit_geometry", "fit_hybrid"),
         "swiftwrf.models.prediction": ("Prediction",),
         "swiftwrf.models.swiftwrf": ("SwiftWRF", "fit"),
@@ -85,7 +85,6 @@ __all__ = [
     "comparison",
     "datasets",
     "fit",
-    "fit_coarray",
     "fit_geometry",
     "fit_hybrid",
     "fit_rssi",
@@ -94,7 +93,6 @@ __all__ = [
     "load_snapshots",
     "load_spectra",
     "make_model",
-    "project",
     "rasterize",
     "rasterize_magnitude",
     "rssi_room",

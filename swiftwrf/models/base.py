@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -51,21 +51,6 @@ class FieldConfig:
     """training rows held out to choose settings: single ones at random, one region at a time, or whole sessions of RSSI"""
     seed: NonNegativeInt = 0
     """seed of everything random"""
-
-
-@dataclass(frozen=True)
-class FitContext:
-    """Arguments of `FieldModel.fit` other than the data; see there."""
-
-    like: FieldModel | None = None
-    device: torch.device = CPU
-    checkpoint: Path | None = None
-    on_record: Callable[[Record], None] | None = None
-    progress: bool = False
-
-    def __post_init__(self) -> None:
-        if self.checkpoint is not None and not Path(self.checkpoint).parent.is_dir():
-            raise InputError(f"the folder of the checkpoint {self.checkpoint} does not exist; create it")
 
 
 class FieldModel(Configured, Saved, Displayed):
@@ -156,7 +141,7 @@ class FieldModel(Configured, Saved, Displayed):
                 checkpoint of another fit or in a folder that does not exist.
             FitError: The loss diverged.
         """
-        context = FitContext(like, to_device(device), checkpoint, on_record, progress)
+        device, checkpoint = to_device(device), check_checkpoint(checkpoint)
         check_training(train)
         self._check_described(train)
         if like is not None and not self.accepts_like(like):
@@ -164,7 +149,7 @@ class FieldModel(Configured, Saved, Displayed):
         if like is not None:
             like.link.check(train)
         self.grid, self.bounds, self.link = train.grid, bounding_box(train.position), Link.from_spectra(train)
-        self._fit(train, context)
+        self._fit(train, like=like, device=device, checkpoint=checkpoint, on_record=on_record, progress=progress)
         return self
 
     def _check_described(self, data: Spectra) -> None:
@@ -172,8 +157,13 @@ class FieldModel(Configured, Saved, Displayed):
             raise InputError(f"{self.name} needs the {' and the '.join(lacking)}, which {data.name} does not describe")
 
     @abstractmethod
-    def _fit(self, train: Spectra, context: FitContext) -> None:
-        """Fit to checked data."""
+    def _fit(self, train: Spectra, **arguments: Any) -> None:
+        """Fit to checked data.
+
+        Args:
+            train: Training spectra.
+            arguments: The other arguments of `fit`. A model declares those that it uses, and ignores the rest by `**_`.
+        """
 
     @abstractmethod
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
@@ -457,6 +447,17 @@ def check_finite(spectrum: Tensor) -> Tensor:
     if not bool(spectrum.detach().sum().isfinite()):
         raise InputError("the model predicts values that are not finite; its parameters overflow, so fit it again")
     return spectrum
+
+
+def check_checkpoint(path: Path | None) -> Path | None:
+    """Return the path of a checkpoint if it can be written.
+
+    Raises:
+        InputError: Its folder does not exist.
+    """
+    if path is not None and not Path(path).parent.is_dir():
+        raise InputError(f"the folder of the checkpoint {path} does not exist; create it")
+    return path
 
 
 @checked

@@ -9,8 +9,9 @@ fine: the first steps fit the primitives alone, the others the network, with the
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -20,7 +21,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import spectrum_loss
-from swiftwrf.models.base import FieldConfig, FieldModel, FitContext
+from swiftwrf.models.base import CPU, FieldConfig, FieldModel
 from swiftwrf.models.mlp import encode, skip_forward, skip_layers
 from swiftwrf.models.primitives import Primitives
 from swiftwrf.positions import frame, normalise
@@ -112,12 +113,21 @@ class SwiftWRFPaper(FieldModel):
     field: DeformableGaussians
     """fitted Gaussians and network; the gradients of their parameters are off after a fit"""
 
-    def _fit(self, train: Spectra, context: FitContext) -> None:
+    def _fit(
+        self,
+        train: Spectra,
+        *,
+        device: torch.device = CPU,
+        checkpoint: Path | None = None,
+        on_record: Callable[[Record], None] | None = None,
+        progress: bool = False,
+        **_: Any,
+    ) -> None:
         work = train.at_most(self.config.max_azimuths)
-        optimisation = Optimisation(self.config, work, context.device)
-        with progress_bar(context.progress) as bar:
+        optimisation = Optimisation(self.config, work, device)
+        with progress_bar(progress) as bar:
             owner = fingerprint(work, asdict(self.config))
-            optimisation.run(Session(context.checkpoint, owner, bar, context.on_record))
+            optimisation.run(Session(checkpoint, owner, bar, on_record))
         self.field = optimisation.result.eval().requires_grad_(False)
 
     def parameters(self) -> Iterable[Tensor]:

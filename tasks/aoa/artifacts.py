@@ -12,7 +12,7 @@ from torch import Tensor
 from augment import sample_positions
 from swiftwrf import Spectra, SwiftWRF, SwiftWRFPaper
 from swiftwrf.models import FieldModel
-from swiftwrf.models.nearest import MemoryModel
+from swiftwrf.models.neighbours import MemoryModel
 from tasks.records import write_json, write_npz
 
 MODEL_FILE = "model"  # name of the file of a swiftwrf model; other field models have their own names

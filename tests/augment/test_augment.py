@@ -19,7 +19,7 @@ from swiftwrf.data.store import Store
 from swiftwrf.metrics import psnr
 from swiftwrf.models import FIELD_MODELS, FieldModel, make_model
 from swiftwrf.models.geometry import model as geometry
-from swiftwrf.models.idw import weights
+from swiftwrf.models.neighbours import weights
 
 ROOM = simulated_room(n=60, seed=3, grid=AngularGrid.hemisphere(15, 60))
 TRAIN, TEST = ROOM.split("random", 0)
@@ -34,7 +34,7 @@ class Recorder(FieldModel):
     name = "recorder"
     kind = "recorder"
 
-    def _fit(self, train, context):
+    def _fit(self, train, like=None, **_):
         self.train = train
 
     def _predict(self, position, grid, with_std):
@@ -183,9 +183,9 @@ def spied():
     class Spy(Recorder):
         searches = True
 
-        def _fit(self, train, context):
-            super()._fit(train, context)
-            structure = context.like.structure if context.like else train
+        def _fit(self, train, like=None, **_):
+            super()._fit(train)
+            structure = like.structure if like else train
             self.structure = structure
             fits.append((train, structure))
 

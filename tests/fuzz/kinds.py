@@ -33,13 +33,13 @@ from augment import Mixed
 from swiftwrf import (
     FIELD_MODELS,
     AngularGrid,
+    CoarrayModel,
     MatchedField,
     Rssi,
     RssiLocator,
     Spectra,
     SwiftWRFPaper,
     fit,
-    fit_coarray,
     fit_rssi,
     load,
     load_rssi,
@@ -125,7 +125,7 @@ def model_of(name: str, folder: Path) -> None:
 
 
 def model_coarray(folder: Path) -> None:
-    fit_coarray(_room(), progress=False).save(folder / "model")
+    CoarrayModel().fit(_room()).save(folder / "model")
 
 
 def model_geometry(folder: Path) -> None:

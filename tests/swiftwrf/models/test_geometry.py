@@ -37,7 +37,7 @@ from swiftwrf.models.geometry.planes import PlaneSet, refined
 from swiftwrf.models.geometry.refine import image_jacobian, phase_jacobian
 from swiftwrf.models.geometry.responses import SteeringResponses
 from swiftwrf.models.geometry.search import SIDES, SIGNS
-from swiftwrf.models.nearest import NearestModel
+from swiftwrf.models.neighbours import NearestModel
 from swiftwrf.runtime.checkpoint import write
 
 QUICK = GeometryConfig(reach=2.0, width=2)
