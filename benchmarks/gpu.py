@@ -41,13 +41,13 @@ from swiftwrf import (
     GeometryModel,
     MatchedField,
     Spectra,
-    SwiftWRFPaper,
     fit,
     make_model,
     simulated_room,
 )
 from swiftwrf.data.simulated.room import ShoeboxRoom
 from swiftwrf.models.geometry.planes import Plane
+from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
 from swiftwrf.online import prequential
 from swiftwrf.rasterize import rasterize_magnitude
 from tasks.aoa.estimators.aann import AANN, AANNConfig

@@ -132,8 +132,8 @@ class TrainedModel(Linked, FieldModel):
     requires the fixed end, it finds both ends of the link in the frame of the training positions by `ends`.
 
     Example:
-        >>> import swiftwrf
-        >>> issubclass(swiftwrf.comparison.Vae, TrainedModel)
+        >>> from swiftwrf.comparison import Vae
+        >>> issubclass(Vae, TrainedModel)
         True
     """
 

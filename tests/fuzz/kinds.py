@@ -31,14 +31,12 @@ from small import GLANCE, PUBLISHED, PUBLISHED_RSSI
 
 from augment import Mixed
 from swiftwrf import (
-    FIELD_MODELS,
     AngularGrid,
     CoarrayModel,
     MatchedField,
     Rssi,
     RssiLocator,
     Spectra,
-    SwiftWRFPaper,
     fit,
     fit_rssi,
     load,
@@ -51,9 +49,11 @@ from swiftwrf import (
 from swiftwrf.comparison import NeRF2Rssi
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.gp import Kernel
+from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import fit_geometry, fit_hybrid
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.path_gains import fit_path_gains
+from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
 from swiftwrf.rssi import PairModel
 from tasks.aoa.estimators.kernel_regression import KernelRegression
 

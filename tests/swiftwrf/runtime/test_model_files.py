@@ -12,7 +12,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from swiftwrf import FIELD_MODELS, CoarrayModel, InputError, SwiftWRF, SwiftWRFPaper, fit, load, make_model
+from swiftwrf import CoarrayModel, InputError, SwiftWRF, fit, load, make_model
+from swiftwrf.models import FIELD_MODELS
+from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
 from swiftwrf.runtime.checkpoint import Saved, read, write
 
 ROOT = Path(__file__).parents[3]
