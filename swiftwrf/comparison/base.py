@@ -117,7 +117,13 @@ class Training(Descent[Model]):
         return torch.Generator().manual_seed(int(state))
 
     def trained(
-        self, owner: str, checkpoint: Path | None, on_record: Callable[[Record], None] | None, progress: bool
+        self,
+        owner: str,
+        *,
+        checkpoint: Path | None = None,
+        on_record: Callable[[Record], None] | None = None,
+        progress: bool = False,
+        **_: Any,
     ) -> Model:
         """Take all steps and return the trained network without gradients; `owner` is the fingerprint of the fit."""
         with progress_bar(progress) as bar:
@@ -158,18 +164,9 @@ class TrainedModel(Linked, FieldModel):
     def render(self, network: Any, position: Tensor, grid: AngularGrid) -> Tensor:
         """Return magnitudes (b, H, W) at positions (b, 3), float64 [m]; differentiable."""
 
-    def _fit(
-        self,
-        train: Spectra,
-        *,
-        device: torch.device = CPU,
-        checkpoint: Path | None = None,
-        on_record: Callable[[Record], None] | None = None,
-        progress: bool = False,
-        **_: Any,
-    ) -> None:
+    def _fit(self, train: Spectra, *, device: torch.device = CPU, **arguments: Any) -> None:
         owner = fingerprint(train, type(self).__name__, asdict(self.config))
-        self.network = self.training(train, device).trained(owner, checkpoint, on_record, progress)
+        self.network = self.training(train, device).trained(owner, **arguments)
 
     def local(self, position: Tensor, device: torch.device) -> Tensor:
         """Return positions, float32 (n, 3) within [-1, 1]^3 in the box around the training positions, on a device."""

@@ -114,7 +114,9 @@ class NeRF2Rssi(RssiPredictor, Saved):
         self.centre, self.receiver = frame(train.transmitter_position)[0], train.receiver_position.double()
         owner = fingerprint(self.config, train, train)
         training = self._training(train, context.device)
-        self.field = training.trained(owner, context.checkpoint, context.on_record, context.progress).cpu()
+        self.field = training.trained(
+            owner, checkpoint=context.checkpoint, on_record=context.on_record, progress=context.progress
+        ).cpu()
 
     def _training(self, train: Rssi, device: torch.device) -> Training[Field]:
         """Return the descent of the squared error of amplitudes where RSSI was detected."""

@@ -114,9 +114,6 @@ class CoarrayModel(Linked, ProcessModel):
     component: Tensor
     """mean magnitude and its components, averaged to few pixels, float32 (1 + K, h, w)"""
 
-    def region(self) -> Tensor:
-        return self.process.known
-
     @single_thread()
     def _fit(self, train: Spectra, **_: Any) -> None:
         array = self.array

@@ -160,9 +160,6 @@ class SwiftWRF(ProcessModel):
     def parameters(self) -> tuple[Tensor, Tensor, Tensor]:
         return self.mean, self.cholesky, self.weight
 
-    def region(self) -> Tensor:
-        return self.process.known.cpu()
-
     def primitives(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return mean, cholesky and weight at positions (n, 3) [m], the arguments of `swiftwrf.rasterize`."""
         self.check_fitted()

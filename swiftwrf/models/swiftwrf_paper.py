@@ -22,7 +22,7 @@ from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import spectrum_loss
 from swiftwrf.models.base import CPU, FieldConfig, FieldModel
-from swiftwrf.models.mlp import encode, skip_forward, skip_layers
+from swiftwrf.models.mlp import SkipMLP, encode
 from swiftwrf.models.primitives import Primitives
 from swiftwrf.positions import frame, normalise
 from swiftwrf.rasterize import rasterize_magnitude
@@ -179,7 +179,7 @@ class DeformableGaussians(nn.Module):
         self.register_buffer("centre", centre)
         self.register_buffer("scale", scale)
         self.primitives = Primitives(n, grid, bounded=True, generator=generator)
-        self.layers = skip_layers(2 * (2 * MEAN_BANDS + 1) + 3 * (2 * POSITION_BANDS + 1), WIDTH, DEPTH, SKIPS)
+        self.layers = SkipMLP(2 * (2 * MEAN_BANDS + 1) + 3 * (2 * POSITION_BANDS + 1), WIDTH, DEPTH, SKIPS)
         self.output = nn.Linear(WIDTH, sum(OFFSETS))
         for layer in self.layers:  # torch's default, sampled from the given generator
             bound = 1 / math.sqrt(cast(nn.Linear, layer).in_features)
@@ -213,7 +213,7 @@ class DeformableGaussians(nn.Module):
         shape = (len(position), len(mean), -1)
         of_mean, of_position = encode(unit, MEAN_BANDS), encode(position, POSITION_BANDS)[:, None]
         x = torch.cat([of_mean.expand(shape), of_position.expand(shape)], dim=-1)
-        offset = self.output(skip_forward(self.layers, x, SKIPS)).split(OFFSETS, dim=-1)
+        offset = self.output(self.layers(x)).split(OFFSETS, dim=-1)
         weight = (attenuation[:, None] + offset[2]) * (response + offset[1])
         return mean + offset[0], cholesky, weight
 

@@ -76,9 +76,6 @@ class HybridModel(ProcessModel):
         """Room whose paths the model uses."""
         return self._room
 
-    def region(self) -> Tensor:
-        return self.process.known
-
     def _fit(self, train: Spectra, *, like: FieldModel | None = None, progress: bool = False, **_: Any) -> None:
         if len(train) > MAX_SPECTRA:
             raise InputError(
