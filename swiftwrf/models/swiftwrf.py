@@ -234,7 +234,7 @@ class SwiftWRF(ProcessModel):
 
 
 class Basis(NamedTuple):
-    """What all predictions on one grid share."""
+    """Tensors that all predictions on one grid share."""
 
     kernel: Tensor  # of each primitive, (N, pixels)
     mean: Tensor  # spectrum, (pixels,)
