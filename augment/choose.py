@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +25,7 @@ from swiftwrf.data.spectra import check_training
 from swiftwrf.data.splits import FOLDS, MIN_TRAINING, Validation, folds
 from swiftwrf.gp import subsample
 from swiftwrf.metrics import psnr
-from swiftwrf.models import FIELD_MODELS, FieldModel, make_model
+from swiftwrf.models import FIELD_MODELS, FieldModel
 from swiftwrf.models.base import model_type
 
 MAX_TEST_SPECTRA = 1000  # predicted spectra of a fold; more do not change the choice
@@ -100,7 +101,7 @@ def candidates(data: Spectra) -> list[str]:
 
 def choose_model(
     measured: Spectra,
-    names: Iterable[str] | None = None,
+    models: Iterable[str | FieldModel | type[FieldModel]] | None = None,
     *,
     validation: Validation = "random",
     seed: int = 0,
@@ -114,25 +115,30 @@ def choose_model(
 
     Args:
         measured: Measured spectra, at least 11.
-        names: Candidates. Defaults to all field models that are fast and whose requirements the data meet.
+        models: Candidates: names, classes, or models, which are fitted with their own options and stay as they are. Defaults
+            to all field models that are fast and whose requirements the data meet.
         validation: Rule by which the spectra are divided into folds.
         seed: Seed of the folds and of the fits.
         device: Device to compute on.
         options: Further options of the candidates. Each candidate takes those that it has.
 
     Raises:
-        InputError: Fewer than 11 spectra, a value that is not finite, an unknown name, an option that no candidate has, or
-            no candidate that can be fitted.
+        InputError: Fewer than 11 spectra, a value that is not finite, an unknown name, two candidates of one name, an option
+            that no candidate has, or no candidate that can be fitted.
 
     Example:
         >>> import swiftwrf
         >>> measured = swiftwrf.simulated_room(n=40, grid=swiftwrf.AngularGrid.hemisphere(10, 40))
-        >>> sorted(choose_model(measured, ("nearest", "idw")).psnr_db)
+        >>> sorted(choose_model(measured, ("nearest", swiftwrf.make_model("idw", seed=1))).psnr_db)
         ['idw', 'nearest']
     """
     check_training(measured)
-    names = candidates(measured) if names is None else tuple(names)
-    types = {name: model_type(name, options.get("preset", "quick")) for name in names}
+    types: dict[str, FieldModel | type[FieldModel]] = {}
+    for model in candidates(measured) if models is None else models:
+        field_model = model_type(model, options.get("preset", "quick")) if isinstance(model, str) else model
+        name = model if isinstance(model, str) else model.name
+        if types.setdefault(name, field_model) is not field_model:
+            raise InputError(f"two candidates have the name {name!r}; give one of them another `name`")
     for option in options:
         if not any(field_model.supported({option: options[option]}) for field_model in types.values()):
             raise InputError(f"none of the candidates {', '.join(types)} has an option {option!r}; leave it out")
@@ -145,17 +151,17 @@ def choose_model(
     left_out: dict[str, str] = {}
     for name, field_model in types.items():
         scored, score, spent = [], [], 0.0
-        own = field_model.supported(options)
         try:
-            for blind, models in zip(blind_folds, searched, strict=True):
+            unfitted = field_model(**field_model.supported(options)) if isinstance(field_model, type) else field_model
+            for blind, fitted in zip(blind_folds, searched, strict=True):
                 structure = None
-                if field_model.searches:
-                    structure, searching = _structure(name, measured, _without(fold, *blind), models, device, own)
+                if unfitted.searches:
+                    structure, searching = _structure(unfitted, measured.subset(_without(fold, *blind)), fitted, device)
                     spent += searching
                 for number in blind:
                     train, test = _split(measured, fold, number)
                     began = time.perf_counter()
-                    model = make_model(name, **own).fit(train, like=structure, device=device)
+                    model = copy(unfitted).fit(train, like=structure, device=device)
                     predicted = model.synthesize(test.position).cpu()
                     spent += time.perf_counter() - began
                     scored.append(Fold(model, train, test))
@@ -184,22 +190,17 @@ def _blind_folds(measured: Spectra, validation: Validation, seed: int) -> tuple[
 
 
 def _structure(
-    name: str,
-    measured: Spectra,
-    rows: Tensor,
-    searched: list[tuple[FieldModel, float]],
-    device: torch.device | str,
-    options: dict[str, Any],
+    unfitted: FieldModel, measured: Spectra, searched: list[tuple[FieldModel, float]], device: torch.device | str
 ) -> tuple[FieldModel, float]:
-    """Return a model fitted to these rows whose structure the named model can reuse, and the seconds of its fit.
+    """Return a model fitted to these spectra whose structure the candidate can reuse, and the seconds of its fit.
 
     Models that are built on the same structure, such as a room, share one search: `searched` collects the fitted models.
     """
     for model, seconds in searched:
-        if FIELD_MODELS[name].accepts_like(model):
+        if unfitted.accepts_like(model):
             return model, seconds
     began = time.perf_counter()
-    model = make_model(name, **options).fit(measured.subset(rows), device=device)
+    model = copy(unfitted).fit(measured, device=device)
     searched.append((model, time.perf_counter() - began))
     return searched[-1]
 

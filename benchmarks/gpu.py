@@ -37,17 +37,17 @@ from torch.profiler import ProfilerActivity, profile
 from augment import Mixed
 from swiftwrf import (
     AngularGrid,
+    CoarrayModel,
     GeometryModel,
     MatchedField,
     Spectra,
-    SwiftWRFPaper,
     fit,
-    fit_coarray,
     make_model,
     simulated_room,
 )
 from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.models.geometry.planes import Plane
+from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
 from swiftwrf.online import prequential
 from swiftwrf.rasterize import rasterize_magnitude
 from tasks.aoa.estimators.aann import AANN, AANNConfig
@@ -161,7 +161,7 @@ def training(config: Config, device: torch.device) -> Row:
 def coarray(config: Config, device: torch.device) -> Row:
     """Spectra a second of the co-array's model, which draws on the CPU of the machine."""
     grid, _, batches = sizes(config)
-    model = fit_coarray(simulated_room(n=40, grid=grid), progress=False)
+    model = CoarrayModel().fit(simulated_room(n=40, grid=grid))
     cpu = torch.device("cpu")
     found = {str(n): rate(partial(model.synthesize, positions(n)), n, cpu, config.seconds) for n in batches}
     print(found, flush=True)

@@ -24,9 +24,10 @@ from synthesis import load as load_scene
 from torch import Tensor
 
 from augment import Mixed
-from swiftwrf import FIELD_MODELS, Spectra, make_model
+from swiftwrf import Spectra, make_model
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import angle_errors, covered, psnr, ssim, summary
+from swiftwrf.models import FIELD_MODELS
 from tasks.aoa.condition import NETWORKS
 from tasks.aoa.estimators import make_estimator
 

@@ -26,13 +26,14 @@ from comparison import MEAN, SHARES, milliseconds, weight
 from record import write_result
 from torch import Tensor
 
-from swiftwrf import FIELD_MODELS, Spectra, load_spectra, make_model
+from swiftwrf import Spectra, load_spectra, make_model
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.choices import Moving
 from swiftwrf.data.raytraced import ROOMS
 from swiftwrf.data.splits import validation_for
 from swiftwrf.gp import subsample
 from swiftwrf.metrics import l1, psnr, ssim, summary
+from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.base import FieldModel
 from swiftwrf.positions import Neighbours
 from swiftwrf.runtime.durable import write_text

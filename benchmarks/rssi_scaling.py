@@ -16,7 +16,8 @@ from committed import RESULTS
 from record import write_result
 from scaling import measuring
 
-from swiftwrf import Rssi, RssiConfig, fit_rssi, rssi_room
+from swiftwrf import Rssi, fit_rssi, rssi_room
+from swiftwrf.rssi import RssiConfig
 
 POINTS = ((1_000, 12), (10_000, 12), (100_000, 12), (1_000, 48), (1_000, 500))
 PREDICTED = 100_000

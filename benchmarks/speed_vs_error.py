@@ -25,12 +25,12 @@ from swiftwrf import (
     Spectra,
     fit,
     make_model,
-    project,
     simulated_room,
 )
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import psnr
+from swiftwrf.models.coarray import project
 from swiftwrf.rasterize import Backend, prepare, rasterize_magnitude
 from tasks import labels
 from tasks.page import figures
@@ -195,7 +195,11 @@ class Study:
             began = time.perf_counter()
             model.fit(self.train)
             seconds = time.perf_counter() - began
-            more = {"parameters": model.n_parameters} if isinstance(model, CoarrayModel) else {}
+            more = (
+                {"parameters": model.process.coefficient.numel() + model.form.numel()}
+                if isinstance(model, CoarrayModel)
+                else {}
+            )
             points.append(self.point(name, model.synthesize, seconds, **more))
         if array is None:
             return points

@@ -18,20 +18,10 @@ from record import write_result
 from tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
 from torch import Tensor
 
-from swiftwrf import (
-    AngularGrid,
-    FieldModel,
-    FitError,
-    InputError,
-    Spectra,
-    SwiftWRF,
-    SwiftWRFPaper,
-    rasterize,
-    simulated_room,
-)
+from swiftwrf import AngularGrid, FieldModel, FitError, InputError, Spectra, SwiftWRF, rasterize, simulated_room
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import psnr
-from swiftwrf.models.swiftwrf_paper import DeformableGaussians
+from swiftwrf.models.swiftwrf_paper import DeformableGaussians, SwiftWRFPaper
 from swiftwrf.positions import frame
 from swiftwrf.rasterize import Backend, rasterize_magnitude
 

@@ -10,10 +10,11 @@ from typing import Any
 import tyro
 from record import write_result
 
-from swiftwrf import Spectra, load_spectra, make_model, project, simulated_room
+from swiftwrf import Spectra, load_spectra, make_model, simulated_room
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.splits import TEST_SHARE, block_split, validation_for
 from swiftwrf.metrics import covered, l1, psnr, ssim, summary
+from swiftwrf.models.coarray import project
 
 S23_ARRAY = PlanarArray.square(4, 915e6, spacing=0.16)  # the files of s23-200 do not describe it
 SCENES = (("s23-200", "random"), ("s23-200", "block"), ("newrf-bedroom", "random"), ("newrf-office", "random"))

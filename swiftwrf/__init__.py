@@ -17,52 +17,44 @@ from swiftwrf.runtime.lazy import import_lazily
 __version__ = version("swiftwrf-tasks")
 
 if TYPE_CHECKING:
-    from swiftwrf import comparison, datasets
     from swiftwrf.array.angles import AngularGrid, ArrayPose
-    from swiftwrf.choices import FIELD_MODELS
     from swiftwrf.data import Rssi, Snapshots, Spectra, load_rssi, load_snapshots, load_spectra
     from swiftwrf.data.simulated import rssi_room, simulated_room
-    from swiftwrf.diagnostics.calibration import Calibration, calibrate
+    from swiftwrf.diagnostics.calibration import calibrate
     from swiftwrf.errors import FitError, InputError
-    from swiftwrf.locate import MatchedField, Posterior, RssiLocator
+    from swiftwrf.locate import MatchedField, RssiLocator
     from swiftwrf.models.base import FieldModel, make_model
-    from swiftwrf.models.coarray import CoarrayModel, fit_coarray, project
+    from swiftwrf.models.coarray import CoarrayModel
     from swiftwrf.models.geometry import GeometryModel, HybridModel
     from swiftwrf.models.prediction import Prediction
     from swiftwrf.models.swiftwrf import SwiftWRF, fit
-    from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
-    from swiftwrf.rasterize import rasterize, rasterize_magnitude
-    from swiftwrf.rssi import PairModel, RssiConfig, RssiModel, fit_rssi
+    from swiftwrf.rasterize import rasterize
+    from swiftwrf.rssi import PairModel, RssiModel, fit_rssi
     from swiftwrf.runtime.checkpoint import load
 
 import_lazily(
     __name__,
     {
-        "swiftwrf": ("comparison", "datasets"),
         "swiftwrf.array.angles": ("AngularGrid", "ArrayPose"),
-        "swiftwrf.choices": ("FIELD_MODELS",),
         "swiftwrf.data": ("Rssi", "Snapshots", "Spectra", "load_rssi", "load_snapshots", "load_spectra"),
         "swiftwrf.data.simulated": ("rssi_room", "simulated_room"),
-        "swiftwrf.diagnostics.calibration": ("Calibration", "calibrate"),
+        "swiftwrf.diagnostics.calibration": ("calibrate",),
         "swiftwrf.errors": ("FitError", "InputError"),
-        "swiftwrf.locate": ("MatchedField", "Posterior", "RssiLocator"),
+        "swiftwrf.locate": ("MatchedField", "RssiLocator"),
         "swiftwrf.models.base": ("FieldModel", "make_model"),
-        "swiftwrf.models.coarray": ("CoarrayModel", "fit_coarray", "project"),
+        "swiftwrf.models.coarray": ("CoarrayModel",),
         "swiftwrf.models.geometry": ("GeometryModel", "HybridModel"),
         "swiftwrf.models.prediction": ("Prediction",),
         "swiftwrf.models.swiftwrf": ("SwiftWRF", "fit"),
-        "swiftwrf.models.swiftwrf_paper": ("SwiftWRFPaper",),
-        "swiftwrf.rasterize": ("rasterize", "rasterize_magnitude"),
-        "swiftwrf.rssi": ("PairModel", "RssiConfig", "RssiModel", "fit_rssi"),
+        "swiftwrf.rasterize": ("rasterize",),
+        "swiftwrf.rssi": ("PairModel", "RssiModel", "fit_rssi"),
         "swiftwrf.runtime.checkpoint": ("load",),
     },
 )
 
 __all__ = [
-    "FIELD_MODELS",
     "AngularGrid",
     "ArrayPose",
-    "Calibration",
     "CoarrayModel",
     "FieldModel",
     "FitError",
@@ -71,30 +63,22 @@ __all__ = [
     "InputError",
     "MatchedField",
     "PairModel",
-    "Posterior",
     "Prediction",
     "Rssi",
-    "RssiConfig",
     "RssiLocator",
     "RssiModel",
     "Snapshots",
     "Spectra",
     "SwiftWRF",
-    "SwiftWRFPaper",
     "calibrate",
-    "comparison",
-    "datasets",
     "fit",
-    "fit_coarray",
     "fit_rssi",
     "load",
     "load_rssi",
     "load_snapshots",
     "load_spectra",
     "make_model",
-    "project",
     "rasterize",
-    "rasterize_magnitude",
     "rssi_room",
     "simulated_room",
 ]

@@ -10,7 +10,7 @@ class Mean(FieldModel):
     name = "outside_mean"
     kind = "outside mean"
 
-    def _fit(self, train, context):
+    def _fit(self, train, **_):
         self.mean = train.spectrum.mean(dim=0)
 
     def _predict(self, position, grid, with_std):

@@ -13,8 +13,9 @@ from unittest import mock
 
 from small import glances, small_published, small_swiftwrf
 
-from swiftwrf import AngularGrid, RssiConfig, RssiModel, rssi_room, simulated_room
+from swiftwrf import AngularGrid, RssiModel, rssi_room, simulated_room
 from swiftwrf.errors import MAX_LENGTH
+from swiftwrf.rssi import RssiConfig
 from swiftwrf.runtime.validation import configuration
 from tasks.aoa import experiment as aoa
 from tasks.aoa.condition import NETWORKS

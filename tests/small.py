@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 from typing import Any, get_type_hints
 from unittest import mock
 
-from swiftwrf import FIELD_MODELS, Spectra
+from swiftwrf import Spectra
 from swiftwrf.comparison import (
     Config,
     DcganConfig,
@@ -18,6 +18,7 @@ from swiftwrf.comparison import (
     VaeConfig,
     WrfGsConfig,
 )
+from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import GeometryConfig
 from swiftwrf.models.geometry.fit import search_room
 from swiftwrf.models.geometry.planes import RoomEstimate

@@ -10,6 +10,7 @@ import pytest
 import torch
 from tables import FILES, rewrite
 
+import swiftwrf
 from augment import Mixed
 from swiftwrf import AngularGrid, load, simulated_room
 
@@ -20,6 +21,12 @@ ROOT = Path(__file__).parent.parent
 def test_tables_come_from_the_results(name):
     text = (ROOT / name).read_text()
     assert rewrite(text) == text, "run python benchmarks/tables.py"
+
+
+def test_each_public_name_has_a_line_in_the_reference():
+    documented = re.findall(r"^::: swiftwrf\.\S*?(\w+)$", (ROOT / "docs" / "api.md").read_text(), flags=re.MULTILINE)
+    assert [name for name in swiftwrf.__all__ if documented.count(name) != 1] == []
+    assert len(swiftwrf.__all__) <= 28, "a new name takes the place of another one"
 
 
 def anchors(page: Path) -> set[str]:

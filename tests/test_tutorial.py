@@ -11,7 +11,8 @@ import pytest
 from quick import PREDICTORS_KEPT, TASKS, QuickNetwork, QuickRssiConfig
 from small import glances
 
-from swiftwrf import RssiConfig, RssiModel
+from swiftwrf import RssiModel
+from swiftwrf.rssi import RssiConfig
 from tasks.aoa.condition import NETWORKS
 from tasks.aoa.estimators import ESTIMATORS
 from tasks.command_line import command_line

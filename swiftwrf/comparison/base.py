@@ -6,6 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -15,12 +16,12 @@ from torch import Tensor, nn
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra, fingerprint
-from swiftwrf.models.base import FieldModel, FitContext
+from swiftwrf.models.base import CPU, FieldModel
 from swiftwrf.models.link import Linked
 from swiftwrf.positions import frame, normalise
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.progress import progress_bar
-from swiftwrf.runtime.session import Descent, Model, Schedule, Session, warm_cosine
+from swiftwrf.runtime.session import Descent, Model, Record, Schedule, Session, warm_cosine
 from swiftwrf.runtime.validation import (
     Fraction,
     NonNegativeInt,
@@ -114,10 +115,18 @@ class Training(Descent[Model]):
         (state,) = np.random.SeedSequence((self.config.seed, self.step)).generate_state(1)
         return torch.Generator().manual_seed(int(state))
 
-    def trained(self, owner: str, context: FitContext) -> Model:
+    def trained(
+        self,
+        owner: str,
+        *,
+        checkpoint: Path | None = None,
+        on_record: Callable[[Record], None] | None = None,
+        progress: bool = False,
+        **_: Any,
+    ) -> Model:
         """Take all steps and return the trained network without gradients; `owner` is the fingerprint of the fit."""
-        with progress_bar(context.progress) as bar:
-            self.run(Session(context.checkpoint, owner, bar, context.on_record))
+        with progress_bar(progress) as bar:
+            self.run(Session(checkpoint, owner, bar, on_record))
         return self.result.eval().requires_grad_(False)
 
 
@@ -128,8 +137,8 @@ class TrainedModel(Linked, FieldModel):
     requires the fixed end, it finds both ends of the link in the frame of the training positions by `ends`.
 
     Example:
-        >>> import swiftwrf
-        >>> issubclass(swiftwrf.comparison.Vae, TrainedModel)
+        >>> from swiftwrf.comparison import Vae
+        >>> issubclass(Vae, TrainedModel)
         True
     """
 
@@ -154,9 +163,9 @@ class TrainedModel(Linked, FieldModel):
     def render(self, network: Any, position: Tensor, grid: AngularGrid) -> Tensor:
         """Return magnitudes (b, H, W) at positions (b, 3), float64 [m]; differentiable."""
 
-    def _fit(self, train: Spectra, context: FitContext) -> None:
+    def _fit(self, train: Spectra, *, device: torch.device = CPU, **arguments: Any) -> None:
         owner = fingerprint(train, type(self).__name__, asdict(self.config))
-        self.network = self.training(train, context.device).trained(owner, context)
+        self.network = self.training(train, device).trained(owner, **arguments)
 
     def local(self, position: Tensor, device: torch.device) -> Tensor:
         """Return positions, float32 (n, 3) within [-1, 1]^3 in the box around the training positions, on a device."""

@@ -113,7 +113,10 @@ class NeRF2Rssi(RssiPredictor, Saved):
     def _fit(self, train: Rssi, context: RssiFitContext) -> None:
         self.centre, self.receiver = frame(train.transmitter_position)[0], train.receiver_position.double()
         owner = fingerprint(self.config, train, train)
-        self.field = self._training(train, context.device).trained(owner, context).cpu()
+        training = self._training(train, context.device)
+        self.field = training.trained(
+            owner, checkpoint=context.checkpoint, on_record=context.on_record, progress=context.progress
+        ).cpu()
 
     def _training(self, train: Rssi, device: torch.device) -> Training[Field]:
         """Return the descent of the squared error of amplitudes where RSSI was detected."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from copy import copy
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -49,26 +49,13 @@ class FieldConfig:
     """seed of everything random"""
 
 
-@dataclass(frozen=True)
-class FitContext:
-    """Arguments of `FieldModel.fit` other than the data; see there."""
-
-    like: FieldModel | None = None
-    device: torch.device = CPU
-    checkpoint: Path | None = None
-    on_record: Callable[[Record], None] | None = None
-    progress: bool = False
-
-    def __post_init__(self) -> None:
-        if self.checkpoint is not None and not Path(self.checkpoint).parent.is_dir():
-            raise InputError(f"the folder of the checkpoint {self.checkpoint} does not exist; create it")
-
-
 class FieldModel(Configured, Saved, Displayed):
     """Base class of all field models.
 
-    A subclass sets `name`, `kind` and `config_type`, and implements `_fit`, `_predict`, `state` and `_restore`. Options are
-    keyword arguments of the constructor; `config_type` declares their ranges.
+    A subclass implements `_fit` and `_predict`, and for `save` and `load` also `_state` and `_restore`. Its `name` and its
+    `kind` in files default to the name of the class. `config_type` declares the options, which are keyword arguments of the
+    constructor. `augment.choose_model` takes the class or an object of it. The decorator `FIELD_MODELS.register("name")` of
+    `swiftwrf.models` makes the name known to `make_model` and to the tasks of this process.
 
     Args:
         config: Options as one object. Defaults to those of the preset.
@@ -80,10 +67,14 @@ class FieldModel(Configured, Saved, Displayed):
 
     Example:
         >>> import swiftwrf
+        >>> class Mean(swiftwrf.FieldModel):
+        ...     def _fit(self, train, **_):
+        ...         self.mean = train.store.mean()
+        ...     def _predict(self, position, grid, with_std):
+        ...         return self.mean.expand(len(position), -1, -1), None
         >>> train, test = swiftwrf.simulated_room(n=50).split()
-        >>> model = swiftwrf.make_model("idw").fit(train)
-        >>> isinstance(model, FieldModel), model.predict(test.position).mean.shape
-        (True, torch.Size([10, 30, 120]))
+        >>> Mean().fit(train).predict(test.position).mean.shape
+        torch.Size([10, 30, 120])
     """
 
     config_type: ClassVar[type[Any]] = FieldConfig
@@ -110,6 +101,10 @@ class FieldModel(Configured, Saved, Displayed):
     """corners of the box around the training positions, float64 (2, 3) [m], set by `fit`"""
     link: Link
     """link of the training spectra, set by `fit`"""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        cls.name, cls.kind = (vars(cls).get(attribute, cls.__name__) for attribute in ("name", "kind"))
+        super().__init_subclass__(**options)
 
     @classmethod
     def lacking(cls, data: Spectra | Link) -> list[str]:
@@ -153,7 +148,7 @@ class FieldModel(Configured, Saved, Displayed):
                 checkpoint of another fit or in a folder that does not exist.
             FitError: The loss diverged.
         """
-        context = FitContext(like, to_device(device), checkpoint, on_record, progress)
+        device, checkpoint = to_device(device), check_checkpoint(checkpoint)
         check_training(train)
         self._check_described(train)
         if like is not None and not self.accepts_like(like):
@@ -161,7 +156,7 @@ class FieldModel(Configured, Saved, Displayed):
         if like is not None:
             like.link.check(train)
         self.grid, self.bounds, self.link = train.grid, bounding_box(train.position), Link.from_spectra(train)
-        self._fit(train, context)
+        self._fit(train, like=like, device=device, checkpoint=checkpoint, on_record=on_record, progress=progress)
         return self
 
     def _check_described(self, data: Spectra) -> None:
@@ -169,8 +164,13 @@ class FieldModel(Configured, Saved, Displayed):
             raise InputError(f"{self.name} needs the {' and the '.join(lacking)}, which {data.name} does not describe")
 
     @abstractmethod
-    def _fit(self, train: Spectra, context: FitContext) -> None:
-        """Fit to checked data."""
+    def _fit(self, train: Spectra, **arguments: Any) -> None:
+        """Fit to checked data.
+
+        Args:
+            train: Training spectra.
+            arguments: The other arguments of `fit`. A model declares those that it uses, and ignores the rest by `**_`.
+        """
 
     @abstractmethod
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
@@ -204,15 +204,29 @@ class FieldModel(Configured, Saved, Displayed):
         return self._predicted(position, grid, with_std=False).mean
 
     def _predicted(self, position: Numbers, grid: AngularGrid | None, with_std: bool) -> Prediction:
-        grid = self._checked_grid(grid)
+        """Predict some positions at a time, with gradients only where something requires them."""
+        grid, position = self._checked_grid(grid), check_positions(position).to(self.device)
+        batch = self._batch_on(position.device)
 
         def evaluate(some: Tensor) -> tuple[Tensor, Tensor | None]:
             mean, std = self._predict(some, grid, with_std)
-            return mean.clamp(0, 1), None if std is None else std.clamp_min(MIN_STD)
+            return mean.float().clamp(0, 1), None if std is None else std.float().clamp_min(MIN_STD)
 
-        position = self._checked(position)
-        mean, std = self._in_batches(evaluate, position, grid)
-        return Prediction(mean, std, position, grid)
+        differentiable = position.requires_grad or any(tensor.requires_grad for tensor in self.parameters())
+        with torch.set_grad_enabled(torch.is_grad_enabled() and differentiable):
+            if torch.is_grad_enabled() or 0 < len(position) <= batch:
+                means, stds = zip(*(evaluate(some) for some in position.split(batch)), strict=True)
+                mean = means[0] if len(means) == 1 else torch.cat(means)
+                std = None if stds[0] is None else torch.cat(stds)
+            else:  # into one tensor, since the parts beside it would double the memory
+                mean, std = torch.empty(len(position), *grid.shape, device=position.device), None
+                for start in range(0, len(position), batch):
+                    rows = slice(start, start + batch)
+                    mean[rows], part = evaluate(position[rows])
+                    if part is not None:
+                        std = torch.empty_like(mean) if std is None else std
+                        std[rows] = part
+        return Prediction(check_finite(mean), std, position, grid)
 
     @single_thread()
     @checked
@@ -336,39 +350,11 @@ class FieldModel(Configured, Saved, Displayed):
         """Return the number of positions evaluated at a time on a device."""
         return self.batch
 
-    def _checked(self, position: Numbers) -> Tensor:
-        return check_positions(position).to(self.device)
-
     def _checked_grid(self, grid: AngularGrid | None) -> AngularGrid:
         self.check_fitted()
         if grid is not None and grid != self.grid and not self.any_grid:
             raise InputError(f"{self.name} predicts spectra on the grid of its training spectra only")
         return grid or self.grid
-
-    def _in_batches(
-        self, evaluate: Callable[[Tensor], tuple[Tensor, Tensor | None]], position: Tensor, grid: AngularGrid
-    ) -> tuple[Tensor, Tensor | None]:
-        """Evaluate some positions at a time, with gradients only where something requires them."""
-        batch = self._batch_on(position.device)
-        with_gradient = position.requires_grad or any(tensor.requires_grad for tensor in self.parameters())
-        if torch.is_grad_enabled() and with_gradient:
-            parts = [evaluate(some) for some in position.split(batch)]
-            stds = [std for _, std in parts if std is not None]
-            return check_finite(torch.cat([mean for mean, _ in parts])), torch.cat(stds) if stds else None
-        if 0 < len(position) <= batch:
-            with torch.no_grad():
-                mean, std = evaluate(position)
-            return check_finite(mean.float()), None if std is None else std.float()
-        out = torch.empty(len(position), *grid.shape, device=position.device)
-        spread: Tensor | None = None
-        with torch.no_grad():
-            for start in range(0, len(position), batch):
-                rows = slice(start, start + batch)
-                out[rows], std = evaluate(position[rows])
-                if std is not None:
-                    spread = torch.empty_like(out) if spread is None else spread
-                    spread[rows] = std
-        return check_finite(out), spread
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """Return the fitted tensors by name, and plain values.
@@ -381,13 +367,13 @@ class FieldModel(Configured, Saved, Displayed):
         described = {"grid": asdict(grid), "bounds": self.bounds.tolist(), "link": self.link.to_json()}
         return tensors, {"options": asdict(self.config)} | described | header
 
-    @abstractmethod
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         """Return the fitted tensors by name, and plain values beside options, grid and link."""
+        raise InputError(f"{self.name} cannot be saved; its class needs _state and _restore")
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
-        model = cls(cls._restored_config(header.get("options", {})))
+        model = cls(from_plain(cls.config_type, header.get("options", {})))
         model.grid = AngularGrid(**header["grid"])
         model.bounds = bounding_box(torch.tensor(header["bounds"], dtype=torch.float64))
         model.link = Link.from_json(header["link"])
@@ -396,13 +382,9 @@ class FieldModel(Configured, Saved, Displayed):
         model._restore(tensors, header)
         return model
 
-    @classmethod
-    def _restored_config(cls, options: Mapping[str, Any]) -> Any:
-        return from_plain(cls.config_type, options)
-
-    @abstractmethod
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         """Take the fitted state over from `_state`, checking every shape first."""
+        raise InputError(f"{self.name} cannot be loaded; its class needs _state and _restore")
 
     def plot(self, position: Numbers, ax: Axes | None = None) -> Axes:
         """Draw the predicted spectrum at one position, seen along the normal of the array.
@@ -456,6 +438,17 @@ def check_finite(spectrum: Tensor) -> Tensor:
     if not bool(spectrum.detach().sum().isfinite()):
         raise InputError("the model predicts values that are not finite; its parameters overflow, so fit it again")
     return spectrum
+
+
+def check_checkpoint(path: Path | None) -> Path | None:
+    """Return the path of a checkpoint if it can be written.
+
+    Raises:
+        InputError: Its folder does not exist.
+    """
+    if path is not None and not Path(path).parent.is_dir():
+        raise InputError(f"the folder of the checkpoint {path} does not exist; create it")
+    return path
 
 
 @checked

@@ -8,27 +8,24 @@ spectrum is exactly 49 real coefficients at any resolution: a constant and, for 
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import lru_cache
-from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray, basis, differences
-from swiftwrf.data.spectra import Spectra, coarsening, fingerprint
-from swiftwrf.data.splits import Validation, folds
+from swiftwrf.data.spectra import Spectra, coarsening
+from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, choose_kernel, principal_components
-from swiftwrf.models.base import ARRAY, FitContext
+from swiftwrf.models.base import ARRAY
 from swiftwrf.models.link import Linked
 from swiftwrf.models.process import ProcessModel
-from swiftwrf.runtime.checkpoint import Header, expect, refusing, restore
-from swiftwrf.runtime.progress import progress_bar
-from swiftwrf.runtime.session import Record
+from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import checked
 
@@ -119,39 +116,8 @@ class CoarrayModel(Linked, ProcessModel):
     component: Tensor
     """mean magnitude and its components, averaged to few pixels, float32 (1 + K, h, w)"""
 
-    @property
-    def n_parameters(self) -> int:
-        """Number of fitted values."""
-        assert self.process.coefficient is not None
-        return self.process.coefficient.numel() + self.form.numel()
-
-    def region(self) -> Tensor:
-        return self.process.known
-
-    def _fit(self, train: Spectra, context: FitContext) -> None:
-        owner = fingerprint(train, self.config.validation, self.config.seed)
-        kept = context.checkpoint
-        if kept is not None and kept.exists():
-            model, header = restore(kept, self.kind)
-            provenance = header.get("provenance")
-            if not isinstance(provenance, dict) or provenance.get("fit") != owner:
-                raise InputError(f"{kept} is of another fit (other spectra or options); remove it or give another path")
-            with refusing(f"{kept} is no co-array model that was kept by a fit"):
-                seconds = float(provenance["seconds"])
-            vars(self).update(vars(model))
-        else:
-            began = time.perf_counter()
-            with progress_bar(context.progress) as bar:
-                bar.add_task("co-array model", total=1)
-                self._solve(train)
-            seconds = time.perf_counter() - began
-            if kept is not None:
-                self.save(kept, {"fit": owner, "seconds": repr(seconds)})
-        if context.on_record is not None:
-            context.on_record({"stage": "final", "seconds": seconds, "elapsed": seconds})
-
     @single_thread()
-    def _solve(self, train: Spectra) -> None:
+    def _fit(self, train: Spectra, **_: Any) -> None:
         array = self.array
         functions = basis(array, train.grid, torch.float32)
         inverse = _inverse(array, train.grid).float()
@@ -213,37 +179,6 @@ class CoarrayModel(Linked, ProcessModel):
         expect(tensors, {"offset": (1,), "form": form, "component": (n_scores, *coarse)})
         self.offset, self.form, self.component = (tensors[name].float() for name in ("offset", "form", "component"))
         self._restore_spread(tensors)
-
-
-def fit_coarray(
-    train: Spectra,
-    *,
-    validation: Validation = "random",
-    seed: int = 0,
-    checkpoint: Path | None = None,
-    on_record: Callable[[Record], None] | None = None,
-    progress: bool = True,
-) -> CoarrayModel:
-    """Fit a co-array model in closed form.
-
-    Args:
-        train: Training spectra with their array.
-        validation: How training spectra are held out to choose the kernel.
-        seed: Seed of the folds.
-        checkpoint: File for the fitted model. If it exists, the model is read from it.
-        on_record: Called once with stage (final), seconds and elapsed, those of the fit also if the model is read.
-        progress: Show a progress bar on a terminal.
-
-    Raises:
-        InputError: As `FieldModel.fit`.
-
-    Example:
-        >>> import swiftwrf
-        >>> fit_coarray(swiftwrf.simulated_room(n=20), progress=False)
-        CoarrayModel(fitted, 30 x 120 directions)
-    """
-    model = CoarrayModel(validation=validation, seed=seed)
-    return model.fit(train, checkpoint=checkpoint, on_record=on_record, progress=progress)
 
 
 def _coarse(spectra: Store) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -10,8 +12,7 @@ from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store
 from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, subsample
-from swiftwrf.models.base import FitContext
-from swiftwrf.models.nearest import MemoryModel
+from swiftwrf.models.neighbours import MemoryModel
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.runtime.checkpoint import Header
 
@@ -31,7 +32,7 @@ class GPModel(ProcessModel, MemoryModel):
     name = "gp"
     kind = "pixel Gaussian process"
 
-    def _fit(self, train: Spectra, context: FitContext) -> None:
+    def _fit(self, train: Spectra, **_: Any) -> None:
         self.position, self.store = train.position, train.store
         fold = folds(train.position, self.config.validation, self.config.seed)
         self._prepare(_without_values(choose_kernel(train.position, train.store, fold), train.position))

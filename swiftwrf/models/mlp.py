@@ -26,32 +26,26 @@ def encode(x: Tensor, bands: int, lowest: float = math.pi) -> Tensor:
     return torch.cat([x, torch.sin(angle).flatten(-2), torch.cos(angle).flatten(-2)], dim=-1)
 
 
-def skip_layers(inputs: int, width: int, depth: int, skips: Collection[int] = NERF_SKIPS) -> nn.ModuleList:
-    """Return linear layers of one width; the layers `skips`, counted from 0, take the input again."""
-    return nn.ModuleList(
-        nn.Linear(inputs if i == 0 else width + (inputs if i in skips else 0), width) for i in range(depth)
-    )
-
-
-def skip_forward(layers: nn.ModuleList, x: Tensor, skips: Collection[int] = NERF_SKIPS) -> Tensor:
-    """Return the output (..., width) of `skip_layers` with ReLU for inputs (..., inputs)."""
-    h = x
-    for i, layer in enumerate(layers):
-        h = torch.relu(layer(torch.cat([h, x], dim=-1) if i in skips else h))
-    return h
-
-
-class SkipMLP(nn.Module):
-    """`skip_layers` as one module.
+class SkipMLP(nn.ModuleList):
+    """Linear layers of one width with ReLU; some take the input again.
 
     Args:
         inputs, width, depth: Size of the input, size of each layer, number of layers.
+        skips: Layers that take the input again, counted from 0.
+
+    Example:
+        >>> [layer.in_features for layer in SkipMLP(3, 8, 3, skips=(2,))]
+        [3, 8, 11]
     """
 
-    def __init__(self, inputs: int, width: int, depth: int) -> None:
-        super().__init__()
-        self.layers = skip_layers(inputs, width, depth)
+    def __init__(self, inputs: int, width: int, depth: int, skips: Collection[int] = NERF_SKIPS) -> None:
+        sizes = [inputs] + [width + inputs * (i in skips) for i in range(1, depth)]
+        super().__init__(nn.Linear(size, width) for size in sizes)
+        self.skips = skips
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the output (..., width) for inputs (..., inputs)."""
-        return skip_forward(self.layers, x)
+        h = x
+        for i, layer in enumerate(self):
+            h = torch.relu(layer(torch.cat([h, x], dim=-1) if i in self.skips else h))
+        return h

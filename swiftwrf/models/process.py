@@ -51,6 +51,9 @@ class ProcessModel(FieldModel):
         self.check_fitted()
         return (self.process.variance(self._process_position(position)) + self.process.kernel.noise).sqrt()
 
+    def region(self) -> Tensor:
+        return self.process.known.cpu()
+
     @property
     def kernel(self) -> Kernel:
         """Kernel of the process, lengths in [m]."""

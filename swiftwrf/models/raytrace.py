@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,7 +12,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.raytraced import Material, Scene, Surface, Tracing, open_scene, sionna, trace
 from swiftwrf.data.raytraced.rooms import rectangle
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext
+from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel
 from swiftwrf.models.geometry import GeometryConfig, GeometryModel
 from swiftwrf.models.link import Linked
 from swiftwrf.runtime.checkpoint import Header
@@ -58,13 +59,13 @@ class RaytraceModel(Linked, FieldModel):
         """Room that is traced; None if a scene is given."""
         return self._room
 
-    def _fit(self, train: Spectra, context: FitContext) -> None:
+    def _fit(self, train: Spectra, *, like: FieldModel | None = None, progress: bool = False, **_: Any) -> None:
         sionna()  # refuses before a room is searched
-        self.progress, self._room = context.progress, None
+        self.progress, self._room = progress, None
         if self.config.scene is None:
-            like = context.like if context.like and context.like.room else None
+            like = like if like and like.room else None
             search = {option.name: getattr(self.config, option.name) for option in fields(GeometryConfig)}
-            self._room = GeometryModel(**search).fit(train, like=like, progress=context.progress)
+            self._room = GeometryModel(**search).fit(train, like=like, progress=progress)
         self._build()
 
     def _build(self) -> None:

@@ -22,13 +22,14 @@ from swiftwrf.data.splits import folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, choose_rank, held_out, principal_components, subsample
 from swiftwrf.metrics import spectrum_loss, std_factor
-from swiftwrf.models.base import FieldConfig, FitContext
+from swiftwrf.models.base import CPU, FieldConfig, FieldModel
 from swiftwrf.models.primitives import constrained, min_width
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.rasterize import rasterize_magnitude
 from swiftwrf.rasterize.reference import kernels
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.progress import progress_bar
+from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 
@@ -96,7 +97,16 @@ class SwiftWRF(ProcessModel):
     process: GaussianProcess
     """process of the K component scores"""
 
-    def _fit(self, train: Spectra, context: FitContext) -> None:
+    def _fit(
+        self,
+        train: Spectra,
+        *,
+        like: FieldModel | None = None,
+        device: torch.device = CPU,
+        on_record: Callable[[Record], None] | None = None,
+        progress: bool = False,
+        **_: Any,
+    ) -> None:
         config, work = self.config, train.at_most(self.config.max_azimuths)
         fold = folds(work.position, config.validation, config.seed)
         kernel = choose_kernel(work.position, work.store, fold)
@@ -106,10 +116,10 @@ class SwiftWRF(ProcessModel):
         (rows,) = subsample(torch.arange(len(work)), rows=MAX_ROWS)
         some, fold = work.subset(rows).in_memory(), fold[rows]
         small = some.at_most(SHAPE_AZIMUTHS).in_memory()
-        n, record = config.n_primitives, context.on_record or (lambda record: None)
-        if n == "auto" and isinstance(context.like, SwiftWRF):
-            n = len(context.like.mean)
-        with progress_bar(context.progress) as bar, single_thread():
+        n, record = config.n_primitives, on_record or (lambda record: None)
+        if n == "auto" and isinstance(like, SwiftWRF):
+            n = len(like.mean)
+        with progress_bar(progress) as bar, single_thread():
             task = bar.add_task("swiftwrf", total=None)
             target = torch.cat(_components(small, rank))
 
@@ -125,7 +135,7 @@ class SwiftWRF(ProcessModel):
             self.mean, self.cholesky = _shapes(target, n, small.grid, SHAPE_STEPS)
             self._regress(work, some, kernel, rank, fold)
         record({"stage": "final", "n_primitives": n})
-        self._move(context.device)
+        self._move(device)
 
     def _regress(self, train: Spectra, some: Spectra, kernel: Kernel, rank: int, fold: Tensor) -> None:
         """Fit weights and calibration to some of the training spectra, with their folds, and the process to all of them."""
@@ -149,9 +159,6 @@ class SwiftWRF(ProcessModel):
 
     def parameters(self) -> tuple[Tensor, Tensor, Tensor]:
         return self.mean, self.cholesky, self.weight
-
-    def region(self) -> Tensor:
-        return self.process.known.cpu()
 
     def primitives(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return mean, cholesky and weight at positions (n, 3) [m], the arguments of `swiftwrf.rasterize`."""
@@ -227,7 +234,7 @@ class SwiftWRF(ProcessModel):
 
 
 class Basis(NamedTuple):
-    """Quantities that all predictions on one grid share."""
+    """Tensors that all predictions on one grid share."""
 
     kernel: Tensor  # of each primitive, (N, pixels)
     mean: Tensor  # spectrum, (pixels,)

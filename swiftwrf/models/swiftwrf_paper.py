@@ -9,8 +9,9 @@ fine: the first steps fit the primitives alone, the others the network, with the
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -20,8 +21,8 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import spectrum_loss
-from swiftwrf.models.base import FieldConfig, FieldModel, FitContext
-from swiftwrf.models.mlp import encode, skip_forward, skip_layers
+from swiftwrf.models.base import CPU, FieldConfig, FieldModel
+from swiftwrf.models.mlp import SkipMLP, encode
 from swiftwrf.models.primitives import Primitives
 from swiftwrf.positions import frame, normalise
 from swiftwrf.rasterize import prepare, rasterize_magnitude
@@ -111,12 +112,21 @@ class SwiftWRFPaper(FieldModel):
     field: DeformableGaussians
     """fitted Gaussians and network; the gradients of their parameters are off after a fit"""
 
-    def _fit(self, train: Spectra, context: FitContext) -> None:
+    def _fit(
+        self,
+        train: Spectra,
+        *,
+        device: torch.device = CPU,
+        checkpoint: Path | None = None,
+        on_record: Callable[[Record], None] | None = None,
+        progress: bool = False,
+        **_: Any,
+    ) -> None:
         work = train.at_most(self.config.max_azimuths)
-        optimisation = Optimisation(self.config, work, context.device)
-        with progress_bar(context.progress) as bar:
+        optimisation = Optimisation(self.config, work, device)
+        with progress_bar(progress) as bar:
             owner = fingerprint(work, asdict(self.config))
-            optimisation.run(Session(context.checkpoint, owner, bar, context.on_record))
+            optimisation.run(Session(checkpoint, owner, bar, on_record))
         self.field = optimisation.result.eval().requires_grad_(False)
 
     def parameters(self) -> Iterable[Tensor]:
@@ -168,7 +178,7 @@ class DeformableGaussians(nn.Module):
         self.register_buffer("centre", centre)
         self.register_buffer("scale", scale)
         self.primitives = Primitives(n, grid, bounded=True, generator=generator)
-        self.layers = skip_layers(2 * (2 * MEAN_BANDS + 1) + 3 * (2 * POSITION_BANDS + 1), WIDTH, DEPTH, SKIPS)
+        self.layers = SkipMLP(2 * (2 * MEAN_BANDS + 1) + 3 * (2 * POSITION_BANDS + 1), WIDTH, DEPTH, SKIPS)
         self.output = nn.Linear(WIDTH, sum(OFFSETS))
         for layer in self.layers:  # torch's default, sampled from the given generator
             bound = 1 / math.sqrt(cast(nn.Linear, layer).in_features)
@@ -202,7 +212,7 @@ class DeformableGaussians(nn.Module):
         shape = (len(position), len(mean), -1)
         of_mean, of_position = encode(unit, MEAN_BANDS), encode(position, POSITION_BANDS)[:, None]
         x = torch.cat([of_mean.expand(shape), of_position.expand(shape)], dim=-1)
-        offset = self.output(skip_forward(self.layers, x, SKIPS)).split(OFFSETS, dim=-1)
+        offset = self.output(self.layers(x)).split(OFFSETS, dim=-1)
         weight = (attenuation[:, None] + offset[2]) * (response + offset[1])
         return mean + offset[0], cholesky, weight
 

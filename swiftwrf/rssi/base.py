@@ -8,7 +8,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from copy import copy
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -21,7 +21,7 @@ from swiftwrf.data.rssi import Offsets, Rssi
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError, listed
 from swiftwrf.gp import Kernel
-from swiftwrf.models.base import FieldConfig, FitContext
+from swiftwrf.models.base import CPU, FieldConfig, check_checkpoint
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_positions, to_tensor
@@ -46,18 +46,22 @@ def map_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterabl
 
 
 @dataclass(frozen=True)
-class RssiFitContext(FitContext):
+class RssiFitContext:
     """Arguments of `RssiPredictor.fit` other than the training rows; see there.
 
     Example:
         >>> import swiftwrf
         >>> data = swiftwrf.rssi_room(n=20)
-        >>> RssiFitContext(pool=data, device=torch.device("cpu")).pool is data
+        >>> RssiFitContext(data).pool is data
         True
     """
 
-    pool: Rssi = field(kw_only=True)
+    pool: Rssi
     parallel: Map | None = None
+    device: torch.device = CPU
+    checkpoint: Path | None = None
+    on_record: Callable[[Record], None] | None = None
+    progress: bool = False
 
 
 class RssiPredictor(Configured, Displayed, ABC):
@@ -149,7 +153,7 @@ class RssiPredictor(Configured, Displayed, ABC):
                 checkpoint of another fit or in a folder that does not exist.
             FitError: The fit diverged.
         """
-        pool = pool or train
+        pool, checkpoint = pool or train, check_checkpoint(checkpoint)
         check_training(train, pool)
         if lacking := self.lacking(train):
             raise InputError(lacking)
@@ -159,7 +163,7 @@ class RssiPredictor(Configured, Displayed, ABC):
             self.attenuation = estimate_floor_attenuation(train, pool)
             pool = replace(self.attenuation, receiver_floor=tuple(receiver_floors(pool).tolist())).removed(pool)
             train = self.attenuation.removed(train)
-        context = RssiFitContext(None, to_device(device), checkpoint, on_record, progress, pool=pool, parallel=parallel)
+        context = RssiFitContext(pool, parallel, to_device(device), checkpoint, on_record, progress)
         self._fit(train, context)
         return self
 

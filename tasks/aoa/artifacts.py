@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from augment import sample_positions
-from swiftwrf import Spectra, SwiftWRF, SwiftWRFPaper
+from swiftwrf import Spectra, SwiftWRF
 from swiftwrf.models import FieldModel
-from swiftwrf.models.nearest import MemoryModel
+from swiftwrf.models.neighbours import MemoryModel
+from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
 from tasks.records import write_json, write_npz
 
 MODEL_FILE = "model"  # name of the file of a swiftwrf model; other field models have their own names

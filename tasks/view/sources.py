@@ -10,9 +10,10 @@ import numpy as np
 import torch
 
 from augment import withhold
-from swiftwrf import FIELD_MODELS, FieldModel, InputError, RssiModel, Spectra, load
+from swiftwrf import FieldModel, InputError, RssiModel, Spectra, load
 from swiftwrf.errors import with_article
 from swiftwrf.locate import RssiLocator
+from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import Plane
 from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.runtime.checkpoint import Saved, refusing

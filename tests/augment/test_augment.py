@@ -19,7 +19,7 @@ from swiftwrf.data.store import Store
 from swiftwrf.metrics import psnr
 from swiftwrf.models import FIELD_MODELS, FieldModel, make_model
 from swiftwrf.models.geometry import model as geometry
-from swiftwrf.models.idw import weights
+from swiftwrf.models.neighbours import weights
 
 ROOM = simulated_room(n=60, seed=3, grid=AngularGrid.hemisphere(15, 60))
 TRAIN, TEST = ROOM.split("random", 0)
@@ -34,7 +34,7 @@ class Recorder(FieldModel):
     name = "recorder"
     kind = "recorder"
 
-    def _fit(self, train, context):
+    def _fit(self, train, like=None, **_):
         self.train = train
 
     def _predict(self, position, grid, with_std):
@@ -185,9 +185,9 @@ def spied():
     class Spy(Recorder):
         searches = True
 
-        def _fit(self, train, context):
-            super()._fit(train, context)
-            structure = context.like.structure if context.like else train
+        def _fit(self, train, like=None, **_):
+            super()._fit(train)
+            structure = like.structure if like else train
             self.structure = structure
             fits.append((train, structure))
 
@@ -262,3 +262,35 @@ def test_models_without_a_structure_are_fitted_once_for_each_scored_fold():
 def test_too_few_spectra_for_a_choice_are_refused():
     with pytest.raises(InputError, match="more than 10 measured spectra, got 10"):
         choose_model(TRAIN.subset(torch.arange(10)), ("nearest",))
+
+
+class Mean(FieldModel):
+    """Two methods are a field model."""
+
+    def _fit(self, train, **_):
+        self.mean = train.store.mean()
+
+    def _predict(self, position, grid, with_std):
+        return self.mean.expand(len(position), -1, -1), None
+
+
+def test_classes_and_models_are_candidates_like_names():
+    alone = choose_model(TRAIN, ("idw",), seed=3)
+    model = make_model("idw", seed=3)
+    chosen = choose_model(TRAIN, (model, Mean), seed=3)
+    assert chosen.name == "idw"
+    assert chosen.psnr_db["idw"] == alone.psnr_db["idw"] > chosen.psnr_db["Mean"]
+    assert not model.is_fitted
+    with pytest.raises(InputError, match="two candidates have the name 'idw'"):
+        choose_model(TRAIN, ("idw", model))
+
+
+def test_a_model_of_two_methods_is_registered_fitted_and_refuses_to_be_saved(tmp_path):
+    with mock.patch.dict(FIELD_MODELS._registered):
+        FIELD_MODELS.register("mine")(Mean)
+        model = make_model("mine").fit(TRAIN)
+    assert "Mean" in model._repr_html_()
+    with pytest.raises(InputError, match="Mean cannot be saved; its class needs _state and _restore"):
+        model.save(tmp_path / "model")
+    with pytest.raises(InputError, match="Mean: cannot be updated"):
+        model.update(TEST)

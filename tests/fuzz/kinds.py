@@ -35,15 +35,13 @@ from fuzz import runs
 from fuzz.commands import config_file, updates_and_conversions
 from fuzz.misuse import CALLS, misuse
 from swiftwrf import (
-    FIELD_MODELS,
     AngularGrid,
+    CoarrayModel,
     MatchedField,
     Rssi,
     RssiLocator,
     Spectra,
-    SwiftWRFPaper,
     fit,
-    fit_coarray,
     fit_rssi,
     load,
     load_rssi,
@@ -55,9 +53,11 @@ from swiftwrf import (
 from swiftwrf.comparison import NeRF2Rssi
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.gp import Kernel
+from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import GeometryModel, HybridModel
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.path_gains import fit_path_gains
+from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
 from swiftwrf.rssi import PairModel
 from tasks.aoa.estimators.kernel_regression import KernelRegression
 
@@ -130,7 +130,7 @@ def model_of(name: str, folder: Path) -> None:
 
 
 def model_coarray(folder: Path) -> None:
-    fit_coarray(_room(), progress=False).save(folder / "model")
+    CoarrayModel().fit(_room()).save(folder / "model")
 
 
 def model_geometry(folder: Path) -> None:

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from swiftwrf import (
-    FIELD_MODELS,
     AngularGrid,
     FitError,
     InputError,
@@ -22,6 +21,7 @@ from swiftwrf import (
     simulated_room,
 )
 from swiftwrf.data.store import Store
+from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import search, uncertainty
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.swiftwrf import smallest

@@ -7,7 +7,8 @@ import pytest
 import torch
 from matplotlib import pyplot
 
-from swiftwrf import AngularGrid, InputError, Posterior, Prediction, Rssi, make_model, rssi_room, simulated_room
+from swiftwrf import AngularGrid, InputError, Prediction, Rssi, make_model, rssi_room, simulated_room
+from swiftwrf.locate import Posterior
 from swiftwrf.plotting import polar_spectrum
 from swiftwrf.rssi import fit_rssi
 

@@ -12,10 +12,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swiftwrf import FIELD_MODELS, AngularGrid, InputError, RssiConfig, RssiModel, load, make_model
+from swiftwrf import AngularGrid, InputError, RssiModel, load, make_model
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.simulated import rssi_room, simulated_room
 from swiftwrf.gp import GaussianProcess, Kernel
+from swiftwrf.models import FIELD_MODELS
+from swiftwrf.rssi import RssiConfig
 from swiftwrf.rssi.floors import FloorAttenuation
 
 SIGNAL = 1e-5  # of the signal: magnitudes up to 1, RSSI over 60 dB

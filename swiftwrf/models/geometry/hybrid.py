@@ -9,6 +9,8 @@ alone.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -18,7 +20,7 @@ from swiftwrf.data.splits import folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, LeaveGroupOut, choose_kernel, principal_components
 from swiftwrf.metrics import psnr
-from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext
+from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.path_gains import PathGains, PriorChoice, choose_prior, fit_path_gains, kernel_of
@@ -74,17 +76,14 @@ class HybridModel(ProcessModel):
         """Room whose paths the model uses."""
         return self._room
 
-    def region(self) -> Tensor:
-        return self.process.known
-
-    def _fit(self, train: Spectra, context: FitContext) -> None:
+    def _fit(self, train: Spectra, *, like: FieldModel | None = None, progress: bool = False, **_: Any) -> None:
         if len(train) > MAX_SPECTRA:
             raise InputError(
                 f"hybrid is fitted to all inner products of its spectra, at most {MAX_SPECTRA} of them, not {len(train)}; "
                 "take geometry, coarray or swiftwrf, or fewer spectra"
             )
-        self._room = GeometryModel(self.config).fit(train, like=context.like, progress=context.progress)
-        self._fit_residual(train, context.like if isinstance(context.like, HybridModel) else None)
+        self._room = GeometryModel(self.config).fit(train, like=like, progress=progress)
+        self._fit_residual(train, like if isinstance(like, HybridModel) else None)
 
     @single_thread()
     def _fit_residual(self, train: Spectra, like: HybridModel | None) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra, check_training, fingerprint
-from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, FitContext, bounding_box
+from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, bounding_box
 from swiftwrf.models.geometry.fit import (
     GeometryConfig,
     extend_room,
@@ -90,10 +90,10 @@ class GeometryModel(Linked, FieldModel):
         room._restore(tensors, header)
         return room
 
-    def _fit(self, train: Spectra, context: FitContext) -> None:
-        owner, known = fingerprint(train), context.like.room if context.like else None
+    def _fit(self, train: Spectra, *, like: FieldModel | None = None, progress: bool = False, **_: Any) -> None:
+        owner, known = fingerprint(train), like.room if like else None
         if known is None:
-            self.estimate = search_room(train, self.config, context.progress)
+            self.estimate = search_room(train, self.config, progress)
         elif known.fingerprint == owner:
             self.estimate = known.estimate
         else:

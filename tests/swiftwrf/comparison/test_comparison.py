@@ -13,18 +13,7 @@ import torch
 from small import PUBLISHED, PUBLISHED_RSSI
 from torch.nn import functional
 
-from swiftwrf import (
-    FIELD_MODELS,
-    AngularGrid,
-    FitError,
-    InputError,
-    Spectra,
-    load,
-    make_model,
-    rasterize_magnitude,
-    rssi_room,
-    simulated_room,
-)
+from swiftwrf import AngularGrid, FitError, InputError, Spectra, load, make_model, rssi_room, simulated_room
 from swiftwrf.comparison import (
     DcganConfig,
     NeRF2Config,
@@ -40,7 +29,9 @@ from swiftwrf.comparison.vae import divergence
 from swiftwrf.comparison.wrfgs import on_sphere
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import psnr
+from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.mlp import encode
+from swiftwrf.rasterize import rasterize_magnitude
 from swiftwrf.runtime.checkpoint import read, write
 
 GRID = AngularGrid.hemisphere(90, 360)

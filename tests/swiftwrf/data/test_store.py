@@ -12,7 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
-from swiftwrf import AngularGrid, InputError, fit_coarray, load, load_spectra, positions, simulated_room
+from swiftwrf import AngularGrid, CoarrayModel, InputError, load, load_spectra, positions, simulated_room
 from swiftwrf.data import store
 from swiftwrf.data.formats import nerf2
 from swiftwrf.data.spectra import check_training, fingerprint
@@ -20,7 +20,7 @@ from swiftwrf.data.store import Store, stored
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.gp import principal_components, process
 from swiftwrf.metrics import psnr
-from swiftwrf.models import coarray, idw, make_model
+from swiftwrf.models import coarray, make_model, neighbours
 from swiftwrf.models.geometry import HybridModel, hybrid
 from swiftwrf.positions import distance, nearest
 from swiftwrf.runtime.durable import cache_folder
@@ -236,7 +236,7 @@ def exact(monkeypatch):
         for module, name in (
             (process, "MAX_EXACT"),
             (coarray, "MAX_EXACT_ROWS"),
-            (idw, "MAX_CHOICE_SPECTRA"),
+            (neighbours, "MAX_CHOICE_SPECTRA"),
             (positions, "MIN_TREE_POSITIONS"),
         ):
             monkeypatch.setattr(module, name, n)
@@ -283,7 +283,7 @@ def test_a_fit_is_the_same_in_memory_and_in_a_file(cache, monkeypatch):
     monkeypatch.setattr(store, "MIN_FILE_SPECTRA", N + 1)
     few = simulated_room(n=N, grid=AngularGrid.hemisphere(8, 32))
     position = few.position[:5]
-    drawn = [fit_coarray(data, progress=False).synthesize(position) for data in (many, few)]
+    drawn = [CoarrayModel().fit(data).synthesize(position) for data in (many, few)]
     torch.testing.assert_close(*drawn, atol=1e-5, rtol=0)
 
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from swiftwrf import AngularGrid, CoarrayModel, InputError, fit_coarray, load, load_spectra, project, simulated_room
+from swiftwrf import AngularGrid, CoarrayModel, InputError, load, load_spectra, simulated_room
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import psnr, ssim
-from swiftwrf.models.coarray import basis, differences
+from swiftwrf.models.coarray import basis, differences, project
 
 GRID = AngularGrid.hemisphere(15, 60)
 
@@ -69,7 +69,7 @@ def test_projection_refuses_other_grids():
 
 def test_model_is_as_good_as_the_mean_is_not(room):
     train, test = room.split("random")
-    drawn = fit_coarray(train).synthesize(test.position)
+    drawn = CoarrayModel().fit(train).synthesize(test.position)
     assert drawn.shape == test.spectrum.shape
     assert 0 <= float(drawn.min()) <= float(drawn.max()) <= 1
     mean = psnr(train.spectrum.mean(dim=0), test.spectrum).median()
@@ -78,14 +78,14 @@ def test_model_is_as_good_as_the_mean_is_not(room):
 
 def test_model_draws_any_resolution_what_the_array_would(room):
     """Twice as fine, every second pixel is the same one."""
-    model = fit_coarray(room)
+    model = CoarrayModel().fit(room)
     fine = AngularGrid.hemisphere(30, 120)
     a, b = model.synthesize(room.position[:3]), model.synthesize(room.position[:3], fine)
     torch.testing.assert_close(b[:, 1::2, ::2], a, atol=1e-4, rtol=0)
 
 
 def test_a_saved_model_synthesizes_the_same_bits(room, tmp_path):
-    model = fit_coarray(room)
+    model = CoarrayModel().fit(room)
     model.save(tmp_path / "model.safetensors")
     again = load(tmp_path / "model.safetensors")
     assert torch.equal(again.synthesize(room.position), model.synthesize(room.position))
@@ -99,33 +99,18 @@ def test_equal_arrays_are_equal_and_share_their_basis():
     assert basis(one, GRID) is basis(two, GRID)
 
 
-def test_fit_goes_on_from_what_was_kept_and_refuses_what_is_of_others(room, tmp_path):
-    records = []
-    kept = tmp_path / "kept"
-    model = fit_coarray(room, checkpoint=kept, on_record=records.append)
-    again = fit_coarray(room, checkpoint=kept, on_record=records.append)
-    assert records[0]["stage"] == "final"
-    assert records[0] == records[1]  # its seconds are those of the fit, not of opening it again
-    assert torch.equal(again.synthesize(room.position), model.synthesize(room.position))
-    with pytest.raises(InputError, match="another fit"):
-        fit_coarray(room, seed=1, checkpoint=kept)
-    other = replace(room, array=PlanarArray(room.array.element, 1.1 * room.array.wavelength))
-    with pytest.raises(InputError, match="another fit"):
-        fit_coarray(other, checkpoint=kept)
-
-
 def test_a_spectrum_without_any_signal_spoils_nothing(room):
     spectrum = room.spectrum.clone()
     spectrum[3] = 0
-    model = fit_coarray(replace(room, store=Store(spectrum)))
+    model = CoarrayModel().fit(replace(room, store=Store(spectrum)))
     assert psnr(model.synthesize(room.position[4:]), spectrum[4:]).median() > 15
 
 
 def test_refuses_spectra_of_an_unknown_array_and_positions_that_are_none(room):
     with pytest.raises(InputError, match="needs the array"):
-        fit_coarray(replace(room, array=None))
+        CoarrayModel().fit(replace(room, array=None))
     with pytest.raises(InputError, match="shape"):
-        fit_coarray(room).synthesize(torch.zeros(3))
+        CoarrayModel().fit(room).synthesize(torch.zeros(3))
 
 
 @pytest.mark.data
@@ -141,7 +126,7 @@ def test_simulated_room_tells_its_array():
 
 
 def test_spectra_are_differentiable_in_the_position(room):
-    model = fit_coarray(room)
+    model = CoarrayModel().fit(room)
     position = room.position[:3] + 0.02
     at = position.clone().requires_grad_()
     model.predict(at).mean.sum().backward()

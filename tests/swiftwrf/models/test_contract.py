@@ -15,7 +15,8 @@ import small
 import torch
 
 import swiftwrf
-from swiftwrf import FIELD_MODELS, AngularGrid, FieldModel, InputError, Spectra, load, make_model
+from swiftwrf import AngularGrid, FieldModel, InputError, Spectra, load, make_model
+from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.base import ARRAY, FIXED_END
 
 OPTIONS = {"swiftwrf": {"n_primitives": 24}}
@@ -206,7 +207,8 @@ def test_unknown_names_are_refused():
 
 USE = """
 import sys, torch, swiftwrf
-assert "outside_mean" in swiftwrf.FIELD_MODELS
+from swiftwrf.models import FIELD_MODELS
+assert "outside_mean" in FIELD_MODELS
 room = swiftwrf.simulated_room(n=12, grid=swiftwrf.AngularGrid.hemisphere(8, 32))
 model = swiftwrf.make_model("outside_mean", seed=1).fit(room)
 assert torch.equal(model.predict(room.position[:2]).mean[1], room.spectrum.mean(dim=0))

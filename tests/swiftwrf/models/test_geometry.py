@@ -34,7 +34,7 @@ from swiftwrf.models.geometry.phase_retrieval import autocorrelation, correlatio
 from swiftwrf.models.geometry.planes import image_jacobian, phase_jacobian, refine, refine_all
 from swiftwrf.models.geometry.search import SIGNS, SteeringResponses
 from swiftwrf.models.geometry.uncertainty import _AlternativeTable, phase_alternatives
-from swiftwrf.models.nearest import NearestModel
+from swiftwrf.models.neighbours import NearestModel
 from swiftwrf.runtime.checkpoint import write
 
 QUICK = GeometryConfig(search_distance_m=2.0, beam_width=2)

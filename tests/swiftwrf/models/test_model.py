@@ -7,10 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from swiftwrf import AngularGrid, InputError, SwiftWRF, fit, load, rasterize_magnitude
+from swiftwrf import AngularGrid, InputError, SwiftWRF, fit, load
 from swiftwrf.data.store import Store
 from swiftwrf.models import swiftwrf as module
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaperConfig
+from swiftwrf.rasterize import rasterize_magnitude
 from swiftwrf.runtime import checkpoint
 
 

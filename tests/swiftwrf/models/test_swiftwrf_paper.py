@@ -7,12 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from swiftwrf import AngularGrid, FitError, InputError, SwiftWRF, SwiftWRFPaper, load, make_model, rasterize_magnitude
+from swiftwrf import AngularGrid, FitError, InputError, SwiftWRF, load, make_model
 from swiftwrf.metrics import psnr
 from swiftwrf.models.mlp import encode
 from swiftwrf.models.primitives import MIN_WIDTH_PIXELS, Primitives
-from swiftwrf.models.swiftwrf_paper import DeformableGaussians, Optimisation, SwiftWRFPaperConfig
+from swiftwrf.models.swiftwrf_paper import DeformableGaussians, Optimisation, SwiftWRFPaper, SwiftWRFPaperConfig
 from swiftwrf.positions import frame
+from swiftwrf.rasterize import rasterize_magnitude
 
 GRID = AngularGrid.hemisphere(15, 60)
 QUICK = SwiftWRFPaperConfig(n_primitives=24, steps=80, check_every=20)

@@ -8,8 +8,9 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
-from swiftwrf import InputError, Rssi, RssiConfig, RssiModel, fit_rssi, load, rssi_room
+from swiftwrf import InputError, Rssi, RssiModel, fit_rssi, load, rssi_room
 from swiftwrf.gp import Kernel
+from swiftwrf.rssi import RssiConfig
 from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, harmonics, log_distance
 from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, PATH_LOSS_STD_DB, fit_receiver

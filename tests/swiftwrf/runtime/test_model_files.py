@@ -12,7 +12,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from swiftwrf import FIELD_MODELS, CoarrayModel, InputError, SwiftWRF, SwiftWRFPaper, fit, fit_coarray, load, make_model
+from swiftwrf import CoarrayModel, InputError, SwiftWRF, fit, load, make_model
+from swiftwrf.models import FIELD_MODELS
+from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
 from swiftwrf.runtime.checkpoint import Saved, read, write
 
 ROOT = Path(__file__).parents[3]
@@ -25,7 +27,7 @@ def models(room, tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
     fit(room, n_primitives=4).save(folder / "swiftwrf")
     SwiftWRFPaper(**TINY).fit(room).save(folder / "swiftwrf_paper")
-    fit_coarray(room).save(folder / "coarray")
+    CoarrayModel().fit(room).save(folder / "coarray")
     return folder
 
 

@@ -17,8 +17,9 @@ from rooms import mirror_room
 from small import with_defaults
 
 from augment import Fold
-from swiftwrf import FIELD_MODELS, MatchedField, load, make_model
+from swiftwrf import MatchedField, load, make_model
 from swiftwrf.locate import MatchedFieldConfig, Posterior, matched_field
+from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import model as geometry
 from swiftwrf.models.geometry.planes import Plane
 from tasks.aoa import cross_validation, experiment
