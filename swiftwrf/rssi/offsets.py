@@ -55,7 +55,7 @@ def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
         raise InputError(f"column {groups.column} has no value {chosen!r}; there are {listed(groups.names)}")
     position = train.transmitter_position
     extent = float((position.amax(dim=0) - position.amin(dim=0)).max()) or 1.0
-    kernel = Kernel(long=LENGTH_SHARE * extent, short=extent, share=1.0, noise=RELATIVE_NOISE)
+    kernel = Kernel(LENGTH_SHARE * extent, matern12_weight=1.0, noise=RELATIVE_NOISE)
     distance = log_distance(position, train.receiver_position)
     member = torch.nn.functional.one_hot(groups.code, len(groups.names)).double()
     normal = torch.zeros(len(groups.names), len(groups.names), dtype=torch.float64)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.errors import FitError
-from swiftwrf.gp import LeaveGroupOut
+from swiftwrf.gp import held_out_errors
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import HeadTable
 from swiftwrf.rssi.path_loss import N_HARMONICS, PathLoss, harmonics, log_distance
@@ -150,5 +150,5 @@ def fold_errors(factor: Tensor, dual: Tensor, fold: Tensor) -> Tensor:
     error = torch.empty_like(dual)
     for number in fold.unique():
         part = (fold == number).nonzero()[:, 0]
-        error[part] = LeaveGroupOut(precision, part).errors(dual)
+        error[part] = held_out_errors(precision, dual, part)
     return error

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
-from swiftwrf.gp import Kernel, LeaveGroupOut, candidates, subsample
+from swiftwrf.gp import Kernel, candidates, held_out_errors, subsample
 from swiftwrf.positions import cells
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import Head, render
@@ -217,11 +217,11 @@ def choose_residual_kernel(
     def error(kernel: Kernel) -> float:
         precision = torch.linalg.inv(kernel.covariance(position))
         dual = precision @ residual.nan_to_num()
-        errors = [LeaveGroupOut(precision, out).errors(dual[:, r])[:n] for r, n, out in held_out]
+        errors = [held_out_errors(precision, dual[:, r], out)[:n] for r, n, out in held_out]
         return float(torch.cat(errors).abs().mean())
 
     # rough fields only: a choice among mixtures with a smooth part follows chance, and its errors are no lower
-    rough = [kernel for kernel in candidates(position, RELATIVE_NOISE_VARIANCES) if kernel.share == 1]
+    rough = [kernel for kernel in candidates(position, RELATIVE_NOISE_VARIANCES) if kernel.matern12_weight == 1]
     stretched = (replace(kernel, vertical=vertical) for vertical in verticals for kernel in rough)
     score, best = min(((error(kernel), kernel) for kernel in stretched), key=lambda pair: pair[0])
     return best, score < float(residual.abs().nanmean())

@@ -136,7 +136,7 @@ def test_an_update_beyond_the_exact_size_is_local(monkeypatch, generator):
     position = torch.rand(30, 3, generator=generator, dtype=torch.float64)
     value = torch.randn(30, 2, generator=generator, dtype=torch.float64)
     process = GaussianProcess.regress(Kernel(), position[:24], value[:24]).updated(position[24:], value[24:])
-    assert not process.exact
+    assert not process.is_exact
     torch.testing.assert_close(process.value, value)
 
 
@@ -213,7 +213,7 @@ def test_a_chosen_kernel_is_that_of_a_fit(name):
     """From another kernel, the choice by the values of the process is that by the spectra."""
     model = fitted(name)
     other = model._copy()
-    other._set_process(model.process.with_kernel(Kernel(long=0.01, share=1.0, noise=0.1)))
+    other._set_process(model.process.with_kernel(Kernel(0.01, matern12_weight=1.0, noise=0.1)))
     found = other.with_chosen_kernel()
     assert found.kernel.correlation_length == pytest.approx(model.with_chosen_kernel().kernel.correlation_length)
     torch.testing.assert_close(found.process.value, model.process.value, rtol=1e-4, atol=1e-4)
@@ -234,7 +234,7 @@ def test_rssi_follows_from_its_residuals():
 def test_rssi_with_a_chosen_kernel_is_a_fit_to_all_rows():
     model = fitted_rssi().update(floor().subset(torch.arange(60, 90))).with_chosen_kernel()
     whole, at = RssiModel().fit(floor()), floor().transmitter_position[:20] + 0.5
-    assert model.kernel.long == pytest.approx(whole.kernel.long)
+    assert model.kernel.matern12_length == pytest.approx(whole.kernel.matern12_length)
     assert model.kernel.noise == whole.kernel.noise
     assert (model.predict(at).mean - whole.predict(at).mean).abs().mean() < 0.5
 

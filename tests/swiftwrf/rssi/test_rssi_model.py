@@ -18,7 +18,7 @@ from swiftwrf.rssi.training import RssiTraining, bin_locations
 from swiftwrf.runtime import checkpoint
 from swiftwrf.runtime.threads import threads_kept
 
-KERNEL = Kernel(long=4.0, short=1.0, share=0.6, noise=1.0)
+KERNEL = Kernel(4.0, 1.0, matern12_weight=0.6, noise=1.0)
 FIELD_DB, NOISE_DB = 3.0, 2.0
 CPU, FIRST = torch.device("cpu"), slice(0, 1)
 
