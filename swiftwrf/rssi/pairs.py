@@ -26,9 +26,8 @@ from swiftwrf.models.base import FieldConfig
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import Neighbours, check_positions, distance
 from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiFitContext, RssiPredictor, SavedRssiPredictor
-from swiftwrf.rssi.model import LEVEL
 from swiftwrf.rssi.path_loss import PairPathLoss
-from swiftwrf.rssi.training import rounding_std
+from swiftwrf.rssi.training import LEVEL, rounding_std
 from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.threads import single_thread

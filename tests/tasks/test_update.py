@@ -12,11 +12,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swiftwrf import FIELD_MODELS, AngularGrid, InputError, RssiConfig, RssiModel, load, make_model
+from swiftwrf import FIELD_MODELS, AngularGrid, InputError, RssiModel, load, make_model
 from swiftwrf.data.floors import Floors
 from swiftwrf.data.simulated import rssi_room, simulated_room
 from swiftwrf.gp import GaussianProcess, Kernel
-from swiftwrf.rssi.floors import FloorAttenuation
+from swiftwrf.rssi import FloorAttenuation, RssiPaperModel
 
 SIGNAL = 1e-5  # of the signal: magnitudes up to 1, RSSI over 60 dB
 OPTIONS = {"swiftwrf": {"n_primitives": 24}}
@@ -203,7 +203,7 @@ def test_rssi_refuses_other_receivers_and_the_papers_head():
     with pytest.raises(InputError, match="receivers"):
         fitted_rssi().update(floor().columns([0, 1]))
     few = floor().columns([0])
-    paper = RssiModel(RssiConfig.paper(steps=2)).fit(few)
+    paper = RssiPaperModel(steps=2).fit(few)
     with pytest.raises(InputError, match="fit it again"):
         paper.update(few)
 
