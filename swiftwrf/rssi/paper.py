@@ -101,7 +101,7 @@ class RssiPaperModel(RssiModel):
         self.n_primitives, self.mixing_weight = config.n_primitives, FIELD_ALONE[:, None].repeat(1, n_receivers)
         self.centre, self.anchor, self.rendered = bins.centre, bins.position.float(), rendered
         self.level = LEVEL_DBM + HeadTable(rendered)(per_receiver[None])[0][0]
-        self.slope, self.slope_std = per_receiver, per_receiver
+        self.slope, self.slope_std = per_receiver, per_receiver.clone()
         self.directivity = torch.zeros(n_receivers, N_HARMONICS)
         dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True)
         self.coefficient, self._posterior = dual.float(), None
